@@ -1,0 +1,66 @@
+"""Configs as JSON: written with every field, read back strictly."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from typing import Any, TypeVar
+
+from .checks import InputError
+
+C = TypeVar("C")
+
+
+def to_dict(cfg: Any) -> dict[str, Any]:
+    """Nested dict of every field of a config dataclass; tuples become lists, as in JSON."""
+    return {
+        f.name: to_dict(v)
+        if dataclasses.is_dataclass(v := getattr(cfg, f.name))
+        else list(v)
+        if isinstance(v, tuple)
+        else v
+        for f in dataclasses.fields(cfg)
+    }
+
+
+def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
+    """Build a config dataclass from a nested dict; unknown fields and wrong types are refused, missing ones default.
+
+    Raises:
+        InputError: naming the field, what was expected and what was found.
+    """
+    if not isinstance(values, dict):
+        raise InputError(
+            f"{where}: expected an object of fields; got {type(values).__name__}. Use a file this program wrote."
+        )
+    hints = typing.get_type_hints(cls)
+    unknown = sorted(set(values) - set(hints))
+    if unknown:
+        raise InputError(f"{where}.{unknown[0]}: no such field. Fields: {', '.join(hints)}.")
+    built = {name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()}
+    try:
+        return cls(**built)
+    except ValueError as error:
+        raise InputError(f"{where}: {error}. Correct the value.") from error
+
+
+def _value(hint: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return from_dict(hint, value, where)
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        ok, want = value in args, f"one of {', '.join(map(repr, args))}"
+    elif origin is tuple:
+        ok = isinstance(value, list | tuple) and all(type(v) is int for v in value)
+        ok, want = ok and (args[-1] is Ellipsis or len(value) == len(args)), "a list of integers"
+        value = tuple(value) if ok else value
+    elif origin is types.UnionType:
+        ok, want = value is None or any(type(value) is a for a in args), str(hint)
+    elif hint is float:
+        ok, want = type(value) in (int, float), "a number"
+    else:
+        ok, want = type(value) is hint, hint.__name__
+    if not ok:
+        raise InputError(f"{where}: expected {want}; got {value!r}. Correct the value.")
+    return value

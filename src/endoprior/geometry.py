@@ -1,0 +1,92 @@
+"""Pinhole geometry on NumPy arrays: pixel grids, projection, back-projection, bilinear look-up.
+
+Pixel (0, 0) is centred at (0.5, 0.5); `x = fx X / Z + cx`. Everything is in mm and px.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .types import Camera
+
+
+def pixel_centers(width: int, height: int) -> NDArray[np.float32]:
+    """(H, W, 2) coordinates (x, y) of the pixel centres, px."""
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5)
+    return np.stack([x, y], -1)
+
+
+def project(points: NDArray, camera: Camera) -> tuple[NDArray, NDArray]:
+    """Project world points onto the image plane.
+
+    Args:
+        points: (..., 3) world coordinates, mm.
+    Returns:
+        (..., 2) pixel coordinates (meaningless where z <= 0) and (...,) camera-space z, mm.
+    """
+    in_camera = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    z = in_camera[..., 2]
+    safe_z = np.where(np.abs(z) < 1e-9, 1e-9, z)
+    x = camera.fx * in_camera[..., 0] / safe_z + camera.cx
+    y = camera.fy * in_camera[..., 1] / safe_z + camera.cy
+    return np.stack([x, y], -1), z
+
+
+def back_project(pixels: NDArray, depth: NDArray, camera: Camera) -> NDArray:
+    """Lift pixels to world points: the inverse of `project`.
+
+    Args:
+        pixels: (..., 2) pixel coordinates, centres at half integers.
+        depth: (...,) camera-space z, mm.
+    Returns:
+        (..., 3) world coordinates, mm.
+    """
+    in_camera = np.stack(
+        [
+            (pixels[..., 0] - camera.cx) / camera.fx * depth,
+            (pixels[..., 1] - camera.cy) / camera.fy * depth,
+            depth,
+        ],
+        -1,
+    )
+    return (in_camera - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
+
+
+def bilinear(image: NDArray, pixels: NDArray) -> NDArray:
+    """Bilinear interpolation with values at pixel centres; the border value is held outside them.
+
+    Args:
+        image: (H, W) or (H, W, C).
+        pixels: (..., 2) coordinates (x, y), px.
+    Returns:
+        (...) or (..., C) interpolated values.
+    """
+    height, width = image.shape[:2]
+    x = np.clip(pixels[..., 0] - 0.5, 0, width - 1)
+    y = np.clip(pixels[..., 1] - 0.5, 0, height - 1)
+    x0, y0 = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
+    x1, y1 = np.minimum(x0 + 1, width - 1), np.minimum(y0 + 1, height - 1)
+    fx, fy = x - x0, y - y0
+    if image.ndim == 3:
+        fx, fy = fx[..., None], fy[..., None]
+    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
+    bottom = image[y1, x0] * (1 - fx) + image[y1, x1] * fx
+    return top * (1 - fy) + bottom * fy
+
+
+def quaternion_to_matrix(quats: NDArray) -> NDArray:
+    """Rotation matrices of quaternions (w, x, y, z) of any non-zero length.
+
+    Args:
+        quats: (..., 4).
+    Returns:
+        (..., 3, 3).
+    """
+    w, x, y, z = np.moveaxis(quats / np.linalg.norm(quats, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)

@@ -1,0 +1,101 @@
+"""The records that pass between modules: frozen, almost no logic.
+
+Shared letters: `H, W` image size, `N` Gaussians, `T` frames. Conventions (axes, pixel centres, units) are decided in
+`docs/conventions.md`: OpenCV camera axes, millimetres, pixel (0, 0) centred at (0.5, 0.5), quaternions (w, x, y, z).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in OpenCV axes (x right, y down, z forward)."""
+
+    width: int
+    """Image width, px."""
+    height: int
+    """Image height, px."""
+    fx: float
+    """Focal length along x, px."""
+    fy: float
+    """Focal length along y, px."""
+    cx: float
+    """Principal point x, px; the centre of the left-most pixel is 0.5."""
+    cy: float
+    """Principal point y, px; the centre of the top-most pixel is 0.5."""
+    world_to_camera: NDArray[np.float64]
+    """(4, 4) rigid transform from world to camera axes, translation in mm."""
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """(3,) position of the camera in world axes, mm."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.T @ translation
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One moment of a sequence: what the left eye saw, and what is known of its depth."""
+
+    index: int
+    """Position in the sequence, 0-based, counting every frame whatever its split."""
+    time: float
+    """index / T, in [0, 1)."""
+    camera: Camera
+    rgb_u8: NDArray[np.uint8]
+    """(H, W, 3) colour, 0..255, as stored in the file."""
+    tissue_mask: NDArray[np.bool_]
+    """(H, W) True where the pixel shows usable tissue (no tool)."""
+    depth: NDArray[np.float32]
+    """(H, W) z of the surface, mm; 0 where `depth_valid` is False."""
+    depth_valid: NDArray[np.bool_]
+    """(H, W) True where the depth was measured."""
+
+    @property
+    def rgb(self) -> NDArray[np.float32]:
+        """(H, W, 3) colour in [0, 1]."""
+        return self.rgb_u8.astype(np.float32) / np.float32(255)
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Gaussians ready to be drawn, at one moment: every value is activated."""
+
+    means: Tensor
+    """(N, 3) centres, world axes, mm."""
+    quats: Tensor
+    """(N, 4) rotations (w, x, y, z); any non-zero length, the renderer normalises."""
+    scales: Tensor
+    """(N, 3) standard deviations along the local axes, mm, > 0."""
+    opacities: Tensor
+    """(N,) in (0, 1)."""
+    sh: Tensor
+    """(N, (D+1)**2, 3) spherical-harmonic colour coefficients of degree D in 0..3."""
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """What every backend returns. After `means2d.retain_grad()`, its `.grad` (px) is what density control reads."""
+
+    color: Tensor
+    """(H, W, 3) composited colour, background included; not clamped."""
+    alpha: Tensor
+    """(H, W) accumulated opacity in [0, 1)."""
+    depth: Tensor
+    """(H, W) sum of weight * z, mm; divide by alpha for the expected depth."""
+    means2d: Tensor
+    """(N, 2) projected centres, px; pixel (0, 0) is centred at (0.5, 0.5)."""
+    radii: Tensor
+    """(N,) int32 radius of the drawn footprint, px; 0 where culled."""

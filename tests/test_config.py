@@ -1,0 +1,75 @@
+"""Configs: the paper's numbers, strict JSON, presets, command-line agreement."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from endoprior.checks import InputError
+from endoprior.config import Config, DensityConfig, HexPlaneConfig
+from endoprior.config_io import from_dict, to_dict
+from endoprior.presets import preset
+
+PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
+PRESETS = ("default", "paper", "released", "endogaussian")
+
+
+@pytest.mark.parametrize("field", sorted(PAPER_VALUES))
+def test_defaults_are_the_papers(field):
+    value = Config()
+    for name in field.split("."):
+        value = getattr(value, name)
+    assert value == PAPER_VALUES[field]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_config_survives_json(name):
+    cfg = preset(name)
+    assert from_dict(Config, json.loads(json.dumps(to_dict(cfg)))) == cfg
+
+
+def test_missing_fields_keep_their_defaults():
+    assert from_dict(Config, {"seed": 7}) == dataclasses.replace(Config(), seed=7)
+
+
+@pytest.mark.parametrize(
+    ("values", "names"),
+    [
+        ({"sed": 1}, "config.sed"),
+        ({"density": {"evry": 1}}, "config.density.evry"),
+        ({"seed": "1"}, "config.seed"),
+        ({"seed": True}, "config.seed"),
+        ({"seed": None}, "config.seed"),
+        ({"temporal": {"gradient": "none"}}, "config.temporal.gradient"),
+        ({"deformation": {"hexplane": {"multires": [1, "2"]}}}, "config.deformation.hexplane.multires"),
+        ({"deformation": {"hexplane": {"resolution": [1, 2]}}}, "config.deformation.hexplane.resolution"),
+        ({"init": {"budget": 0}}, "config.init"),
+        ({"density": {"min_densify_weight": float("nan")}}, "config.density"),
+        ([], "config"),
+    ],
+)
+def test_bad_configs_are_named(values, names):
+    with pytest.raises(InputError) as caught:
+        from_dict(Config, values)
+    assert str(caught.value).startswith(names + ":") and "\n" not in str(caught.value)
+
+
+def test_unknown_preset():
+    with pytest.raises(InputError, match="preset: expected one of default, paper"):
+        preset("best")
+
+
+def test_paper_preset_is_the_defaults():
+    assert preset("paper") == Config()
+
+
+def test_baseline_knows_no_prior():
+    cfg = preset("endogaussian")
+    assert cfg.init.sampler == "pool" and cfg.temporal.weight == 0
+    assert cfg.density.min_densify_weight == 1 and not cfg.density.prior_prune
+
+
+def test_only_tuples_lists_and_plain_values_are_configured():
+    assert to_dict(HexPlaneConfig())["multires"] == [1, 2, 4, 8]
+    assert to_dict(DensityConfig())["prior_prune"] is True
