@@ -1,0 +1,127 @@
+"""PNG files to arrays, with a complaint that names the file when one is not what it should be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..checks import InputError
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+"""First bytes of every PNG file."""
+
+
+def complaint(path: Path | str, expected: str, got: str, next_step: str) -> InputError:
+    """The error for a file or folder that cannot be used, on one line."""
+    return InputError(f"{path}: expected {expected}; got {got}. {next_step}")
+
+
+def read_color(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """Read an 8-bit color image.
+
+    Args:
+        path: the file; an alpha channel is dropped.
+        size: (width, height) it must have, px; None accepts any.
+    Returns:
+        (H, W, 3) red, green, blue, 0..255.
+    Raises:
+        InputError: unreadable, not 8-bit color, or of another size.
+    """
+    pixels = _decode(path, size)
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+        raise complaint(path, "an 8-bit RGB image", _describe(pixels), "Convert it to 8-bit RGB.")
+    return np.ascontiguousarray(pixels[..., 2::-1])
+
+
+def read_tool_mask(path: Path, tool_value: int = 255, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
+    """Read a binary mask file.
+
+    Args:
+        path: an 8-bit image with values 0 and 255 only, gray or with equal channels.
+        tool_value: 255, or 0 where the file marks tissue instead of tools.
+        size: (width, height) it must have, px; None accepts any.
+    Returns:
+        (H, W) True on tools.
+    Raises:
+        InputError: unreadable, of another size or depth, or with other values.
+    """
+    pixels = _single_channel(path, _decode(path, size))
+    if pixels.dtype != np.uint8:
+        raise complaint(path, "an 8-bit mask", _describe(pixels), "Save it with values 0 and 255.")
+    high = pixels == 255
+    other = pixels[~high & (pixels != 0)]
+    if other.size:
+        values = np.unique(other)
+        zero_and_one = values.tolist() == [1] and not high.any()
+        hint = "Multiply it by 255." if zero_and_one else "Threshold it, without smoothing."
+        raise complaint(path, "mask values 0 and 255", _list_some(values), hint)
+    return high if tool_value == 255 else ~high
+
+
+def read_depth(path: Path, scale: float = 1.0, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+    """Read a depth image.
+
+    Args:
+        path: an 8-bit or 16-bit image, gray or with equal channels.
+        scale: mm per unit of the file.
+        size: (width, height) it must have, px; None accepts any.
+    Returns:
+        (H, W) depth, mm; 0 where the file has 0.
+    Raises:
+        InputError: unreadable, of another size or depth.
+    """
+    pixels = _single_channel(path, _decode(path, size))
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise complaint(path, "an 8-bit or 16-bit depth image", _describe(pixels), "Save it as 16-bit PNG.")
+    return pixels.astype(np.float32) * np.float32(scale)
+
+
+def _decode(path: Path, size: tuple[int, int] | None) -> NDArray:
+    """The stored array, channels in OpenCV's order (blue first), checked for its size."""
+    try:
+        encoded = np.fromfile(path, np.uint8)
+    except OSError as error:
+        got = error.strerror or str(error)
+        raise complaint(path, "a readable file", got, "Check the path and the rights.") from None
+    # A PNG that ends early is refused before decoding, which would also let libpng write to stderr.
+    whole = encoded[:8].tobytes() != PNG_SIGNATURE or b"IEND" in encoded.tobytes()
+    try:
+        pixels = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if encoded.size and whole else None
+    except cv2.error:  # such as a header that promises more pixels than OpenCV accepts
+        pixels = None
+    if pixels is None:
+        raise complaint(path, "an image", f"{encoded.size} bytes that cannot be decoded", "Write the file again.")
+    got = (pixels.shape[1], pixels.shape[0])
+    if size is not None and got != size:
+        raise complaint(
+            path,
+            f"{size[0]}x{size[1]} px like the first image",
+            f"{got[0]}x{got[1]}",
+            "Bring all images, masks and depth to one size.",
+        )
+    return pixels
+
+
+def _single_channel(path: Path, pixels: NDArray) -> NDArray:
+    """(H, W) view of a gray image, also of one stored with equal color channels."""
+    if pixels.ndim == 2:
+        return pixels
+    first = pixels[..., 0]
+    if any((pixels[..., c] != first).any() for c in range(1, min(pixels.shape[2], 3))):
+        raise complaint(path, "one channel", "a color image", "Save the values themselves, not a color map.")
+    return first
+
+
+def _describe(pixels: NDArray) -> str:
+    """Type and channels of an array in words, such as '16-bit, 1 channel'."""
+    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    kind = "float" if np.issubdtype(pixels.dtype, np.floating) else f"{8 * pixels.dtype.itemsize}-bit"
+    return f"{kind}, {channels} channel{'s' if channels > 1 else ''}"
+
+
+def _list_some(values: NDArray) -> str:
+    """At most four of the values, comma separated."""
+    return ", ".join(str(v) for v in values[:4].tolist()) + (" and more" if len(values) > 4 else "")

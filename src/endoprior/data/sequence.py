@@ -1,0 +1,158 @@
+"""A sequence of frames that are read when first asked for, and its split into training and test frames.
+
+`T` frames; every 8th frame, starting at frame 1, is a test frame.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from collections.abc import Sequence as ReadOnlyList
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Literal, overload
+
+from ..types import Camera, Frame
+from .images import complaint
+from .truth import Truth
+
+Split = Literal["train", "test", "video"]
+TEST_EVERY = 8
+TOOL_FRACTION_WARNING = 0.6
+"""A larger share of tool pixels than this is more often an inverted mask than a picture of tools."""
+
+
+class Sequence:
+    """Frames of one scene. Each is decoded once and kept: about 2.9 MB a frame at 640 x 512."""
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: list[Camera],
+        read_frame: Callable[[int], Frame],
+        *,
+        frames_per_second: float | None = None,
+        files: list[Path] | None = None,
+        truth: Truth | None = None,
+        remarks: list[str] | None = None,
+        mask_folder: str = "masks",
+    ) -> None:
+        """Describe a sequence; nothing is decoded yet.
+
+        Args:
+            path: folder the sequence came from; names it in messages.
+            cameras: the camera of each frame.
+            read_frame: decodes frame i; called once per frame.
+            frames_per_second: of the video, None if unknown.
+            files: every file that makes up the sequence, for `fingerprint`.
+            truth: ground truth of a synthetic sequence.
+            remarks: what the reader found odd but usable, one line each.
+            mask_folder: name of the folder the masks came from; names it in messages.
+        """
+        self.path = path
+        self.frames_per_second = frames_per_second
+        self.truth = truth
+        self._cameras = cameras
+        self._read_frame = read_frame
+        self._files = files or []
+        self._remarks = remarks or []
+        self._masks = path / mask_folder
+        self._cache: dict[int, Frame] = {}
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    def camera(self, index: int) -> Camera:
+        """The camera of frame `index`."""
+        return self._cameras[index]
+
+    def frame(self, index: int) -> Frame:
+        """Frame `index`, counted over the whole sequence from 0.
+
+        Raises:
+            IndexError: no such frame.
+            InputError: one of its files cannot be used.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame must be in 0..{len(self) - 1}; got {index}")
+        if index not in self._cache:
+            self._cache[index] = self._read_frame(index)
+        return self._cache[index]
+
+    def indices(self, split: Split) -> list[int]:
+        """Ascending frame indices of a split: `test` has (i - 1) % 8 == 0, `train` the others, `video` all.
+
+        Raises:
+            ValueError: an unknown split.
+        """
+        if split not in ("train", "test", "video"):
+            raise ValueError(f"split must be train, test or video; got {split!r}")
+        return [i for i in range(len(self)) if split == "video" or is_test_frame(i) == (split == "test")]
+
+    def frames(self, split: Split) -> FrameList:
+        """The frames of a split, decoded one by one as they are used."""
+        return FrameList(self, self.indices(split))
+
+    def fingerprint(self) -> str:
+        """SHA-256, in hex, of the names (below the folder) and contents of all files of the sequence."""
+        digest = hashlib.sha256()
+        for file in sorted(self._files):
+            digest.update(str(file.relative_to(self.path).as_posix()).encode() + b"\0")
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+        return digest.hexdigest()
+
+    def validate(self) -> list[str]:
+        """Decode every frame and refuse what cannot be trained on.
+
+        Returns:
+            Remarks about what is usable but suspicious, one line each.
+        Raises:
+            InputError: a file cannot be used, or no frame has tissue, or no tissue pixel has depth.
+        """
+        with ThreadPoolExecutor() as pool:  # decoding releases the interpreter lock
+            frames = list(pool.map(self.frame, range(len(self))))
+        tissue = [frame.tissue_mask.mean() for frame in frames]
+        if not any(tissue):
+            hint = "The polarity may be inverted: masks are 255 on tools."
+            raise complaint(self._masks, "tissue in at least one frame", "tool everywhere", hint)
+        if not any(frame.depth_valid.any() for frame in frames):
+            hint = "Provide depth in mm, 0 where it is missing."
+            raise complaint(self.path / "depth", "depth > 0 in at least one frame", "0 everywhere", hint)
+        if not any((frame.depth_valid & frame.tissue_mask).any() for frame in self.frames("train")):
+            hint = "The mask's polarity may be inverted, or the depth may be of the tool only."
+            raise complaint(self.path / "depth", "depth on tissue in a training frame", "none", hint)
+        remarks = list(self._remarks)
+        tool = 1 - sum(tissue) / len(tissue)
+        if tool > TOOL_FRACTION_WARNING:
+            remarks.append(f"{self._masks}: {tool:.0%} of all pixels are tool; the polarity may be inverted")
+        empty = [frame.index for frame in frames if not (frame.depth_valid & frame.tissue_mask).any()]
+        if empty:
+            remarks.append(f"{self.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")
+        return remarks
+
+
+class FrameList(ReadOnlyList[Frame]):
+    """A read-only list of frames that decodes each when it is used."""
+
+    def __init__(self, sequence: Sequence, indices: list[int]) -> None:
+        """Args: sequence: where frames come from. indices: which, in order."""
+        self.sequence = sequence
+        self.indices = indices
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @overload
+    def __getitem__(self, position: int) -> Frame: ...
+    @overload
+    def __getitem__(self, position: slice) -> FrameList: ...
+    def __getitem__(self, position: int | slice) -> Frame | FrameList:
+        """The frame at a position in this list (negative: from the end), or the lazy list of a slice of positions."""
+        if isinstance(position, slice):
+            return FrameList(self.sequence, self.indices[position])
+        return self.sequence.frame(self.indices[position])
+
+
+def is_test_frame(index: int) -> bool:
+    """Whether a frame is held out: indices 1, 9, 17, ..."""
+    return (index - 1) % TEST_EVERY == 0

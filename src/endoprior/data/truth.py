@@ -1,0 +1,70 @@
+"""Ground truth of a synthetic sequence: what the tool hid, exact depth, and tracked material points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .images import complaint, read_color
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Material points that move with the tissue."""
+
+    points: NDArray[np.float32]
+    """(T, P, 3) positions in camera axes, mm."""
+    visible: NDArray[np.bool_]
+    """(T, P) True where the point is in the picture and nothing hides it."""
+
+
+class Truth:
+    """The `truth/` folder of a sequence; files are read when asked for, parts that are absent are None."""
+
+    def __init__(self, folder: Path, names: list[str]) -> None:
+        """Args: folder: the `truth/` folder. names: stem of each frame's files, in the order of the sequence."""
+        self.folder = folder
+        self._names = names
+
+    def tissue(self, index: int) -> NDArray[np.uint8] | None:
+        """(H, W, 3) picture of frame `index` without the tool, 0..255."""
+        path = self.folder / "tissue" / f"{self._names[index]}.png"
+        return read_color(path) if path.parent.is_dir() else None
+
+    def depth(self, index: int) -> NDArray[np.float32] | None:
+        """(H, W) exact z of the tissue of frame `index`, tool ignored, mm."""
+        path = self.folder / "depth" / f"{self._names[index]}.npy"
+        return np.asarray(_load(path), np.float32) if path.parent.is_dir() else None
+
+    @cached_property
+    def tracks(self) -> Tracks | None:
+        """All tracks, or None."""
+        path = self.folder / "tracks.npz"
+        if not path.exists():
+            return None
+        stored = _load(path)
+        if not isinstance(stored, dict) or not {"points", "visible"} <= stored.keys():
+            got = ", ".join(stored) if isinstance(stored, dict) else "one array"
+            raise complaint(path, "arrays points and visible", got, "Write the truth again.")
+        tracks = Tracks(np.asarray(stored["points"], np.float32), np.asarray(stored["visible"], bool))
+        frames, count = tracks.visible.shape if tracks.visible.ndim == 2 else (-1, -1)
+        if frames != len(self._names) or tracks.points.shape != (frames, count, 3):
+            got = f"{tracks.points.shape} and {tracks.visible.shape}"
+            want = f"shapes (T, P, 3) and (T, P) with T = {len(self._names)}"
+            raise complaint(path, want, got, "Write the truth again.")
+        return tracks
+
+
+def _load(path: Path) -> NDArray | dict[str, NDArray]:
+    """The array of an .npy file or the named arrays of an .npz file; no pickles. A complaint names the file."""
+    try:
+        with path.open("rb") as file:
+            stored = np.load(file, allow_pickle=False)
+            return stored if isinstance(stored, np.ndarray) else {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise complaint(path, "a NumPy file", str(error).split("\n")[0], "Write the truth again.") from None

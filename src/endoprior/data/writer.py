@@ -1,0 +1,193 @@
+"""Writes a sequence folder (the EndoNeRF layout plus `sequence.json`), whole or not at all.
+
+Everything goes into a hidden folder beside the target, which takes the target's name when the sequence is complete.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..checks import InputError
+
+TOOL_VALUE = 255
+"""Value of tool pixels in `masks/`; tissue is 0."""
+
+
+@dataclass(frozen=True)
+class SequenceMeta:
+    """The facts of a sequence that its pictures do not show. Angles and poses: the camera stands still at the origin."""
+
+    width: int
+    """px."""
+    height: int
+    """px."""
+    fx: float
+    """Focal length along x, px."""
+    fy: float
+    """Focal length along y, px."""
+    cx: float
+    """Principal point x, px; the left-most pixel is centered at 0.5."""
+    cy: float
+    """Principal point y, px."""
+    frames_per_second: float
+    """1/s."""
+    baseline_mm: float | None = None
+    """Distance between the eyes, mm; None for a single eye."""
+    depth_scale: float = 0.01
+    """mm per unit of the 16-bit depth PNG."""
+    depth_source: str | None = None
+    """Where the depth came from, for example `stereo`; None where there is none."""
+    note: str = ""
+    """What a reader should know."""
+
+
+class SequenceWriter:
+    """Collects the frames of one sequence; use it as a context manager.
+
+    Leaving the `with` block normally completes the folder; leaving it by an exception removes what was written.
+    """
+
+    def __init__(self, out: Path, meta: SequenceMeta) -> None:
+        """Prepare to write `out`.
+
+        Raises:
+            InputError: `out` is a file or a folder that is not empty, or cannot be created.
+        """
+        self.out, self.meta, self.count = Path(out), meta, 0
+        refuse_occupied(self.out)
+        self._bounds: list[tuple[float, float]] = []
+        self._partial = self.out.absolute().parent / f".{self.out.name}.partial-{os.getpid()}"
+        try:
+            shutil.rmtree(self._partial, ignore_errors=True)
+            self._partial.mkdir(parents=True)
+        except OSError as error:
+            raise InputError(
+                f"`{self.out}`: expected a place where a folder can be made; got {error.strerror}. Choose another folder."
+            ) from error
+
+    def __enter__(self) -> SequenceWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        if kind is not None:
+            shutil.rmtree(self._partial, ignore_errors=True)
+            return
+        try:
+            self._finish()
+        except BaseException:
+            shutil.rmtree(self._partial, ignore_errors=True)
+            raise
+
+    def add(
+        self,
+        rgb: NDArray[np.uint8],
+        tool_mask: NDArray[np.bool_],
+        depth: NDArray[np.float32] | None = None,
+        right: NDArray[np.uint8] | None = None,
+    ) -> None:
+        """Append one frame.
+
+        Args:
+            rgb: (H, W, 3) picture, 0..255.
+            tool_mask: (H, W) True where a tool is.
+            depth: (H, W) z in mm, 0 or not finite where missing; None in every frame for a sequence without depth.
+            right: (H, W, 3) what the right eye sees, 0..255; None in every frame for a single eye.
+        """
+        size = (self.meta.height, self.meta.width)
+        for name, array in (("rgb", rgb), ("tool_mask", tool_mask), ("depth", depth), ("right", right)):
+            if array is not None and array.shape[:2] != size:
+                raise ValueError(f"{name} must be {size[0]} x {size[1]} pixels; got {array.shape}. Resize it first.")
+        self.write_image("images", rgb)
+        self.write_image("masks", np.where(tool_mask, TOOL_VALUE, 0).astype(np.uint8))
+        near, far = 0.0, 0.0
+        if depth is not None:
+            valid = np.isfinite(depth) & (depth > 0)
+            units = np.where(valid, depth, 0) / self.meta.depth_scale
+            self.write_image("depth", np.clip(np.round(units), 0, 65535).astype(np.uint16))
+            if valid.any():
+                near, far = float(depth[valid].min()), float(depth[valid].max())
+        if right is not None:
+            self.write_image("right", right)
+        self._bounds.append((near, far))
+        self.count += 1
+
+    def write_image(self, folder: str, pixels: NDArray) -> None:
+        """Write `pixels` as `folder`/NNNNNN.png, numbered like the frame that the next `add` appends.
+
+        Args:
+            folder: relative to the sequence, for example `truth/tissue`.
+            pixels: (H, W, 3) RGB 8-bit, or (H, W) 8- or 16-bit.
+        """
+        path = self._file(f"{folder}/{self.count:06d}.png")
+        stored = np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels
+        # Fast compression: a sequence is written once and read many times, and noise does not compress anyway.
+        if not cv2.imwrite(str(path), stored, [cv2.IMWRITE_PNG_COMPRESSION, 2]):
+            raise OSError(f"could not write {path}")
+
+    def write_array(self, name: str, array: NDArray) -> None:
+        """Write `name` (relative, `.npy`)."""
+        np.save(self._file(name), array)
+
+    def write_arrays(self, name: str, **arrays: NDArray) -> None:
+        """Write named arrays to `name` (relative, `.npz`)."""
+        np.savez_compressed(self._file(name), **arrays)
+
+    def write_json(self, name: str, content: dict[str, Any]) -> None:
+        """Write `content` to `name` (relative, `.json`)."""
+        self._file(name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+    def _file(self, name: str) -> Path:
+        """The place of a file in the unfinished folder; its parents exist afterwards."""
+        path = self._partial / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def _finish(self) -> None:
+        """Write what describes the whole sequence and give the folder its name."""
+        if self.count == 0:
+            raise ValueError("a sequence must have at least one frame; got none")
+        refuse_occupied(self.out)
+        meta = self.meta
+        poses = np.zeros((self.count, 17))
+        # 3x5 per frame: camera-to-world [R | t] = identity, then (H, W, focal); row-major, then near and far.
+        camera = np.concatenate([np.eye(3, 4), [[meta.height], [meta.width], [meta.fx]]], 1)
+        poses[:, :15] = camera.ravel()
+        poses[:, 15:] = self._bounds
+        self.write_array("poses_bounds.npy", poses)
+        described = {
+            "width": meta.width,
+            "height": meta.height,
+            "fx": meta.fx,
+            "fy": meta.fy,
+            "cx": meta.cx,
+            "cy": meta.cy,
+            "baseline_mm": meta.baseline_mm,
+            "frames_per_second": meta.frames_per_second,
+            "depth_unit": "mm",
+            "depth_scale": meta.depth_scale,
+            "mask_tool_value": TOOL_VALUE,
+            "depth_source": meta.depth_source,
+            "note": meta.note,
+        }
+        self.write_json("sequence.json", described)
+        if self.out.is_dir():
+            self.out.rmdir()
+        self._partial.replace(self.out)
+
+
+def refuse_occupied(out: Path) -> None:
+    """Raise InputError unless `out` does not exist yet or is an empty folder."""
+    if out.is_dir() and any(out.iterdir()):
+        raise InputError(f"`{out}`: expected a new or empty folder; got one with files in it. Choose another or empty it.")
+    if not out.is_dir() and (out.exists() or out.is_symlink()):
+        raise InputError(f"`{out}`: expected a new or empty folder; got a file. Choose another name.")

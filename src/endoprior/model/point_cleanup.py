@@ -1,0 +1,67 @@
+"""Thinning and cleaning of a point cloud: one point per voxel, and no point far from its neighbors. `N` points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Colored points."""
+
+    points: NDArray[np.float32]
+    """(N, 3) world coordinates, mm."""
+    colors: NDArray[np.float32]
+    """(N, 3) red, green, blue in [0, 1]."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def merge_voxels(cloud: PointCloud, divisions: int) -> PointCloud:
+    """Replace the points of each voxel by their mean position and mean color.
+
+    Args:
+        cloud: finite points.
+        divisions: the longest side of the cloud's box is this many voxels long; its corner is the center of a voxel.
+    Returns:
+        One point per occupied voxel, ordered by voxel (x, then y, then z).
+    """
+    if len(cloud) == 0:
+        return cloud
+    points = cloud.points.astype(np.float64)
+    low = points.min(0)
+    side = (points.max(0) - low).max() / divisions
+    if side == 0:  # all points coincide
+        return PointCloud(cloud.points[:1], cloud.colors.mean(0, dtype=np.float64, keepdims=True).astype(np.float32))
+    voxel = np.floor((points - low) / side + 0.5).astype(np.int64)
+    _, owner, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
+    owner = owner.reshape(-1)
+
+    def mean(values: NDArray[np.floating]) -> NDArray[np.float32]:
+        sums = [np.bincount(owner, values[:, c], len(count)) for c in range(3)]
+        return (np.stack(sums, -1) / count[:, None]).astype(np.float32)
+
+    return PointCloud(mean(points), mean(cloud.colors))
+
+
+def remove_outliers(cloud: PointCloud, num_neighbors: int, num_std: float) -> PointCloud:
+    """Drop points whose mean distance to their neighbors is unusually large.
+
+    Args:
+        cloud: finite points.
+        num_neighbors: nearest points that are averaged, the point itself (distance 0) counted as one of them.
+        num_std: points above mean + this many standard deviations of those averages are dropped.
+    Returns:
+        The other points, in their order; the cloud itself when it has no more than `num_neighbors` points.
+    """
+    if len(cloud) <= num_neighbors:
+        return cloud
+    distance, _ = cKDTree(cloud.points).query(cloud.points, k=num_neighbors)
+    average = distance.reshape(len(cloud), -1).mean(1)
+    keep = average <= average.mean() + num_std * average.std(ddof=1)
+    return PointCloud(cloud.points[keep], cloud.colors[keep])

@@ -1,0 +1,10 @@
+"""Where an image deserves Gaussians: highlights (`specular`), texture (`salience`) and their product (`joint`).
+
+NumPy only; every function works on one image.
+"""
+
+from .joint import joint_texture_prior
+from .salience import edge_magnitude, salience
+from .specular import specular_likelihood
+
+__all__ = ["edge_magnitude", "joint_texture_prior", "salience", "specular_likelihood"]

@@ -1,0 +1,47 @@
+"""The joint texture prior: where tissue shows texture and no highlight. `H, W` image size."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..checks import check_shape
+from ..config import PriorConfig
+from .salience import salience
+from .specular import specular_likelihood
+
+
+def joint_texture_prior(
+    rgb: NDArray[np.floating], tissue_mask: NDArray[np.bool_], cfg: PriorConfig | None = None
+) -> NDArray[np.float32]:
+    """How much each pixel can be trusted to anchor a Gaussian: rho = M (1 - L^sp) E, paper Eq. (1).
+
+    Args:
+        rgb: (H, W, 3) floating-point color in [0, 1].
+        tissue_mask: (H, W) bool, True on usable tissue (M).
+        cfg: parameters of the two cues; the paper's by default.
+    Returns:
+        (H, W) prior in [0, 1]; 0 off the tissue, and everywhere when the mask is empty.
+    Raises:
+        ValueError: a shape or type differs, or a color is not finite or outside [0, 1].
+    """
+    cfg = cfg or PriorConfig()
+    rgb, tissue_mask = np.asarray(rgb), np.asarray(tissue_mask)
+    check_shape("rgb:H,W,3 tissue_mask:H,W", rgb=rgb, tissue_mask=tissue_mask)
+    _check_values(rgb, tissue_mask)
+    keep = np.float32(1) - specular_likelihood(rgb, cfg.specular)
+    return np.where(tissue_mask, keep * salience(rgb, tissue_mask, cfg.salience), np.float32(0))
+
+
+def _check_values(rgb: NDArray, tissue_mask: NDArray) -> None:
+    """Raise ValueError unless `rgb` is an image of floats in [0, 1] and `tissue_mask` is bool."""
+    if not np.issubdtype(rgb.dtype, np.floating):
+        raise ValueError(f"rgb must be floating point in [0, 1]; got {rgb.dtype}. Divide 8-bit color by 255.")
+    if tissue_mask.dtype != np.bool_:
+        raise ValueError(f"tissue_mask must be bool, True on tissue; got {tissue_mask.dtype}. Compare it with a value.")
+    if rgb.size == 0:
+        raise ValueError(f"rgb must have at least one pixel; got shape {rgb.shape}.")
+    low, high = float(rgb.min()), float(rgb.max())
+    # The negated test also catches NaN, which min and max hand on.
+    if not (low >= 0 and high <= 1):
+        raise ValueError(f"rgb must be finite and in [0, 1]; got values from {low:g} to {high:g}. Scale the image.")

@@ -1,0 +1,378 @@
+"""Where points are drawn and how they are lifted."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.stats import chisquare
+
+from endoprior.checks import InputError
+from endoprior.config import InitConfig, PriorConfig, SalienceConfig, SpecularConfig
+from endoprior.data import load_sequence
+from endoprior.geometry import project
+from endoprior.model.initialize import (
+    draw_pixels,
+    eroded_mask,
+    initial_log_scales,
+    initial_points,
+    pixel_probability,
+    quotas,
+    sampling_distribution,
+)
+from endoprior.model.point_cleanup import PointCloud, merge_voxels, remove_outliers
+from endoprior.priors import joint_texture_prior
+from endoprior.types import Camera, Frame
+
+HEIGHT, WIDTH = 26, 32
+
+
+@pytest.fixture
+def rho() -> np.ndarray:
+    return np.random.default_rng(1).random((HEIGHT, WIDTH), dtype=np.float32)
+
+
+@pytest.fixture
+def mask() -> np.ndarray:
+    """Tissue but for a tool in the lower right corner."""
+    tissue = np.ones((HEIGHT, WIDTH), bool)
+    tissue[14:, 20:] = False
+    return tissue
+
+
+def tilted_camera() -> Camera:
+    """A camera that is neither at the origin nor parallel to its axes."""
+    c, s = math.cos(0.4), math.sin(0.4)
+    rotation = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation, (5, -8, 12)
+    return Camera(WIDTH, HEIGHT, 30.0, 31.0, 15.0, 14.0, world_to_camera)
+
+
+def make_frame(mask: np.ndarray, index: int = 0, camera: Camera | None = None) -> Frame:
+    """A frame of random colors whose depth is known except in two rows."""
+    rng = np.random.default_rng(100 + index)
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[4:6] = False
+    depth = np.where(valid, 50 + 10 * rng.random((HEIGHT, WIDTH)), 0).astype(np.float32)
+    rgb = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    return Frame(index, index / 10, camera or tilted_camera(), rgb, mask, depth, valid)
+
+
+def pixels_of(cloud: PointCloud, camera: Camera) -> np.ndarray:
+    """(N, 2) image coordinates of the points."""
+    return project(cloud.points.astype(np.float64), camera)[0]
+
+
+# --- Eq. (6)
+
+
+def erosion_loop(mask: np.ndarray, element: np.ndarray) -> np.ndarray:
+    """Minimum over the element; pixels outside the image do not count."""
+    half = element.shape[0] // 2
+    out = np.zeros_like(mask)
+    for v in range(mask.shape[0]):
+        for u in range(mask.shape[1]):
+            lowest = True
+            for dv in range(-half, half + 1):
+                for du in range(-half, half + 1):
+                    y, x = v + dv, u + du
+                    inside = 0 <= y < mask.shape[0] and 0 <= x < mask.shape[1]
+                    if element[dv + half, du + half] and inside:
+                        lowest = lowest and bool(mask[y, x])
+            out[v, u] = lowest
+    return out
+
+
+@pytest.mark.parametrize("size", [3, 5, 9])
+def test_erosion_matches_loop(mask, size):
+    mask[3, 3] = False
+    element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    np.testing.assert_array_equal(eroded_mask(mask, size), erosion_loop(mask, element))
+
+
+def test_erosion_falls_back_and_can_be_off(mask):
+    assert eroded_mask(mask, 1) is mask
+    speck = np.zeros_like(mask)
+    speck[3, 3] = True
+    np.testing.assert_array_equal(eroded_mask(speck, 9), speck)
+
+
+def test_distribution_matches_loop(rho, mask):
+    element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
+    eroded = erosion_loop(mask, element)
+    inside = [(v, u) for v in range(HEIGHT) for u in range(WIDTH) if eroded[v, u]]
+    total = sum(float(rho[p]) for p in inside)
+    want = np.zeros((HEIGHT, WIDTH))
+    for p in inside:
+        want[p] = 0.45 / (len(inside) + 1e-6) + 0.55 * float(rho[p]) / (total + 1e-6)
+    # normalizing removes the epsilons: 1e-6 in sums of several hundred
+    np.testing.assert_allclose(sampling_distribution(rho, mask), want, rtol=1e-8)
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.45, 1.0])
+def test_distribution_sums_to_one_inside_the_eroded_mask(rho, mask, eta):
+    probability = sampling_distribution(rho, mask, InitConfig(uniform_fraction=eta))
+    assert probability.dtype == np.float64
+    assert probability.sum() == pytest.approx(1, abs=1e-12)  # float64, 800 terms
+    assert not probability[~eroded_mask(mask, 9)].any() and probability.min() >= 0
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.45])
+def test_no_texture_gives_even_draws(mask, eta):
+    probability = sampling_distribution(np.zeros((HEIGHT, WIDTH)), mask, InitConfig(uniform_fraction=eta))
+    inside = probability[eroded_mask(mask, 9)]
+    np.testing.assert_allclose(inside, 1 / len(inside), rtol=1e-12)
+
+
+def test_no_tissue_gives_nothing(rho, mask):
+    assert not sampling_distribution(rho, np.zeros_like(mask)).any()
+
+
+def test_poisoned_prior_is_named(rho, mask):
+    for value in (np.nan, -0.1, np.inf):
+        rho[2, 2] = value
+        with pytest.raises(ValueError, match="rho must be finite and >= 0"):
+            sampling_distribution(rho, mask)
+    with pytest.raises(ValueError, match="tissue_mask must have shape"):
+        sampling_distribution(rho, mask[1:])
+
+
+# --- drawing
+
+
+def test_single_draws_follow_the_distribution(rho, mask):
+    probability = sampling_distribution(rho[:12, :16], mask[:12, :16], InitConfig(erosion_px=5))
+    rng = np.random.default_rng(7)
+    draws = 50_000
+    drawn = np.bincount(
+        [draw_pixels(probability, 1, rng)[0] for _ in range(draws)], minlength=probability.size
+    ).reshape(probability.shape)
+    possible = probability > 0
+    assert not drawn[~possible].any()
+    # a correct sampler fails one time in 10,000, and the seed is fixed
+    assert chisquare(drawn[possible], draws * probability[possible]).pvalue > 1e-4
+
+
+def test_a_million_draws_without_replacement_follow_the_distribution(rho, mask):
+    # Tiled 1,250 times, each pixel is so rare that drawing 2 % of the field leaves the odds as they were.
+    probability = sampling_distribution(rho[:12, :16], mask[:12, :16], InitConfig(erosion_px=5))
+    tiles = 1250
+    field = np.tile(probability.reshape(1, -1), (tiles, 1))
+    rng = np.random.default_rng(8)
+    drawn = np.zeros(probability.size)
+    for _ in range(200):
+        flat = draw_pixels(field, 5000, rng)
+        assert len(np.unique(flat)) == 5000
+        drawn += np.bincount(flat % probability.size, minlength=probability.size)
+    expected = 1_000_000 * probability.ravel()
+    # counting noise of 1 / sqrt(2,300) for the rarest pixel, 4 of which the worst of 192 may reach; depletion adds 1 %
+    np.testing.assert_allclose(drawn, expected, rtol=0.1, atol=0)
+
+
+def test_pairs_are_drawn_in_turn():
+    weights = np.array([[1.0, 2.0, 3.0]])
+    rng = np.random.default_rng(9)
+    draws = 20_000
+    pairs = np.array([draw_pixels(weights, 2, rng) for _ in range(draws)])
+    # P{1,2} = 2/6 * 3/4 + 3/6 * 2/3
+    share = (pairs == [1, 2]).all(1).mean()
+    assert share == pytest.approx(2 / 6 * 3 / 4 + 3 / 6 * 2 / 3, abs=4 * 0.5 / math.sqrt(draws))  # 4 standard errors
+
+
+def test_draws_take_what_there_is():
+    weights = np.array([[0, 0.5, 0, 1e-300]])
+    rng = np.random.default_rng(0)
+    np.testing.assert_array_equal(draw_pixels(weights, 10, rng), [1, 3])
+    assert len(draw_pixels(weights, 0, rng)) == 0
+    assert len(draw_pixels(np.zeros((2, 2)), 3, rng)) == 0
+
+
+@pytest.mark.parametrize(("budget", "frames"), [(20_000, 55), (20_000, 136), (3, 5), (7, 1), (10, 5)])
+def test_quotas_sum_to_the_budget(budget, frames):
+    shares = quotas(budget, frames)
+    assert sum(shares) == budget and len(shares) == frames and max(shares) - min(shares) <= 1
+    assert shares == sorted(shares, reverse=True)
+
+
+def test_published_shares():
+    assert set(quotas(20_000, 55)) == {363, 364} and set(quotas(20_000, 136)) == {147, 148}
+
+
+# --- the cloud
+
+
+@pytest.mark.parametrize("sampler", ["prior", "uniform", "pool"])
+def test_points_project_onto_centers_of_measured_tissue(mask, sampler):
+    frame = make_frame(mask)
+    cloud = initial_points([frame], InitConfig(sampler=sampler, budget=150, pool_fraction=0.3))
+    assert len(cloud) == 150 and cloud.points.dtype == cloud.colors.dtype == np.float32
+    pixels = pixels_of(cloud, frame.camera)
+    corner = pixels - 0.5
+    u, v = np.rint(corner).astype(int).T
+    # float32 points at 60 mm: 4e-6 mm, half a pixel per mm
+    np.testing.assert_allclose(corner, np.stack([u, v], -1), atol=2e-5)
+    assert frame.tissue_mask[v, u].all() and frame.depth_valid[v, u].all()
+    np.testing.assert_array_equal(cloud.colors, frame.rgb[v, u])
+    z = project(cloud.points.astype(np.float64), frame.camera)[1]
+    np.testing.assert_allclose(z, frame.depth[v, u], rtol=1e-6)  # float32
+    distinct = len(np.unique(v * WIDTH + u))
+    if sampler == "pool":
+        assert distinct < 150  # with replacement
+    else:
+        assert distinct == 150
+        inside = eroded_mask(mask, 9)[v, u]
+        assert inside.all() if sampler == "prior" else not inside.all()
+
+
+def test_legacy_offset_is_half_a_pixel_up_left(mask):
+    frame = make_frame(mask)
+    exact, legacy = (initial_points([frame], InitConfig(budget=80, pixel_offset=o)) for o in ("exact", "legacy"))
+    shift = pixels_of(legacy, frame.camera) - pixels_of(exact, frame.camera)
+    np.testing.assert_allclose(shift, -0.5, atol=2e-5)  # float32 points, as above
+
+
+def test_seed_decides(mask):
+    frames = [make_frame(mask, i) for i in range(3)]
+    cfg = InitConfig(budget=100)
+    first, again, other = (initial_points(frames, cfg, seed=s) for s in (5, 5, 6))
+    np.testing.assert_array_equal(first.points, again.points)
+    np.testing.assert_array_equal(first.colors, again.colors)
+    assert not np.array_equal(first.points, other.points)
+
+
+def test_every_frame_gives_its_share(mask):
+    frames = [make_frame(mask, i) for i in range(3)]
+    cloud = initial_points(frames, InitConfig(budget=101, sampler="uniform"))
+    colors = [{tuple(c) for c in frame.rgb.reshape(-1, 3)} for frame in frames]
+    assert [sum(tuple(c) in known for c in cloud.colors) for known in colors] == [34, 34, 33]
+
+
+def test_pool_keeps_a_share_of_each_frame(mask):
+    frames = [make_frame(mask, i) for i in range(4)]
+    cloud = initial_points(frames, InitConfig(budget=5000, sampler="pool", pool_fraction=0.05))
+    usable = int((mask & frames[0].depth_valid).sum())
+    # 5,000 draws from 4 x 30 points miss none of them
+    assert len(cloud) == 5000 and len(np.unique(cloud.points, axis=0)) == 4 * int(0.05 * usable)
+
+
+def test_pool_of_a_tiny_share_still_has_a_point_of_each_frame(mask):
+    frames = [make_frame(mask, i) for i in range(4)]
+    cloud = initial_points(frames, InitConfig(budget=200, sampler="pool", pool_fraction=0))
+    assert len(np.unique(cloud.points, axis=0)) == 4
+
+
+def test_frame_that_is_too_small_gives_what_it_has_and_says_so(mask, caplog):
+    small = np.zeros_like(mask)
+    small[10, 3:8] = True
+    frames = [make_frame(mask, 0), make_frame(small, 1), make_frame(np.zeros_like(mask), 2)]
+    with caplog.at_level(logging.WARNING):
+        cloud = initial_points(frames, InitConfig(budget=90))
+    assert len(cloud) == 30 + 5
+    assert [record.getMessage() for record in caplog.records] == [
+        "initialization: 55 of 90 points could not be drawn, too few tissue pixels"
+    ]
+
+
+@pytest.mark.parametrize("sampler", ["prior", "uniform", "pool"])
+@pytest.mark.parametrize("frames", ["none", "tool", "no depth"])
+def test_nothing_to_sample_is_bad_input(mask, sampler, frames, caplog):
+    frame = make_frame(mask)
+    given = {
+        "none": [],
+        "tool": [replace(frame, tissue_mask=np.zeros_like(mask))],
+        "no depth": [replace(frame, depth_valid=np.zeros_like(mask))],
+    }[frames]
+    with pytest.raises(InputError, match="initialization: expected at least 4 tissue pixels with depth") as caught:
+        initial_points(given, InitConfig(sampler=sampler))
+    assert "\n" not in str(caught.value) and caplog.text.count("\n") <= 1
+
+
+def test_released_options_change_the_weights_as_told(mask):
+    frame = make_frame(mask)
+    frame = replace(frame, rgb_u8=(frame.rgb_u8 // 2 + 120))  # bright: the 97th percentile exceeds 0.85
+    eroded = eroded_mask(mask, 9)
+    base, prior = InitConfig(), PriorConfig()
+    bright = np.percentile(frame.rgb.max(-1)[eroded], 97)
+    assert bright > 0.86
+    raised = PriorConfig(specular=SpecularConfig(value_threshold=float(bright)))
+    cases = [
+        (base, joint_texture_prior(frame.rgb, mask, prior)),
+        (replace(base, adaptive_specular=True), joint_texture_prior(frame.rgb, mask, raised)),
+        (replace(base, salience_on_eroded_mask=True), joint_texture_prior(frame.rgb, eroded, prior)),
+    ]
+    results = []
+    for cfg, rho in cases:
+        want = np.where(frame.depth_valid, sampling_distribution(rho, mask, cfg), 0)
+        np.testing.assert_array_equal(pixel_probability(frame, cfg, prior), want)
+        results.append(want)
+    assert not np.allclose(results[0], results[1]) and not np.allclose(results[0], results[2])
+
+
+def test_adaptive_threshold_never_falls(mask):
+    frame = make_frame(mask)
+    dim = replace(frame, rgb_u8=frame.rgb_u8 // 4)
+    adaptive = InitConfig(adaptive_specular=True)
+    np.testing.assert_array_equal(
+        pixel_probability(dim, adaptive, PriorConfig()), pixel_probability(dim, InitConfig(), PriorConfig())
+    )
+
+
+def test_prior_config_reaches_the_sampler(mask):
+    frame = make_frame(mask)
+    other = PriorConfig(salience=SalienceConfig(percentile=50))
+    plain, changed = (pixel_probability(frame, InitConfig(), p) for p in (PriorConfig(), other))
+    assert not np.array_equal(plain, changed)
+
+
+def test_texture_attracts_points():
+    frame = make_frame(np.ones((HEIGHT, WIDTH), bool))
+    rgb = frame.rgb_u8.copy() // 2
+    rgb[:, : WIDTH // 2] = 90
+    frame = replace(frame, rgb_u8=rgb, depth_valid=np.ones((HEIGHT, WIDTH), bool), depth=np.full_like(frame.depth, 60))
+    cloud = initial_points([frame], InitConfig(budget=100))
+    left = (pixels_of(cloud, frame.camera)[:, 0] < WIDTH // 2 - 1).mean()
+    assert left == pytest.approx(0.45 / 2, abs=0.1)  # only the even share; binomial, 100 draws: sd 0.04
+
+
+def test_clean_up_merges_and_removes(mask):
+    frames = [make_frame(mask, i) for i in range(3)]
+    plain = InitConfig(budget=600)
+    cfg = replace(plain, cleanup=True, voxel_divisions=20)
+    cloud = initial_points(frames, cfg)
+    want = remove_outliers(merge_voxels(initial_points(frames, plain), 20), 20, 1.5)
+    np.testing.assert_array_equal(cloud.points, want.points)
+    assert 4 < len(cloud) < 600
+
+
+# --- on files
+
+
+def test_tiny_sequence_gives_the_budget_on_the_plane(tiny_sequence):
+    seq = load_sequence(tiny_sequence)
+    cloud = initial_points(seq.frames("train"), InitConfig(budget=1000))
+    assert len(cloud) == 1000
+    x, y, z = cloud.points.T.astype(np.float64)
+    # the fixture's plane z = z0 + 0.1 x + 0.15 y with z0 in 58..62; 0.5 mm for clipping at the percentiles
+    assert (np.abs(z - 0.1 * x - 0.15 * y - 60) < 2.5).all()
+
+
+def test_test_frames_are_never_read(tiny_sequence):
+    frames = load_sequence(tiny_sequence).frames("train")
+    want = initial_points(frames, InitConfig(budget=300))
+    for i in (1, 9):
+        (tiny_sequence / f"images/{i:06d}.png").write_bytes(b"")
+    got = initial_points(load_sequence(tiny_sequence).frames("train"), InitConfig(budget=300))
+    np.testing.assert_array_equal(got.points, want.points)
+
+
+def test_real_clip(real_clip):
+    frames = load_sequence(real_clip).frames("train")[:6]
+    cloud = initial_points(frames, InitConfig(budget=2000, cleanup=True))
+    assert 1500 < len(cloud) < 2000
+    spacing = np.exp(initial_log_scales(cloud.points))
+    assert 0.2 < np.median(spacing) < 10  # mm, a field of about 130 x 110 mm
