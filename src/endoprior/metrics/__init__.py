@@ -1,0 +1,43 @@
+"""Scores: pure functions of NumPy arrays, one frame or one pair of frames at a time.
+
+A frame on which a score has no meaning (an empty mask, no measured depth) scores NaN; `mean_over_frames` leaves such
+frames out and says NaN when none is left. A score whose network or weights are not there raises `ScoreUnavailable`; its
+text is the reason to print, and nothing else is ever measured in its place. Torch, torchvision and lpips are imported
+only when a network score is asked for.
+"""
+
+from __future__ import annotations
+
+from .flow import FlowEstimator, dis_flow, flow_error
+from .frames import mean_over_frames
+from .image import depth_rmse, depth_rmse_endogaussian, psnr, psnr_behind_tool, psnr_tissue, quantize, ssim, to_uint8
+from .lpips import LpipsDistance, lpips_distance
+from .raft import RaftFlow, raft_flow
+from .stability import depth_instability
+from .tracks import TrackError, track_error
+from .weights import FoundWeights, ScoreUnavailable, WeightsMissing
+
+__all__ = [
+    "FlowEstimator",
+    "FoundWeights",
+    "LpipsDistance",
+    "RaftFlow",
+    "ScoreUnavailable",
+    "TrackError",
+    "WeightsMissing",
+    "depth_instability",
+    "depth_rmse",
+    "depth_rmse_endogaussian",
+    "dis_flow",
+    "flow_error",
+    "lpips_distance",
+    "mean_over_frames",
+    "psnr",
+    "psnr_behind_tool",
+    "psnr_tissue",
+    "quantize",
+    "raft_flow",
+    "ssim",
+    "to_uint8",
+    "track_error",
+]

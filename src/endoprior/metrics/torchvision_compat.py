@@ -1,0 +1,73 @@
+"""Import torchvision, also where its compiled operators do not fit the installed torch.
+
+A CUDA build of torchvision beside a CPU-only torch cannot load its operators, and its import then stops at "operator
+torchvision::nms does not exist" because it describes two of them by name. RAFT and the classifiers use no compiled
+operator, so declaring those two names is enough. Only this file and the lpips package import torchvision.
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+from typing import Any
+
+from .weights import ScoreUnavailable
+
+MISSING_OPERATORS = (
+    "nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
+    "qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
+)
+"""Schemas of the operators torchvision describes while it is imported."""
+
+# The declarations live as long as the library object does; torch forgets them when it is collected.
+_declared: list[Any] = []
+
+
+def import_torchvision() -> ModuleType:
+    """The torchvision module, after declaring its missing operators if that is what keeps it from loading.
+
+    Raises:
+        ScoreUnavailable: torchvision is not installed, or does not work beside this torch.
+    """
+    try:
+        return _import_torchvision()
+    except RuntimeError as error:
+        if "operator torchvision::" not in str(error):
+            raise _broken(error) from error
+    _declare_operators()
+    try:
+        return _import_torchvision()
+    except RuntimeError as error:
+        raise _broken(error) from error
+
+
+def _import_torchvision() -> ModuleType:
+    """The torchvision module with the parts used here; RuntimeError where it does not fit torch."""
+    try:
+        importlib.import_module("torchvision.models.optical_flow")
+        return importlib.import_module("torchvision")
+    except ImportError as error:
+        raise ScoreUnavailable(
+            f"torchvision cannot be imported ({error}). Install it with: pip install endoprior[networks]"
+        ) from error
+
+
+def _declare_operators() -> None:
+    """Tell torch the names of the operators torchvision could not load; calling them still fails."""
+    import torch
+
+    if not _declared:
+        library = torch.library.Library("torchvision", "DEF")
+        for schema in MISSING_OPERATORS:
+            library.define(schema)
+        _declared.append(library)
+
+
+def _broken(error: RuntimeError) -> ScoreUnavailable:
+    """The reason to report for a torchvision that does not work beside this torch."""
+    import torch
+
+    cause = str(error).strip().splitlines()[0]
+    return ScoreUnavailable(
+        f"torchvision does not work beside torch {torch.__version__} ({cause}). Install the matching one"
+    )

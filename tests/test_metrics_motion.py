@@ -1,0 +1,105 @@
+"""Depth stability and track error against closed forms."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from endoprior.metrics import depth_instability, track_error
+from endoprior.types import Camera
+
+ALL = np.ones((6, 8), bool)
+
+
+def camera() -> Camera:
+    """A camera that is not at the origin: track error must not use its pose."""
+    pose = np.eye(4)
+    pose[:3, 3] = 5, 6, 7
+    return Camera(width=640, height=512, fx=500, fy=600, cx=320, cy=256, world_to_camera=pose)
+
+
+def test_instability_of_a_surface_that_moves_as_one():
+    depth = np.linspace(40, 90, 48).reshape(6, 8)
+    assert depth_instability(depth, depth - 1.5, ALL, ALL) == pytest.approx(1.5)
+    assert depth_instability(depth, depth, ALL, ALL) == 0
+
+
+def test_instability_counts_pixels_that_are_tissue_and_drawn_in_both_frames():
+    depth_a, depth_b = np.full((1, 5), 10.0), np.full((1, 5), 12.0)
+    mask_a, mask_b = np.ones((1, 5), bool), np.ones((1, 5), bool)
+    depth_a[0, 0], depth_b[0, 1] = 0, 0  # not drawn in one of them
+    mask_a[0, 2] = mask_b[0, 3] = False
+    depth_b[0, 2] = depth_a[0, 3] = np.nan  # outside the masks: may be anything
+    depth_b[0, 4] = 17
+    assert depth_instability(depth_a, depth_b, mask_a, mask_b) == 7
+
+
+def test_instability_without_a_common_pixel_is_nan():
+    assert np.isnan(depth_instability(np.ones((6, 8)), np.ones((6, 8)), ALL, ~ALL))
+    assert np.isnan(depth_instability(np.zeros((6, 8)), np.ones((6, 8)), ALL, ALL))
+
+
+def test_instability_names_bad_input():
+    depth = np.ones((6, 8))
+    with pytest.raises(ValueError, match="must be finite under both masks"):
+        depth_instability(depth, np.full((6, 8), np.nan), ALL, ALL)
+    with pytest.raises(ValueError, match="must be bool"):
+        depth_instability(depth, depth, ALL, ALL.astype(int))
+    with pytest.raises(ValueError, match="depth_b must have shape"):
+        depth_instability(depth, depth[1:], ALL, ALL)
+
+
+def test_metrics_import_without_torch():
+    code = "import sys, endoprior.metrics.stability; print('torch' in sys.modules, 'torchvision' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False"]
+
+
+def points() -> np.ndarray:
+    """(3, 4, 3) points in camera axes at z = 50 mm."""
+    found = np.random.default_rng(0).uniform(-10, 10, (3, 4, 3))
+    found[..., 2] = 50
+    return found
+
+
+def test_track_error_of_a_constant_offset():
+    truth, visible = points(), np.ones((3, 4), bool)
+    error = track_error(truth + np.array([3, 4, 0]), truth, visible, camera())
+    assert error.mm == pytest.approx(5)
+    assert error.px == pytest.approx(np.hypot(500 * 3 / 50, 600 * 4 / 50))
+
+
+def test_track_error_counts_visible_points_alone():
+    truth, visible = points(), np.ones((3, 4), bool)
+    predicted = truth.copy()
+    predicted[1, 2] += [0, 5, 0]
+    predicted[0, 0] = np.nan
+    visible[0, 0] = False
+    error = track_error(predicted, truth, visible, camera())
+    assert error.mm == pytest.approx(5 / 11)
+    assert error.px == pytest.approx(600 * 5 / 50 / 11)
+
+
+def test_track_error_that_cannot_be_had_is_nan():
+    truth, visible = points(), np.ones((3, 4), bool)
+    assert np.isnan(track_error(truth, truth, ~visible, camera())).all()
+    behind = truth.copy()
+    behind[2, 3, 2] = -50
+    error = track_error(behind, truth, visible, camera())
+    assert error.mm == pytest.approx(100 / 12)
+    assert np.isnan(error.px)
+
+
+def test_track_error_names_bad_input():
+    truth, visible = points(), np.ones((3, 4), bool)
+    with pytest.raises(ValueError, match="truth must have z > 0"):
+        track_error(truth, -truth, visible, camera())
+    with pytest.raises(ValueError, match="must be finite where visible"):
+        track_error(truth * np.nan, truth, visible, camera())
+    with pytest.raises(ValueError, match="visible must be bool"):
+        track_error(truth, truth, visible.astype(int), camera())
+    with pytest.raises(ValueError, match="truth must have shape"):
+        track_error(truth, truth[:, :-1], visible, camera())
