@@ -1,0 +1,173 @@
+"""Adaptive density control guided by the prior: running statistics, and the plan of what to clone, split and remove.
+
+Eqs. (7) and (8) and the pruning rule after them. `plan` only decides; `optim.apply_plan` acts. `N` Gaussians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .config import DensityConfig
+from .types import RenderOutput
+
+SCORE_EPS = 1e-6
+"""epsilon of Eq. (7)."""
+
+
+@dataclass
+class DensityStats:
+    """Sums per Gaussian since the last event (gradient) or since the stage began (score)."""
+
+    grad2d_ndc_sum: Tensor
+    """(N,) sum of screen-space gradient norms, NDC units."""
+    num_seen: Tensor
+    """(N,) times drawn since the last event."""
+    score_sum: Tensor
+    """(N,) sum of rho at the projected centre over valid projections."""
+    num_valid: Tensor
+    """(N,) n_i: valid projections at which the score was sampled."""
+    opacity_sum: Tensor
+    """(N,) sum of the opacity at those moments."""
+
+    @staticmethod
+    def zeros(num: int) -> DensityStats:
+        """Statistics of `num` Gaussians of which nothing is known."""
+        return DensityStats(*(torch.zeros(num) for _ in range(5)))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The sums by name."""
+        return dict(vars(self))
+
+    def score(self, unobserved: float) -> Tensor:
+        """(N,) texture-prior score s in [0, 1], Eq. (7); `unobserved` where nothing was sampled."""
+        mean = self.score_sum / (self.num_valid + SCORE_EPS)
+        return torch.where(self.num_valid > 0, mean, unobserved)
+
+    def mean_opacity(self, current: Tensor) -> Tensor:
+        """(N,) running mean opacity; the `current` one where nothing was sampled."""
+        return torch.where(self.num_valid > 0, self.opacity_sum / self.num_valid.clamp(min=1), current)
+
+    def add_gradient(self, out: RenderOutput, width: int, height: int) -> None:
+        """Add one rendering's screen-space gradient, after backward; Gaussians that were not drawn are left alone."""
+        drawn = out.radii > 0
+        grad_ndc = out.means2d.grad * torch.tensor([width / 2, height / 2])
+        self.grad2d_ndc_sum += torch.where(drawn, grad_ndc.norm(dim=-1), 0)
+        self.num_seen += drawn
+
+    def add_score(
+        self, out: RenderOutput, prior: Tensor, tissue_mask: Tensor, opacities: Tensor, scale: float = 1.0
+    ) -> None:
+        """Sample rho where the drawn centres fall on tissue: s_it and m_it of Eq. (7).
+
+        Args:
+            prior: (H, W) rho in [0, 1]. tissue_mask: (H, W) float, 1 on tissue. opacities: (N,) canonical.
+            scale: pixels of `prior` per pixel of the rendering.
+        """
+        maps = torch.stack([prior, tissue_mask])[None]
+        means2d = out.means2d.detach() * scale
+        sampled = _bilinear(maps, means2d)
+        valid = valid_projection(means2d, out.radii, sampled[1], prior.shape)
+        self.score_sum += torch.where(valid, sampled[0], 0)
+        self.opacity_sum += torch.where(valid, opacities.detach(), 0)
+        self.num_valid += valid
+
+    def clear_gradient(self) -> None:
+        """Forget the gradients of every Gaussian, as each density event does."""
+        self.grad2d_ndc_sum.zero_()
+        self.num_seen.zero_()
+
+
+def valid_projection(means2d: Tensor, radii: Tensor, mask_value: Tensor, shape: tuple[int, int]) -> Tensor:
+    """(N,) m_it: drawn, inside the image, and on tissue (interpolated mask above one half)."""
+    height, width = shape
+    x, y = means2d.unbind(-1)
+    inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
+    return inside & (radii > 0) & (mask_value > 0.5)
+
+
+def sample_mask(tissue_mask: Tensor, means2d: Tensor) -> Tensor:
+    """(N,) mask value, bilinear, at projected centres in px."""
+    return _bilinear(tissue_mask[None, None], means2d.detach())[0]
+
+
+def _bilinear(maps: Tensor, means2d: Tensor) -> Tensor:
+    """(C, N) values of (1, C, H, W) maps at (N, 2) px, pixel centres at half integers, zero outside."""
+    height, width = maps.shape[-2:]
+    # align_corners=False puts -1 and 1 on the outer pixel edges: exactly our pixel convention.
+    grid = torch.stack([means2d[:, 0] * (2 / width) - 1, means2d[:, 1] * (2 / height) - 1], -1)
+    grid = grid.nan_to_num(nan=-2.0, posinf=2.0, neginf=-2.0).clamp(-2, 2)
+    sampled = torch.nn.functional.grid_sample(
+        maps, grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return sampled[0, :, 0]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What one density event does to each of `N` Gaussians; at most one of the three is True."""
+
+    clone: Tensor
+    """(N,) bool: a copy is added."""
+    split: Tensor
+    """(N,) bool: replaced by two smaller children."""
+    remove: Tensor
+    """(N,) bool: goes."""
+
+
+def due(iteration: int, is_last_of_fine: bool, cfg: DensityConfig) -> bool:
+    """Whether a density event follows this iteration (1-based, counted within the stage)."""
+    inside = cfg.start_iteration < iteration < cfg.stop_iteration
+    return inside and iteration % cfg.every == 0 and not is_last_of_fine
+
+
+def densify_weight(score: Tensor, cfg: DensityConfig) -> Tensor:
+    """(N,) factor of the gradient in Eq. (8): lambda_min + (1 - lambda_min) s."""
+    floor = cfg.min_densify_weight
+    return floor + (1 - floor) * score
+
+
+def plan(stats: DensityStats, scales: Tensor, opacities: Tensor, extent: float, cfg: DensityConfig) -> Plan:
+    """Choose what to clone, split and remove: Eq. (8), the prior prune, and 3DGS's rules. Pure.
+
+    Args:
+        scales: (N, 3) canonical, mm. opacities: (N,) canonical. extent: scene extent, mm.
+    """
+    score = stats.score(cfg.unobserved_score)
+    gradient = stats.grad2d_ndc_sum / stats.num_seen.clamp(min=1)
+    largest = scales.amax(-1)
+    faint = opacities < cfg.prune_opacity
+    huge = largest > cfg.prune_max_scale_mm if cfg.prune_max_scale_mm > 0 else torch.zeros_like(faint)
+    distrusted = torch.zeros_like(faint)
+    if cfg.prior_prune:
+        distrusted = (
+            (stats.num_valid >= cfg.min_valid)
+            & (score < cfg.prior_threshold)
+            & (stats.mean_opacity(opacities) < cfg.prior_opacity)
+        )
+    grow = (densify_weight(score, cfg) * gradient >= cfg.grow_threshold) & ~faint
+    small = largest <= cfg.clone_extent * extent
+    # Pruning follows growth: children are smaller and unobserved, so only their size can condemn them.
+    children_huge = huge & (largest / cfg.split_shrink > cfg.prune_max_scale_mm)
+    split = grow & ~small & ~children_huge
+    clone = grow & small & ~huge & ~distrusted
+    remove = (faint | huge | distrusted) & ~split
+    if len(scales) + int(clone.sum()) + int(split.sum()) - int(remove.sum()) > cfg.max_gaussians:
+        clone, split = torch.zeros_like(clone), torch.zeros_like(split)
+        remove = faint | huge | distrusted
+    return Plan(clone=clone, split=split, remove=remove)
+
+
+def scene_extent(camera_centers: Tensor, points: Tensor, cfg: DensityConfig) -> float:
+    """Length that separates small from large Gaussians, mm.
+
+    `camera`: 1.1 times the radius of the camera centres, as 3DGS has it; 0 for a still camera, so nothing is cloned.
+    `scene`: 1.1 times the largest distance of a point from the points' centroid.
+
+    Args:
+        camera_centers: (T, 3). points: (N, 3).
+    """
+    cloud = camera_centers if cfg.extent_mode == "camera" else points
+    return 1.1 * float((cloud - cloud.mean(0)).norm(dim=-1).max())

@@ -1,0 +1,154 @@
+"""Texture-aware temporal consistency: neighbours move together, the more so the better their texture. Eqs. (9)-(11).
+
+Shared letters: `N` Gaussians of the scene, `P` of them chosen for one step, `K` neighbours. "now" is frame t,
+"before" the adjacent training frame t - dt.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from .config import TemporalConfig
+
+MIN_WEIGHT = 1e-4
+"""Motion weights up to this are treated as zero (released code)."""
+SQRT_EPS = 1e-8
+"""Under the root of the displacement norm, mm**2: a finite gradient at zero."""
+SUM_EPS = 1e-8
+"""Least sum of pair weights; a larger one would silence the term, since typical weights are near 0.002."""
+
+RELAX_TRIES, RELAX_THRESHOLD_STEP, RELAX_TEMPERATURE_FACTOR = 8, 0.05, 1.5
+RELAX_THRESHOLD_FLOOR, RELAX_TEMPERATURE_CAP = 0.25, 0.30
+
+
+def motion_weight(score: NDArray, threshold: float, temperature: float) -> NDArray:
+    """w^mot = sigmoid((s - tau_m) / gamma_m), Eq. (9).
+
+    Args:
+        score: (N,) texture-prior scores in [0, 1].
+    Returns:
+        (N,) in (0, 1).
+    """
+    return 1 / (1 + np.exp(-(score - threshold) / temperature))
+
+
+def effective_size(weights: NDArray) -> float:
+    """Kish's effective sample size (sum w)^2 / sum w^2; 0 for no weight."""
+    square = float((weights**2).sum())
+    return float(weights.sum()) ** 2 / square if square > 0 else 0.0
+
+
+def relaxed_motion_weight(score: NDArray, cfg: TemporalConfig) -> NDArray:
+    """Eq. (9), with tau_m lowered and gamma_m raised until enough Gaussians count (released code).
+
+    Returns:
+        (N,) weights; those up to `MIN_WEIGHT` are 0.
+    """
+    threshold, temperature = cfg.motion_threshold, cfg.motion_temperature
+    tries = RELAX_TRIES if cfg.adaptive_motion_weight else 0
+    weights = motion_weight(score, threshold, temperature)
+    for _ in range(tries):
+        if effective_size(weights) >= cfg.min_effective:
+            break
+        threshold = max(threshold - RELAX_THRESHOLD_STEP, RELAX_THRESHOLD_FLOOR)
+        temperature = min(temperature * RELAX_TEMPERATURE_FACTOR, RELAX_TEMPERATURE_CAP)
+        weights = motion_weight(score, threshold, temperature)
+    return np.where(weights > MIN_WEIGHT, weights, 0)
+
+
+def systematic_sample(weights: NDArray, count: int) -> NDArray[np.intp]:
+    """At most `count` distinct indices, spread evenly over the cumulative weight: no randomness, more where heavier.
+
+    Args:
+        weights: (N,) >= 0. count: > 0; if no more than this many weights are positive, all of them are taken.
+    Returns:
+        (P,) increasing indices, P <= count.
+    """
+    positive = np.flatnonzero(weights > 0)
+    if len(positive) <= count:
+        return positive
+    cumulative = np.cumsum(weights[positive], dtype=np.float64)
+    marks = (np.arange(count) + 0.5) / count * cumulative[-1]
+    return positive[np.unique(np.searchsorted(cumulative, marks))]
+
+
+def choose(score: NDArray, eligible: NDArray, cfg: TemporalConfig) -> tuple[NDArray[np.intp], NDArray]:
+    """The Gaussians that take part in one step, and their motion weights.
+
+    Args:
+        score: (N,) in [0, 1]. eligible: (N,) bool, the set S_t.
+    Returns:
+        (P,) indices and (P,) weights; P = 0 when fewer than `min_points` qualify.
+    """
+    weights = relaxed_motion_weight(score, cfg) if cfg.pair_weights else np.ones_like(score)
+    weights = np.where(eligible, weights, 0)
+    count = cfg.max_points or len(weights)
+    chosen = systematic_sample(weights, count)
+    if len(chosen) < max(cfg.min_points, cfg.num_neighbors + 1):
+        chosen = chosen[:0]
+    return chosen, weights[chosen]
+
+
+def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
+    """The `k` nearest other points of each point.
+
+    Args:
+        points: (P, 3) mm, P > k.
+    Returns:
+        (P, k) indices, nearest first, and (P, k) distances, mm.
+    """
+    distances, indices = cKDTree(points).query(points, k=k + 1, workers=1)
+    # The point itself is normally the first hit; among coincident points it may be any of them, or none.
+    own = indices == np.arange(len(points))[:, None]
+    own[~own.any(1), -1] = True
+    return indices[~own].reshape(-1, k), distances[~own].reshape(-1, k)
+
+
+def affinity(distances: NDArray, indices: NDArray, weights: NDArray) -> NDArray:
+    """w_ij = exp(-|mu_i - mu_j|^2 / (2 sigma_loc^2)) w_i w_j, Eq. (10), floored at 1e-8.
+
+    sigma_loc, which the paper leaves open, is the median neighbour distance of the step (released code).
+
+    Args:
+        distances: (P, K) mm. indices: (P, K) of the neighbours. weights: (P,) motion weights.
+    Returns:
+        (P, K) pair weights.
+    """
+    sigma = max(float(np.median(distances)), 1e-8)
+    near = np.exp(-(distances**2) / (2 * sigma**2))
+    return np.maximum(near * weights[:, None] * weights[indices], SUM_EPS)
+
+
+def huber(x: Tensor, delta: float, scale: str) -> Tensor:
+    """Huber's penalty of x >= 0: x^2 / 2 up to delta, delta (x - delta / 2) above; `released` divides it by delta."""
+    literal = torch.where(x <= delta, 0.5 * x * x, delta * (x - 0.5 * delta))
+    return literal / delta if scale == "released" else literal
+
+
+def local_motion_loss(
+    now: Tensor, before: Tensor, indices: NDArray, pair_weights: NDArray, cfg: TemporalConfig
+) -> tuple[Tensor, Tensor]:
+    """The two halves of L_local, Eq. (11), unweighted: displacement and distance.
+
+    Args:
+        now, before: (P, 3) deformed centres at t and t - dt, mm. Detach `before` to train one end only.
+        indices: (P, K) neighbours, found at t - dt. pair_weights: (P, K) from `affinity`.
+    Returns:
+        Mean |d_i - d_j| (mm) and mean Huber penalty of the change of |mu_i - mu_j|, both weighted by w_ij.
+    """
+    index = torch.from_numpy(indices)
+    weight = torch.from_numpy(pair_weights).to(now.dtype)
+    weight = weight / weight.sum().clamp(min=SUM_EPS)
+    displacement = now - before
+    difference = displacement[:, None] - displacement[index]
+    disp = (difference.square().sum(-1) + SQRT_EPS).sqrt()
+    stretch = (_length(now[:, None] - now[index]) - _length(before[:, None] - before[index])).abs()
+    return (weight * disp).sum(), (weight * huber(stretch, cfg.huber_delta, cfg.huber_scale)).sum()
+
+
+def _length(vectors: Tensor) -> Tensor:
+    return (vectors.square().sum(-1) + SQRT_EPS**2).sqrt()

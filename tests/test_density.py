@@ -1,0 +1,198 @@
+"""Density control: the score of Eq. (7), the weight of Eq. (8), the plan, and its application."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from endoprior import density
+from endoprior.config import Config, DensityConfig
+from endoprior.density import DensityStats, Plan
+from endoprior.model.gaussians import create_gaussians
+from endoprior.optim import Optimizer, split_children
+from endoprior.types import RenderOutput
+
+CFG = DensityConfig()
+
+
+def output(means2d, radii=None):
+    means2d = torch.tensor(means2d, dtype=torch.float32).reshape(-1, 2).requires_grad_()
+    radii = torch.ones(len(means2d), dtype=torch.int32) if radii is None else torch.tensor(radii, dtype=torch.int32)
+    empty = torch.zeros(0)
+    return RenderOutput(empty, empty, empty, means2d, radii)
+
+
+def stats_of(num, *, gradient=0.0, score=None, num_valid=0, opacity=0.5):
+    stats = DensityStats.zeros(num)
+    stats.grad2d_ndc_sum += gradient
+    stats.num_seen += 1
+    if score is not None:
+        stats.num_valid += num_valid
+        stats.score_sum += score * num_valid
+        stats.opacity_sum += opacity * num_valid
+    return stats
+
+
+def gaussians(num, cfg=None, seed=0):
+    rng = np.random.default_rng(seed)
+    return create_gaussians(rng.normal(size=(num, 3)), rng.random((num, 3)), rng.normal(size=num), cfg or Config())
+
+
+@pytest.mark.parametrize("c", [0.0, 0.3, 1.0])
+def test_a_constant_prior_gives_that_score_to_every_observed_gaussian(c):
+    stats = DensityStats.zeros(3)
+    prior, mask = torch.full((20, 30), c), torch.ones(20, 30)
+    for _ in range(5):
+        stats.add_score(output([[3, 4], [29.9, 0.1], [15, 10]]), prior, mask, torch.full((3,), 0.4))
+    # epsilon 1e-6 in the denominator of Eq. (7)
+    assert stats.score(0.0).tolist() == pytest.approx([c] * 3, abs=1e-6)
+    assert stats.mean_opacity(torch.zeros(3)).tolist() == pytest.approx([0.4] * 3)
+
+
+def test_score_samples_a_ramp_at_the_projected_centre():
+    ramp = (torch.arange(30) + 0.5).expand(20, 30) / 30  # value x / 30 at x px
+    stats = DensityStats.zeros(2)
+    stats.add_score(output([[7.25, 3.0], [20.5, 12.0]]), ramp.contiguous(), torch.ones(20, 30), torch.ones(2))
+    assert stats.score(0.0).tolist() == pytest.approx([7.25 / 30, 20.5 / 30], abs=1e-5)
+
+
+def test_projections_off_the_image_off_tissue_or_undrawn_do_not_count():
+    mask = torch.ones(20, 30)
+    mask[:, :10] = 0
+    stats = DensityStats.zeros(5)
+    where = [[-1, 5], [15, 25], [4, 4], [20, 10], [20, 10]]
+    stats.add_score(output(where, [1, 1, 1, 0, 1]), torch.ones(20, 30), mask, torch.ones(5))
+    assert stats.num_valid.tolist() == [0, 0, 0, 0, 1]
+
+
+@pytest.mark.parametrize("unobserved", [0.0, 1.0])
+def test_unobserved_gaussians_get_the_configured_score(unobserved):
+    assert DensityStats.zeros(2).score(unobserved).tolist() == [unobserved] * 2
+
+
+@pytest.mark.parametrize(("unobserved", "factor"), [(0.0, 0.35), (1.0, 1.0)])
+def test_factor_of_an_unobserved_gaussian(unobserved, factor):
+    weight = density.densify_weight(DensityStats.zeros(1).score(unobserved), CFG)
+    assert weight.item() == pytest.approx(factor)
+
+
+def test_gradient_is_counted_in_ndc_and_only_where_drawn():
+    out = output([[1, 1], [2, 2]], [1, 0])
+    out.means2d.grad = torch.tensor([[3.0, 4.0], [1.0, 1.0]])
+    stats = DensityStats.zeros(2)
+    stats.add_gradient(out, width=200, height=100)
+    assert stats.grad2d_ndc_sum.tolist() == pytest.approx([np.hypot(300, 200), 0])
+    assert stats.num_seen.tolist() == [1, 0]
+
+
+def test_nothing_is_cloned_at_extent_zero():
+    stats = stats_of(4, gradient=1.0, score=1.0, num_valid=1)
+    scales = torch.full((4, 3), 1e-3)
+    planned = density.plan(stats, scales, torch.full((4,), 0.5), 0.0, CFG)
+    assert planned.split.all() and not planned.clone.any() and not planned.remove.any()
+
+
+def test_small_gaussians_are_cloned_in_a_large_scene():
+    stats = stats_of(2, gradient=1.0, score=1.0, num_valid=1)
+    scales = torch.tensor([[0.5, 0.1, 0.1], [5.0, 0.1, 0.1]])
+    planned = density.plan(stats, scales, torch.full((2,), 0.5), 100.0, CFG)
+    assert planned.clone.tolist() == [True, False] and planned.split.tolist() == [False, True]
+
+
+@pytest.mark.parametrize("cfg", [replace(CFG, min_densify_weight=1.0), CFG])
+def test_score_one_or_floor_one_is_plain_growth(cfg):
+    gradient = torch.tensor([1.9e-4, 2.1e-4])
+    stats = stats_of(2, gradient=gradient, score=1.0, num_valid=10**6)
+    planned = density.plan(stats, torch.ones(2, 3), torch.full((2,), 0.5), 0.0, cfg)
+    assert planned.split.tolist() == [False, True]
+
+
+def test_a_low_score_raises_the_bar():
+    stats = stats_of(2, gradient=torch.tensor([4e-4, 6e-4]), score=0.0, num_valid=5)
+    planned = density.plan(stats, torch.ones(2, 3), torch.full((2,), 0.5), 0.0, CFG)
+    assert planned.split.tolist() == [False, True]  # 0.35 x 6e-4 > 2e-4 > 0.35 x 4e-4
+
+
+@pytest.mark.parametrize(
+    ("num_valid", "score", "opacity", "gone"),
+    [(20, 0.1, 0.007, True), (19, 0.1, 0.007, False), (20, 0.3, 0.007, False), (20, 0.1, 0.008, False)],
+)
+def test_prior_prune_needs_all_three(num_valid, score, opacity, gone):
+    stats = stats_of(1, score=score, num_valid=num_valid, opacity=opacity)
+    planned = density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, CFG)
+    assert planned.remove.item() is gone
+    off = density.plan(stats, torch.ones(1, 3), torch.tensor([0.5]), 0.0, replace(CFG, prior_prune=False))
+    assert not off.remove.item()
+
+
+def test_faint_and_huge_gaussians_go():
+    cfg = replace(CFG, prune_max_scale_mm=40.0)
+    scales = torch.tensor([[1.0] * 3, [41.0] * 3, [1.0] * 3])
+    planned = density.plan(stats_of(3), scales, torch.tensor([0.004, 0.5, 0.5]), 0.0, cfg)
+    assert planned.remove.tolist() == [True, True, False]
+
+
+def test_a_huge_gaussian_whose_children_fit_is_split():
+    cfg = replace(CFG, prune_max_scale_mm=40.0)
+    stats = stats_of(2, gradient=1.0, score=1.0, num_valid=1)
+    planned = density.plan(stats, torch.tensor([[50.0] * 3, [70.0] * 3]), torch.full((2,), 0.5), 0.0, cfg)
+    assert planned.split.tolist() == [True, False] and planned.remove.tolist() == [False, True]
+
+
+def test_growth_stops_at_the_guard():
+    cfg = replace(CFG, max_gaussians=3)
+    planned = density.plan(stats_of(3, gradient=1.0), torch.ones(3, 3), torch.full((3,), 0.5), 0.0, cfg)
+    assert not planned.split.any()
+
+
+def test_events_of_the_published_schedule():
+    coarse = {i for i in range(1, 1001) if density.due(i, False, CFG)}
+    fine = {i for i in range(1, 3001) if density.due(i, i == 3000, CFG)}
+    assert coarse == {600, 700, 800, 900, 1000}
+    assert fine == set(range(600, 3000, 100)) and len(fine) == 24
+
+
+@pytest.mark.parametrize("kind", ["hexplane", "basis"])
+def test_every_row_stays_together_through_a_plan(kind):
+    cfg = Config()
+    cfg = replace(cfg, deformation=replace(cfg.deformation, kind=kind))
+    model = gaussians(6, cfg)
+    optimizer = Optimizer(model, None, cfg, 10.0)
+    for i, (name, value) in enumerate(model.tensors.items()):  # mark every row of every tensor by its Gaussian
+        marks = torch.arange(6.0).reshape(-1, *[1] * (value.ndim - 1)) + 10 * i
+        value.data += 0 if name in ("means", "quats", "log_scales") else marks
+        optimizer.states[name].first += marks + 1
+    before = {name: value.detach().clone() for name, value in model.tensors.items()}
+    stats = DensityStats(*(torch.arange(6.0) + k for k in range(5)))
+    flags = torch.eye(6, dtype=torch.bool)
+    planned = Plan(clone=flags[1], split=flags[2], remove=flags[4])
+    grown = optimizer.apply_plan(planned, stats, np.random.default_rng(0))
+    parents = torch.tensor([0, 1, 3, 5, 1, 2, 2])  # kept, then the clone, then two children
+    for name, value in model.tensors.items():
+        assert len(value) == 7 and value.requires_grad and value.is_leaf
+        if name not in ("means", "log_scales"):
+            torch.testing.assert_close(value.detach(), before[name][parents])
+        state = optimizer.states[name]
+        assert state.first.shape == state.second.shape == value.shape
+        assert (state.first[4:] == 0).all()
+        assert (state.first[:4].reshape(4, -1)[:, 0] > 0).all()
+    assert grown.num_valid.tolist() == [3, 4, 6, 8, 0, 0, 0]
+    assert not grown.grad2d_ndc_sum.any() and not grown.num_seen.any()
+
+
+def test_children_of_a_split_come_from_the_parent_and_are_smaller():
+    model = gaussians(1)
+    model["means"].data[:] = torch.tensor([1.0, 2.0, 3.0])
+    model["log_scales"].data[:] = torch.log(torch.tensor([2.0, 1e-6, 1e-6]))
+    model["quats"].data[:] = torch.tensor([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])  # a quarter turn about z: x becomes y
+    children = split_children(model, torch.tensor([True]), 1.6, np.random.default_rng(0))
+    moved = children["means"] - torch.tensor([1.0, 2.0, 3.0])
+    assert (moved[:, 1].abs() > 1e-2).all() and moved[:, [0, 2]].abs().max() < 1e-4
+    torch.testing.assert_close(children["log_scales"].exp()[:, 0], torch.full((2,), 2.0 / 1.6))
+
+
+def test_extent_of_a_still_camera_is_zero():
+    centers, points = torch.zeros(5, 3), torch.tensor([[0.0, 0, 0], [2.0, 0, 0]])
+    assert density.scene_extent(centers, points, CFG) == 0
+    assert density.scene_extent(centers, points, replace(CFG, extent_mode="scene")) == pytest.approx(1.1)
