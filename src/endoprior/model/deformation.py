@@ -1,0 +1,136 @@
+"""How canonical Gaussians move: the offsets of one moment, and the HexPlane field that predicts them.
+
+Offsets are added to the raw parameters: centres (mm), log scales, quaternions before normalization, opacity logits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..checks import InputError, check_shape
+from ..config import DeformationConfig
+from .heads import OffsetHeads
+from .hexplane import PLANE_NAMES, PlaneGrid
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """What one moment adds to the raw parameters of N Gaussians; None where nothing is added."""
+
+    means: Tensor
+    """(N, 3) displacement of the centres, mm."""
+    log_scales: Tensor | None = None
+    """(N, 3)."""
+    quats: Tensor | None = None
+    """(N, 4), added before normalization."""
+    opacity_logits: Tensor | None = None
+    """(N,)."""
+    sh_dc: Tensor | None = None
+    """(N, 3), added to the spherical-harmonic coefficient of degree 0."""
+
+
+def offset_names(cfg: DeformationConfig) -> tuple[str, ...]:
+    """Fields of `Offsets` that both kinds of deformation predict under `cfg`, in their order of storage."""
+    wanted = {
+        "means": True,
+        "quats": cfg.deform_quats,
+        "log_scales": cfg.deform_scales,
+        "opacity_logits": cfg.deform_opacity,
+    }
+    return tuple(name for name, used in wanted.items() if used)
+
+
+class HexPlaneField:
+    """The paper's deformation field: box, planes, trunk and heads.
+
+    `grid` and its `PlaneAdam` own the planes; `parameters_by_group` names what autograd trains.
+    """
+
+    def __init__(self, box: Tensor, cfg: DeformationConfig, generator: torch.Generator) -> None:
+        """Start a field.
+
+        Args:
+            box: (2, 3) corners, mm, in the order [max, min]; `box_of_points` makes one.
+            generator: source of all random numbers: space planes first, then trunk and heads.
+        """
+        check_shape("box:2,3", box=box)
+        self.cfg = cfg
+        self.grid = PlaneGrid(cfg.hexplane)
+        self.grid.initialize(generator)
+        self.box = box.detach().to(torch.float32).clone().requires_grad_(cfg.hexplane.learn_box)
+        self.heads = OffsetHeads(
+            self.grid.num_features, cfg.hexplane.width, offset_names(cfg), cfg.hexplane.bias_init, generator
+        )
+
+    @classmethod
+    def from_points(cls, points: Tensor, cfg: DeformationConfig, generator: torch.Generator) -> HexPlaneField:
+        """A field whose box holds the initial points (N, 3), mm."""
+        return cls(box_of_points(points), cfg, generator)
+
+    @property
+    def num_plane_values(self) -> int:
+        """Trained numbers in the planes."""
+        return self.grid.num_values
+
+    def offsets(self, means: Tensor, time: float) -> Offsets:
+        """What `time` adds to Gaussians with canonical centres `means`.
+
+        Args:
+            means: (N, 3) float32, world axes, mm; any subset of the Gaussians, N may be 0.
+            time: in [0, 1).
+        Returns:
+            Offsets with a gradient path to `means`, the box and the network; the planes' gradient goes to `grid.grads`.
+        """
+        # As in the paper's code the first corner is the maximum, so coordinates run against the axes.
+        unit = (means - self.box[0]) / (self.box[1] - self.box[0])
+        found = self.heads(self.grid.sample(unit, time))
+        if "opacity_logits" in found:
+            found["opacity_logits"] = found["opacity_logits"][:, 0]
+        return Offsets(**found)
+
+    def parameters_by_group(self) -> dict[str, list[Tensor] | Tensor]:
+        """Tensors that autograd trains: `network` (a list) and `box` (2, 3), which needs no gradient if it is fixed."""
+        return {"network": list(self.heads.parameters.values()), "box": self.box}
+
+    def state_arrays(self) -> dict[str, Tensor]:
+        """Every number that defines the field, by name; views of live memory, not copies."""
+        arrays = {"hexplane.box": self.box.detach()}
+        for scale in range(self.grid.num_scales):
+            arrays |= {f"hexplane.{scale}.{name}": self.grid.plane(scale, name) for name in PLANE_NAMES}
+        return arrays | {f"heads.{name}": value.detach() for name, value in self.heads.parameters.items()}
+
+    def load_state_arrays(self, arrays: Mapping[str, Tensor]) -> None:
+        """Copy in what `state_arrays` gave; other names in `arrays` are ignored.
+
+        Raises:
+            InputError: an array is missing or has another shape.
+        """
+        for name, target in self.state_arrays().items():
+            found = arrays.get(name)
+            if found is None or found.shape != target.shape:
+                shape = None if found is None else tuple(found.shape)
+                raise InputError(
+                    f"{name}: expected an array of shape {tuple(target.shape)}; got {shape or 'none'}. "
+                    "Load the scene with the configuration it was trained with."
+                )
+            target.copy_(found)
+
+
+def box_of_points(points: Tensor) -> Tensor:
+    """Box (2, 3) in the order [max, min] around points (N, 3), mm.
+
+    An axis along which all points agree would divide by zero: its two corners are moved apart by 1 mm.
+
+    Raises:
+        ValueError: no points, or points that are not finite.
+    """
+    check_shape("points:N,3", points=points)
+    if not len(points) or not torch.isfinite(points).all():
+        raise ValueError(f"points must be finite and at least one; got {len(points)} of them")
+    high, low = points.detach().amax(0), points.detach().amin(0)
+    flat = (high <= low).to(high.dtype) / 2
+    return torch.stack([high + flat, low - flat])

@@ -1,0 +1,89 @@
+"""The canonical Gaussians: raw parameters, their activations, and what a deformation makes of them.
+
+`N` Gaussians; every tensor's first axis is the Gaussian. Raw values are unconstrained: `exp` turns
+`log_scales` into mm, the logistic function turns `opacity_logits` into opacities.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..config import Config
+from ..types import Splats
+from .basis import identity_motion
+from .deformation import Offsets
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
+class Gaussians:
+    """Trainable per-Gaussian tensors, by name.
+
+    Names and shapes: `means` (N, 3) mm, `quats` (N, 4) wxyz, `log_scales` (N, 3), `opacity_logits` (N,),
+    `sh_dc` (N, 1, 3), `sh_rest` (N, (D+1)**2 - 1, 3) and, with the basis deformation, `motion` (N, B, C).
+    """
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        self.tensors = {name: value.detach().contiguous().requires_grad_() for name, value in tensors.items()}
+
+    def __len__(self) -> int:
+        return len(self.tensors["means"])
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self.tensors[name]
+
+    @property
+    def scales(self) -> Tensor:
+        """(N, 3) canonical standard deviations, mm."""
+        return self.tensors["log_scales"].exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """(N,) canonical opacities in (0, 1)."""
+        return self.tensors["opacity_logits"].sigmoid()
+
+    def splats(self, offsets: Offsets | None, sh_degree: int) -> Splats:
+        """Activate the parameters, moved by `offsets` (None: canonical), with colour up to `sh_degree`."""
+        t = self.tensors
+        sh_dc = t["sh_dc"]
+        if offsets is not None and offsets.sh_dc is not None:
+            sh_dc = sh_dc + offsets.sh_dc[:, None, :]
+        num_rest = (sh_degree + 1) ** 2 - 1
+        return Splats(
+            means=_moved(t["means"], offsets and offsets.means),
+            quats=_moved(t["quats"], offsets and offsets.quats),
+            scales=_moved(t["log_scales"], offsets and offsets.log_scales).exp(),
+            opacities=_moved(t["opacity_logits"], offsets and offsets.opacity_logits).sigmoid(),
+            sh=torch.cat([sh_dc, t["sh_rest"][:, :num_rest]], 1) if num_rest else sh_dc,
+        )
+
+
+def _moved(value: Tensor, offset: Tensor | None) -> Tensor:
+    return value if offset is None else value + offset
+
+
+def create_gaussians(points: NDArray, colors: NDArray, log_scales: NDArray, cfg: Config) -> Gaussians:
+    """Gaussians at the initial points: isotropic, unrotated, of the points' colour, nearly transparent.
+
+    Args:
+        points: (N, 3) mm. colors: (N, 3) in [0, 1]. log_scales: (N,) log of mm.
+    """
+    num = len(points)
+    opacity = cfg.init.opacity
+    tensors = {
+        "means": torch.from_numpy(np.ascontiguousarray(points, np.float32)),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1),
+        "log_scales": torch.from_numpy(np.asarray(log_scales, np.float32))[:, None].repeat(1, 3),
+        "opacity_logits": torch.full((num,), float(np.log(opacity / (1 - opacity)))),
+        "sh_dc": (torch.from_numpy(np.asarray(colors, np.float32))[:, None, :] - 0.5) / SH_C0,
+        "sh_rest": torch.zeros(num, (cfg.schedule.sh_degree + 1) ** 2 - 1, 3),
+    }
+    if cfg.deformation.kind == "basis":
+        tensors["motion"] = identity_motion(num, cfg.deformation)
+    return Gaussians(tensors)

@@ -1,0 +1,61 @@
+"""The small network that reads offsets from a feature: one shared linear trunk, one head per kind of offset.
+
+trunk: linear F -> W. Head: ReLU, linear W -> W, ReLU, linear W -> outputs (EndoGaussian). Weights start Xavier
+uniform, so the offsets are not zero at the start.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn.functional import linear, relu
+from torch.nn.init import xavier_uniform_
+
+OUTPUT_WIDTH = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1}
+
+
+class OffsetHeads:
+    """Trunk and heads; `parameters` names every trained tensor."""
+
+    def __init__(
+        self,
+        num_features: int,
+        width: int,
+        outputs: tuple[str, ...],
+        bias_init: Literal["default", "zero"],
+        generator: torch.Generator,
+    ) -> None:
+        """Draw the weights from `generator`.
+
+        Args:
+            num_features: F, width of the feature.
+            width: W, hidden width.
+            outputs: which of `OUTPUT_WIDTH` to predict; the others have no head.
+            bias_init: `default` draws biases from U[-1, 1] / sqrt(inputs) as PyTorch does; `zero` sets them to 0.
+        """
+        self.outputs = outputs
+        self.parameters: dict[str, Tensor] = {}
+        layers = [("trunk", num_features, width)]
+        for name in outputs:
+            layers += [(f"{name}.hidden", width, width), (f"{name}.output", width, OUTPUT_WIDTH[name])]
+        for layer, fan_in, fan_out in layers:
+            weight, bias = torch.empty(fan_out, fan_in), torch.zeros(fan_out)
+            xavier_uniform_(weight, generator=generator)
+            if bias_init == "default":
+                bias.uniform_(-1 / math.sqrt(fan_in), 1 / math.sqrt(fan_in), generator=generator)
+            self.parameters[f"{layer}.weight"] = weight.requires_grad_(True)
+            self.parameters[f"{layer}.bias"] = bias.requires_grad_(True)
+
+    def __call__(self, features: Tensor) -> dict[str, Tensor]:
+        """Offsets (N, outputs) by name, from features (N, F)."""
+        trunk = relu(self._linear("trunk", features))
+        return {
+            name: self._linear(f"{name}.output", relu(self._linear(f"{name}.hidden", trunk))) for name in self.outputs
+        }
+
+    def _linear(self, layer: str, inputs: Tensor) -> Tensor:
+        """One linear layer by name."""
+        return linear(inputs, self.parameters[f"{layer}.weight"], self.parameters[f"{layer}.bias"])

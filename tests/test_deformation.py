@@ -1,0 +1,273 @@
+"""Offsets of one moment: the HexPlane field with its box and heads, and the temporal basis."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from endoprior.checks import InputError
+from endoprior.config import BasisConfig, DeformationConfig, HexPlaneConfig
+from endoprior.model.basis import basis_offsets, basis_weights, identity_motion, motion_layout
+from endoprior.model.deformation import HexPlaneField, Offsets, box_of_points
+from endoprior.model.heads import OffsetHeads
+from endoprior.model.hexplane import PLANE_NAMES
+
+SMALL = DeformationConfig(hexplane=HexPlaneConfig((6, 5, 4), 8, 12, (1, 2)))
+BASIS = DeformationConfig(kind="basis", basis=BasisConfig(num_bases=9, relative_width=0.7))
+
+
+def points(num: int = 60, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(num, 3, generator=generator) * torch.tensor([40.0, 30.0, 10.0]) + torch.tensor([-20.0, -15, 50])
+
+
+def field(cfg: DeformationConfig = SMALL, seed: int = 0) -> HexPlaneField:
+    return HexPlaneField.from_points(points(), cfg, torch.Generator().manual_seed(seed))
+
+
+def test_box_is_max_then_min_and_never_flat() -> None:
+    cloud = points()
+    assert torch.equal(box_of_points(cloud), torch.stack([cloud.amax(0), cloud.amin(0)]))
+    cloud[:, 2] = 7
+    box = box_of_points(cloud)
+    assert box[:, 2].tolist() == [7.5, 6.5]
+    with pytest.raises(ValueError, match="finite"):
+        box_of_points(torch.zeros(0, 3))
+    with pytest.raises(ValueError, match="finite"):
+        box_of_points(torch.full((2, 3), float("nan")))
+
+
+def literal_offsets(model: HexPlaneField, means: Tensor, box: Tensor, time: float) -> Tensor:
+    """Displacement by the formulas of the published code, float64: u = (x - max) * 2 / (min - max) - 1."""
+    where = (means - box[0]) * 2 / (box[1] - box[0]) - 1
+    where = torch.cat([where, torch.full_like(where[:, :1], time)], -1)
+    features = []
+    for s in range(model.grid.num_scales):
+        product = 1.0
+        for name in PLANE_NAMES:
+            axes = where[:, ["xyzt".index(axis) for axis in name]][None, None]
+            image = model.grid.plane(s, name).double().permute(2, 0, 1)[None]
+            product = product * grid_sample(image, axes, padding_mode="border", align_corners=True)[0, :, 0].T
+        features.append(product)
+    layers = {name: value.detach().double() for name, value in model.heads.parameters.items()}
+    hidden = torch.cat(features, -1)
+    for layer in ("trunk", "means.hidden", "means.output"):
+        if layer != "trunk":
+            hidden = hidden.clamp(min=0)
+        hidden = hidden @ layers[f"{layer}.weight"].T + layers[f"{layer}.bias"]
+    return hidden
+
+
+def test_field_agrees_with_the_literal_formulas() -> None:
+    """Offsets, and gradients of centres and box, where some Gaussians have left the box."""
+    model = field()
+    model.grid.values.uniform_(0.3, 1.1, generator=torch.Generator().manual_seed(2))
+    means = (points(80, 1) * 1.05).requires_grad_(True)
+    cotangent = torch.randn(80, 3, generator=torch.Generator().manual_seed(3))
+    got = model.offsets(means, 0.6).means
+    (got * cotangent).sum().backward()
+    double_means = means.detach().double().requires_grad_(True)
+    double_box = model.box.detach().double().requires_grad_(True)
+    want = literal_offsets(model, double_means, double_box, 0.6)
+    (want * cotangent).sum().backward()
+    # float32 sums of 24 and 32 terms around 1.
+    torch.testing.assert_close(got, want.float(), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(means.grad, double_means.grad.float(), rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(model.box.grad, double_box.grad.float(), rtol=1e-3, atol=1e-4)
+
+
+def test_network_gradients_by_central_differences() -> None:
+    model, means = field(), points(40, 1)
+    loss = lambda: model.offsets(means, 0.3).means.double().square().sum()  # noqa: E731
+    loss().backward()
+    with torch.no_grad():
+        for tensor in model.parameters_by_group()["network"]:
+            if tensor.grad is None:  # heads that this loss does not read
+                continue
+            index = int(tensor.grad.abs().argmax())
+            flat, step = tensor.view(-1), 1e-2
+            flat[index] += step
+            above = loss().item()
+            flat[index] -= 2 * step
+            below = loss().item()
+            flat[index] += step
+            # The loss is piecewise polynomial of low degree; a ReLU of a few Gaussians may switch inside the step.
+            assert (above - below) / (2 * step) == pytest.approx(tensor.grad.view(-1)[index].item(), rel=0.03)
+
+
+def test_plane_gradients_reach_the_buffer_through_the_field() -> None:
+    model = field()
+    model.offsets(points(), 0.3).means.square().sum().backward()
+    assert model.grid.grads.abs().sum() > 0
+    fixed = field(replace(SMALL, hexplane=replace(SMALL.hexplane, learn_box=False)))
+    fixed.offsets(points(), 0.3).means.square().sum().backward()
+    assert fixed.box.grad is None and fixed.grid.grads.abs().sum() > 0
+    assert model.box.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize(
+    ("cfg", "fields"),
+    [
+        (SMALL, {"means": (7, 3), "quats": (7, 4), "log_scales": (7, 3)}),
+        (replace(SMALL, deform_scales=False, deform_quats=False), {"means": (7, 3)}),
+        (
+            replace(SMALL, deform_opacity=True),
+            {"means": (7, 3), "quats": (7, 4), "log_scales": (7, 3), "opacity_logits": (7,)},
+        ),
+    ],
+)
+def test_fields_of_the_offsets(cfg: DeformationConfig, fields: dict[str, tuple[int, ...]]) -> None:
+    """EndoNeRF, SCARED, and the released code with its opacity head; nothing starts at zero offset."""
+    model = field(cfg)
+    found = {name: value for name, value in vars(model.offsets(points(7), 0.2)).items() if value is not None}
+    assert {name: tuple(value.shape) for name, value in found.items()} == fields
+    assert all((value != 0).any() for value in found.values())
+    expected = {"trunk"} | {f"{name}.{layer}" for name in fields for layer in ("hidden", "output")}
+    assert {name.rsplit(".", 1)[0] for name in model.heads.parameters} == expected
+
+
+def test_offsets_of_no_gaussians_and_of_a_subset() -> None:
+    model, cloud = field(), points()
+    model.offsets(cloud[:0], 0.1).means.sum().backward()
+    assert model.offsets(cloud[:0], 0.1).quats.shape == (0, 4)
+    with torch.no_grad():
+        everyone, few = model.offsets(cloud, 0.1), model.offsets(cloud[10:20], 0.1)
+    # Matrix products of another height may block their sums in another way.
+    torch.testing.assert_close(few.means, everyone.means[10:20], rtol=1e-5, atol=1e-6)
+
+
+def test_heads_start_as_stated() -> None:
+    width, features = 32, 256
+    default = OffsetHeads(features, width, ("means", "quats"), "default", torch.Generator().manual_seed(1))
+    zero = OffsetHeads(features, width, ("means", "quats"), "zero", torch.Generator().manual_seed(1))
+    for name, value in default.parameters.items():
+        fan_in = features if name.startswith("trunk") else width
+        if name.endswith("weight"):
+            bound = math.sqrt(6 / sum(value.shape))  # Xavier uniform
+            assert 0.9 * bound < value.abs().max() <= bound
+        else:
+            assert 0 < value.abs().max() <= 1 / math.sqrt(fan_in)
+            assert not zero.parameters[name].any()
+    again = OffsetHeads(features, width, ("means", "quats"), "default", torch.Generator().manual_seed(1))
+    assert all(torch.equal(a, b) for a, b in zip(default.parameters.values(), again.parameters.values(), strict=True))
+
+
+def test_seed_alone_decides_the_start() -> None:
+    torch.manual_seed(123)
+    before = torch.random.get_rng_state()
+    first = field(seed=4).state_arrays()
+    assert torch.equal(torch.random.get_rng_state(), before)  # the global generator is nobody's business
+    second, other = field(seed=4).state_arrays(), field(seed=5).state_arrays()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not torch.equal(first["heads.trunk.weight"], other["heads.trunk.weight"])
+
+
+def test_state_survives_a_file(tmp_path: Path) -> None:
+    source, target = field(seed=1), field(seed=2)
+    names = set(source.state_arrays())
+    assert {"hexplane.box", "hexplane.0.xy", "hexplane.1.zt", "heads.trunk.weight"} <= names
+    save_file(source.state_arrays(), tmp_path / "scene.safetensors")
+    box, network = target.box, target.parameters_by_group()["network"]
+    target.load_state_arrays(load_file(tmp_path / "scene.safetensors"))
+    assert torch.equal(target.offsets(points(), 0.7).means, source.offsets(points(), 0.7).means)
+    # Optimizers hold these very tensors.
+    assert target.box is box and target.parameters_by_group()["network"][0] is network[0] and box.requires_grad
+
+
+def test_a_wrong_state_is_refused() -> None:
+    model, arrays = field(), dict(field().state_arrays())
+    arrays["hexplane.0.xy"] = arrays["hexplane.0.xy"][:-1]
+    with pytest.raises(InputError, match=r"hexplane\.0\.xy: expected"):
+        model.load_state_arrays(arrays)
+    del arrays["hexplane.0.xy"]
+    with pytest.raises(InputError, match="got none"):
+        model.load_state_arrays(arrays)
+
+
+def test_time_moves_the_field_once_its_time_planes_differ() -> None:
+    model, cloud = field(), points()
+    assert torch.equal(model.offsets(cloud, 0.1).means, model.offsets(cloud, 0.9).means)  # time planes start at 1
+    model.grid.plane(0, "xt")[-1] = 2
+    assert not torch.equal(model.offsets(cloud, 0.1).means, model.offsets(cloud, 0.99).means)
+
+
+def test_motion_layout_follows_the_configuration() -> None:
+    assert motion_layout(BASIS) == {
+        "means": slice(0, 3),
+        "quats": slice(3, 7),
+        "log_scales": slice(7, 10),
+        "sh_dc": slice(10, 13),
+    }
+    rigid = replace(BASIS, deform_scales=False, deform_quats=False, deform_opacity=True)
+    assert motion_layout(rigid) == {"means": slice(0, 3), "opacity_logits": slice(3, 4), "sh_dc": slice(4, 7)}
+    plain = replace(rigid, deform_opacity=False, basis=replace(BASIS.basis, deform_color=False))
+    assert identity_motion(5, plain).shape == (5, 9, 3)
+
+
+def literal_weights(time: float, cfg: BasisConfig) -> list[float]:
+    weights = []
+    sigma = cfg.relative_width / cfg.num_bases
+    for b in range(cfg.num_bases):
+        center = b / (cfg.num_bases - 1)
+        inside = abs(time - center) <= 4 * sigma
+        weights.append(math.exp(-((time - center) ** 2) / (2 * sigma**2)) if inside else 0.0)
+    return weights
+
+
+@pytest.mark.parametrize("time", [0.0, 0.31, 0.5, 0.999, 1.0])
+def test_basis_by_its_definition(time: float) -> None:
+    cfg = replace(BASIS, deform_opacity=True)
+    motion = torch.randn(300, 9, 14, generator=torch.Generator().manual_seed(1))
+    weights = literal_weights(time, cfg.basis)
+    np.testing.assert_allclose(basis_weights(time, cfg.basis), weights, rtol=1e-12)
+    assert 0 in weights  # the cut is being tested
+    total = sum(w * motion[:, b].double() for b, w in enumerate(weights)).float()
+    got = basis_offsets(motion, time, cfg)
+    parts = [got.means, got.quats, got.log_scales, got.opacity_logits[:, None], got.sh_dc]
+    torch.testing.assert_close(torch.cat(parts, -1), total, rtol=1e-5, atol=1e-6)  # nine float32 terms
+
+
+def test_basis_cut_is_at_four_standard_deviations() -> None:
+    cfg = BasisConfig(num_bases=101, relative_width=1.01)  # sigma = 0.01 = distance of the centers
+    assert np.flatnonzero(basis_weights(0.5 + 1e-9, cfg)).tolist() == list(range(47, 55))
+    assert basis_weights(0.5, cfg)[50] == 1
+    assert basis_weights(0.505, cfg)[46] == pytest.approx(0, abs=0)
+    assert basis_weights(0.4999, cfg)[46] == pytest.approx(math.exp(-0.5 * 3.99**2), rel=1e-6)
+    assert not basis_weights(7.0, cfg).any()
+
+
+def test_basis_gradient() -> None:
+    motion = torch.randn(3, 9, 13, dtype=torch.float64, requires_grad=True)
+
+    def offsets(motion: Tensor) -> tuple[Tensor, ...]:
+        found = basis_offsets(motion, 0.4, BASIS)
+        return found.means, found.quats, found.log_scales, found.sh_dc
+
+    assert torch.autograd.gradcheck(offsets, (motion,))
+
+
+def test_basis_starts_as_the_identity() -> None:
+    motion = identity_motion(4, BASIS).requires_grad_(True)
+    found = basis_offsets(motion, 0.25, BASIS)
+    assert isinstance(found, Offsets) and found.opacity_logits is None
+    assert not any(value.any() for value in (found.means, found.quats, found.log_scales, found.sh_dc))
+    found.means.sum().backward()
+    assert motion.grad.any()  # and it can leave it
+
+
+def test_basis_of_no_gaussians_far_times_and_wrong_shapes() -> None:
+    motion = identity_motion(0, BASIS).requires_grad_(True)
+    basis_offsets(motion, 0.5, BASIS).means.sum().backward()
+    assert motion.grad.shape == motion.shape
+    ones = identity_motion(2, BASIS) + 1
+    assert not basis_offsets(ones, 5.0, BASIS).means.any()
+    with pytest.raises(ValueError, match="motion"):
+        basis_offsets(ones[..., :-1], 0.5, BASIS)
