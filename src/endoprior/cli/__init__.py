@@ -1,0 +1,70 @@
+"""The command line: find the command, run it, and turn every failure into the right exit status.
+
+Exit status: 0 done; 2 bad input or usage, one line on stderr; 1 a failure of ours, with traceback; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+from ..checks import InputError
+
+COMMANDS = {
+    "demo": "phantom sequence -> train -> eval -> render, with a summary and pictures",
+    "phantom": "write a synthetic surgical sequence with full ground truth",
+    "prior": "draw the cue maps and the joint texture prior of each frame",
+    "train": "train one scene and score it",
+    "eval": "score a trained scene on a split",
+    "render": "draw a trained scene: colour, depth, side-by-side, video",
+}
+"""Name and one-line description; each lives in the module of this package named like it (`eval` in `evaluate`)."""
+
+MODULES = {"eval": "evaluate"}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: arguments without the program's name; None takes them from the process.
+    Returns:
+        The exit status.
+    """
+    argv = sys.argv[1:] if argv is None else argv
+    if not argv or argv[0] in ("-h", "--help"):
+        print(overview())
+        return 0
+    if argv[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("endoprior"))
+        return 0
+    name, rest = argv[0], argv[1:]
+    try:
+        if name not in COMMANDS:
+            raise InputError(f"{name}: no such command; expected one of {', '.join(COMMANDS)}. Try `endoprior --help`.")
+        import_module(f".{MODULES.get(name, name)}", __package__).run(rest)
+    except InputError as error:
+        print(f"endoprior: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("endoprior: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def overview() -> str:
+    """The text of `endoprior --help`."""
+    lines = [f"  {name:<9}{about}" for name, about in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: endoprior COMMAND ...",
+            "",
+            "From an endoscope video to a moving 3D model of the tissue, on any CPU. Research use only.",
+            "",
+            *lines,
+            "",
+            "`endoprior COMMAND --help` explains every option.",
+        ]
+    )

@@ -1,0 +1,58 @@
+"""`endoprior demo [OUT]`."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from ..presets import PresetName, preset
+from .parsing import parse
+from .progress import say
+
+
+@dataclass
+class Demo:
+    """Everything once, on synthetic data: phantom sequence -> train -> eval -> render, with a report."""
+
+    out: tyro.conf.Positional[Path] = Path("demo")
+    """Folder for sequence/, run/, report.png; must be new or empty."""
+    preset: PresetName = "default"
+    """Config to train with."""
+    frames: int = 48
+    """Frames of the phantom."""
+    seed: int = 0
+    """Seed of the phantom and of the training."""
+
+
+def run(argv: list[str]) -> None:
+    """Make the phantom, train on it, score, draw, and say what to look at."""
+    args = parse(Demo, argv, "demo")
+    from dataclasses import replace
+
+    from ..data import load_sequence
+    from ..model.scene import load_scene
+    from ..phantom import PhantomConfig, write_phantom
+    from ..run_folder import prepare_run_folder
+    from ..show.report import write_report
+    from .render import Render, draw
+    from .train import train_and_evaluate
+
+    prepare_run_folder(args.out, resume=False)
+    began = clock.perf_counter()
+    data, folder = args.out / "sequence", args.out / "run"
+    say(f"1/4  a phantom of {args.frames} frames: {data}")
+    write_phantom(data, PhantomConfig(frames=args.frames, seed=args.seed))
+    say("2/4  training")
+    cfg = replace(preset(args.preset), seed=args.seed)
+    # Network scores may want large downloads, which a demo should not start unasked.
+    train_and_evaluate(data, cfg, folder, resume=False, networks=False, weights_dir=None)
+    say("\n3/4  drawing")
+    scene = load_scene(folder)
+    draw(scene, Render(run=folder))
+    say("4/4  report")
+    report = args.out / "report.png"
+    write_report(scene, load_sequence(data), folder, report)
+    say(f"\nDone in {clock.perf_counter() - began:.0f} s. Look at:\n  {report}\n  {folder / 'video.mp4'}")

@@ -1,0 +1,91 @@
+"""`endoprior eval RUN`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from ..checks import InputError
+from .parsing import parse
+from .progress import say
+
+if TYPE_CHECKING:
+    from ..model.scene import Scene
+
+
+@dataclass
+class Eval:
+    """Score a trained scene; writes metrics.json and per_frame.json into the run folder (or --out)."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder."""
+    data: Path | None = None
+    """Sequence folder; the one the run was trained on if not given."""
+    split: Literal["test", "train", "video"] = "test"
+    """Frames to score."""
+    out: Path | None = None
+    """Folder for the two files."""
+    networks: bool = True
+    """Also score with RAFT and LPIPS where their weights can be had."""
+    weights_dir: Path | None = None
+    """Folder with the weights of RAFT and LPIPS."""
+
+
+def run(argv: list[str]) -> None:
+    """Score and print."""
+    args = parse(Eval, argv, "eval")
+    from ..model.scene import load_scene
+
+    scene = load_scene(args.run)
+    data = args.data or sequence_of_run(args.run)
+    evaluate_run(scene, data, args.out or args.run, args.split, args.networks, args.weights_dir, extra={})
+
+
+def evaluate_run(
+    scene: Scene,
+    data: Path,
+    out: Path,
+    split: Literal["test", "train", "video"],
+    networks: bool,
+    weights_dir: Path | None,
+    extra: dict[str, float],
+) -> None:
+    """Score `scene` on the sequence folder `data`, write the two files into `out`, print a table.
+
+    Depth is scored against what was measured, whatever the run's preset took for measured in training.
+    """
+    from ..config import DataConfig
+    from ..data import load_sequence
+    from ..evaluate import evaluate
+
+    sequence = load_sequence(data, DataConfig(use_gt_masks=scene.config.data.use_gt_masks))
+    result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir)
+    result.protocol["masks"] = "gt_masks/" if scene.config.data.use_gt_masks else "masks/"
+    result.scores |= extra
+    result.save(out)
+    say(f"\nscores on the {split} split ({len(sequence.indices(split))} frames)")
+    for name, value in result.scores.items():
+        say(f"  {name:<28}{value:.4g}" if isinstance(value, float) else f"  {name:<28}{value}")
+    for name, reason in result.skipped.items():
+        say(f"  {name:<28}skipped: {reason}")
+    say(f"{out / 'metrics.json'}")
+
+
+def sequence_of_run(run_folder: Path) -> Path:
+    """The sequence folder a run was trained on, by its config.json.
+
+    Raises:
+        InputError: config.json is missing or says nothing, or the folder has gone.
+    """
+    file = run_folder / "config.json"
+    try:
+        data = Path(json.loads(file.read_text())["data"]["path"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{file}: expected the path of the sequence; {error!r}. Pass --data FOLDER.") from None
+    if not data.is_dir():
+        raise InputError(f"{data}: the sequence this run was trained on is not there. Pass --data FOLDER.")
+    return data

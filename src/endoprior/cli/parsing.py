@@ -1,0 +1,35 @@
+"""Arguments from dataclasses, by tyro; a mistake becomes one line instead of a page."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from typing import TypeVar
+
+import tyro
+
+from ..checks import InputError
+
+A = TypeVar("A")
+BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
+
+
+def parse(cls: type[A], argv: list[str], command: str, default: A | None = None) -> A:
+    """Fill the dataclass `cls` from `argv`; `--help` prints and exits with status 0.
+
+    Raises:
+        InputError: an unknown option, a missing argument, or a value of the wrong kind or range.
+    """
+    said = io.StringIO()
+    extra = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(cls, args=argv, prog=f"endoprior {command}", description=cls.__doc__, **extra)
+    except SystemExit as exit_:
+        if exit_.code == 0:
+            raise
+        text = " ".join(BOX_DRAWING.sub(" ", said.getvalue()).split())
+        raise InputError(f"{text} Try `endoprior {command} --help`.") from None
+    except ValueError as error:  # a range check of the config
+        raise InputError(f"{error}. Try `endoprior {command} --help`.") from None

@@ -1,0 +1,37 @@
+"""`endoprior prior DATA OUT`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from ..config import PriorConfig
+from .parsing import parse
+from .progress import say
+
+
+@dataclass
+class Prior:
+    """Draw the cue maps and the joint texture prior of each frame: a PNG per map and a contact sheet."""
+
+    data: tyro.conf.Positional[Path]
+    """Sequence folder."""
+    out: tyro.conf.Positional[Path]
+    """Folder for specular/, salience/, prior/ and contact_sheet.png."""
+    split: Literal["train", "test", "video"] = "video"
+    """Frames to draw."""
+    config: Annotated[PriorConfig, tyro.conf.arg(name="")] = field(default_factory=PriorConfig)
+
+
+def run(argv: list[str]) -> None:
+    """Draw the maps."""
+    args = parse(Prior, argv, "prior")
+    from ..data import load_sequence
+    from ..show.prior_maps import write_prior_maps
+
+    sequence = load_sequence(args.data)
+    sheet = write_prior_maps(sequence, args.split, args.config, args.out)
+    say(f"{len(sequence.indices(args.split))} frames\n{sheet}")

@@ -1,0 +1,93 @@
+"""Progress of long work: a bar with rate and time left on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time as clock
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..train_state import StepReport
+    from ..trainer import Trainer
+
+PLAIN_EVERY_SECONDS = 10.0
+
+
+def say(text: str) -> None:
+    """One line on stdout, at once."""
+    print(text, flush=True)
+
+
+@contextmanager
+def training_progress() -> Iterator:
+    """Yield the `on_step` callback of `train.train`."""
+    if sys.stderr.isatty():
+        with _bar() as callback:
+            yield callback
+    else:
+        yield _PlainLines()
+
+
+class _PlainLines:
+    """A line every few seconds, for log files."""
+
+    def __init__(self) -> None:
+        self.began = clock.monotonic()
+        self.last = self.began
+        self.done_before: int | None = None
+
+    def __call__(self, report: StepReport, trainer: Trainer) -> None:
+        done, total = iterations_done(trainer)
+        if self.done_before is None:
+            self.done_before = done - 1
+        now = clock.monotonic()
+        if now - self.last < PLAIN_EVERY_SECONDS and done < total:
+            return
+        self.last = now
+        rate = (done - self.done_before) / max(now - self.began, 1e-9)
+        left = (total - done) / max(rate, 1e-9)
+        say(
+            f"{report.stage.name.lower()} {done}/{total}  {rate:.1f} it/s  {left:.0f} s left  "
+            f"color {report.terms['color']:.4f}  {report.num_gaussians} Gaussians"
+        )
+
+
+@contextmanager
+def _bar() -> Iterator:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[facts]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task("starting", total=None, rate="", facts="")
+
+        def callback(report: StepReport, trainer: Trainer) -> None:
+            done, total = iterations_done(trainer)
+            progress.update(
+                task,
+                completed=done,
+                total=total,
+                description=report.stage.name.lower(),
+                rate=f"{1 / max(report.seconds, 1e-9):.0f} it/s",
+                facts=f"color {report.terms['color']:.4f}  {report.num_gaussians} Gaussians",
+            )
+
+        yield callback
+
+
+def iterations_done(trainer: Trainer) -> tuple[int, int]:
+    """Iterations done and in all, over both stages."""
+    from ..train_state import Stage
+
+    coarse, fine = trainer.stage_length(Stage.COARSE), trainer.stage_length(Stage.FINE)
+    before = coarse if trainer.state.stage is Stage.FINE else 0
+    return before + trainer.state.iteration, coarse + fine

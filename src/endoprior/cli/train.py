@@ -1,0 +1,98 @@
+"""`endoprior train DATA OUT`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time as clock
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+import tyro
+
+from ..checks import InputError
+from ..config import Config
+from ..presets import PresetName, preset
+from .parsing import parse
+from .progress import say, training_progress
+
+
+@dataclass
+class Train:
+    """Train one scene and score it. Every option below --resume is a field of the config; the preset sets it."""
+
+    data: tyro.conf.Positional[Path]
+    """Sequence folder: images/, masks/, depth/, poses_bounds.npy."""
+    out: tyro.conf.Positional[Path]
+    """Run folder to write."""
+    preset: PresetName = "default"
+    """Where the config starts from."""
+    init_budget: int | None = None
+    """Short for --init.budget."""
+    device: Literal["auto", "cpu"] = "auto"
+    """Where to compute; auto takes the best that works here and says so."""
+    weights_dir: Path | None = None
+    """Folder with the weights of RAFT and LPIPS."""
+    networks: bool = True
+    """Also score with RAFT and LPIPS where their weights can be had."""
+    resume: bool = False
+    """Continue the run in OUT from its checkpoint."""
+    config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+
+
+def run(argv: list[str]) -> None:
+    """Train, score, and print where the results are."""
+    args = parse(Train, argv, "train", default=_preset_defaults(argv))
+    cfg = args.config
+    if args.init_budget is not None:
+        cfg = dataclasses.replace(cfg, init=dataclasses.replace(cfg.init, budget=args.init_budget))
+    train_and_evaluate(args.data, cfg, args.out, args.resume, args.networks, args.weights_dir)
+
+
+def train_and_evaluate(
+    data: Path, cfg: Config, out: Path, resume: bool, networks: bool, weights_dir: Path | None
+) -> None:
+    """Train on the folder `data` into the run folder `out`, score the test split there, print the scores."""
+    from ..data import load_sequence
+    from ..run_folder import prepare_run_folder
+    from ..train import train
+    from .evaluate import evaluate_run
+
+    sequence = load_sequence(data, cfg.data)
+    prepare_run_folder(out, resume=resume)
+    say(f"{data}: {len(sequence)} frames; backend {cfg.render.backend}")
+    for remark in sequence.validate():
+        say(f"note: {remark}")
+    began = clock.perf_counter()
+    try:
+        with training_progress() as on_step:
+            scene = train(sequence, cfg, out, resume=resume, on_step=on_step)
+    except KeyboardInterrupt:
+        say(f"Stopped; the state is saved. Go on with the same command and --resume ({out}).")
+        raise
+    seconds = clock.perf_counter() - began
+    done = _logged_seconds(out / "log.jsonl")
+    speed = {"train_seconds": seconds, "iterations_per_second": done}
+    evaluate_run(scene, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
+
+
+def _logged_seconds(log: Path) -> float:
+    """Iterations per second by the log: the reciprocal of the mean time of the iterations it shows."""
+    seconds = [json.loads(line)["seconds"] for line in log.read_text().splitlines()]
+    return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0
+
+
+def _preset_defaults(argv: list[str]) -> Train:
+    """Defaults with the config of the preset named in `argv`, so that --help and options build on it."""
+    name = "default"
+    for i, word in enumerate(argv):
+        if word == "--preset" and i + 1 < len(argv):
+            name = argv[i + 1]
+        elif word.startswith("--preset="):
+            name = word.removeprefix("--preset=")
+    if name not in get_args(PresetName):
+        raise InputError(
+            f"--preset: expected one of {', '.join(get_args(PresetName))}; got {name!r}. Choose one of them."
+        )
+    return Train(data=tyro.MISSING, out=tyro.MISSING, preset=name, config=preset(name))

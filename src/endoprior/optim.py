@@ -1,0 +1,201 @@
+"""Adam with one learning rate per group, its schedules, and the one place that resizes per-Gaussian tensors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .adam_kernels import adam_columns
+from .config import Config, OptimConfig
+from .density import DensityStats, Plan
+from .geometry import quaternion_to_matrix
+from .model.basis import basis_weights, motion_layout
+from .model.deformation import HexPlaneField
+from .model.gaussians import Gaussians
+from .model.plane_adam import PlaneAdam
+
+BETA1, BETA2 = 0.9, 0.999
+
+
+def log_linear(start: float, end: float, iteration: int, steps: int) -> float:
+    """Learning rate that falls from `start` to `end` over `steps` iterations, linearly in its logarithm, then holds."""
+    share = min(max(iteration / steps, 0.0), 1.0)
+    return math.exp(math.log(start) * (1 - share) + math.log(end) * share)
+
+
+class AdamState:
+    """Moments of one parameter seen as (rows, columns), and how often each column was stepped."""
+
+    def __init__(self, param: Tensor) -> None:
+        self.first = torch.zeros_like(param, requires_grad=False)
+        self.second = torch.zeros_like(param, requires_grad=False)
+        self.steps = np.zeros(max(param[0].numel(), 1) if len(param) else 1, np.int64)
+
+    def update(self, param: Tensor, rates: np.ndarray, epsilon: float, begin: int, end: int) -> None:
+        """One step of columns [begin, end); other columns keep value, moments and count.
+
+        Args:
+            param: (R, ...) leaf with `.grad`. rates: (columns,) learning rate of each.
+        """
+        if param.grad is None or param.numel() == 0:
+            return
+        self.steps[begin:end] += 1
+        steps = self.steps[begin:end]
+        rate = (rates[begin:end] / (1 - BETA1**steps)).astype(np.float32)
+        root_scale = (1 / np.sqrt(1 - BETA2**steps)).astype(np.float32)
+        views = [
+            t.detach().reshape(len(param), -1).numpy()
+            for t in (param, param.grad.contiguous(), self.first, self.second)
+        ]
+        adam_columns(*views, begin, rate, root_scale, np.float32(BETA1), np.float32(BETA2), np.float32(epsilon))
+
+
+class Optimizer:
+    """Adam over the Gaussians and the deformation field of one stage; rebuilt, moments and all, when a stage begins."""
+
+    def __init__(self, gaussians: Gaussians, field: HexPlaneField | None, cfg: Config, spatial_scale: float) -> None:
+        self.gaussians, self.field, self.cfg, self.spatial_scale = gaussians, field, cfg, spatial_scale
+        self.states = {name: AdamState(value) for name, value in gaussians.tensors.items()}
+        self.plane_adam = None
+        if field is not None:
+            self.states |= {name: AdamState(value) for name, value in _field_parameters(field).items()}
+            self.plane_adam = PlaneAdam(field.grid, epsilon=cfg.optim.epsilon)
+
+    def step(self, iteration: int, time: float | None) -> None:
+        """Apply the gradients and clear them.
+
+        Args:
+            iteration: 1-based, within the stage.
+            time: moment of the frame just rendered, or None in the coarse stage, where nothing deforms. Temporal
+                coefficients whose basis function is zero at that time are not stepped: their gradient is zero, and
+                stepping them on momentum alone would move the tissue at moments that were not looked at.
+        """
+        optim = self.cfg.optim
+        decay = {"iteration": iteration, "steps": optim.decay_iterations}
+        for name, param in self.gaussians.tensors.items():
+            if name != "motion":
+                self._step_all(name, param, self._rate(name, decay))
+            elif time is not None:
+                self._step_motion(param, time, decay)
+        if self.field is not None and time is not None:
+            network = self.spatial_scale * log_linear(optim.network_lr, optim.network_lr_final, **decay)
+            planes = self.spatial_scale * log_linear(optim.planes_lr, optim.planes_lr_final, **decay)
+            for name, param in _field_parameters(self.field).items():
+                self._step_all(name, param, planes if name == "box" else network)
+            self.plane_adam.step(planes)
+        self.clear_gradients()
+
+    def _step_all(self, name: str, param: Tensor, rate: float) -> None:
+        state = self.states[name]
+        state.update(param, np.full(len(state.steps), rate), self.cfg.optim.epsilon, 0, len(state.steps))
+
+    def clear_gradients(self) -> None:
+        """Drop every gradient."""
+        for param in self.gaussians.tensors.values():
+            param.grad = None
+        if self.field is not None:
+            for param in _field_parameters(self.field).values():
+                param.grad = None
+
+    def _rate(self, name: str, decay: dict) -> float:
+        optim = self.cfg.optim
+        if name == "means":
+            return self.spatial_scale * log_linear(optim.means_lr, optim.means_lr_final, **decay)
+        return {
+            "quats": optim.quats_lr,
+            "log_scales": optim.scales_lr,
+            "opacity_logits": optim.opacity_lr,
+            "sh_dc": optim.sh_dc_lr,
+            "sh_rest": optim.sh_rest_lr,
+        }[name]
+
+    def _step_motion(self, param: Tensor, time: float, decay: dict) -> None:
+        cfg = self.cfg.deformation
+        active = np.flatnonzero(basis_weights(time, cfg.basis))
+        if len(active) == 0:
+            return
+        rates = np.tile(motion_rates(self.cfg, **decay), param.shape[1])
+        channels = param.shape[2]
+        begin, end = active[0] * channels, (active[-1] + 1) * channels
+        self.states["motion"].update(param, rates, self.cfg.optim.epsilon, begin, end)
+
+    def apply_plan(self, plan: Plan, stats: DensityStats, rng: np.random.Generator) -> DensityStats:
+        """Clone, split and remove as planned, in the parameters, Adam's moments and the statistics alike.
+
+        Rows that stay keep everything; the gradient sums of all are cleared, as after each event. New rows start with
+        zero moments and unobserved.
+
+        Returns:
+            The statistics of the new set.
+        """
+        keep = ~(plan.remove | plan.split)
+        tensors = self.gaussians.tensors
+        children = split_children(self.gaussians, plan.split, self.cfg.density.split_shrink, rng)
+        num_new = 0
+        for name, value in tensors.items():
+            data = value.detach()
+            added = torch.cat([data[plan.clone], children[name]])
+            num_new = len(added)
+            tensors[name] = torch.cat([data[keep], added]).contiguous().requires_grad_()
+            state = self.states[name]
+            state.first, state.second = (_grown(m, keep, num_new) for m in (state.first, state.second))
+        grown = DensityStats(*(_grown(value, keep, num_new) for value in stats.tensors().values()))
+        grown.clear_gradient()
+        return grown
+
+    def state_arrays(self) -> dict[str, Tensor]:
+        """Moments and step counts by name, for a checkpoint."""
+        arrays = {}
+        for name, state in self.states.items():
+            arrays |= {f"{name}.first": state.first, f"{name}.second": state.second}
+            arrays[f"{name}.steps"] = torch.from_numpy(state.steps)
+        return arrays | (self.plane_adam.state_arrays() if self.plane_adam else {})
+
+    def load_state_arrays(self, arrays: dict[str, Tensor]) -> None:
+        """Inverse of `state_arrays`."""
+        for name, state in self.states.items():
+            state.first, state.second = arrays[f"{name}.first"].clone(), arrays[f"{name}.second"].clone()
+            state.steps = arrays[f"{name}.steps"].numpy().copy()
+        if self.plane_adam:
+            self.plane_adam.load_state_arrays(arrays)
+
+
+def _field_parameters(field: HexPlaneField) -> dict[str, Tensor]:
+    """Network and box by name; the box only if it is trained."""
+    groups = field.parameters_by_group()
+    named = {f"network.{i}": value for i, value in enumerate(groups["network"])}
+    return named | ({"box": groups["box"]} if groups["box"].requires_grad else {})
+
+
+def motion_rates(cfg: Config, iteration: int, steps: int) -> np.ndarray:
+    """(C,) learning rate of each channel of the temporal basis."""
+    optim: OptimConfig = cfg.optim
+    decay = log_linear(1.0, optim.basis_decay, iteration, steps)
+    rates = {
+        "means": optim.basis_means_lr,
+        "quats": optim.basis_quats_lr,
+        "log_scales": optim.basis_log_scales_lr,
+        "opacity_logits": optim.basis_opacity_lr,
+        "sh_dc": optim.basis_color_lr,
+    }
+    layout = motion_layout(cfg.deformation)
+    return np.concatenate([np.full(part.stop - part.start, rates[name] * decay) for name, part in layout.items()])
+
+
+def split_children(gaussians: Gaussians, split: Tensor, shrink: float, rng: np.random.Generator) -> dict[str, Tensor]:
+    """Two children for each Gaussian marked in `split` (N,): centres drawn from it, scales divided by `shrink`."""
+    tensors = {name: value.detach()[split] for name, value in gaussians.tensors.items()}
+    children = {name: torch.cat([value, value]) for name, value in tensors.items()}
+    scales, quats = children["log_scales"].exp().numpy(), children["quats"].numpy()
+    offsets = rng.normal(size=scales.shape) * scales
+    turned = np.einsum("nij,nj->ni", quaternion_to_matrix(quats.astype(np.float64)), offsets)
+    children["means"] = children["means"] + torch.from_numpy(turned.astype(np.float32))
+    children["log_scales"] = children["log_scales"] - math.log(shrink)
+    return children
+
+
+def _grown(rows: Tensor, keep: Tensor, num_new: int) -> Tensor:
+    return torch.cat([rows[keep], rows.new_zeros((num_new, *rows.shape[1:]))]).contiguous()

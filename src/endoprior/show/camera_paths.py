@@ -1,0 +1,81 @@
+"""Camera paths: a list of (time, camera) to draw a scene along."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..checks import InputError
+from ..types import Camera
+
+View = tuple[float, Camera]
+
+SWAY_SHARE = 0.12
+"""Amplitude of the swaying camera, as a share of the distance to the tissue."""
+
+
+def times_path(times: list[float], cameras: tuple[Camera, ...]) -> list[View]:
+    """The sequence's own camera at each of `times` in [0, 1]."""
+    last = len(cameras) - 1
+    return [(time, cameras[min(round(time * len(cameras)), last)]) for time in times]
+
+
+def sway_path(times: list[float], cameras: tuple[Camera, ...], distance_mm: float) -> list[View]:
+    """The sequence's camera moved around a small circle, always looking at the point `distance_mm` straight ahead."""
+    views = []
+    for k, (time, camera) in enumerate(times_path(times, cameras)):
+        angle = 2 * np.pi * k / max(len(times), 1)
+        shift = SWAY_SHARE * distance_mm * np.array([np.sin(angle), 0.6 * (1 - np.cos(angle)), 0])
+        views.append((time, replace(camera, world_to_camera=_looking(shift, distance_mm) @ camera.world_to_camera)))
+    return views
+
+
+def _looking(position: NDArray, distance: float) -> NDArray:
+    """(4, 4) from the old camera axes to those of a camera at `position` that looks at (0, 0, distance)."""
+    forward = np.array([0, 0, distance]) - position
+    forward /= np.linalg.norm(forward)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ position
+    return matrix
+
+
+def read_path(file: Path, cameras: tuple[Camera, ...]) -> list[View]:
+    """Read a camera path: a JSON list of {"time": t in [0, 1], "world_to_camera": 4 x 4, mm, OpenCV axes}.
+
+    A view may leave out the matrix; it then has the sequence's camera of that time. Intrinsics are the sequence's.
+
+    Raises:
+        InputError: the file is missing, is not such a list, or a matrix is not a rigid motion.
+    """
+    try:
+        entries = json.loads(file.read_text())
+        views = [_view(entry, cameras) for entry in entries]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f'{file}: expected a JSON list of {{"time": .., "world_to_camera": 4 x 4}}; {error!r}. Correct the file.'
+        ) from None
+    if not views:
+        raise InputError(f"{file}: expected at least one view; got none. Add one.")
+    return views
+
+
+def _view(entry: dict, cameras: tuple[Camera, ...]) -> View:
+    time = float(entry["time"])
+    if not 0 <= time <= 1:
+        raise ValueError(f"time {time} is not in [0, 1]")
+    (_, camera), *_ = times_path([time], cameras)
+    if "world_to_camera" not in entry:
+        return time, camera
+    matrix = np.asarray(entry["world_to_camera"], np.float64)
+    rotation = matrix[:3, :3]
+    rigid = matrix.shape == (4, 4) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]) or np.linalg.det(rotation) < 0:
+        raise ValueError("world_to_camera is not a 4 x 4 rotation and translation")
+    return time, replace(camera, world_to_camera=matrix)

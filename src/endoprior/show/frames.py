@@ -1,0 +1,58 @@
+"""Drawn views on disk: colour and depth per view, side-by-side pictures, and a video."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import whole_file
+from ..model.scene import Scene
+from ..types import Frame
+from .camera_paths import View
+from .pictures import colorize, label, tile, to_u8, write_png
+from .video import write_video
+
+
+def write_views(
+    scene: Scene,
+    views: list[View],
+    out: Path,
+    video: Path,
+    frames: list[Frame] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Draw each view into `out/rgb/*.png`, `out/depth/*.npy` (mm, float32) and `out/side_by_side/*.png`, and a film.
+
+    Args:
+        frames: the originals, one per view; without them the side-by-side shows colour and depth only.
+        video: path of the mp4 of the side-by-side pictures.
+    """
+    span = depth_span(scene)
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        for k, (time, camera) in enumerate(views):
+            drawn = scene.render(time, camera)
+            color, depth = to_u8(drawn.color.numpy()), drawn.depth.numpy()
+            name = f"{frames[k].index if frames else k:06d}"
+            write_png(out / "rgb" / f"{name}.png", color)
+            with whole_file(out / "depth" / f"{name}.npy") as temporary:
+                np.save(temporary, depth)
+            parts = [label(frames[k].rgb_u8, "input")] if frames else []
+            parts += [label(color, "EndoPrior-GS"), label(colorize(depth, *span, depth > 0), "depth")]
+            beside = tile(parts, len(parts))
+            write_png(out / "side_by_side" / f"{name}.png", beside)
+            progress(k + 1, len(views))
+            yield beside
+
+    write_video(video, pictures(), scene.frames_per_second)
+
+
+def depth_span(scene: Scene) -> tuple[float, float]:
+    """Depths, mm, between which nearly all of the first moment lies: one colour scale for all pictures of a scene."""
+    depth = scene.render(0.0).depth.numpy()
+    drawn = depth[depth > 0]
+    low, high = np.percentile(drawn, (2, 98)) if drawn.size else (0.0, 1.0)
+    return float(low), float(high)

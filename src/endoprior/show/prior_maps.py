@@ -1,0 +1,58 @@
+"""The cue maps and the joint texture prior of a sequence, as pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import whole_folder
+from ..checks import InputError
+from ..config import PriorConfig
+from ..data import Sequence, Split
+from ..priors import joint_texture_prior, salience, specular_likelihood
+from .pictures import colorize, label, tile, to_u8, write_png
+
+SHEET_FRAMES = 6
+SHEET_WIDTH_PX = 320
+
+
+def write_prior_maps(sequence: Sequence, split: Split, cfg: PriorConfig, out: Path) -> Path:
+    """Write `specular/`, `salience/` and `prior/` (grey, 255 = 1) and `contact_sheet.png` into `out`.
+
+    Returns:
+        Path of the contact sheet.
+    Raises:
+        InputError: `out` exists and is not empty.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: expected a new or empty folder; got one that is in use. Choose another.")
+    frames = sequence.frames(split)
+    shown = set(np.linspace(0, len(frames) - 1, min(SHEET_FRAMES, len(frames))).astype(int).tolist())
+    rows: list[NDArray[np.uint8]] = []
+    with whole_folder(out) as folder:
+        for position, frame in enumerate(frames):
+            maps = {
+                "specular": specular_likelihood(frame.rgb, cfg.specular),
+                "salience": salience(frame.rgb, frame.tissue_mask, cfg.salience),
+                "prior": joint_texture_prior(frame.rgb, frame.tissue_mask, cfg),
+            }
+            for name, values in maps.items():
+                write_png(folder / name / f"{frame.index:06d}.png", to_u8(values))
+            if position in shown:
+                pictures = {f"frame {frame.index}": frame.rgb_u8, "tissue mask": _grey(frame.tissue_mask)}
+                pictures |= {name: colorize(values, 0, 1) for name, values in maps.items()}
+                rows += [label(_small(picture), name) for name, picture in pictures.items()]
+        write_png(folder / "contact_sheet.png", tile(rows, 5))
+    return out / "contact_sheet.png"
+
+
+def _grey(mask: NDArray) -> NDArray[np.uint8]:
+    return np.repeat(to_u8(mask)[..., None], 3, -1)
+
+
+def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height = max(round(picture.shape[0] * SHEET_WIDTH_PX / picture.shape[1]), 1)
+    return cv2.resize(picture, (SHEET_WIDTH_PX, height), interpolation=cv2.INTER_AREA)

@@ -1,0 +1,114 @@
+"""One picture that tells how a run went: frames beside what was seen, curves, and the scores."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ..atomic import whole_file
+from ..config import PriorConfig
+from ..data import Sequence
+from ..model.scene import Scene
+from ..priors import joint_texture_prior
+from .frames import depth_span
+from .pictures import colorize, to_u8
+
+SHOWN_SCORES = {
+    "psnr_tissue": "PSNR on tissue, dB",
+    "psnr": "PSNR as published, dB",
+    "ssim": "SSIM",
+    "depth_rmse_mm": "depth error, mm",
+    "flow_error_dis": "flow error (DIS), px",
+    "depth_instability_mm": "depth instability, mm",
+    "psnr_behind_tool": "PSNR behind tool, dB",
+    "depth_rmse_behind_tool_mm": "depth error behind tool, mm",
+    "track_error_mm": "track error, mm",
+    "num_gaussians": "Gaussians",
+    "fps": "frames/s drawn",
+    "train_seconds": "training, s",
+}
+ERROR_FULL_SCALE = 0.15
+"""Colour error, in [0, 1], that the error map shows as its last colour."""
+
+
+def write_report(scene: Scene, sequence: Sequence, run: Path, path: Path) -> None:
+    """Draw the report of a finished run folder as one PNG.
+
+    Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; then the
+    training curve, the PSNR of each test frame, and the scores of `metrics.json`.
+    """
+    metrics = json.loads((run / "metrics.json").read_text())
+    per_frame = json.loads((run / "per_frame.json").read_text())
+    log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    rows = _picture_rows(scene, sequence)
+    # Agg is named per figure: choosing a backend for the whole process would be the caller's affair.
+    figure = Figure(figsize=(2.6 * len(rows[0]), 2.1 * len(rows) + 3.4), layout="constrained", dpi=110)
+    matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+    top, bottom = figure.subfigures(2, 1, height_ratios=[2.1 * len(rows), 3.4])
+    axes = np.atleast_2d(top.subplots(len(rows), len(rows[0])))
+    for row, cells in zip(axes, rows, strict=True):
+        for axis, (title, picture) in zip(row, cells, strict=True):
+            axis.imshow(picture)
+            axis.set_title(title, fontsize=8)
+            axis.set_axis_off()
+    loss_axis, psnr_axis, table_axis = bottom.subplots(1, 3, width_ratios=[1, 1, 1.1])
+    _draw_loss(loss_axis, log)
+    _draw_psnr(psnr_axis, per_frame)
+    _draw_scores(table_axis, metrics)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary)
+
+
+def _picture_rows(scene: Scene, sequence: Sequence) -> list[list[tuple[str, NDArray[np.uint8]]]]:
+    frames = sequence.frames("test")
+    shown = sorted({int(k) for k in np.linspace(0, len(frames) - 1, 3)})
+    span = depth_span(scene)
+    rows = []
+    for frame in (frames[k] for k in shown):
+        drawn = scene.render(frame.time, frame.camera)
+        color, depth = np.clip(drawn.color.numpy(), 0, 1), drawn.depth.numpy()
+        error = np.abs(color - frame.rgb).mean(-1)
+        cells = [(f"input, frame {frame.index} (held out)", frame.rgb_u8), ("rendered, tool removed", to_u8(color))]
+        tissue = sequence.truth.tissue(frame.index) if sequence.truth else None
+        if tissue is not None:
+            cells.append(("true tissue", tissue))
+        rho = joint_texture_prior(frame.rgb, frame.tissue_mask, PriorConfig())
+        cells += [
+            (f"error on tissue, 0..{ERROR_FULL_SCALE}", colorize(error, 0, ERROR_FULL_SCALE, frame.tissue_mask)),
+            (f"depth, {span[0]:.0f}..{span[1]:.0f} mm", colorize(depth, *span, depth > 0)),
+            ("joint texture prior", colorize(rho, 0, 1)),
+        ]
+        rows.append(cells)
+    return rows
+
+
+def _draw_loss(axis: matplotlib.axes.Axes, log: list[dict]) -> None:
+    axis.semilogy([sum(line["terms"].values()) for line in log], linewidth=0.6, color="tab:red")
+    starts = [k for k in range(1, len(log)) if log[k]["stage"] != log[k - 1]["stage"]]
+    for k in starts:
+        axis.axvline(k, color="gray", linestyle=":", label="fine stage begins")
+    axis.set_title("training objective", fontsize=9)
+    axis.set_xlabel("log line (every 10 iterations)", fontsize=8)
+    if starts:
+        axis.legend(fontsize=7)
+
+
+def _draw_psnr(axis: matplotlib.axes.Axes, per_frame: list[dict]) -> None:
+    points = [(row["index"], row["psnr_tissue"]) for row in per_frame if "psnr_tissue" in row]
+    if points:
+        axis.plot(*zip(*points, strict=True), "o-", color="tab:blue", markersize=4)
+    axis.set_title("PSNR on tissue, held-out frames, dB", fontsize=9)
+    axis.set_xlabel("frame", fontsize=8)
+    axis.grid(alpha=0.3)
+
+
+def _draw_scores(axis: matplotlib.axes.Axes, metrics: dict) -> None:
+    scores = metrics["scores"]
+    lines = [f"{text:<30}{scores[name]:>10.4g}" for name, text in SHOWN_SCORES.items() if name in scores]
+    axis.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=axis.transAxes)
+    axis.set_axis_off()

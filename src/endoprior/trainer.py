@@ -1,0 +1,212 @@
+"""One training run, step by step.
+
+Two stages. Coarse: the first training frame alone, nothing deforms. Fine: a random training frame each time, deformed.
+Every random choice is a pure function of (seed, stage, iteration), so a resumed run repeats an uninterrupted one.
+"""
+
+from __future__ import annotations
+
+import time as clock
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import density, render, temporal
+from .config import Config
+from .data import Sequence
+from .density import DensityStats
+from .geometry import project
+from .loss_kernels import supervised_losses
+from .model.deformation import HexPlaneField
+from .model.gaussians import Gaussians, create_gaussians
+from .model.initialize import initial_log_scales, initial_points
+from .model.scene import Scene, offsets_at
+from .optim import Optimizer
+from .train_state import Stage, StepReport, TrainState
+from .training_frames import TrainingFrame, TrainingFrames
+from .types import RenderOutput
+
+DEFAULT_FRAMES_PER_SECOND = 25.0
+"""Playing speed of a sequence that does not say its own."""
+
+
+class Trainer:
+    """One training run; `steps` advances it, `scene` is its result so far."""
+
+    def __init__(self, sequence: Sequence, cfg: Config) -> None:
+        self.sequence, self.cfg = sequence, cfg
+        self.frames = TrainingFrames(sequence, cfg.prior)
+        self.rasterize = render.load(cfg.render.backend)
+        self.background = torch.zeros(3)
+        self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
+        self.spatial_scale = spatial_scale(self.camera_centers, cfg)
+        self.state: TrainState | None = None
+
+    @property
+    def camera_centers(self) -> Tensor:
+        """(T, 3) camera positions of the training frames, mm."""
+        return torch.from_numpy(np.stack([self.cameras[i].center for i in self.frames.indices]))
+
+    def start(self) -> None:
+        """Draw the initial points and build the state before the first iteration."""
+        cfg = self.cfg
+        cloud = initial_points(self.sequence.frames("train"), cfg.init, cfg.prior, cfg.seed)
+        log_scales = initial_log_scales(cloud.points, cfg.init.variance_factor)
+        gaussians = create_gaussians(cloud.points, cloud.colors, log_scales, cfg)
+        field = None
+        if cfg.deformation.kind == "hexplane":
+            generator = torch.Generator().manual_seed(cfg.seed)
+            field = HexPlaneField.from_points(gaussians["means"].detach(), cfg.deformation, generator)
+        first = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
+        self._enter(first, gaussians, field)
+
+    def _enter(self, stage: Stage, gaussians: Gaussians, field: HexPlaneField | None) -> None:
+        optimizer = Optimizer(gaussians, field, self.cfg, self.spatial_scale)
+        self.state = TrainState(stage, 0, gaussians, field, optimizer, DensityStats.zeros(len(gaussians)))
+
+    def stage_length(self, stage: Stage) -> int:
+        """Iterations of a stage."""
+        schedule = self.cfg.schedule
+        return schedule.coarse_iterations if stage is Stage.COARSE else schedule.fine_iterations
+
+    @property
+    def finished(self) -> bool:
+        """Whether all iterations are done."""
+        state = self.state
+        return state.stage is Stage.FINE and state.iteration >= self.stage_length(Stage.FINE)
+
+    def step(self) -> StepReport:
+        """One iteration: draw, compare, differentiate, grow or prune, update."""
+        began = clock.perf_counter()
+        state = self.state
+        if state.stage is Stage.COARSE and state.iteration >= self.stage_length(Stage.COARSE):
+            self._enter(Stage.FINE, state.gaussians, state.field)
+            state = self.state
+        cfg, iteration = self.cfg, state.iteration + 1
+        fine = state.stage is Stage.FINE
+        rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
+        position = int(rng.integers(len(self.frames))) if fine else 0
+        half = fine and iteration <= cfg.schedule.half_resolution_iterations
+        frame = self.frames.frame(position, half=half)
+
+        offsets = offsets_at(state.gaussians, state.field, frame.time, cfg) if fine else None
+        splats = state.gaussians.splats(offsets, self._sh_degree(iteration))
+        out = self.rasterize(
+            splats,
+            frame.camera,
+            background=self.background,
+            depth_grad_to_means=cfg.render.depth_grad_to_means,
+        )
+        out.means2d.retain_grad()
+        terms = supervised_terms(out, frame, cfg)
+        if fine and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration:
+            terms |= self._temporal_terms(splats.means, out, position, frame)
+        sum(terms.values()).backward()
+
+        with torch.no_grad():
+            self._observe(out, position, frame, iteration)
+            state.optimizer.step(iteration, frame.time if fine else None)
+            last = fine and iteration == self.stage_length(Stage.FINE)
+            if density.due(iteration, last, cfg.density):
+                self._control_density(rng)
+        state.iteration = iteration
+        report = {name: float(value.detach()) for name, value in terms.items()}
+        return StepReport(state.stage, iteration, report, len(state.gaussians), clock.perf_counter() - began)
+
+    def _sh_degree(self, iteration: int) -> int:
+        """Degree in use: +1 per `sh_every` iterations of each stage, never falling back (method of 3DGS)."""
+        schedule = self.cfg.schedule
+        done = iteration // schedule.sh_every
+        if self.state.stage is Stage.FINE:
+            done += schedule.coarse_iterations // schedule.sh_every
+        return min(done, schedule.sh_degree)
+
+    def _temporal_terms(
+        self, means: Tensor, out: RenderOutput, position: int, frame: TrainingFrame
+    ) -> dict[str, Tensor]:
+        """L_local of Eq. (11), weighted; nothing without a training frame just before, or with few Gaussians."""
+        cfg, state = self.cfg.temporal, self.state
+        before_frame = self.frames.before(position)
+        if before_frame is None:
+            return {}
+        stats = state.stats
+        mask_value = density.sample_mask(frame.tissue_mask, out.means2d)
+        drawn = out.radii > 0
+        if cfg.valid_at_both:
+            drawn = density.valid_projection(out.means2d.detach(), out.radii, mask_value, frame.tissue_mask.shape)
+        eligible = drawn & (stats.num_valid >= cfg.min_valid)
+        score = stats.score(self.cfg.density.unobserved_score)
+        chosen, weights = temporal.choose(score.numpy(), eligible.numpy(), cfg)
+        if len(chosen) == 0:
+            return {}
+        index = torch.from_numpy(chosen)
+        with torch.set_grad_enabled(cfg.gradient == "both"):
+            offsets = offsets_at(state.gaussians, state.field, before_frame.time, self.cfg, index)
+            before = state.gaussians["means"][index] + offsets.means
+        if cfg.valid_at_both:
+            kept = on_tissue(before.detach(), before_frame)
+            index, weights, before = index[kept], weights[kept.numpy()], before[kept]
+            if len(index) < max(cfg.min_points, cfg.num_neighbors + 1):
+                return {}
+        indices, distances = temporal.neighbors(before.detach().numpy(), cfg.num_neighbors)
+        pair_weights = temporal.affinity(distances, indices, weights)
+        displacement, distance = temporal.local_motion_loss(means[index], before, indices, pair_weights, cfg)
+        return {
+            "displacement": cfg.weight * cfg.displacement_weight * displacement,
+            "distance": cfg.weight * cfg.distance_weight * distance,
+        }
+
+    def _observe(self, out: RenderOutput, position: int, frame: TrainingFrame, iteration: int) -> None:
+        """Feed the running statistics: the gradient always, the prior's score when the config says so."""
+        cfg, state = self.cfg.density, self.state
+        camera = frame.camera
+        state.stats.add_gradient(out, camera.width, camera.height)
+        if cfg.score_mode == "every" or density.due(iteration, False, cfg):
+            prior, tissue_mask = self.frames.prior(position)
+            scale = prior.shape[1] / camera.width
+            state.stats.add_score(out, prior, tissue_mask, state.gaussians.opacities, scale)
+
+    def _control_density(self, rng: np.random.Generator) -> None:
+        state, cfg = self.state, self.cfg.density
+        extent = density.scene_extent(self.camera_centers, state.gaussians["means"], cfg)
+        planned = density.plan(state.stats, state.gaussians.scales, state.gaussians.opacities, extent, cfg)
+        state.stats = state.optimizer.apply_plan(planned, state.stats, rng)
+
+    def scene(self) -> Scene:
+        """The scene as it stands."""
+        state = self.state
+        return Scene(
+            gaussians=state.gaussians,
+            field=state.field,
+            config=self.cfg,
+            cameras=self.cameras,
+            frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
+            prior_score=state.stats.score(self.cfg.density.unobserved_score),
+            num_valid=state.stats.num_valid.clone(),
+        )
+
+
+def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: Config) -> dict[str, Tensor]:
+    """Weighted colour, depth and total-variation terms of Eq. (12)."""
+    depth = out.depth / out.alpha.clamp(min=1e-6) if cfg.loss.depth_mode == "expected" else out.depth
+    enough = float(frame.measured.sum()) >= cfg.loss.min_depth_pixels
+    weights = (1.0, cfg.loss.depth_weight if enough else 0.0, cfg.loss.tv_weight)
+    terms = supervised_losses(
+        out.color, depth, frame.rgb_u8, frame.inverse_depth, frame.tissue_mask, frame.measured, weights
+    )
+    return dict(zip(("color", "depth", "tv"), terms, strict=True))
+
+
+def on_tissue(points: Tensor, frame: TrainingFrame) -> Tensor:
+    """(P,) bool: whether world points (P, 3) mm project in front of the camera, into the image, onto tissue."""
+    pixels, z = project(points.numpy(), frame.camera)
+    means2d = torch.from_numpy(pixels.astype(np.float32))
+    value = density.sample_mask(frame.tissue_mask, means2d)
+    return density.valid_projection(means2d, torch.from_numpy(z > 0).int(), value, frame.tissue_mask.shape)
+
+
+def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:
+    """Factor of the learning rates that are lengths: 1.1 x radius of the camera path; a constant for a still one."""
+    radius = 1.1 * float((camera_centers - camera_centers.mean(0)).norm(dim=-1).max())
+    return radius if radius > 1e-3 else cfg.optim.still_camera_scale
