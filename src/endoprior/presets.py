@@ -76,5 +76,14 @@ def endogaussian() -> Config:
 
 
 def default() -> Config:
-    """What we recommend."""
-    return Config(deformation=DeformationConfig(kind="basis"))
+    """What we recommend: the paper's prior, and motion as temporal coefficients of each Gaussian."""
+    base = Config()
+    return replace(
+        base,
+        deformation=replace(base.deformation, kind="basis"),
+        temporal=replace(base.temporal, start_iteration=500, max_points=1024, min_valid=1, valid_at_both=False),
+        optim=replace(base.optim, decay_iterations=2000),
+        schedule=replace(
+            base.schedule, coarse_iterations=0, fine_iterations=2000, half_resolution_iterations=800, sh_degree=0
+        ),
+    )

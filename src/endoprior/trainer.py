@@ -141,9 +141,7 @@ class Trainer:
         if len(chosen) == 0:
             return {}
         index = torch.from_numpy(chosen)
-        with torch.set_grad_enabled(cfg.gradient == "both"):
-            offsets = offsets_at(state.gaussians, state.field, before_frame.time, self.cfg, index)
-            before = state.gaussians["means"][index] + offsets.means
+        before = self._means_before(before_frame.time, index)
         if cfg.valid_at_both:
             kept = on_tissue(before.detach(), before_frame)
             index, weights, before = index[kept], weights[kept.numpy()], before[kept]
@@ -156,6 +154,17 @@ class Trainer:
             "displacement": cfg.weight * cfg.displacement_weight * displacement,
             "distance": cfg.weight * cfg.distance_weight * distance,
         }
+
+    def _means_before(self, time: float, index: Tensor) -> Tensor:
+        """(P, 3) centres of the chosen Gaussians at an earlier moment, with a gradient only if that end is trained."""
+        state = self.state
+        if self.cfg.temporal.gradient == "both":
+            # Moving all and then choosing is cheaper than the scattered gradient of choosing first.
+            moved = state.gaussians["means"] + offsets_at(state.gaussians, state.field, time, self.cfg).means
+            return moved[index]
+        with torch.no_grad():
+            offsets = offsets_at(state.gaussians, state.field, time, self.cfg, index)
+            return state.gaussians["means"][index] + offsets.means
 
     def _observe(self, out: RenderOutput, position: int, frame: TrainingFrame, iteration: int) -> None:
         """Feed the running statistics: the gradient always, the prior's score when the config says so."""

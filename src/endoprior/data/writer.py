@@ -25,7 +25,7 @@ TOOL_VALUE = 255
 
 @dataclass(frozen=True)
 class SequenceMeta:
-    """The facts of a sequence that its pictures do not show. Angles and poses: the camera stands still at the origin."""
+    """The facts of a sequence that its pictures do not show. The camera stands still at the origin."""
 
     width: int
     """px."""
@@ -72,13 +72,15 @@ class SequenceWriter:
             self._partial.mkdir(parents=True)
         except OSError as error:
             raise InputError(
-                f"`{self.out}`: expected a place where a folder can be made; got {error.strerror}. Choose another folder."
+                f"`{self.out}`: expected a place for a folder; got {error.strerror}. Choose another folder."
             ) from error
 
     def __enter__(self) -> SequenceWriter:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if kind is not None:
             shutil.rmtree(self._partial, ignore_errors=True)
             return
@@ -188,6 +190,6 @@ class SequenceWriter:
 def refuse_occupied(out: Path) -> None:
     """Raise InputError unless `out` does not exist yet or is an empty folder."""
     if out.is_dir() and any(out.iterdir()):
-        raise InputError(f"`{out}`: expected a new or empty folder; got one with files in it. Choose another or empty it.")
+        raise InputError(f"`{out}`: expected a new or empty folder; got one with files. Choose another or empty it.")
     if not out.is_dir() and (out.exists() or out.is_symlink()):
         raise InputError(f"`{out}`: expected a new or empty folder; got a file. Choose another name.")

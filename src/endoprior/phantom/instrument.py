@@ -1,0 +1,258 @@
+"""Two laparoscopic graspers: a dark shaft, a metal collar, a wrist and two jaws, as signed distances traced per sample.
+
+A tool's 26 numbers (`pack_tool`): pivot, wrist, backward shaft direction, jaw direction, hinge and side axes (six
+3-vectors in camera axes, mm), cosine and sine of half the opening, linear color of the collar and of the shaft.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from .motion import ToolPose
+from .noise import FAST
+from .raster import FAR
+from .shading import HIGHLIGHT_LIMIT, LIGHTS_MM, REFERENCE_MM, ggx
+
+JAW_MM = 13.0
+"""Length of a jaw."""
+GRIP_MM = 2.0
+"""How far behind the jaws' ends the tissue is held."""
+STEEL, GOLD = (0.72, 0.70, 0.67), (0.80, 0.52, 0.14)
+CARBON, BLACK = (0.050, 0.053, 0.050), (0.014, 0.014, 0.017)
+_STEPS = 70
+_TASKS = 64
+_SHAFT_BOUND_MM, _JAW_BOUND_MM = 3.6, 11.0
+"""Radii of the cylinder around shaft and collar, and of the ball around jaws and wrist, that hold the whole tool."""
+
+
+def pack_tool(
+    pose: ToolPose, collar: tuple[float, float, float], shaft: tuple[float, float, float]
+) -> NDArray[np.float32]:
+    """(26,) numbers of one instrument at one moment, as the module docstring lists them."""
+    reach = pose.tip - pose.pivot
+    direct = reach / np.linalg.norm(reach)
+    view = pose.tip / np.linalg.norm(pose.tip)
+    # The wrist bends the jaws from the shaft's direction towards the tissue.
+    jaw = 0.62 * direct + 0.55 * view
+    jaw /= np.linalg.norm(jaw)
+    wrist = pose.tip - (JAW_MM - GRIP_MM) * jaw
+    back = pose.pivot - wrist
+    back /= np.linalg.norm(back)
+    # The hinge points roughly at the camera, so that the opening of the jaws is seen.
+    hinge = -view + (view @ jaw) * jaw
+    hinge /= np.linalg.norm(hinge)
+    side = np.cross(hinge, jaw)
+    hinge, side = (
+        np.cos(pose.roll) * hinge + np.sin(pose.roll) * side,
+        np.cos(pose.roll) * side - np.sin(pose.roll) * hinge,
+    )
+    half = pose.opening / 2
+    parts = (pose.pivot, wrist, back, jaw, hinge, side, (np.cos(half), np.sin(half)), collar, shaft)
+    return np.concatenate([np.asarray(part, float) for part in parts]).astype(np.float32)
+
+
+@njit(cache=True, fastmath=FAST)
+def _cylinder(along, radial, start, stop, radius, rounding):
+    # Signed distance to a cylinder between `start` and `stop` on its axis, with rounded rims.
+    dx = radial - radius + rounding
+    dy = abs(along - np.float32(0.5) * (start + stop)) - np.float32(0.5) * (stop - start) + rounding
+    ox, oy = max(dx, np.float32(0)), max(dy, np.float32(0))
+    return np.sqrt(ox * ox + oy * oy) + min(max(dx, dy), np.float32(0)) - rounding
+
+
+@njit(cache=True, fastmath=FAST)
+def _jaw(x, y, z):
+    # Signed distance to one jaw: a tapered rounded bar along x with an oval window; z is away from the other jaw.
+    zero, half = np.float32(0), np.float32(0.5)
+    f = min(max(x * np.float32(1 / JAW_MM), zero), np.float32(1))
+    half_width = np.float32(2.1) - np.float32(0.9) * f * f
+    thick = np.float32(1.55) - np.float32(0.75) * f
+    r = np.float32(0.47) * thick
+    qx = abs(x - np.float32(JAW_MM / 2 - 0.8)) - np.float32(JAW_MM / 2 + 0.8) + r
+    qy = abs(y) - half_width + r
+    qz = abs(z - half * thick - np.float32(0.06)) - half * thick + r
+    ox, oy, oz = max(qx, zero), max(qy, zero), max(qz, zero)
+    bar = np.sqrt(ox * ox + oy * oy + oz * oz) + min(max(qx, max(qy, qz)), zero) - r
+    wx = x - min(max(x, np.float32(4.6)), np.float32(9.6))
+    window = np.float32(0.62) - np.sqrt(wx * wx + y * y)
+    return max(bar, window)
+
+
+@njit(cache=True, fastmath=FAST)
+def _distance(px, py, pz, g):
+    # Signed distance, mm, from a point to the instrument `g` (26,), and its part: 0 shaft, 1 collar, 2 wrist and jaws.
+    dx, dy, dz = px - g[3], py - g[4], pz - g[5]
+    along = dx * g[6] + dy * g[7] + dz * g[8]
+    square = dx * dx + dy * dy + dz * dz
+    radial = np.sqrt(max(square - along * along, np.float32(0)))
+    shaft = _cylinder(along, radial, np.float32(9.5), np.float32(400), np.float32(3.25), np.float32(0.3))
+    if along > np.float32(13):
+        return shaft, 0  # the other parts are further away than the shaft's near end
+    # The collar has two grooves.
+    groove = np.float32(0.22) * max(
+        np.float32(0), np.cos((along - np.float32(5.2)) * np.float32(2.1)) - np.float32(0.55)
+    )
+    collar = _cylinder(along, radial + groove, np.float32(4.8), np.float32(10), np.float32(3.3), np.float32(0.6))
+    x = dx * g[9] + dy * g[10] + dz * g[11]
+    y = dx * g[12] + dy * g[13] + dz * g[14]
+    z = dx * g[15] + dy * g[16] + dz * g[17]
+    # Wrist: two prongs of a tapering fork between collar and hinge, and the hinge's pin.
+    taper = np.float32(2.0) + np.float32(0.17) * max(along, np.float32(0))
+    fork = _cylinder(along, radial, np.float32(-1.6), np.float32(6), taper, np.float32(0.7))
+    fork = max(fork, np.float32(1.0) - abs(y))
+    pin = _cylinder(y, np.sqrt(x * x + z * z), np.float32(-2.5), np.float32(2.5), np.float32(1.15), np.float32(0.25))
+    c, s = g[18], g[19]
+    jaws = min(_jaw(c * x + s * z, y, c * z - s * x), _jaw(c * x - s * z, y, -c * z - s * x))
+    metal = min(min(fork, pin), jaws)
+    nearest, part = shaft, 0
+    if collar < nearest:
+        nearest, part = collar, 1
+    if metal < nearest:
+        nearest, part = metal, 2
+    return nearest, part
+
+
+@njit(cache=True, fastmath=FAST)
+def _light(n, v, p, part, g, lights, grain, out):
+    # Radiance of a tool point: position p, unit normal n, unit direction v to the eye; writes out (3,).
+    zero, one = np.float32(0), np.float32(1)
+    facing = max(n[0] * v[0] + n[1] * v[1] + n[2] * v[2], zero)
+    # What a mirror would show: darkness behind the camera, elsewhere lit organs in streaks of light and shade.
+    rx = np.float32(2) * facing * n[0] - v[0]
+    ry = np.float32(2) * facing * n[1] - v[1]
+    rz = np.float32(2) * facing * n[2] - v[2]
+    ahead = min(max(rz * np.float32(1.3) + np.float32(1.0), zero), one)
+    streak = np.sin(np.float32(5.0) * rx + np.float32(1.5) * ry + np.float32(0.8)) * np.sin(np.float32(4.0) * ry - rx)
+    streak = np.float32(0.12) + np.float32(1.1) * max(streak, zero) ** 2
+    fresnel = (one - facing) ** 5
+    rough, diffuse, mirror, k = np.float32(0.24), np.float32(0.07), np.float32(0.95), 20
+    if part == 0:
+        rough, diffuse, mirror, k = np.float32(0.42), np.float32(1), np.float32(0.05) + np.float32(0.35) * fresnel, 23
+    for c in range(3):
+        tint = g[k + c] if part < 2 else np.float32(0.72 - 0.02 * c)
+        seen = ahead * streak * (np.float32(0.34) if c == 0 else np.float32(0.25)) + np.float32(0.006)
+        out[c] = mirror * seen * (tint if part > 0 else one)
+    for m in range(lights.shape[0]):
+        lx, ly, lz = lights[m, 0] - p[0], lights[m, 1] - p[1], lights[m, 2] - p[2]
+        square = lx * lx + ly * ly + lz * lz
+        norm = one / np.sqrt(square)
+        lx, ly, lz = lx * norm, ly * norm, lz * norm
+        power = np.float32(REFERENCE_MM * REFERENCE_MM) / square * lz * lz * lz * lz * np.float32(0.5)
+        lit = max(n[0] * lx + n[1] * ly + n[2] * lz, zero)
+        hx, hy, hz = lx + v[0], ly + v[1], lz + v[2]
+        norm = one / np.sqrt(hx * hx + hy * hy + hz * hz)
+        half = max((n[0] * hx + n[1] * hy + n[2] * hz) * norm, zero)
+        shine = ggx(half, rough) * (np.float32(0.010) if part == 0 else np.float32(0.085)) * lit
+        for c in range(3):
+            tint = g[k + c] if part < 2 else np.float32(0.72 - 0.02 * c)
+            out[c] += power * (diffuse * tint * grain * lit + shine * (one if part == 0 else tint))
+    for c in range(3):
+        out[c] = min(out[c], np.float32(HIGHLIGHT_LIMIT))
+
+
+@njit(parallel=True, cache=True, fastmath=FAST)
+def _draw(tools, tissue_z, eye, lights, focal, cx, cy, far, color, depth):
+    # A task takes every 64th row, since tools fill only some rows. Sphere-traces each tool in front of the tissue
+    # tissue_z (SH, SW), mm; writes color (SH, SW, 3) and depth (SH, SW), only where a tool is nearest.
+    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    for task in prange(_TASKS):
+        n, v = np.zeros(3, np.float32), np.zeros(3, np.float32)
+        p, radiance = np.zeros(3, np.float32), np.zeros(3, np.float32)
+        for s in range((depth.shape[0] - task + _TASKS - 1) // _TASKS * depth.shape[1]):
+            i, j = task + s // depth.shape[1] * _TASKS, s % depth.shape[1]
+            rx, ry = (np.float32(j) + half - cx) / focal, (np.float32(i) + half - cy) / focal
+            norm = one / np.sqrt(rx * rx + ry * ry + one)
+            rx, ry, rz = rx * norm, ry * norm, norm
+            for k in range(tools.shape[0]):
+                g = tools[k]
+                # Trace only where the ray is inside a cylinder around the shaft or a ball around the jaws.
+                mx, my, mz = eye[0] - g[3], eye[1] - g[4], eye[2] - g[5]
+                ray_axis, eye_axis = rx * g[6] + ry * g[7] + rz * g[8], mx * g[6] + my * g[7] + mz * g[8]
+                enter, leave = np.float32(1e9), np.float32(-1)
+                qa = max(one - ray_axis * ray_axis, np.float32(1e-6))
+                qb = mx * rx + my * ry + mz * rz - eye_axis * ray_axis
+                qc = mx * mx + my * my + mz * mz - eye_axis * eye_axis - np.float32(_SHAFT_BOUND_MM**2)
+                root = qb * qb - qa * qc
+                if root > zero:
+                    root = np.sqrt(root)
+                    enter, leave = (-qb - root) / qa, (-qb + root) / qa
+                mx, my, mz = mx - np.float32(6) * g[9], my - np.float32(6) * g[10], mz - np.float32(6) * g[11]
+                qb = mx * rx + my * ry + mz * rz
+                root = qb * qb - (mx * mx + my * my + mz * mz - np.float32(_JAW_BOUND_MM**2))
+                if root > zero:
+                    root = np.sqrt(root)
+                    enter, leave = min(enter, -qb - root), max(leave, -qb + root)
+                stop = min(min(tissue_z[i, j], depth[i, j]) / rz, leave)
+                t, part, hit = max(enter, np.float32(8)), 0, False
+                if t >= stop:
+                    continue
+                for _ in range(_STEPS):
+                    d, part = _distance(eye[0] + t * rx, eye[1] + t * ry, eye[2] + t * rz, g)
+                    if d < np.float32(0.012):
+                        hit = True
+                        break
+                    t += np.float32(0.92) * d
+                    if t > stop:
+                        break
+                if not hit or t >= stop:
+                    continue
+                p[0], p[1], p[2] = eye[0] + t * rx, eye[1] + t * ry, eye[2] + t * rz
+                # Gradient of the distance from four corners of a small tetrahedron.
+                e = np.float32(0.03)
+                d0 = _distance(p[0] + e, p[1] - e, p[2] - e, g)[0]
+                d1 = _distance(p[0] - e, p[1] - e, p[2] + e, g)[0]
+                d2 = _distance(p[0] - e, p[1] + e, p[2] - e, g)[0]
+                d3 = _distance(p[0] + e, p[1] + e, p[2] + e, g)[0]
+                n[0], n[1], n[2] = d0 - d1 - d2 + d3, -d0 - d1 + d2 + d3, -d0 + d1 - d2 + d3
+                norm = one / max(np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]), np.float32(1e-9))
+                grain = one
+                if part == 0:
+                    # Fine rings and streaks of the composite shaft.
+                    along = (p[0] - g[3]) * g[6] + (p[1] - g[4]) * g[7] + (p[2] - g[5]) * g[8]
+                    around = (n[0] * g[12] + n[1] * g[13] + n[2] * g[14]) * norm
+                    weave = np.float32(1.9) * np.sin(along * np.float32(0.9) + around * np.float32(5))
+                    grain += np.float32(0.14) * np.sin(around * np.float32(43) + weave)
+                    grain += np.float32(0.05) * np.sin(along * np.float32(9.5))
+                for c in range(3):
+                    n[c] *= norm
+                if part > 0:
+                    # Machining marks: a slight waviness that breaks up the reflections of flat faces.
+                    wave = np.sin(p[0] * np.float32(2.3) + np.float32(1.7) * np.sin(p[1] * np.float32(1.9)))
+                    mark = np.sin(p[1] * np.float32(7.1) + p[2] * np.float32(5.3) - p[0] * np.float32(6.1))
+                    n[0] += np.float32(0.10) * wave + np.float32(0.03) * mark
+                    n[1] += np.float32(0.09) * np.sin(p[1] * np.float32(2.7) - p[0] * np.float32(1.3))
+                    norm = one / np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+                    for c in range(3):
+                        n[c] *= norm
+                v[0], v[1], v[2] = -rx, -ry, -rz
+                _light(n, v, p, part, g, lights, grain, radiance)
+                depth[i, j] = t * rz
+                for c in range(3):
+                    color[i, j, c] = radiance[c]
+
+
+def draw_tools(
+    poses: tuple[ToolPose, ToolPose],
+    tissue_z: NDArray[np.float32],
+    eye: NDArray[np.float32],
+    focal: float,
+    center: tuple[float, float],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Draw both instruments in front of the tissue.
+
+    Args:
+        poses: the carbon-shafted grasper, and the gold and black one.
+        tissue_z: (SH, SW) depth of the tissue, mm.
+        eye: (3,) camera center in the left eye's axes, mm.
+        focal, center: of the sample grid, px.
+    Returns:
+        (SH, SW, 3) linear radiance and (SH, SW) z in mm; z = raster.FAR where no tool is seen.
+    """
+    tools = np.stack([pack_tool(poses[0], STEEL, CARBON), pack_tool(poses[1], GOLD, BLACK)])
+    color = np.zeros((*tissue_z.shape, 3), np.float32)
+    depth = np.full(tissue_z.shape, FAR, np.float32)
+    f, cx, cy = (np.float32(value) for value in (focal, *center))
+    _draw(tools, tissue_z, eye.astype(np.float32), LIGHTS_MM, f, cx, cy, FAR, color, depth)
+    return color, depth

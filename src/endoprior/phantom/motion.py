@@ -1,0 +1,149 @@
+"""How the tissue and the instruments move: breathing of the whole field, pulls by the grasper, the tips' paths.
+
+Every motion is a product of smooth functions of place and time (quintic steps, cosines, Gaussians), so that velocities
+are continuous. `phase` is time as a fraction of the sequence, in [0, 1].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import PhantomConfig
+from .surface import Anatomy, Plane, organs_at
+
+_BREATH_FRAMES = 40
+_PULL_FRAMES = 48
+_WIDE_MM, _NARROW_MM, _NARROW_SHARE = 14.0, 5.2, 0.45
+"""A pull moves a broad neighborhood and a small tent around the jaws."""
+
+
+def smooth_step(low: float, high: float, x: float) -> float:
+    """0 below `low`, 1 above `high`, a quintic with continuous second derivative between."""
+    t = min(max((x - low) / (high - low), 0.0), 1.0)
+    return t * t * t * (t * (t * 6 - 15) + 10)
+
+
+@dataclass(frozen=True)
+class Pull:
+    """One grasp: where, which way, when."""
+
+    center: NDArray[np.float64]
+    """(2,) grasped point in plane coordinates, mm."""
+    height: float
+    """Rest height of the surface there, mm."""
+    vector: NDArray[np.float64]
+    """(3,) displacement at the grasped point when fully pulled, along e_a, e_b, normal, mm."""
+    start: float
+    """Phase at which this cycle of approach, pull and release begins."""
+    length: float
+    """Its duration in phase."""
+
+    def strength(self, phase: float) -> float:
+        """0..1: how far the pull has gone."""
+        local = (phase - self.start) / self.length
+        return smooth_step(0.22, 0.50, local) * (1 - smooth_step(0.60, 0.84, local))
+
+    def weight(self, a: NDArray, b: NDArray) -> NDArray:
+        """(...,) share of the pull at plane points, 1 at its center."""
+        square = (a - self.center[0]) ** 2 + (b - self.center[1]) ** 2
+        narrow, wide = np.exp(-square / (2 * _NARROW_MM**2)), np.exp(-square / (2 * _WIDE_MM**2))
+        return _NARROW_SHARE * narrow + (1 - _NARROW_SHARE) * wide
+
+
+@dataclass(frozen=True)
+class ToolPose:
+    """Where an instrument is at one moment, in camera axes, mm."""
+
+    pivot: NDArray[np.float64]
+    """(3,) point the shaft always passes through (the port in the abdominal wall)."""
+    tip: NDArray[np.float64]
+    """(3,) point between the jaws, 2 mm behind their ends."""
+    opening: float
+    """Angle between the jaws, rad."""
+    roll: float
+    """Rotation of the hinge about the jaws' direction, rad."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """All that moves, for one seed."""
+
+    plane: Plane
+    anatomy: Anatomy
+    frames: int
+    breathing_mm: float
+    pulls: tuple[Pull, ...]
+    idles: NDArray[np.float64]
+    """(cycles + 1, 3) places (a, b, height) in mm where the grasper waits between grasps."""
+    hover: NDArray[np.float64]
+    """(6,) second tool: center (a, b, height), sweep (a, b) in mm, time shift in rad."""
+    side: float
+    """+1: the grasper enters from the right, -1: from the left."""
+
+    def displacement(self, a: NDArray, b: NDArray, phase: float) -> NDArray[np.float64]:
+        """(..., 3) motion away from rest along e_a, e_b and the normal, mm, at plane points `a, b`."""
+        cycle = 2 * np.pi * phase * (self.frames - 1) / _BREATH_FRAMES
+        # The field swells and slides; far parts lag a little and move a little less.
+        lag = 0.006 * a - 0.009 * b
+        swell = 0.5 * self.breathing_mm * (np.sin(cycle - lag) + 0.18 * np.sin(2 * (cycle - lag) + 0.7))
+        slide = 0.3 * self.breathing_mm * np.sin(cycle - lag - 0.5)
+        reach = 1 + 0.25 * np.cos(0.035 * a + 0.9) * np.cos(0.03 * b - 0.4)
+        moved = np.stack([0.35 * slide * reach, -slide * reach, swell * reach], -1)
+        for pull in self.pulls:
+            strength = pull.strength(phase)
+            if strength > 0:
+                moved = moved + (strength * pull.weight(a, b))[..., None] * pull.vector
+        return moved
+
+    def held(self, pull: Pull, phase: float) -> NDArray[np.float64]:
+        """(3,) camera-space position of the surface point that `pull` takes hold of, mm."""
+        a, b = pull.center
+        moved = self.displacement(np.array(a), np.array(b), phase)
+        return self.plane.lift(a + moved[0], b + moved[1], pull.height + moved[2])
+
+    def tools(self, phase: float) -> tuple[ToolPose, ToolPose]:
+        """The grasper and the hovering instrument."""
+        k = min(int(phase * len(self.pulls)), len(self.pulls) - 1)
+        pull = self.pulls[k]
+        local = (phase - pull.start) / pull.length
+        held = self.held(pull, phase)
+        leaving = local > 0.5
+        idle = self.plane.lift(*self.idles[k + 1 if leaving else k])
+        near = 1 - smooth_step(0.72, 1.0, local) if leaving else smooth_step(0.0, 0.19, local)
+        tip = idle + near * (held - idle)
+        closed = smooth_step(0.15, 0.23, local) * (1 - smooth_step(0.66, 0.74, local))
+        grasper = ToolPose(np.array([self.side * 66.0, 50.0, 12.0]), tip, 0.05 + 0.60 * (1 - closed), 0.15 * near)
+        a, b, height, sweep_a, sweep_b, shift = self.hover
+        swing = 2 * np.pi * phase * max(1.0, self.frames / 64) + shift
+        wander = self.plane.lift(
+            a + sweep_a * np.sin(swing), b + sweep_b * np.cos(0.8 * swing), height + 2 * np.cos(swing)
+        )
+        opening = 0.30 + 0.22 * np.sin(1.7 * swing)
+        second = ToolPose(np.array([-self.side * 72.0, 34.0, 20.0]), wander, opening, -0.5)
+        return grasper, second
+
+
+def build_motion(cfg: PhantomConfig, plane: Plane, anatomy: Anatomy) -> Motion:
+    """Choose the motion of one seed: the grasper takes the hero loop, each time at another place."""
+    rng = np.random.default_rng([cfg.seed, 4])
+    side = float(rng.choice([-1.0, 1.0]))
+    cycles = max(1, round(cfg.frames / _PULL_FRAMES))
+    hero = anatomy.paths[0].astype(float)
+    # Only the part of the loop inside the picture can be seen to move; nearest to the grasper's side first.
+    central = hero[(np.abs(hero[:, 0]) < 20) & (np.abs(hero[:, 1]) < 16)]
+    pulls, idles = [], []
+    for k in range(cycles + 1):
+        center = central[rng.integers(len(central))] + rng.normal(0, 1.0, 2)
+        # Waiting places stay near the middle, so that the tool never leaves the picture.
+        idle = np.clip(center + np.array([side * rng.uniform(2, 10), rng.uniform(3, 9)]), [-11, -10], [11, 6])
+        idles.append([*idle, rng.uniform(25, 30)])
+        if k < cycles:
+            away = np.array([side * rng.uniform(0.3, 0.75), rng.uniform(-0.35, 0.35), rng.uniform(0.65, 0.9)])
+            height = float(organs_at(anatomy, *center.reshape(2, 1, 1)).height[0, 0])
+            pulls.append(Pull(center, height, cfg.pull_mm * away / np.linalg.norm(away), k / cycles, 1 / cycles))
+    hover = [-side * rng.uniform(17, 24), rng.uniform(8, 14), rng.uniform(21, 25)]
+    hover += [rng.uniform(5, 9), rng.uniform(4, 7), rng.uniform(0, 6.3)]
+    return Motion(plane, anatomy, cfg.frames, cfg.breathing_mm, tuple(pulls), np.array(idles), np.array(hover), side)

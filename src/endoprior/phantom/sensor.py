@@ -1,0 +1,88 @@
+"""From light to files: exposure, tone curve, vignetting, sensor noise, and depth as a stereo matcher would give it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import PhantomConfig
+
+_KNEE = 0.55
+"""Exposed radiance above which the tone curve bends towards white."""
+_TARGET_MEDIAN = 0.15
+"""Exposed radiance of the middle of the first frame; about 0.42 of full scale after the tone curve."""
+
+
+def exposure_gain(radiance: NDArray[np.float32]) -> float:
+    """The gain that brings the median of a tool-free picture (H, W, 3) to the target; kept for the whole sequence."""
+    return _TARGET_MEDIAN / max(float(np.median(radiance @ np.array([0.30, 0.59, 0.11], np.float32))), 1e-6)
+
+
+def vignette(width: int, height: int) -> NDArray[np.float32]:
+    """(H, W, 1) share of the light that the lens passes: 1 in the middle, about a third in the corners."""
+    x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
+    y = ((np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1)[:, None]
+    square = (x * x + 0.8 * y * y) / np.float32(1.8)
+    return (1 - np.float32(0.68) * square**1.3)[..., None]
+
+
+def develop(radiance: NDArray[np.float32], gain: float, shading: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W, 3) display values in [0, 255], noise-free: gain, lens shading, soft shoulder, gamma 2.2."""
+    x = radiance * (np.float32(gain) * shading)
+    over = np.maximum(x - _KNEE, 0)
+    x = np.minimum(x, _KNEE) + np.float32(0.47) * np.tanh(over / np.float32(0.6))
+    return np.clip(x, 0, 1) ** np.float32(1 / 2.2) * np.float32(255)
+
+
+def expose(display: NDArray[np.float32], noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """(H, W, 3) 8-bit picture with sensor noise, which gamma lifts in dark places.
+
+    Args:
+        display: (H, W, 3) noise-free values in [0, 255].
+        noise: standard deviation at mid grey, in 8-bit levels.
+    """
+    if noise > 0:
+        grain = rng.standard_normal(display.shape, dtype=np.float32)
+        # Shared by the channels in part, as demosaicing leaves it; gamma lifts the noise of dark pixels.
+        grain = np.float32(0.8) * grain + np.float32(0.6) * grain.mean(-1, keepdims=True)
+        level = np.float32(noise) * (np.float32(1.25) - np.float32(0.5 / 255) * display)
+        display = display + level * grain
+    return np.clip(display + 0.5, 0, 255).astype(np.uint8)
+
+
+def stereo_depth(
+    z: NDArray[np.float32], picture: NDArray[np.uint8], cfg: PhantomConfig, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """What a stereo matcher would measure of the depth `z` (H, W), mm; 0 where it would find nothing.
+
+    The disparity fx * baseline / z gets a smooth error (matching windows), an independent one and steps of 1/16 px,
+    all scaled to the image width. Missing: half-occluded strips left of nearer edges, the edges themselves, glints.
+    """
+    unit = cfg.width / 640
+    product = cfg.focal * cfg.baseline_mm
+    disparity = product / z
+    sigma = max(7 * unit, 0.8)
+    smooth = cv2.GaussianBlur(rng.standard_normal(z.shape, dtype=np.float32), (0, 0), sigma)
+    smooth *= np.float32(2 * np.sqrt(np.pi) * sigma)  # back to unit variance
+    fine = rng.standard_normal(z.shape, dtype=np.float32)
+    error = np.float32(cfg.depth_noise_px * unit) * (smooth * np.float32(0.95) + fine * np.float32(0.3))
+    step = unit / 16
+    measured = product / (np.round((disparity + error) / step) * step)
+    square = np.ones((3, 3), np.uint8)
+    # Beside a jump (more than a slope of 4 makes from pixel to pixel) matching windows straddle two surfaces.
+    far_edge = z - cv2.erode(z, square) > 2 + 4 * z / cfg.focal
+    hidden = cv2.dilate(far_edge.astype(np.uint8), square) | _half_occluded(disparity)
+    glint = cv2.dilate((picture.min(-1) >= 246).astype(np.uint8), square)
+    return np.where((hidden | glint) > 0, 0, measured).astype(np.float32)
+
+
+def _half_occluded(disparity: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(H, W) 1 where a nearer surface hides a pixel of `disparity` (H, W), px, from the right eye."""
+    column = np.arange(disparity.shape[1], dtype=np.float32)
+    seen_at = column - disparity
+    # Nearer surfaces shift further left: a pixel is hidden when one to its right lands at or left of its own place.
+    ahead = np.minimum.accumulate(seen_at[:, ::-1], 1)[:, ::-1]
+    hidden = np.zeros(disparity.shape, np.uint8)
+    hidden[:, :-1] = ahead[:, 1:] < seen_at[:, :-1] - 0.5
+    return hidden

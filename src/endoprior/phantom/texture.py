@@ -1,0 +1,130 @@
+"""What the tissue looks like, in material coordinates: color, fine relief, wetness and crevice darkening.
+
+Letters: (TH, TW) texels; texel (i, j) is at g_u = (j + 0.5) / TW, g_v = (i + 0.5) / TH.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .noise import cells, fractal
+from .surface import FLOOR, LIVER, Anatomy, Organs, Plane, organs_at, soften
+from .vessels import vessel_maps
+
+CHANNELS = 7
+"""Red, green, blue (linear albedo in [0, 1]), relief slope along a and b, wetness and openness in [0, 1]."""
+
+_LOOP = (0.74, 0.40, 0.38)
+_LOOP_PALE = (0.86, 0.60, 0.53)
+_LOOP_DUSKY = (0.56, 0.25, 0.31)
+_FLOOR = (0.74, 0.46, 0.45)
+_FAT = (0.88, 0.70, 0.46)
+_LIVER = (0.40, 0.16, 0.14)
+_TRUNK = (0.38, 0.10, 0.16)
+_TWIG = (0.56, 0.13, 0.14)
+
+
+def _linear(display: tuple[float, float, float]) -> NDArray[np.float32]:
+    """(3,) linear light of a display color in [0, 1]."""
+    return np.array(display, np.float32) ** np.float32(2.2)
+
+
+def _step(low: float, high: float, x: NDArray) -> NDArray:
+    """Smooth 0..1 transition of x between low and high."""
+    t = np.clip((x - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def build_texture(plane: Plane, anatomy: Anatomy, width: int, height: int) -> NDArray[np.float32]:
+    """(TH, TW, CHANNELS) material maps for a grid of `height` x `width` texels."""
+    grid_v, grid_u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
+    a, b = plane.coordinates(grid_u, grid_v)
+    a, b = a.astype(np.float32), b.astype(np.float32)
+    mm_per_texel = float(np.diff(a[height // 2]).mean())
+    organs = organs_at(anatomy, a, b)
+    rng = np.random.default_rng([anatomy.seed, 3])
+    trunks, twigs = vessel_maps(plane, a, b, organs, rng)
+    seed = anatomy.seed + 100
+    # Patches with hardly any texture: pale, vessel-free serosa.
+    plain = _step(0.12, 0.42, fractal(a / 21, b / 21, 1, seed))
+    wrinkles = _wrinkles(organs, a, b, seed)
+    albedo = _albedo(organs, a, b, plain, wrinkles, trunks, twigs, seed, rng)
+    relief = _relief(organs, a, b, wrinkles, trunks, seed) * (1 - 0.6 * plain)
+    smooth = soften(relief.astype(np.float32), mm_per_texel, 0.09)
+    texture = np.zeros((height, width, CHANNELS), np.float32)
+    texture[..., :3] = albedo
+    # Texel spacing in b is that of a to within the plane's foreshortening, which np.gradient gets from b itself.
+    texture[..., 3] = np.gradient(smooth, axis=1) / np.gradient(a, axis=1)
+    texture[..., 4] = np.gradient(smooth, axis=0) / np.gradient(b, axis=0)
+    texture[..., 5] = np.clip(0.75 + 0.7 * fractal(a / 9, b / 9, 2, seed + 1), 0.25, 1)
+    texture[..., 6] = _openness(organs.height, mm_per_texel)
+    return texture
+
+
+def _wrinkles(organs: Organs, a: NDArray, b: NDArray, seed: int) -> NDArray[np.float32]:
+    """Fine creases in [-1, 1]: across the axis on loops, in every direction elsewhere."""
+    offset = 37.0 * organs.owner
+    along = organs.along + 0.8 * fractal(a / 4, b / 4, 2, seed + 2)
+    rings = fractal(along / 0.95 + offset, organs.across / 4.2, 3, seed + 3)
+    crumpled = fractal(a / 1.5 + fractal(a / 3, b / 3, 1, seed + 5), b / 1.5, 3, seed + 4)
+    return np.where(organs.owner >= 0, 0.6 * rings + 0.4 * crumpled, crumpled)
+
+
+def _relief(
+    organs: Organs, a: NDArray, b: NDArray, wrinkles: NDArray, trunks: NDArray, seed: int
+) -> NDArray[np.float32]:
+    """Fine height in mm that bends normals only: creases, grain, raised vessels, liver lobules."""
+    strength = 0.55 + 0.9 * np.clip(fractal(a / 13, b / 13, 2, seed + 6) + 0.35, 0, 1)
+    grain = fractal(a / 0.62, b / 0.62, 2, seed + 7)
+    swell = fractal(a / 4.5, b / 4.5, 2, seed + 8)
+    serosa = 0.34 * strength * wrinkles + 0.030 * grain + 0.3 * swell + 0.10 * trunks
+    lobules = 0.06 * np.minimum(cells(a / 1.25, b / 1.25, seed + 9), 0.5) + 0.02 * grain + 0.1 * swell
+    return np.where(organs.owner == LIVER, lobules, serosa).astype(np.float32)
+
+
+def _albedo(
+    organs: Organs,
+    a: NDArray,
+    b: NDArray,
+    plain: NDArray,
+    wrinkles: NDArray,
+    trunks: NDArray,
+    twigs: NDArray,
+    seed: int,
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """(TH, TW, 3) linear color in [0, 1]."""
+    mottle = fractal(a / 6, b / 6, 4, seed + 20)
+    fine = fractal(a / 1.1, b / 1.1, 3, seed + 21)
+    loop, pale, dusky = _linear(_LOOP), _linear(_LOOP_PALE), _linear(_LOOP_DUSKY)
+    # Each loop has its own complexion between dusky and pale.
+    complexion = np.concatenate([rng.uniform(-0.45, 0.35, 64), [0, 0]]).astype(np.float32)[organs.owner]
+    tone = np.clip(complexion - 0.12 + 0.95 * mottle, -1, 1)[..., None]
+    color = loop + np.maximum(tone, 0) * (pale - loop) + np.maximum(-tone, 0) * (dusky - loop)
+    fat_amount = _step(0.02, 0.34, fractal(a / 10, b / 10, 3, seed + 22)) * 0.85
+    floor = _linear(_FLOOR) + fat_amount[..., None] * (_linear(_FAT) - _linear(_FLOOR))
+    floor = floor * (1 + 0.25 * mottle[..., None])
+    lobule = _step(0.0, 0.32, cells(a / 1.25, b / 1.25, seed + 9))
+    liver = _linear(_LIVER) * (0.72 + 0.38 * lobule + 0.35 * mottle)[..., None]
+    color = np.where((organs.owner == FLOOR)[..., None], floor, color)
+    serosa = 1 + (1 - 0.75 * plain) * (0.26 * fine + 0.38 * wrinkles)
+    color = color * serosa[..., None] + (0.25 * plain)[..., None] * (pale - color)
+    shown = 1 - 0.8 * plain
+    for map_, ink, opacity in ((twigs, _TWIG, 0.62), (trunks, _TRUNK, 0.80)):
+        color = color + (opacity * shown * map_)[..., None] * (_linear(ink) - color)
+    color = np.where((organs.owner == LIVER)[..., None], liver, color)
+    return np.clip(color, 0.004, 1).astype(np.float32)
+
+
+def _openness(height: NDArray[np.float32], mm_per_texel: float) -> NDArray[np.float32]:
+    """In (0, 1]: how much of the light reaches a point; small in the creases between organs."""
+    coarse = max(1, round(0.5 / mm_per_texel))
+    small = cv2.resize(height, None, fx=1 / coarse, fy=1 / coarse, interpolation=cv2.INTER_AREA)
+    buried = sum(
+        weight * np.maximum(soften(small, mm_per_texel * coarse, radius) - small, 0)
+        for radius, weight in ((1.5, 0.55), (4.0, 0.25), (9.0, 0.10))
+    )
+    small_openness = np.exp(-buried).astype(np.float32)
+    return cv2.resize(small_openness, height.shape[::-1], interpolation=cv2.INTER_LINEAR)

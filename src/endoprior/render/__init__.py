@@ -1,0 +1,49 @@
+"""Splats + Camera -> RenderOutput. Knows nothing of time, priors or losses.
+
+`reference` is the definition: dense, slow, plain torch, any floating type. `cpu` is the fast one: Numba kernels,
+float32.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Literal, Protocol, get_args
+
+from ..checks import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..types import Camera, RenderOutput, Splats
+
+Backend = Literal["cpu", "reference"]
+
+
+class Rasterizer(Protocol):
+    """What `load` returns."""
+
+    def __call__(
+        self, splats: Splats, camera: Camera, *, background: Tensor, depth_grad_to_means: bool = True
+    ) -> RenderOutput:
+        """Draw the Gaussians, near to far.
+
+        Args:
+            background: (3,) colour behind everything, in [0, 1].
+            depth_grad_to_means: False stops the gradient of `depth` from reaching the composited z values; z still gets
+                gradient through the projected covariance, and the weights keep theirs.
+        Raises:
+            ValueError: a shape, a floating type or the number of SH coefficients does not fit.
+        """
+        ...
+
+
+def load(backend: Backend) -> Rasterizer:
+    """Import one backend. There is no fallback: the caller gets the one it named, or an error.
+
+    Raises:
+        InputError: there is no backend of that name.
+    """
+    if backend not in get_args(Backend):
+        names = ", ".join(get_args(Backend))
+        raise InputError(f"backend: expected one of {names}; got {backend!r}. Choose one of those.")
+    return import_module(f".{backend}", __package__).rasterize

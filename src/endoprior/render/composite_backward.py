@@ -1,0 +1,138 @@
+"""Front-to-back compositing of the tiles, backward: the same walk again, with gradients.
+
+With weights w_j, colours c_j (z among them), cotangents v and final transmittance T_end, Gaussian i at one pixel gets
+`dL/dalpha_i = T_i (c_i . v) - rest_i / (1 - alpha_i)`, where `rest_i = sum_{j > i} w_j (c_j . v) + T_end (background .
+v - v_alpha)`. `rest` starts as the whole sum, known from the forward pass, and loses one term per Gaussian: no list is
+walked backwards. Each pair writes one row of moments; `gather` adds them up per Gaussian in a fixed order and turns
+them into gradients. In this file `v_x` is dL/dx, and dp is dL / d log alpha, 0 where ALPHA_MAX binds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from . import tiles
+from .pixel_kernels import LARGEST_ALPHA, draw, log2_alpha
+from .simd import LANES, fma, lane_numbers, load, splat, store, total, where_ge
+from .tiles import FIRST_ROWS, ID, SLOT, STRIPS, TILE_HEIGHT, TILE_WIDTH
+
+PLANES = 6
+"""Transmittance; cotangents of red, green, blue, depth; rest."""
+ROW = PLANES * LANES
+STRIP_SIZE = TILE_HEIGHT * ROW
+MOMENTS = 10
+"""Sums over pixels of dp times 1, dx, dy, dx^2, dx dy, dy^2, and of the weight times the four cotangents."""
+f4 = np.float32
+
+
+@njit(inline="always")
+def _differentiate_pair(record, pair, left, top, state, moments):
+    # Walks the same rows as the forward pass. (left, top): centre of the tile's first pixel. Writes moments (MOMENTS,).
+    root, m_log2 = record[tiles.ROOT], splat(record[tiles.M_LOG2])
+    root_k, log2_opacity = splat(root * record[tiles.K]), splat(record[tiles.LOG2_OPACITY])
+    red, green, blue = splat(record[tiles.RED]), splat(record[tiles.GREEN]), splat(record[tiles.BLUE])
+    z, center_y = splat(record[tiles.Z]), splat(record[tiles.Y] - top)
+    one, zero = splat(f4(1.0)), splat(f4(0.0))
+    s_1 = s_x = s_y = s_xx = s_xy = s_yy = s_red = s_green = s_blue = s_z = zero
+    for strip in range(STRIPS):
+        first, end = pair[FIRST_ROWS + 2 * strip], pair[FIRST_ROWS + 2 * strip + 1]
+        dx = lane_numbers() - splat(record[tiles.X] - left - f4(strip * LANES))
+        base = splat(root) * dx
+        y = splat(f4(first))
+        column_1 = column_y = zero  # dx is the same on all rows: its moments can wait until the strip is done
+        place = strip * STRIP_SIZE + first * ROW
+        for _ in range(first, end):
+            dy = y - center_y
+            transmittance = load(state, place)
+            alpha, weight, behind = draw(log2_alpha(base, root_k, m_log2, log2_opacity, dy), transmittance)
+            store(state, place, behind)
+            v_red, v_green = load(state, place + LANES), load(state, place + 2 * LANES)
+            v_blue, v_z = load(state, place + 3 * LANES), load(state, place + 4 * LANES)
+            gain = weight * fma(red, v_red, fma(green, v_green, fma(blue, v_blue, z * v_z)))
+            rest = load(state, place + 5 * LANES) - gain
+            store(state, place + 5 * LANES, rest)
+            dp = where_ge(alpha, splat(LARGEST_ALPHA), zero, gain - rest * alpha / (one - alpha))
+            dp_dy = dp * dy
+            column_1 = column_1 + dp
+            column_y = column_y + dp_dy
+            s_yy = fma(dp_dy, dy, s_yy)
+            s_red = fma(weight, v_red, s_red)
+            s_green = fma(weight, v_green, s_green)
+            s_blue = fma(weight, v_blue, s_blue)
+            s_z = fma(weight, v_z, s_z)
+            place += ROW
+            y = y + one
+        column_x = column_1 * dx
+        s_1, s_x, s_y = s_1 + column_1, s_x + column_x, s_y + column_y
+        s_xx, s_xy = fma(column_x, dx, s_xx), fma(column_y, dx, s_xy)
+    moments[0], moments[1], moments[2] = total(s_1), total(s_x), total(s_y)
+    moments[3], moments[4], moments[5] = total(s_xx), total(s_xy), total(s_yy)
+    moments[6], moments[7], moments[8], moments[9] = total(s_red), total(s_green), total(s_blue), total(s_z)
+
+
+@njit(cache=True, error_model="numpy")
+def _differentiate_tile(records, pairs, needed, left, top, state, moments):
+    # Writes the moments of one tile's pairs, near to far; zeros for those that the forward pass did not need.
+    for p in range(needed):
+        pair = pairs[p]
+        _differentiate_pair(records[pair[ID]], pair, f4(left + 0.5), f4(top + 0.5), state, moments[pair[SLOT]])
+    for p in range(needed, len(pairs)):
+        moments[pairs[p, SLOT]] = f4(0.0)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def composite_backward(
+    records, pairs, tile_starts, tile_ends, by_cost, workers,
+    color, depth, transmittance, v_color, v_depth, v_alpha, moments,
+):  # fmt: skip
+    # One task per worker, as in the forward pass. Writes moments (P, MOMENTS), one row per slot.
+    height, width = depth.shape
+    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    for worker in prange(workers):
+        state = np.zeros(STRIPS * STRIP_SIZE, f4)
+        for index in range(worker, by_cost.size, workers):
+            tile = by_cost[index]
+            top, left = tile // tiles_x * TILE_HEIGHT, tile % tiles_x * TILE_WIDTH
+            state[:] = f4(0.0)  # pixels outside the image stay full
+            for r in range(min(TILE_HEIGHT, height - top)):
+                for c in range(min(TILE_WIDTH, width - left)):
+                    y, x = top + r, left + c
+                    v_r, v_g, v_b, v_z = v_color[y, x, 0], v_color[y, x, 1], v_color[y, x, 2], v_depth[y, x]
+                    rest = v_r * color[y, x, 0] + v_g * color[y, x, 1] + v_b * color[y, x, 2] + v_z * depth[y, x]
+                    place = c // LANES * STRIP_SIZE + r * ROW + c % LANES
+                    state[place] = f4(1.0)
+                    state[place + LANES], state[place + 2 * LANES] = v_r, v_g
+                    state[place + 3 * LANES], state[place + 4 * LANES] = v_b, v_z
+                    state[place + 5 * LANES] = rest - v_alpha[y, x] * transmittance[y, x]
+            start, end = tile_starts[tile], tile_starts[tile + 1]
+            needed = tile_ends[tile] - start
+            _differentiate_tile(records, pairs[start:end], needed, left, top, state, moments)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def gather(moments, slot_starts, row_forms, opacities, v_means2d, v_row_forms, v_opacities, v_colors, v_z):
+    # One iteration per Gaussian: sums its slots in order; writes one row of each v_*.
+    # log alpha = log opacity - (a u^2 + m dy^2) / 2 with u = dx + k dy; moving the centre moves (dx, dy) the other way.
+    for g in prange(slot_starts.size - 1):
+        s_1 = s_x = s_y = s_xx = s_xy = s_yy = s_red = s_green = s_blue = s_z = f4(0.0)
+        for slot in range(slot_starts[g], slot_starts[g + 1]):
+            s_1 += moments[slot, 0]
+            s_x += moments[slot, 1]
+            s_y += moments[slot, 2]
+            s_xx += moments[slot, 3]
+            s_xy += moments[slot, 4]
+            s_yy += moments[slot, 5]
+            s_red += moments[slot, 6]
+            s_green += moments[slot, 7]
+            s_blue += moments[slot, 8]
+            s_z += moments[slot, 9]
+        a, k, m = row_forms[g, 0], row_forms[g, 1], row_forms[g, 2]
+        u_y = s_xy + k * s_yy
+        v_means2d[g, 0] = a * (s_x + k * s_y)
+        v_means2d[g, 1] = k * v_means2d[g, 0] + m * s_y
+        v_row_forms[g, 0] = f4(-0.5) * (s_xx + k * (s_xy + u_y))
+        v_row_forms[g, 1] = -a * u_y
+        v_row_forms[g, 2] = f4(-0.5) * s_yy
+        v_opacities[g] = s_1 / opacities[g] if slot_starts[g + 1] > slot_starts[g] else f4(0.0)
+        v_colors[g, 0], v_colors[g, 1], v_colors[g, 2], v_z[g] = s_red, s_green, s_blue, s_z

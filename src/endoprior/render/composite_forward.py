@@ -1,0 +1,100 @@
+"""Front-to-back compositing of the tiles, forward.
+
+One task per worker, over every `workers`-th tile of the list sorted by cost, so that the workers finish together. A
+tile keeps its pixels in one flat array `state[strip, row, plane, lane]`, with PLANES planes of LANES pixels per row of
+a strip: small enough for the nearest cache. Inputs are trusted: see `tiles.Tiles`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from . import tiles
+from .pixel_kernels import STOP, draw, log2_alpha
+from .simd import LANES, fma, lane_numbers, larger, load, splat, store
+from .tiles import FIRST_ROWS, ID, STRIPS, TILE_HEIGHT, TILE_WIDTH
+
+PLANES = 5
+"""Transmittance; red, green, blue, depth drawn so far."""
+ROW = PLANES * LANES
+"""Numbers per row of a strip."""
+STRIP_SIZE = TILE_HEIGHT * ROW
+CHECK_EVERY = 32
+"""Pairs between two looks at whether the whole tile is full."""
+f4 = np.float32
+
+
+@njit(inline="always")
+def _is_full(state):
+    # Whether no pixel of the tile can take anything more.
+    largest = load(state, 0)
+    for row in range(1, STRIPS * TILE_HEIGHT):
+        largest = larger(largest, load(state, row * ROW))
+    lanes = np.empty(LANES, f4)
+    store(lanes, 0, largest)
+    return lanes.max() < STOP
+
+
+@njit(inline="always")
+def _draw_pair(record, pair, left, top, state):
+    # Draws one Gaussian on the rows of one tile that it touches. (left, top): centre of the tile's first pixel.
+    root, m_log2 = record[tiles.ROOT], splat(record[tiles.M_LOG2])
+    root_k, log2_opacity = splat(root * record[tiles.K]), splat(record[tiles.LOG2_OPACITY])
+    red, green, blue = splat(record[tiles.RED]), splat(record[tiles.GREEN]), splat(record[tiles.BLUE])
+    z, center_y = splat(record[tiles.Z]), splat(record[tiles.Y] - top)
+    for strip in range(STRIPS):
+        first, end = pair[FIRST_ROWS + 2 * strip], pair[FIRST_ROWS + 2 * strip + 1]
+        base = splat(root) * (lane_numbers() - splat(record[tiles.X] - left - f4(strip * LANES)))
+        y = splat(f4(first))
+        place = strip * STRIP_SIZE + first * ROW
+        for _ in range(first, end):
+            exponent = log2_alpha(base, root_k, m_log2, log2_opacity, y - center_y)
+            _, weight, behind = draw(exponent, load(state, place))
+            store(state, place, behind)
+            store(state, place + LANES, fma(weight, red, load(state, place + LANES)))
+            store(state, place + 2 * LANES, fma(weight, green, load(state, place + 2 * LANES)))
+            store(state, place + 3 * LANES, fma(weight, blue, load(state, place + 3 * LANES)))
+            store(state, place + 4 * LANES, fma(weight, z, load(state, place + 4 * LANES)))
+            place += ROW
+            y = y + splat(f4(1.0))
+
+
+@njit(cache=True, error_model="numpy")
+def _draw_tile(records, pairs, left, top, columns, rows, state):
+    # Draws the pairs of one tile, near to far, and returns how many it needed before all pixels were full.
+    state[:] = f4(0.0)  # pixels outside the image stay full
+    for r in range(rows):
+        for c in range(columns):
+            state[c // LANES * STRIP_SIZE + r * ROW + c % LANES] = f4(1.0)
+    for p in range(len(pairs)):
+        _draw_pair(records[pairs[p, ID]], pairs[p], f4(left + 0.5), f4(top + 0.5), state)
+        if p % CHECK_EVERY == CHECK_EVERY - 1 and _is_full(state):
+            return p + 1
+    return len(pairs)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def composite_forward(
+    records, pairs, tile_starts, by_cost, workers, background, color, depth, transmittance, tile_ends
+):
+    # Writes color (H, W, 3), depth (H, W), transmittance (H, W), and tile_ends (L,): where each tile's list was left.
+    height, width = depth.shape
+    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    for worker in prange(workers):
+        state = np.empty(STRIPS * STRIP_SIZE, f4)
+        for index in range(worker, by_cost.size, workers):
+            tile = by_cost[index]
+            top, left = tile // tiles_x * TILE_HEIGHT, tile % tiles_x * TILE_WIDTH
+            rows, columns = min(TILE_HEIGHT, height - top), min(TILE_WIDTH, width - left)
+            start, end = tile_starts[tile], tile_starts[tile + 1]
+            tile_ends[tile] = start + _draw_tile(records, pairs[start:end], left, top, columns, rows, state)
+            for r in range(rows):
+                for c in range(columns):
+                    place = c // LANES * STRIP_SIZE + r * ROW + c % LANES
+                    y, x, t = top + r, left + c, abs(state[place])
+                    color[y, x, 0] = state[place + LANES] + t * background[0]
+                    color[y, x, 1] = state[place + 2 * LANES] + t * background[1]
+                    color[y, x, 2] = state[place + 3 * LANES] + t * background[2]
+                    depth[y, x] = state[place + 4 * LANES]
+                    transmittance[y, x] = t

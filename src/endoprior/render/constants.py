@@ -1,0 +1,22 @@
+"""The numbers every backend shares: what is culled, what is drawn, when a pixel is full.
+
+They are those of 3D Gaussian splatting (Kerbl et al. 2023) and of EndoGaussian's rasterizer. Numba does not notice a
+change here: delete `render/__pycache__` after one.
+"""
+
+from __future__ import annotations
+
+NEAR_Z = 0.2
+"""A Gaussian whose centre has camera z <= this is culled, mm."""
+BLUR_PX2 = 0.3
+"""Added to both diagonal entries of the projected covariance, px^2, so that nothing is thinner than a pixel."""
+JACOBIAN_MARGIN = 0.3
+"""The perspective Jacobian is evaluated at most this fraction of tan(field of view / 2) outside the image."""
+ALPHA_MAX = 0.99
+"""Largest alpha of one Gaussian at one pixel; no gradient flows where it binds."""
+ALPHA_MIN = 1.0 / 255.0
+"""A Gaussian is not drawn at a pixel where its alpha would be below this: the exact edge of its footprint."""
+STOP_TRANSMITTANCE = 1e-4
+"""The Gaussian that would bring a pixel's transmittance below this is not drawn there, nor any behind it."""
+OVERFLOW = 3.4e38
+"""A Gaussian is culled when one of its projected numbers reaches this, the end of float32."""

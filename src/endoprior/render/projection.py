@@ -1,0 +1,150 @@
+"""EWA projection in torch (Zwicker et al. 2001): 3D Gaussians to 2D ones. The definition the CPU kernels must meet.
+
+The camera maps p = (x, y, z) to (fx x/z + cx, fy y/z + cy). Its Jacobian J is taken at the centre, with x/z and y/z
+limited to a little outside the image (`JACOBIAN_MARGIN`) because the linearization fails there. Then
+`cov2d = J W R diag(s^2) R^T W^T J^T + BLUR_PX2 I`. Shared letter: `N` Gaussians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..checks import check_shape
+from ..types import Camera, Splats
+from . import sh
+from .constants import ALPHA_MIN, BLUR_PX2, JACOBIAN_MARGIN, NEAR_Z, OVERFLOW
+
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Gaussians in the image. Where `radii` is 0 the rows are finite but meaningless, and carry no gradient."""
+
+    means2d: Tensor
+    """(N, 2) centres, px."""
+    cov2d: Tensor
+    """(N, 3) covariance entries xx, xy, yy, blur included, px^2."""
+    z: Tensor
+    """(N,) camera-space z of the centres, mm."""
+    colors: Tensor
+    """(N, 3) colour seen from the camera, >= 0."""
+    radii: Tensor
+    """(N,) int32 ceil(3 sigma) along the long axis, px; 0 where nothing of it can reach a pixel."""
+
+
+def check(splats: Splats, background: Tensor) -> int:
+    """Check what every backend requires of its input, and return the SH degree.
+
+    Raises:
+        ValueError: shapes disagree, types differ, or K is not 1, 4, 9 or 16.
+    """
+    sizes = check_shape(
+        "means:N,3 quats:N,4 scales:N,3 opacities:N sh:N,K,3", **{n: getattr(splats, n) for n in FIELDS}
+    )
+    check_shape("background:3", background=background)
+    dtypes = {getattr(splats, name).dtype for name in FIELDS} | {background.dtype}
+    if len(dtypes) > 1:
+        raise ValueError(f"splats and background must share one dtype; got {sorted(map(str, dtypes))}")
+    return sh.degree_of(sizes["K"])
+
+
+def jacobian_limits(camera: Camera) -> tuple[float, float, float, float]:
+    """Smallest and largest x/z, then y/z, at which the Jacobian is evaluated; they follow the true principal point."""
+    margin_x = JACOBIAN_MARGIN * 0.5 * camera.width / camera.fx
+    margin_y = JACOBIAN_MARGIN * 0.5 * camera.height / camera.fy
+    return (
+        -camera.cx / camera.fx - margin_x,
+        (camera.width - camera.cx) / camera.fx + margin_x,
+        -camera.cy / camera.fy - margin_y,
+        (camera.height - camera.cy) / camera.fy + margin_y,
+    )
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """(N, 3, 3) rotations of (N, 4) quaternions (w, x, y, z) of any length but zero."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    entries = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in entries], -2)
+
+
+def project(splats: Splats, camera: Camera) -> Projected:
+    """Project every Gaussian, and find out which of them can be drawn.
+
+    Culled are: centre at or behind `NEAR_Z`; any number not finite, or a result that overflows; a quaternion of length
+    0; a footprint (where alpha >= `ALPHA_MIN`) that misses every pixel centre's bounding box.
+    """
+    with torch.no_grad():  # decide first; a `where` after the fact would let NaN into the gradients
+        usable = _usable(splats, camera)
+    placeholder = _placeholder(splats, camera)
+    safe = {}
+    for name in FIELDS:
+        values = getattr(splats, name)
+        keep = usable.reshape(-1, *(1,) * (values.dim() - 1))
+        safe[name] = torch.where(keep, values, placeholder[name])
+    means2d, cov2d, z, colors = _project(Splats(**safe), camera)
+    return Projected(means2d, cov2d, z, colors, _radii(means2d, cov2d, safe["opacities"], usable, camera))
+
+
+def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Means, covariances, z and colours of Gaussians trusted to be in front of the camera."""
+    view = torch.as_tensor(camera.world_to_camera, dtype=splats.means.dtype)
+    x, y, z = (splats.means @ view[:3, :3].T + view[:3, 3]).unbind(-1)
+    left, right, top, bottom = jacobian_limits(camera)
+    slope_x, slope_y = (x / z).clamp(left, right), (y / z).clamp(top, bottom)
+    axes = view[:3, :3] @ rotation_matrices(splats.quats) * splats.scales[:, None, :]  # columns: the axes, camera frame
+    spread_x = (camera.fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])  # rows of J times the axes
+    spread_y = (camera.fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
+    cov2d = torch.stack(
+        [
+            (spread_x * spread_x).sum(-1) + BLUR_PX2,
+            (spread_x * spread_y).sum(-1),
+            (spread_y * spread_y).sum(-1) + BLUR_PX2,
+        ],
+        -1,
+    )
+    means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
+    towards = splats.means - torch.as_tensor(camera.center, dtype=splats.means.dtype)
+    return means2d, cov2d, z, sh.colors(splats.sh, towards / towards.norm(dim=-1, keepdim=True))
+
+
+def _usable(splats: Splats, camera: Camera) -> Tensor:
+    """(N,) True where the Gaussian is finite, in front of the camera, and stays finite when projected."""
+    per_gaussian = [splats.means, splats.quats, splats.scales, splats.opacities[:, None], splats.sh.flatten(1)]
+    usable = torch.cat(per_gaussian, -1).isfinite().all(-1) & (splats.quats.norm(dim=-1) > 0)
+    means2d, cov2d, z, colors = _project(splats, camera)
+    largest = torch.cat([means2d, z[:, None], (cov2d[:, :1] * cov2d[:, 2:]), colors], -1).abs().sum(-1)
+    return usable & (z > NEAR_Z) & (largest < OVERFLOW)  # False for NaN
+
+
+def _placeholder(splats: Splats, camera: Camera) -> dict[str, Tensor]:
+    """One harmless Gaussian, 1 mm small and 1 mm beyond the near plane, to stand in for the culled ones."""
+    rotation = torch.as_tensor(camera.world_to_camera[:3, :3], dtype=splats.means.dtype)
+    center = torch.as_tensor(camera.center, dtype=splats.means.dtype)
+    return {
+        "means": center + (NEAR_Z + 1) * rotation[2],
+        "quats": splats.quats.new_tensor([1.0, 0.0, 0.0, 0.0]),
+        "scales": splats.scales.new_ones(3),
+        "opacities": splats.opacities.new_tensor(0.0),
+        "sh": splats.sh.new_zeros(splats.sh.shape[1:]),
+    }
+
+
+@torch.no_grad()
+def _radii(means2d: Tensor, cov2d: Tensor, opacities: Tensor, usable: Tensor, camera: Camera) -> Tensor:
+    """ceil(3 sigma_max), and 0 unless the box around {alpha >= ALPHA_MIN} holds a pixel centre's coordinates."""
+    xx, xy, yy = cov2d.unbind(-1)
+    long_axis = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
+    reach = (2 * torch.log((opacities / ALPHA_MIN).clamp(min=1))).sqrt()  # in standard deviations
+    box = reach[:, None] * torch.stack([xx, yy], -1).sqrt()
+    size = means2d.new_tensor([camera.width, camera.height])
+    touches = ((means2d + box >= 0.5) & (means2d - box <= size - 0.5)).all(-1)
+    radii = (3 * long_axis.sqrt()).ceil().clamp(max=2**30).to(torch.int32)
+    return torch.where(usable & touches & (opacities >= ALPHA_MIN), radii, 0)

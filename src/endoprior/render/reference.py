@@ -1,0 +1,52 @@
+"""The definition of what a rasterizer returns: every Gaussian at every pixel, in plain torch, differentiated by
+autograd.
+
+Memory is H x W x N numbers several times over: for small scenes, tests and reading. float32 or float64.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..geometry import pixel_centers
+from ..types import Camera, RenderOutput, Splats
+from .constants import ALPHA_MAX, ALPHA_MIN, STOP_TRANSMITTANCE
+from .projection import check, project
+
+
+def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_to_means: bool = True) -> RenderOutput:
+    """Draw the Gaussians near to far (Kerbl et al. 2023, Eq. 3); ties in z keep their order. See
+    `render.Rasterizer`."""
+    check(splats, background)
+    seen = project(splats, camera)
+    order = seen.z.argsort(stable=True)
+    order = order[seen.radii[order] > 0]
+    alpha = _alpha(seen.means2d[order], seen.cov2d[order], splats.opacities[order], camera)
+    alpha = alpha * _drawn(alpha)
+    behind = torch.cumprod(torch.cat([torch.ones_like(alpha[..., :1]), 1 - alpha], -1), -1)
+    weights, transmittance = alpha * behind[..., :-1], behind[..., -1]
+    z = seen.z if depth_grad_to_means else seen.z.detach()
+    return RenderOutput(
+        color=weights @ seen.colors[order] + transmittance[..., None] * background,
+        alpha=1 - transmittance,
+        depth=weights @ z[order],
+        means2d=seen.means2d,
+        radii=seen.radii,
+    )
+
+
+def _alpha(means2d: Tensor, cov2d: Tensor, opacities: Tensor, camera: Camera) -> Tensor:
+    """(H, W, N) opacity times the 2D Gaussian, at most ALPHA_MAX, exactly 0 below ALPHA_MIN."""
+    pixels = torch.as_tensor(pixel_centers(camera.width, camera.height), dtype=means2d.dtype)
+    dx, dy = (pixels[:, :, None] - means2d).unbind(-1)
+    xx, xy, yy = cov2d.unbind(-1)
+    squared_distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)  # Mahalanobis
+    alpha = (opacities * torch.exp(-0.5 * squared_distance)).clamp(max=ALPHA_MAX)
+    return torch.where(alpha >= ALPHA_MIN, alpha, 0)
+
+
+@torch.no_grad()
+def _drawn(alpha: Tensor) -> Tensor:
+    """(H, W, N) 1 until a Gaussian would bring the transmittance below STOP_TRANSMITTANCE, 0 from that one on."""
+    return (torch.cumprod(1 - alpha, -1) >= STOP_TRANSMITTANCE).to(alpha.dtype)

@@ -1,0 +1,170 @@
+"""The command line: exit statuses, one-line complaints, and the main path from a folder to scores and a film."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from endoprior.cli import COMMANDS, main
+
+QUICK = [
+    "--init-budget", "300", "--schedule.coarse-iterations", "2", "--schedule.fine-iterations", "20",
+    "--schedule.half-resolution-iterations", "4", "--no-networks",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A quickly trained run folder and its sequence."""
+    from conftest import write_tiny_sequence
+
+    folder = tmp_path_factory.mktemp("cli")
+    data = write_tiny_sequence(folder / "tiny")
+    assert main(["train", str(data), str(folder / "run"), *QUICK]) == 0
+    return data, folder / "run"
+
+
+def complaint(capsys) -> str:
+    """The one line on stderr."""
+    text = capsys.readouterr().err
+    assert text.startswith("endoprior: ") and text.count("\n") == 1 and "Traceback" not in text
+    return text
+
+
+def test_overview_names_every_command(capsys):
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in COMMANDS)
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as left:
+        main([command, "--help"])
+    assert left.value.code == 0
+    assert f"endoprior {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["trian"], "trian: no such command"),
+        (["train"], "required"),
+        (["train", "nowhere", "out"], "nowhere"),
+        (["train", "nowhere", "out", "--sed", "1"], "--sed"),
+        (["train", "nowhere", "out", "--preset", "best"], "--preset"),
+        (["train", "nowhere", "out", "--seed", "one"], "one"),
+        (["train", "nowhere", "out", "--density.min-densify-weight", "2"], "min_densify_weight"),
+        (["eval", "nowhere"], "nowhere"),
+        (["render", "nowhere"], "nowhere"),
+        (["prior", "nowhere", "out"], "nowhere"),
+        (["phantom", "out", "--frames", "1"], "frames"),
+    ],
+)
+def test_bad_usage_is_one_line_and_status_2(arguments, says, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert says in complaint(capsys)
+    assert list(tmp_path.iterdir()) == [], "something was left behind"
+
+
+def test_train_scores_and_says_what_was_skipped(run):
+    _, folder = run
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert set(metrics) == {"protocol", "scores", "skipped"}
+    expected = {"psnr", "psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis", "depth_instability_mm"}
+    expected |= {"num_gaussians", "num_low_prior", "num_low_opacity", "num_large_scale"}
+    expected |= {"fps", "train_seconds", "iterations_per_second"}
+    assert expected <= set(metrics["scores"])
+    assert {"flow_error", "lpips"} <= set(metrics["skipped"])
+    assert metrics["protocol"]["frames"] == [1, 9]
+    per_frame = json.loads((folder / "per_frame.json").read_text())
+    assert [row["index"] for row in per_frame] == [1, 9]
+    assert metrics["scores"]["psnr_tissue"] == pytest.approx(np.mean([row["psnr_tissue"] for row in per_frame]))
+
+
+def test_eval_repeats_the_scores_of_train(run, tmp_path):
+    _, folder = run
+    assert main(["eval", str(folder), "--out", str(tmp_path), "--no-networks"]) == 0
+    first, second = (json.loads((place / "metrics.json").read_text())["scores"] for place in (folder, tmp_path))
+    timed = {"fps", "train_seconds", "iterations_per_second"}
+    assert {k: v for k, v in first.items() if k not in timed} == {k: v for k, v in second.items() if k not in timed}
+
+
+def test_eval_of_other_data_is_refused(run, make_tiny_sequence, capsys):
+    _, folder = run
+    assert main(["eval", str(folder), "--data", str(make_tiny_sequence("short", num_frames=9))]) == 2
+    assert "17 frames" in complaint(capsys)
+
+
+def test_eval_without_its_sequence_says_so(run, tmp_path, capsys):
+    _, folder = run
+    shutil.copytree(folder, tmp_path / "moved")
+    facts = json.loads((tmp_path / "moved" / "config.json").read_text())
+    facts["data"]["path"] = "/gone"
+    (tmp_path / "moved" / "config.json").write_text(json.dumps(facts))
+    assert main(["eval", str(tmp_path / "moved")]) == 2
+    assert "--data" in complaint(capsys)
+
+
+def test_render_writes_frames_depth_and_a_film(run, tmp_path):
+    _, folder = run
+    assert main(["render", str(folder), str(tmp_path / "out"), "--split", "test"]) == 0
+    assert sorted(p.name for p in (tmp_path / "out" / "rgb").iterdir()) == ["000001.png", "000009.png"]
+    assert cv2.imread(str(tmp_path / "out" / "rgb" / "000001.png")).shape == (40, 48, 3)
+    depth = np.load(tmp_path / "out" / "depth" / "000009.npy")
+    assert depth.shape == (40, 48) and depth.dtype == np.float32
+    assert cv2.imread(str(tmp_path / "out" / "side_by_side" / "000001.png")).shape == (40, 3 * 48, 3)
+    film = cv2.VideoCapture(str(tmp_path / "out" / "video.mp4"))
+    assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == 2
+
+
+def test_render_of_chosen_times_and_a_camera_path(run, tmp_path, capsys):
+    _, folder = run
+    assert main(["render", str(folder), str(tmp_path / "a"), "--times", "0", "0.5", "--camera", "sway"]) == 0
+    assert len(list((tmp_path / "a" / "rgb").iterdir())) == 2
+    moved = np.eye(4)
+    moved[0, 3] = 2
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps([{"time": 0.2}, {"time": 0.2, "world_to_camera": moved.tolist()}]))
+    assert main(["render", str(folder), str(tmp_path / "b"), "--camera-path", str(path)]) == 0
+    first, second = (cv2.imread(str(p)).astype(int) for p in sorted((tmp_path / "b" / "rgb").iterdir()))
+    assert np.abs(first - second).mean() > 1, "moving the camera changed nothing"
+    moved[0, 0] = 2
+    path.write_text(json.dumps([{"time": 0.2, "world_to_camera": moved.tolist()}]))
+    capsys.readouterr()
+    assert main(["render", str(folder), str(tmp_path / "c"), "--camera-path", str(path)]) == 2
+    assert "path.json" in complaint(capsys)
+
+
+def test_prior_draws_maps_and_a_sheet(run, tmp_path, capsys):
+    data, _ = run
+    assert main(["prior", str(data), str(tmp_path / "out"), "--split", "test"]) == 0
+    for name in ("specular", "salience", "prior"):
+        assert len(list((tmp_path / "out" / name).iterdir())) == 2
+    rho = cv2.imread(str(tmp_path / "out" / "prior" / "000001.png"), cv2.IMREAD_GRAYSCALE)
+    tool = cv2.imread(str(data / "masks" / "000001.png"), cv2.IMREAD_GRAYSCALE) > 0
+    assert (rho[tool] == 0).all() and rho[~tool].max() == 255
+    assert (tmp_path / "out" / "contact_sheet.png").is_file()
+    capsys.readouterr()
+    assert main(["prior", str(data), str(tmp_path / "out")]) == 2
+    complaint(capsys)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda file: file.write_bytes(b""), "scene.safetensors"),
+        (lambda file: file.write_bytes(file.read_bytes()[:-100]), "scene.safetensors"),
+        (lambda file: file.write_bytes(b"\xff" * 64), "scene.safetensors"),
+        (lambda file: file.unlink(), "scene.safetensors"),
+    ],
+)
+def test_a_damaged_scene_is_named(run, tmp_path, capsys, damage, says):
+    _, folder = run
+    shutil.copytree(folder, tmp_path / "run")
+    damage(tmp_path / "run" / "scene.safetensors")
+    assert main(["eval", str(tmp_path / "run")]) == 2
+    assert says in complaint(capsys)

@@ -1,0 +1,93 @@
+"""Scoring with truth: carried points, tracks, what is behind the tool; the report."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from endoprior.cli import main
+from endoprior.data import load_sequence
+from endoprior.evaluate import evaluate, track_error
+from endoprior.model.carry import carry_points
+from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.presets import preset
+from endoprior.train import train
+from endoprior.trainer import Trainer
+
+
+@pytest.fixture(scope="module")
+def phantom(tmp_path_factory):
+    """A small phantom."""
+    out = tmp_path_factory.mktemp("evaluate") / "phantom"
+    write_phantom(out, PhantomConfig(frames=10, width=96, height=80))
+    return load_sequence(out)
+
+
+def still_scene(sequence, budget=400):
+    """An untrained scene: Gaussians where they start, that do not move."""
+    cfg = preset("default")
+    cfg = replace(cfg, init=replace(cfg.init, budget=budget))
+    trainer = Trainer(sequence, cfg)
+    trainer.start()
+    return trainer.scene()
+
+
+def test_carried_points_follow_a_common_motion(phantom):
+    scene = still_scene(phantom)
+    motion = scene.gaussians["motion"]
+    with torch.no_grad():
+        motion[:, :, 0] = 1.5  # the same shift of x in every basis function
+    times = [0.1, 0.5, 0.9]
+    shift = [scene.at(t).means[0, 0].item() - scene.gaussians["means"][0, 0].item() for t in times]
+    start = scene.at(0.5).means[:5].numpy().astype(np.float64)
+    carried = carry_points(scene, start, np.full(5, 1), times)
+    for k in range(3):
+        expected = start + np.array([shift[k] - shift[1], 0, 0])
+        assert carried[k] == pytest.approx(expected, abs=1e-4)  # float32 centres near 100 mm
+
+
+def test_track_error_of_a_still_scene_is_how_far_the_tissue_moved(phantom):
+    tracks = phantom.truth.tracks
+    followed = tracks.visible.sum(0) > 1
+    points, visible = tracks.points[:, followed], tracks.visible[:, followed].copy()
+    first, columns = visible.argmax(0), np.arange(followed.sum())
+    visible[first, columns] = False
+    moved = np.linalg.norm(points - points[first, columns], axis=-1)[visible].mean()
+    assert track_error(still_scene(phantom), phantom).mm == pytest.approx(moved, rel=1e-3)
+
+
+def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):
+    cfg = preset("default")
+    cfg = replace(
+        cfg,
+        init=replace(cfg.init, budget=400),
+        schedule=replace(cfg.schedule, coarse_iterations=0, fine_iterations=5),
+    )
+    names = {"psnr_behind_tool", "depth_rmse_behind_tool_mm", "track_error_mm", "track_error_px"}
+    scores = evaluate(train(phantom, cfg), phantom, networks=False).scores
+    assert names <= set(scores) and all(np.isfinite(scores[name]) for name in names)
+    plain = load_sequence(tiny_sequence)
+    assert not names & set(evaluate(train(plain, cfg), plain, networks=False).scores)
+
+
+def test_demo_leaves_what_it_promises(tmp_path, monkeypatch):
+    """The demo's path at a small size; its full size is `make demo`."""
+    from endoprior import phantom as package
+
+    def small(out, cfg, progress=None):
+        write_phantom(out, replace(cfg, width=96, height=80), progress)
+
+    quick = preset("default")
+    quick = replace(
+        quick,
+        init=replace(quick.init, budget=300),
+        schedule=replace(quick.schedule, coarse_iterations=0, fine_iterations=10, half_resolution_iterations=0),
+    )
+    monkeypatch.setattr(package, "write_phantom", small)
+    monkeypatch.setattr("endoprior.cli.demo.preset", lambda name: quick)
+    assert main(["demo", str(tmp_path / "demo"), "--frames", "10"]) == 0
+    for part in ("report.png", "run/video.mp4", "run/metrics.json", "run/scene.safetensors", "sequence/truth/tracks.npz"):
+        assert (tmp_path / "demo" / part).stat().st_size > 0
+    assert "track_error_mm" in json.loads((tmp_path / "demo" / "run" / "metrics.json").read_text())["scores"]

@@ -1,0 +1,418 @@
+"""The phantom: geometry against closed forms and slow loops, the written folder against its own ground truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import cv2
+import numba
+import numpy as np
+import pytest
+
+from endoprior.checks import InputError
+from endoprior.geometry import bilinear
+from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.phantom.generate import visible_points
+from endoprior.phantom.instrument import JAW_MM, draw_tools, pack_tool
+from endoprior.phantom.motion import ToolPose, build_motion, smooth_step
+from endoprior.phantom.noise import cells, fractal
+from endoprior.phantom.raster import FAR, rasterize, vertex_normals
+from endoprior.phantom.sensor import develop, expose, stereo_depth
+from endoprior.phantom.surface import build_anatomy, build_plane, organs_at
+
+SMALL = PhantomConfig(frames=6, width=96, height=80, seed=3, stereo=True)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """One small stereo sequence, written once."""
+    out = tmp_path_factory.mktemp("phantom") / "sequence"
+    write_phantom(out, SMALL)
+    return out
+
+
+def read(path):
+    """One PNG, RGB where it has color."""
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert pixels is not None, path
+    return pixels[..., ::-1] if pixels.ndim == 3 else pixels
+
+
+def frame(folder, index):
+    """(image, mask, depth mm, truth image, truth z) of one frame."""
+    name = f"{index:06d}"
+    depth = read(folder / f"depth/{name}.png") * 0.01
+    truth = read(folder / f"truth/tissue/{name}.png"), np.load(folder / f"truth/depth/{name}.npy")
+    return read(folder / f"images/{name}.png"), read(folder / f"masks/{name}.png") == 255, depth, *truth
+
+
+# --- the written folder ---------------------------------------------------------------------------------------------
+
+
+def test_layout_and_types(folder):
+    names = [f"{i:06d}" for i in range(SMALL.frames)]
+    for kind, suffix in (
+        ("images", "png"),
+        ("masks", "png"),
+        ("depth", "png"),
+        ("right", "png"),
+        ("truth/tissue", "png"),
+        ("truth/depth", "npy"),
+    ):
+        assert sorted(p.name for p in (folder / kind).iterdir()) == [f"{n}.{suffix}" for n in names], kind
+    for kind in ("images", "right", "truth/tissue"):
+        pixels = read(folder / kind / "000000.png")
+        assert (pixels.shape, pixels.dtype) == ((80, 96, 3), np.uint8)
+    for index in range(SMALL.frames):
+        mask = read(folder / f"masks/{index:06d}.png")
+        assert mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}
+    assert read(folder / "depth/000000.png").dtype == np.uint16
+    z = np.load(folder / "truth/depth/000000.npy")
+    assert z.dtype == np.float32 and np.isfinite(z).all() and 40 < z.min() and z.max() < 120
+    assert not list(folder.parent.glob(".*")), "the unfinished folder is left over"
+
+
+def test_description_and_poses(folder):
+    described = json.loads((folder / "sequence.json").read_text())
+    assert (described["width"], described["height"], described["mask_tool_value"]) == (96, 80, 255)
+    assert described["fx"] == described["fy"] == pytest.approx(0.9 * 96)
+    assert (described["cx"], described["cy"], described["depth_unit"], described["depth_scale"]) == (48, 40, "mm", 0.01)
+    assert described["baseline_mm"] == 4.2
+    poses = np.load(folder / "poses_bounds.npy")
+    assert poses.shape == (6, 17)
+    camera = poses[:, :15].reshape(6, 3, 5)
+    assert np.array_equal(camera[:, :, :4], np.broadcast_to(np.eye(3, 4), (6, 3, 4)))
+    assert np.allclose(camera[:, :, 4], [80, 96, described["fx"]])
+    assert (poses[:, 15] > 15).all() and (poses[:, 16] < 120).all() and (poses[:, 15] < poses[:, 16]).all()
+
+
+def test_mask_marks_a_tool_of_sensible_size(folder):
+    for index in range(SMALL.frames):
+        image, mask, _, truth, _ = frame(folder, index)
+        assert 0.02 < mask.mean() < 0.40
+        # Inside the mask the picture is mostly something else than tissue: metal has little color.
+        gap = np.abs(image.astype(float) - truth).max(-1)
+        assert np.median(gap[mask]) > 20 > np.percentile(gap[~mask], 99)
+
+
+def test_picture_is_the_truth_plus_noise_outside_the_mask(folder):
+    for index in range(SMALL.frames):
+        image, mask, _, truth, _ = frame(folder, index)
+        gap = image.astype(float)[~mask] - truth[~mask]
+        # noise 1.6 levels at mid grey, up to 1.25 times that in the dark; clipping at 0 and 255 only shrinks it
+        assert abs(gap.mean()) < 0.15 and 1.0 < gap.std() < 2.4 and np.abs(gap).max() < 12
+
+
+def test_depth_is_tissue_depth_with_stereo_errors(folder):
+    for index in range(SMALL.frames):
+        _, mask, depth, _, z = frame(folder, index)
+        measured = (depth > 0) & ~mask
+        error = np.abs(depth - z)[measured]
+        assert 0.05 < np.median(error) < 1.0  # about 0.3 mm is intended; 0 would mean no error model
+        assert 0 < (depth == 0).mean() < 0.2  # 3-5 % at full size; bands one pixel wide weigh more in a small picture
+        # A tool is nearer than the tissue behind it, and depth sees the tool.
+        inside = (depth > 0) & cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+        assert np.median((z - depth)[inside]) > 3
+
+
+def test_tracks_lie_on_the_true_surface_where_visible(folder):
+    tracks = np.load(folder / "truth/tracks.npz")
+    points, visible = tracks["points"], tracks["visible"]
+    assert points.shape == (6, 256, 3) and points.dtype == np.float32
+    assert visible.shape == (6, 256) and visible.dtype == bool
+    assert visible[0].mean() > 0.6 and not visible.all()
+    fx, cx, cy = 0.9 * 96, 48.0, 40.0
+    for index in range(SMALL.frames):
+        _, mask, _, _, z = frame(folder, index)
+        p = points[index][visible[index]].astype(float)
+        pixels = np.stack([fx * p[:, 0] / p[:, 2] + cx, fx * p[:, 1] / p[:, 2] + cy], -1)
+        assert (pixels >= 0).all() and (pixels <= [96, 80]).all()
+        column, row = pixels[:, 0].astype(int), pixels[:, 1].astype(int)
+        assert not mask[row, column].any()
+        error = np.abs(bilinear(z, pixels) - p[:, 2])
+        # One pixel is 0.9 mm here, so bilinear depth is off by the surface's curvature over one pixel.
+        assert np.median(error) < 0.1 and np.percentile(error, 95) < 1.2
+
+
+def test_something_moves_far_and_something_hardly(folder):
+    points = np.load(folder / "truth/tracks.npz")["points"]
+    moved = np.linalg.norm(points - points[:1], axis=-1).max(0)
+    assert moved.max() > 8 and np.percentile(moved, 20) < 4.5  # the pull is local, breathing is a few mm
+
+
+def test_occlusion_wanders_and_ends(folder):
+    masks = np.stack([frame(folder, i)[1] for i in range(SMALL.frames)])
+    ever = masks.any(0)
+    assert (ever & ~masks.all(0)).sum() > 0.3 * ever.sum()
+
+
+def test_right_eye_sees_the_left_picture_shifted_by_disparity(folder):
+    described = json.loads((folder / "calibration.json").read_text())
+    assert described["T_mm"] == [-4.2, 0, 0] and described["K_left"] == described["K_right"]
+    assert np.array_equal(described["R"], np.eye(3)) and described["K_left"][0][2] == 48
+    image, mask, _, _, z = frame(folder, 0)
+    right = read(folder / "right/000000.png").astype(float)
+    x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(80) + 0.5)
+    disparity = 0.9 * 96 * 4.2 / z
+    interior = (x - disparity > 1) & ~cv2.dilate(mask.astype(np.uint8), np.ones((3, 25), np.uint8)).astype(bool)
+    gap = {
+        shift: np.abs(bilinear(right, np.stack([x - shift * disparity, y], -1)) - image)[interior].mean()
+        for shift in (0.0, 0.7, 1.0, 1.3)
+    }
+    # Highlights and noise differ between the eyes; the match must still be clearly best at the true disparity.
+    assert gap[1.0] < 0.85 * min(gap[0.7], gap[1.3]) and gap[1.0] < 0.5 * gap[0.0]
+
+
+def test_same_seed_same_bytes_whatever_the_threads(folder, tmp_path):
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        write_phantom(tmp_path / "again", SMALL)
+    finally:
+        numba.set_num_threads(threads)
+    files = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
+    assert files == sorted(p.relative_to(tmp_path / "again") for p in (tmp_path / "again").rglob("*") if p.is_file())
+    for name in files:
+        assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+
+
+def test_seeds_differ_and_mono_has_no_right_eye(folder, tmp_path):
+    out = tmp_path / "other"
+    done = []
+    cfg = dataclasses.replace(SMALL, seed=4, frames=2, stereo=False)
+    write_phantom(out, cfg, progress=lambda index, count: done.append((index, count)))
+    assert done == [(1, 2), (2, 2)]
+    assert not (out / "right").exists() and not (out / "calibration.json").exists()
+    gap = read(out / "truth/tissue/000000.png").astype(float) - read(folder / "truth/tissue/000000.png")
+    assert np.abs(gap).mean() > 15
+    assert np.abs(np.load(out / "truth/depth/000000.npy") - np.load(folder / "truth/depth/000000.npy")).mean() > 2
+
+
+def test_principal_point_moves_the_picture(tmp_path):
+    # The same ray is seen at another pixel: an off-center principal point shifts the true depth map by whole pixels.
+    out, count = {}, 2
+    for x in (48.0, 52.0):
+        cfg = PhantomConfig(frames=count, width=96, height=80, principal_x=x)
+        write_phantom(tmp_path / str(x), cfg)
+        out[x] = np.load(tmp_path / str(x) / "truth/depth/000000.npy")
+        assert json.loads((tmp_path / str(x) / "sequence.json").read_text())["cx"] == x
+    # The mesh is laid out anew, so depths agree to its resolution (1.7 mm cells) except at the rims of organs.
+    assert np.median(np.abs(out[48.0][:, :-4] - out[52.0][:, 4:])) < 0.05
+
+
+def test_occupied_output_is_refused(tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "note.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"full.*new or empty"):
+        write_phantom(tmp_path / "full", SMALL)
+    assert [p.name for p in tmp_path.rglob("*")] == ["full", "note.txt"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frames": 1},
+        {"width": 16},
+        {"height": 0},
+        {"seed": -1},
+        {"pull_mm": 99.0},
+        {"noise": float("nan")},
+        {"width": 640, "height": 64},
+        {"principal_x": 0.0},
+        {"tracks": 0},
+        {"baseline_mm": -4.2},
+    ],
+)
+def test_bad_sizes_are_input_errors(change):
+    with pytest.raises(InputError, match="expected") as caught:
+        PhantomConfig(**change)
+    assert "\n" not in str(caught.value)
+
+
+# --- motion ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_motion_never_folds_the_tissue(seed):
+    cfg = PhantomConfig(seed=seed, pull_mm=15, breathing_mm=8)
+    motion = build_motion(cfg, build_plane(cfg), build_anatomy(seed))
+    b, a = np.mgrid[-60:60:1.0, -70:70:1.0]
+    for phase in (0.0, 0.4, 0.55, 0.7):
+        moved = motion.displacement(a, b, phase)
+        (ab, aa), (bb, ba) = np.gradient(a + moved[..., 0]), np.gradient(b + moved[..., 1])
+        assert (aa * bb - ab * ba).min() > 0.02  # area ratio of the map (a, b) -> moved (a, b); 1 is undeformed
+
+
+def test_motion_and_tools_have_no_jerks():
+    cfg = PhantomConfig(frames=96)  # two cycles, so that the hand-over between them is covered
+    motion = build_motion(cfg, build_plane(cfg), build_anatomy(0))
+    steps = 2000
+    phases = np.linspace(0, 1, steps)
+    center = motion.pulls[0].center
+    tissue = np.array([motion.displacement(*np.float64(center).reshape(2, 1), p)[0] for p in phases])
+    tips = np.array([motion.tools(p)[0].tip for p in phases])
+    hover = np.array([motion.tools(p)[1].tip for p in phases])
+    for path in (tissue, tips, hover):
+        velocity = np.diff(path, axis=0) * steps
+        # A jump in velocity would show at full size however fine the steps; smooth motion changes it by O(1 / steps).
+        assert np.abs(np.diff(velocity, axis=0)).max() < 0.03 * max(np.abs(velocity).max(), 1)
+
+
+def test_the_grasper_holds_what_it_pulls():
+    cfg = PhantomConfig(seed=1)
+    motion = build_motion(cfg, build_plane(cfg), build_anatomy(1))
+    pull = motion.pulls[0]
+    for phase in (0.3, 0.5, 0.6):
+        assert np.allclose(motion.tools(phase)[0].tip, motion.held(pull, phase), atol=1e-9)
+        assert motion.tools(phase)[0].opening < 0.1
+    assert motion.tools(0.0)[0].opening > 0.5
+    dragged = motion.held(pull, 0.55) - motion.held(pull, 0.0)
+    assert np.linalg.norm(dragged) > 8 and pull.strength(0.0) == 0 and pull.strength(1.0) == 0
+
+
+def test_smooth_step_closed_form():
+    assert [smooth_step(1, 3, x) for x in (0, 1, 2, 3, 4)] == [0, 0, 0.5, 1, 1]
+
+
+# --- geometry and noise ---------------------------------------------------------------------------------------------
+
+
+def test_plane_coordinates_and_grid_are_inverse():
+    cfg = PhantomConfig(seed=5)
+    plane = build_plane(cfg)
+    assert np.allclose(plane.axes @ plane.axes.T, np.eye(3), atol=1e-12)
+    assert plane.axes[2, 2] < 0 and plane.axes[1, 1] > 0  # normal to the camera, e_b down the picture
+    grid_u, grid_v = np.meshgrid([0.0, 0.3, 1.0], [0.1, 0.8], indexing="xy")
+    a, b = plane.coordinates(grid_u, grid_v)
+    assert np.allclose(plane.grid(a, b), (grid_u, grid_v), atol=1e-12)
+
+
+def test_loop_height_slow_loop():
+    anatomy = build_anatomy(2)
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(-20, 20, (2, 1, 25))
+    organs = organs_at(anatomy, a, b)
+    for j in range(25):
+        k = organs.owner[0, j]
+        if k < 0:
+            continue
+        best = (np.inf, 0.0, 0.0)
+        path = anatomy.paths[k].astype(float)
+        for m in range(len(path) - 1):
+            edge, offset = path[m + 1] - path[m], np.array([a[0, j], b[0, j]]) - path[m]
+            f = np.clip(offset @ edge / (edge @ edge), 0, 1)
+            distance = np.linalg.norm(offset - f * edge)
+            radius = (1 - f) * anatomy.radii[k, m] + f * anatomy.radii[k, m + 1]
+            base = (1 - f) * anatomy.bases[k, m] + f * anatomy.bases[k, m + 1]
+            best = min(best, (distance, radius, base))
+        distance, radius, base = best
+        assert abs(organs.across[0, j]) == pytest.approx(distance, abs=1e-4)  # float32 coordinates of tens of mm
+        if distance < 0.9 * radius:
+            want = base + 0.9 * radius * np.sqrt(1 - (distance / radius) ** 2)
+            assert organs.height[0, j] == pytest.approx(want, abs=1e-3)
+
+
+def test_rasterized_slanted_plane_closed_form():
+    b, a = np.mgrid[-60:60:9.0, -60:60:7.0]
+    vertices = np.stack([a, b, 70 + 0.3 * a - 0.2 * b], -1)
+    hits = rasterize(vertices, 60.0, (32.0, 24.0), 64, 48)
+    x, y = np.meshgrid((np.arange(64) + 0.5 - 32) / 60, (np.arange(48) + 0.5 - 24) / 60)
+    z = 70 / (1 - 0.3 * x + 0.2 * y)  # ray (x, y, 1) z on the plane
+    assert np.allclose(hits[..., 2], z, rtol=2e-5)  # float32 screen coordinates
+    assert np.allclose(hits[..., 0], (x * z - a[0, 0]) / (a[0, -1] - a[0, 0]), atol=1e-4)
+    assert np.allclose(hits[..., 1], (y * z - b[0, 0]) / (b[-1, 0] - b[0, 0]), atol=1e-4)
+    want = np.array([0.3, -0.2, -1]) / np.linalg.norm([0.3, -0.2, -1])
+    assert np.allclose(vertex_normals(vertices), want, atol=1e-6)
+
+
+def test_nearest_surface_wins_and_gaps_stay_far():
+    # A mesh that runs to the right at z = 60 and folds back to the left at z = 50: the near sheet hides the far one.
+    x = np.array([-10.0, 10.0, 10.0, -5.0])
+    z = np.array([60.0, 60.0, 50.0, 50.0])
+    vertices = np.stack([np.stack([x, np.full(4, y), z], -1) for y in (-10.0, 10.0)])
+    for mesh in (vertices, vertices[:, ::-1]):  # whichever sheet is drawn first
+        hits = rasterize(mesh, 60.0, (20.0, 20.0), 40, 40)
+        assert np.allclose(hits[20, 16:30, 2], 50) and np.allclose(hits[20, 11:13, 2], 60)
+        assert hits[20, 2, 2] == FAR and hits[2, 20, 2] == FAR
+
+
+def test_a_point_is_visible_unless_out_of_frame_buried_or_under_a_tool():
+    cfg = PhantomConfig(width=96, height=80)
+    z, tool = np.full((80, 96), 60, np.float32), np.zeros((80, 96), bool)
+    tool[:, 60:] = True
+    points = np.array([[0, 0, 60.0], [0, 0, 63.0], [-60, 0, 60.0], [20, 0, 60.0]])
+    assert visible_points(points, z, tool, cfg).tolist() == [True, False, False, False]
+
+
+def test_tool_depth_closed_form():
+    # A shaft across the view: every point seen on it lies one radius (3.25 mm) from its axis.
+    pose = ToolPose(np.array([-80.0, 0.0, 60.0]), np.array([20.0, 0.0, 60.0]), 0.2, 0.0)
+    tool = pack_tool(pose, (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)).astype(float)
+    wrist, back = tool[3:6], tool[6:9]
+    eye = np.zeros(3, np.float32)
+    color, depth = draw_tools((pose, pose), np.full((80, 96), 90, np.float32), eye, 80.0, (48.0, 40.5))
+    y, x = np.nonzero(depth < FAR)
+    points = np.stack([(x + 0.5 - 48) / 80, (y + 0.5 - 40.5) / 80, np.ones(len(x))], -1) * depth[y, x, None]
+    along = (points - wrist) @ back
+    radial = np.linalg.norm(points - wrist - along[:, None] * back, axis=-1)
+    assert (along > 13).sum() > 100
+    assert np.allclose(radial[along > 13], 3.25, atol=0.02)  # tracing stops 0.012 mm from the surface
+    assert radial.max() < 0.5 * JAW_MM and along.min() > -JAW_MM - 0.5
+    assert (depth[40] < FAR).sum() > 60 and depth[0, 0] == FAR
+    assert (color[depth < FAR] > 0).all() and np.isfinite(color).all() and (color[depth >= FAR] == 0).all()
+    _, hidden = draw_tools((pose, pose), np.full((80, 96), 50, np.float32), eye, 80.0, (48.0, 40.5))
+    assert (hidden == FAR).all()  # nearer tissue hides the tool
+
+
+def test_fractal_slow_loop_and_continuity():
+    x, y = np.array([[0.3, 1.3, 7.0]]), np.array([[0.6, -2.2, 3.0]])
+    one, two = fractal(x, y, 1, 5), fractal(x, y, 2, 5)
+    assert one[0, 2] == 0  # gradient noise vanishes on lattice points
+    assert np.allclose(fractal(x + 1e-4, y, 2, 5), two, atol=2e-3) and not np.allclose(one, fractal(x, y, 1, 6))
+    grid = np.meshgrid(np.linspace(0, 40, 200), np.linspace(0, 40, 200))
+    noise = fractal(*grid, 3, 9)
+    assert abs(noise.mean()) < 0.05 and 0.15 < noise.std() < 0.5
+    assert cells(*grid, 1).min() >= 0 and 0.1 < cells(*grid, 1).mean() < 0.6
+
+
+# --- sensor ---------------------------------------------------------------------------------------------------------
+
+
+def test_stereo_error_on_a_wall_closed_form():
+    cfg = PhantomConfig(depth_noise_px=0.16)
+    z = np.full((200, 640), 75, np.float32)
+    depth = stereo_depth(z, np.zeros((200, 640, 3), np.uint8), cfg, np.random.default_rng(0))
+    assert (depth > 0).all()
+    # sigma_z = z^2 / (f b) * sigma_d, plus the 1/16 px steps (1/sqrt(12) of a step); 15 % for the finite sample
+    want = 75**2 / (cfg.focal * cfg.baseline_mm) * np.hypot(0.16, 1 / 16 / np.sqrt(12))
+    assert depth.std() == pytest.approx(want, rel=0.15) and abs(np.median(depth) - 75) < 0.05
+
+
+def test_half_occluded_strip_lies_left_of_the_near_object():
+    cfg = PhantomConfig(depth_noise_px=0.0)
+    z = np.full((40, 640), 100, np.float32)
+    z[:, 300:400] = 50
+    depth = stereo_depth(z, np.zeros((40, 640, 3), np.uint8), cfg, np.random.default_rng(0))
+    gap = cfg.focal * cfg.baseline_mm * (1 / 50 - 1 / 100)  # px: how far the object shifts against the wall
+    missing = depth[20] == 0
+    assert missing[int(300 - gap) + 2 : 300].all() and not missing[: int(300 - gap) - 3].any()
+    assert not missing[404:].any() and not missing[302:398].any()
+
+
+def test_glints_have_no_depth():
+    picture = np.zeros((40, 640, 3), np.uint8)
+    picture[20, 100] = 255
+    depth = stereo_depth(np.full((40, 640), 75, np.float32), picture, PhantomConfig(), np.random.default_rng(0))
+    assert (depth == 0).sum() == 9 and depth[20, 100] == 0
+
+
+def test_tone_curve_rises_and_noise_keeps_the_level():
+    ramp = np.linspace(0, 3, 300, dtype=np.float32)[None, :, None].repeat(3, -1)
+    curve = develop(ramp, 1.0, np.ones((1, 300, 1), np.float32))[0, :, 0]
+    assert (np.diff(curve) >= 0).all() and curve[0] == 0 and curve[-1] > 250
+    flat = np.full((200, 200, 3), 127.0, np.float32)
+    noisy = expose(flat, 2.0, np.random.default_rng(0)).astype(float)
+    # rounding adds 1/12 to the variance; channels share part of their noise
+    assert abs(noisy.mean() - 127) < 0.05 and noisy.std() == pytest.approx(2.0, rel=0.15)
+    assert (expose(flat, 0.0, np.random.default_rng(0)) == 127).all()
