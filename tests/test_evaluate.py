@@ -88,6 +88,12 @@ def test_demo_leaves_what_it_promises(tmp_path, monkeypatch):
     monkeypatch.setattr(package, "write_phantom", small)
     monkeypatch.setattr("endoprior.cli.demo.preset", lambda name: quick)
     assert main(["demo", str(tmp_path / "demo"), "--frames", "10"]) == 0
-    for part in ("report.png", "run/video.mp4", "run/metrics.json", "run/scene.safetensors", "sequence/truth/tracks.npz"):
+    for part in (
+        "report.png",
+        "run/video.mp4",
+        "run/metrics.json",
+        "run/scene.safetensors",
+        "sequence/truth/tracks.npz",
+    ):
         assert (tmp_path / "demo" / part).stat().st_size > 0
     assert "track_error_mm" in json.loads((tmp_path / "demo" / "run" / "metrics.json").read_text())["scores"]

@@ -129,7 +129,7 @@ def test_resume_refuses_another_config_or_other_data(make_tiny_sequence, tmp_pat
     other = make_tiny_sequence("two", num_frames=9) if change == "data" else tmp_path / "one"
     if change == "seed":
         cfg = replace(cfg, seed=5)
-    with pytest.raises(InputError, match="checkpoint.safetensors"):
+    with pytest.raises(InputError, match=r"checkpoint\.safetensors"):
         train(load_sequence(other), cfg, tmp_path / "run", resume=True)
 
 
@@ -141,7 +141,7 @@ def test_a_used_folder_is_refused(tiny_sequence, tmp_path):
 
 def test_a_damaged_checkpoint_is_named(tiny_sequence, tmp_path):
     (tmp_path / "checkpoint.safetensors").write_bytes(b"\x10garbage")
-    with pytest.raises(InputError, match="checkpoint.safetensors"):
+    with pytest.raises(InputError, match=r"checkpoint\.safetensors"):
         train(load_sequence(tiny_sequence), tiny_config("basis", 1, 1), tmp_path, resume=True)
 
 

@@ -1,4 +1,4 @@
-"""Named arrays and a description in one safetensors file: whole, versioned, no pickle, equal bytes for equal content."""
+"""Named arrays and a description in one safetensors file: whole, versioned, no pickle, equal bytes if equal content."""
 
 from __future__ import annotations
 

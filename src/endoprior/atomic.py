@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from .checks import InputError
+
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
@@ -30,16 +32,39 @@ def whole_file(path: Path) -> Iterator[Path]:
 def whole_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling folder of `path`; rename it onto `path` on success, remove it on failure.
 
-    An empty folder at `path` is replaced; the caller has made sure that there is nothing else.
+    Raises:
+        InputError: `path` is in use, or no folder can be made there.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    temporary.mkdir()
+    refuse_occupied(path)
+    temporary = path.absolute().with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(
+            f"{path}: expected a place where a folder can be made; got {error.strerror}. Choose another."
+        ) from error
     try:
         yield temporary
+        refuse_occupied(path)
         os.replace(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def refuse_occupied(path: Path, otherwise: str = "") -> None:
+    """Raise InputError unless `path` does not exist yet or is an empty folder.
+
+    Args:
+        otherwise: what else the user could do, appended to the message.
+    """
+    if path.is_dir() and any(path.iterdir()):
+        found = "one with files in it"
+    elif not path.is_dir() and (path.exists() or path.is_symlink()):
+        found = "a file"
+    else:
+        return
+    raise InputError(f"{path}: expected a new or empty folder; got {found}. Choose another{otherwise}.")
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .atomic import whole_file, write_json
+from .atomic import refuse_occupied, whole_file, write_json
 from .checkpoint import load_checkpoint, save_checkpoint
 from .checks import InputError
 from .config_io import to_dict
@@ -33,13 +33,14 @@ def prepare_run_folder(out: Path, *, resume: bool) -> None:
     """Make sure `out` can take a run.
 
     Raises:
-        InputError: it is a file, or it holds something and `resume` is False.
+        InputError: it is a file, or it holds something and `resume` is False, or it cannot be made.
     """
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: expected a folder for the run; got a file. Choose another name.")
-    if not resume and out.is_dir() and any(out.iterdir()):
-        raise InputError(f"{out}: expected a new or empty folder; got files in it. Choose another, or add --resume.")
-    out.mkdir(parents=True, exist_ok=True)
+    if not (resume and out.is_dir()):
+        refuse_occupied(out, ", or add --resume to continue a run")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: expected a place for a folder; got {error.strerror}. Choose another.") from error
 
 
 def train_in_folder(

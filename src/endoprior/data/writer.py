@@ -6,8 +6,6 @@ Everything goes into a hidden folder beside the target, which takes the target's
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -17,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError
+from ..atomic import refuse_occupied, whole_folder
 
 TOOL_VALUE = 255
 """Value of tool pixels in `masks/`; tissue is 0."""
@@ -66,14 +64,8 @@ class SequenceWriter:
         self.out, self.meta, self.count = Path(out), meta, 0
         refuse_occupied(self.out)
         self._bounds: list[tuple[float, float]] = []
-        self._partial = self.out.absolute().parent / f".{self.out.name}.partial-{os.getpid()}"
-        try:
-            shutil.rmtree(self._partial, ignore_errors=True)
-            self._partial.mkdir(parents=True)
-        except OSError as error:
-            raise InputError(
-                f"`{self.out}`: expected a place for a folder; got {error.strerror}. Choose another folder."
-            ) from error
+        self._folder = whole_folder(self.out)
+        self._partial = self._folder.__enter__()
 
     def __enter__(self) -> SequenceWriter:
         return self
@@ -81,14 +73,13 @@ class SequenceWriter:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
-            shutil.rmtree(self._partial, ignore_errors=True)
-            return
-        try:
-            self._finish()
-        except BaseException:
-            shutil.rmtree(self._partial, ignore_errors=True)
-            raise
+        if kind is None:
+            try:
+                self._finish()
+            except BaseException as error:
+                self._folder.__exit__(type(error), error, error.__traceback__)
+                raise
+        self._folder.__exit__(kind, value, trace)
 
     def add(
         self,
@@ -158,7 +149,6 @@ class SequenceWriter:
         """Write what describes the whole sequence and give the folder its name."""
         if self.count == 0:
             raise ValueError("a sequence must have at least one frame; got none")
-        refuse_occupied(self.out)
         meta = self.meta
         poses = np.zeros((self.count, 17))
         # 3x5 per frame: camera-to-world [R | t] = identity, then (H, W, focal); row-major, then near and far.
@@ -182,14 +172,3 @@ class SequenceWriter:
             "note": meta.note,
         }
         self.write_json("sequence.json", described)
-        if self.out.is_dir():
-            self.out.rmdir()
-        self._partial.replace(self.out)
-
-
-def refuse_occupied(out: Path) -> None:
-    """Raise InputError unless `out` does not exist yet or is an empty folder."""
-    if out.is_dir() and any(out.iterdir()):
-        raise InputError(f"`{out}`: expected a new or empty folder; got one with files. Choose another or empty it.")
-    if not out.is_dir() and (out.exists() or out.is_symlink()):
-        raise InputError(f"`{out}`: expected a new or empty folder; got a file. Choose another name.")

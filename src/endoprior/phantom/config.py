@@ -30,7 +30,7 @@ class PhantomConfig:
     baseline_mm: float = 4.2
     """Distance between the eyes, mm, 0.5..10; also sets how the error of `depth/` grows with distance."""
     focal_per_width: float = 0.9
-    """Focal length divided by image width, 0.5..2."""
+    """Focal length divided by image width, 0.5..1.4."""
     principal_x: float | None = None
     """Principal point x, px; none means the image center."""
     principal_y: float | None = None
@@ -55,7 +55,7 @@ class PhantomConfig:
             ("height", 32, 4096),
             ("seed", 0, 2**31 - 1),
             ("baseline_mm", 0.5, 10),
-            ("focal_per_width", 0.5, 2),
+            ("focal_per_width", 0.5, 1.4),
             ("frames_per_second", 0.1, 1000),
             ("breathing_mm", 0, 8),
             ("pull_mm", 0, 15),

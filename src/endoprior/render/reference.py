@@ -24,7 +24,7 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
     order = order[seen.radii[order] > 0]
     alpha = _alpha(seen.means2d[order], seen.cov2d[order], splats.opacities[order], camera)
     alpha = alpha * _drawn(alpha)
-    behind = torch.cumprod(torch.cat([torch.ones_like(alpha[..., :1]), 1 - alpha], -1), -1)
+    behind = torch.cumprod(torch.cat([alpha.new_ones((*alpha.shape[:2], 1)), 1 - alpha], -1), -1)
     weights, transmittance = alpha * behind[..., :-1], behind[..., -1]
     z = seen.z if depth_grad_to_means else seen.z.detach()
     return RenderOutput(

@@ -1,6 +1,6 @@
 """The harmonics of `sh` and their gradients, one Gaussian at a time, for the CPU kernels.
 
-`values` and `slopes` are scratch rows that the caller owns, so that nothing is allocated per Gaussian.
+`values` and `v_values` are rows that the caller owns, so that nothing is allocated per Gaussian.
 """
 
 from __future__ import annotations

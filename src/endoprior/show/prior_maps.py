@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import whole_folder
-from ..checks import InputError
+from ..atomic import refuse_occupied, whole_folder
 from ..config import PriorConfig
 from ..data import Sequence, Split
 from ..priors import joint_texture_prior, salience, specular_likelihood
@@ -27,8 +26,7 @@ def write_prior_maps(sequence: Sequence, split: Split, cfg: PriorConfig, out: Pa
     Raises:
         InputError: `out` exists and is not empty.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out}: expected a new or empty folder; got one that is in use. Choose another.")
+    refuse_occupied(out)
     frames = sequence.frames(split)
     shown = set(np.linspace(0, len(frames) - 1, min(SHEET_FRAMES, len(frames))).astype(int).tolist())
     rows: list[NDArray[np.uint8]] = []

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -46,9 +47,9 @@ def write_report(scene: Scene, sequence: Sequence, run: Path, path: Path) -> Non
     per_frame = json.loads((run / "per_frame.json").read_text())
     log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     rows = _picture_rows(scene, sequence)
-    # Agg is named per figure: choosing a backend for the whole process would be the caller's affair.
+    # A canvas of its own: choosing a backend for the whole process would be the caller's affair.
     figure = Figure(figsize=(2.6 * len(rows[0]), 2.1 * len(rows) + 3.4), layout="constrained", dpi=110)
-    matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+    FigureCanvasAgg(figure)
     top, bottom = figure.subfigures(2, 1, height_ratios=[2.1 * len(rows), 3.4])
     axes = np.atleast_2d(top.subplots(len(rows), len(rows[0])))
     for row, cells in zip(axes, rows, strict=True):
@@ -87,7 +88,7 @@ def _picture_rows(scene: Scene, sequence: Sequence) -> list[list[tuple[str, NDAr
     return rows
 
 
-def _draw_loss(axis: matplotlib.axes.Axes, log: list[dict]) -> None:
+def _draw_loss(axis: Axes, log: list[dict]) -> None:
     axis.semilogy([sum(line["terms"].values()) for line in log], linewidth=0.6, color="tab:red")
     starts = [k for k in range(1, len(log)) if log[k]["stage"] != log[k - 1]["stage"]]
     for k in starts:
@@ -98,7 +99,7 @@ def _draw_loss(axis: matplotlib.axes.Axes, log: list[dict]) -> None:
         axis.legend(fontsize=7)
 
 
-def _draw_psnr(axis: matplotlib.axes.Axes, per_frame: list[dict]) -> None:
+def _draw_psnr(axis: Axes, per_frame: list[dict]) -> None:
     points = [(row["index"], row["psnr_tissue"]) for row in per_frame if "psnr_tissue" in row]
     if points:
         axis.plot(*zip(*points, strict=True), "o-", color="tab:blue", markersize=4)
@@ -107,7 +108,7 @@ def _draw_psnr(axis: matplotlib.axes.Axes, per_frame: list[dict]) -> None:
     axis.grid(alpha=0.3)
 
 
-def _draw_scores(axis: matplotlib.axes.Axes, metrics: dict) -> None:
+def _draw_scores(axis: Axes, metrics: dict) -> None:
     scores = metrics["scores"]
     lines = [f"{text:<30}{scores[name]:>10.4g}" for name, text in SHOWN_SCORES.items() if name in scores]
     axis.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=axis.transAxes)

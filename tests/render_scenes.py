@@ -1,0 +1,104 @@
+"""Small random scenes for the renderer's tests, in float32 numbers so that every backend gets the same input."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from endoprior import render
+from endoprior.types import Camera, RenderOutput, Splats
+
+NAMES = tuple(field.name for field in fields(Splats))
+
+
+def camera(width: int = 50, height: int = 37, seed: int | None = 0) -> Camera:
+    """A camera with unequal focal lengths and an off-centre principal point; seed None: at the origin, unrotated."""
+    pose = np.eye(4)
+    if seed is not None:
+        rng = np.random.default_rng(seed)
+        pose[:3, :3] = Rotation.from_rotvec(rng.normal(size=3) * 0.5).as_matrix()
+        pose[:3, 3] = rng.normal(size=3) * 5
+    return Camera(width, height, 1.1 * width, 1.3 * width, 0.45 * width, 0.6 * height, pose)
+
+
+def splats(
+    view: Camera, num: int = 60, degree: int = 3, seed: int = 0, widths: tuple[float, float] = (0.2, 4.0)
+) -> Splats:
+    """Gaussians at 30-60 mm over and around the image; standard deviations in `widths`, px, each axis on its own."""
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(30, 60, num)
+    x = (rng.uniform(-0.3, 1.3, num) * view.width - view.cx) / view.fx * z
+    y = (rng.uniform(-0.3, 1.3, num) * view.height - view.cy) / view.fy * z
+    to_world = np.linalg.inv(view.world_to_camera)
+    scales = np.exp(rng.uniform(*np.log(widths), (num, 3))) * (z / view.fx)[:, None]
+    values = (
+        np.stack([x, y, z], -1) @ to_world[:3, :3].T + to_world[:3, 3],
+        rng.normal(size=(num, 4)) * 2,
+        scales,
+        rng.uniform(0.01, 0.999, num),
+        rng.normal(size=(num, (degree + 1) ** 2, 3)) * 0.3,
+    )
+    return Splats(*(torch.tensor(v, dtype=torch.float32) for v in values))
+
+
+def one(view: Camera, x: float, y: float, z: float, **changes: Tensor) -> Splats:
+    """A round gray Gaussian of opacity 0.6 and 1 px whose centre projects to (x, y); the camera must be unrotated."""
+    assert np.array_equal(view.world_to_camera, np.eye(4))
+    values = {
+        "means": torch.tensor([[(x - view.cx) / view.fx * z, (y - view.cy) / view.fy * z, z]]),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "scales": torch.full((1, 3), z / view.fx),
+        "opacities": torch.tensor([0.6]),
+        "sh": torch.zeros(1, 1, 3),
+    }
+    return Splats(**(values | changes))
+
+
+def cast(scene: Splats, dtype: torch.dtype) -> Splats:
+    """The same numbers as fresh leaves that require gradients."""
+    return Splats(*(getattr(scene, name).detach().to(dtype).clone().requires_grad_() for name in NAMES))
+
+
+def pick(scene: Splats, rows: Tensor) -> Splats:
+    """Some of the Gaussians, in that order."""
+    return Splats(*(getattr(scene, name)[rows] for name in NAMES))
+
+
+def poison(scene: Splats, name: str, row: int, value: float) -> Splats:
+    """A copy in which all numbers of one field of one Gaussian are `value`."""
+    changed = getattr(scene, name).clone()
+    changed[row] = value
+    return replace(scene, **{name: changed})
+
+
+def draw(
+    backend: str,
+    scene: Splats,
+    view: Camera,
+    *,
+    background: tuple[float, float, float] = (0.1, 0.2, 0.3),
+    depth_grad_to_means: bool = True,
+    dtype: torch.dtype | None = None,
+    seed: int = 0,
+) -> tuple[RenderOutput, dict[str, Tensor]]:
+    """Draw, and pull seeded random cotangents of colour, depth and alpha back to every input.
+
+    Returns:
+        the picture, and the gradients by name, those of `means2d` and `background` among them. float64 for the
+        reference unless `dtype` says otherwise.
+    """
+    dtype = dtype or (torch.float64 if backend == "reference" else torch.float32)
+    scene, behind = cast(scene, dtype), torch.tensor(background, dtype=dtype, requires_grad=True)
+    out = render.load(backend)(scene, view, background=behind, depth_grad_to_means=depth_grad_to_means)
+    out.means2d.retain_grad()
+    generator = torch.Generator().manual_seed(seed)
+    pulled = 0
+    for image in (out.color, out.depth, out.alpha):
+        pulled = pulled + (torch.randn(image.shape, generator=generator).to(dtype) * image).sum()
+    pulled.backward()
+    grads = {name: getattr(scene, name).grad for name in NAMES}
+    return out, grads | {"means2d": out.means2d.grad, "background": behind.grad}

@@ -1,0 +1,243 @@
+"""The CPU backend on its own: central differences, determinism, invariance, poison, and what its tiles may skip."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+import torch
+from numba import njit
+from render_scenes import NAMES, camera, draw, one, pick, poison, splats
+from scipy.spatial.transform import Rotation
+
+from endoprior.render import constants, simd, tiles
+from endoprior.render.cpu import rasterize
+from endoprior.render.pixel_kernels import draw as draw_lanes
+from endoprior.types import Splats
+
+BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
+
+
+def same_bits(first, second):
+    """Whether two draws are identical, gradients included."""
+    images = all(torch.equal(getattr(first[0], n), getattr(second[0], n)) for n in ("color", "alpha", "depth", "radii"))
+    return images and all(torch.equal(first[1][n], second[1][n]) for n in first[1])
+
+
+def test_same_bits_for_any_number_of_threads():
+    view = camera(100, 90)
+    scene = splats(view, 400, widths=(0.5, 20.0))
+    threads = numba.get_num_threads()
+    drawn = []
+    try:
+        for count in (1, threads, 1, threads):
+            numba.set_num_threads(count)
+            drawn.append(draw("cpu", scene, view))
+    finally:
+        numba.set_num_threads(threads)
+    assert all(same_bits(drawn[0], other) for other in drawn[1:])
+
+
+def test_order_of_the_list_does_not_matter():
+    """Depths differ, so the sort undoes any permutation: the very same bits."""
+    view = camera()
+    scene = splats(view)
+    order = torch.randperm(60, generator=torch.Generator().manual_seed(1))
+    want, want_grads = draw("cpu", scene, view)
+    got, grads = draw("cpu", pick(scene, order), view)
+    assert torch.equal(got.color, want.color) and torch.equal(got.depth, want.depth)
+    assert all(torch.equal(grads[name], want_grads[name][order]) for name in NAMES)
+
+
+def test_ties_in_depth_keep_their_order():
+    view = camera(seed=None)
+    layers = [one(view, 20.5, 10.5, 40.0, sh=torch.full((1, 1, 3), value)) for value in (1.0, -1.0)]
+    for first, second in (layers, layers[::-1]):
+        both = Splats(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in NAMES))
+        color = rasterize(both, view, background=torch.zeros(3)).color[10, 20, 0]
+        bright = 0.5 + 0.28209479 * float(first.sh[0, 0, 0])
+        assert abs(color - (0.6 * bright + 0.24 * (1 - bright))) < 1e-6
+
+
+def test_moving_scene_and_camera_together_changes_nothing():
+    """Degree 0: colour does not turn with the world. World coordinates round in float32, about 1e-6 of 60 mm."""
+    view = camera()
+    scene = splats(view, degree=0)
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.2])
+    shift = np.array([4.0, -7.0, 2.0])
+    w, x, y, z = np.roll(turn.as_quat(), 1)
+    left_multiply = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]).float()
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = turn.as_matrix(), shift
+    moved = replace(
+        scene,
+        means=scene.means @ torch.tensor(turn.as_matrix().T).float() + torch.tensor(shift).float(),
+        quats=scene.quats @ left_multiply.T,
+    )
+    want = rasterize(scene, view, background=BACKGROUND)
+    there = replace(view, world_to_camera=view.world_to_camera @ np.linalg.inv(motion))
+    got = rasterize(moved, there, background=BACKGROUND)
+    assert (got.color - want.color).abs().max() < 1e-4  # 1e-5 px of displacement at slopes of up to 1 per px
+
+
+def test_central_differences():
+    """Directional derivatives, away from every cutoff: see `test_gradcheck` of the reference for why it is away."""
+    view = camera(20, 16)
+    scene = splats(view, 5, widths=(12.0, 20.0))  # weak colours stay above the cutoff at 0
+    scene = replace(scene, opacities=torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5]), sh=0.2 * scene.sh)
+    _, grads = draw("cpu", scene, view)
+    generator = torch.Generator().manual_seed(0)
+    weights = [torch.randn(s, generator=generator).double() for s in ((16, 20, 3), (16, 20), (16, 20))]
+    steps = {"means": 0.05, "quats": 0.02, "scales": 0.02, "opacities": 0.01, "sh": 0.05}
+
+    def loss(moved):
+        out = rasterize(moved, view, background=BACKGROUND)
+        return sum((w * v.double()).sum() for w, v in zip(weights, (out.color, out.depth, out.alpha), strict=True))
+
+    for name, step in steps.items():
+        value = getattr(scene, name)
+        direction = torch.randn(value.shape, generator=generator)
+        ends = [loss(replace(scene, **{name: value + sign * step * direction})) for sign in (1, -1)]
+        slope = float((ends[0] - ends[1]) / (2 * step))
+        want = float((grads[name].double() * direction).sum())
+        # float32 rounding of a sum near 1e3 over the step, and the third derivative times step^2
+        assert slope == pytest.approx(want, rel=5e-3, abs=2e-2), name
+
+
+POISON = [(name, value) for name in NAMES for value in (float("nan"), float("inf"), -float("inf"))]
+POISON += [(name, 1e38) for name in ("means", "quats", "scales")]  # finite, but their squares are not
+
+
+@pytest.mark.parametrize("name, value", POISON)
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_poison_is_culled(backend, name, value):
+    """The poisoned Gaussian is as if it were not there, and gets finite gradients: zeros where it is culled."""
+    view = camera(24, 20)
+    scene = splats(view, 12)
+    out, grads = draw(backend, poison(scene, name, 5, value), view, dtype=torch.float32)
+    assert all(torch.isfinite(image).all() for image in (out.color, out.alpha, out.depth, out.means2d))
+    assert all(torch.isfinite(grad).all() for grad in grads.values())
+    if not np.isfinite(value):
+        without, _ = draw(
+            backend, pick(scene, torch.tensor([i for i in range(12) if i != 5])), view, dtype=torch.float32
+        )
+        assert out.radii[5] == 0
+        assert torch.equal(out.color, without.color)
+        assert all((grads[field][5] == 0).all() for field in NAMES)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_zero_quaternion_behind_and_tiny_are_culled_or_finite(backend):
+    view = camera(24, 20, seed=None)
+    scene = splats(view, 6)
+    scene.quats[0] = 0
+    scene.means[1, 2] = -40
+    scene.means[2, 2] = 0.99 * constants.NEAR_Z
+    scene.scales[3] = 1e-30
+    scene.opacities[4] = 1e-3
+    out, grads = draw(backend, scene, view, dtype=torch.float32)
+    assert (out.radii[[0, 1, 2, 4]] == 0).all()
+    assert torch.isfinite(out.color).all() and all(torch.isfinite(grad).all() for grad in grads.values())
+
+
+def test_huge_gaussians_cover_everything():
+    """A standard deviation of 10,000 px: alpha is the opacity at every pixel."""
+    view = camera(seed=None)
+    scene = one(view, 20.5, 10.5, 40.0, scales=torch.full((1, 3), 1e4 * 40 / view.fx))
+    out = rasterize(scene, view, background=BACKGROUND)
+    assert torch.allclose(out.alpha, torch.tensor(0.6), atol=1e-4)  # 50 px are 0.005 sigma
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_empty_scene_is_background(backend):
+    view = camera(9, 7)
+    nothing = Splats(*(torch.zeros(shape) for shape in [(0, 3), (0, 4), (0, 3), (0,), (0, 4, 3)]))
+    out, grads = draw(backend, nothing, view, dtype=torch.float32)
+    assert torch.equal(out.color, BACKGROUND.expand(7, 9, 3))
+    assert out.alpha.sum() == 0 and out.depth.sum() == 0 and len(out.radii) == 0
+    assert grads["means"].shape == (0, 3)
+
+
+def test_other_types_are_refused():
+    view = camera()
+    scene = splats(view, 2)
+    doubled = Splats(*(getattr(scene, name).double() for name in NAMES))
+    with pytest.raises(ValueError, match=r"float32 on the cpu; got torch\.float64"):
+        rasterize(doubled, view, background=BACKGROUND.double())
+
+
+def test_inputs_may_be_strided():
+    view = camera()
+    scene = splats(view)
+    strided = Splats(*(getattr(scene, name).mT.contiguous().mT if name in ("means", "quats", "scales", "sh")
+                       else getattr(scene, name) for name in NAMES))  # fmt: skip
+    assert not strided.means.is_contiguous()
+    assert same_bits(draw("cpu", scene, view), draw("cpu", strided, view))
+
+
+def test_a_picture_needs_no_gradient():
+    view = camera()
+    with torch.no_grad():
+        out = rasterize(splats(view), view, background=BACKGROUND)
+    assert not out.color.requires_grad
+
+
+def test_tiles_skip_only_what_is_not_drawn():
+    """Slow loop: every pixel whose alpha reaches ALPHA_MIN lies in the listed rows of its strip, for every Gaussian.
+
+    And not much more is listed: on average at most two rows per strip beyond the drawn ones.
+    """
+    rng = np.random.default_rng(0)
+    width, height, num = 75, 70, 120
+    centers = rng.uniform(-20, 95, (num, 2)).astype(np.float32)
+    a = np.exp(rng.uniform(-5, 1, num))
+    k, m = rng.normal(size=num) * 2, np.exp(rng.uniform(-7, 1, num))
+    row_forms = np.stack([a, k, m], -1).astype(np.float32)
+    opacities = rng.uniform(0.005, 0.99, num).astype(np.float32)
+    z, colors = rng.uniform(1, 2, num).astype(np.float32), np.zeros((num, 3), np.float32)
+    work = tiles.build(centers, row_forms, z, colors, opacities, np.ones(num, np.int32), width, height)
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    tiles_x = -(-width // tiles.TILE_WIDTH)
+    listed = np.zeros((num, height, width), bool)
+    for tile in range(len(work.tile_starts) - 1):
+        pairs = work.pairs[work.tile_starts[tile] : work.tile_starts[tile + 1]]
+        assert (np.diff(z[pairs[:, tiles.ID]]) > 0).all()
+        for pair in pairs:
+            for strip in range(tiles.STRIPS):
+                first, end = pair[tiles.FIRST_ROWS + 2 * strip : tiles.FIRST_ROWS + 2 * strip + 2]
+                top = tile // tiles_x * tiles.TILE_HEIGHT
+                left = tile % tiles_x * tiles.TILE_WIDTH + strip * simd.LANES
+                listed[pair[tiles.ID], top + first : top + max(end, first), left : left + simd.LANES] = True
+    extra = 0
+    for g in range(num):
+        u = x - centers[g, 0] + k[g] * (y - centers[g, 1])
+        alpha = opacities[g] * np.exp(-0.5 * (a[g] * u**2 + m[g] * (y - centers[g, 1]) ** 2))
+        drawn = alpha >= constants.ALPHA_MIN
+        assert not (drawn & ~listed[g]).any()
+        strips = [slice(s, s + simd.LANES) for s in range(0, width, simd.LANES)]
+        extra += sum(int((listed[g][:, s].any(1) & ~drawn[:, s].any(1)).sum()) for s in strips)
+    num_strips = sum((listed[:, :, s : s + simd.LANES].any((1, 2))).sum() for s in range(0, width, simd.LANES))
+    assert extra <= 2 * num_strips
+    slots = np.sort(work.pairs[:, tiles.SLOT])
+    assert np.array_equal(slots, np.arange(len(slots))) and work.slot_starts[-1] == len(slots)
+
+
+@njit
+def _alphas(exponents, out):
+    for i in range(0, exponents.size, simd.LANES):
+        alpha, _, _ = draw_lanes(simd.load(exponents, i), simd.splat(np.float32(1.0)))
+        simd.store(out, i, alpha)
+
+
+def test_alpha_is_a_power_of_two_to_one_part_in_a_million():
+    exponents = np.linspace(np.log2(1 / 255), 0.0, 4096).astype(np.float32)[8:]
+    exponents = exponents[: exponents.size // simd.LANES * simd.LANES]
+    out = np.empty_like(exponents)
+    _alphas(exponents, out)
+    want = np.minimum(2.0 ** exponents.astype(np.float64), np.float32(constants.ALPHA_MAX))
+    assert np.abs(out / want - 1).max() < 5e-7
+    outside = np.array([-8.0, -130.0, -1e30, -np.inf] * (simd.LANES // 4), np.float32)
+    _alphas(outside, out[: simd.LANES])
+    assert (out[: simd.LANES] == 0).all()

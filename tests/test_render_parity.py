@@ -1,0 +1,116 @@
+"""Every fast backend against the reference: picture and gradients, with the same cotangents."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+import torch
+from render_scenes import camera, draw, splats
+
+from endoprior import render
+
+FAST = [name for name in get_args(render.Backend) if name != "reference"]
+
+
+def test_a_fast_backend_is_under_test():
+    assert FAST, "nothing to compare with the reference"
+
+
+def agree(got, want, relative, name):
+    """Largest difference, in units of the largest value."""
+    scale = want.abs().max().clamp(min=1e-12)
+    gap = ((got.double() - want) / scale).abs().max()
+    assert gap <= relative, f"{name} differs by {gap:.1e} of its largest value"
+
+
+def compare(backend, scene, view, picture=2e-6, gradient=1e-5, **options):
+    """Picture, alpha and depth within a few float32 roundings per layer; gradients sum more of them."""
+    want, want_grads = draw("reference", scene, view, **options)
+    got, grads = draw(backend, scene, view, **options)
+    for name in ("color", "alpha", "depth"):
+        agree(getattr(got, name), getattr(want, name), picture, name)
+    drawn = want.radii > 0
+    agree(got.means2d[drawn], want.means2d[drawn], 1e-6, "means2d")
+    assert torch.equal(got.radii > 0, drawn)
+    assert (got.radii - want.radii).abs().max() <= 1  # ceil may fall on either side
+    for name, value in want_grads.items():
+        agree(grads[name], value, gradient, f"gradient of {name}")
+    return want, want_grads
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("depth_grad_to_means", [True, False])
+def test_agrees_with_reference(backend, degree, depth_grad_to_means):
+    """Rotated camera, off-centre principal point, every SH degree, many Gaussians outside the image."""
+    view = camera(seed=degree)
+    scene = splats(view, degree=degree, seed=degree)
+    want, grads = compare(backend, scene, view, depth_grad_to_means=depth_grad_to_means)
+    assert want.alpha.max() > 0.9 and (want.radii == 0).any()  # the scene is not trivial
+    assert all(value.abs().max() > 0 for value in grads.values())
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize("width, height", [(1, 1), (16, 32), (33, 31), (70, 65), (7, 100)])
+def test_agrees_at_any_size(backend, width, height):
+    """Images smaller than a tile, of exactly one, and not a multiple of one."""
+    view = camera(width, height, seed=1)
+    scene = splats(view, 40, degree=1, seed=2, widths=(0.5, 6.0))
+    compare(backend, scene, view)
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_agrees_on_needles_and_sheets(backend):
+    """Axes from 1/50 px to 30 px: the blur alone keeps them drawable.
+
+    The moments that make the gradient of a needle's shape cancel down from length^2 to width^2, here by up to
+    30^2 / 0.3 = 3000 float32 roundings.
+    """
+    view = camera(80, 60, seed=5)
+    scene = splats(view, 40, degree=0, seed=3, widths=(0.02, 30.0))
+    compare(backend, scene, view, picture=2e-5, gradient=5e-4)
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_agrees_where_pixels_fill_up(backend):
+    """Hundreds of opaque layers: ALPHA_MAX binds, pixels stop, tiles are left early.
+
+    Rounding of the transmittance can decide otherwise than float64 at a stop, hence the share that may differ.
+    """
+    view = camera(40, 40, seed=2)
+    scene = splats(view, 1500, degree=0, seed=4, widths=(1.0, 8.0))
+    want, want_grads = draw("reference", scene, view)
+    got, grads = draw(backend, scene, view)
+    assert (want.alpha > 0.9).all() and want.alpha.max() > 0.9995
+    off = ((got.color - want.color).abs().max(-1).values > 1e-5).float().mean()
+    assert off < 0.005, f"{off:.2%} of pixels differ"
+    for name in ("sh", "opacities", "means2d"):
+        gap = (grads[name] - want_grads[name]).norm() / want_grads[name].norm()
+        assert gap < 1e-3, f"gradient of {name} differs by {gap:.1e}"
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_gradient_is_orthogonal_to_the_length_of_a_quaternion(backend):
+    view = camera()
+    scene = splats(view)
+    _, grads = draw(backend, scene, view)
+    along = (grads["quats"] * scene.quats).sum(-1) / scene.quats.norm(dim=-1)
+    assert along.abs().max() <= 1e-5 * grads["quats"].norm(dim=-1).max()  # float32 rounding of a dot product
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_gradients_reach_only_what_is_asked(backend):
+    """A loss on alpha alone, with most inputs frozen."""
+    view = camera()
+    scene = splats(view)
+    results = {}
+    for name, dtype in (("reference", torch.float64), (backend, torch.float32)):
+        opacities = scene.opacities.to(dtype).requires_grad_()
+        values = [value.to(dtype) for value in (scene.means, scene.quats, scene.scales)]
+        drawn = render.load(name)(
+            type(scene)(*values, opacities, scene.sh.to(dtype)), view, background=torch.zeros(3, dtype=dtype)
+        )
+        drawn.alpha.sum().backward()
+        results[name] = opacities.grad
+    agree(results[backend], results["reference"], 1e-5, "gradient of opacities")
