@@ -42,7 +42,7 @@ def gaussians(num, cfg=None, seed=0):
 @pytest.mark.parametrize("c", [0.0, 0.3, 1.0])
 def test_a_constant_prior_gives_that_score_to_every_observed_gaussian(c):
     stats = DensityStats.zeros(3)
-    prior, mask = torch.full((20, 30), c), torch.ones(20, 30)
+    prior, mask = torch.full((20, 30), c), torch.ones(20, 30, dtype=torch.bool)
     for _ in range(5):
         stats.add_score(output([[3, 4], [29.9, 0.1], [15, 10]]), prior, mask, torch.full((3,), 0.4))
     # epsilon 1e-6 in the denominator of Eq. (7)
@@ -53,13 +53,13 @@ def test_a_constant_prior_gives_that_score_to_every_observed_gaussian(c):
 def test_score_samples_a_ramp_at_the_projected_centre():
     ramp = (torch.arange(30) + 0.5).expand(20, 30) / 30  # value x / 30 at x px
     stats = DensityStats.zeros(2)
-    stats.add_score(output([[7.25, 3.0], [20.5, 12.0]]), ramp.contiguous(), torch.ones(20, 30), torch.ones(2))
+    stats.add_score(output([[7.25, 3.0], [20.5, 12.0]]), ramp.contiguous(), torch.ones(20, 30, dtype=torch.bool), torch.ones(2))
     assert stats.score(0.0).tolist() == pytest.approx([7.25 / 30, 20.5 / 30], abs=1e-5)
 
 
 def test_projections_off_the_image_off_tissue_or_undrawn_do_not_count():
-    mask = torch.ones(20, 30)
-    mask[:, :10] = 0
+    mask = torch.ones(20, 30, dtype=torch.bool)
+    mask[:, :10] = False
     stats = DensityStats.zeros(5)
     where = [[-1, 5], [15, 25], [4, 4], [20, 10], [20, 10]]
     stats.add_score(output(where, [1, 1, 1, 0, 1]), torch.ones(20, 30), mask, torch.ones(5))

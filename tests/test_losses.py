@@ -15,8 +15,8 @@ def scene(seed: int, height: int = 13, width: int = 17):
     depth[torch.rand(height, width, generator=g) < 0.1] = 0
     target_u8 = torch.randint(0, 256, (height, width, 3), generator=g, dtype=torch.uint8)
     target_inverse = 1 / (torch.rand(height, width, generator=g) * 60 + 40)
-    tissue = (torch.rand(height, width, generator=g) < 0.8).float()
-    measured = tissue * (torch.rand(height, width, generator=g) < 0.9)
+    tissue = (torch.rand(height, width, generator=g) < 0.8)
+    measured = tissue & (torch.rand(height, width, generator=g) < 0.9)
     return color, depth, target_u8, target_inverse, tissue, measured
 
 
@@ -32,8 +32,8 @@ def definition(color, depth, target_u8, target_inverse, tissue, measured, weight
 
 
 def test_color_l1_of_a_constant_offset_is_the_offset():
-    target, mask = torch.rand(5, 6, 3), torch.ones(5, 6)
-    mask[0] = 0
+    target, mask = torch.rand(5, 6, 3), torch.ones(5, 6, dtype=torch.bool)
+    mask[0] = False
     color = target + 0.25
     color[0] = 9  # not tissue: must not count
     assert losses.color_l1(color, target, mask).item() == pytest.approx(0.25, abs=1e-6)
@@ -48,9 +48,9 @@ def test_inverse_depth_keeps_zero_where_nothing_is_drawn():
 
 
 def test_depth_term_is_zero_with_too_few_pixels():
-    ones = torch.ones(3, 3)
-    assert losses.inverse_depth_l1(ones, 2 * ones, ones, min_pixels=10).item() == 0
-    assert losses.inverse_depth_l1(ones, 2 * ones, ones, min_pixels=9).item() == 1
+    ones, measured = torch.ones(3, 3), torch.ones(3, 3, dtype=torch.bool)
+    assert losses.inverse_depth_l1(ones, 2 * ones, measured, min_pixels=10).item() == 0
+    assert losses.inverse_depth_l1(ones, 2 * ones, measured, min_pixels=9).item() == 1
 
 
 def test_total_variation_of_a_step():
@@ -97,7 +97,7 @@ def test_fused_terms_refuse_to_be_scaled():
 def test_fused_terms_of_a_frame_without_tissue_are_finite():
     color, depth, target, inverse, tissue, measured = scene(1)
     nothing = torch.zeros_like(tissue)
-    terms = supervised_losses(color, depth, target, inverse, nothing, nothing * measured, (1.0, 1.0, 0.0))
+    terms = supervised_losses(color, depth, target, inverse, nothing, nothing & measured, (1.0, 1.0, 0.0))
     assert terms.tolist() == [0, 0, 0]
 
 

@@ -63,10 +63,10 @@ class DensityStats:
         """Sample rho where the drawn centres fall on tissue: s_it and m_it of Eq. (7).
 
         Args:
-            prior: (H, W) rho in [0, 1]. tissue_mask: (H, W) float, 1 on tissue. opacities: (N,) canonical.
+            prior: (H, W) rho in [0, 1]. tissue_mask: (H, W) bool, True on tissue. opacities: (N,) canonical.
             scale: pixels of `prior` per pixel of the rendering.
         """
-        maps = torch.stack([prior, tissue_mask])[None]
+        maps = torch.stack([prior, tissue_mask.float()])[None]
         means2d = out.means2d.detach() * scale
         sampled = _bilinear(maps, means2d)
         valid = valid_projection(means2d, out.radii, sampled[1], prior.shape)
@@ -90,7 +90,7 @@ def valid_projection(means2d: Tensor, radii: Tensor, mask_value: Tensor, shape: 
 
 def sample_mask(tissue_mask: Tensor, means2d: Tensor) -> Tensor:
     """(N,) mask value, bilinear, at projected centres in px."""
-    return _bilinear(tissue_mask[None, None], means2d.detach())[0]
+    return _bilinear(tissue_mask[None, None].float(), means2d.detach())[0]
 
 
 def _bilinear(maps: Tensor, means2d: Tensor) -> Tensor:

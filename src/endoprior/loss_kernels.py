@@ -32,7 +32,7 @@ def supervised_losses(
     Args:
         color: (H, W, 3) float32. depth: (H, W) float32 mm, 0 where nothing is drawn.
         target_u8: (H, W, 3) uint8. target_inverse: (H, W) 1 / mm.
-        tissue_mask, measured: (H, W) float32, 1 where colour, respectively depth, is compared.
+        tissue_mask, measured: (H, W) bool, True where colour, respectively depth, is compared.
         weights: factors of the three terms; the depth term is 0 where its factor is.
     Returns:
         (3,) the weighted terms.
@@ -101,7 +101,7 @@ def _rows(color, depth, target_u8, target_inverse, tissue_mask, measured, invers
         up, down = max(y - 1, 0), min(y + 1, height - 1)
         for x in range(width):
             left, right = max(x - 1, 0), min(x + 1, width - 1)
-            tissue = tissue_mask[y, x]
+            tissue, known = np.float32(tissue_mask[y, x]), np.float32(measured[y, x])
             for k in range(3):
                 c = color[y, x, k]
                 e = c - np.float32(target_u8[y, x, k]) * scale
@@ -112,9 +112,9 @@ def _rows(color, depth, target_u8, target_inverse, tissue_mask, measured, invers
                 v_color[y, x, k] = f_color * tissue * _sign(e) + f_tv * pull
             q = inverse[y, x]
             e = q - target_inverse[y, x]
-            s_depth += measured[y, x] * abs(e)
+            s_depth += known * abs(e)
             to_right, to_down = inverse[y, right] - q, inverse[down, x] - q
             s_tvd += abs(to_right) + abs(to_down)
             pull = _sign(q - inverse[y, left]) + _sign(q - inverse[up, x]) - _sign(to_right) - _sign(to_down)
-            v_depth[y, x] = -q * q * (f_depth * measured[y, x] * _sign(e) + f_tvd * pull)
+            v_depth[y, x] = -q * q * (f_depth * known * _sign(e) + f_tvd * pull)
         sums[y, 0], sums[y, 1], sums[y, 2], sums[y, 3] = s_color, s_depth, s_tv, s_tvd

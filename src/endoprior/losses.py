@@ -13,7 +13,7 @@ def color_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
     """L_rgb: mean absolute colour difference over tissue pixels and channels.
 
     Args:
-        color, target: (H, W, 3). tissue_mask: (H, W) float, 1 on tissue.
+        color, target: (H, W, 3). tissue_mask: (H, W) bool, True on tissue.
     """
     count = (tissue_mask.sum() * color.shape[-1]).clamp(min=1)
     return ((color - target).abs() * tissue_mask[..., None]).sum() / count
@@ -29,7 +29,7 @@ def inverse_depth_l1(inverse: Tensor, target: Tensor, measured: Tensor, min_pixe
     """L_depth: mean absolute difference of inverse depths over measured tissue pixels, 1 / mm.
 
     Args:
-        inverse, target: (H, W) 1 / mm. measured: (H, W) float, 1 where tissue has a depth.
+        inverse, target: (H, W) 1 / mm. measured: (H, W) bool, True where tissue has a depth.
         min_pixels: with fewer measured pixels the loss is 0.
     """
     count = measured.sum()

@@ -26,11 +26,11 @@ class TrainingFrame:
     rgb_u8: Tensor
     """(H, W, 3) uint8."""
     tissue_mask: Tensor
-    """(H, W) float, 1 on tissue."""
+    """(H, W) bool, True on tissue."""
     inverse_depth: Tensor
     """(H, W) 1 / mm; 0 where there is no depth."""
     measured: Tensor
-    """(H, W) float, 1 where tissue has a depth."""
+    """(H, W) bool, True where tissue has a depth."""
 
     @property
     def rgb(self) -> Tensor:
@@ -66,7 +66,7 @@ class TrainingFrames:
         return None
 
     def prior(self, position: int) -> tuple[Tensor, Tensor]:
-        """rho (H, W) in [0, 1] and the tissue mask (H, W) as float, at full resolution."""
+        """rho (H, W) in [0, 1] and the tissue mask (H, W) bool, at full resolution."""
         if position not in self._priors:
             frame = self.sequence.frame(self.indices[position])
             self._priors[position] = torch.from_numpy(
@@ -83,9 +83,9 @@ def _training_frame(frame: Frame) -> TrainingFrame:
         time=frame.time,
         camera=frame.camera,
         rgb_u8=torch.from_numpy(frame.rgb_u8),
-        tissue_mask=torch.from_numpy(frame.tissue_mask.astype(np.float32)),
+        tissue_mask=torch.from_numpy(frame.tissue_mask),
         inverse_depth=torch.from_numpy(inverse),
-        measured=torch.from_numpy((frame.tissue_mask & frame.depth_valid).astype(np.float32)),
+        measured=torch.from_numpy(frame.tissue_mask & frame.depth_valid),
     )
 
 
