@@ -1,15 +1,17 @@
 """Time the CPU renderer, stage by stage, on a random scene; with `--yardstick PATH`, beside another compositing kernel.
 
-    python bench/bench_render.py [--gaussians 25000] [--size 640 512] [--repeats 25] [--yardstick compositing.py]
+    OMP_WAIT_POLICY=PASSIVE python bench/bench_render.py [--gaussians 25000] [--size 640 512] [--repeats 25] [--yardstick compositing.py]
 
 Prints medians in ms. The yardstick module is run alternately with ours in this process, on its own scene; it must have
-`scene(N, W, H)`, `forward`, `backward`, and the tables `PX`, `PY`.
+`scene(N, W, H)`, `forward`, `backward`, and the tables `PX`, `PY`. Without OMP_WAIT_POLICY=PASSIVE, torch's idle threads
+spin on the cores that Numba's threads need (each brings its own OpenMP), and everything takes up to three times as long.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
+import os
 import statistics
 import time
 from collections import defaultdict

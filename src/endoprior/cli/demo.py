@@ -5,6 +5,7 @@ from __future__ import annotations
 import time as clock
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -17,7 +18,7 @@ from .progress import say
 class Demo:
     """Everything once, on synthetic data: phantom sequence -> train -> eval -> render, with a report."""
 
-    out: tyro.conf.Positional[Path] = Path("demo")
+    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]] = Path("demo")
     """Folder for sequence/, run/, report.png; must be new or empty."""
     preset: PresetName = "default"
     """Config to train with."""

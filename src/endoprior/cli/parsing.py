@@ -29,7 +29,13 @@ def parse(cls: type[A], argv: list[str], command: str, default: A | None = None)
     except SystemExit as exit_:
         if exit_.code == 0:
             raise
-        text = " ".join(BOX_DRAWING.sub(" ", said.getvalue()).split())
-        raise InputError(f"{text} Try `endoprior {command} --help`.") from None
+        raise InputError(f"{_one_line(said.getvalue())}. Try `endoprior {command} --help`.") from None
     except ValueError as error:  # a range check of the config
         raise InputError(f"{error}. Try `endoprior {command} --help`.") from None
+
+
+def _one_line(page: str) -> str:
+    """What went wrong, out of tyro's framed page: without the frame, its title, and the closing advice."""
+    body = [BOX_DRAWING.sub(" ", line).strip() for line in page.splitlines() if not line.startswith("\u256d")]
+    text = " ".join(" ".join(body).split("For full helptext")[0].split())
+    return text.rstrip(". ")

@@ -17,7 +17,7 @@ from .progress import say
 class Phantom:
     """Write a synthetic surgical sequence with full ground truth."""
 
-    out: tyro.conf.Positional[Path]
+    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Sequence folder to write; must be new or empty."""
     config: Annotated[PhantomConfig, tyro.conf.arg(name="")] = field(default_factory=PhantomConfig)
 

@@ -17,9 +17,9 @@ from .progress import say
 class Prior:
     """Draw the cue maps and the joint texture prior of each frame: a PNG per map and a contact sheet."""
 
-    data: tyro.conf.Positional[Path]
+    data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
     """Sequence folder."""
-    out: tyro.conf.Positional[Path]
+    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for specular/, salience/, prior/ and contact_sheet.png."""
     split: Literal["train", "test", "video"] = "video"
     """Frames to draw."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 class Render:
     """Draw a trained scene: rgb/*.png, depth/*.npy (mm), side_by_side/*.png and an mp4."""
 
-    run: tyro.conf.Positional[Path]
+    run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder."""
-    out: tyro.conf.Positional[Path | None] = None
+    out: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="OUT")]] = None
     """Folder for the frames; RUN/renders if not given, and then the film is RUN/video.mp4."""
     split: Literal["video", "test", "train"] = "video"
     """Frames of the sequence to draw."""

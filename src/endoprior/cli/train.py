@@ -22,9 +22,9 @@ from .progress import say, training_progress
 class Train:
     """Train one scene and score it. Every option below --resume is a field of the config; the preset sets it."""
 
-    data: tyro.conf.Positional[Path]
+    data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
     """Sequence folder: images/, masks/, depth/, poses_bounds.npy."""
-    out: tyro.conf.Positional[Path]
+    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Run folder to write."""
     preset: PresetName = "default"
     """Where the config starts from."""

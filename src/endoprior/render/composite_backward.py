@@ -52,7 +52,8 @@ def _differentiate_pair(record, pair, left, top, state, moments):
             gain = weight * fma(red, v_red, fma(green, v_green, fma(blue, v_blue, z * v_z)))
             rest = load(state, place + 5 * LANES) - gain
             store(state, place + 5 * LANES, rest)
-            dp = where_ge(alpha, splat(LARGEST_ALPHA), zero, gain - rest * alpha / (one - alpha))
+            # rest alpha / (1 - alpha), as weight = T alpha and behind = T (1 - alpha)
+            dp = where_ge(alpha, splat(LARGEST_ALPHA), zero, gain - rest * weight / behind)
             dp_dy = dp * dy
             column_1 = column_1 + dp
             column_y = column_y + dp_dy
@@ -72,6 +73,28 @@ def _differentiate_pair(record, pair, left, top, state, moments):
 
 
 @njit(cache=True, error_model="numpy")
+def _read_tile(color, depth, transmittance, v_color, v_depth, v_alpha, left, top, state):
+    # Fills the planes of one tile.
+    height, width = depth.shape
+    state[:] = f4(-1.0)  # pixels outside the image are full
+    for strip in range(STRIPS):
+        x = left + strip * LANES
+        for r in range(min(TILE_HEIGHT, height - top)):
+            y, place = top + r, strip * STRIP_SIZE + r * ROW
+            for q in range(min(LANES, width - x)):
+                v_r, v_g, v_b, v_z = v_color[y, x + q, 0], v_color[y, x + q, 1], v_color[y, x + q, 2], v_depth[y, x + q]
+                picture = v_r * color[y, x + q, 0] + v_g * color[y, x + q, 1] + v_b * color[y, x + q, 2]
+                state[place + q] = f4(1.0)
+                state[place + LANES + q] = v_r
+                state[place + 2 * LANES + q] = v_g
+                state[place + 3 * LANES + q] = v_b
+                state[place + 4 * LANES + q] = v_z
+                state[place + 5 * LANES + q] = (
+                    picture + v_z * depth[y, x + q] - v_alpha[y, x + q] * transmittance[y, x + q]
+                )
+
+
+@njit(cache=True, error_model="numpy")
 def _differentiate_tile(records, pairs, needed, left, top, state, moments):
     # Writes the moments of one tile's pairs, near to far; zeros for those that the forward pass did not need.
     for p in range(needed):
@@ -87,24 +110,14 @@ def composite_backward(
     color, depth, transmittance, v_color, v_depth, v_alpha, moments,
 ):  # fmt: skip
     # One task per worker, as in the forward pass. Writes moments (P, MOMENTS), one row per slot.
-    height, width = depth.shape
+    width = depth.shape[1]
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     for worker in prange(workers):
-        state = np.zeros(STRIPS * STRIP_SIZE, f4)
+        state = np.empty(STRIPS * STRIP_SIZE, f4)
         for index in range(worker, by_cost.size, workers):
             tile = by_cost[index]
             top, left = tile // tiles_x * TILE_HEIGHT, tile % tiles_x * TILE_WIDTH
-            state[:] = f4(0.0)  # pixels outside the image stay full
-            for r in range(min(TILE_HEIGHT, height - top)):
-                for c in range(min(TILE_WIDTH, width - left)):
-                    y, x = top + r, left + c
-                    v_r, v_g, v_b, v_z = v_color[y, x, 0], v_color[y, x, 1], v_color[y, x, 2], v_depth[y, x]
-                    rest = v_r * color[y, x, 0] + v_g * color[y, x, 1] + v_b * color[y, x, 2] + v_z * depth[y, x]
-                    place = c // LANES * STRIP_SIZE + r * ROW + c % LANES
-                    state[place] = f4(1.0)
-                    state[place + LANES], state[place + 2 * LANES] = v_r, v_g
-                    state[place + 3 * LANES], state[place + 4 * LANES] = v_b, v_z
-                    state[place + 5 * LANES] = rest - v_alpha[y, x] * transmittance[y, x]
+            _read_tile(color, depth, transmittance, v_color, v_depth, v_alpha, left, top, state)
             start, end = tile_starts[tile], tile_starts[tile + 1]
             needed = tile_ends[tile] - start
             _differentiate_tile(records, pairs[start:end], needed, left, top, state, moments)

@@ -63,7 +63,7 @@ def _draw_pair(record, pair, left, top, state):
 @njit(cache=True, error_model="numpy")
 def _draw_tile(records, pairs, left, top, columns, rows, state):
     # Draws the pairs of one tile, near to far, and returns how many it needed before all pixels were full.
-    state[:] = f4(0.0)  # pixels outside the image stay full
+    state[:] = f4(0.0)  # pixels outside the image are full
     for r in range(rows):
         for c in range(columns):
             state[c // LANES * STRIP_SIZE + r * ROW + c % LANES] = f4(1.0)

@@ -32,11 +32,11 @@ def log2_alpha(base, root_k, m_log2, log2_opacity, dy):
 
 @njit(forceinline=True)
 def draw(exponent, transmittance):
-    """Alpha of the Gaussian at the pixels and its weight, both 0 where it is not drawn, and the transmittance behind
+    """Alpha of the Gaussian at the pixels, its weight, which is 0 where it is not drawn, and the transmittance behind
     it.
 
-    A negative transmittance marks a pixel that is full: its magnitude stays what it was and nothing more is drawn. All
-    are vectors.
+    A transmittance below STOP marks a pixel that is full: its magnitude stays what it was and nothing more is drawn.
+    All are vectors.
     """
     zero = splat(f4(0.0))
     whole = floor(exponent)
@@ -51,4 +51,4 @@ def draw(exponent, transmittance):
     behind = fma(-transmittance, alpha, transmittance)
     stop = splat(STOP)
     weight = where_ge(behind, stop, transmittance * alpha, zero)
-    return where_ge(behind, stop, alpha, zero), weight, where_ge(behind, stop, behind, -magnitude(transmittance))
+    return alpha, weight, where_ge(behind, stop, behind, -magnitude(transmittance))

@@ -80,8 +80,7 @@ def project_forward(
                 continue
             x = view[0, 0] * wx + view[0, 1] * wy + view[0, 2] * wz + view[0, 3]
             y = view[1, 0] * wx + view[1, 1] * wy + view[1, 2] * wz + view[1, 3]
-            if not _axes(view, quats[g], scales[g], axes) > 0.0:
-                continue
+            _axes(view, quats[g], scales[g], axes)
             _, _, b0, b1, b2, c0, c1, c2 = _spread(lens, x, y, z, axes)
             xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
             px, py = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
@@ -94,7 +93,7 @@ def project_forward(
                 red += values[i] * sh[g, i, 0]
                 green += values[i] * sh[g, i, 1]
                 blue += values[i] * sh[g, i, 2]
-            # One sum notices every NaN and infinity: all terms are >= 0 or unbounded only through them.
+            # One sum notices every NaN and infinity; a quaternion of length 0 gives NaN.
             size = abs(px) + abs(py) + z + xx * yy + abs(red) + abs(green) + abs(blue) + abs(opacities[g])
             if not size < OVERFLOW:
                 continue

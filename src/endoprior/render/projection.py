@@ -118,10 +118,10 @@ def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Te
 def _usable(splats: Splats, camera: Camera) -> Tensor:
     """(N,) True where the Gaussian is finite, in front of the camera, and stays finite when projected."""
     per_gaussian = [splats.means, splats.quats, splats.scales, splats.opacities[:, None], splats.sh.flatten(1)]
-    usable = torch.cat(per_gaussian, -1).isfinite().all(-1) & (splats.quats.norm(dim=-1) > 0)
+    usable = torch.cat(per_gaussian, -1).isfinite().all(-1)
     means2d, cov2d, z, colors = _project(splats, camera)
     largest = torch.cat([means2d, z[:, None], (cov2d[:, :1] * cov2d[:, 2:]), colors], -1).abs().sum(-1)
-    return usable & (z > NEAR_Z) & (largest < OVERFLOW)  # False for NaN
+    return usable & (z > NEAR_Z) & (largest < OVERFLOW)  # False for NaN, as a quaternion of length 0 gives
 
 
 def _placeholder(splats: Splats, camera: Camera) -> dict[str, Tensor]:

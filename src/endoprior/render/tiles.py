@@ -31,8 +31,12 @@ HALF_LOG2_E = np.float32(0.5 * log2(np.e))
 
 LOG2_ALPHA_MIN = log2(ALPHA_MIN)
 
+LAST = np.iinfo(np.int64).max
+
 # Columns of a pair.
 ID, SLOT, FIRST_ROWS = range(3)
+TILE = SLOT
+"""While pairs are still listed Gaussian by Gaussian."""
 PAIR_SIZE = FIRST_ROWS + 2 * STRIPS
 
 
@@ -63,30 +67,37 @@ def build(
     height: int,
 ) -> Tiles:
     """Sort the Gaussians with `radii` > 0 by z (ties by index) and list their tiles."""
-    records = np.empty((len(z), RECORD_SIZE), np.float32)
-    keys = np.empty(len(z), np.int64)
-    visible = _write_records(means2d, row_forms, z, z.view(np.int32), colors, opacities, radii, records, keys)
-    near_to_far = np.sort(keys[:visible]) & 0xFFFFFFFF
+    num, num_visible = len(z), np.count_nonzero(radii)
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
-    slot_starts = np.zeros(len(z) + 1, np.int64)
+    records, keys = np.empty((num, RECORD_SIZE), np.float32), np.empty(num, np.int64)
+    gaussians = (means2d, row_forms, z, z.view(np.int32), colors, opacities, radii)
+    _write_records(*gaussians, records, keys)
+    near_to_far = np.sort(keys)[:num_visible] & 0xFFFFFFFF
+
+    box_starts = np.zeros(num_visible + 1, np.int64)
+    _count_boxes(records, near_to_far, width, height, box_starts)
+    np.cumsum(box_starts, out=box_starts)
+    boxes = np.empty((box_starts[-1], PAIR_SIZE), np.int32)
+    slot_starts = np.zeros(num + 1, np.int64)
     counts = np.zeros((CHUNKS, tiles_x * tiles_y), np.int64)
     costs = np.zeros((CHUNKS, tiles_x * tiles_y), np.int64)
-    _count(records, near_to_far, width, height, tiles_x, slot_starts, counts, costs)
+    _list_pairs(records, near_to_far, width, height, tiles_x, box_starts, boxes, slot_starts, counts, costs)
+
     np.cumsum(slot_starts, out=slot_starts)
     tile_starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
     np.cumsum(counts.sum(0), out=tile_starts[1:])
     cursors = tile_starts[:-1] + np.cumsum(counts, 0) - counts
     pairs = np.empty((tile_starts[-1], PAIR_SIZE), np.int32)
-    _fill(records, near_to_far, width, height, tiles_x, slot_starts, cursors, pairs)
+    _sort_pairs(near_to_far, box_starts, boxes, slot_starts, cursors, pairs)
     return Tiles(records, pairs, tile_starts, slot_starts, np.argsort(-costs.sum(0), kind="stable"))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(parallel=True, cache=True, error_model="numpy")
 def _write_records(means2d, row_forms, z, z_bits, colors, opacities, radii, records, keys):
-    # One thread. Writes the record of each visible Gaussian and its sort key: the bits of z (monotone as z > 0), then
-    # id.
-    visible = 0
-    for g in range(z.size):
+    # One iteration per Gaussian. Writes its record, if it is visible, and its sort key: the bits of z (monotone, as z
+    # is > 0), then its index; invisible ones come last.
+    for g in prange(z.size):
+        keys[g] = LAST
         if radii[g] > 0:
             records[g, X], records[g, Y] = means2d[g, 0], means2d[g, 1]
             records[g, ROOT] = np.sqrt(row_forms[g, 0] * HALF_LOG2_E)
@@ -95,47 +106,65 @@ def _write_records(means2d, row_forms, z, z_bits, colors, opacities, radii, reco
             records[g, LOG2_OPACITY] = np.log2(opacities[g])
             records[g, RED], records[g, GREEN], records[g, BLUE] = colors[g, 0], colors[g, 1], colors[g, 2]
             records[g, Z] = z[g]
-            keys[visible] = (np.int64(z_bits[g]) << 32) | g
-            visible += 1
-    return visible
+            keys[g] = (np.int64(z_bits[g]) << 32) | g
 
 
 @njit(inline="always")
-def _spans(record, width, height, spans):
-    # Fills spans[column, 0:2] with the first and last + 1 image row where the footprint
-    # square (dx + k dy)^2 + m dy^2 <= level  meets each column of strips, and returns its first and last + 1 tile
-    # column. The level is widened a little, so that float32 rounding in the pixel kernels cannot draw outside the
-    # listed rows.
-    x, y, k, m = np.float64(record[X]), np.float64(record[Y]), np.float64(record[K]), np.float64(record[M_LOG2])
-    square = np.float64(record[ROOT]) ** 2
+def _footprint(record):
+    # The footprint is  square (dx + k dy)^2 + m dy^2 <= level.  Returns square, k, m, level in float64, the largest dy
+    # (tip, found at dx = -k tip) and the largest dx (reach).
+    # The level is widened a little, so that float32 rounding in the pixel kernels cannot draw outside of it.
+    square, k, m = np.float64(record[ROOT]) ** 2, np.float64(record[K]), np.float64(record[M_LOG2])
     level = np.float64(record[LOG2_OPACITY]) - LOG2_ALPHA_MIN + 0.01
-    c = square * k * k + m
-    tip = np.sqrt(level / m)  # largest dy of the footprint, found at dx = -k tip
-    reach = tip * np.sqrt(c / square)  # largest dx
-    first = max(np.ceil(x - reach - 0.501), 0.0)
-    last = min(np.floor(x + reach - 0.499), width - 1.0)
+    tip = np.sqrt(level / m)
+    return square, k, m, level, tip, tip * np.sqrt(k * k + m / square)
+
+
+@njit(inline="always")
+def _pixels(center, before, after, size):
+    # First and last + 1 pixel of 0..size-1 with its centre in [center + before, center + after], a hair more.
+    first, last = max(np.ceil(center + before - 0.501), 0.0), min(np.floor(center + after - 0.499), size - 1.0)
     if not first <= last:
         return 0, 0
-    first_column, end_column = np.int64(first) // LANES, np.int64(last) // LANES + 1
-    first_tile, end_tile = first_column // STRIPS, (end_column + STRIPS - 1) // STRIPS
-    inverse_c = 1.0 / c
+    return np.int64(first), np.int64(last) + 1
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _count_boxes(records, near_to_far, width, height, box_starts):
+    # One iteration per visible Gaussian, near to far. Writes, at rank + 1, how many tiles the box around it touches:
+    # room enough for its pairs.
+    for rank in prange(near_to_far.size):
+        record = records[near_to_far[rank]]
+        _, _, _, _, tip, reach = _footprint(record)
+        left, right = _pixels(record[X], -reach, reach, width)
+        top, bottom = _pixels(record[Y], -tip, tip, height)
+        columns = (right + TILE_WIDTH - 1) // TILE_WIDTH - left // TILE_WIDTH
+        rows = (bottom + TILE_HEIGHT - 1) // TILE_HEIGHT - top // TILE_HEIGHT
+        box_starts[rank + 1] = columns * rows
+
+
+@njit(inline="always")
+def _write_spans(record, width, height, spans):
+    # Fills spans[column, 0:2] with the first and last + 1 image row where the footprint meets each column of strips,
+    # for the tiles that it touches, and returns its first and last + 1 tile column.
+    square, k, m, level, tip, reach = _footprint(record)
+    left, right = _pixels(record[X], -reach, reach, width)
+    first_tile, end_tile = left // TILE_WIDTH, (right + TILE_WIDTH - 1) // TILE_WIDTH
+    c = square * k * k + m
     for column in range(first_tile * STRIPS, end_tile * STRIPS):
         spans[column, 0] = spans[column, 1] = 0
-        if column < first_column or column >= end_column:
-            continue
-        # Bottom and top are the tips if they lie in the strip, else on the edge of the strip that is nearer to them.
-        left, right = max(column * LANES + 0.5 - x, -reach), min(column * LANES + LANES - 0.5 - x, reach)
-        bottom = tip
-        at = min(max(-k * tip, left), right)
-        if at != -k * tip:
-            bottom = inverse_c * (np.sqrt(max(c * level - square * m * at * at, 0.0)) - square * k * at)
-        top = -tip
-        at = min(max(k * tip, left), right)
-        if at != k * tip:
-            top = -inverse_c * (np.sqrt(max(c * level - square * m * at * at, 0.0)) + square * k * at)
-        first_row, last_row = max(np.ceil(y + top - 0.501), 0.0), min(np.floor(y + bottom - 0.499), height - 1.0)
-        if first_row <= last_row:
-            spans[column, 0], spans[column, 1] = np.int64(first_row), np.int64(last_row) + 1
+        first_x = max(column * LANES + 0.5 - record[X], -reach)
+        last_x = min(column * LANES + LANES - 0.5 - record[X], reach)
+        if first_x <= last_x:
+            # Its ends are the tips if they lie in the strip, else on the edge of the strip that is nearer to them.
+            top, bottom = -tip, tip
+            x = min(max(k * tip, first_x), last_x)
+            if x != k * tip:
+                top = -(np.sqrt(max(c * level - square * m * x * x, 0.0)) + square * k * x) / c
+            x = min(max(-k * tip, first_x), last_x)
+            if x != -k * tip:
+                bottom = (np.sqrt(max(c * level - square * m * x * x, 0.0)) - square * k * x) / c
+            spans[column, 0], spans[column, 1] = _pixels(record[Y], top, bottom, height)
     return first_tile, end_tile
 
 
@@ -150,45 +179,40 @@ def _tile_rows(spans, tile_column):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _count(records, near_to_far, width, height, tiles_x, slot_starts, counts, costs):
-    # One task per chunk of the depth order. Adds up pairs per Gaussian (at slot_starts[g + 1]), and pairs and strip
-    # rows per (chunk, tile).
+def _list_pairs(records, near_to_far, width, height, tiles_x, box_starts, boxes, slot_starts, counts, costs):
+    # One task per chunk of the depth order. Writes the pairs of each Gaussian into its box, with the tile in place of
+    # the slot, and how many there are at slot_starts[g + 1]; adds up pairs and strip rows per (chunk, tile).
     for chunk in prange(CHUNKS):
         spans = np.empty((tiles_x * STRIPS, 2), np.int64)
         for rank in range(near_to_far.size * chunk // CHUNKS, near_to_far.size * (chunk + 1) // CHUNKS):
-            g = near_to_far[rank]
-            first_tile, end_tile = _spans(records[g], width, height, spans)
+            g, place = near_to_far[rank], box_starts[rank]
+            first_tile, end_tile = _write_spans(records[g], width, height, spans)
             for tile_column in range(first_tile, end_tile):
                 first_row, end_row = _tile_rows(spans, tile_column)
                 for tile_row in range(first_row, end_row):
-                    tile = tile_row * tiles_x + tile_column
+                    tile, top = tile_row * tiles_x + tile_column, tile_row * TILE_HEIGHT
+                    boxes[place, ID], boxes[place, TILE] = g, tile
+                    for strip in range(STRIPS):
+                        column = tile_column * STRIPS + strip
+                        first = min(max(spans[column, 0] - top, 0), TILE_HEIGHT)
+                        end = max(min(spans[column, 1] - top, TILE_HEIGHT), first)
+                        boxes[place, FIRST_ROWS + 2 * strip], boxes[place, FIRST_ROWS + 2 * strip + 1] = first, end
+                        costs[chunk, tile] += end - first
                     counts[chunk, tile] += 1
-                    slot_starts[g + 1] += 1
-                    for column in range(tile_column * STRIPS, (tile_column + 1) * STRIPS):
-                        begin = max(spans[column, 0], tile_row * TILE_HEIGHT)
-                        costs[chunk, tile] += max(min(spans[column, 1], (tile_row + 1) * TILE_HEIGHT) - begin, 0)
+                    place += 1
+            slot_starts[g + 1] = place - box_starts[rank]
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _fill(records, near_to_far, width, height, tiles_x, slot_starts, cursors, pairs):
-    # The same walk as `_count`; cursors (CHUNKS, L) say where each chunk's next pair of a tile goes.
+def _sort_pairs(near_to_far, box_starts, boxes, slot_starts, cursors, pairs):
+    # One task per chunk, as above; cursors (CHUNKS, L) say where each chunk's next pair of a tile goes in `pairs`.
     for chunk in prange(CHUNKS):
-        spans = np.empty((tiles_x * STRIPS, 2), np.int64)
         for rank in range(near_to_far.size * chunk // CHUNKS, near_to_far.size * (chunk + 1) // CHUNKS):
             g = near_to_far[rank]
-            slot = slot_starts[g]
-            first_tile, end_tile = _spans(records[g], width, height, spans)
-            for tile_column in range(first_tile, end_tile):
-                first_row, end_row = _tile_rows(spans, tile_column)
-                for tile_row in range(first_row, end_row):
-                    tile = tile_row * tiles_x + tile_column
-                    pair = pairs[cursors[chunk, tile]]
-                    cursors[chunk, tile] += 1
-                    pair[ID], pair[SLOT] = g, slot
-                    slot += 1
-                    for strip in range(STRIPS):
-                        column = tile_column * STRIPS + strip
-                        begin = max(spans[column, 0] - tile_row * TILE_HEIGHT, 0)
-                        pair[FIRST_ROWS + 2 * strip] = min(begin, TILE_HEIGHT)
-                        end = min(spans[column, 1] - tile_row * TILE_HEIGHT, TILE_HEIGHT)
-                        pair[FIRST_ROWS + 2 * strip + 1] = max(end, 0)
+            for i in range(slot_starts[g + 1] - slot_starts[g]):
+                pair = boxes[box_starts[rank] + i]
+                place = cursors[chunk, pair[TILE]]
+                cursors[chunk, pair[TILE]] = place + 1
+                pairs[place, ID], pairs[place, SLOT] = g, slot_starts[g] + i
+                for j in range(FIRST_ROWS, PAIR_SIZE):
+                    pairs[place, j] = pair[j]
