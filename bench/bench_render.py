@@ -1,10 +1,11 @@
 """Time the CPU renderer, stage by stage, on a random scene; with `--yardstick PATH`, beside another compositing kernel.
 
-    OMP_WAIT_POLICY=PASSIVE python bench/bench_render.py [--gaussians 25000] [--size 640 512] [--repeats 25] [--yardstick compositing.py]
+    OMP_WAIT_POLICY=PASSIVE python bench/bench_render.py [--gaussians 25000] [--size 640 512] [--yardstick PATH]
 
 Prints medians in ms. The yardstick module is run alternately with ours in this process, on its own scene; it must have
-`scene(N, W, H)`, `forward`, `backward`, and the tables `PX`, `PY`. Without OMP_WAIT_POLICY=PASSIVE, torch's idle threads
-spin on the cores that Numba's threads need (each brings its own OpenMP), and everything takes up to three times as long.
+`scene(N, W, H)`, `forward`, `backward`, and the tables `PX`, `PY`. Without OMP_WAIT_POLICY=PASSIVE, idle threads of
+torch spin on the cores that Numba's threads need (each brings its own OpenMP), and everything takes up to three times
+as long.
 """
 
 from __future__ import annotations
@@ -139,10 +140,9 @@ def time_stages(num: int, width: int, height: int, repeats: int) -> None:
         clock.run("project, backward", project_backward, *world, *grads)
         out = clock.run("whole, forward", draw)
         clock.run("whole, backward", torch.autograd.backward, [out.color, out.depth], [v_color, v_depth])
-    pairs = len(ours.tiles.pairs)
-    print(
-        f"{num} Gaussians, {width}x{height}, {pairs} pairs, {numba.get_num_threads()} threads; median of {repeats}, ms"
-    )
+    waiting = os.environ.get("OMP_WAIT_POLICY", "not set")
+    print(f"{num} Gaussians, {width}x{height}, {len(ours.tiles.pairs)} pairs, median of {repeats}, ms")
+    print(f"{numba.get_num_threads()} threads, OMP_WAIT_POLICY {waiting}")
     stages = [name for name in clock.laps if "whole" not in name]
     everything = sum(clock.median(name) for name in stages)
     for name in clock.laps:

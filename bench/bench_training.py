@@ -1,7 +1,7 @@
 """Time the parts of an iteration that are not drawing or deforming, each beside plain torch in the same process.
 
-`python bench/bench_training.py [SEQUENCE]` prints median milliseconds; with a sequence folder also whole iterations of the
-`default` preset on it.
+`python bench/bench_training.py [SEQUENCE]` prints median milliseconds; with a sequence folder also whole iterations of
+the `default` preset on it.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ def bench_adam() -> tuple[float, float]:
     """One-pass Adam and torch's, over the temporal coefficients of 20,000 Gaussians (8 million numbers)."""
     param = torch.rand(NUM, 31, 13).requires_grad_()
     param.grad = torch.rand_like(param)
-    state, rates = AdamState(param), np.full(31 * 13, 1e-3)
+    state = AdamState(param)
     other = param.detach().clone().requires_grad_()
     other.grad = param.grad.clone()
     torch_adam = torch.optim.Adam([other], lr=1e-3, eps=1e-15)
-    return median_ms(lambda: state.update(param, rates, 1e-15, 0, len(rates))), median_ms(torch_adam.step)
+    return median_ms(lambda: state.update(param, 1e-3, 1e-15)), median_ms(torch_adam.step)
 
 
 def bench_temporal(num_points: int) -> float:

@@ -53,7 +53,9 @@ def test_a_constant_prior_gives_that_score_to_every_observed_gaussian(c):
 def test_score_samples_a_ramp_at_the_projected_centre():
     ramp = (torch.arange(30) + 0.5).expand(20, 30) / 30  # value x / 30 at x px
     stats = DensityStats.zeros(2)
-    stats.add_score(output([[7.25, 3.0], [20.5, 12.0]]), ramp.contiguous(), torch.ones(20, 30, dtype=torch.bool), torch.ones(2))
+    stats.add_score(
+        output([[7.25, 3.0], [20.5, 12.0]]), ramp.contiguous(), torch.ones(20, 30, dtype=torch.bool), torch.ones(2)
+    )
     assert stats.score(0.0).tolist() == pytest.approx([7.25 / 30, 20.5 / 30], abs=1e-5)
 
 

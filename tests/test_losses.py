@@ -15,7 +15,7 @@ def scene(seed: int, height: int = 13, width: int = 17):
     depth[torch.rand(height, width, generator=g) < 0.1] = 0
     target_u8 = torch.randint(0, 256, (height, width, 3), generator=g, dtype=torch.uint8)
     target_inverse = 1 / (torch.rand(height, width, generator=g) * 60 + 40)
-    tissue = (torch.rand(height, width, generator=g) < 0.8)
+    tissue = torch.rand(height, width, generator=g) < 0.8
     measured = tissue & (torch.rand(height, width, generator=g) < 0.9)
     return color, depth, target_u8, target_inverse, tissue, measured
 

@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -187,13 +188,16 @@ def test_half_resolution_keeps_the_geometry(tiny_sequence):
 
 
 def test_ctrl_c_on_the_command_line_saves_and_says_how_to_go_on(tiny_sequence, tmp_path):
-    code = (
-        "import signal, sys, threading, os; from endoprior.cli import main;"
-        "threading.Timer(6, lambda: os.kill(os.getpid(), signal.SIGINT)).start();"
-        f"sys.exit(main(['train', {str(tiny_sequence)!r}, {str(tmp_path / 'run')!r}, '--init-budget', '200',"
-        " '--schedule.fine-iterations', '1000000']))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 130, done.stderr
-    assert "--resume" in done.stdout
-    assert (tmp_path / "run" / "checkpoint.safetensors").is_file()
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "endoprior", "train", str(tiny_sequence), str(out)]
+    command += ["--init-budget", "200", "--schedule.fine-iterations", "1000000"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        log = out / "log.jsonl"
+        for _ in range(600):  # the first line of the log says that the loop is running
+            if log.exists() and log.stat().st_size:
+                break
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        said, complaint = process.communicate(timeout=60)
+    assert process.returncode == 130, complaint
+    assert "--resume" in said and (out / "checkpoint.safetensors").is_file()

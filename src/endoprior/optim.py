@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from .adam_kernels import adam_columns
+from .adam_kernels import adam_flat, adam_outer
 from .config import Config, OptimConfig
 from .density import DensityStats, Plan
 from .geometry import quaternion_to_matrix
-from .model.basis import basis_weights, motion_layout
+from .model.basis import RankOneGradient, motion_layout
 from .model.deformation import HexPlaneField
 from .model.gaussians import Gaussians
 from .model.plane_adam import PlaneAdam
@@ -27,30 +28,51 @@ def log_linear(start: float, end: float, iteration: int, steps: int) -> float:
 
 
 class AdamState:
-    """Moments of one parameter seen as (rows, columns), and how often each column was stepped."""
+    """Moments of one parameter, and how often it was stepped: a temporal basis counts each of its functions."""
 
-    def __init__(self, param: Tensor) -> None:
+    def __init__(self, param: Tensor, num_counts: int = 1) -> None:
         self.first = torch.zeros_like(param, requires_grad=False)
         self.second = torch.zeros_like(param, requires_grad=False)
-        self.steps = np.zeros(max(param[0].numel(), 1) if len(param) else 1, np.int64)
+        self.steps = np.zeros(num_counts, np.int64)
 
-    def update(self, param: Tensor, rates: np.ndarray, epsilon: float, begin: int, end: int) -> None:
-        """One step of columns [begin, end); other columns keep value, moments and count.
-
-        Args:
-            param: (R, ...) leaf with `.grad`. rates: (columns,) learning rate of each.
-        """
+    def update(self, param: Tensor, rate: float, epsilon: float) -> None:
+        """One step of the whole parameter, a leaf with `.grad`; without a gradient nothing happens."""
         if param.grad is None or param.numel() == 0:
             return
+        self.steps += 1
+        rates, root_scale = _corrected(np.array([rate]), self.steps)
+        tensors = (param, param.grad.contiguous(), self.first, self.second)
+        adam_flat(*(t.detach().reshape(-1).numpy() for t in tensors), rates[0], root_scale[0], *_constants(epsilon))
+
+    def update_bases(self, param: Tensor, gradients: list[RankOneGradient], rates: NDArray, epsilon: float) -> None:
+        """One step of the basis functions that any of the gradients reaches; the others keep value, moments and count.
+
+        Stepping the others on momentum alone would move the tissue at moments that were not looked at.
+
+        Args:
+            param: (N, B, C). rates: (C,) learning rate of each channel.
+        """
+        if not gradients or param.numel() == 0:
+            return
+        weights = np.stack([gradient.weights for gradient in gradients]).astype(np.float32)
+        active = np.flatnonzero(weights.any(0))
+        if len(active) == 0:
+            return
+        begin, end = active[0], active[-1] + 1
         self.steps[begin:end] += 1
-        steps = self.steps[begin:end]
-        rate = (rates[begin:end] / (1 - BETA1**steps)).astype(np.float32)
-        root_scale = (1 / np.sqrt(1 - BETA2**steps)).astype(np.float32)
-        views = [
-            t.detach().reshape(len(param), -1).numpy()
-            for t in (param, param.grad.contiguous(), self.first, self.second)
-        ]
-        adam_columns(*views, begin, rate, root_scale, np.float32(BETA1), np.float32(BETA2), np.float32(epsilon))
+        scaled, root_scale = _corrected(rates[None, :], self.steps[begin:end, None])
+        v_offsets = np.stack([gradient.v_offsets for gradient in gradients])
+        views = (param.detach().numpy(), weights, v_offsets, self.first.numpy(), self.second.numpy())
+        adam_outer(*views, begin, scaled, root_scale[:, 0], *_constants(epsilon))
+
+
+def _corrected(rates: NDArray, steps: NDArray) -> tuple[NDArray, NDArray]:
+    """Learning rates over 1 - beta1^steps, and 1 / sqrt(1 - beta2^steps): Adam's corrections of its young moments."""
+    return (rates / (1 - BETA1**steps)).astype(np.float32), (1 / np.sqrt(1 - BETA2**steps)).astype(np.float32)
+
+
+def _constants(epsilon: float) -> tuple[np.float32, np.float32, np.float32]:
+    return np.float32(BETA1), np.float32(BETA2), np.float32(epsilon)
 
 
 class Optimizer:
@@ -58,44 +80,44 @@ class Optimizer:
 
     def __init__(self, gaussians: Gaussians, field: HexPlaneField | None, cfg: Config, spatial_scale: float) -> None:
         self.gaussians, self.field, self.cfg, self.spatial_scale = gaussians, field, cfg, spatial_scale
-        self.states = {name: AdamState(value) for name, value in gaussians.tensors.items()}
+        self.states = {
+            name: AdamState(value, value.shape[1] if name == "motion" else 1)
+            for name, value in gaussians.tensors.items()
+        }
         self.plane_adam = None
         if field is not None:
             self.states |= {name: AdamState(value) for name, value in _field_parameters(field).items()}
             self.plane_adam = PlaneAdam(field.grid, epsilon=cfg.optim.epsilon)
 
-    def step(self, iteration: int, time: float | None) -> None:
-        """Apply the gradients and clear them.
+    def step(self, iteration: int) -> None:
+        """Apply the gradients and clear them. What got no gradient is left alone, momentum and all.
 
         Args:
             iteration: 1-based, within the stage.
-            time: moment of the frame just rendered, or None in the coarse stage, where nothing deforms. Temporal
-                coefficients whose basis function is zero at that time are not stepped: their gradient is zero, and
-                stepping them on momentum alone would move the tissue at moments that were not looked at.
         """
         optim = self.cfg.optim
         decay = {"iteration": iteration, "steps": optim.decay_iterations}
         for name, param in self.gaussians.tensors.items():
-            if name != "motion":
-                self._step_all(name, param, self._rate(name, decay))
-            elif time is not None:
-                self._step_motion(param, time, decay)
-        if self.field is not None and time is not None:
+            if name == "motion":
+                gradients = self.gaussians.motion_gradients
+                self.states[name].update_bases(param, gradients, motion_rates(self.cfg, **decay), optim.epsilon)
+            else:
+                self.states[name].update(param, self._rate(name, decay), optim.epsilon)
+        if self.field is not None:
             network = self.spatial_scale * log_linear(optim.network_lr, optim.network_lr_final, **decay)
             planes = self.spatial_scale * log_linear(optim.planes_lr, optim.planes_lr_final, **decay)
-            for name, param in _field_parameters(self.field).items():
-                self._step_all(name, param, planes if name == "box" else network)
-            self.plane_adam.step(planes)
+            parameters = _field_parameters(self.field)
+            for name, param in parameters.items():
+                self.states[name].update(param, planes if name == "box" else network, optim.epsilon)
+            if any(param.grad is not None for param in parameters.values()):
+                self.plane_adam.step(planes)
         self.clear_gradients()
-
-    def _step_all(self, name: str, param: Tensor, rate: float) -> None:
-        state = self.states[name]
-        state.update(param, np.full(len(state.steps), rate), self.cfg.optim.epsilon, 0, len(state.steps))
 
     def clear_gradients(self) -> None:
         """Drop every gradient."""
         for param in self.gaussians.tensors.values():
             param.grad = None
+        self.gaussians.motion_gradients.clear()
         if self.field is not None:
             for param in _field_parameters(self.field).values():
                 param.grad = None
@@ -111,16 +133,6 @@ class Optimizer:
             "sh_dc": optim.sh_dc_lr,
             "sh_rest": optim.sh_rest_lr,
         }[name]
-
-    def _step_motion(self, param: Tensor, time: float, decay: dict) -> None:
-        cfg = self.cfg.deformation
-        active = np.flatnonzero(basis_weights(time, cfg.basis))
-        if len(active) == 0:
-            return
-        rates = np.tile(motion_rates(self.cfg, **decay), param.shape[1])
-        channels = param.shape[2]
-        begin, end = active[0] * channels, (active[-1] + 1) * channels
-        self.states["motion"].update(param, rates, self.cfg.optim.epsilon, begin, end)
 
     def apply_plan(self, plan: Plan, stats: DensityStats, rng: np.random.Generator) -> DensityStats:
         """Clone, split and remove as planned, in the parameters, Adam's moments and the statistics alike.
@@ -170,7 +182,7 @@ def _field_parameters(field: HexPlaneField) -> dict[str, Tensor]:
     return named | ({"box": groups["box"]} if groups["box"].requires_grad else {})
 
 
-def motion_rates(cfg: Config, iteration: int, steps: int) -> np.ndarray:
+def motion_rates(cfg: Config, iteration: int, steps: int) -> NDArray:
     """(C,) learning rate of each channel of the temporal basis."""
     optim: OptimConfig = cfg.optim
     decay = log_linear(1.0, optim.basis_decay, iteration, steps)

@@ -106,7 +106,7 @@ class Trainer:
 
         with torch.no_grad():
             self._observe(out, position, frame, iteration)
-            state.optimizer.step(iteration, frame.time if fine else None)
+            state.optimizer.step(iteration)
             last = fine and iteration == self.stage_length(Stage.FINE)
             if density.due(iteration, last, cfg.density):
                 self._control_density(rng)

@@ -7,6 +7,7 @@ identity. Bases of this kind were used per Gaussian by Yang et al., "Deform3DGS"
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -50,12 +51,24 @@ def basis_weights(time: float, cfg: BasisConfig) -> NDArray[np.float64]:
     return np.where(np.abs(distance) <= CUT_STANDARD_DEVIATIONS * sigma, weights, 0.0)
 
 
-def basis_offsets(motion: Tensor, time: float, cfg: DeformationConfig) -> Offsets:
+@dataclass(frozen=True)
+class RankOneGradient:
+    """Gradient of `motion` from one moment, weights (B,) times v_offsets (N, channels): never written out in full."""
+
+    weights: NDArray[np.float32]
+    v_offsets: NDArray[np.float32]
+
+
+def basis_offsets(
+    motion: Tensor, time: float, cfg: DeformationConfig, sink: list[RankOneGradient] | None = None
+) -> Offsets:
     """What `time` adds to Gaussians with coefficients `motion`.
 
     Args:
-        motion: (N, B, channels) coefficients; channels as in `motion_layout`, those of the centres in mm.
+        motion: (N, B, channels) coefficients; channels as in `motion_layout`, those of the centers in mm.
         time: in [0, 1].
+        sink: takes the gradient of `motion` in place of `motion.grad`. One moment's gradient is an outer product, 30
+            times smaller than the coefficients, and the optimizer can use it as it is.
     Returns:
         Offsets, differentiable in `motion`.
     Raises:
@@ -63,7 +76,7 @@ def basis_offsets(motion: Tensor, time: float, cfg: DeformationConfig) -> Offset
     """
     layout = motion_layout(cfg)
     check_shape(f"motion:N,{cfg.basis.num_bases},{max(part.stop for part in layout.values())}", motion=motion)
-    total = _WeightedSum.apply(motion, basis_weights(time, cfg.basis))
+    total = _WeightedSum.apply(motion, basis_weights(time, cfg.basis), sink)
     found = {name: total[:, part] for name, part in layout.items()}
     if "opacity_logits" in found:
         found["opacity_logits"] = found["opacity_logits"][:, 0]
@@ -74,22 +87,25 @@ class _WeightedSum(torch.autograd.Function):
     """sum_b weights[b] * motion[:, b] over the band of weights that are not 0."""
 
     @staticmethod
-    def forward(ctx: Any, motion: Tensor, weights: NDArray[np.float64]) -> Tensor:
+    def forward(ctx: Any, motion: Tensor, weights: NDArray[np.float64], sink: list[RankOneGradient] | None) -> Tensor:
         coefficients = motion.detach().contiguous().numpy()
         weights = weights.astype(coefficients.dtype)
         band = np.flatnonzero(weights)
         ctx.band = (int(band[0]), int(band[-1]) + 1) if len(band) else (0, 0)
-        ctx.weights, ctx.shape = weights, coefficients.shape
+        ctx.weights, ctx.shape, ctx.sink = weights, coefficients.shape, sink
         out = np.empty((len(coefficients), coefficients.shape[2]), dtype=coefficients.dtype)
         _weighted_sum(coefficients, weights, *ctx.band, out)
         return torch.from_numpy(out)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, None, None]:
+        if ctx.sink is not None:
+            ctx.sink.append(RankOneGradient(ctx.weights, v_out.contiguous().numpy()))
+            return None, None, None
         v_motion = np.zeros(ctx.shape, dtype=ctx.weights.dtype)
         _weighted_sum_backward(v_out.contiguous().numpy(), ctx.weights, *ctx.band, v_motion)
-        return torch.from_numpy(v_motion), None
+        return torch.from_numpy(v_motion), None, None
 
 
 @njit(parallel=True, cache=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..config import Config
 from ..types import Splats
-from .basis import identity_motion
+from .basis import RankOneGradient, identity_motion
 from .deformation import Offsets
 
 SH_C0 = 0.28209479177387814
@@ -31,6 +31,8 @@ class Gaussians:
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
         self.tensors = {name: value.detach().contiguous().requires_grad_() for name, value in tensors.items()}
+        self.motion_gradients: list[RankOneGradient] = []
+        """Gradient of `motion` since the last optimizer step, one entry per moment."""
 
     def __len__(self) -> int:
         return len(self.tensors["means"])

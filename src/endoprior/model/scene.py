@@ -27,11 +27,15 @@ FORMAT = "endoprior-scene-1"
 def offsets_at(
     gaussians: Gaussians, field: HexPlaneField | None, time: float, cfg: Config, chosen: Tensor | None = None
 ) -> Offsets:
-    """Deformation of the Gaussians (of the `chosen` (P,) ones only, if given) at `time` in [0, 1]."""
+    """Deformation of the Gaussians (of the `chosen` (P,) ones only, if given) at `time` in [0, 1].
+
+    Unless some are chosen, the gradient of temporal coefficients goes to `gaussians.motion_gradients`.
+    """
     rows = slice(None) if chosen is None else chosen
     if field is not None:
         return field.offsets(gaussians["means"][rows], time)
-    return basis_offsets(gaussians["motion"][rows], time, cfg.deformation)
+    sink = gaussians.motion_gradients if chosen is None else None
+    return basis_offsets(gaussians["motion"][rows], time, cfg.deformation, sink)
 
 
 @dataclass(frozen=True)

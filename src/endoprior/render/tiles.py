@@ -28,10 +28,9 @@ CHUNKS = 8
 X, Y, ROOT, K, M_LOG2, LOG2_OPACITY, RED, GREEN, BLUE, Z = range(10)
 RECORD_SIZE = 12
 HALF_LOG2_E = np.float32(0.5 * log2(np.e))
-
 LOG2_ALPHA_MIN = log2(ALPHA_MIN)
-
 LAST = np.iinfo(np.int64).max
+"""Sort key of what is not drawn."""
 
 # Columns of a pair.
 ID, SLOT, FIRST_ROWS = range(3)
@@ -71,11 +70,10 @@ def build(
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     records, keys = np.empty((num, RECORD_SIZE), np.float32), np.empty(num, np.int64)
     gaussians = (means2d, row_forms, z, z.view(np.int32), colors, opacities, radii)
-    _write_records(*gaussians, records, keys)
+    box_starts = np.zeros(num + 1, np.int64)
+    _write_records(*gaussians, width, height, records, keys, box_starts)
     near_to_far = np.sort(keys)[:num_visible] & 0xFFFFFFFF
 
-    box_starts = np.zeros(num_visible + 1, np.int64)
-    _count_boxes(records, near_to_far, width, height, box_starts)
     np.cumsum(box_starts, out=box_starts)
     boxes = np.empty((box_starts[-1], PAIR_SIZE), np.int32)
     slot_starts = np.zeros(num + 1, np.int64)
@@ -90,23 +88,6 @@ def build(
     pairs = np.empty((tile_starts[-1], PAIR_SIZE), np.int32)
     _sort_pairs(near_to_far, box_starts, boxes, slot_starts, cursors, pairs)
     return Tiles(records, pairs, tile_starts, slot_starts, np.argsort(-costs.sum(0), kind="stable"))
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def _write_records(means2d, row_forms, z, z_bits, colors, opacities, radii, records, keys):
-    # One iteration per Gaussian. Writes its record, if it is visible, and its sort key: the bits of z (monotone, as z
-    # is > 0), then its index; invisible ones come last.
-    for g in prange(z.size):
-        keys[g] = LAST
-        if radii[g] > 0:
-            records[g, X], records[g, Y] = means2d[g, 0], means2d[g, 1]
-            records[g, ROOT] = np.sqrt(row_forms[g, 0] * HALF_LOG2_E)
-            records[g, K] = row_forms[g, 1]
-            records[g, M_LOG2] = row_forms[g, 2] * HALF_LOG2_E
-            records[g, LOG2_OPACITY] = np.log2(opacities[g])
-            records[g, RED], records[g, GREEN], records[g, BLUE] = colors[g, 0], colors[g, 1], colors[g, 2]
-            records[g, Z] = z[g]
-            keys[g] = (np.int64(z_bits[g]) << 32) | g
 
 
 @njit(inline="always")
@@ -130,17 +111,25 @@ def _pixels(center, before, after, size):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _count_boxes(records, near_to_far, width, height, box_starts):
-    # One iteration per visible Gaussian, near to far. Writes, at rank + 1, how many tiles the box around it touches:
-    # room enough for its pairs.
-    for rank in prange(near_to_far.size):
-        record = records[near_to_far[rank]]
-        _, _, _, _, tip, reach = _footprint(record)
-        left, right = _pixels(record[X], -reach, reach, width)
-        top, bottom = _pixels(record[Y], -tip, tip, height)
-        columns = (right + TILE_WIDTH - 1) // TILE_WIDTH - left // TILE_WIDTH
-        rows = (bottom + TILE_HEIGHT - 1) // TILE_HEIGHT - top // TILE_HEIGHT
-        box_starts[rank + 1] = columns * rows
+def _write_records(means2d, row_forms, z, z_bits, colors, opacities, radii, width, height, records, keys, box_starts):
+    # One iteration per Gaussian. Writes its sort key: the bits of z (monotone, as z is > 0), then its index; and if it
+    # is visible its record and, at g + 1, how many tiles the box around it touches: room enough for its pairs.
+    for g in prange(z.size):
+        keys[g] = LAST
+        if radii[g] > 0:
+            records[g, X], records[g, Y] = means2d[g, 0], means2d[g, 1]
+            records[g, ROOT] = np.sqrt(row_forms[g, 0] * HALF_LOG2_E)
+            records[g, K] = row_forms[g, 1]
+            records[g, M_LOG2] = row_forms[g, 2] * HALF_LOG2_E
+            records[g, LOG2_OPACITY] = np.log2(opacities[g])
+            records[g, RED], records[g, GREEN], records[g, BLUE] = colors[g, 0], colors[g, 1], colors[g, 2]
+            records[g, Z] = z[g]
+            keys[g] = (np.int64(z_bits[g]) << 32) | g
+            _, _, _, _, tip, reach = _footprint(records[g])
+            left, right = _pixels(records[g, X], -reach, reach, width)
+            top, bottom = _pixels(records[g, Y], -tip, tip, height)
+            columns = (right + TILE_WIDTH - 1) // TILE_WIDTH - left // TILE_WIDTH
+            box_starts[g + 1] = columns * ((bottom + TILE_HEIGHT - 1) // TILE_HEIGHT - top // TILE_HEIGHT)
 
 
 @njit(inline="always")
@@ -185,7 +174,8 @@ def _list_pairs(records, near_to_far, width, height, tiles_x, box_starts, boxes,
     for chunk in prange(CHUNKS):
         spans = np.empty((tiles_x * STRIPS, 2), np.int64)
         for rank in range(near_to_far.size * chunk // CHUNKS, near_to_far.size * (chunk + 1) // CHUNKS):
-            g, place = near_to_far[rank], box_starts[rank]
+            g = near_to_far[rank]
+            place = box_starts[g]
             first_tile, end_tile = _write_spans(records[g], width, height, spans)
             for tile_column in range(first_tile, end_tile):
                 first_row, end_row = _tile_rows(spans, tile_column)
@@ -200,7 +190,7 @@ def _list_pairs(records, near_to_far, width, height, tiles_x, box_starts, boxes,
                         costs[chunk, tile] += end - first
                     counts[chunk, tile] += 1
                     place += 1
-            slot_starts[g + 1] = place - box_starts[rank]
+            slot_starts[g + 1] = place - box_starts[g]
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
@@ -210,7 +200,7 @@ def _sort_pairs(near_to_far, box_starts, boxes, slot_starts, cursors, pairs):
         for rank in range(near_to_far.size * chunk // CHUNKS, near_to_far.size * (chunk + 1) // CHUNKS):
             g = near_to_far[rank]
             for i in range(slot_starts[g + 1] - slot_starts[g]):
-                pair = boxes[box_starts[rank] + i]
+                pair = boxes[box_starts[g] + i]
                 place = cursors[chunk, pair[TILE]]
                 cursors[chunk, pair[TILE]] = place + 1
                 pairs[place, ID], pairs[place, SLOT] = g, slot_starts[g] + i

@@ -1,0 +1,80 @@
+"""Adam: against torch's, with outer-product gradients, and with basis functions that are not looked at."""
+
+import numpy as np
+import pytest
+import torch
+
+from endoprior.config import Config
+from endoprior.model.basis import RankOneGradient, motion_layout
+from endoprior.optim import AdamState, log_linear, motion_rates
+from endoprior.presets import preset
+
+
+def test_update_is_torchs_adam():
+    g = torch.Generator().manual_seed(0)
+    ours = torch.randn(7, 3, 5, generator=g).requires_grad_()
+    theirs = ours.detach().clone().requires_grad_()
+    adam, state = torch.optim.Adam([theirs], lr=1e-2, eps=1e-15), AdamState(ours)
+    for _ in range(10):
+        ours.grad = torch.randn(7, 3, 5, generator=g)
+        theirs.grad = ours.grad.clone()
+        state.update(ours, 1e-2, 1e-15)
+        adam.step()
+    # Ten steps of float32, rounded in another order.
+    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
+
+
+def test_outer_product_gradients_are_the_written_out_ones():
+    rng = np.random.default_rng(0)
+    motion = torch.from_numpy(rng.normal(size=(6, 4, 3)).astype(np.float32)).requires_grad_()
+    dense = motion.detach().clone().requires_grad_()
+    state, adam = AdamState(motion, 4), AdamState(dense)
+    for _ in range(5):
+        gradients = [
+            RankOneGradient(rng.random(4).astype(np.float32), rng.normal(size=(6, 3)).astype(np.float32))
+            for _ in range(2)
+        ]
+        dense.grad = torch.from_numpy(sum(np.einsum("b,nc->nbc", g.weights, g.v_offsets) for g in gradients))
+        state.update_bases(motion, gradients, np.full(3, 1e-2), 1e-15)
+        adam.update(dense, 1e-2, 1e-15)
+    torch.testing.assert_close(motion, dense, rtol=1e-5, atol=1e-6)  # float32 sums in another order
+
+
+def test_bases_out_of_sight_stay_where_they_are():
+    motion = torch.zeros(2, 4, 3).requires_grad_()
+    state = AdamState(motion, 4)
+    for weights in ([1.0, 0.5, 0, 0], [0, 0, 0.5, 1.0]):
+        gradient = RankOneGradient(np.array(weights, np.float32), np.ones((2, 3), np.float32))
+        state.update_bases(motion, [gradient], np.array([1e-2, 1e-2, 0.0]), 1e-15)
+    # Each was stepped once, so Adam's first step, of length lr, is all that happened; the last channel has rate 0.
+    torch.testing.assert_close(motion.detach()[..., :2], torch.full((2, 4, 2), -1e-2))
+    assert not motion.detach()[..., 2].any()
+    assert state.steps.tolist() == [1, 1, 1, 1]
+
+
+def test_without_a_gradient_nothing_moves():
+    param = torch.ones(3).requires_grad_()
+    state = AdamState(param)
+    param.grad = torch.ones(3)
+    state.update(param, 0.1, 1e-15)
+    moved, param.grad = param.detach().clone(), None
+    state.update(param, 0.1, 1e-15)
+    assert torch.equal(param.detach(), moved)
+
+
+def test_log_linear_ends_and_middle():
+    assert [log_linear(1e-2, 1e-4, i, 10) for i in (0, 5, 10, 99)] == pytest.approx([1e-2, 1e-3, 1e-4, 1e-4])
+
+
+def test_motion_rates_follow_the_layout():
+    cfg = preset("default")
+    layout = motion_layout(cfg.deformation)
+    rates = motion_rates(cfg, 0, 100)
+    optim = cfg.optim
+    expected = {"means": optim.basis_means_lr, "quats": optim.basis_quats_lr}
+    expected |= {"log_scales": optim.basis_log_scales_lr, "sh_dc": optim.basis_color_lr}
+    assert set(layout) == set(expected)
+    for name, part in layout.items():
+        assert rates[part] == pytest.approx(expected[name])
+    assert rates == pytest.approx(expected)
+    assert motion_rates(cfg, 100, 100) == pytest.approx(rates * Config().optim.basis_decay)
