@@ -81,9 +81,18 @@ def default() -> Config:
     return replace(
         base,
         deformation=replace(base.deformation, kind="basis"),
+        render=replace(base.render, depth_grad_to_means=True),
+        loss=replace(base.loss, depth_weight=3.0),
         temporal=replace(base.temporal, start_iteration=500, max_points=1024, min_valid=1, valid_at_both=False),
-        optim=replace(base.optim, decay_iterations=2000),
+        density=replace(base.density, grow_threshold=1e-4),
+        optim=replace(
+            base.optim,
+            basis_quats_lr=1e-2,
+            basis_log_scales_lr=1e-2,
+            basis_color_lr=1e-2,
+            decay_iterations=2400,
+        ),
         schedule=replace(
-            base.schedule, coarse_iterations=0, fine_iterations=2000, half_resolution_iterations=800, sh_degree=0
+            base.schedule, coarse_iterations=0, fine_iterations=2400, half_resolution_iterations=800, sh_degree=1
         ),
     )

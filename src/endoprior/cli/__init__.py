@@ -32,8 +32,8 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
         The exit status.
     """
-    # Torch and Numba each have a pool of threads, and torch's idle ones spin on the cores that Numba's need: drawing and
-    # its gradient take three times as long (docs/log.md). Read once, when torch is first imported; a user's choice stays.
+    # Torch and Numba each have a pool of threads, and torch's idle ones spin on the cores that Numba's need: drawing
+    # and its gradient take three times as long (docs/log.md). Read when torch is first imported; a user's choice stays.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     argv = sys.argv[1:] if argv is None else argv
     if not argv or argv[0] in ("-h", "--help"):
