@@ -76,7 +76,7 @@ class Compositing:
     """Our compositing of Gaussians that are already in the image, with its buffers."""
 
     def __init__(self, gaussians: tuple[np.ndarray, ...], width: int, height: int, cotangents: np.ndarray) -> None:
-        """gaussians: means2d, row_forms, z, colors, opacities, radii; cotangents: (H, W, 5) of colour, depth, alpha."""
+        """gaussians: means2d, row_forms, z, colors, opacities, radii; cotangents: (H, W, 5) of color, depth, alpha."""
         self.gaussians, self.size = gaussians, (width, height)
         self.v_color, self.v_depth, self.v_alpha = (np.ascontiguousarray(cotangents[..., c]) for c in (slice(3), 3, 4))
         self.color = np.empty((height, width, 3), np.float32)
@@ -182,7 +182,7 @@ def time_beside(yardstick: ModuleType, num: int, width: int, height: int, repeat
     print(f"  forward + backward     ratio {np.median(mine) / np.median(yours):.3f}")
     gap = np.abs(np.moveaxis(picture[:3], 0, -1) - ours.color).max(-1)
     print(
-        f"  largest difference in colour {gap.max():.1e}; {np.mean(gap > 1e-4):.2%} of pixels differ by more than 1e-4"
+        f"  largest difference in color {gap.max():.1e}; {np.mean(gap > 1e-4):.2%} of pixels differ by more than 1e-4"
     )
 
 

@@ -67,7 +67,7 @@ def bench_adam() -> tuple[float, float]:
 
 
 def bench_temporal(num_points: int) -> float:
-    """Neighbours, affinities, loss and gradient of Eq. (11) for a set of points."""
+    """Neighbors, affinities, loss and gradient of Eq. (11) for a set of points."""
     cfg = TemporalConfig()
     before = torch.rand(num_points, 3, generator=torch.Generator().manual_seed(0)) * 60
     now = (before + 0.1 * torch.rand(num_points, 3)).requires_grad_()

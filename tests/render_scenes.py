@@ -16,7 +16,7 @@ NAMES = tuple(field.name for field in fields(Splats))
 
 
 def camera(width: int = 50, height: int = 37, seed: int | None = 0) -> Camera:
-    """A camera with unequal focal lengths and an off-centre principal point; seed None: at the origin, unrotated."""
+    """A camera with unequal focal lengths and an off-center principal point; seed None: at the origin, unrotated."""
     pose = np.eye(4)
     if seed is not None:
         rng = np.random.default_rng(seed)
@@ -46,7 +46,7 @@ def splats(
 
 
 def one(view: Camera, x: float, y: float, z: float, **changes: Tensor) -> Splats:
-    """A round gray Gaussian of opacity 0.6 and 1 px whose centre projects to (x, y); the camera must be unrotated."""
+    """A round gray Gaussian of opacity 0.6 and 1 px whose center projects to (x, y); the camera must be unrotated."""
     assert np.array_equal(view.world_to_camera, np.eye(4))
     values = {
         "means": torch.tensor([[(x - view.cx) / view.fx * z, (y - view.cy) / view.fy * z, z]]),
@@ -85,7 +85,7 @@ def draw(
     dtype: torch.dtype | None = None,
     seed: int = 0,
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
-    """Draw, and pull seeded random cotangents of colour, depth and alpha back to every input.
+    """Draw, and pull seeded random cotangents of color, depth and alpha back to every input.
 
     Returns:
         the picture, and the gradients by name, those of `means2d` and `background` among them. float64 for the

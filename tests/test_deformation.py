@@ -67,7 +67,7 @@ def literal_offsets(model: HexPlaneField, means: Tensor, box: Tensor, time: floa
 
 
 def test_field_agrees_with_the_literal_formulas() -> None:
-    """Offsets, and gradients of centres and box, where some Gaussians have left the box."""
+    """Offsets, and gradients of centers and box, where some Gaussians have left the box."""
     model = field()
     model.grid.values.uniform_(0.3, 1.1, generator=torch.Generator().manual_seed(2))
     means = (points(80, 1) * 1.05).requires_grad_(True)

@@ -45,7 +45,7 @@ def test_carried_points_follow_a_common_motion(phantom):
     carried = carry_points(scene, start, np.full(5, 1), times)
     for k in range(3):
         expected = start + np.array([shift[k] - shift[1], 0, 0])
-        assert carried[k] == pytest.approx(expected, abs=1e-4)  # float32 centres near 100 mm
+        assert carried[k] == pytest.approx(expected, abs=1e-4)  # float32 centers near 100 mm
 
 
 def test_track_error_of_a_still_scene_is_how_far_the_tissue_moved(phantom):

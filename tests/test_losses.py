@@ -8,7 +8,7 @@ from endoprior.loss_kernels import supervised_losses
 
 
 def scene(seed: int, height: int = 13, width: int = 17):
-    """Random colours and depths, some of them not drawn, and targets with holes."""
+    """Random colors and depths, some of them not drawn, and targets with holes."""
     g = torch.Generator().manual_seed(seed)
     color = torch.rand(height, width, 3, generator=g)
     depth = torch.rand(height, width, generator=g) * 60 + 40

@@ -100,7 +100,7 @@ def test_picture_is_the_truth_plus_noise_outside_the_mask(folder):
     for index in range(SMALL.frames):
         image, mask, _, truth, _ = frame(folder, index)
         gap = image.astype(float)[~mask] - truth[~mask]
-        # noise 1.6 levels at mid grey, up to 1.25 times that in the dark; clipping at 0 and 255 only shrinks it
+        # noise 1.6 levels at mid gray, up to 1.25 times that in the dark; clipping at 0 and 255 only shrinks it
         assert abs(gap.mean()) < 0.15 and 1.0 < gap.std() < 2.4 and np.abs(gap).max() < 12
 
 

@@ -62,7 +62,7 @@ def test_ties_in_depth_keep_their_order():
 
 
 def test_moving_scene_and_camera_together_changes_nothing():
-    """Degree 0: colour does not turn with the world. World coordinates round in float32, about 1e-6 of 60 mm."""
+    """Degree 0: color does not turn with the world. World coordinates round in float32, about 1e-6 of 60 mm."""
     view = camera()
     scene = splats(view, degree=0)
     turn = Rotation.from_rotvec([0.3, -0.5, 0.2])
@@ -85,7 +85,7 @@ def test_moving_scene_and_camera_together_changes_nothing():
 def test_central_differences():
     """Directional derivatives, away from every cutoff: see `test_gradcheck` of the reference for why it is away."""
     view = camera(20, 16)
-    scene = splats(view, 5, widths=(12.0, 20.0))  # weak colours stay above the cutoff at 0
+    scene = splats(view, 5, widths=(12.0, 20.0))  # weak colors stay above the cutoff at 0
     scene = replace(scene, opacities=torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5]), sh=0.2 * scene.sh)
     _, grads = draw("cpu", scene, view)
     generator = torch.Generator().manual_seed(0)

@@ -43,7 +43,7 @@ def compare(backend, scene, view, picture=2e-6, gradient=1e-5, **options):
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("depth_grad_to_means", [True, False])
 def test_agrees_with_reference(backend, degree, depth_grad_to_means):
-    """Rotated camera, off-centre principal point, every SH degree, many Gaussians outside the image."""
+    """Rotated camera, off-center principal point, every SH degree, many Gaussians outside the image."""
     view = camera(seed=degree)
     scene = splats(view, degree=degree, seed=degree)
     want, grads = compare(backend, scene, view, depth_grad_to_means=depth_grad_to_means)

@@ -23,7 +23,7 @@ def test_one_gaussian_on_a_pixel_centre():
     view = camera(seed=None)
     out = rasterize(one(view, 20.5, 10.5, 40.0, sh=torch.tensor([[[1.0, 0.0, -1.0]]])), view, background=BLACK)
     red = 0.5 + 1.0 / (2 * np.sqrt(np.pi))
-    # float32 rounds opacity, colour and projection once each
+    # float32 rounds opacity, color and projection once each
     assert torch.allclose(out.color[10, 20], 0.6 * torch.tensor([red, 0.5, 1 - red]).float(), atol=1e-6)
     assert torch.isclose(out.alpha[10, 20], torch.tensor(0.6), atol=1e-6)
     assert torch.isclose(out.depth[10, 20], torch.tensor(0.6 * 40), rtol=1e-6)
@@ -36,7 +36,7 @@ def test_footprint_is_the_blurred_projection():
     scene = one(view, 20.5, 10.5, 40.0)
     out = rasterize(scene, view, background=BLACK)
     variance_x, variance_y = 1.0 + constants.BLUR_PX2, (view.fy / view.fx) ** 2 + constants.BLUR_PX2
-    # atol: the off-centre view direction tilts J; it reaches the sum of squares at second order in 0.1
+    # atol: the off-center view direction tilts J; it reaches the sum of squares at second order in 0.1
     assert torch.isclose(out.alpha[10, 21], torch.tensor(0.6 * np.exp(-0.5 / variance_x)).float(), rtol=2e-2)
     assert torch.isclose(out.alpha[11, 20], torch.tensor(0.6 * np.exp(-0.5 / variance_y)).float(), rtol=2e-2)
 
@@ -115,7 +115,7 @@ def test_gradcheck(depth_grad_to_means):
 
     if depth_grad_to_means:
         assert torch.autograd.gradcheck(outputs, (background, *inputs))
-    else:  # depth deliberately does not know its own z: colour and alpha must still be exact
+    else:  # depth deliberately does not know its own z: color and alpha must still be exact
         assert torch.autograd.gradcheck(lambda *values: outputs(*values)[:2], (background, *inputs))
 
 
@@ -163,8 +163,8 @@ def test_shape_and_type_errors_name_the_field():
 
 
 def test_principal_point_moves_the_limits():
-    """The Jacobian's limits follow the true principal point; centred, they are 1.3 tan(fov / 2)."""
-    centred = Camera(100, 80, 50.0, 40.0, 50.0, 40.0, np.eye(4))
-    assert jacobian_limits(centred) == pytest.approx((-1.3, 1.3, -1.3, 1.3))
+    """The Jacobian's limits follow the true principal point; centered, they are 1.3 tan(fov / 2)."""
+    centered = Camera(100, 80, 50.0, 40.0, 50.0, 40.0, np.eye(4))
+    assert jacobian_limits(centered) == pytest.approx((-1.3, 1.3, -1.3, 1.3))
     shifted = Camera(100, 80, 50.0, 40.0, 60.0, 40.0, np.eye(4))
     assert jacobian_limits(shifted) == pytest.approx((-1.5, 1.1, -1.3, 1.3))

@@ -105,7 +105,7 @@ def test_loss_is_the_literal_double_loop():
             top_disp += pair[i, k] * np.linalg.norm(d_i - d_j)
             top_dist += pair[i, k] * penalty
             total += pair[i, k]
-    # The root's 1e-8 mm^2 adds less than 1e-9 to displacements of millimetres.
+    # The root's 1e-8 mm^2 adds less than 1e-9 to displacements of millimeters.
     assert disp.item() == pytest.approx(top_disp / total, rel=1e-7)
     assert dist.item() == pytest.approx(top_dist / total, rel=1e-7)
 

@@ -90,7 +90,7 @@ class InitConfig:
     voxel_divisions: int = 400
     """Voxels along the longest side of the point cloud's box."""
     outlier_neighbors: int = 20
-    """Neighbours whose mean distance is judged."""
+    """Neighbors whose mean distance is judged."""
     outlier_std: float = 1.5
     """Points farther than mean + this many standard deviations are dropped."""
     pixel_offset: Literal["exact", "legacy"] = "exact"
@@ -134,11 +134,11 @@ class BasisConfig:
     """One coefficient per Gaussian, temporal basis function and channel: a linear map, no network."""
 
     num_bases: int = 31
-    """B: Gaussian bumps over time, centred evenly on [0, 1]."""
+    """B: Gaussian bumps over time, centered evenly on [0, 1]."""
     relative_width: float = 1.2
     """Standard deviation of a bump in units of 1 / B."""
     deform_color: bool = True
-    """Also let the view-independent colour change with time."""
+    """Also let the view-independent color change with time."""
 
     def __post_init__(self) -> None:
         check_range("num_bases", self.num_bases, 2, 1000)
@@ -177,7 +177,7 @@ class LossConfig:
     depth_weight: float = 1.0
     """lambda_depth, of the L1 on inverse depth (1 / mm)."""
     tv_weight: float = 0.03
-    """lambda_tv, of the total variation of colour and inverse depth over the whole frame."""
+    """lambda_tv, of the total variation of color and inverse depth over the whole frame."""
     depth_mode: Literal["accumulated", "expected"] = "accumulated"
     """Depth that is compared: sum of weight * z, or that divided by alpha."""
     min_depth_pixels: int = 10
@@ -274,7 +274,7 @@ class OptimConfig:
     """Adam, one learning rate per group. Rates marked * are multiplied by the spatial scale of the sequence."""
 
     means_lr: float = 1.6e-4
-    """* Initial rate of the centres."""
+    """* Initial rate of the centers."""
     means_lr_final: float = 1.6e-6
     """* Rate at `decay_iterations`; log-linear in between."""
     network_lr: float = 1.6e-4
@@ -284,7 +284,7 @@ class OptimConfig:
     """* Initial rate of planes and box."""
     planes_lr_final: float = 1.6e-5
     basis_means_lr: float = 2e-2
-    """Initial rate of the temporal coefficients of the centres, mm."""
+    """Initial rate of the temporal coefficients of the centers, mm."""
     basis_quats_lr: float = 2e-3
     basis_log_scales_lr: float = 5e-3
     basis_opacity_lr: float = 2e-2
@@ -313,7 +313,7 @@ class ScheduleConfig:
     fine_iterations: int = 3000
     """Stage two: a random training frame each time, deformed."""
     sh_degree: int = 3
-    """Highest degree of the colour's spherical harmonics."""
+    """Highest degree of the color's spherical harmonics."""
     half_resolution_iterations: int = 0
     """Fine iterations, from the first on, that see frames of half the width and height."""
     sh_every: int = 500

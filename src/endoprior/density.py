@@ -26,7 +26,7 @@ class DensityStats:
     num_seen: Tensor
     """(N,) times drawn since the last event."""
     score_sum: Tensor
-    """(N,) sum of rho at the projected centre over valid projections."""
+    """(N,) sum of rho at the projected center over valid projections."""
     num_valid: Tensor
     """(N,) n_i: valid projections at which the score was sampled."""
     opacity_sum: Tensor
@@ -60,7 +60,7 @@ class DensityStats:
     def add_score(
         self, out: RenderOutput, prior: Tensor, tissue_mask: Tensor, opacities: Tensor, scale: float = 1.0
     ) -> None:
-        """Sample rho where the drawn centres fall on tissue: s_it and m_it of Eq. (7).
+        """Sample rho where the drawn centers fall on tissue: s_it and m_it of Eq. (7).
 
         Args:
             prior: (H, W) rho in [0, 1]. tissue_mask: (H, W) bool, True on tissue. opacities: (N,) canonical.
@@ -89,12 +89,12 @@ def valid_projection(means2d: Tensor, radii: Tensor, mask_value: Tensor, shape: 
 
 
 def sample_mask(tissue_mask: Tensor, means2d: Tensor) -> Tensor:
-    """(N,) mask value, bilinear, at projected centres in px."""
+    """(N,) mask value, bilinear, at projected centers in px."""
     return _bilinear(tissue_mask[None, None].float(), means2d.detach())[0]
 
 
 def _bilinear(maps: Tensor, means2d: Tensor) -> Tensor:
-    """(C, N) values of (1, C, H, W) maps at (N, 2) px, pixel centres at half integers, zero outside."""
+    """(C, N) values of (1, C, H, W) maps at (N, 2) px, pixel centers at half integers, zero outside."""
     height, width = maps.shape[-2:]
     # align_corners=False puts -1 and 1 on the outer pixel edges: exactly our pixel convention.
     grid = torch.stack([means2d[:, 0] * (2 / width) - 1, means2d[:, 1] * (2 / height) - 1], -1)
@@ -163,7 +163,7 @@ def plan(stats: DensityStats, scales: Tensor, opacities: Tensor, extent: float, 
 def scene_extent(camera_centers: Tensor, points: Tensor, cfg: DensityConfig) -> float:
     """Length that separates small from large Gaussians, mm.
 
-    `camera`: 1.1 times the radius of the camera centres, as 3DGS has it; 0 for a still camera, so nothing is cloned.
+    `camera`: 1.1 times the radius of the camera centers, as 3DGS has it; 0 for a still camera, so nothing is cloned.
     `scene`: 1.1 times the largest distance of a point from the points' centroid.
 
     Args:

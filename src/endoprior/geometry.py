@@ -1,6 +1,6 @@
 """Pinhole geometry on NumPy arrays: pixel grids, projection, back-projection, bilinear look-up.
 
-Pixel (0, 0) is centred at (0.5, 0.5); `x = fx X / Z + cx`. Everything is in mm and px.
+Pixel (0, 0) is centered at (0.5, 0.5); `x = fx X / Z + cx`. Everything is in mm and px.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from .types import Camera
 
 
 def pixel_centers(width: int, height: int) -> NDArray[np.float32]:
-    """(H, W, 2) coordinates (x, y) of the pixel centres, px."""
+    """(H, W, 2) coordinates (x, y) of the pixel centers, px."""
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5)
     return np.stack([x, y], -1)
 
@@ -37,7 +37,7 @@ def back_project(pixels: NDArray, depth: NDArray, camera: Camera) -> NDArray:
     """Lift pixels to world points: the inverse of `project`.
 
     Args:
-        pixels: (..., 2) pixel coordinates, centres at half integers.
+        pixels: (..., 2) pixel coordinates, centers at half integers.
         depth: (...,) camera-space z, mm.
     Returns:
         (..., 3) world coordinates, mm.
@@ -54,7 +54,7 @@ def back_project(pixels: NDArray, depth: NDArray, camera: Camera) -> NDArray:
 
 
 def bilinear(image: NDArray, pixels: NDArray) -> NDArray:
-    """Bilinear interpolation with values at pixel centres; the border value is held outside them.
+    """Bilinear interpolation with values at pixel centers; the border value is held outside them.
 
     Args:
         image: (H, W) or (H, W, C).

@@ -27,12 +27,12 @@ def supervised_losses(
     measured: Tensor,
     weights: tuple[float, float, float],
 ) -> Tensor:
-    """Weighted colour, depth and total-variation terms; the gradient flows to `color` and `depth`.
+    """Weighted color, depth and total-variation terms; the gradient flows to `color` and `depth`.
 
     Args:
         color: (H, W, 3) float32. depth: (H, W) float32 mm, 0 where nothing is drawn.
         target_u8: (H, W, 3) uint8. target_inverse: (H, W) 1 / mm.
-        tissue_mask, measured: (H, W) bool, True where colour, respectively depth, is compared.
+        tissue_mask, measured: (H, W) bool, True where color, respectively depth, is compared.
         weights: factors of the three terms; the depth term is 0 where its factor is.
     Returns:
         (3,) the weighted terms.
@@ -92,7 +92,7 @@ def _sign(x):
 @njit(parallel=True, cache=True, fastmath=FLAGS)
 def _rows(color, depth, target_u8, target_inverse, tissue_mask, measured, inverse, factors, v_color, v_depth, sums):
     # One task per row y: writes v_color[y], v_depth[y] and sums[y], the unweighted (color, depth, two variations).
-    # The variation's gradient is the signs of the differences to the four neighbours: no task writes another's row.
+    # The variation's gradient is the signs of the differences to the four neighbors: no task writes another's row.
     height, width = depth.shape
     scale = np.float32(1 / 255)
     f_color, f_depth, f_tv, f_tvd = factors

@@ -1,4 +1,4 @@
-"""Supervised terms of the objective, Eq. (12): masked colour, inverse depth, total variation.
+"""Supervised terms of the objective, Eq. (12): masked color, inverse depth, total variation.
 
 Pure functions; `H, W` is the image. Weights are applied by the caller.
 """
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def color_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
-    """L_rgb: mean absolute colour difference over tissue pixels and channels.
+    """L_rgb: mean absolute color difference over tissue pixels and channels.
 
     Args:
         color, target: (H, W, 3). tissue_mask: (H, W) bool, True on tissue.

@@ -198,7 +198,7 @@ def motion_rates(cfg: Config, iteration: int, steps: int) -> NDArray:
 
 
 def split_children(gaussians: Gaussians, split: Tensor, shrink: float, rng: np.random.Generator) -> dict[str, Tensor]:
-    """Two children for each Gaussian marked in `split` (N,): centres drawn from it, scales divided by `shrink`."""
+    """Two children for each Gaussian marked in `split` (N,): centers drawn from it, scales divided by `shrink`."""
     tensors = {name: value.detach()[split] for name, value in gaussians.tensors.items()}
     children = {name: torch.cat([value, value]) for name, value in tensors.items()}
     scales, quats = children["log_scales"].exp().numpy(), children["quats"].numpy()

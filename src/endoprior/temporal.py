@@ -1,6 +1,6 @@
-"""Texture-aware temporal consistency: neighbours move together, the more so the better their texture. Eqs. (9)-(11).
+"""Texture-aware temporal consistency: neighbors move together, the more so the better their texture. Eqs. (9)-(11).
 
-Shared letters: `N` Gaussians of the scene, `P` of them chosen for one step, `K` neighbours. "now" is frame t,
+Shared letters: `N` Gaussians of the scene, `P` of them chosen for one step, `K` neighbors. "now" is frame t,
 "before" the adjacent training frame t - dt.
 """
 
@@ -111,10 +111,10 @@ def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
 def affinity(distances: NDArray, indices: NDArray, weights: NDArray) -> NDArray:
     """w_ij = exp(-|mu_i - mu_j|^2 / (2 sigma_loc^2)) w_i w_j, Eq. (10), floored at 1e-8.
 
-    sigma_loc, which the paper leaves open, is the median neighbour distance of the step (released code).
+    sigma_loc, which the paper leaves open, is the median neighbor distance of the step (released code).
 
     Args:
-        distances: (P, K) mm. indices: (P, K) of the neighbours. weights: (P,) motion weights.
+        distances: (P, K) mm. indices: (P, K) of the neighbors. weights: (P,) motion weights.
     Returns:
         (P, K) pair weights.
     """
@@ -135,8 +135,8 @@ def local_motion_loss(
     """The two halves of L_local, Eq. (11), unweighted: displacement and distance.
 
     Args:
-        now, before: (P, 3) deformed centres at t and t - dt, mm. Detach `before` to train one end only.
-        indices: (P, K) neighbours, found at t - dt. pair_weights: (P, K) from `affinity`.
+        now, before: (P, 3) deformed centers at t and t - dt, mm. Detach `before` to train one end only.
+        indices: (P, K) neighbors, found at t - dt. pair_weights: (P, K) from `affinity`.
     Returns:
         Mean |d_i - d_j| (mm) and mean Huber penalty of the change of |mu_i - mu_j|, both weighted by w_ij.
     """

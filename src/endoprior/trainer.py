@@ -156,7 +156,7 @@ class Trainer:
         }
 
     def _means_before(self, time: float, index: Tensor) -> Tensor:
-        """(P, 3) centres of the chosen Gaussians at an earlier moment, with a gradient only if that end is trained."""
+        """(P, 3) centers of the chosen Gaussians at an earlier moment, with a gradient only if that end is trained."""
         state = self.state
         if self.cfg.temporal.gradient == "both":
             # Moving all and then choosing is cheaper than the scattered gradient of choosing first.
@@ -197,7 +197,7 @@ class Trainer:
 
 
 def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: Config) -> dict[str, Tensor]:
-    """Weighted colour, depth and total-variation terms of Eq. (12)."""
+    """Weighted color, depth and total-variation terms of Eq. (12)."""
     depth = out.depth / out.alpha.clamp(min=1e-6) if cfg.loss.depth_mode == "expected" else out.depth
     enough = float(frame.measured.sum()) >= cfg.loss.min_depth_pixels
     weights = (1.0, cfg.loss.depth_weight if enough else 0.0, cfg.loss.tv_weight)

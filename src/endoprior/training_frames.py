@@ -34,7 +34,7 @@ class TrainingFrame:
 
     @property
     def rgb(self) -> Tensor:
-        """(H, W, 3) colour in [0, 1]."""
+        """(H, W, 3) color in [0, 1]."""
         return self.rgb_u8.float() / 255
 
 
@@ -90,7 +90,7 @@ def _training_frame(frame: Frame) -> TrainingFrame:
 
 
 def halved(frame: Frame) -> Frame:
-    """The frame at half width and height, rounded down: colours averaged, masks and depth where all four agree."""
+    """The frame at half width and height, rounded down: colors averaged, masks and depth where all four agree."""
     height, width = frame.tissue_mask.shape[0] // 2, frame.tissue_mask.shape[1] // 2
     camera = frame.camera
     small = replace(

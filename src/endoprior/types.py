@@ -1,7 +1,7 @@
 """The records that pass between modules: frozen, almost no logic.
 
-Shared letters: `H, W` image size, `N` Gaussians, `T` frames. Conventions (axes, pixel centres, units) are decided in
-`docs/conventions.md`: OpenCV camera axes, millimetres, pixel (0, 0) centred at (0.5, 0.5), quaternions (w, x, y, z).
+Shared letters: `H, W` image size, `N` Gaussians, `T` frames. Conventions (axes, pixel centers, units) are decided in
+`docs/conventions.md`: OpenCV camera axes, millimeters, pixel (0, 0) centered at (0.5, 0.5), quaternions (w, x, y, z).
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class Camera:
     fy: float
     """Focal length along y, px."""
     cx: float
-    """Principal point x, px; the centre of the left-most pixel is 0.5."""
+    """Principal point x, px; the center of the left-most pixel is 0.5."""
     cy: float
-    """Principal point y, px; the centre of the top-most pixel is 0.5."""
+    """Principal point y, px; the center of the top-most pixel is 0.5."""
     world_to_camera: NDArray[np.float64]
     """(4, 4) rigid transform from world to camera axes, translation in mm."""
 
@@ -52,7 +52,7 @@ class Frame:
     """index / T, in [0, 1)."""
     camera: Camera
     rgb_u8: NDArray[np.uint8]
-    """(H, W, 3) colour, 0..255, as stored in the file."""
+    """(H, W, 3) color, 0..255, as stored in the file."""
     tissue_mask: NDArray[np.bool_]
     """(H, W) True where the pixel shows usable tissue (no tool)."""
     depth: NDArray[np.float32]
@@ -62,7 +62,7 @@ class Frame:
 
     @property
     def rgb(self) -> NDArray[np.float32]:
-        """(H, W, 3) colour in [0, 1]."""
+        """(H, W, 3) color in [0, 1]."""
         return self.rgb_u8.astype(np.float32) / np.float32(255)
 
 
@@ -71,15 +71,15 @@ class Splats:
     """Gaussians ready to be drawn, at one moment: every value is activated."""
 
     means: Tensor
-    """(N, 3) centres, world axes, mm."""
+    """(N, 3) centers, world axes, mm."""
     quats: Tensor
-    """(N, 4) rotations (w, x, y, z); any non-zero length, the renderer normalises."""
+    """(N, 4) rotations (w, x, y, z); any non-zero length, the renderer normalizes."""
     scales: Tensor
     """(N, 3) standard deviations along the local axes, mm, > 0."""
     opacities: Tensor
     """(N,) in (0, 1)."""
     sh: Tensor
-    """(N, (D+1)**2, 3) spherical-harmonic colour coefficients of degree D in 0..3."""
+    """(N, (D+1)**2, 3) spherical-harmonic color coefficients of degree D in 0..3."""
 
     def __len__(self) -> int:
         return len(self.means)
@@ -90,12 +90,12 @@ class RenderOutput:
     """What every backend returns. After `means2d.retain_grad()`, its `.grad` (px) is what density control reads."""
 
     color: Tensor
-    """(H, W, 3) composited colour, background included; not clamped."""
+    """(H, W, 3) composited color, background included; not clamped."""
     alpha: Tensor
     """(H, W) accumulated opacity in [0, 1)."""
     depth: Tensor
     """(H, W) sum of weight * z, mm; divide by alpha for the expected depth."""
     means2d: Tensor
-    """(N, 2) projected centres, px; pixel (0, 0) is centred at (0.5, 0.5)."""
+    """(N, 2) projected centers, px; pixel (0, 0) is centered at (0.5, 0.5)."""
     radii: Tensor
     """(N,) int32 radius of the drawn footprint, px; 0 where culled."""

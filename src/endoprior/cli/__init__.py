@@ -17,7 +17,7 @@ COMMANDS = {
     "prior": "draw the cue maps and the joint texture prior of each frame",
     "train": "train one scene and score it",
     "eval": "score a trained scene on a split",
-    "render": "draw a trained scene: colour, depth, side-by-side, video",
+    "render": "draw a trained scene: color, depth, side-by-side, video",
 }
 """Name and one-line description; each lives in the module of this package named like it (`eval` in `evaluate`)."""
 

@@ -36,7 +36,7 @@ class FlowEstimator(Protocol):
 
 @dataclass(frozen=True)
 class DisFlow:
-    """Dense inverse search (Kroeger et al. 2016) from OpenCV, medium preset, on grey images. No network, any CPU."""
+    """Dense inverse search (Kroeger et al. 2016) from OpenCV, medium preset, on gray images. No network, any CPU."""
 
     score_name: str = "flow_error_dis"
 
@@ -49,10 +49,10 @@ class DisFlow:
         if min(first.shape[:2]) < DIS_MIN_SIZE:
             height, width = first.shape[:2]
             raise ScoreUnavailable(f"DIS flow needs images of at least {DIS_MIN_SIZE} px a side; got {width}x{height}")
-        grey_first, grey_second = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second))
+        gray_first, gray_second = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second))
         # A new estimator for each pair: it keeps buffers, and a pair must not depend on the one before.
         estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        return estimator.calc(grey_first, grey_second, None)
+        return estimator.calc(gray_first, gray_second, None)
 
 
 def dis_flow() -> DisFlow:

@@ -24,7 +24,7 @@ SSIM_C2 = 0.03**2
 
 
 def to_uint8(image: NDArray) -> NDArray[np.uint8]:
-    """(H, W, 3) colour as an 8-bit file stores it: clipped to [0, 1], times 255, halves rounded up.
+    """(H, W, 3) color as an 8-bit file stores it: clipped to [0, 1], times 255, halves rounded up.
 
     Raises:
         ValueError: the image is not a finite floating-point array.
@@ -34,7 +34,7 @@ def to_uint8(image: NDArray) -> NDArray[np.uint8]:
 
 
 def quantize(image: NDArray) -> NDArray[np.float32]:
-    """(H, W, 3) colour in [0, 1] after a round trip through an 8-bit file; see `to_uint8`."""
+    """(H, W, 3) color in [0, 1] after a round trip through an 8-bit file; see `to_uint8`."""
     return to_uint8(image).astype(np.float32) / np.float32(255)
 
 
@@ -45,8 +45,8 @@ def psnr(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
     -10 log10(masked fraction of the frame), about 1 dB where tissue fills 80 % of it.
 
     Args:
-        image: (H, W, 3) rendered colour in [0, 1].
-        target: (H, W, 3) true colour in [0, 1].
+        image: (H, W, 3) rendered color in [0, 1].
+        target: (H, W, 3) true color in [0, 1].
         mask: (H, W) True = tissue.
     Returns:
         dB; infinity for equal images, NaN for an empty mask.
@@ -67,7 +67,7 @@ def psnr_behind_tool(image: NDArray, tissue_truth: NDArray, mask: NDArray[np.boo
     """PSNR of what was drawn behind the tool against the tissue that is really there, dB.
 
     Args:
-        image: (H, W, 3) rendered colour in [0, 1].
+        image: (H, W, 3) rendered color in [0, 1].
         tissue_truth: (H, W, 3) the same frame without the tool, in [0, 1].
         mask: (H, W) True = tissue; the pixels where it is False are scored.
     Returns:
@@ -85,8 +85,8 @@ def ssim(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
     wholly outside the mask score 1, as in the published protocol.
 
     Args:
-        image: (H, W, 3) rendered colour in [0, 1].
-        target: (H, W, 3) true colour in [0, 1].
+        image: (H, W, 3) rendered color in [0, 1].
+        target: (H, W, 3) true color in [0, 1].
         mask: (H, W) True = tissue.
     Returns:
         Value in [-1, 1]; 1 for equal images, NaN for an empty mask.
@@ -151,7 +151,7 @@ def depth_rmse_endogaussian(depth: NDArray, target: NDArray, mask: NDArray[np.bo
 
 
 def _squared_error(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(num_masked, 3) squared colour differences of the masked pixels."""
+    """(num_masked, 3) squared color differences of the masked pixels."""
     return (image[mask].astype(np.float64) - target[mask].astype(np.float64)) ** 2
 
 
@@ -193,6 +193,6 @@ def _checked_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _check_finite_float(name: str, values: NDArray) -> None:
     """Raise ValueError unless the values are floating point and all finite."""
     if not np.issubdtype(values.dtype, np.floating):
-        raise ValueError(f"{name} must be floating point; got {values.dtype}. Divide 8-bit colour by 255")
+        raise ValueError(f"{name} must be floating point; got {values.dtype}. Divide 8-bit color by 255")
     if not np.isfinite(values).all():
         raise ValueError(f"{name} must be finite; got {np.count_nonzero(~np.isfinite(values))} values that are not")

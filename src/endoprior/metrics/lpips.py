@@ -42,8 +42,8 @@ class LpipsDistance:
         """LPIPS of the masked images scaled to [-1, 1], averaged over the frame.
 
         Args:
-            image: (H, W, 3) rendered colour in [0, 1].
-            target: (H, W, 3) true colour in [0, 1].
+            image: (H, W, 3) rendered color in [0, 1].
+            target: (H, W, 3) true color in [0, 1].
             mask: (H, W) True = tissue; everything else is black in both images.
         Returns:
             Distance >= 0; 0 for equal images, NaN for an empty mask.

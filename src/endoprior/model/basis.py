@@ -1,7 +1,7 @@
 """Temporal basis: every Gaussian has its own coefficients for a few bumps over time. Linear, no network.
 
 offset_i(t) = sum_b w_b(t) motion_i,b with w_b(t) = exp(-(t - c_b)^2 / (2 s^2)), cut to 0 beyond four standard
-deviations (there w < 3.4e-4). Centres c_b lie evenly on [0, 1], s = relative_width / B. Zero coefficients are the
+deviations (there w < 3.4e-4). Centers c_b lie evenly on [0, 1], s = relative_width / B. Zero coefficients are the
 identity. Bases of this kind were used per Gaussian by Yang et al., "Deform3DGS", MICCAI 2024.
 """
 

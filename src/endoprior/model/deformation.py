@@ -1,6 +1,6 @@
 """How canonical Gaussians move: the offsets of one moment, and the HexPlane field that predicts them.
 
-Offsets are added to the raw parameters: centres (mm), log scales, quaternions before normalization, opacity logits.
+Offsets are added to the raw parameters: centers (mm), log scales, quaternions before normalization, opacity logits.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Offsets:
     """What one moment adds to the raw parameters of N Gaussians; None where nothing is added."""
 
     means: Tensor
-    """(N, 3) displacement of the centres, mm."""
+    """(N, 3) displacement of the centers, mm."""
     log_scales: Tensor | None = None
     """(N, 3)."""
     quats: Tensor | None = None
@@ -77,7 +77,7 @@ class HexPlaneField:
         return self.grid.num_values
 
     def offsets(self, means: Tensor, time: float) -> Offsets:
-        """What `time` adds to Gaussians with canonical centres `means`.
+        """What `time` adds to Gaussians with canonical centers `means`.
 
         Args:
             means: (N, 3) float32, world axes, mm; any subset of the Gaussians, N may be 0.

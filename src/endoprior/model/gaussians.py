@@ -51,7 +51,7 @@ class Gaussians:
         return self.tensors["opacity_logits"].sigmoid()
 
     def splats(self, offsets: Offsets | None, sh_degree: int) -> Splats:
-        """Activate the parameters, moved by `offsets` (None: canonical), with colour up to `sh_degree`."""
+        """Activate the parameters, moved by `offsets` (None: canonical), with color up to `sh_degree`."""
         t = self.tensors
         sh_dc = t["sh_dc"]
         if offsets is not None and offsets.sh_dc is not None:
@@ -71,7 +71,7 @@ def _moved(value: Tensor, offset: Tensor | None) -> Tensor:
 
 
 def create_gaussians(points: NDArray, colors: NDArray, log_scales: NDArray, cfg: Config) -> Gaussians:
-    """Gaussians at the initial points: isotropic, unrotated, of the points' colour, nearly transparent.
+    """Gaussians at the initial points: isotropic, unrotated, of the points' color, nearly transparent.
 
     Args:
         points: (N, 3) mm. colors: (N, 3) in [0, 1]. log_scales: (N,) log of mm.

@@ -42,7 +42,7 @@ class PhantomConfig:
     pull_mm: float = 12.0
     """How far the grasper drags the tissue it holds, mm, 0..15."""
     noise: float = 1.6
-    """Standard deviation of the sensor noise at mid grey, in 8-bit levels, 0..20."""
+    """Standard deviation of the sensor noise at mid gray, in 8-bit levels, 0..20."""
     depth_noise_px: float = 0.16
     """Standard deviation of the disparity error of `depth/`, in px of a 640 px wide image, 0..2."""
     tracks: int = 256
@@ -65,7 +65,7 @@ class PhantomConfig:
         ):
             _require(name, getattr(self, name), low, high)
         _require("width / height", self.width / self.height, 0.6, 2.0)
-        # A principal point far off center would look past the modelled tissue.
+        # A principal point far off center would look past the modeled tissue.
         _require("principal_x", self.center[0], 0.35 * self.width, 0.65 * self.width)
         _require("principal_y", self.center[1], 0.35 * self.height, 0.65 * self.height)
 

@@ -40,7 +40,7 @@ def expose(display: NDArray[np.float32], noise: float, rng: np.random.Generator)
 
     Args:
         display: (H, W, 3) noise-free values in [0, 255].
-        noise: standard deviation at mid grey, in 8-bit levels.
+        noise: standard deviation at mid gray, in 8-bit levels.
     """
     if noise > 0:
         grain = rng.standard_normal(display.shape, dtype=np.float32)

@@ -28,7 +28,7 @@ class Rasterizer(Protocol):
         """Draw the Gaussians, near to far.
 
         Args:
-            background: (3,) colour behind everything, in [0, 1].
+            background: (3,) color behind everything, in [0, 1].
             depth_grad_to_means: False stops the gradient of `depth` from reaching the composited z values; z still gets
                 gradient through the projected covariance, and the weights keep theirs.
         Raises:

@@ -1,6 +1,6 @@
 """Front-to-back compositing of the tiles, backward: the same walk again, with gradients.
 
-With weights w_j, colours c_j (z among them), cotangents v and final transmittance T_end, Gaussian i at one pixel gets
+With weights w_j, colors c_j (z among them), cotangents v and final transmittance T_end, Gaussian i at one pixel gets
 `dL/dalpha_i = T_i (c_i . v) - rest_i / (1 - alpha_i)`, where `rest_i = sum_{j > i} w_j (c_j . v) + T_end (background .
 v - v_alpha)`. `rest` starts as the whole sum, known from the forward pass, and loses one term per Gaussian: no list is
 walked backwards. Each pair writes one row of moments; `gather` adds them up per Gaussian in a fixed order and turns
@@ -28,7 +28,7 @@ f4 = np.float32
 
 @njit(inline="always")
 def _differentiate_pair(record, pair, left, top, state, moments):
-    # Walks the same rows as the forward pass. (left, top): centre of the tile's first pixel. Writes moments (MOMENTS,).
+    # Walks the same rows as the forward pass. (left, top): center of the tile's first pixel. Writes moments (MOMENTS,).
     root, m_log2 = record[tiles.ROOT], splat(record[tiles.M_LOG2])
     root_k, log2_opacity = splat(root * record[tiles.K]), splat(record[tiles.LOG2_OPACITY])
     red, green, blue = splat(record[tiles.RED]), splat(record[tiles.GREEN]), splat(record[tiles.BLUE])
@@ -126,7 +126,7 @@ def composite_backward(
 @njit(parallel=True, cache=True, error_model="numpy")
 def gather(moments, slot_starts, row_forms, opacities, v_means2d, v_row_forms, v_opacities, v_colors, v_z):
     # One iteration per Gaussian: sums its slots in order; writes one row of each v_*.
-    # log alpha = log opacity - (a u^2 + m dy^2) / 2 with u = dx + k dy; moving the centre moves (dx, dy) the other way.
+    # log alpha = log opacity - (a u^2 + m dy^2) / 2 with u = dx + k dy; moving the center moves (dx, dy) the other way.
     for g in prange(slot_starts.size - 1):
         s_1 = s_x = s_y = s_xx = s_xy = s_yy = s_red = s_green = s_blue = s_z = f4(0.0)
         for slot in range(slot_starts[g], slot_starts[g + 1]):

@@ -38,7 +38,7 @@ def _is_full(state):
 
 @njit(inline="always")
 def _draw_pair(record, pair, left, top, state):
-    # Draws one Gaussian on the rows of one tile that it touches. (left, top): centre of the tile's first pixel.
+    # Draws one Gaussian on the rows of one tile that it touches. (left, top): center of the tile's first pixel.
     root, m_log2 = record[tiles.ROOT], splat(record[tiles.M_LOG2])
     root_k, log2_opacity = splat(root * record[tiles.K]), splat(record[tiles.LOG2_OPACITY])
     red, green, blue = splat(record[tiles.RED]), splat(record[tiles.GREEN]), splat(record[tiles.BLUE])

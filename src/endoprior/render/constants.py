@@ -7,7 +7,7 @@ change here: delete `render/__pycache__` after one.
 from __future__ import annotations
 
 NEAR_Z = 0.2
-"""A Gaussian whose centre has camera z <= this is culled, mm."""
+"""A Gaussian whose center has camera z <= this is culled, mm."""
 BLUR_PX2 = 0.3
 """Added to both diagonal entries of the projected covariance, px^2, so that nothing is thinner than a pixel."""
 JACOBIAN_MARGIN = 0.3

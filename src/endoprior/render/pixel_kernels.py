@@ -1,6 +1,6 @@
 """What one Gaussian does to LANES pixels of a row: inlined by both compositing passes, so that both decide alike.
 
-A Gaussian is drawn from its row form (see `project_kernels`): with (dx, dy) measured from its centre,
+A Gaussian is drawn from its row form (see `project_kernels`): with (dx, dy) measured from its center,
 `alpha = opacity exp(-(a (dx + k dy)^2 + m dy^2) / 2) = 2^(log2(opacity) - (root dx + root k dy)^2 - m_log2 dy^2)`,
 where `root = sqrt(a log2(e) / 2)` and `m_log2 = m log2(e) / 2`.
 """

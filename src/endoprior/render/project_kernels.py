@@ -1,12 +1,12 @@
-"""EWA projection and colour of all Gaussians, forward and backward, one Gaussian per iteration.
+"""EWA projection and color of all Gaussians, forward and backward, one Gaussian per iteration.
 
 Meets `projection.project`. What compositing needs of a 2D Gaussian is its *row form* (a, k, m):
-`power = -(a (dx + k dy)^2 + m dy^2) / 2`: every row is a 1D Gaussian of precision a, centred k dy to the left, and its
+`power = -(a (dx + k dy)^2 + m dy^2) / 2`: every row is a 1D Gaussian of precision a, centered k dy to the left, and its
 peak falls off with precision m. With covariance (xx, xy, yy): `a = yy / det`, `k = -xy / yy`, `m = 1 / yy`. Unlike the
 inverse covariance it has no cancellation, and `det` has none either: for the blurred product B B^T + b I of a 2x3
 matrix with rows r1, r2, `det = |r1 x r2|^2 + b (|r1|^2 + |r2|^2) + b^2`.
 
-Geometry is float64 inside (the time goes to memory and square roots), colours are float32. In this file `v_x` is dL/dx.
+Geometry is float64 inside (the time goes to memory and square roots), colors are float32. In this file `v_x` is dL/dx.
 `lens` is (fx, fy, cx, cy, left, right, top, bottom), the last four from `projection.jacobian_limits`.
 """
 
@@ -40,7 +40,7 @@ def _axes(view, quat, scales, axes):
 
 @njit(inline="always")
 def _spread(lens, x, y, z, axes):
-    # Rows of J times the axes (Jacobian limited to the neighbourhood of the image), and the limited slopes.
+    # Rows of J times the axes (Jacobian limited to the neighborhood of the image), and the limited slopes.
     slope_x, slope_y = min(max(x / z, lens[4]), lens[5]), min(max(y / z, lens[6]), lens[7])
     gx, gy = lens[0] / z, lens[1] / z
     b0 = gx * (axes[0, 0] - slope_x * axes[2, 0])
@@ -164,7 +164,7 @@ def project_backward(
                 v_y += v_slope / z
                 v_depth -= v_slope * y / (z * z)
 
-            # Colour -> coefficients and direction of view -> mean.
+            # Color -> coefficients and direction of view -> mean.
             dx, dy, dz = wx - center[0], wy - center[1], wz - center[2]
             inverse = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
             dx, dy, dz = dx * inverse, dy * inverse, dz * inverse

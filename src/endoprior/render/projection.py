@@ -1,6 +1,6 @@
 """EWA projection in torch (Zwicker et al. 2001): 3D Gaussians to 2D ones. The definition the CPU kernels must meet.
 
-The camera maps p = (x, y, z) to (fx x/z + cx, fy y/z + cy). Its Jacobian J is taken at the centre, with x/z and y/z
+The camera maps p = (x, y, z) to (fx x/z + cx, fy y/z + cy). Its Jacobian J is taken at the center, with x/z and y/z
 limited to a little outside the image (`JACOBIAN_MARGIN`) because the linearization fails there. Then
 `cov2d = J W R diag(s^2) R^T W^T J^T + BLUR_PX2 I`. Shared letter: `N` Gaussians.
 """
@@ -25,13 +25,13 @@ class Projected:
     """Gaussians in the image. Where `radii` is 0 the rows are finite but meaningless, and carry no gradient."""
 
     means2d: Tensor
-    """(N, 2) centres, px."""
+    """(N, 2) centers, px."""
     cov2d: Tensor
     """(N, 3) covariance entries xx, xy, yy, blur included, px^2."""
     z: Tensor
-    """(N,) camera-space z of the centres, mm."""
+    """(N,) camera-space z of the centers, mm."""
     colors: Tensor
-    """(N, 3) colour seen from the camera, >= 0."""
+    """(N, 3) color seen from the camera, >= 0."""
     radii: Tensor
     """(N,) int32 ceil(3 sigma) along the long axis, px; 0 where nothing of it can reach a pixel."""
 
@@ -78,8 +78,8 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def project(splats: Splats, camera: Camera) -> Projected:
     """Project every Gaussian, and find out which of them can be drawn.
 
-    Culled are: centre at or behind `NEAR_Z`; any number not finite, or a result that overflows; a quaternion of length
-    0; a footprint (where alpha >= `ALPHA_MIN`) that misses every pixel centre's bounding box.
+    Culled are: center at or behind `NEAR_Z`; any number not finite, or a result that overflows; a quaternion of length
+    0; a footprint (where alpha >= `ALPHA_MIN`) that misses every pixel center's bounding box.
     """
     with torch.no_grad():  # decide first; a `where` after the fact would let NaN into the gradients
         usable = _usable(splats, camera)
@@ -94,7 +94,7 @@ def project(splats: Splats, camera: Camera) -> Projected:
 
 
 def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Means, covariances, z and colours of Gaussians trusted to be in front of the camera."""
+    """Means, covariances, z and colors of Gaussians trusted to be in front of the camera."""
     view = torch.as_tensor(camera.world_to_camera, dtype=splats.means.dtype)
     x, y, z = (splats.means @ view[:3, :3].T + view[:3, 3]).unbind(-1)
     left, right, top, bottom = jacobian_limits(camera)
@@ -139,7 +139,7 @@ def _placeholder(splats: Splats, camera: Camera) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def _radii(means2d: Tensor, cov2d: Tensor, opacities: Tensor, usable: Tensor, camera: Camera) -> Tensor:
-    """ceil(3 sigma_max), and 0 unless the box around {alpha >= ALPHA_MIN} holds a pixel centre's coordinates."""
+    """ceil(3 sigma_max), and 0 unless the box around {alpha >= ALPHA_MIN} holds a pixel center's coordinates."""
     xx, xy, yy = cov2d.unbind(-1)
     long_axis = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
     reach = (2 * torch.log((opacities / ALPHA_MIN).clamp(min=1))).sqrt()  # in standard deviations

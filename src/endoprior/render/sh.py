@@ -1,4 +1,4 @@
-"""Colour that depends on the direction of view: real spherical harmonics of degree 0 to 3, in torch.
+"""Color that depends on the direction of view: real spherical harmonics of degree 0 to 3, in torch.
 
 Order and signs are those of 3DGS PLY files: coefficients (l, m) with m = -l..l, Condon-Shortley phase kept. With the
 Legendre functions written out, each is a constant times a polynomial of the unit direction (x, y, z).
@@ -57,7 +57,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colors(sh: Tensor, directions: Tensor) -> Tensor:
-    """(N, 3) colour >= 0 seen along (N, 3) unit directions: the expansion + 0.5, cut off at 0 (no gradient there).
+    """(N, 3) color >= 0 seen along (N, 3) unit directions: the expansion + 0.5, cut off at 0 (no gradient there).
 
     Args:
         sh: (N, K, 3) coefficients.

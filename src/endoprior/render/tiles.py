@@ -103,7 +103,7 @@ def _footprint(record):
 
 @njit(inline="always")
 def _pixels(center, before, after, size):
-    # First and last + 1 pixel of 0..size-1 with its centre in [center + before, center + after], a hair more.
+    # First and last + 1 pixel of 0..size-1 with its center in [center + before, center + after], a hair more.
     first, last = max(np.ceil(center + before - 0.501), 0.0), min(np.floor(center + after - 0.499), size - 1.0)
     if not first <= last:
         return 0, 0

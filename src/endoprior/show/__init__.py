@@ -1,1 +1,1 @@
-"""Pictures and films for people: colour maps, contact sheets, videos, the report. Nothing here feeds a score."""
+"""Pictures and films for people: color maps, contact sheets, videos, the report. Nothing here feeds a score."""

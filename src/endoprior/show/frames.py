@@ -1,4 +1,4 @@
-"""Drawn views on disk: colour and depth per view, side-by-side pictures, and a video."""
+"""Drawn views on disk: color and depth per view, side-by-side pictures, and a video."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def write_views(
     """Draw each view into `out/rgb/*.png`, `out/depth/*.npy` (mm, float32) and `out/side_by_side/*.png`, and a film.
 
     Args:
-        frames: the originals, one per view; without them the side-by-side shows colour and depth only.
+        frames: the originals, one per view; without them the side-by-side shows color and depth only.
         video: path of the mp4 of the side-by-side pictures.
     """
     span = depth_span(scene)
@@ -51,7 +51,7 @@ def write_views(
 
 
 def depth_span(scene: Scene) -> tuple[float, float]:
-    """Depths, mm, between which nearly all of the first moment lies: one colour scale for all pictures of a scene."""
+    """Depths, mm, between which nearly all of the first moment lies: one color scale for all pictures of a scene."""
     depth = scene.render(0.0).depth.numpy()
     drawn = depth[depth > 0]
     low, high = np.percentile(drawn, (2, 98)) if drawn.size else (0.0, 1.0)

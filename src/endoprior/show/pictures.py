@@ -1,4 +1,4 @@
-"""Small pieces that pictures are made of: colour-mapped maps, labels, tiles, PNG files."""
+"""Small pieces that pictures are made of: color-mapped maps, labels, tiles, PNG files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..atomic import whole_file
 
 
 def write_png(path: Path, rgb_u8: NDArray[np.uint8]) -> None:
-    """Write an (H, W, 3) RGB or (H, W) grey 8-bit picture, whole or not at all."""
+    """Write an (H, W, 3) RGB or (H, W) gray 8-bit picture, whole or not at all."""
     with whole_file(path) as temporary:
         pixels = rgb_u8[..., ::-1] if rgb_u8.ndim == 3 else rgb_u8
         if not cv2.imwrite(str(temporary), pixels):
@@ -25,7 +25,7 @@ def to_u8(unit: NDArray) -> NDArray[np.uint8]:
 
 
 def colorize(values: NDArray, low: float, high: float, valid: NDArray | None = None) -> NDArray[np.uint8]:
-    """Turbo colours of an (H, W) map: blue at `low`, red at `high`; black where `valid` is False."""
+    """Turbo colors of an (H, W) map: blue at `low`, red at `high`; black where `valid` is False."""
     span = max(high - low, 1e-9)
     colors = cv2.applyColorMap(to_u8((np.nan_to_num(values) - low) / span), cv2.COLORMAP_TURBO)[..., ::-1]
     return colors if valid is None else colors * np.asarray(valid, np.uint8)[..., None]

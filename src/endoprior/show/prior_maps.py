@@ -19,7 +19,7 @@ SHEET_WIDTH_PX = 320
 
 
 def write_prior_maps(sequence: Sequence, split: Split, cfg: PriorConfig, out: Path) -> Path:
-    """Write `specular/`, `salience/` and `prior/` (grey, 255 = 1) and `contact_sheet.png` into `out`.
+    """Write `specular/`, `salience/` and `prior/` (gray, 255 = 1) and `contact_sheet.png` into `out`.
 
     Returns:
         Path of the contact sheet.
@@ -40,14 +40,14 @@ def write_prior_maps(sequence: Sequence, split: Split, cfg: PriorConfig, out: Pa
             for name, values in maps.items():
                 write_png(folder / name / f"{frame.index:06d}.png", to_u8(values))
             if position in shown:
-                pictures = {f"frame {frame.index}": frame.rgb_u8, "tissue mask": _grey(frame.tissue_mask)}
+                pictures = {f"frame {frame.index}": frame.rgb_u8, "tissue mask": _gray(frame.tissue_mask)}
                 pictures |= {name: colorize(values, 0, 1) for name, values in maps.items()}
                 rows += [label(_small(picture), name) for name, picture in pictures.items()]
         write_png(folder / "contact_sheet.png", tile(rows, 5))
     return out / "contact_sheet.png"
 
 
-def _grey(mask: NDArray) -> NDArray[np.uint8]:
+def _gray(mask: NDArray) -> NDArray[np.uint8]:
     return np.repeat(to_u8(mask)[..., None], 3, -1)
 
 

@@ -34,7 +34,7 @@ SHOWN_SCORES = {
     "train_seconds": "training, s",
 }
 ERROR_FULL_SCALE = 0.15
-"""Colour error, in [0, 1], that the error map shows as its last colour."""
+"""Color error, in [0, 1], that the error map shows as its last color."""
 
 
 def write_report(scene: Scene, sequence: Sequence, run: Path, path: Path) -> None:
