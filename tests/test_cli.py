@@ -57,6 +57,8 @@ def test_every_command_explains_itself(command, capsys):
         (["train", "nowhere", "out", "--preset", "best"], "--preset"),
         (["train", "nowhere", "out", "--seed", "one"], "one"),
         (["train", "nowhere", "out", "--density.min-densify-weight", "2"], "min_densify_weight"),
+        (["train", "nowhere", "out", "--device", "cuda"], "--device"),
+        (["train", "nowhere", "out", "--weights-dir", "no-weights"], "no-weights"),
         (["eval", "nowhere"], "nowhere"),
         (["render", "nowhere"], "nowhere"),
         (["prior", "nowhere", "out"], "nowhere"),

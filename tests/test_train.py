@@ -175,6 +175,16 @@ def test_eligible_frames_of_the_temporal_term(make_tiny_sequence):
         assert sum(views.before(k) is not None for k in range(len(views))) == eligible
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("gradient", "trained"), [("current", False), ("both", True)])
+def test_only_the_configured_ends_of_a_displacement_are_trained(tiny_sequence, kind, gradient, trained):
+    cfg = tiny_config(kind, coarse=0)
+    trainer = Trainer(load_sequence(tiny_sequence), replace(cfg, temporal=replace(cfg.temporal, gradient=gradient)))
+    trainer.start()
+    before = trainer._means_before(0.2, torch.arange(5))
+    assert before.requires_grad is trained and before.shape == (5, 3)
+
+
 def test_half_resolution_keeps_the_geometry(tiny_sequence):
     from endoprior.geometry import back_project, project
     from endoprior.training_frames import halved

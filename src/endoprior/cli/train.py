@@ -30,8 +30,8 @@ class Train:
     """Where the config starts from."""
     init_budget: int | None = None
     """Short for --init.budget."""
-    device: Literal["auto", "cpu"] = "auto"
-    """Where to compute; auto takes the best that works here and says so."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; this version computes on the CPU only, which is what auto takes."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     networks: bool = True
@@ -45,6 +45,10 @@ def run(argv: list[str]) -> None:
     """Train, score, and print where the results are."""
     args = parse(Train, argv, "train", default=_preset_defaults(argv))
     cfg = args.config
+    if args.device == "cuda":
+        raise InputError("--device: expected auto or cpu; got cuda, not supported yet. Leave the option out.")
+    if args.weights_dir and not args.weights_dir.is_dir():
+        raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
     if args.init_budget is not None:
         cfg = dataclasses.replace(cfg, init=dataclasses.replace(cfg.init, budget=args.init_budget))
     train_and_evaluate(args.data, cfg, args.out, args.resume, args.networks, args.weights_dir)
