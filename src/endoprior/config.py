@@ -46,8 +46,8 @@ class SpecularConfig:
     """tau_o: two or more channels above it make the likelihood 1."""
 
     def __post_init__(self) -> None:
-        check_range("value_temperature", self.value_temperature, 1e-6, 1e6)
-        check_range("saturation_temperature", self.saturation_temperature, 1e-6, 1e6)
+        check_range("value_temperature", self.value_temperature, 1e-30, 1e30)
+        check_range("saturation_temperature", self.saturation_temperature, 1e-30, 1e30)
 
 
 @dataclass(frozen=True)
