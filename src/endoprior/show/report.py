@@ -110,6 +110,10 @@ def _draw_psnr(axis: Axes, per_frame: list[dict]) -> None:
 
 def _draw_scores(axis: Axes, metrics: dict) -> None:
     scores = metrics["scores"]
-    lines = [f"{text:<30}{scores[name]:>10.4g}" for name, text in SHOWN_SCORES.items() if name in scores]
+    lines = [f"{text:<30}{_number(scores[name]):>10}" for name, text in SHOWN_SCORES.items() if name in scores]
     axis.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=axis.transAxes)
     axis.set_axis_off()
+
+
+def _number(value: float) -> str:
+    return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
