@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -135,15 +136,14 @@ def test_released_huber_is_the_literal_one_over_delta():
 
 
 def test_gradient_against_central_differences():
-    before = torch.from_numpy(points(15, 5))
-    now = torch.from_numpy(points(15, 6)).requires_grad_()
-    indices, distances = temporal.neighbors(before.numpy(), 8)
+    now, before = (torch.from_numpy(points(15, seed)).requires_grad_() for seed in (5, 6))
+    indices, distances = temporal.neighbors(before.detach().numpy(), 8)
     pair = temporal.affinity(distances, indices, np.ones(15))
 
-    def total(x):
-        return sum(temporal.local_motion_loss(x, before, indices, pair, CFG))
+    def terms(a, b):
+        return temporal.local_motion_loss(a, b, indices, pair, replace(CFG, huber_delta=2.0))
 
-    assert torch.autograd.gradcheck(total, now, eps=1e-6, atol=1e-6)
+    assert torch.autograd.gradcheck(terms, (now, before), eps=1e-6, atol=1e-6)
 
 
 def test_gradient_is_finite_where_nothing_moves():
@@ -151,3 +151,120 @@ def test_gradient_is_finite_where_nothing_moves():
     now = before.clone().requires_grad_()
     sum(loss(now, before)).backward()
     assert torch.isfinite(now.grad).all()
+
+
+def motion(num=600, seed=0, dtype=torch.float32):
+    """A cloud that drifts, a little differently everywhere; neighbors; pair weights."""
+    rng = np.random.default_rng(seed)
+    before = torch.from_numpy(rng.uniform([-10, -10, 70], [10, 10, 90], (num, 3))).to(dtype)
+    now = before + torch.from_numpy(rng.normal(0.5, 0.05, (num, 3))).to(dtype)
+    indices, distances = temporal.neighbors(before.numpy(), 8)
+    return now, before, indices, temporal.affinity(distances, indices, rng.uniform(0.1, 1, num))
+
+
+def loss_and_gradients(function, now, before, indices, pair, cfg, upstream=(2.0, -3.0)):
+    now, before = now.clone().requires_grad_(), before.clone().requires_grad_()
+    terms = function(now, before, indices, pair, cfg)
+    gradients = torch.autograd.grad(upstream[0] * terms[0] + upstream[1] * terms[1], (now, before))
+    return *(t.detach() for t in terms), *gradients
+
+
+# In float32 the change of a length is the difference of two roots near 1 mm: 1e-7 mm of error in changes of 0.01 mm.
+@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float32, 1e-4), (torch.float64, 1e-11)])
+@pytest.mark.parametrize("scale", ["literal", "released"])
+def test_fused_loss_and_gradient_are_those_of_the_definition(dtype, rtol, scale):
+    cfg = replace(CFG, huber_scale=scale)
+    now, before, indices, pair = motion(dtype=dtype)
+    got = loss_and_gradients(temporal.local_motion_loss, now, before, indices, pair, cfg)
+    want = loss_and_gradients(temporal.local_motion_definition, now.double(), before.double(), indices, pair, cfg)
+    for g, w in zip(got[:2], want[:2], strict=True):
+        assert g.dtype == dtype and g.item() == pytest.approx(w.item(), rel=min(rtol, 1e-5))
+    for g, w in zip(got[2:], want[2:], strict=True):
+        assert g.dtype == dtype
+        torch.testing.assert_close(g.double(), w, rtol=rtol, atol=rtol * w.abs().max().item())
+
+
+def test_a_point_that_is_everybodys_neighbor_gets_all_their_pulls():
+    now, before, indices, pair = motion(dtype=torch.float64)
+    indices[1:, 3] = 0
+    got = loss_and_gradients(temporal.local_motion_loss, now, before, indices, pair, CFG)
+    want = loss_and_gradients(temporal.local_motion_definition, now, before, indices, pair, CFG)
+    for g, w in zip(got, want, strict=True):
+        torch.testing.assert_close(g, w, rtol=1e-10, atol=1e-14)
+
+
+def test_only_the_end_that_wants_a_gradient_gets_one():
+    now, before, indices, pair = motion()
+    both = loss_and_gradients(temporal.local_motion_loss, now, before, indices, pair, CFG, (1.0, 1.0))
+    for wanted in (0, 1):
+        ends = [now.clone(), before.clone()]
+        ends[wanted].requires_grad_()
+        sum(temporal.local_motion_loss(*ends, indices, pair, CFG)).backward()
+        assert torch.equal(ends[wanted].grad, both[2 + wanted]) and ends[1 - wanted].grad is None
+    assert not temporal.local_motion_loss(now, before, indices, pair, CFG)[0].requires_grad
+
+
+def test_pulls_within_the_cloud_cancel():
+    _, _, on_now, on_before = loss_and_gradients(temporal.local_motion_loss, *motion(dtype=torch.float64), CFG)
+    for gradient in (on_now, on_before):  # the loss does not change when one end moves as a whole
+        assert gradient.sum(0).abs().max() < 1e-12 < gradient.abs().max()
+
+
+def test_the_number_of_threads_changes_no_bit():
+    threads, results = numba.get_num_threads(), []
+    try:
+        for count in (1, threads):
+            numba.set_num_threads(count)
+            now, before, indices, pair = motion(3000)
+            results.append(
+                (
+                    torch.from_numpy(pair),
+                    *loss_and_gradients(temporal.local_motion_loss, now, before, indices, pair, CFG),
+                )
+            )
+    finally:
+        numba.set_num_threads(threads)
+    for one, many in zip(*results, strict=True):
+        assert torch.equal(one, many)
+
+
+@pytest.mark.parametrize("num", [1, 2, 5, 600, 3001])
+@pytest.mark.parametrize("kind", ["smooth", "ties", "equal", "two values", "skewed rows"])
+def test_median_is_numpys(num, kind):
+    rng = np.random.default_rng(num)
+    values = {
+        "smooth": lambda: np.sort(rng.gamma(3, size=(num, 7)), 1),
+        "ties": lambda: rng.integers(0, 9, (num, 7)) / 8,
+        "equal": lambda: np.full((num, 7), 0.3),
+        "two values": lambda: rng.integers(0, 2, (num, 8)) / 3,
+        # The rows that are looked at first tell nothing of the others.
+        "skewed rows": lambda: rng.gamma(3, size=(num, 8)) + 100 * (np.arange(num) % max(num // 512, 1) == 0)[:, None],
+    }[kind]()
+    assert temporal.median(values) == np.median(values)
+
+
+def test_pairs_without_weight_keep_a_little():
+    p = points(30)
+    indices, distances = temporal.neighbors(p, 4)
+    assert (temporal.affinity(distances, indices, np.zeros(30)) == temporal.SUM_EPS).all()
+
+
+def test_a_point_at_nan_shows():
+    now, before, indices, pair = motion()
+    now[7] = torch.nan
+    displacement, distance, on_now, on_before = loss_and_gradients(
+        temporal.local_motion_loss, now, before, indices, pair, CFG
+    )
+    assert displacement.isnan() and distance.isnan() and on_now[7].isnan().all() and on_before[7].isnan().all()
+
+
+def test_what_does_not_fit_together_is_an_error():
+    now, before, indices, pair = motion()
+    with pytest.raises(ValueError, match="before must have shape"):
+        temporal.local_motion_loss(now, before[:-1], indices, pair, CFG)
+    with pytest.raises(ValueError, match="before must have the type"):
+        temporal.local_motion_loss(now, before.double(), indices, pair, CFG)
+    for wrong in (-1, len(now)):
+        indices[3, 2] = wrong
+        with pytest.raises(ValueError, match="indices must be in"):
+            temporal.local_motion_loss(now, before, indices, pair, CFG)

@@ -9,17 +9,15 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from .checks import check_shape
 from .config import TemporalConfig
+from .neighbor_kernels import MAX_COORDINATE, nearest
+from .temporal_kernels import SQRT_EPS, SUM_EPS, local_motion, median, weigh_pairs
 
 MIN_WEIGHT = 1e-4
 """Motion weights up to this are treated as zero (released code)."""
-SQRT_EPS = 1e-8
-"""Under the root of the displacement norm, mm**2: a finite gradient at zero."""
-SUM_EPS = 1e-8
-"""Least sum of pair weights; a larger one would silence the term, since typical weights are near 0.002."""
 
 RELAX_TRIES, RELAX_THRESHOLD_STEP, RELAX_TEMPERATURE_FACTOR = 8, 0.05, 1.5
 RELAX_THRESHOLD_FLOOR, RELAX_TEMPERATURE_CAP = 0.25, 0.30
@@ -94,18 +92,21 @@ def choose(score: NDArray, eligible: NDArray, cfg: TemporalConfig) -> tuple[NDAr
 
 
 def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
-    """The `k` nearest other points of each point.
+    """The `k` nearest other points of each point; of equally near ones those with the smallest indices.
 
     Args:
-        points: (P, 3) mm, P > k.
+        points: (P, 3) mm, finite, 0 < k < P.
     Returns:
         (P, k) indices, nearest first, and (P, k) distances, mm.
+    Raises:
+        ValueError: too few points, or a coordinate that is not finite or too large to be squared.
     """
-    distances, indices = cKDTree(points).query(points, k=k + 1, workers=1)
-    # The point itself is normally the first hit; among coincident points it may be any of them, or none.
-    own = indices == np.arange(len(points))[:, None]
-    own[~own.any(1), -1] = True
-    return indices[~own].reshape(-1, k), distances[~own].reshape(-1, k)
+    check_shape("points:P,3", points=points)
+    if not 0 < k < len(points):
+        raise ValueError(f"k must be in [1, {len(points) - 1}], the number of other points; got {k}")
+    if not float(np.abs(points).max()) <= MAX_COORDINATE:
+        raise ValueError(f"points must be finite, of magnitude up to {MAX_COORDINATE:g} mm")
+    return nearest(np.ascontiguousarray(points), k)
 
 
 def affinity(distances: NDArray, indices: NDArray, weights: NDArray) -> NDArray:
@@ -118,9 +119,8 @@ def affinity(distances: NDArray, indices: NDArray, weights: NDArray) -> NDArray:
     Returns:
         (P, K) pair weights.
     """
-    sigma = max(float(np.median(distances)), 1e-8)
-    near = np.exp(-(distances**2) / (2 * sigma**2))
-    return np.maximum(near * weights[:, None] * weights[indices], SUM_EPS)
+    sigma = max(median(distances), 1e-8)
+    return weigh_pairs(distances, indices, weights, sigma)
 
 
 def huber(x: Tensor, delta: float, scale: str) -> Tensor:
@@ -140,6 +140,25 @@ def local_motion_loss(
     Returns:
         Mean |d_i - d_j| (mm) and mean Huber penalty of the change of |mu_i - mu_j|, both weighted by w_ij.
     """
+    check_shape(
+        "now:P,3 before:P,3 indices:P,K pair_weights:P,K",
+        now=now,
+        before=before,
+        indices=indices,
+        pair_weights=pair_weights,
+    )
+    if now.dtype != before.dtype:
+        raise ValueError(f"before must have the type of now, {now.dtype}; got {before.dtype}")
+    if not 0 <= indices.min() <= indices.max() < len(now):
+        raise ValueError(f"indices must be in [0, {len(now) - 1}]; got {indices.min()} to {indices.max()}")
+    factor = 1 / cfg.huber_delta if cfg.huber_scale == "released" else 1.0
+    return local_motion(now, before, indices, pair_weights, cfg.huber_delta, factor)
+
+
+def local_motion_definition(
+    now: Tensor, before: Tensor, indices: NDArray, pair_weights: NDArray, cfg: TemporalConfig
+) -> tuple[Tensor, Tensor]:
+    """`local_motion_loss` in plain torch: same arguments, same result but for rounding, more passes."""
     index = torch.from_numpy(indices)
     weight = torch.from_numpy(pair_weights).to(now.dtype)
     weight = weight / weight.sum().clamp(min=SUM_EPS)

@@ -1,0 +1,181 @@
+"""Exact nearest neighbors: by hand, against all distances, invariances, threads, poison. The lanes."""
+
+import numba
+import numpy as np
+import pytest
+from numba import njit
+
+from endoprior import float64_lanes as f8
+from endoprior.neighbor_kernels import MAX_COORDINATE, curve_order
+from endoprior.temporal import neighbors
+
+NUM = 700
+"""Points of a cloud: more than 64 blocks of eight, so there are three levels of groups, and the last block is short."""
+
+
+def surface(rng, num=NUM):
+    x, y = rng.uniform(-30, 30, (2, num))
+    return np.c_[x, y, 60 + 8 * np.sin(x / 9) + rng.normal(0, 0.1, num)]
+
+
+def with_outliers(rng, distance):
+    cloud = surface(rng)
+    cloud[[5, 300, 301]] = distance * rng.normal(size=(3, 3))
+    return cloud
+
+
+CLOUDS = {
+    "surface": surface,
+    "volume": lambda rng: rng.uniform(0, 1, (NUM, 3)),
+    "clusters": lambda rng: rng.uniform(-50, 50, (NUM, 3))[rng.integers(0, 4, NUM)] + rng.normal(0, 1e-7, (NUM, 3)),
+    "line": lambda rng: rng.uniform(0, 1, (NUM, 1)) * [[1, 2, 3]],
+    "axis": lambda rng: rng.uniform(0, 1, (NUM, 1)) * [[0, 1, 0]],
+    "lattice": lambda rng: rng.permuted(np.argwhere(np.ones((9, 9, 9)))[:NUM].astype(float), axis=0),  # ties everywhere
+    "coincident": lambda rng: np.full((NUM, 3), 3.7),
+    "half coincident": lambda rng: np.where(np.arange(NUM)[:, None] % 2, surface(rng), 0.0),
+    "two places": lambda rng: np.repeat(rng.integers(0, 2, (NUM, 1)), 3, 1) * 1.0,
+    "far outliers": lambda rng: with_outliers(rng, 1e6),
+    "absurd outliers": lambda rng: with_outliers(rng, 1e30),
+    "largest": lambda rng: with_outliers(rng, 1e149),
+    "tiny": lambda rng: 1e-300 * surface(rng),  # squares underflow: all distances are zero
+    "heavy tails": lambda rng: rng.standard_cauchy((NUM, 3)) ** 3,
+}
+
+
+def full_search(points, k):
+    """All distances in float64, sorted by (distance, index)."""
+    p = points.astype(np.float64)
+    x, y, z = (p[:, None, a] - p[None, :, a] for a in range(3))
+    square = x * x + y * y + z * z
+    np.fill_diagonal(square, np.inf)
+    order = np.argsort(square, 1, kind="stable")[:, :k]
+    return order, np.sqrt(np.take_along_axis(square, order, 1))
+
+
+def assert_exact(points, k):
+    indices, distances = neighbors(points, k)
+    want, want_distances = full_search(points, k)
+    assert indices.dtype == np.intp and distances.dtype == np.float64
+    assert np.array_equal(indices, want)
+    assert np.array_equal(distances, want_distances)
+
+
+def test_points_on_a_line_by_hand():
+    indices, distances = neighbors(np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [7, 0, 0]]), 2)
+    assert indices.tolist() == [[1, 2], [0, 2], [1, 0], [2, 1]]
+    assert distances.tolist() == [[1, 3], [1, 2], [2, 3], [4, 6]]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", CLOUDS)
+def test_every_neighbor_is_found(name, dtype):
+    cloud = CLOUDS[name](np.random.default_rng(0))
+    if dtype == np.float32:
+        cloud = cloud.clip(-1e37, 1e37)
+    assert_exact(cloud.astype(dtype), 8)
+
+
+@pytest.mark.parametrize("num", [2, 3, 7, 8, 9, 16, 63, 64, 65, 72, 511, 513])
+def test_any_number_of_points_and_neighbors(num):
+    cloud = surface(np.random.default_rng(num), num)
+    for k in {1, min(8, num - 1), num - 1}:
+        assert_exact(cloud, k)
+
+
+def test_a_crowded_cell_of_the_curve_gets_its_own():
+    rng = np.random.default_rng(1)
+    cloud = surface(rng, 3000)
+    cloud[0] = 1e9
+
+    def step(points):
+        order = curve_order(points)
+        assert np.array_equal(np.sort(order), np.arange(len(points)))
+        return np.median(np.linalg.norm(np.diff(points[order], axis=0), axis=1))
+
+    assert step(cloud) < 1.2 * step(cloud[1:])  # without the finer curve: the order drawn, 20 times farther
+
+
+def test_coincident_points_keep_their_order_on_the_curve():
+    assert np.array_equal(curve_order(np.zeros((1000, 3))), np.arange(1000))
+
+
+def test_renaming_and_turning_the_points_changes_nothing():
+    rng = np.random.default_rng(2)
+    cloud, new = surface(rng), rng.permutation(NUM)
+    indices, distances = neighbors(cloud, 8)
+    renamed, same = neighbors(cloud[new], 8)
+    assert np.array_equal(new[renamed], indices[new])
+    assert np.array_equal(same, distances[new])
+    turned, _ = neighbors(np.ascontiguousarray(-cloud[:, [2, 0, 1]]), 8)
+    assert np.array_equal(turned, indices)
+
+
+def test_the_number_of_threads_changes_no_bit():
+    cloud, threads = CLOUDS["lattice"](np.random.default_rng(3)), numba.get_num_threads()
+    results = []
+    try:
+        for count in (1, threads):
+            numba.set_num_threads(count)
+            results.append(neighbors(cloud, 8))
+    finally:
+        numba.set_num_threads(threads)
+    for one, many in zip(*results, strict=True):
+        assert np.array_equal(one, many)
+
+
+def test_arrays_of_any_layout_are_read():
+    cloud = surface(np.random.default_rng(4))
+    assert np.array_equal(neighbors(np.asfortranarray(cloud), 3)[0], neighbors(cloud, 3)[0])
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf, 10 * MAX_COORDINATE])
+def test_what_is_no_place_is_an_error(poison):
+    cloud = surface(np.random.default_rng(5))
+    cloud[17, 1] = poison
+    with pytest.raises(ValueError, match="points must be finite"):
+        neighbors(cloud, 8)
+
+
+def test_no_place_in_float32_is_an_error():
+    cloud = surface(np.random.default_rng(5)).astype(np.float32)
+    cloud[17, 1] = np.inf
+    with pytest.raises(ValueError, match="points must be finite"):
+        neighbors(cloud, 8)
+
+
+@pytest.mark.parametrize(("num", "k"), [(8, 8), (1, 1), (0, 1), (8, 0)])
+def test_too_few_points_are_an_error(num, k):
+    with pytest.raises(ValueError, match="number of other points"):
+        neighbors(np.zeros((num, 3)), k)
+
+
+def test_points_in_the_plane_are_an_error():
+    with pytest.raises(ValueError, match="points must have shape"):
+        neighbors(np.zeros((20, 2)), 3)
+
+
+@njit
+def _run(a, b, out):
+    x, y = f8.load(a, 3), f8.load(b, 0)
+    results = (x + y, x - y, x * y, f8.larger(x, y), f8.pick(f8.less(x, y), x, y), f8.splat(2.5))
+    for i in range(len(results)):
+        f8.store(out, i * f8.LANES, results[i])
+    return f8.less(x, y), f8.equal(x, y), f8.largest(y)
+
+
+def test_lanes_are_numpys():
+    rng = np.random.default_rng(6)
+    padded, b = rng.normal(size=f8.LANES + 3), rng.normal(size=f8.LANES)  # loads from offset 3: not aligned
+    a = padded[3:]
+    a[2] = b[2]
+    out = np.empty(6 * f8.LANES)
+    less, equal, largest = _run(padded, b, out)
+    want = [a + b, a - b, a * b, np.maximum(a, b), np.where(a < b, a, b), np.full(f8.LANES, 2.5)]
+    assert np.array_equal(out.reshape(6, -1), want)
+    assert less == (a < b) @ 2 ** np.arange(f8.LANES) and equal == 4 and largest == b.max()
+
+
+def test_nothing_is_less_than_or_equal_to_nan():
+    number, nan = np.zeros(f8.LANES + 3), np.full(f8.LANES + 3, np.nan)
+    for a, b in ((number, nan), (nan, number), (nan, nan)):
+        assert _run(a, b[3:], np.empty(6 * f8.LANES))[:2] == (0, 0)
