@@ -1,10 +1,12 @@
 # Two commands on a fresh machine: `make demo` and `make test`. Both create .venv and install the pinned requirements.
+# `make bench` times every stage beside plain torch and fails if one fell behind bench/baseline.json; options go in
+# BENCH, for example `make bench BENCH=--quick`.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint bench clean
 
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
@@ -15,6 +17,9 @@ test: $(VENV)/.test-installed lint
 lint: $(VENV)/.test-installed
 	$(BIN)/ruff check src tests bench
 	$(BIN)/ruff format --check src tests bench
+
+bench: $(VENV)/.installed
+	$(BIN)/python bench/run.py --baseline bench/baseline.json $(BENCH)
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

@@ -1,0 +1,152 @@
+"""A whole training iteration of the presets `default` and `paper`, beside the same loop with plain torch inside.
+
+`python bench/iteration.py [--quick] [--json FILE]`
+
+The data is a phantom of a few frames. One and the same iteration is repeated: a fine one at full resolution, with all
+degrees of color, with the temporal term, without growth.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import common
+import plain
+import torch
+
+from endoprior import temporal
+from endoprior import trainer as trainer_module
+from endoprior.config import Config
+from endoprior.data import Sequence, load_sequence
+from endoprior.density import DensityStats
+from endoprior.model import scene as scene_module
+from endoprior.model.deformation import HexPlaneField
+from endoprior.optim import Optimizer
+from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.presets import preset
+from endoprior.render import cpu, tiles
+from endoprior.train_state import Stage, StepReport
+from endoprior.trainer import Trainer
+
+PRESETS = ("default", "paper")
+FRAMES = 4
+"""Of which the second is a test frame: the fourth has a training frame just before it."""
+FIRST, LAST = 4, 40
+"""Iterations among which the one to repeat is looked for; all degrees of color are in use from the first on."""
+NEVER = 1_000_000
+TORCH_MOST = common.Size(20_000, 640, 512)
+"""With more Gaussians or pixels, autograd's memory takes torch from seconds to minutes."""
+PARTS = {
+    "deformation": [
+        (scene_module, "basis_offsets"),
+        (HexPlaneField, "offsets"),
+        (HexPlaneField, "offsets_and_displacement"),
+    ],
+    "projection + SH": [(cpu, "project_forward")],
+    "binning + sort": [(tiles, "build")],
+    "compositing": [(cpu, "composite_forward")],
+    "losses": [(trainer_module, "supervised_terms")],
+    "temporal term": [(temporal, n) for n in ("choose", "neighbors", "affinity", "local_motion_loss")],
+    "compositing backward": [(cpu, "composite_backward"), (cpu, "gather")],
+    "projection backward": [(cpu, "project_backward")],
+    "other backward": [(torch.Tensor, "backward")],
+    "density statistics": [(DensityStats, "add_gradient"), (DensityStats, "add_score")],
+    "optimizer": [(Optimizer, "step")],
+}
+
+
+def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
+    """For each preset and size one row for the whole, then one for each part."""
+    measured = []
+    for width, height in common.pictures(sizes):
+        with tempfile.TemporaryDirectory() as folder:
+            write_phantom(Path(folder) / "phantom", PhantomConfig(frames=FRAMES, width=width, height=height))
+            sequence = load_sequence(Path(folder) / "phantom")
+            for name in PRESETS:
+                for num in (size.num for size in sizes if size[1:] == (width, height)):
+                    measured += rows(name, sequence, common.Size(num, width, height))
+    return measured
+
+
+def rows(name: str, sequence: Sequence, size: common.Size) -> list[common.Row]:
+    """The rows of one preset and size."""
+    trainer = started(sequence, config(name, size.num))
+    repeated = settle(trainer)
+    ours = {"": lambda _: repeat(trainer, repeated)}
+    theirs = None
+    if size.num <= TORCH_MOST.num and size.width <= TORCH_MOST.width:
+        other = started(sequence, trainer.cfg)
+        in_torch(other)
+        theirs = {"": lambda _: repeat_in_torch(other, repeated)}
+    picture, num = (size.width, size.height), len(trainer.state.gaussians)
+    measured = common.rows(f"iteration {name}", common.race(ours, theirs), num, picture)
+    return measured + common.part_rows(f"iteration {name}", ours, PARTS, common.Size(num, *picture))
+
+
+def config(name: str, num: int) -> Config:
+    """The preset with `num` Gaussians, every term active at once, and nothing that changes the number."""
+    cfg = preset(name)
+    return replace(
+        cfg,
+        init=replace(cfg.init, budget=num),
+        schedule=replace(cfg.schedule, coarse_iterations=0, half_resolution_iterations=0, sh_every=1),
+        temporal=replace(cfg.temporal, start_iteration=1, min_valid=1),
+        density=replace(cfg.density, start_iteration=NEVER),
+    )
+
+
+def started(sequence: Sequence, cfg: Config) -> Trainer:
+    """A trainer before its first iteration, with everything it keeps of the frames already made."""
+    trainer = Trainer(sequence, cfg)
+    trainer.start()
+    for position in range(len(trainer.frames)):
+        trainer.frames.frame(position)
+        trainer.frames.prior(position)
+    return trainer
+
+
+def settle(trainer: Trainer) -> int:
+    """Train until all is warm and an iteration had the temporal term; return that iteration."""
+    for iteration in range(1, LAST):
+        if "distance" in trainer.step().terms and iteration >= FIRST:
+            return iteration
+    raise RuntimeError(f"no iteration up to {LAST} had the temporal term: too few Gaussians or frames")
+
+
+def repeat(trainer: Trainer, iteration: int) -> StepReport:
+    """Do a fine iteration again: the same frame, the same terms."""
+    trainer.state.stage, trainer.state.iteration = Stage.FINE, iteration - 1
+    return trainer.step()
+
+
+def in_torch(trainer: Trainer) -> None:
+    """Put plain torch in the place of the parts that a trainer holds."""
+    state = trainer.state
+    trained = list(state.gaussians.tensors.values())
+    if state.field is not None:
+        state.field = plain.Field(state.field)
+        trained += state.field.parameters()
+    trainer.rasterize = plain.rasterize
+    state.optimizer = plain.Adam(trained, trainer.cfg.optim.epsilon)
+
+
+def repeat_in_torch(trainer: Trainer, iteration: int) -> StepReport:
+    """`repeat`, with plain torch also in the place of the functions that a trainer calls."""
+    with ExitStack() as stack:
+        for owner, name in (
+            (scene_module, "basis_offsets"),
+            (trainer_module, "supervised_losses"),
+            (temporal, "neighbors"),
+            (temporal, "affinity"),
+            (temporal, "local_motion_loss"),
+        ):
+            stack.enter_context(mock.patch.object(owner, name, getattr(plain, name)))
+        return repeat(trainer, iteration)
+
+
+if __name__ == "__main__":
+    common.main(measure, __doc__)

@@ -1,0 +1,36 @@
+"""Projection and spherical harmonics of all Gaussians, forward and backward, beside `render.projection` in torch.
+
+`python bench/projection.py [--quick] [--json FILE]`
+"""
+
+from __future__ import annotations
+
+import common
+import scenes
+import torch
+
+from endoprior.render.cpu import Project
+from endoprior.render.projection import project
+
+PICTURE = (640, 512)
+"""It matters only for what is culled, which is next to nothing here."""
+
+
+def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
+    """Two rows for each number of Gaussians."""
+    measured = []
+    for num in common.nums(sizes):
+        splats, camera = scenes.splats(common.Size(num, *PICTURE))
+        inputs = [t.requires_grad_() for t in (splats.means, splats.quats, splats.scales, splats.sh)]
+        cotangents = [torch.randn(shape) for shape in ((num, 2), (num, 3), (num,), (num, 3))]
+        ours = {
+            "forward": lambda _, i=inputs, s=splats, c=camera: Project.apply(*i, s.opacities, c)[:4],
+            "backward": lambda out, i=inputs, v=cotangents: torch.autograd.grad(out, i, v),
+        }
+        theirs = ours | {"forward": lambda _, s=splats, c=camera: list(vars(project(s, c)).values())[:4]}
+        measured += common.rows("projection + SH", common.race(ours, theirs), num)
+    return measured
+
+
+if __name__ == "__main__":
+    common.main(measure, __doc__)
