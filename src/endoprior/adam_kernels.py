@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit, prange
 
 FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
+CHUNK = 128  # rows per task
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS)
@@ -36,16 +37,27 @@ def adam_outer(param, weights, v, first, second, begin, rate, root_scale, beta1,
     param, first, second (R, B, C); weights (K, B), v (K, R, C) float32. Updates bases begin .. begin + rate.shape[0];
     rate (b, C) and root_scale (b,).
     """
+    num_rows, num_bases, channels = param.shape
+    bases = rate.shape[0]
+    width, start = bases * channels, begin * channels
+    # Bases and channels of a row lie side by side: one long loop over both vectorizes, 13 channels alone do not.
+    rates, root_scales = np.empty(width, np.float32), np.empty(width, np.float32)
+    for i in range(width):
+        rates[i], root_scales[i] = rate[i // channels, i % channels], root_scale[i // channels]
+    params = param.reshape(num_rows, num_bases * channels)
+    firsts, seconds = first.reshape(num_rows, num_bases * channels), second.reshape(num_rows, num_bases * channels)
     one = np.float32(1)
-    for r in prange(param.shape[0]):
-        for i in range(rate.shape[0]):
-            b = begin + i
-            for c in range(param.shape[2]):
-                g = np.float32(0)
-                for k in range(weights.shape[0]):
-                    g += weights[k, b] * v[k, r, c]
-                m = beta1 * first[r, b, c] + (one - beta1) * g
-                u = beta2 * second[r, b, c] + (one - beta2) * g * g
-                first[r, b, c] = m
-                second[r, b, c] = u
-                param[r, b, c] -= rate[i, c] * m / (np.sqrt(u) * root_scale[i] + epsilon)
+    for task in prange((num_rows + CHUNK - 1) // CHUNK):
+        grad = np.empty(width, np.float32)
+        for r in range(task * CHUNK, min(num_rows, (task + 1) * CHUNK)):
+            grad[:] = np.float32(0)
+            for k in range(weights.shape[0]):
+                for b in range(bases):
+                    for c in range(channels):
+                        grad[b * channels + c] += weights[k, begin + b] * v[k, r, c]
+            p = params[r, start : start + width]
+            m, u = firsts[r, start : start + width], seconds[r, start : start + width]
+            for i in range(width):
+                m[i] = beta1 * m[i] + (one - beta1) * grad[i]
+                u[i] = beta2 * u[i] + (one - beta2) * grad[i] * grad[i]
+                p[i] -= rates[i] * m[i] / (np.sqrt(u[i]) * root_scales[i] + epsilon)
