@@ -8,14 +8,20 @@ import numpy as np
 import pytest
 
 from endoprior.model.initialize import initial_log_scales
-from endoprior.model.point_cleanup import PointCloud, merge_voxels, remove_outliers
+from endoprior.model.point_cleanup import PointCloud, joined, merge_voxels, remove_outliers
+
+
+def cloud_of(points: np.ndarray, colors: np.ndarray) -> PointCloud:
+    """A cloud whose points come from frames 0, 1, 2, ..."""
+    return PointCloud(points, colors, np.arange(len(points), dtype=np.int32))
+
 
 # --- clean-up
 
 
 def test_voxel_merge_matches_loop():
     rng = np.random.default_rng(2)
-    cloud = PointCloud(rng.random((300, 3), np.float32) * [10, 5, 2], rng.random((300, 3), np.float32))
+    cloud = cloud_of(rng.random((300, 3), np.float32) * [10, 5, 2], rng.random((300, 3), np.float32))
     low = [min(p[k] for p in cloud.points) for k in range(3)]
     side = max(max(p[k] for p in cloud.points) - low[k] for k in range(3)) / 8
     voxels: dict[tuple[int, ...], list[int]] = {}
@@ -28,32 +34,33 @@ def test_voxel_merge_matches_loop():
         # float32 results of float64 means
         np.testing.assert_allclose(merged.points[row], cloud.points[voxels[key]].mean(0), rtol=1e-5)
         np.testing.assert_allclose(merged.colors[row], cloud.colors[voxels[key]].mean(0), rtol=1e-5)
+        assert merged.origins[row] == voxels[key][0]
 
 
 def test_voxel_merge_does_not_depend_on_the_order():
     rng = np.random.default_rng(3)
-    cloud = PointCloud(rng.random((200, 3), np.float32), rng.random((200, 3), np.float32))
+    cloud = cloud_of(rng.random((200, 3), np.float32), rng.random((200, 3), np.float32))
     order = rng.permutation(200)
-    shuffled = PointCloud(cloud.points[order], cloud.colors[order])
+    shuffled = cloud_of(cloud.points[order], cloud.colors[order])
     np.testing.assert_allclose(merge_voxels(cloud, 5).points, merge_voxels(shuffled, 5).points, rtol=1e-6)  # float32
 
 
 def test_coinciding_and_empty_clouds():
     point = np.full((5, 3), 2.5, np.float32)
     colors = np.linspace(0, 1, 15, dtype=np.float32).reshape(5, 3)
-    merged = merge_voxels(PointCloud(point, colors), 400)
+    merged = merge_voxels(cloud_of(point, colors), 400)
     np.testing.assert_array_equal(merged.points, [[2.5, 2.5, 2.5]])
     np.testing.assert_allclose(merged.colors, [colors.mean(0)], rtol=1e-6)
-    empty = PointCloud(point[:0], colors[:0])
+    empty = cloud_of(point[:0], colors[:0])
     assert len(merge_voxels(empty, 400)) == len(remove_outliers(empty, 20, 1.5)) == 0
-    assert len(remove_outliers(PointCloud(point, colors), 20, 1.5)) == 5
+    assert len(remove_outliers(cloud_of(point, colors), 20, 1.5)) == 5
 
 
 def test_outlier_removal_matches_loop():
     rng = np.random.default_rng(4)
     points = rng.standard_normal((80, 3)).astype(np.float32)
     points[:3] *= 20
-    cloud = PointCloud(points, rng.random((80, 3), np.float32))
+    cloud = cloud_of(points, rng.random((80, 3), np.float32))
     average = []
     for a in points.astype(float):
         nearest = sorted(math.dist(a, b) for b in points.astype(float))[:6]  # the first is the point itself
@@ -101,3 +108,12 @@ def test_coinciding_points_get_the_floor():
 def test_poisoned_points_are_named(points):
     with pytest.raises(ValueError, match="points must"):
         initial_log_scales(points)
+
+
+def test_joined_keeps_order_and_origins():
+    rng = np.random.default_rng(5)
+    cloud = cloud_of(rng.random((10, 3), np.float32), rng.random((10, 3), np.float32))
+    again = joined([cloud.taken(np.arange(4)), cloud.taken(np.arange(10) >= 4)])
+    for name in ("points", "colors", "origins"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(cloud, name))
+    assert len(joined([])) == 0

@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from collections.abc import Sequence as ReadOnlyList
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -19,7 +21,7 @@ from ..config import InitConfig, PriorConfig
 from ..geometry import back_project
 from ..priors import joint_texture_prior
 from ..types import Frame
-from .point_cleanup import PointCloud, merge_voxels, remove_outliers
+from .point_cleanup import PointCloud, joined, merge_voxels, remove_outliers
 
 EPSILON = 1e-6
 """Keeps Eq. (6) finite where the mask or the prior is empty."""
@@ -27,6 +29,8 @@ MIN_SQUARED_SPACING = 1e-7
 """mm^2; initial scale of points that coincide, as EndoGaussian sets it."""
 ADAPTIVE_PERCENTILE = 97.0
 """Percentile of brightness that raises tau_v under `adaptive_specular`."""
+FRAMES_AT_ONCE = 8
+"""Frames whose probabilities are held in memory together."""
 MIN_POINTS = 4
 """A scale needs three neighbors."""
 
@@ -55,32 +59,38 @@ def initial_points(
     cfg, prior_cfg = cfg or InitConfig(), prior_cfg or PriorConfig()
     rng = np.random.default_rng(seed)
     counts = [0] * len(frames) if cfg.sampler == "pool" else quotas(cfg.budget, len(frames))
-    parts, missing = [], 0
-    for position, count in enumerate(counts):
-        frame = frames[position]
-        probability = pixel_probability(frame, cfg, prior_cfg)
+    clouds, missing = [], 0
+    for position, probability in enumerate(_probabilities(frames, cfg, prior_cfg)):
+        frame, count = frames[position], counts[position]
         available = int(np.count_nonzero(probability))
         if cfg.sampler == "pool":
             count = min(available, max(1, int(cfg.pool_fraction * available)))
         missing += max(0, count - available)
-        parts.append(_lift(frame, draw_pixels(probability, count, rng), cfg))
-    points = np.concatenate([part.points for part in parts]) if parts else np.zeros((0, 3), np.float32)
-    colors = np.concatenate([part.colors for part in parts]) if parts else np.zeros((0, 3), np.float32)
-    if cfg.sampler == "pool" and len(points):
-        chosen = rng.integers(len(points), size=cfg.budget)
-        points, colors = points[chosen], colors[chosen]
+        clouds.append(_lift(frame, position, draw_pixels(probability, count, rng), cfg))
+    cloud = joined(clouds)
+    if cfg.sampler == "pool" and len(cloud):
+        cloud = cloud.taken(rng.integers(len(cloud), size=cfg.budget))
     if missing:
         log.warning("initialization: %d of %d points could not be drawn, too few tissue pixels", missing, cfg.budget)
-    cloud = PointCloud(points, colors)
     if cfg.cleanup:
+        num_drawn = len(cloud)
         cloud = remove_outliers(merge_voxels(cloud, cfg.voxel_divisions), cfg.outlier_neighbors, cfg.outlier_std)
-        log.info("initialization: %d of %d points left after clean-up", len(cloud), len(points))
+        log.info("initialization: %d of %d points left after clean-up", len(cloud), num_drawn)
     if len(cloud) < MIN_POINTS:
         raise InputError(
             f"initialization: expected at least {MIN_POINTS} tissue pixels with depth in the training frames; "
             f"got {len(cloud)}. Check masks, depth and the budget."
         )
     return cloud
+
+
+def _probabilities(
+    frames: ReadOnlyList[Frame], cfg: InitConfig, prior_cfg: PriorConfig
+) -> Iterator[NDArray[np.float64]]:
+    """`pixel_probability` of each frame in turn, a few at a time side by side: NumPy releases the interpreter lock."""
+    with ThreadPoolExecutor() as pool:
+        for start in range(0, len(frames), FRAMES_AT_ONCE):
+            yield from pool.map(lambda f: pixel_probability(f, cfg, prior_cfg), frames[start : start + FRAMES_AT_ONCE])
 
 
 def pixel_probability(frame: Frame, cfg: InitConfig, prior_cfg: PriorConfig) -> NDArray[np.float64]:
@@ -188,10 +198,11 @@ def initial_log_scales(points: NDArray[np.floating], variance_factor: float = 1.
     return (0.5 * np.log(variance_factor * spacing)).astype(np.float32)
 
 
-def _lift(frame: Frame, flat: NDArray[np.intp], cfg: InitConfig) -> PointCloud:
-    """World points and colors of pixels given by flat index."""
+def _lift(frame: Frame, position: int, flat: NDArray[np.intp], cfg: InitConfig) -> PointCloud:
+    """World points and colors of pixels given by flat index, in the frame at `position`."""
     v, u = np.divmod(flat, frame.camera.width)
     offset = 0.5 if cfg.pixel_offset == "exact" else 0.0
     pixels = np.stack([u, v], -1) + offset
     points = back_project(pixels, frame.depth[v, u].astype(np.float64), frame.camera)
-    return PointCloud(points.astype(np.float32), frame.rgb_u8[v, u].astype(np.float32) / np.float32(255))
+    colors = frame.rgb_u8[v, u].astype(np.float32) / np.float32(255)
+    return PointCloud(points.astype(np.float32), colors, np.full(len(points), position, np.int32))

@@ -17,9 +17,22 @@ class PointCloud:
     """(N, 3) world coordinates, mm."""
     colors: NDArray[np.float32]
     """(N, 3) red, green, blue in [0, 1]."""
+    origins: NDArray[np.int32]
+    """(N,) position of the frame each point was lifted from, in the list of frames sampled."""
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def taken(self, rows: NDArray) -> PointCloud:
+        """The points that `rows`, an index or a mask, picks."""
+        return PointCloud(self.points[rows], self.colors[rows], self.origins[rows])
+
+
+def joined(clouds: list[PointCloud]) -> PointCloud:
+    """One cloud of all; an empty list gives an empty cloud."""
+    empty = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.int32))
+    parts = [(cloud.points, cloud.colors, cloud.origins) for cloud in clouds or [empty]]
+    return PointCloud(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def merge_voxels(cloud: PointCloud, divisions: int) -> PointCloud:
@@ -29,7 +42,7 @@ def merge_voxels(cloud: PointCloud, divisions: int) -> PointCloud:
         cloud: finite points.
         divisions: the longest side of the cloud's box is this many voxels long; its corner is the center of a voxel.
     Returns:
-        One point per occupied voxel, ordered by voxel (x, then y, then z).
+        One point per occupied voxel, ordered by voxel (x, then y, then z), with the origin of its first point.
     """
     if len(cloud) == 0:
         return cloud
@@ -37,16 +50,17 @@ def merge_voxels(cloud: PointCloud, divisions: int) -> PointCloud:
     low = points.min(0)
     side = (points.max(0) - low).max() / divisions
     if side == 0:  # all points coincide
-        return PointCloud(cloud.points[:1], cloud.colors.mean(0, dtype=np.float64, keepdims=True).astype(np.float32))
+        color = cloud.colors.mean(0, dtype=np.float64, keepdims=True).astype(np.float32)
+        return PointCloud(cloud.points[:1], color, cloud.origins[:1])
     voxel = np.floor((points - low) / side + 0.5).astype(np.int64)
-    _, owner, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
+    _, first, owner, count = np.unique(voxel, axis=0, return_index=True, return_inverse=True, return_counts=True)
     owner = owner.reshape(-1)
 
     def mean(values: NDArray[np.floating]) -> NDArray[np.float32]:
         sums = [np.bincount(owner, values[:, c], len(count)) for c in range(3)]
         return (np.stack(sums, -1) / count[:, None]).astype(np.float32)
 
-    return PointCloud(mean(points), mean(cloud.colors))
+    return PointCloud(mean(points), mean(cloud.colors), cloud.origins[first])
 
 
 def remove_outliers(cloud: PointCloud, num_neighbors: int, num_std: float) -> PointCloud:
@@ -64,4 +78,4 @@ def remove_outliers(cloud: PointCloud, num_neighbors: int, num_std: float) -> Po
     distance, _ = cKDTree(cloud.points).query(cloud.points, k=num_neighbors)
     average = distance.reshape(len(cloud), -1).mean(1)
     keep = average <= average.mean() + num_std * average.std(ddof=1)
-    return PointCloud(cloud.points[keep], cloud.colors[keep])
+    return cloud.taken(keep)
