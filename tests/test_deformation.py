@@ -84,6 +84,27 @@ def test_field_agrees_with_the_literal_formulas() -> None:
     torch.testing.assert_close(model.box.grad, double_box.grad.float(), rtol=1e-3, atol=1e-4)
 
 
+def test_displacement_at_another_time_is_that_of_a_second_call() -> None:
+    """Offsets, displacement and every gradient; heads other than that of the centers see one time only."""
+    results = []
+    for together in (True, False):
+        model = field(replace(SMALL, deform_opacity=True))
+        model.grid.values.uniform_(0.3, 1.1, generator=torch.Generator().manual_seed(2))
+        means = (points(80, 1) * 1.05).requires_grad_(True)
+        if together:
+            offsets, displacement = model.offsets_and_displacement(means, 0.6, 0.2)
+        else:
+            offsets, displacement = model.offsets(means, 0.6), model.offsets(means, 0.2).means
+        made = [displacement, *vars(offsets).values()]
+        found = [value for value in made if value is not None]
+        sum((k + 1) * value.square().sum() for k, value in enumerate(found)).backward()
+        network = [tensor.grad for tensor in model.parameters_by_group()["network"]]
+        results.append([*found, means.grad, model.box.grad, model.grid.grads, *network])
+    assert len(results[0]) == 5 + 3 + 18
+    for together, apart in zip(*results, strict=True):
+        torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-4)  # float32 sums over 80 Gaussians
+
+
 def test_network_gradients_by_central_differences() -> None:
     model, means = field(), points(40, 1)
     loss = lambda: model.offsets(means, 0.3).means.double().square().sum()  # noqa: E731

@@ -10,6 +10,7 @@ from endoprior import density
 from endoprior.config import Config, DensityConfig
 from endoprior.density import DensityStats, Plan
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.morton import morton_order
 from endoprior.optim import Optimizer, split_children
 from endoprior.types import RenderOutput
 
@@ -170,16 +171,22 @@ def test_every_row_stays_together_through_a_plan(kind):
     flags = torch.eye(6, dtype=torch.bool)
     planned = Plan(clone=flags[1], split=flags[2], remove=flags[4])
     grown = optimizer.apply_plan(planned, stats, np.random.default_rng(0))
-    parents = torch.tensor([0, 1, 3, 5, 1, 2, 2])  # kept, then the clone, then two children
+    # The marks say which Gaussian each row was: the kept ones, the clone, two children, in an order of their own.
+    parents = (model["opacity_logits"].detach()[:, None] - before["opacity_logits"]).abs().argmin(1)
+    assert sorted(parents.tolist()) == [0, 1, 1, 2, 2, 3, 5]
+    assert np.array_equal(morton_order(model["means"].detach().numpy()), np.arange(7))
+    old = optimizer.states["opacity_logits"].first > 0
+    assert sorted(parents[old].tolist()) == [0, 1, 3, 5]
+    assert torch.equal(model["means"].detach()[old], before["means"][parents[old]])
     for name, value in model.tensors.items():
-        assert len(value) == 7 and value.requires_grad and value.is_leaf
+        assert len(value) == 7 and value.requires_grad and value.is_leaf and value.is_contiguous()
         if name not in ("means", "log_scales"):
             torch.testing.assert_close(value.detach(), before[name][parents])
         state = optimizer.states[name]
         assert state.first.shape == state.second.shape == value.shape
-        assert (state.first[4:] == 0).all()
-        assert (state.first[:4].reshape(4, -1)[:, 0] > 0).all()
-    assert grown.num_valid.tolist() == [3, 4, 6, 8, 0, 0, 0]
+        marks = parents + 1 + 10 * list(model.tensors).index(name)
+        assert torch.equal(state.first.reshape(7, -1)[:, 0], torch.where(old, marks.float(), 0))
+    assert torch.equal(grown.num_valid, torch.where(old, parents + 3.0, 0))
     assert not grown.grad2d_ndc_sum.any() and not grown.num_seen.any()
 
 

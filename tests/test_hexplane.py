@@ -13,7 +13,8 @@ from torch.nn.functional import grid_sample
 
 from endoprior.checks import InputError
 from endoprior.config import HexPlaneConfig
-from endoprior.model.hexplane import PLANE_NAMES, PlaneGrid
+from endoprior.model import hexplane_lookup
+from endoprior.model.hexplane import PLANE_NAMES, PlaneGrid, mapped_zeros
 from endoprior.model.hexplane_kernels import FRESH, TOUCHED
 from endoprior.model.plane_adam import PlaneAdam, plane_adam_step
 
@@ -120,6 +121,79 @@ def test_agrees_with_grid_sample(channels: int, time_map: str) -> None:
         assert (grid.marks[received] == TOUCHED | FRESH).all() and (grid.marks == 0).any()
 
 
+def random_layer(grid: PlaneGrid, width: int = 5) -> tuple[Tensor, Tensor]:
+    """Weight and bias of a linear layer on the features."""
+    generator = torch.Generator().manual_seed(6)
+    weight = torch.randn(width, grid.num_features, generator=generator) / grid.num_features
+    return weight.requires_grad_(True), torch.randn(width, generator=generator).requires_grad_(True)
+
+
+@pytest.mark.parametrize("channels", [1, 20, 64])
+def test_linear_layer_agrees_with_grid_sample(channels: int) -> None:
+    """Values and all gradients at three moments, two of them in the same row of the time planes."""
+    times = (0.2, 0.25, 0.9)
+    grid = random_grid(HexPlaneConfig((5, 4, 6), 7, channels, (1, 3)))
+    unit = random_unit(150, 3, -0.2, 1.2).requires_grad_(True)
+    weight, bias = random_layer(grid)
+    cotangents = torch.randn(3, 150, 5, generator=torch.Generator().manual_seed(9))
+    got = torch.stack(grid.linear(unit, times, weight, bias))
+    (got * cotangents).sum().backward()
+
+    exact = [tensor.detach().double().requires_grad_(True) for tensor in (grid.values, unit, weight, bias)]
+    values, double_unit, double_weight, double_bias = exact
+    features = [reference(planes_of(grid, values), double_unit, time) for time in times]
+    want = torch.stack([f @ double_weight.T + double_bias for f in features])
+    (want * cotangents).sum().backward()
+    torch.testing.assert_close(got, want.float(), rtol=2e-5, atol=2e-6)  # float32 means over up to 128 products
+    for found, expected in zip((grid.grads, unit.grad, weight.grad, bias.grad), exact, strict=True):
+        # Sums over 150 Gaussians and three moments.
+        torch.testing.assert_close(found, expected.grad.float(), rtol=1e-4, atol=1e-3)
+
+
+def test_moments_together_equal_moments_apart() -> None:
+    """One call for two moments, over more than one chunk, is two calls; a moment that nothing reads owes nothing."""
+    num, times = hexplane_lookup._CHUNK + 77, (0.3, 0.45)
+    cotangents = torch.randn(2, num, 5, generator=torch.Generator().manual_seed(2))
+    for read in ((0, 1), (0,), (1,)):
+        results = []
+        for calls in ((times,), tuple((time,) for time in times)):
+            grid, unit = random_grid(), random_unit(num).requires_grad_(True)
+            weight, bias = random_layer(grid)
+            out = [made for call in calls for made in grid.linear(unit, call, weight, bias)]
+            sum((out[m] * cotangents[m]).sum() for m in read).backward()
+            results.append((torch.stack(out), unit.grad, weight.grad, bias.grad, grid.grads))
+        for together, apart in zip(*results, strict=True):
+            # float32; sums over 2125 Gaussians of terms around 1, in another order.
+            torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-3)
+
+
+def test_linear_layer_is_sampling_and_a_product() -> None:
+    grid, unit = random_grid(), random_unit(70)
+    weight, bias = random_layer(grid)
+    with torch.no_grad():
+        (got,) = grid.linear(unit, (0.6,), weight, bias)
+        torch.testing.assert_close(got, grid.sample(unit, 0.6) @ weight.T + bias)
+    assert not grid.marks.any()
+    assert grid.linear(unit[:0], (0.1, 0.2), weight, bias)[1].shape == (0, 5)
+    for wrong in ({"times": (0.1, float("nan"))}, {"weight": weight[:, 1:]}, {"bias": bias[1:]}):
+        with pytest.raises(ValueError, match=next(iter(wrong)).removesuffix("s")):
+            grid.linear(**({"unit": unit, "times": (0.1,), "weight": weight, "bias": bias} | wrong))
+
+
+def test_order_of_gaussians_does_not_matter() -> None:
+    grid, unit = random_grid(), random_unit(300)
+    order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(grid.sample(unit[order], 0.4), grid.sample(unit, 0.4)[order])
+
+
+def test_planes_begin_on_a_cache_line() -> None:
+    for shape in ((3, 7), (1,), (0, 4), (1000, 64)):
+        zeros = mapped_zeros(*shape)
+        assert zeros.shape == shape and zeros.is_contiguous() and not zeros.any() and zeros.data_ptr() % 64 == 0
+    adam = PlaneAdam(random_grid())
+    assert all(t.data_ptr() % 64 == 0 for t in (adam.grid.values, adam.grid.grads, adam.exp_avg, adam.exp_avg_sq))
+
+
 def test_many_chunks_agree_with_grid_sample() -> None:
     """More Gaussians than one task holds, and a count that is no multiple of it."""
     grid, unit = random_grid(), random_unit(1003)
@@ -192,6 +266,19 @@ def test_a_nan_position_shows_and_stays_alone() -> None:
     assert torch.equal(far, grid.sample(torch.tensor([[1.0, 0.0, 1.0]]), 0.3))
 
 
+def test_division_of_labor_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With more threads a task takes fewer channels: here all 40, 32 or 16 of them, whatever this machine has."""
+    results = []
+    for threads in (1, 2, 64):
+        monkeypatch.setattr(hexplane_lookup.numba, "get_num_threads", lambda threads=threads: threads)
+        grid, unit = random_grid(HexPlaneConfig((5, 4, 6), 7, 40, (1, 3))), random_unit(400).requires_grad_(True)
+        weight, bias = random_layer(grid)
+        sum(made.square().sum() for made in grid.linear(unit, (0.1, 0.4), weight, bias)).backward()
+        results.append((unit.grad, weight.grad, grid.grads))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
 def test_thread_count_changes_no_bit() -> None:
     results = []
     threads = numba.get_num_threads()
@@ -204,7 +291,9 @@ def test_thread_count_changes_no_bit() -> None:
                 unit = random_unit(700, step).requires_grad_(True)
                 feature = grid.sample(unit, step / 3)
                 feature.square().sum().backward()
-                kept = (feature.detach(), unit.grad, grid.grads.clone())
+                made = grid.linear(unit, (step / 3, step / 4), *random_layer(grid))
+                sum(m.square().sum() for m in made).backward()
+                kept = (feature.detach(), made[1].detach(), unit.grad, grid.grads.clone())
                 adam.step(1e-2)
             results.append((*kept, grid.values))
     finally:

@@ -39,3 +39,42 @@ def test_operations_are_numpys():
     while halves.size > 1:
         halves = halves[: halves.size // 2] + halves[halves.size // 2 :]
     assert total == halves[0]
+
+
+@njit
+def _copy_some(source, target, loaded, lanes):
+    for k in range(len(loaded)):
+        some = simd.load_some(source, 3, lanes if k else simd.LANES)  # the second load must not see the first
+        simd.store(loaded[k], 0, some)
+    simd.store_some(target, 2, some + simd.splat(f4(1.0)), lanes)
+
+
+@njit
+def _copy_all(source, target):
+    simd.store_some(target, 2, simd.load_some(source, 3, None) + simd.splat(f4(1.0)), None)
+
+
+def test_a_part_of_a_vector_touches_nothing_else():
+    source = np.arange(40, dtype=f4)
+    for lanes in (0, 1, 5, simd.LANES):
+        target, loaded = np.full(40, -1, f4), np.full((2, simd.LANES), -1, f4)
+        _copy_some(source, target, loaded, lanes)
+        want = np.full(40, -1, f4)
+        want[2 : 2 + lanes] = source[3 : 3 + lanes] + 1
+        assert np.array_equal(target, want)
+        part = source[3 : 3 + simd.LANES]
+        assert np.array_equal(loaded, [part, np.where(np.arange(simd.LANES) < lanes, part, 0)])
+    target = np.zeros(40, f4)
+    _copy_all(source, target)
+    assert np.array_equal(np.flatnonzero(target), np.arange(2, 2 + simd.LANES))
+    assert np.array_equal(target[2 : 2 + simd.LANES], source[3 : 3 + simd.LANES] + 1)
+
+
+@njit
+def _ask(array, offset):
+    simd.prefetch(array, offset)
+
+
+def test_asking_for_a_cache_line_is_safe_anywhere():
+    for offset in (0, 5, 10**9, -(10**9)):
+        _ask(np.zeros(8, f4), offset)

@@ -15,6 +15,7 @@ import torch
 from endoprior.checks import InputError
 from endoprior.config import Config
 from endoprior.data import load_sequence
+from endoprior.model.morton import morton_order
 from endoprior.model.scene import load_scene
 from endoprior.optim import log_linear
 from endoprior.presets import preset
@@ -183,6 +184,56 @@ def test_only_the_configured_ends_of_a_displacement_are_trained(tiny_sequence, k
     trainer.start()
     before = trainer._means_before(0.2, torch.arange(5))
     assert before.requires_grad is trained and before.shape == (5, 3)
+
+
+def test_both_moments_at_once_have_the_gradients_of_one_after_the_other(tiny_sequence, monkeypatch):
+    cfg = tiny_config("hexplane", coarse=0, fine=7)
+    cfg = replace(cfg, temporal=replace(cfg.temporal, gradient="both", weight=1e3))
+    runs = []
+    for apart in (False, True):
+        trainer = Trainer(load_sequence(tiny_sequence), cfg)
+        trainer.start()
+        field, deform, seen = trainer.state.field, trainer._deform, []
+        field.grid.values.uniform_(0.2, 1.2, generator=torch.Generator().manual_seed(1))  # so that something moves
+
+        # In place of a step, which would amplify noise.
+        def observe(iteration, trainer=trainer, field=field, seen=seen):
+            network = [value.grad.clone() for value in field.parameters_by_group()["network"] if value.grad is not None]
+            means = trainer.state.gaussians["means"].grad.clone()
+            seen.append([means, field.box.grad.clone(), field.grid.grads.clone(), *network])
+            trainer.state.optimizer.clear_gradients()
+            field.grid.clear_grads()
+
+        monkeypatch.setattr(trainer.state.optimizer, "step", observe)
+        if apart:
+            monkeypatch.setattr(trainer, "_deform", lambda frame, _, deform=deform: deform(frame, None))
+        terms = [trainer.step().terms for _ in range(7)]
+        runs.append((terms, seen))
+    (terms, together), (other_terms, apart) = runs
+    assert sum("displacement" in term for term in terms) > 2
+    for a, b in zip(terms, other_terms, strict=True):
+        assert a == pytest.approx(b, rel=1e-4, abs=1e-7)  # float32, lengths of hundredths of a millimeter
+    for a, b in zip(together, apart, strict=True):
+        for found, expected in zip(a, b, strict=True):
+            scale = float(expected.abs().max())
+            torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4 * scale)  # sums in another order
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gaussians_stay_in_the_order_of_space(tiny_sequence, kind):
+    cfg = tiny_config(kind)
+    trainer = Trainer(load_sequence(tiny_sequence), cfg)
+    trainer.start()
+    ordered = [np.arange(len(trainer.state.gaussians))]
+    found = [morton_order(trainer.state.gaussians["means"].detach().numpy())]
+    while not trainer.finished:
+        num = len(trainer.state.gaussians)
+        trainer.step()
+        if len(trainer.state.gaussians) != num:  # a density event has just sorted them
+            found.append(morton_order(trainer.state.gaussians["means"].detach().numpy()))
+            ordered.append(np.arange(len(trainer.state.gaussians)))
+    assert len(found) > 2
+    assert all(np.array_equal(a, b) for a, b in zip(found, ordered, strict=True))
 
 
 def test_half_resolution_keeps_the_geometry(tiny_sequence):

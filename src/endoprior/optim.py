@@ -16,6 +16,7 @@ from .geometry import quaternion_to_matrix
 from .model.basis import RankOneGradient, motion_layout
 from .model.deformation import HexPlaneField
 from .model.gaussians import Gaussians
+from .model.morton import morton_order
 from .model.plane_adam import PlaneAdam
 
 BETA1, BETA2 = 0.9, 0.999
@@ -138,23 +139,23 @@ class Optimizer:
         """Clone, split and remove as planned, in the parameters, Adam's moments and the statistics alike.
 
         Rows that stay keep everything; the gradient sums of all are cleared, as after each event. New rows start with
-        zero moments and unobserved.
+        zero moments and unobserved. All are then put in the order of `morton_order`.
 
         Returns:
             The statistics of the new set.
         """
-        keep = ~(plan.remove | plan.split)
         tensors = self.gaussians.tensors
         children = split_children(self.gaussians, plan.split, self.cfg.density.split_shrink, rng)
-        num_new = 0
+        added = {name: torch.cat([value.detach()[plan.clone], children[name]]) for name, value in tensors.items()}
+        staying = (~(plan.remove | plan.split)).nonzero()[:, 0]
+        rows = torch.cat([staying, len(plan.split) + torch.arange(len(added["means"]))])
+        means = torch.cat([tensors["means"].detach(), added["means"]])[rows]
+        rows = rows[torch.from_numpy(morton_order(means.numpy()))]
         for name, value in tensors.items():
-            data = value.detach()
-            added = torch.cat([data[plan.clone], children[name]])
-            num_new = len(added)
-            tensors[name] = torch.cat([data[keep], added]).contiguous().requires_grad_()
+            tensors[name] = torch.cat([value.detach(), added[name]])[rows].requires_grad_()
             state = self.states[name]
-            state.first, state.second = (_grown(m, keep, num_new) for m in (state.first, state.second))
-        grown = DensityStats(*(_grown(value, keep, num_new) for value in stats.tensors().values()))
+            state.first, state.second = (_with_zeros(m, rows) for m in (state.first, state.second))
+        grown = DensityStats(*(_with_zeros(value, rows) for value in stats.tensors().values()))
         grown.clear_gradient()
         return grown
 
@@ -209,5 +210,8 @@ def split_children(gaussians: Gaussians, split: Tensor, shrink: float, rng: np.r
     return children
 
 
-def _grown(rows: Tensor, keep: Tensor, num_new: int) -> Tensor:
-    return torch.cat([rows[keep], rows.new_zeros((num_new, *rows.shape[1:]))]).contiguous()
+def _with_zeros(values: Tensor, rows: Tensor) -> Tensor:
+    """The `rows` of `values`; those beyond its end are zeros."""
+    chosen = values[rows.clamp(max=len(values) - 1)]
+    chosen[rows >= len(values)] = 0
+    return chosen

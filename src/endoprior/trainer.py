@@ -18,9 +18,10 @@ from .data import Sequence
 from .density import DensityStats
 from .geometry import project
 from .loss_kernels import supervised_losses
-from .model.deformation import HexPlaneField
+from .model.deformation import HexPlaneField, Offsets
 from .model.gaussians import Gaussians, create_gaussians
 from .model.initialize import initial_log_scales, initial_points
+from .model.morton import morton_order
 from .model.scene import Scene, offsets_at
 from .optim import Optimizer
 from .train_state import Stage, StepReport, TrainState
@@ -52,6 +53,7 @@ class Trainer:
         """Draw the initial points and build the state before the first iteration."""
         cfg = self.cfg
         cloud = initial_points(self.sequence.frames("train"), cfg.init, cfg.prior, cfg.seed)
+        cloud = cloud.taken(morton_order(cloud.points))
         log_scales = initial_log_scales(cloud.points, cfg.init.variance_factor)
         gaussians = create_gaussians(cloud.points, cloud.colors, log_scales, cfg)
         field = None
@@ -90,7 +92,10 @@ class Trainer:
         half = fine and iteration <= cfg.schedule.half_resolution_iterations
         frame = self.frames.frame(position, half=half)
 
-        offsets = offsets_at(state.gaussians, state.field, frame.time, cfg) if fine else None
+        before_frame = None
+        if fine and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration:
+            before_frame = self.frames.before(position)
+        offsets, means_before = self._deform(frame, before_frame) if fine else (None, None)
         splats = state.gaussians.splats(offsets, self._sh_degree(iteration))
         out = self.rasterize(
             splats,
@@ -100,8 +105,8 @@ class Trainer:
         )
         out.means2d.retain_grad()
         terms = supervised_terms(out, frame, cfg)
-        if fine and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration:
-            terms |= self._temporal_terms(splats.means, out, position, frame)
+        if before_frame is not None:
+            terms |= self._temporal_terms(splats.means, means_before, out, frame, before_frame)
         sum(terms.values()).backward()
 
         with torch.no_grad():
@@ -122,14 +127,25 @@ class Trainer:
             done += schedule.coarse_iterations // schedule.sh_every
         return min(done, schedule.sh_degree)
 
+    def _deform(self, frame: TrainingFrame, before_frame: TrainingFrame | None) -> tuple[Offsets, Tensor | None]:
+        """Offsets at `frame` and, where one call gives both with gradients, the centers (N, 3) at the frame before."""
+        state = self.state
+        if before_frame is None or state.field is None or self.cfg.temporal.gradient != "both":
+            return offsets_at(state.gaussians, state.field, frame.time, self.cfg), None
+        means = state.gaussians["means"]
+        offsets, displacement = state.field.offsets_and_displacement(means, frame.time, before_frame.time)
+        return offsets, means + displacement
+
     def _temporal_terms(
-        self, means: Tensor, out: RenderOutput, position: int, frame: TrainingFrame
+        self,
+        means: Tensor,
+        means_before: Tensor | None,
+        out: RenderOutput,
+        frame: TrainingFrame,
+        before_frame: TrainingFrame,
     ) -> dict[str, Tensor]:
-        """L_local of Eq. (11), weighted; nothing without a training frame just before, or with few Gaussians."""
+        """L_local of Eq. (11), weighted; nothing with few Gaussians."""
         cfg, state = self.cfg.temporal, self.state
-        before_frame = self.frames.before(position)
-        if before_frame is None:
-            return {}
         stats = state.stats
         mask_value = density.sample_mask(frame.tissue_mask, out.means2d)
         drawn = out.radii > 0
@@ -141,7 +157,7 @@ class Trainer:
         if len(chosen) == 0:
             return {}
         index = torch.from_numpy(chosen)
-        before = self._means_before(before_frame.time, index)
+        before = self._means_before(before_frame.time, index) if means_before is None else means_before[index]
         if cfg.valid_at_both:
             kept = on_tissue(before.detach(), before_frame)
             index, weights, before = index[kept], weights[kept.numpy()], before[kept]

@@ -49,11 +49,17 @@ class OffsetHeads:
             self.parameters[f"{layer}.weight"] = weight.requires_grad_(True)
             self.parameters[f"{layer}.bias"] = bias.requires_grad_(True)
 
-    def __call__(self, features: Tensor) -> dict[str, Tensor]:
-        """Offsets (N, outputs) by name, from features (N, F)."""
-        trunk = relu(self._linear("trunk", features))
+    @property
+    def trunk(self) -> tuple[Tensor, Tensor]:
+        """Weight (W, F) and bias (W,) of the linear trunk, which whoever makes the features applies to them."""
+        return self.parameters["trunk.weight"], self.parameters["trunk.bias"]
+
+    def __call__(self, trunk: Tensor, only: tuple[str, ...] | None = None) -> dict[str, Tensor]:
+        """Offsets (N, outputs) by name, from what the trunk makes of the features, (N, W); of `only` some heads."""
+        shared = relu(trunk)
         return {
-            name: self._linear(f"{name}.output", relu(self._linear(f"{name}.hidden", trunk))) for name in self.outputs
+            name: self._linear(f"{name}.output", self._linear(f"{name}.hidden", shared).relu_())
+            for name in only or self.outputs
         }
 
     def _linear(self, layer: str, inputs: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """HexPlane: features of (x, y, z, t) as products of six planes, at several spatial scales.
 
 The planes hold tens of millions of numbers of which one step reads a small part, so they live outside the autograd
-graph: `PlaneGrid.sample` is differentiable in the position, and its backward adds the gradient of the planes to the
-persistent buffer `PlaneGrid.grads`. `plane_adam.py` consumes that buffer.
+graph: `PlaneGrid.sample` and `PlaneGrid.linear` are differentiable in the position, and their backward adds the
+gradient of the planes to the persistent buffer `PlaneGrid.grads`. `plane_adam.py` consumes that buffer.
 
 Sampling is that of the published field: bilinear, corners aligned, border padding; product over the planes, features
 of the scales concatenated (EndoGaussian; Cao and Johnson, "HexPlane", CVPR 2023).
@@ -10,20 +10,30 @@ of the scales concatenated (EndoGaussian; Cao and Johnson, "HexPlane", CVPR 2023
 
 from __future__ import annotations
 
-from typing import Any
+import math
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from ..checks import InputError, check_shape
 from ..config import HexPlaneConfig
 from . import hexplane_kernels as kernels
+from .hexplane_lookup import Linear, Sample
 
 PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
 _COLUMN_AXES = (0, 0, 1, 0, 1, 2)
 _SPACE_ROW_AXES = (1, 2, 2)
+_CACHE_LINE = 64
+"""Bytes."""
+
+
+def mapped_zeros(*shape: int) -> Tensor:
+    """float32 zeros that begin on a cache line and take memory only where written: NumPy maps, torch would fill."""
+    size = math.prod(shape)
+    room = np.zeros(size + _CACHE_LINE // 4, dtype=np.float32)
+    start = -room.ctypes.data % _CACHE_LINE // 4
+    return torch.from_numpy(room[start : start + size]).view(shape)
 
 
 class PlaneGrid:
@@ -62,8 +72,7 @@ class PlaneGrid:
         self.table_start = (np.cumsum(space) - space.ravel()).reshape(-1, 3)
         self.num_cells = int(sizes.sum())
         self.values = torch.ones(self.num_cells, self.channels)
-        # NumPy's zeros are mapped, not written: cells that no Gaussian reaches cost no memory.
-        self.grads = torch.from_numpy(np.zeros((self.num_cells, self.channels), dtype=np.float32))
+        self.grads = mapped_zeros(self.num_cells, self.channels)
         self.marks = torch.zeros(self.num_cells, dtype=torch.uint8)
 
     @property
@@ -134,46 +143,31 @@ class PlaneGrid:
         Raises:
             ValueError: a wrong shape or a time that is not finite.
         """
-        check_shape("unit:N,3", unit=unit)
-        if not np.isfinite(time):
-            raise ValueError(f"time must be finite; got {time!r}")
+        self._check(unit, (time,))
         if torch.is_grad_enabled() and not unit.requires_grad:
             unit = unit.detach().requires_grad_(True)
-        return _Sample.apply(unit, time, self)
+        return Sample.apply(unit, time, self)
 
+    def linear(self, unit: Tensor, times: tuple[float, ...], weight: Tensor, bias: Tensor) -> tuple[Tensor, ...]:
+        """A linear layer on the features of one or more moments.
 
-class _Sample(torch.autograd.Function):
-    """Bridge between autograd and the kernels."""
+        Equal to `sample(unit, time) @ weight.T + bias`, but the features, many times wider than what is made of them,
+        do not leave the cache, and what does not depend on time is looked up once.
 
-    @staticmethod
-    def forward(ctx: Any, unit: Tensor, time: float, grid: PlaneGrid) -> Tensor:
-        row, fraction = grid.time_row(time)
-        values = grid.values.numpy()
-        tables = np.empty((int(grid.resolution.sum()), grid.channels), dtype=np.float32)
-        kernels.slice_time(values, grid.time_start, grid.table_start, grid.resolution, row, fraction, tables)
-        out = np.empty((len(unit), grid.num_scales, grid.channels), dtype=np.float32)
-        positions = unit.detach().contiguous()
-        kernels.gather(positions.numpy(), values, tables, grid.space_start, grid.table_start, grid.resolution, out)
-        ctx.save_for_backward(positions)
-        ctx.grid, ctx.moment, ctx.tables = grid, (row, fraction), tables
-        return torch.from_numpy(out).view(len(unit), grid.num_features)
+        Args:
+            unit: (N, 3), as in `sample`.
+            times: M moments in [0, 1].
+            weight: (W, S * C). bias: (W,).
+        Returns:
+            (N, W) float32 per moment. With gradients, backward also adds to `grads`.
+        Raises:
+            ValueError: a wrong shape or a time that is not finite.
+        """
+        self._check(unit, times)
+        check_shape(f"weight:W,{self.num_features} bias:W", weight=weight, bias=bias)
+        return Linear.apply(unit, weight, bias, times, self)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor, None, None]:
-        grid: PlaneGrid = ctx.grid
-        (positions,) = ctx.saved_tensors
-        unit, tables, num = positions.numpy(), ctx.tables, len(positions)
-        values, grads, marks = grid.values.numpy(), grid.grads.numpy(), grid.marks.numpy()
-        v_features = v_out.contiguous().numpy().reshape(num, grid.num_scales, grid.channels)
-        v_unit = np.zeros((num, 3), dtype=np.float32)
-        v_samples = np.empty((6, num, grid.channels), dtype=np.float32)  # of one scale at a time, to save memory
-        v_tables, table_marks = np.zeros_like(tables), np.zeros(len(tables), dtype=np.uint8)
-        layout = (grid.space_start, grid.table_start, grid.resolution)
-        for s in range(grid.num_scales):
-            kernels.gather_backward(s, unit, values, tables, *layout, v_features, v_samples, v_unit)
-            kernels.scatter(s, unit, v_samples, *layout, grads, v_tables, marks, table_marks)
-        kernels.slice_time_backward(
-            v_tables, table_marks, grid.time_start, grid.table_start, grid.resolution, *ctx.moment, grads, marks
-        )
-        return torch.from_numpy(v_unit), None, None
+    def _check(self, unit: Tensor, times: tuple[float, ...]) -> None:
+        check_shape("unit:N,3", unit=unit)
+        if not np.isfinite(times).all():
+            raise ValueError(f"time must be finite; got {times!r}")

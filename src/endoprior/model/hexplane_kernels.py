@@ -1,18 +1,26 @@
-"""HexPlane look-up on the CPU: gather forward, two deterministic passes backward.
+"""HexPlane look-up on the CPU: gather forward, differentiate and scatter backward, at several moments at once.
 
-Shared letters: `N` Gaussians, `S` scales, `C` channels of a plane. Shared arrays (all C-contiguous, trusted):
+Shared letters: `N` Gaussians, `M` moments, `S` scales, `C` channels of a plane. Samples of the planes xy, xz, yz are
+the same at every moment, so each is read once, and what all moments owe it is added up before it is written. Shared
+arrays (all C-contiguous, trusted; "flat" ones are one-dimensional views of the shape that is given):
 
 - `unit` (N, 3) float32: position in the box, 0 at its first corner, 1 at its second; anything outside is clamped.
-- `values`, `grads` (cells, C) float32: every plane of every scale, one row per cell; a plane is a block of rows.
-- `space_start` (S, 3) int64: first row of planes xy, xz, yz. The cell (row r, column c) of plane `ab` is row
+- `values`, `grads` (cells, C) float32, flat: every plane of every scale; a plane is a block of cells.
+- `space_start` (S, 3) int64: first cell of planes xy, xz, yz. The cell (row r, column c) of plane `ab` is
   `start + r * resolution[a] + c`, where c runs along a and r along b.
-- `time_start` (S, 3) int64: first row of planes xt, yt, zt (rows are moments, columns run along the space axis).
-- `tables` (columns, C) float32: the time planes at one moment; `table_start` (S, 3) is their first rows.
-- `resolution` (S, 3) int64: cells along x, y, z of each scale, at least 2.
+- `time_start` (S, 3) int64: first cell of planes xt, yt, zt (rows are moments, columns run along the space axis).
+- `tables`, `v_tables` (columns, M, C), flat: the time planes at the moments; `table_start` (S, 3): first columns.
+- `features` (M, N, S, C) float32, flat.
+- `resolution` (S, 3) int64: cells along x, y, z of each scale, at least 2. `layout` is (space_start, table_start,
+  resolution).
 - `marks` (cells,) uint8: 0 never touched, `TOUCHED` touched before, `TOUCHED | FRESH` has a gradient now.
 
-All sums run in an order that the number of threads does not change, so equal inputs give equal bits. Scratch rows have
-a constant length because the compiler must know that they do not overlap before it vectorizes.
+Work is done in vectors of `LANES` channels. `lanes` is None for a whole vector and a number for the last one of planes
+whose channels are no multiple of it; Numba compiles a version for each. `values` and `grads` should start on a cache
+line: a vector that straddles two costs twice, and shares one with another task. Memory is the bottleneck: Gaussians
+that lie near each other should follow each other.
+
+All sums run in an order that the number of threads does not change, so equal inputs give equal bits.
 """
 
 from __future__ import annotations
@@ -20,240 +28,293 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from ..render.simd import LANES, fma, load_some, prefetch, splat, store_some, total
+
 MAX_CHANNELS = 256
 TOUCHED = 1
 FRESH = 2
 
-_FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
-_CHUNK = 64  # Gaussians per task of the gathers
-_LANES = 16  # channels per task of the scatters: one cache line
+_CHUNK = 64  # Gaussians per task of the gather
+_AHEAD = 4  # Gaussians between asking for cells and using them
 _ONE = np.float32(1)
 _ZERO = np.float32(0)
-# Column axis and row axis of the planes xy, xz, yz.
-_COLUMN_AXIS = (0, 0, 1)
-_ROW_AXIS = (1, 2, 2)
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(inline="always")
 def _locate(unit, resolution):
-    """Cell, fraction in [0, 1] and whether the gradient passes, for one coordinate with border padding.
-
-    As in torch's `grid_sample`, the gradient stops on the border too. NaN ends up in the fraction.
-    """
+    # Cell, fraction in [0, 1] and slope (cells per unit) of one coordinate with border padding. As in torch's
+    # `grid_sample`, the gradient stops on the border too. NaN ends up in the fraction.
     top = np.float32(resolution - 1)
     position = unit * top
     if position <= _ZERO:
-        return 0, _ZERO, False
-    if position >= top:
-        return resolution - 2, _ONE, False
-    if position != position:
-        return 0, position, False
-    cell = min(int(position), resolution - 2)
-    return cell, position - np.float32(cell), True
+        cell, fraction, slope = 0, _ZERO, _ZERO
+    elif position >= top:
+        cell, fraction, slope = resolution - 2, _ONE, _ZERO
+    elif position != position:
+        cell, fraction, slope = 0, position, _ZERO
+    else:
+        cell = min(int(position), resolution - 2)
+        fraction, slope = position - np.float32(cell), top
+    return cell, fraction, slope
 
 
-@njit(parallel=True, cache=True, fastmath=_FAST)
-def slice_time(values, time_start, table_start, resolution, row, fraction, tables):
-    """Write the time planes at one moment: `tables` = lerp of plane rows `row` and `row + 1`. One task per plane."""
-    channels = values.shape[1]
+@njit(inline="always")
+def _find(unit, n, s, layout):
+    # Where Gaussian n lies at scale s: first cells in xy, xz, yz, first columns in the tables, fractions, slopes.
+    space_start, table_start, resolution = layout
+    x, fx, slope_x = _locate(unit[n, 0], resolution[s, 0])
+    y, fy, slope_y = _locate(unit[n, 1], resolution[s, 1])
+    z, fz, slope_z = _locate(unit[n, 2], resolution[s, 2])
+    width, depth = resolution[s, 0], resolution[s, 1]
+    cells = (space_start[s, 0] + y * width + x, space_start[s, 1] + z * width + x, space_start[s, 2] + z * depth + y)
+    columns = (table_start[s, 0] + x, table_start[s, 1] + y, table_start[s, 2] + z)
+    return cells, columns, (splat(fx), splat(fy), splat(fz)), (slope_x, slope_y, slope_z)
+
+
+@njit(inline="always")
+def _bilinear(values, near, far, step, u, v, lanes):
+    # Sample of a plane and its derivatives along columns and rows, in cells. Row `near` and the next one, `far`, both
+    # from the left column on; `step` elements to the right one.
+    a, b = load_some(values, near, lanes), load_some(values, near + step, lanes)
+    c, d = load_some(values, far, lanes), load_some(values, far + step, lanes)
+    down_left, down_right = c - a, d - b
+    left, right = fma(v, down_left, a), fma(v, down_right, b)
+    across = right - left
+    return fma(u, across, left), across, fma(u, down_right - down_left, down_left)
+
+
+@njit(inline="always")
+def _add_bilinear(grads, near, far, step, u, v, v_sample, lanes):
+    # Adds v_sample to the four cells of a sample. All are read before any is written: rows lie a power of two apart,
+    # and a load soon after a store with the same low address bits would wait for it.
+    below = v * v_sample
+    above = v_sample - below
+    above_right, below_right = u * above, u * below
+    a, b = load_some(grads, near, lanes) + (above - above_right), load_some(grads, near + step, lanes) + above_right
+    c, d = load_some(grads, far, lanes) + (below - below_right), load_some(grads, far + step, lanes) + below_right
+    store_some(grads, near, a, lanes)
+    store_some(grads, near + step, b, lanes)
+    store_some(grads, far, c, lanes)
+    store_some(grads, far + step, d, lanes)
+
+
+@njit(inline="always")
+def _linear(tables, at, step, u, lanes):
+    # Sample of a time plane and its derivative, in cells.
+    left = load_some(tables, at, lanes)
+    across = load_some(tables, at + step, lanes) - left
+    return fma(u, across, left), across
+
+
+@njit(inline="always")
+def _add_linear(v_tables, at, step, u, v_sample, lanes):
+    # Adds v_sample to the two columns of a sample.
+    on_right = u * v_sample
+    a = load_some(v_tables, at, lanes) + (v_sample - on_right)
+    b = load_some(v_tables, at + step, lanes) + on_right
+    store_some(v_tables, at, a, lanes)
+    store_some(v_tables, at + step, b, lanes)
+
+
+@njit(inline="always")
+def _expect(array, cells, c, steps):
+    # Asks for the cells of all three samples, at channel `c`.
+    step, down_x, down_y, _ = steps
+    for cell, down in ((cells[0], down_x), (cells[1], down_x), (cells[2], down_y)):
+        place = cell * step + c
+        prefetch(array, place)
+        prefetch(array, place + step)
+        prefetch(array, place + down)
+        prefetch(array, place + down + step)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def slice_time(values, channels, time_start, table_start, resolution, rows, fractions, tables):
+    # Cuts the time planes at the moments: tables = lerp of plane rows `rows[m]` and `rows[m] + 1`. One task per plane.
+    num_moments = len(rows)
     for task in prange(time_start.size):
         s, a = task // 3, task % 3
         width = resolution[s, a]
-        first = time_start[s, a] + row * width
         for j in range(width):
-            below, above, target = first + j, first + width + j, table_start[s, a] + j
-            for c in range(channels):
-                tables[target, c] = values[below, c] + fraction * (values[above, c] - values[below, c])
+            for m in range(num_moments):
+                below = (time_start[s, a] + rows[m] * width + j) * channels
+                above, target = below + width * channels, ((table_start[s, a] + j) * num_moments + m) * channels
+                for c in range(channels):
+                    tables[target + c] = values[below + c] + fractions[m] * (values[above + c] - values[below + c])
 
 
-@njit(parallel=True, cache=True, fastmath=_FAST)
-def gather(unit, values, tables, space_start, table_start, resolution, out):
-    """Write `out` (N, S, C), the product of the six plane samples. One task per chunk of Gaussians."""
+@njit(parallel=True, cache=True, error_model="numpy")
+def gather(unit, values, channels, tables, num_moments, layout, features):
+    # Writes `features`, the products of the six plane samples. One task per chunk of Gaussians.
     num = len(unit)
     for task in prange((num + _CHUNK - 1) // _CHUNK):
         last = min(num, (task + 1) * _CHUNK)
-        _gather_chunk(task * _CHUNK, last, unit, values, tables, space_start, table_start, resolution, out)
+        _gather_chunk(task * _CHUNK, last, unit, values, channels, tables, num_moments, layout, features)
 
 
-@njit(cache=True, fastmath=_FAST)
-def _gather_chunk(first, last, unit, values, tables, space_start, table_start, resolution, out):
-    """`gather` for Gaussians first..last-1. Loops over channels are short and many so that each one vectorizes."""
-    channels = values.shape[1]
+@njit(cache=True, error_model="numpy")
+def _gather_chunk(first, last, unit, values, channels, tables, num_moments, layout, features):
+    # `gather` for Gaussians first..last-1.
+    resolution = layout[2]
+    num, num_scales, whole = len(unit), len(resolution), channels // LANES * LANES
     for n in range(first, last):
-        for s in range(len(resolution)):
-            x, fx, _ = _locate(unit[n, 0], resolution[s, 0])
-            y, fy, _ = _locate(unit[n, 1], resolution[s, 1])
-            z, fz, _ = _locate(unit[n, 2], resolution[s, 2])
-            for c in range(channels):
-                out[n, s, c] = _ONE
-            for p in range(3):
-                cell, f = (x, fx) if p == 0 else ((y, fy) if p == 1 else (z, fz))
-                i = table_start[s, p] + cell
-                for c in range(channels):
-                    out[n, s, c] *= tables[i, c] + f * (tables[i + 1, c] - tables[i, c])
-                column, fu = (y, fy) if p == 2 else (x, fx)
-                row, fv = (y, fy) if p == 0 else (z, fz)
-                i = space_start[s, p] + row * resolution[s, _COLUMN_AXIS[p]] + column
-                k = i + resolution[s, _COLUMN_AXIS[p]]
-                w00, w01 = (_ONE - fv) * (_ONE - fu), (_ONE - fv) * fu
-                w10, w11 = fv * (_ONE - fu), fv * fu
-                for c in range(channels):
-                    out[n, s, c] *= (
-                        w00 * values[i, c] + w01 * values[i + 1, c] + w10 * values[k, c] + w11 * values[k + 1, c]
-                    )
+        for s in range(num_scales):
+            cells, columns, fractions, _ = _find(unit, n, s, layout)
+            steps = (channels, resolution[s, 0] * channels, resolution[s, 1] * channels, num_moments * channels)
+            ahead, _, _, _ = _find(unit, min(n + _AHEAD, num - 1), s, layout)
+            place, stride = (n * num_scales + s) * channels, num * num_scales * channels
+            for c in range(0, whole, LANES):
+                _expect(values, ahead, c, steps)
+                _gather_block(
+                    c, None,
+                    values, tables, num_moments, cells, columns, fractions, steps, features, place, stride,
+                )  # fmt: skip
+            if whole < channels:
+                _gather_block(
+                    whole, channels - whole,
+                    values, tables, num_moments, cells, columns, fractions, steps, features, place, stride,
+                )  # fmt: skip
 
 
-@njit(parallel=True, cache=True, fastmath=_FAST)
-def gather_backward(s, unit, values, tables, space_start, table_start, resolution, v_out, v_samples, v_unit):
-    """First backward pass, for scale `s`: what each plane sample and each coordinate owes. One task per chunk.
+@njit(inline="always")
+def _gather_block(c, lanes, values, tables, num_moments, cells, columns, fractions, steps, features, place, stride):
+    # `gather` for one Gaussian, one scale and the channels from `c` on. `steps`: elements between cells of a row,
+    # between rows of planes over x and over y, between columns of the tables. Moment m writes to `place + m * stride`.
+    step, down_x, down_y, step_t = steps
+    ux, uy, uz = fractions
+    xy, xz, yz = cells[0] * step + c, cells[1] * step + c, cells[2] * step + c
+    sample_xy, _, _ = _bilinear(values, xy, xy + down_x, step, ux, uy, lanes)
+    sample_xz, _, _ = _bilinear(values, xz, xz + down_x, step, ux, uz, lanes)
+    sample_yz, _, _ = _bilinear(values, yz, yz + down_y, step, uy, uz, lanes)
+    space = sample_xy * (sample_xz * sample_yz)
+    for m in range(num_moments):
+        at = m * step + c
+        sample_xt, _ = _linear(tables, columns[0] * step_t + at, step_t, ux, lanes)
+        sample_yt, _ = _linear(tables, columns[1] * step_t + at, step_t, uy, lanes)
+        sample_zt, _ = _linear(tables, columns[2] * step_t + at, step_t, uz, lanes)
+        moment = sample_xt * (sample_yt * sample_zt)
+        store_some(features, m * stride + place + c, space * moment, lanes)
 
-    Reads `v_out` (N, S, C) = dL/d(feature); writes `v_samples` (6, N, C) for planes xy, xz, yz, xt, yt, zt of this
-    scale and adds to `v_unit` (N, 3).
-    """
-    num = len(unit)
-    for task in prange((num + _CHUNK - 1) // _CHUNK):
-        _gather_backward_chunk(
-            task * _CHUNK, min(num, (task + 1) * _CHUNK), s, unit, values, tables,
-            space_start, table_start, resolution, v_out, v_samples, v_unit,
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def scatter(
+    unit, values, channels, tables, num_moments, layout, features, grads, v_tables, marks, table_marks, v_unit, share
+):
+    # The backward pass. `features` holds dL/d(features) on entry and the features themselves on return. Adds to
+    # `grads` and `v_tables`, marks cells and columns, and writes v_unit (S, blocks, N, 3), where a block is a vector of
+    # channels; its sum over scales and blocks is dL/d(unit).
+    # One task per (scale, `share` channels, a multiple of LANES), each walking all Gaussians in order; tasks share no
+    # memory. A large share reads and writes a cell in one piece. Fine scales cost more, so they alternate with coarse.
+    num_scales = len(layout[2])
+    for task in prange((channels + share - 1) // share * num_scales):
+        turn, first = task % num_scales, task // num_scales * share
+        s = turn // 2 if turn % 2 else num_scales - 1 - turn // 2
+        _scatter_share(
+            s, first, min(channels, first + share), unit, values, channels, tables, num_moments, layout,
+            features, grads, v_tables, marks, table_marks, v_unit[s],
         )  # fmt: skip
 
 
-@njit(cache=True, fastmath=_FAST)
-def _gather_backward_chunk(
-    first, last, s, unit, values, tables, space_start, table_start, resolution, v_out, v_samples, v_unit
+@njit(cache=True, error_model="numpy")
+def _scatter_share(
+    s, first, last, unit, values, channels, tables, num_moments, layout,
+    features, grads, v_tables, marks, table_marks, v_unit,
+):  # fmt: skip
+    # `scatter` for one scale and channels first..last-1.
+    resolution = layout[2]
+    num, num_scales, whole = len(unit), len(resolution), first + (last - first) // LANES * LANES
+    width, depth = resolution[s, 0], resolution[s, 1]
+    steps = (channels, width * channels, depth * channels, num_moments * channels)
+    for n in range(num):
+        cells, columns, fractions, slopes = _find(unit, n, s, layout)
+        ahead, _, _, _ = _find(unit, min(n + _AHEAD, num - 1), s, layout)
+        place, stride = (n * num_scales + s) * channels, num * num_scales * channels
+        for c in range(first, whole, LANES):
+            _expect(values, ahead, c, steps)
+            _expect(grads, ahead, c, steps)
+            _scatter_block(
+                c, None, values, tables, num_moments, cells, columns, fractions, slopes, steps,
+                features, place, stride, grads, v_tables, v_unit, n,
+            )  # fmt: skip
+        if whole < last:
+            _scatter_block(
+                whole, last - whole, values, tables, num_moments, cells, columns, fractions, slopes, steps,
+                features, place, stride, grads, v_tables, v_unit, n,
+            )  # fmt: skip
+        if first == 0:
+            _mark(marks, cells[0], width)
+            _mark(marks, cells[1], width)
+            _mark(marks, cells[2], depth)
+            for column in columns:
+                table_marks[column] = table_marks[column + 1] = 1
+
+
+@njit(inline="always")
+def _scatter_block(
+    c, lanes, values, tables, num_moments, cells, columns, fractions, slopes, steps,
+    features, place, stride, grads, v_tables, v_unit, n,
+):  # fmt: skip
+    # `scatter` for one Gaussian, one scale and the channels from `c` on; arguments as in `_gather_block`.
+    # `sample_ab` is that of plane ab, `ab_a` its slope along a.
+    step, down_x, down_y, step_t = steps
+    ux, uy, uz = fractions
+    xy, xz, yz = cells[0] * step + c, cells[1] * step + c, cells[2] * step + c
+    sample_xy, xy_x, xy_y = _bilinear(values, xy, xy + down_x, step, ux, uy, lanes)
+    sample_xz, xz_x, xz_z = _bilinear(values, xz, xz + down_x, step, ux, uz, lanes)
+    sample_yz, yz_y, yz_z = _bilinear(values, yz, yz + down_y, step, uy, uz, lanes)
+    of_z = sample_xz * sample_yz
+    space = sample_xy * of_z
+    v_x = v_y = v_z = v_space = splat(_ZERO)
+    for m in range(num_moments):
+        at = m * step + c
+        xt, yt, zt = columns[0] * step_t + at, columns[1] * step_t + at, columns[2] * step_t + at
+        sample_xt, xt_x = _linear(tables, xt, step_t, ux, lanes)
+        sample_yt, yt_y = _linear(tables, yt, step_t, uy, lanes)
+        sample_zt, zt_z = _linear(tables, zt, step_t, uz, lanes)
+        of_yz = sample_yt * sample_zt
+        moment = sample_xt * of_yz
+        v_feature = load_some(features, m * stride + place + c, lanes)
+        store_some(features, m * stride + place + c, space * moment, lanes)
+        v_space = fma(v_feature, moment, v_space)
+        v_moment = v_feature * space
+        v_xt, v_rest = v_moment * of_yz, v_moment * sample_xt
+        v_yt, v_zt = v_rest * sample_zt, v_rest * sample_yt
+        v_x, v_y, v_z = fma(v_xt, xt_x, v_x), fma(v_yt, yt_y, v_y), fma(v_zt, zt_z, v_z)
+        _add_linear(v_tables, xt, step_t, ux, v_xt, lanes)
+        _add_linear(v_tables, yt, step_t, uy, v_yt, lanes)
+        _add_linear(v_tables, zt, step_t, uz, v_zt, lanes)
+    v_xy, v_rest = v_space * of_z, v_space * sample_xy
+    v_xz, v_yz = v_rest * sample_yz, v_rest * sample_xz
+    _add_bilinear(grads, xy, xy + down_x, step, ux, uy, v_xy, lanes)
+    _add_bilinear(grads, xz, xz + down_x, step, ux, uz, v_xz, lanes)
+    _add_bilinear(grads, yz, yz + down_y, step, uy, uz, v_yz, lanes)
+    v_unit[c // LANES, n, 0] = total(fma(v_xy, xy_x, fma(v_xz, xz_x, v_x))) * slopes[0]
+    v_unit[c // LANES, n, 1] = total(fma(v_xy, xy_y, fma(v_yz, yz_y, v_y))) * slopes[1]
+    v_unit[c // LANES, n, 2] = total(fma(v_xz, xz_z, fma(v_yz, yz_z, v_z))) * slopes[2]
+
+
+@njit(inline="always")
+def _mark(marks, cell, width):
+    # The four cells of a sample have a gradient.
+    marks[cell] = marks[cell + 1] = marks[cell + width] = marks[cell + width + 1] = TOUCHED | FRESH
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def slice_time_backward(
+    v_tables, channels, table_marks, time_start, table_start, resolution, rows, fractions, grads, marks
 ):
-    """`gather_backward` for Gaussians first..last-1."""
-    channels = values.shape[1]
-    # Rows 0..5: the samples; 6: v_out times the product of the time samples; 7: ... of the space samples.
-    scratch = np.empty((8, MAX_CHANNELS), dtype=np.float32)
-    for n in range(first, last):
-        x, fx, x_inside = _locate(unit[n, 0], resolution[s, 0])
-        y, fy, y_inside = _locate(unit[n, 1], resolution[s, 1])
-        z, fz, z_inside = _locate(unit[n, 2], resolution[s, 2])
-        for p in range(3):
-            column, fu = (y, fy) if p == 2 else (x, fx)
-            row, fv = (y, fy) if p == 0 else (z, fz)
-            i = space_start[s, p] + row * resolution[s, _COLUMN_AXIS[p]] + column
-            k = i + resolution[s, _COLUMN_AXIS[p]]
-            w00, w01 = (_ONE - fv) * (_ONE - fu), (_ONE - fv) * fu
-            w10, w11 = fv * (_ONE - fu), fv * fu
-            for c in range(channels):
-                scratch[p, c] = (
-                    w00 * values[i, c] + w01 * values[i + 1, c] + w10 * values[k, c] + w11 * values[k + 1, c]
-                )
-            cell, f = (x, fx) if p == 0 else ((y, fy) if p == 1 else (z, fz))
-            i = table_start[s, p] + cell
-            for c in range(channels):
-                scratch[3 + p, c] = tables[i, c] + f * (tables[i + 1, c] - tables[i, c])
-        for c in range(channels):
-            scratch[6, c] = v_out[n, s, c] * (scratch[3, c] * scratch[4, c] * scratch[5, c])
-            scratch[7, c] = v_out[n, s, c] * (scratch[0, c] * scratch[1, c] * scratch[2, c])
-        vx, vy, vz = _ZERO, _ZERO, _ZERO
-        for p in range(3):
-            q, r = (p + 1) % 3, (p + 2) % 3  # the other two planes of the same kind
-            for c in range(channels):
-                v_samples[p, n, c] = scratch[6, c] * (scratch[q, c] * scratch[r, c])
-            for c in range(channels):
-                v_samples[3 + p, n, c] = scratch[7, c] * (scratch[3 + q, c] * scratch[3 + r, c])
-            column, fu = (y, fy) if p == 2 else (x, fx)
-            row, fv = (y, fy) if p == 0 else (z, fz)
-            i = space_start[s, p] + row * resolution[s, _COLUMN_AXIS[p]] + column
-            k = i + resolution[s, _COLUMN_AXIS[p]]
-            v_column, v_row, v_cell = _ZERO, _ZERO, _ZERO
-            for c in range(channels):
-                top, bottom = values[i + 1, c] - values[i, c], values[k + 1, c] - values[k, c]
-                left, right = values[k, c] - values[i, c], values[k + 1, c] - values[i + 1, c]
-                v_column += v_samples[p, n, c] * (top + fv * (bottom - top))
-                v_row += v_samples[p, n, c] * (left + fu * (right - left))
-            i = table_start[s, p] + (x if p == 0 else (y if p == 1 else z))
-            for c in range(channels):
-                v_cell += v_samples[3 + p, n, c] * (tables[i + 1, c] - tables[i, c])
-            if p == 0:  # planes xy and xt
-                vx += v_column + v_cell
-                vy += v_row
-            elif p == 1:  # xz and yt
-                vx += v_column
-                vz += v_row
-                vy += v_cell
-            else:  # yz and zt
-                vy += v_column
-                vz += v_row + v_cell
-        if x_inside:
-            v_unit[n, 0] += vx * np.float32(resolution[s, 0] - 1)
-        if y_inside:
-            v_unit[n, 1] += vy * np.float32(resolution[s, 1] - 1)
-        if z_inside:
-            v_unit[n, 2] += vz * np.float32(resolution[s, 2] - 1)
-
-
-@njit(parallel=True, cache=True, fastmath=_FAST)
-def scatter(s, unit, v_samples, space_start, table_start, resolution, grads, v_tables, marks, table_marks):
-    """Second backward pass, for scale `s`: add `v_samples` to the cells they came from.
-
-    One task per (block of channels, plane), each walking all Gaussians in order; tasks share no memory. Adds to
-    `grads` and `v_tables` (columns, C); the tasks of the first block set `marks` and `table_marks` (columns,).
-    """
-    for task in prange(6 * ((grads.shape[1] + _LANES - 1) // _LANES)):
-        p, block = task % 6, task // 6
-        if p < 3:
-            _scatter_space(p, block, s, unit, v_samples, space_start, resolution, grads, marks)
-        else:
-            _scatter_time(p - 3, block, s, unit, v_samples, table_start, resolution, v_tables, table_marks)
-
-
-@njit(cache=True, fastmath=_FAST)
-def _scatter_space(p, block, s, unit, v_samples, space_start, resolution, grads, marks):
-    """`scatter` for one block of channels of one of the planes xy, xz, yz."""
-    lanes = min(_LANES, grads.shape[1] - block * _LANES)
-    offset = np.uintp(block * _LANES)  # unsigned: spares the compiler the check for negative indices
-    width, height = resolution[s, _COLUMN_AXIS[p]], resolution[s, _ROW_AXIS[p]]
-    for n in range(len(unit)):
-        column, fu, _ = _locate(unit[n, _COLUMN_AXIS[p]], width)
-        row, fv, _ = _locate(unit[n, _ROW_AXIS[p]], height)
-        i = space_start[s, p] + row * width + column
-        k = i + width
-        w00, w01 = (_ONE - fv) * (_ONE - fu), (_ONE - fv) * fu
-        w10, w11 = fv * (_ONE - fu), fv * fu
-        for lane in range(lanes):
-            c = offset + np.uintp(lane)
-            grads[i, c] += w00 * v_samples[p, n, c]
-            grads[i + 1, c] += w01 * v_samples[p, n, c]
-        for lane in range(lanes):
-            c = offset + np.uintp(lane)
-            grads[k, c] += w10 * v_samples[p, n, c]
-            grads[k + 1, c] += w11 * v_samples[p, n, c]
-        if block == 0:
-            marks[i] = marks[i + 1] = marks[k] = marks[k + 1] = TOUCHED | FRESH
-
-
-@njit(cache=True, fastmath=_FAST)
-def _scatter_time(a, block, s, unit, v_samples, table_start, resolution, v_tables, table_marks):
-    """`scatter` for one block of channels of the time plane of axis `a`."""
-    lanes = min(_LANES, v_tables.shape[1] - block * _LANES)
-    offset = np.uintp(block * _LANES)
-    for n in range(len(unit)):
-        cell, f, _ = _locate(unit[n, a], resolution[s, a])
-        i = table_start[s, a] + cell
-        for lane in range(lanes):
-            c = offset + np.uintp(lane)
-            v_tables[i, c] += (_ONE - f) * v_samples[3 + a, n, c]
-            v_tables[i + 1, c] += f * v_samples[3 + a, n, c]
-        if block == 0:
-            table_marks[i] = table_marks[i + 1] = 1
-
-
-@njit(parallel=True, cache=True, fastmath=_FAST)
-def slice_time_backward(v_tables, table_marks, time_start, table_start, resolution, row, fraction, grads, marks):
-    """Add `v_tables` to rows `row` and `row + 1` of the time planes, where marked. One task per plane."""
-    channels = grads.shape[1]
+    # Adds `v_tables` to rows `rows[m]` and `rows[m] + 1` of the time planes, where marked. One task per plane.
+    num_moments = len(rows)
     for task in prange(time_start.size):
         s, a = task // 3, task % 3
         width = resolution[s, a]
-        first = time_start[s, a] + row * width
-        for j in range(width):
-            source, below, above = table_start[s, a] + j, first + j, first + width + j
-            if table_marks[source]:
-                for c in range(channels):
-                    grads[below, c] += (_ONE - fraction) * v_tables[source, c]
-                    grads[above, c] += fraction * v_tables[source, c]
-                marks[below] = marks[above] = TOUCHED | FRESH
+        for m in range(num_moments):
+            for j in range(width):
+                column, cell = table_start[s, a] + j, time_start[s, a] + rows[m] * width + j
+                if table_marks[column]:
+                    source = (column * num_moments + m) * channels
+                    below, above = cell * channels, (cell + width) * channels
+                    for c in range(channels):
+                        grads[below + c] += (_ONE - fractions[m]) * v_tables[source + c]
+                        grads[above + c] += fractions[m] * v_tables[source + c]
+                    marks[cell] = marks[cell + width] = TOUCHED | FRESH

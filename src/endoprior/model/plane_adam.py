@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit, prange
 from torch import Tensor, from_numpy
 
-from .hexplane import PlaneGrid
+from .hexplane import PlaneGrid, mapped_zeros
 from .hexplane_kernels import FRESH, TOUCHED
 
 _GROUP = 32  # cells in a row that one task takes at a time: a few kilobytes of each array
@@ -31,8 +31,7 @@ class PlaneAdam:
         """Start with zero moments at step 0. Moments take memory only where cells are touched."""
         shape = (grid.num_cells, grid.channels)
         self.grid, self.epsilon, self.betas, self.steps = grid, epsilon, betas, 0
-        self.exp_avg = from_numpy(np.zeros(shape, dtype=np.float32))
-        self.exp_avg_sq = from_numpy(np.zeros(shape, dtype=np.float32))
+        self.exp_avg, self.exp_avg_sq = mapped_zeros(*shape), mapped_zeros(*shape)
 
     def step(self, lr: float) -> None:
         """Apply one step with learning rate `lr`, then clear the gradients."""

@@ -147,6 +147,63 @@ def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
 
 
 @intrinsic
+def prefetch(typing_context: Any, array: Any, offset: Any) -> Any:
+    """Ask for the cache line of element `offset` of a flat float32 array; any offset is safe."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        byte_pointer, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        address = builder.bitcast(_address(context, builder, signature, args), byte_pointer)
+        function_type = ir.FunctionType(ir.VoidType(), [byte_pointer, number, number, number])
+        function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch")
+        builder.call(function, [address, number(0), number(3), number(1)])  # to read, into the nearest cache, data
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp), generate
+
+
+def _copy(builder: Any, source: Any, target: Any, count: Any) -> None:
+    """Copy `count` floats one by one between two pointers."""
+    number = ir.FloatType().as_pointer()
+    source, target = builder.bitcast(source, number), builder.bitcast(target, number)
+    with cgutils.for_range(builder, count) as loop:
+        builder.store(builder.load(builder.gep(source, [loop.index])), builder.gep(target, [loop.index]))
+
+
+@intrinsic
+def load_some(typing_context: Any, array: Any, offset: Any, lanes: Any) -> Any:
+    """`load` of the first `lanes` elements, then zeros: slow, for what is left over. None loads all, as `load` does."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        address = _address(context, builder, signature, args)
+        if isinstance(lanes, types.NoneType):
+            return builder.load(address, align=4)
+        slot = cgutils.alloca_once(builder, FLOATS)
+        builder.store(ir.Constant(FLOATS, [0.0] * LANES), slot)
+        _copy(builder, address, slot, args[2])
+        return builder.load(slot)
+
+    return vector(array, types.intp, types.none if isinstance(lanes, types.NoneType) else types.intp), generate
+
+
+@intrinsic
+def store_some(typing_context: Any, array: Any, offset: Any, value: Any, lanes: Any) -> Any:
+    """`store` of the first `lanes` elements; None stores all."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        address = _address(context, builder, signature, args)
+        if isinstance(lanes, types.NoneType):
+            builder.store(args[2], address, align=4)
+        else:
+            slot = cgutils.alloca_once(builder, FLOATS)
+            builder.store(args[2], slot)
+            _copy(builder, slot, address, args[3])
+        return context.get_dummy_value()
+
+    number = types.none if isinstance(lanes, types.NoneType) else types.intp
+    return types.none(array, types.intp, vector, number), generate
+
+
+@intrinsic
 def total(typing_context: Any, a: Any) -> Any:
     """Sum of the lanes, halves first."""
 
