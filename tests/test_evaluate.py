@@ -28,7 +28,7 @@ def phantom(tmp_path_factory):
 def still_scene(sequence, budget=400):
     """An untrained scene: Gaussians where they start, that do not move."""
     cfg = preset("default")
-    cfg = replace(cfg, init=replace(cfg.init, budget=budget))
+    cfg = replace(cfg, init=replace(cfg.init, budget=budget, motion="rest"))
     trainer = Trainer(sequence, cfg)
     trainer.start()
     return trainer.scene()

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from .checks import check_range
+from .checks import InputError, check_range
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,8 @@ class InitConfig:
     """Initial variance = this times the mean squared distance to the 3 nearest points (released code: 0.4)."""
     opacity: float = 0.1
     """Initial opacity."""
+    motion: Literal["rest", "flow"] = "rest"
+    """Start of the temporal coefficients (`kind` basis): at rest, or along tracks of optical flow and depth."""
 
     def __post_init__(self) -> None:
         check_range("budget", self.budget, 1, 10_000_000)
@@ -345,3 +347,10 @@ class Config:
     density: DensityConfig = field(default_factory=DensityConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+
+    def __post_init__(self) -> None:
+        if self.init.motion == "flow" and self.deformation.kind != "basis":
+            raise InputError(
+                f"init.motion: expected rest with deformation.kind {self.deformation.kind}; got flow, which only the "
+                "temporal basis can start from. Set --init.motion rest."
+            )

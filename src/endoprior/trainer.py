@@ -18,11 +18,13 @@ from .data import Sequence
 from .density import DensityStats
 from .geometry import project
 from .loss_kernels import supervised_losses
+from .model.basis import motion_layout
 from .model.deformation import HexPlaneField, Offsets
 from .model.gaussians import Gaussians, create_gaussians
 from .model.initialize import initial_log_scales, initial_points
 from .model.morton import morton_order
 from .model.scene import Scene, offsets_at
+from .model.tracks import initial_motion
 from .optim import Optimizer
 from .train_state import Stage, StepReport, TrainState
 from .training_frames import TrainingFrame, TrainingFrames
@@ -56,6 +58,9 @@ class Trainer:
         cloud = cloud.taken(morton_order(cloud.points))
         log_scales = initial_log_scales(cloud.points, cfg.init.variance_factor)
         gaussians = create_gaussians(cloud.points, cloud.colors, log_scales, cfg)
+        if cfg.init.motion == "flow" and cfg.deformation.kind == "basis":
+            motion = initial_motion(self.sequence.frames("train"), cloud, cfg.deformation.basis)
+            gaussians["motion"].detach()[..., motion_layout(cfg.deformation)["means"]] = torch.from_numpy(motion)
         field = None
         if cfg.deformation.kind == "hexplane":
             generator = torch.Generator().manual_seed(cfg.seed)

@@ -1,0 +1,198 @@
+"""Where surface points travel: optical flow from frame to frame, lifted by measured depth, as temporal coefficients.
+
+Coefficients that start at zero have to learn every motion from color, whose gradient reaches a few pixels only; tissue
+that moves farther than that between frames is then explained by Gaussians that fade in and out. Following each point by
+dense inverse search (Kroeger et al. 2016, OpenCV) first gives training the motion, and leaves it to refine it.
+
+Shared letters: `T` training frames, `N` points, `B` basis functions.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence as ReadOnlyList
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..config import BasisConfig
+from ..geometry import back_project, bilinear, project
+from ..types import Camera, Frame
+from .basis import basis_weights
+from .point_cleanup import PointCloud
+
+MIN_SIZE_PX = 32
+"""Smallest image side that dense inverse search can work on."""
+HALVED_FROM_PX = 256
+"""Frames whose shorter side is at least this long are followed at half their size: four times faster, hardly worse."""
+RETURN_PX, RETURN_SHARE = 1.0, 0.05
+"""A point is lost where forward and backward flow disagree by more than this, plus this share of the step."""
+STILL_MARGIN = 1.1
+"""A point stands still if its color explains the frames there, up to this factor as well as along its track."""
+BLUR_PX = 1.5
+"""Standard deviation of the blur under which colors are compared."""
+RIDGE = 1e-2
+"""Of the least squares that turn tracks into coefficients; frames count 1 each."""
+
+log = logging.getLogger(__name__)
+
+
+def initial_motion(frames: ReadOnlyList[Frame], cloud: PointCloud, cfg: BasisConfig) -> NDArray[np.float32]:
+    """Temporal coefficients that carry every point of the cloud along its track.
+
+    Args:
+        frames: T training frames (never test frames), in order.
+        cloud: points with the frames they were lifted from.
+    Returns:
+        (N, B, 3) coefficients of the centers, mm; 0 for frames too small for optical flow.
+    """
+    height, width = frames[0].tissue_mask.shape
+    if min(height, width) < MIN_SIZE_PX:
+        log.warning("initial motion: frames of %d x %d px are too small for optical flow", width, height)
+        return np.zeros((len(cloud), cfg.num_bases, 3), np.float32)
+    points = cloud.points.astype(np.float64)
+    pixels = follow(frames, points, cloud.origins)
+    moving = ~stands_still(frames, points, cloud.origins, pixels)
+    log.info("initial motion: %d of %d points move", moving.sum(), len(cloud))
+    offsets = fill_gaps(lift(frames, pixels[:, moving]) - points[moving])
+    motion = np.zeros((len(cloud), cfg.num_bases, 3), np.float32)
+    motion[moving] = fit_basis(offsets, [frame.time for frame in frames], cfg)
+    return motion
+
+
+def follow(frames: ReadOnlyList[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Pixels of each point in every frame, by chaining flow away from its own frame in both directions.
+
+    A point is lost, from there on, where it leaves image or tissue or where the flow back does not return to it.
+
+    Args:
+        points: (N, 3) world, mm. origins: (N,) position in `frames` that each was lifted from.
+    Returns:
+        (T, N, 2) px; NaN where a point is lost.
+    """
+    pixels = np.full((len(frames), len(points), 2), np.nan)
+    for position in np.unique(origins):
+        own = origins == position
+        pixels[position, own] = project(points[own], frames[position].camera)[0]
+    flows = _flows(frames)
+    for k in range(len(frames) - 1):
+        from_earlier = origins <= k
+        pixels[k + 1, from_earlier] = _advance(pixels[k, from_earlier], *flows[k], frames[k + 1].tissue_mask)
+    for k in range(len(frames) - 1, 0, -1):
+        from_later = origins >= k
+        forward, backward = flows[k - 1]
+        pixels[k - 1, from_later] = _advance(pixels[k, from_later], backward, forward, frames[k - 1].tissue_mask)
+    return pixels
+
+
+def _flows(frames: ReadOnlyList[Frame]) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Flow (h, w, 2) from each frame to the next and back, in px of the image it was computed on."""
+    height, width = frames[0].tissue_mask.shape
+    shrink = 2 if min(height, width) >= HALVED_FROM_PX else 1
+    size = (width // shrink, height // shrink)
+    grays = [
+        cv2.resize(cv2.cvtColor(frame.rgb_u8, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+        for frame in frames
+    ]
+
+    def both_ways(k: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        # A new estimator for each pair: it keeps buffers, and a pair must not depend on the one before.
+        estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        forward = estimator.calc(grays[k], grays[k + 1], None)
+        return forward, estimator.calc(grays[k + 1], grays[k], None)
+
+    with ThreadPoolExecutor() as pool:  # OpenCV releases the interpreter lock
+        return list(pool.map(both_ways, range(len(grays) - 1)))
+
+
+def _advance(pixels: NDArray, there: NDArray, back: NDArray, tissue_mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Pixels (M, 2) one frame on by the flow `there`; NaN for those that are lost or were."""
+    height, width = tissue_mask.shape
+    shrink = np.array([width / there.shape[1], height / there.shape[0]])
+    known = np.isfinite(pixels[:, 0])
+    start = pixels[known]
+    step = bilinear(there, start / shrink) * shrink
+    end = start + step
+    gap = np.linalg.norm(step + bilinear(back, end / shrink) * shrink, axis=-1)
+    x, y = _nearest(end, width, height)
+    inside = ((end >= 0) & (end <= (width, height))).all(-1)
+    found = inside & tissue_mask[y, x] & (gap <= RETURN_PX + RETURN_SHARE * np.linalg.norm(step, axis=-1))
+    moved = np.full_like(pixels, np.nan)
+    moved[np.flatnonzero(known)[found]] = end[found]
+    return moved
+
+
+def stands_still(
+    frames: ReadOnlyList[Frame], points: NDArray, origins: NDArray[np.integer], pixels: NDArray
+) -> NDArray[np.bool_]:
+    """(N,) whether a point left at rest matches the frames as well as its track does.
+
+    Chained flow drifts, and depth jitters: where nothing moves, rest is the better guess.
+
+    Args:
+        points: (N, 3) world, mm. origins: (N,) positions in `frames`. pixels: (T, N, 2) from `follow`.
+    """
+    blurred = [cv2.GaussianBlur(cv2.cvtColor(f.rgb_u8, cv2.COLOR_RGB2GRAY), (0, 0), BLUR_PX) for f in frames]
+    own_gray, along_track, at_rest = np.zeros((3, len(points)))
+    for position, image in enumerate(blurred):
+        own = origins == position
+        own_gray[own] = bilinear(image, pixels[position, own])
+    for position, image in enumerate(blurred):
+        seen = np.isfinite(pixels[position, :, 0]) & (origins != position)
+        resting = _project_in_front(points[seen], frames[position].camera)
+        along_track[seen] += np.abs(bilinear(image, pixels[position, seen]) - own_gray[seen])
+        at_rest[seen] += np.abs(bilinear(image, resting) - own_gray[seen])
+    return at_rest <= STILL_MARGIN * along_track
+
+
+def _project_in_front(points: NDArray, camera: Camera) -> NDArray[np.float64]:
+    """Pixels (M, 2) of world points; far outside the image for those behind the camera."""
+    pixels, z = project(points, camera)
+    return np.where((z > 0)[:, None], pixels, -1e6)
+
+
+def lift(frames: ReadOnlyList[Frame], pixels: NDArray) -> NDArray[np.float64]:
+    """World points (T, N, 3) mm of pixels (T, N, 2); NaN where the pixel is unknown or has no measured depth."""
+    found = np.full((*pixels.shape[:2], 3), np.nan)
+    for position, frame in enumerate(frames):
+        known = np.flatnonzero(np.isfinite(pixels[position, :, 0]))
+        height, width = frame.tissue_mask.shape
+        x, y = _nearest(pixels[position, known], width, height)
+        measured = frame.depth_valid[y, x]
+        depth = frame.depth[y, x].astype(np.float64)[measured]
+        found[position, known[measured]] = back_project(pixels[position, known[measured]], depth, frame.camera)
+    return found
+
+
+def _nearest(pixels: NDArray, width: int, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Column and row of the pixel that each position falls into, held inside the image."""
+    x, y = np.floor(pixels).astype(np.intp).T
+    return np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
+
+
+def fill_gaps(offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Offsets (T, N, 3) with NaN rows filled: linear in frames between known ones, held before and after.
+
+    A point that is nowhere known stays at rest.
+    """
+    num_frames, num = offsets.shape[:2]
+    frame = np.arange(num_frames)[:, None]
+    known = np.isfinite(offsets[..., 0])
+    last = np.maximum.accumulate(np.where(known, frame, -1), 0)
+    following = np.minimum.accumulate(np.where(known, frame, num_frames)[::-1], 0)[::-1]
+    before = np.where(last >= 0, last, np.where(following < num_frames, following, 0))
+    after = np.where(following < num_frames, following, before)
+    share = np.where(after > before, (frame - before) / np.maximum(after - before, 1), 0)[..., None]
+    columns = np.arange(num)
+    return np.nan_to_num((1 - share) * offsets[before, columns] + share * offsets[after, columns])
+
+
+def fit_basis(offsets: NDArray[np.float64], times: list[float], cfg: BasisConfig) -> NDArray[np.float32]:
+    """Least-squares coefficients (N, B, 3) of offsets (T, N, 3) mm at T `times` in [0, 1]."""
+    weights = np.stack([basis_weights(time, cfg) for time in times])
+    normal = weights.T @ weights + RIDGE * np.eye(cfg.num_bases)
+    solve = np.linalg.solve(normal, weights.T)
+    fitted = solve @ offsets.reshape(len(times), -1)
+    return np.ascontiguousarray(fitted.reshape(cfg.num_bases, -1, 3).transpose(1, 0, 2), np.float32)

@@ -1,0 +1,164 @@
+"""Initial motion: points followed through synthetic frames whose motion is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import write_tiny_sequence
+
+from endoprior.checks import InputError
+from endoprior.config import BasisConfig, Config, InitConfig
+from endoprior.data import load_sequence
+from endoprior.geometry import back_project, project
+from endoprior.model import tracks
+from endoprior.model.basis import basis_weights
+from endoprior.model.point_cleanup import PointCloud
+from endoprior.presets import preset
+from endoprior.trainer import Trainer
+from endoprior.types import Camera, Frame
+
+WIDTH, HEIGHT, NUM_FRAMES, DEPTH = 160, 128, 7, 50.0
+
+
+def moving_frames(
+    step_px: tuple[float, float], *, tool: slice | None = None, moving: slice = slice(None)
+) -> list[Frame]:
+    """A textured plane at 50 mm that shifts by `step_px` a frame in the columns `moving` and rests elsewhere."""
+    noise = np.random.default_rng(0).random((HEIGHT + 160, WIDTH + 160, 3)).astype(np.float32)
+    texture = cv2.GaussianBlur(noise, (0, 0), 3)
+    texture = (texture - texture.min()) / (texture.max() - texture.min())
+    camera = Camera(WIDTH, HEIGHT, 200.0, 200.0, WIDTH / 2, HEIGHT / 2, np.eye(4))
+    frames = []
+    for i in range(NUM_FRAMES):
+        shift = np.array([[1, 0, step_px[0] * i - 80], [0, 1, step_px[1] * i - 80]], np.float32)
+        picture = cv2.warpAffine(texture, np.array([[1, 0, -80], [0, 1, -80]], np.float32), (WIDTH, HEIGHT))
+        picture[:, moving] = cv2.warpAffine(texture, shift, (WIDTH, HEIGHT))[:, moving]
+        mask = np.ones((HEIGHT, WIDTH), bool)
+        if tool is not None:
+            mask[:, tool] = False
+        depth = np.full((HEIGHT, WIDTH), DEPTH, np.float32)
+        rgb = (255 * picture).astype(np.uint8)
+        frames.append(Frame(i, i / NUM_FRAMES, camera, rgb, mask, depth, np.ones((HEIGHT, WIDTH), bool)))
+    return frames
+
+
+def cloud_at(pixels: list[tuple[float, float]], origin: int, camera: Camera) -> PointCloud:
+    """Points seen at `pixels` in frame `origin`."""
+    points = back_project(np.array(pixels), np.full(len(pixels), DEPTH), camera).astype(np.float32)
+    return PointCloud(points, np.zeros_like(points), np.full(len(pixels), origin, np.int32))
+
+
+def followed(frames: list[Frame], cloud: PointCloud) -> np.ndarray:
+    """(T, N, 2) tracks of the cloud."""
+    return tracks.follow(frames, cloud.points.astype(np.float64), cloud.origins)
+
+
+@pytest.mark.parametrize("origin", [0, 3, 6])
+def test_a_shifting_plane_is_followed_both_ways(origin):
+    frames = moving_frames((2.0, -1.0))
+    cloud = cloud_at([(80.5, 60.5), (70.25, 70.0)], origin, frames[0].camera)
+    pixels = followed(frames, cloud)
+    start = project(cloud.points.astype(np.float64), frames[0].camera)[0]
+    for k in range(NUM_FRAMES):
+        np.testing.assert_allclose(pixels[k], start + np.array([2.0, -1.0]) * (k - origin), atol=0.5)  # chained flow
+
+
+def test_coefficients_move_the_points_with_the_plane():
+    frames = moving_frames((2.0, -1.0))
+    cloud = cloud_at([(80.5, 60.5)], 3, frames[0].camera)
+    cfg = BasisConfig(num_bases=7)
+    motion = tracks.initial_motion(frames, cloud, cfg)
+    assert motion.shape == (1, 7, 3)
+    for frame in frames:
+        moved = cloud.points + np.tensordot(basis_weights(frame.time, cfg), motion, (0, 1))
+        expected = cloud.points + (frame.index - 3) * np.array([2.0, -1.0, 0.0]) * DEPTH / 200
+        np.testing.assert_allclose(moved, expected, atol=0.2)  # mm; half a pixel is 0.125 mm
+
+
+def test_what_rests_gets_no_motion_and_what_moves_does():
+    frames = moving_frames((1.5, 0.0), moving=slice(80, None))
+    cloud = cloud_at([(20.5, 60.5), (40.5, 30.5), (120.5, 64.5)], 0, frames[0].camera)
+    motion = tracks.initial_motion(frames, cloud, BasisConfig(num_bases=7))
+    assert not motion[:2].any()
+    assert np.abs(motion[2]).max() > 0.5
+
+
+def test_a_point_is_lost_behind_the_tool_and_stays_lost():
+    frames = moving_frames((4.0, 0.0), tool=slice(90, None))
+    pixels = followed(frames, cloud_at([(80.5, 64.5)], 0, frames[0].camera))
+    assert np.isfinite(pixels[:3]).all()
+    assert np.isnan(pixels[3:]).all()
+
+
+def test_flow_that_does_not_return_loses_the_point():
+    there = np.full((HEIGHT, WIDTH, 2), 3.0, np.float32)
+    tissue_mask = np.ones((HEIGHT, WIDTH), bool)
+    start = np.array([[50.0, 50.0], [np.nan, np.nan]])
+    np.testing.assert_allclose(tracks._advance(start, there, -there, tissue_mask)[0], [53, 53])
+    assert np.isnan(tracks._advance(start, there, -there, tissue_mask)[1]).all()
+    assert np.isnan(tracks._advance(start, there, there, tissue_mask)).all()
+
+
+def test_gaps_are_filled_linearly_and_held_at_the_ends():
+    offsets = np.full((6, 3, 3), np.nan)
+    offsets[1, 0], offsets[4, 0] = 3.0, 9.0
+    offsets[2, 1] = 5.0
+    filled = tracks.fill_gaps(offsets)
+    np.testing.assert_allclose(filled[:, 0, 0], [3, 3, 5, 7, 9, 9])
+    np.testing.assert_allclose(filled[:, 1], 5)
+    np.testing.assert_array_equal(filled[:, 2], 0)
+
+
+def test_fit_follows_what_the_basis_can_say():
+    cfg, rng = BasisConfig(num_bases=5), np.random.default_rng(1)
+    times = [i / 40 for i in range(40)]
+    coefficients = rng.normal(size=(4, 5, 3))
+    weights = np.stack([basis_weights(t, cfg) for t in times])
+    offsets = np.einsum("tb,nbc->tnc", weights, coefficients)
+    fitted = tracks.fit_basis(offsets, times, cfg)
+    assert fitted.shape == (4, 5, 3)
+    np.testing.assert_allclose(np.einsum("tb,nbc->tnc", weights, fitted), offsets, atol=0.05)  # the ridge pulls to 0
+
+
+def test_unmeasured_depth_leaves_a_gap():
+    frames = moving_frames((0.0, 0.0))
+    frames[2].depth_valid[:] = False
+    cloud = cloud_at([(40.5, 40.5)], 0, frames[0].camera)
+    lifted = tracks.lift(frames, followed(frames, cloud))
+    assert np.isnan(lifted[2]).all()
+    np.testing.assert_allclose(lifted[[0, 1, 3, 4, 5, 6], 0], np.broadcast_to(cloud.points, (6, 3)), atol=0.13)
+
+
+def test_frames_too_small_for_flow_start_at_rest(caplog):
+    frames = moving_frames((1.0, 0.0))
+    small = [
+        Frame(f.index, f.time, f.camera, f.rgb_u8[:16], f.tissue_mask[:16], f.depth[:16], f.depth_valid[:16])
+        for f in frames
+    ]
+    motion = tracks.initial_motion(small, cloud_at([(8.5, 8.5)], 0, frames[0].camera), BasisConfig(num_bases=4))
+    assert motion.shape == (1, 4, 3)
+    assert not motion.any()
+    assert "too small" in caplog.text
+
+
+def test_training_starts_along_the_tracks(tmp_path):
+    sequence = load_sequence(write_tiny_sequence(tmp_path / "tiny", width=96, height=80))
+    cfg = preset("default")
+    trainer = Trainer(sequence, replace(cfg, init=replace(cfg.init, budget=300)))
+    trainer.start()
+    motion = trainer.state.gaussians["motion"].detach()
+    assert motion[..., :3].abs().amax() > 0.3  # mm; the plane slides by 3 mm
+    assert not motion[..., 3:].any()
+    # The points drift with the plane: most of the track's way is theirs at every moment.
+    moved = torch.einsum("b,nbc->nc", torch.from_numpy(basis_weights(0.25, cfg.deformation.basis)).float(), motion)
+    still = torch.einsum("b,nbc->nc", torch.from_numpy(basis_weights(0.75, cfg.deformation.basis)).float(), motion)
+    assert (moved - still)[:, 0].median() == pytest.approx(3.0, abs=1.0)
+
+
+def test_only_the_basis_can_start_along_tracks():
+    with pytest.raises(InputError, match=r"init\.motion: expected rest with deformation\.kind hexplane; got flow"):
+        Config(init=InitConfig(motion="flow"))
