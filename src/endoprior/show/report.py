@@ -31,6 +31,7 @@ SHOWN_SCORES = {
     "track_error_mm": "track error, mm",
     "num_gaussians": "Gaussians",
     "fps": "frames/s drawn",
+    "fps_cached": "frames/s from the cache",
     "train_seconds": "training, s",
 }
 ERROR_FULL_SCALE = 0.15

@@ -1,0 +1,63 @@
+"""Playing a scene: its own frames, deformed once and kept, so that drawing one again costs no deformation."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+
+from .. import render
+from ..types import Camera, RenderOutput, Splats
+from .scene import Scene
+
+DEFAULT_MAX_BYTES = 1 << 30
+"""Memory that kept frames may take; about 4 MB a frame for 40,000 Gaussians with color of degree 1."""
+
+
+class Playback:
+    """Frames of a scene by index, kept once deformed; the one not drawn for longest goes first when room runs out.
+
+    The pictures are those of `Scene.render`, bit for bit. For a moment between frames use the scene itself.
+    """
+
+    def __init__(self, scene: Scene, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
+        """Keep nothing yet.
+
+        Args:
+            scene: what to play.
+            max_bytes: for the kept frames together; at least one frame is always kept.
+        """
+        self.scene, self.max_bytes = scene, max_bytes
+        self._kept: OrderedDict[int, Splats] = OrderedDict()
+        self._rasterize = render.load(scene.config.render.backend)
+        self._background = torch.zeros(3)
+
+    def __len__(self) -> int:
+        return len(self.scene.cameras)
+
+    def splats(self, index: int) -> Splats:
+        """The Gaussians of frame `index`, activated.
+
+        Raises:
+            IndexError: no such frame.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame must be in 0..{len(self) - 1}; got {index}")
+        if index not in self._kept:
+            splats = self.scene.at(index / len(self))
+            room = max(self.max_bytes // max(_num_bytes(splats), 1), 1)
+            while len(self._kept) >= room:
+                self._kept.popitem(last=False)
+            self._kept[index] = splats
+        self._kept.move_to_end(index)
+        return self._kept[index]
+
+    @torch.no_grad()
+    def render(self, index: int, camera: Camera | None = None) -> RenderOutput:
+        """Draw frame `index`, from `camera` or else from where it was taken. See `Scene.render`."""
+        return self._rasterize(self.splats(index), camera or self.scene.cameras[index], background=self._background)
+
+
+def _num_bytes(splats: Splats) -> int:
+    tensors = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)

@@ -1,0 +1,78 @@
+"""Playing from kept frames: the same pictures, within the memory allowed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from endoprior.config import Config
+from endoprior.model.gaussians import create_gaussians
+from endoprior.model.playback import Playback
+from endoprior.model.scene import Scene
+from endoprior.presets import preset
+from endoprior.types import Camera
+
+NUM_FRAMES = 5
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A hundred Gaussians that move at random, seen by five cameras."""
+    cfg: Config = preset("default")
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-15, -12, 50], [15, 12, 60], (100, 3)).astype(np.float32)
+    gaussians = create_gaussians(points, rng.random((100, 3), np.float32), np.zeros(100, np.float32), cfg)
+    with torch.no_grad():
+        gaussians["motion"].copy_(torch.from_numpy(rng.normal(size=gaussians["motion"].shape) * 0.3))
+    camera = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
+    return Scene(gaussians, None, cfg, (camera,) * NUM_FRAMES, 25.0, torch.zeros(100), torch.zeros(100))
+
+
+def pictures_equal(a, b) -> bool:
+    """Whether two renderings agree to the bit."""
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("color", "depth", "alpha"))
+
+
+def test_kept_frames_draw_as_the_scene_does(scene):
+    playback = Playback(scene)
+    for _ in range(2):
+        for i in range(NUM_FRAMES):
+            assert pictures_equal(playback.render(i), scene.render(i / NUM_FRAMES))
+    assert not pictures_equal(playback.render(0), playback.render(3))
+
+
+def test_a_frame_is_deformed_once(scene, monkeypatch):
+    asked = []
+    original = Scene.at
+    monkeypatch.setattr(Scene, "at", lambda self, time: asked.append(time) or original(self, time))
+    playback = Playback(scene)
+    for i in (0, 1, 0, 1, 1):
+        playback.render(i)
+    assert asked == [0.0, 1 / NUM_FRAMES]
+
+
+def test_the_frame_not_drawn_for_longest_goes_first(scene, monkeypatch):
+    asked = []
+    original = Scene.at
+    monkeypatch.setattr(Scene, "at", lambda self, time: asked.append(round(time * NUM_FRAMES)) or original(self, time))
+    one = Playback(scene)
+    one.splats(0)
+    size = sum(t.numel() * 4 for t in vars(one.splats(0)).values())
+    playback = Playback(scene, max_bytes=2 * size + 8)
+    asked.clear()
+    for i in (0, 1, 0, 2, 0, 1):
+        playback.splats(i)
+    assert asked == [0, 1, 2, 1]
+    tight = Playback(scene, max_bytes=0)
+    assert pictures_equal(tight.render(1), scene.render(1 / NUM_FRAMES))
+
+
+def test_another_camera_and_no_such_frame(scene):
+    playback = Playback(scene)
+    wide = replace(scene.cameras[0], width=80, cx=40.0)
+    assert playback.render(2, wide).color.shape == (48, 80, 3)
+    with pytest.raises(IndexError, match=r"0\.\.4"):
+        playback.render(NUM_FRAMES)
