@@ -235,11 +235,11 @@ def test_motion_layout_follows_the_configuration() -> None:
 
 def literal_weights(time: float, cfg: BasisConfig) -> list[float]:
     weights = []
-    sigma = cfg.relative_width / cfg.num_bases
+    sigma, end = cfg.relative_width / cfg.num_bases, math.exp(-4.5)
     for b in range(cfg.num_bases):
         center = b / (cfg.num_bases - 1)
-        inside = abs(time - center) <= 4 * sigma
-        weights.append(math.exp(-((time - center) ** 2) / (2 * sigma**2)) if inside else 0.0)
+        inside = abs(time - center) <= 3 * sigma
+        weights.append((math.exp(-((time - center) ** 2) / (2 * sigma**2)) - end) / (1 - end) if inside else 0.0)
     return weights
 
 
@@ -256,12 +256,12 @@ def test_basis_by_its_definition(time: float) -> None:
     torch.testing.assert_close(torch.cat(parts, -1), total, rtol=1e-5, atol=1e-6)  # nine float32 terms
 
 
-def test_basis_cut_is_at_four_standard_deviations() -> None:
+def test_a_bump_ends_at_three_standard_deviations_without_a_jump() -> None:
     cfg = BasisConfig(num_bases=101, relative_width=1.01)  # sigma = 0.01 = distance of the centers
-    assert np.flatnonzero(basis_weights(0.5 + 1e-9, cfg)).tolist() == list(range(47, 55))
+    assert np.flatnonzero(basis_weights(0.5 + 1e-9, cfg)).tolist() == list(range(48, 54))
     assert basis_weights(0.5, cfg)[50] == 1
-    assert basis_weights(0.505, cfg)[46] == pytest.approx(0, abs=0)
-    assert basis_weights(0.4999, cfg)[46] == pytest.approx(math.exp(-0.5 * 3.99**2), rel=1e-6)
+    assert basis_weights(0.505, cfg)[47] == 0
+    assert 0 < basis_weights(0.49999, cfg)[47] < 1e-4
     assert not basis_weights(7.0, cfg).any()
 
 

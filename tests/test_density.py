@@ -69,6 +69,33 @@ def test_projections_off_the_image_off_tissue_or_undrawn_do_not_count():
     assert stats.num_valid.tolist() == [0, 0, 0, 0, 1]
 
 
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_score_agrees_with_grid_sample(scale):
+    """Over more than one task, on and off the image, NaN among them."""
+    generator = torch.Generator().manual_seed(0)
+    num = 3000
+    means2d = torch.rand(num, 2, generator=generator) * torch.tensor([40.0, 30.0]) - 5
+    means2d[7], means2d[8, 1], means2d[9] = torch.nan, torch.inf, torch.tensor([30.0, 20.0]) / scale
+    radii = torch.randint(0, 3, (num,), generator=generator, dtype=torch.int32)
+    prior, mask = torch.rand(20, 30, generator=generator), torch.rand(20, 30, generator=generator) > 0.3
+    opacities = torch.rand(num, generator=generator)
+    stats = DensityStats.zeros(num)
+    stats.add_score(output(means2d.tolist(), radii.tolist()), prior, mask, opacities, scale)
+
+    grid = (2 * scale * means2d / torch.tensor([30.0, 20.0]) - 1)[None, None]
+    maps = torch.stack([prior, mask.float()])[None]
+    value, on_tissue = torch.nn.functional.grid_sample(maps, grid, padding_mode="border", align_corners=False)[0, :, 0]
+    inside = ((scale * means2d >= 0) & (scale * means2d <= torch.tensor([30.0, 20.0]))).all(-1)
+    clear = (on_tissue - 0.5).abs() > 1e-5  # float32: the threshold may fall either way
+    valid = inside & (radii > 0) & (on_tissue > 0.5)
+    assert 100 < valid.sum() < num - 100
+    assert torch.equal(stats.num_valid[clear], valid.float()[clear])
+    torch.testing.assert_close(stats.score_sum[clear], torch.where(valid, value, 0)[clear], rtol=1e-5, atol=1e-5)
+    assert torch.equal(stats.opacity_sum[clear], torch.where(valid, opacities, 0)[clear])
+    found = density.valid_projection(scale * means2d, radii, mask)
+    assert torch.equal(found, stats.num_valid > 0)
+
+
 @pytest.mark.parametrize("unobserved", [0.0, 1.0])
 def test_unobserved_gaussians_get_the_configured_score(unobserved):
     assert DensityStats.zeros(2).score(unobserved).tolist() == [unobserved] * 2

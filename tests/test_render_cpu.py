@@ -12,7 +12,8 @@ from numba import njit
 from render_scenes import NAMES, camera, draw, one, pick, poison, splats
 from scipy.spatial.transform import Rotation
 
-from endoprior.render import constants, simd, tiles
+from endoprior import simd
+from endoprior.render import constants, tiles
 from endoprior.render.cpu import rasterize
 from endoprior.render.pixel_kernels import draw as draw_lanes
 from endoprior.types import Splats

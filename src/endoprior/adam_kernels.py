@@ -9,8 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from .simd import LANES, prefetch
+
 FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
 CHUNK = 128  # rows per task
+_AHEAD = 4  # rows between asking for the bases of one and updating them
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS)
@@ -44,19 +47,25 @@ def adam_outer(param, weights, v, first, second, begin, rate, root_scale, beta1,
     rates, root_scales = np.empty(width, np.float32), np.empty(width, np.float32)
     for i in range(width):
         rates[i], root_scales[i] = rate[i // channels, i % channels], root_scale[i // channels]
-    params = param.reshape(num_rows, num_bases * channels)
-    firsts, seconds = first.reshape(num_rows, num_bases * channels), second.reshape(num_rows, num_bases * channels)
+    stride = num_bases * channels
+    params, firsts, seconds = param.reshape(-1), first.reshape(-1), second.reshape(-1)
     one = np.float32(1)
     for task in prange((num_rows + CHUNK - 1) // CHUNK):
         grad = np.empty(width, np.float32)
         for r in range(task * CHUNK, min(num_rows, (task + 1) * CHUNK)):
+            # What is updated is a short piece of each row: too short for the processor to foresee the next one.
+            ahead = (r + _AHEAD) * stride + start
+            for i in range(0, width + LANES, LANES):
+                prefetch(params, ahead + i)
+                prefetch(firsts, ahead + i)
+                prefetch(seconds, ahead + i)
             grad[:] = np.float32(0)
             for k in range(weights.shape[0]):
                 for b in range(bases):
                     for c in range(channels):
                         grad[b * channels + c] += weights[k, begin + b] * v[k, r, c]
-            p = params[r, start : start + width]
-            m, u = firsts[r, start : start + width], seconds[r, start : start + width]
+            place = r * stride + start
+            p, m, u = params[place : place + width], firsts[place : place + width], seconds[place : place + width]
             for i in range(width):
                 m[i] = beta1 * m[i] + (one - beta1) * grad[i]
                 u[i] = beta2 * u[i] + (one - beta2) * grad[i] * grad[i]

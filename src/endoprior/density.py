@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from . import density_kernels as kernels
 from .config import DensityConfig
 from .types import RenderOutput
 
@@ -52,10 +55,9 @@ class DensityStats:
 
     def add_gradient(self, out: RenderOutput, width: int, height: int) -> None:
         """Add one rendering's screen-space gradient, after backward; Gaussians that were not drawn are left alone."""
-        drawn = out.radii > 0
-        grad_ndc = out.means2d.grad * torch.tensor([width / 2, height / 2])
-        self.grad2d_ndc_sum += torch.where(drawn, grad_ndc.norm(dim=-1), 0)
-        self.num_seen += drawn
+        gradient = out.means2d.grad.contiguous().numpy()
+        half = np.float32(width / 2), np.float32(height / 2)
+        kernels.add_gradient(out.radii.numpy(), gradient, *half, self.grad2d_ndc_sum.numpy(), self.num_seen.numpy())
 
     def add_score(
         self, out: RenderOutput, prior: Tensor, tissue_mask: Tensor, opacities: Tensor, scale: float = 1.0
@@ -66,13 +68,10 @@ class DensityStats:
             prior: (H, W) rho in [0, 1]. tissue_mask: (H, W) bool, True on tissue. opacities: (N,) canonical.
             scale: pixels of `prior` per pixel of the rendering.
         """
-        maps = torch.stack([prior, tissue_mask.float()])[None]
-        means2d = out.means2d.detach() * scale
-        sampled = _bilinear(maps, means2d)
-        valid = valid_projection(means2d, out.radii, sampled[1], prior.shape)
-        self.score_sum += torch.where(valid, sampled[0], 0)
-        self.opacity_sum += torch.where(valid, opacities.detach(), 0)
-        self.num_valid += valid
+        kernels.add_score(
+            *_projections(out.means2d, out.radii), np.float32(scale), prior.numpy(), tissue_mask.numpy(),
+            opacities.detach().numpy(), self.score_sum.numpy(), self.opacity_sum.numpy(), self.num_valid.numpy(),
+        )  # fmt: skip
 
     def clear_gradient(self) -> None:
         """Forget the gradients of every Gaussian, as each density event does."""
@@ -80,29 +79,19 @@ class DensityStats:
         self.num_seen.zero_()
 
 
-def valid_projection(means2d: Tensor, radii: Tensor, mask_value: Tensor, shape: tuple[int, int]) -> Tensor:
-    """(N,) m_it: drawn, inside the image, and on tissue (interpolated mask above one half)."""
-    height, width = shape
-    x, y = means2d.unbind(-1)
-    inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
-    return inside & (radii > 0) & (mask_value > 0.5)
+def valid_projection(means2d: Tensor, radii: Tensor, tissue_mask: Tensor) -> Tensor:
+    """(N,) bool m_it of Eq. (7): drawn, inside the image, and on tissue (interpolated mask above one half).
+
+    Args:
+        means2d: (N, 2) px. radii: (N,) px, 0 where not drawn. tissue_mask: (H, W) bool, True on tissue.
+    """
+    found = np.empty(len(radii), np.bool_)
+    kernels.valid(*_projections(means2d, radii), tissue_mask.numpy(), found)
+    return torch.from_numpy(found)
 
 
-def sample_mask(tissue_mask: Tensor, means2d: Tensor) -> Tensor:
-    """(N,) mask value, bilinear, at projected centers in px."""
-    return _bilinear(tissue_mask[None, None].float(), means2d.detach())[0]
-
-
-def _bilinear(maps: Tensor, means2d: Tensor) -> Tensor:
-    """(C, N) values of (1, C, H, W) maps at (N, 2) px, pixel centers at half integers, zero outside."""
-    height, width = maps.shape[-2:]
-    # align_corners=False puts -1 and 1 on the outer pixel edges: exactly our pixel convention.
-    grid = torch.stack([means2d[:, 0] * (2 / width) - 1, means2d[:, 1] * (2 / height) - 1], -1)
-    grid = grid.nan_to_num(nan=-2.0, posinf=2.0, neginf=-2.0).clamp(-2, 2)
-    sampled = torch.nn.functional.grid_sample(
-        maps, grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return sampled[0, :, 0]
+def _projections(means2d: Tensor, radii: Tensor) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    return means2d.detach().contiguous().numpy(), radii.contiguous().numpy()
 
 
 @dataclass(frozen=True)

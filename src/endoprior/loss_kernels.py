@@ -44,20 +44,15 @@ class _SupervisedLosses(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, color, depth, target_u8, target_inverse, tissue_mask, measured, weights) -> Tensor:
         height, width = depth.shape
-        num_color = max(float(tissue_mask.sum()) * 3, 1.0)
-        num_depth = max(float(measured.sum()), 1.0)
-        factors = np.array(
-            [
-                weights[0] / num_color,
-                weights[1] / num_depth,
-                weights[2] / (height * width * 3),
-                weights[2] / depth.numel(),
-            ],
-            np.float32,
-        )
         arrays = [
             t.detach().contiguous().numpy() for t in (color, depth, target_u8, target_inverse, tissue_mask, measured)
         ]
+        num_color, num_depth = (max(np.count_nonzero(mask), 1) for mask in arrays[4:])
+        num_pixels = height * width
+        color, depth, tv = weights
+        factors = np.array(
+            [color / (3 * num_color), depth / num_depth, tv / (3 * num_pixels), tv / num_pixels], np.float32
+        )
         v_color, v_depth = np.empty_like(arrays[0]), np.empty_like(arrays[1])
         inverse = np.empty_like(arrays[1])
         sums = np.zeros((height, 4), np.float64)
@@ -93,28 +88,50 @@ def _sign(x):
 def _rows(color, depth, target_u8, target_inverse, tissue_mask, measured, inverse, factors, v_color, v_depth, sums):
     # One task per row y: writes v_color[y], v_depth[y] and sums[y], the unweighted (color, depth, two variations).
     # The variation's gradient is the signs of the differences to the four neighbors: no task writes another's row.
+    # A row is one flat run of numbers, three per pixel for color: loops over it vectorize, loops over channels do not.
     height, width = depth.shape
     scale = np.float32(1 / 255)
     f_color, f_depth, f_tv, f_tvd = factors
+    colors, targets = color.reshape(height, 3 * width), target_u8.reshape(height, 3 * width)
+    v_colors = v_color.reshape(height, 3 * width)
     for y in prange(height):
-        s_color = s_depth = s_tv = s_tvd = np.float32(0)
         up, down = max(y - 1, 0), min(y + 1, height - 1)
+        weight = np.empty(3 * width, np.float32)
         for x in range(width):
-            left, right = max(x - 1, 0), min(x + 1, width - 1)
-            tissue, known = np.float32(tissue_mask[y, x]), np.float32(measured[y, x])
-            for k in range(3):
-                c = color[y, x, k]
-                e = c - np.float32(target_u8[y, x, k]) * scale
-                s_color += tissue * abs(e)
-                to_right, to_down = color[y, right, k] - c, color[down, x, k] - c
-                s_tv += abs(to_right) + abs(to_down)
-                pull = _sign(c - color[y, left, k]) + _sign(c - color[up, x, k]) - _sign(to_right) - _sign(to_down)
-                v_color[y, x, k] = f_color * tissue * _sign(e) + f_tv * pull
-            q = inverse[y, x]
-            e = q - target_inverse[y, x]
-            s_depth += known * abs(e)
-            to_right, to_down = inverse[y, right] - q, inverse[down, x] - q
-            s_tvd += abs(to_right) + abs(to_down)
-            pull = _sign(q - inverse[y, left]) + _sign(q - inverse[up, x]) - _sign(to_right) - _sign(to_down)
-            v_depth[y, x] = -q * q * (f_depth * known * _sign(e) + f_tvd * pull)
-        sums[y, 0], sums[y, 1], sums[y, 2], sums[y, 3] = s_color, s_depth, s_tv, s_tvd
+            weight[3 * x] = weight[3 * x + 1] = weight[3 * x + 2] = np.float32(tissue_mask[y, x])
+        sums[y, 0] = _fidelity(colors[y], targets[y], scale, weight, f_color, v_colors[y])
+        sums[y, 2] = _variation(colors[up], colors[y], colors[down], 3, f_tv, v_colors[y])
+        for x in range(width):
+            weight[x] = np.float32(measured[y, x])
+        sums[y, 1] = _fidelity(inverse[y], target_inverse[y], np.float32(1), weight[:width], f_depth, v_depth[y])
+        sums[y, 3] = _variation(inverse[up], inverse[y], inverse[down], 1, f_tvd, v_depth[y])
+        for x in range(width):
+            v_depth[y, x] *= -inverse[y, x] * inverse[y, x]
+
+
+@njit(cache=True, inline="always")
+def _fidelity(row, target, scale, weight, factor, v_row):
+    # Weighted sum of |row - scale * target|; sets v_row to `factor` times its gradient.
+    total = np.float32(0)
+    for i in range(len(row)):
+        e = row[i] - np.float32(target[i]) * scale
+        total += weight[i] * abs(e)
+        v_row[i] = factor * weight[i] * _sign(e)
+    return total
+
+
+@njit(cache=True, inline="always")
+def _variation(above, row, below, step, factor, v_row):
+    # Sum of |differences| to the next pixel, `step` numbers on, and to the row below; adds `factor` times the gradient
+    # of the whole image's variation to v_row.
+    total = np.float32(0)
+    size = len(row)
+    for i in range(size):
+        total += abs(below[i] - row[i])
+        v_row[i] += factor * (_sign(row[i] - above[i]) - _sign(below[i] - row[i]))
+    for i in range(size - step):
+        total += abs(row[i + step] - row[i])
+        v_row[i] -= factor * _sign(row[i + step] - row[i])
+    for i in range(step, size):
+        v_row[i] += factor * _sign(row[i] - row[i - step])
+    return total

@@ -152,10 +152,9 @@ class Trainer:
         """L_local of Eq. (11), weighted; nothing with few Gaussians."""
         cfg, state = self.cfg.temporal, self.state
         stats = state.stats
-        mask_value = density.sample_mask(frame.tissue_mask, out.means2d)
         drawn = out.radii > 0
         if cfg.valid_at_both:
-            drawn = density.valid_projection(out.means2d.detach(), out.radii, mask_value, frame.tissue_mask.shape)
+            drawn = density.valid_projection(out.means2d, out.radii, frame.tissue_mask)
         eligible = drawn & (stats.num_valid >= cfg.min_valid)
         score = stats.score(self.cfg.density.unobserved_score)
         chosen, weights = temporal.choose(score.numpy(), eligible.numpy(), cfg)
@@ -232,8 +231,7 @@ def on_tissue(points: Tensor, frame: TrainingFrame) -> Tensor:
     """(P,) bool: whether world points (P, 3) mm project in front of the camera, into the image, onto tissue."""
     pixels, z = project(points.numpy(), frame.camera)
     means2d = torch.from_numpy(pixels.astype(np.float32))
-    value = density.sample_mask(frame.tissue_mask, means2d)
-    return density.valid_projection(means2d, torch.from_numpy(z > 0).int(), value, frame.tissue_mask.shape)
+    return density.valid_projection(means2d, torch.from_numpy(z > 0).int(), frame.tissue_mask)
 
 
 def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:

@@ -12,8 +12,8 @@ from math import log2
 import numpy as np
 from numba import njit
 
+from ..simd import floor, fma, magnitude, scale_by_power_of_two, smaller, splat, where_ge
 from .constants import ALPHA_MAX, ALPHA_MIN, STOP_TRANSMITTANCE
-from .simd import floor, fma, magnitude, scale_by_power_of_two, smaller, splat, where_ge
 
 f4 = np.float32
 LOG2_ALPHA_MIN = f4(log2(ALPHA_MIN))

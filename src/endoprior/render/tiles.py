@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ..simd import LANES
 from .constants import ALPHA_MIN
-from .simd import LANES
 
 STRIPS = 2
 """Strips of LANES px side by side in a tile; the rows that a Gaussian touches are known per strip."""

@@ -1,4 +1,4 @@
-"""Sixteen float32 side by side, as a Numba type: compositing says itself what is a vector, instead of hoping for it.
+"""Sixteen float32 side by side, as a Numba type: a kernel says itself what is a vector, instead of hoping for it.
 
 LLVM maps it to what the processor has (one register of AVX-512, two of AVX2, four of SSE or NEON). The operations carry
 no fast-math flag: each rounds once, as written, so that two kernels that use the same lines take bit-identical
@@ -148,7 +148,7 @@ def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
 
 @intrinsic
 def prefetch(typing_context: Any, array: Any, offset: Any) -> Any:
-    """Ask for the cache line of element `offset` of a flat float32 array; any offset is safe."""
+    """Ask for the cache line of element `offset` of a flat array; any offset is safe."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         byte_pointer, number = ir.IntType(8).as_pointer(), ir.IntType(32)
