@@ -13,8 +13,8 @@ from conftest import write_tiny_sequence
 from endoprior.checks import InputError
 from endoprior.config import BasisConfig, Config, InitConfig
 from endoprior.data import load_sequence
-from endoprior.geometry import back_project, project
-from endoprior.model import tracks
+from endoprior.geometry import back_project, bilinear, project
+from endoprior.model import track_kernels, tracks
 from endoprior.model.basis import basis_weights
 from endoprior.model.point_cleanup import PointCloud
 from endoprior.presets import preset
@@ -94,20 +94,62 @@ def test_a_point_is_lost_behind_the_tool_and_stays_lost():
     assert np.isnan(pixels[3:]).all()
 
 
+def advanced(start: np.ndarray, there: np.ndarray, back: np.ndarray, tissue_mask: np.ndarray) -> np.ndarray:
+    """Pixels one frame on, all points active."""
+    out = np.full_like(start, 7.0)
+    active = np.ones(len(start), bool)
+    track_kernels.advance(start, active, there, back, tissue_mask, tracks.RETURN_PX, tracks.RETURN_SHARE, out)
+    return out
+
+
 def test_flow_that_does_not_return_loses_the_point():
     there = np.full((HEIGHT, WIDTH, 2), 3.0, np.float32)
     tissue_mask = np.ones((HEIGHT, WIDTH), bool)
     start = np.array([[50.0, 50.0], [np.nan, np.nan]])
-    np.testing.assert_allclose(tracks._advance(start, there, -there, tissue_mask)[0], [53, 53])
-    assert np.isnan(tracks._advance(start, there, -there, tissue_mask)[1]).all()
-    assert np.isnan(tracks._advance(start, there, there, tissue_mask)).all()
+    np.testing.assert_allclose(advanced(start, there, -there, tissue_mask)[0], [53, 53])
+    assert np.isnan(advanced(start, there, -there, tissue_mask)[1]).all()
+    assert np.isnan(advanced(start, there, there, tissue_mask)).all()
+
+
+def test_a_step_agrees_with_arrays():
+    """Against the same rule written with `bilinear`, on rough flow of half the size, on and off the image."""
+    rng = np.random.default_rng(0)
+    there = rng.normal(size=(HEIGHT // 2, WIDTH // 2, 2)).astype(np.float32)
+    back = (-there + rng.normal(size=there.shape) * 0.4).astype(np.float32)
+    tissue_mask = rng.random((HEIGHT, WIDTH)) < 0.8
+    start = rng.random((4000, 2)) * [WIDTH + 6, HEIGHT + 6] - 3
+    step = 2 * bilinear(there, start / 2)
+    end = start + step
+    x, y = np.clip(np.floor(end).astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
+    gap = np.linalg.norm(step + 2 * bilinear(back, end / 2), axis=-1)
+    found = ((end >= 0) & (end <= (WIDTH, HEIGHT))).all(-1) & tissue_mask[y, x]
+    found &= gap <= 1.0 + 0.05 * np.linalg.norm(step, axis=-1)
+    assert 500 < found.sum() < 3500
+    # float32 flow
+    np.testing.assert_allclose(
+        advanced(start, there, back, tissue_mask), np.where(found[:, None], end, np.nan), rtol=1e-6, atol=1e-5
+    )
+
+
+def test_mismatch_is_summed_over_known_points():
+    rng = np.random.default_rng(1)
+    image = rng.integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+    pixels, resting = rng.random((2, 50, 2)) * [WIDTH, HEIGHT]
+    pixels[:5], active, gray = np.nan, np.arange(50) != 9, rng.random(50) * 255
+    along, rest = np.ones(50), np.ones(50)
+    track_kernels.add_mismatch(image, pixels, active, resting, gray, along, rest)
+    counted = active & np.isfinite(pixels[:, 0])
+    for total, place in ((along, pixels), (rest, resting)):
+        expected = 1 + np.where(counted, np.abs(bilinear(image, np.nan_to_num(place)) - gray), 0)
+        np.testing.assert_allclose(total, expected)
 
 
 def test_gaps_are_filled_linearly_and_held_at_the_ends():
     offsets = np.full((6, 3, 3), np.nan)
     offsets[1, 0], offsets[4, 0] = 3.0, 9.0
     offsets[2, 1] = 5.0
-    filled = tracks.fill_gaps(offsets)
+    filled = offsets.copy()
+    track_kernels.fill_gaps(filled)
     np.testing.assert_allclose(filled[:, 0, 0], [3, 3, 5, 7, 9, 9])
     np.testing.assert_allclose(filled[:, 1], 5)
     np.testing.assert_array_equal(filled[:, 2], 0)

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from collections.abc import Sequence as ReadOnlyList
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -29,8 +28,6 @@ MIN_SQUARED_SPACING = 1e-7
 """mm^2; initial scale of points that coincide, as EndoGaussian sets it."""
 ADAPTIVE_PERCENTILE = 97.0
 """Percentile of brightness that raises tau_v under `adaptive_specular`."""
-FRAMES_AT_ONCE = 8
-"""Frames whose probabilities are held in memory together."""
 MIN_POINTS = 4
 """A scale needs three neighbors."""
 
@@ -57,19 +54,17 @@ def initial_points(
         InputError: fewer than 4 points are left.
     """
     cfg, prior_cfg = cfg or InitConfig(), prior_cfg or PriorConfig()
-    rng = np.random.default_rng(seed)
-    counts = [0] * len(frames) if cfg.sampler == "pool" else quotas(cfg.budget, len(frames))
-    clouds, missing = [], 0
-    for position, probability in enumerate(_probabilities(frames, cfg, prior_cfg)):
-        frame, count = frames[position], counts[position]
-        available = int(np.count_nonzero(probability))
-        if cfg.sampler == "pool":
-            count = min(available, max(1, int(cfg.pool_fraction * available)))
-        missing += max(0, count - available)
-        clouds.append(_lift(frame, position, draw_pixels(probability, count, rng), cfg))
-    cloud = joined(clouds)
+    shares = [None] * len(frames) if cfg.sampler == "pool" else quotas(cfg.budget, len(frames))
+
+    def drawn(position: int) -> tuple[PointCloud, int]:
+        rng = np.random.default_rng([seed, position])
+        return _draw_points(frames[position], position, shares[position], cfg, prior_cfg, rng)
+
+    with ThreadPoolExecutor() as pool:  # NumPy and OpenCV release the interpreter lock
+        found = list(pool.map(drawn, range(len(frames))))
+    cloud, missing = joined([points for points, _ in found]), sum(missed for _, missed in found)
     if cfg.sampler == "pool" and len(cloud):
-        cloud = cloud.taken(rng.integers(len(cloud), size=cfg.budget))
+        cloud = cloud.taken(np.random.default_rng(seed).integers(len(cloud), size=cfg.budget))
     if missing:
         log.warning("initialization: %d of %d points could not be drawn, too few tissue pixels", missing, cfg.budget)
     if cfg.cleanup:
@@ -84,13 +79,15 @@ def initial_points(
     return cloud
 
 
-def _probabilities(
-    frames: ReadOnlyList[Frame], cfg: InitConfig, prior_cfg: PriorConfig
-) -> Iterator[NDArray[np.float64]]:
-    """`pixel_probability` of each frame in turn, a few at a time side by side: NumPy releases the interpreter lock."""
-    with ThreadPoolExecutor() as pool:
-        for start in range(0, len(frames), FRAMES_AT_ONCE):
-            yield from pool.map(lambda f: pixel_probability(f, cfg, prior_cfg), frames[start : start + FRAMES_AT_ONCE])
+def _draw_points(
+    frame: Frame, position: int, count: int | None, cfg: InitConfig, prior_cfg: PriorConfig, rng: np.random.Generator
+) -> tuple[PointCloud, int]:
+    """`count` points of one frame (None: the share of its pixels that is pooled), and how many it could not give."""
+    probability = pixel_probability(frame, cfg, prior_cfg)
+    available = int(np.count_nonzero(probability))
+    if count is None:
+        count = min(available, max(1, int(cfg.pool_fraction * available)))
+    return _lift(frame, position, draw_pixels(probability, count, rng), cfg), max(0, count - available)
 
 
 def pixel_probability(frame: Frame, cfg: InitConfig, prior_cfg: PriorConfig) -> NDArray[np.float64]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ..config import BasisConfig
 from ..geometry import back_project, bilinear, project
 from ..types import Camera, Frame
+from . import track_kernels as kernels
 from .basis import basis_weights
 from .point_cleanup import PointCloud
 
@@ -56,7 +57,8 @@ def initial_motion(frames: ReadOnlyList[Frame], cloud: PointCloud, cfg: BasisCon
     pixels = follow(frames, points, cloud.origins)
     moving = ~stands_still(frames, points, cloud.origins, pixels)
     log.info("initial motion: %d of %d points move", moving.sum(), len(cloud))
-    offsets = fill_gaps(lift(frames, pixels[:, moving]) - points[moving])
+    offsets = lift(frames, pixels[:, moving]) - points[moving]
+    kernels.fill_gaps(offsets)
     motion = np.zeros((len(cloud), cfg.num_bases, 3), np.float32)
     motion[moving] = fit_basis(offsets, [frame.time for frame in frames], cfg)
     return motion
@@ -76,14 +78,12 @@ def follow(frames: ReadOnlyList[Frame], points: NDArray, origins: NDArray[np.int
     for position in np.unique(origins):
         own = origins == position
         pixels[position, own] = project(points[own], frames[position].camera)[0]
-    flows = _flows(frames)
+    flows, limits = _flows(frames), (RETURN_PX, RETURN_SHARE)
     for k in range(len(frames) - 1):
-        from_earlier = origins <= k
-        pixels[k + 1, from_earlier] = _advance(pixels[k, from_earlier], *flows[k], frames[k + 1].tissue_mask)
+        kernels.advance(pixels[k], origins <= k, *flows[k], frames[k + 1].tissue_mask, *limits, pixels[k + 1])
     for k in range(len(frames) - 1, 0, -1):
-        from_later = origins >= k
         forward, backward = flows[k - 1]
-        pixels[k - 1, from_later] = _advance(pixels[k, from_later], backward, forward, frames[k - 1].tissue_mask)
+        kernels.advance(pixels[k], origins >= k, backward, forward, frames[k - 1].tissue_mask, *limits, pixels[k - 1])
     return pixels
 
 
@@ -107,23 +107,6 @@ def _flows(frames: ReadOnlyList[Frame]) -> list[tuple[NDArray[np.float32], NDArr
         return list(pool.map(both_ways, range(len(grays) - 1)))
 
 
-def _advance(pixels: NDArray, there: NDArray, back: NDArray, tissue_mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Pixels (M, 2) one frame on by the flow `there`; NaN for those that are lost or were."""
-    height, width = tissue_mask.shape
-    shrink = np.array([width / there.shape[1], height / there.shape[0]])
-    known = np.isfinite(pixels[:, 0])
-    start = pixels[known]
-    step = bilinear(there, start / shrink) * shrink
-    end = start + step
-    gap = np.linalg.norm(step + bilinear(back, end / shrink) * shrink, axis=-1)
-    x, y = _nearest(end, width, height)
-    inside = ((end >= 0) & (end <= (width, height))).all(-1)
-    found = inside & tissue_mask[y, x] & (gap <= RETURN_PX + RETURN_SHARE * np.linalg.norm(step, axis=-1))
-    moved = np.full_like(pixels, np.nan)
-    moved[np.flatnonzero(known)[found]] = end[found]
-    return moved
-
-
 def stands_still(
     frames: ReadOnlyList[Frame], points: NDArray, origins: NDArray[np.integer], pixels: NDArray
 ) -> NDArray[np.bool_]:
@@ -140,10 +123,8 @@ def stands_still(
         own = origins == position
         own_gray[own] = bilinear(image, pixels[position, own])
     for position, image in enumerate(blurred):
-        seen = np.isfinite(pixels[position, :, 0]) & (origins != position)
-        resting = _project_in_front(points[seen], frames[position].camera)
-        along_track[seen] += np.abs(bilinear(image, pixels[position, seen]) - own_gray[seen])
-        at_rest[seen] += np.abs(bilinear(image, resting) - own_gray[seen])
+        resting = _project_in_front(points, frames[position].camera)
+        kernels.add_mismatch(image, pixels[position], origins != position, resting, own_gray, along_track, at_rest)
     return at_rest <= STILL_MARGIN * along_track
 
 
@@ -170,23 +151,6 @@ def _nearest(pixels: NDArray, width: int, height: int) -> tuple[NDArray[np.intp]
     """Column and row of the pixel that each position falls into, held inside the image."""
     x, y = np.floor(pixels).astype(np.intp).T
     return np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
-
-
-def fill_gaps(offsets: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Offsets (T, N, 3) with NaN rows filled: linear in frames between known ones, held before and after.
-
-    A point that is nowhere known stays at rest.
-    """
-    num_frames, num = offsets.shape[:2]
-    frame = np.arange(num_frames)[:, None]
-    known = np.isfinite(offsets[..., 0])
-    last = np.maximum.accumulate(np.where(known, frame, -1), 0)
-    following = np.minimum.accumulate(np.where(known, frame, num_frames)[::-1], 0)[::-1]
-    before = np.where(last >= 0, last, np.where(following < num_frames, following, 0))
-    after = np.where(following < num_frames, following, before)
-    share = np.where(after > before, (frame - before) / np.maximum(after - before, 1), 0)[..., None]
-    columns = np.arange(num)
-    return np.nan_to_num((1 - share) * offsets[before, columns] + share * offsets[after, columns])
 
 
 def fit_basis(offsets: NDArray[np.float64], times: list[float], cfg: BasisConfig) -> NDArray[np.float32]:
