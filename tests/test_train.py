@@ -236,18 +236,6 @@ def test_gaussians_stay_in_the_order_of_space(tiny_sequence, kind):
     assert all(np.array_equal(a, b) for a, b in zip(found, ordered, strict=True))
 
 
-def test_half_resolution_keeps_the_geometry(tiny_sequence):
-    from endoprior.geometry import back_project, project
-    from endoprior.training_frames import halved
-
-    frame = load_sequence(tiny_sequence).frame(3)
-    small = halved(frame)
-    assert small.rgb_u8.shape == (20, 24, 3) and small.camera.width == 24
-    point = back_project(np.array([21.0, 13.0]), np.array(60.0), frame.camera)
-    assert project(point, small.camera)[0] == pytest.approx([10.5, 6.5])
-    assert small.rgb_u8.mean() == pytest.approx(frame.rgb_u8.mean(), abs=0.5)  # rounding of each average
-
-
 def test_ctrl_c_on_the_command_line_saves_and_says_how_to_go_on(tiny_sequence, tmp_path):
     out = tmp_path / "run"
     command = [sys.executable, "-m", "endoprior", "train", str(tiny_sequence), str(out)]

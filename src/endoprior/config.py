@@ -24,8 +24,14 @@ class DataConfig:
     """... and from above at this one."""
     lift_missing_depth: bool = False
     """EndoGaussian's habit: missing depth becomes the near clip value and counts as measured."""
+    shrink: int = 1
+    """Read frames at this fraction of their width and height: 2 averages blocks of 2 x 2 pixels."""
+    first_frames: int = 0
+    """Read only so many frames from the start of the sequence; 0 reads all."""
 
     def __post_init__(self) -> None:
+        check_range("shrink", self.shrink, 1, 64)
+        check_range("first_frames", self.first_frames, 0, 10_000_000)
         check_range("depth_clip_low_percentile", self.depth_clip_low_percentile, 0, 100)
         check_range("depth_clip_high_percentile", self.depth_clip_high_percentile, self.depth_clip_low_percentile, 100)
 

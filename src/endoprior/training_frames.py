@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import PriorConfig
-from .data import Sequence
+from .data import Sequence, shrunk
 from .priors import joint_texture_prior
 from .types import Camera, Frame
 
@@ -56,7 +54,7 @@ class TrainingFrames:
         key = (position, half)
         if key not in self._frames:
             frame = self.sequence.frame(self.indices[position])
-            self._frames[key] = _training_frame(halved(frame) if half else frame)
+            self._frames[key] = _training_frame(shrunk(frame, 2 if half else 1))
         return self._frames[key]
 
     def before(self, position: int) -> TrainingFrame | None:
@@ -87,26 +85,3 @@ def _training_frame(frame: Frame) -> TrainingFrame:
         inverse_depth=torch.from_numpy(inverse),
         measured=torch.from_numpy(frame.tissue_mask & frame.depth_valid),
     )
-
-
-def halved(frame: Frame) -> Frame:
-    """The frame at half width and height, rounded down: colors averaged, masks and depth where all four agree."""
-    height, width = frame.tissue_mask.shape[0] // 2, frame.tissue_mask.shape[1] // 2
-    camera = frame.camera
-    small = replace(
-        camera, width=width, height=height, fx=camera.fx / 2, fy=camera.fy / 2, cx=camera.cx / 2, cy=camera.cy / 2
-    )
-    valid = _blocks(frame.depth_valid, height, width).all((1, 3))
-    depth = _blocks(frame.depth, height, width).mean((1, 3), dtype=np.float32)
-    return replace(
-        frame,
-        camera=small,
-        rgb_u8=cv2.resize(frame.rgb_u8[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA),
-        tissue_mask=_blocks(frame.tissue_mask, height, width).all((1, 3)),
-        depth=np.where(valid, depth, np.float32(0)),
-        depth_valid=valid,
-    )
-
-
-def _blocks(image: NDArray, height: int, width: int) -> NDArray:
-    return image[: 2 * height, : 2 * width].reshape(height, 2, width, 2)

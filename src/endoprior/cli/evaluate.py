@@ -58,13 +58,11 @@ def evaluate_run(
 
     Depth is scored against what was measured, whatever the run's preset took for measured in training.
     """
-    from ..config import DataConfig
     from ..data import load_sequence
-    from ..evaluate import evaluate
+    from ..evaluate import evaluate, scored_data
 
-    sequence = load_sequence(data, DataConfig(use_gt_masks=scene.config.data.use_gt_masks))
+    sequence = load_sequence(data, scored_data(scene.config.data))
     result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir)
-    result.protocol["masks"] = "gt_masks/" if scene.config.data.use_gt_masks else "masks/"
     result.scores |= extra
     result.save(out)
     say(f"\nscores on the {split} split ({len(sequence.indices(split))} frames)")

@@ -48,6 +48,7 @@ def run(argv: list[str]) -> None:
 def draw(scene: Scene, args: Render) -> None:
     """Draw what `args` asks for and say where it is."""
     from ..data import load_sequence
+    from ..evaluate import scored_data
     from ..show.camera_paths import read_path, sway_path, times_path
     from ..show.frames import depth_span, write_views
     from .evaluate import sequence_of_run
@@ -60,7 +61,7 @@ def draw(scene: Scene, args: Render) -> None:
     else:
         times = list(args.times)
         if not times:
-            sequence = load_sequence(args.data or sequence_of_run(args.run))
+            sequence = load_sequence(args.data or sequence_of_run(args.run), scored_data(scene.config.data))
             if len(sequence) != total:
                 raise InputError(
                     f"{sequence.path}: expected {total} frames; got {len(sequence)}. Pass the run's sequence."

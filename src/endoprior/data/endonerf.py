@@ -20,6 +20,7 @@ from ..types import Camera, Frame
 from .depth import clean_depth
 from .images import complaint, read_color, read_depth, read_tool_mask
 from .sequence import Sequence
+from .shrink import shrunk, shrunk_camera
 from .truth import Truth
 
 ROTATION_TOLERANCE = 1e-3
@@ -62,29 +63,40 @@ def load_sequence(
     remarks: list[str] = _unequal_names(images, masks) + _unequal_names(images, depths)
     poses = _read_poses(path / "poses_bounds.npy", len(images))
     cameras = _cameras(poses, described, width, height, pose_axes, path, remarks)
+    count = min(cfg.first_frames or len(images), len(images))
+    if count < 2 or min(width, height) // cfg.shrink < 1:
+        hint = "Lower data.shrink or raise data.first_frames."
+        raise complaint(path, "2 frames of 1x1 px to be left", f"{count} of {width}x{height} / {cfg.shrink}", hint)
 
     def read_frame(index: int) -> Frame:
         size = (width, height)
         depth, depth_valid = clean_depth(read_depth(depths[index], described.get("depth_scale", 1.0), size), cfg)
-        return Frame(
+        frame = Frame(
             index=index,
-            time=index / len(images),
+            time=index / count,
             camera=cameras[index],
             rgb_u8=read_color(images[index], size),
             tissue_mask=~read_tool_mask(masks[index], described.get("mask_tool_value", 255), size),
             depth=depth,
             depth_valid=depth_valid,
         )
+        return shrunk(frame, cfg.shrink)
 
+    truth = None
+    if (path / "truth").is_dir():
+        truth = Truth(path / "truth", [file.stem for file in images])
+        if cfg.shrink > 1 or count < len(images):
+            truth = None
+            remarks.append(f"{path / 'truth'}: left out, because it belongs to the whole sequence at its full size")
     description = [path / "sequence.json"] if described else []
     return Sequence(
         path,
-        cameras,
+        [shrunk_camera(camera, cfg.shrink) for camera in cameras[:count]],
         read_frame,
         frames_per_second=float(described["frames_per_second"]) if "frames_per_second" in described else None,
         mask_folder=folders[1],
-        files=[*images, *masks, *depths, path / "poses_bounds.npy", *description],
-        truth=Truth(path / "truth", [file.stem for file in images]) if (path / "truth").is_dir() else None,
+        files=[*images[:count], *masks[:count], *depths[:count], path / "poses_bounds.npy", *description],
+        truth=truth,
         remarks=remarks,
     )
 
