@@ -9,12 +9,13 @@ import torch
 
 from endoprior.cli import main
 from endoprior.data import load_sequence
-from endoprior.evaluate import evaluate, track_error
+from endoprior.evaluate import evaluate
 from endoprior.model.carry import carry_points
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.presets import preset
 from endoprior.train import train
 from endoprior.trainer import Trainer
+from endoprior.truth_scores import track_scores
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def test_track_error_of_a_still_scene_is_how_far_the_tissue_moved(phantom):
     first, columns = visible.argmax(0), np.arange(followed.sum())
     visible[first, columns] = False
     moved = np.linalg.norm(points - points[first, columns], axis=-1)[visible].mean()
-    assert track_error(still_scene(phantom), phantom).mm == pytest.approx(moved, rel=1e-3)
+    assert track_scores(still_scene(phantom), phantom)["track_error_mm"] == pytest.approx(moved, rel=1e-3)
 
 
 def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):
@@ -66,6 +67,7 @@ def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):
         schedule=replace(cfg.schedule, coarse_iterations=0, fine_iterations=5),
     )
     names = {"psnr_behind_tool", "depth_rmse_behind_tool_mm", "track_error_mm", "track_error_px"}
+    names |= {"track_fold_rate", "track_tear_rate"}
     scores = evaluate(train(phantom, cfg), phantom, networks=False).scores
     assert names <= set(scores) and all(np.isfinite(scores[name]) for name in names)
     plain = load_sequence(tiny_sequence)

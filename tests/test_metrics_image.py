@@ -14,6 +14,7 @@ from endoprior.metrics import (
     psnr_tissue,
     quantize,
     ssim,
+    ssim_tissue,
     to_uint8,
 )
 
@@ -183,3 +184,16 @@ def test_mean_over_frames_leaves_out_what_has_no_value():
     assert mean_over_frames([1.0, np.nan, 3.0, np.inf]) == 2.0
     assert np.isnan(mean_over_frames([np.nan]))
     assert np.isnan(mean_over_frames([]))
+
+
+def test_ssim_of_tissue_leaves_the_masked_part_out():
+    """Black in both images scores 1; the tissue alone scores what is left of the mean."""
+    rng = np.random.default_rng(3)
+    image, target = rng.random((2, 40, 60, 3)).astype(np.float32)
+    mask = np.zeros((40, 60), bool)
+    mask[:, :30] = True
+    whole = np.ones_like(mask)
+    assert ssim_tissue(image, target, whole) == pytest.approx(ssim(image, target, whole))
+    assert ssim_tissue(image, target, mask) < ssim(image, target, mask)
+    assert ssim_tissue(image, image, mask) == pytest.approx(1)
+    assert np.isnan(ssim_tissue(image, target, np.zeros_like(mask)))

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from endoprior.metrics import depth_instability, track_error
+from endoprior.metrics import depth_instability, neighbor_breaks, track_error
 from endoprior.types import Camera
 
 ALL = np.ones((6, 8), bool)
@@ -103,3 +103,56 @@ def test_track_error_names_bad_input():
         track_error(truth, truth, visible.astype(int), camera())
     with pytest.raises(ValueError, match="truth must have shape"):
         track_error(truth, truth[:, :-1], visible, camera())
+
+
+# --- folds and tears
+
+
+def grid_of_points(frames: int = 3) -> np.ndarray:
+    """(T, 16, 3) a resting 4 x 4 grid of points, 1 mm apart."""
+    x, y = np.meshgrid(np.arange(4.0), np.arange(4.0))
+    return np.tile(np.stack([x.ravel(), y.ravel(), np.full(16, 50.0)], -1), (frames, 1, 1))
+
+
+def breaks(predicted: np.ndarray, truth: np.ndarray, first: int = 0):
+    visible = np.ones(truth.shape[:2], bool)
+    visible[first] = False
+    return neighbor_breaks(predicted, truth, visible, np.full(truth.shape[1], first))
+
+
+def test_tissue_that_moves_or_turns_as_one_neither_folds_nor_tears():
+    truth = grid_of_points()
+    assert breaks(truth + np.array([3, -1, 2]), truth) == (0, 0)
+    angle = np.radians(80)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    assert breaks(truth @ turn.T, truth) == (0, 0)
+    assert breaks(truth * 1.9, truth) == (0, 0)
+
+
+def test_turned_inside_out_is_all_fold_and_stretched_is_all_tear():
+    truth = grid_of_points()
+    assert breaks(-truth, truth) == (1, 0)
+    assert breaks(truth * 2.1, truth) == (0, 1)
+
+
+def test_one_lost_point_tears_its_own_pairs_only():
+    truth = grid_of_points()
+    predicted = truth.copy()
+    predicted[2, 5] += [0, 0, 30]
+    pairs = {tuple(sorted((a, b))) for a in range(16) for b in nearest_four(truth[0], a)}
+    own = [pair for pair in pairs if 5 in pair]
+    fold, tear = breaks(predicted, truth)
+    assert fold == 0 and tear == pytest.approx(len(own) / (2 * len(pairs)))
+
+
+def nearest_four(points: np.ndarray, a: int) -> list[int]:
+    from scipy.spatial import cKDTree
+
+    return [int(b) for b in cKDTree(points).query(points[a], k=5)[1] if b != a]
+
+
+def test_breaks_need_a_pair_that_both_frames_show():
+    truth = grid_of_points()
+    assert np.isnan(neighbor_breaks(truth, truth, np.zeros((3, 16), bool), np.zeros(16, int))).all()
+    alone = neighbor_breaks(truth[:, :2], truth[:, :2], np.ones((3, 2), bool), np.array([0, 1]))
+    assert np.isnan(alone).all()  # they start in different frames

@@ -19,18 +19,18 @@ from numpy.typing import NDArray
 from . import metrics
 from .atomic import write_json
 from .checks import InputError
+from .config import DataConfig
 from .data import Sequence
 from .metrics import ScoreUnavailable
-from .model.carry import carry_points
 from .model.playback import Playback
 from .model.scene import Scene
+from .truth_scores import track_scores
 from .types import Frame
 
 Split = Literal["train", "test", "video"]
 LOW_PRIOR, LOW_PRIOR_OBSERVATIONS, LOW_OPACITY, LARGE_SCALE_MM = 0.2, 20, 0.01, 40.0
 """Thresholds of the paper's primitive diagnostics."""
 FPS_WARM_UP, FPS_RENDERS = 10, 60
-MIN_FOLLOWED_POINTS = 1
 
 
 @dataclass
@@ -59,6 +59,8 @@ class Evaluation:
 class Rendered:
     """One frame as the scene shows it."""
 
+    color: NDArray[np.float32] | None
+    """(H, W, 3) in [0, 1], as it was drawn; kept for the scored frames only."""
     rgb_u8: NDArray[np.uint8]
     """(H, W, 3): the protocol scores 8-bit images, as the released code does."""
     depth: NDArray[np.float32]
@@ -87,9 +89,10 @@ def evaluate(
             f"{sequence.path}: expected the {len(scene.cameras)} frames the scene was trained on; got {len(sequence)}. "
             "Pass the same sequence."
         )
-    result = Evaluation(_protocol(sequence, split))
+    result = Evaluation(_protocol(sequence, split, scene.config.data))
     progress("drawing")
-    drawn = {frame.index: _draw(scene, frame) for frame in sequence.frames("video")}
+    scored = set(sequence.indices(split))
+    drawn = {frame.index: _draw(scene, frame, frame.index in scored) for frame in sequence.frames("video")}
     frames = list(sequence.frames(split))
     progress("images and depth")
     _image_scores(result, frames, drawn)
@@ -107,13 +110,21 @@ def evaluate(
     return result
 
 
-def _protocol(sequence: Sequence, split: Split) -> dict[str, Any]:
+def scored_data(trained: DataConfig) -> DataConfig:
+    """How frames are read to score a scene: those it was trained on, depth as it was measured."""
+    return DataConfig(use_gt_masks=trained.use_gt_masks, shrink=trained.shrink, first_frames=trained.first_frames)
+
+
+def _protocol(sequence: Sequence, split: Split, data: DataConfig) -> dict[str, Any]:
     return {
         "split": split,
         "split_rule": "test iff (i - 1) % 8 == 0",
         "frames": sequence.indices(split),
         "images": "8-bit round trip; psnr, ssim, lpips and flow on images multiplied by the tissue mask",
-        "masks": "masks/ of the sequence, tissue = not tool",
+        "shrink": data.shrink,
+        "masks": f"{'gt_masks/' if data.use_gt_masks else 'masks/'} of the sequence, tissue = not tool",
+        "strict_*": "color as drawn, not rounded to 8 bits; tissue pixels only; flow: flow_error_dis_adjacent",
+        "depth_rmse_endogaussian": "8-bit depths that wrap, only to compare with that paper's tables",
         "depth": "sum of weight * z against measured depth on tissue, mm, mean of per-frame RMSE",
         "flow_error": "consecutive frames of the split; *_adjacent: all adjacent frames of the video",
         "depth_instability_mm": "all adjacent frames of the video",
@@ -121,9 +132,10 @@ def _protocol(sequence: Sequence, split: Split) -> dict[str, Any]:
     }
 
 
-def _draw(scene: Scene, frame: Frame) -> Rendered:
+def _draw(scene: Scene, frame: Frame, scored: bool) -> Rendered:
     out = scene.render(frame.time, frame.camera)
-    return Rendered(metrics.to_uint8(out.color.numpy()), out.depth.numpy())
+    color = out.color.numpy()
+    return Rendered(np.clip(color, 0, 1) if scored else None, metrics.to_uint8(color), out.depth.numpy())
 
 
 def _image_scores(result: Evaluation, frames: list[Frame], drawn: dict[int, Rendered]) -> None:
@@ -135,11 +147,14 @@ def _image_scores(result: Evaluation, frames: list[Frame], drawn: dict[int, Rend
             "psnr_tissue": metrics.psnr_tissue(image, target, mask),
             "ssim": metrics.ssim(image, target, mask),
             "depth_rmse_mm": metrics.depth_rmse(drawn[frame.index].depth, frame.depth, mask & frame.depth_valid),
+            "depth_rmse_endogaussian": metrics.depth_rmse_endogaussian(drawn[frame.index].depth, frame.depth, mask),
+            "strict_psnr": metrics.psnr_tissue(drawn[frame.index].color, target, mask),
+            "strict_ssim": metrics.ssim_tissue(drawn[frame.index].color, target, mask),
         }
         result.per_frame.append({"index": frame.index, "time": frame.time} | _finite(row))
-    for name in ("psnr", "psnr_tissue", "ssim", "depth_rmse_mm"):
+    for name in row:
         mean = metrics.mean_over_frames([row.get(name, math.nan) for row in result.per_frame])
-        reason = "no tissue with measured depth" if name == "depth_rmse_mm" else "no tissue in the split"
+        reason = "no tissue with measured depth" if name.startswith("depth") else "no tissue in the split"
         result.add(name, mean, reason)
 
 
@@ -229,38 +244,8 @@ def _truth_scores(
             depth.append(metrics.depth_rmse(drawn[frame.index].depth, exact, ~frame.tissue_mask & (exact > 0)))
     result.add("psnr_behind_tool", metrics.mean_over_frames(color), "no true picture behind the tool")
     result.add("depth_rmse_behind_tool_mm", metrics.mean_over_frames(depth), "no true depth behind the tool")
-    error = track_error(scene, sequence)
-    result.add("track_error_mm", error.mm, "no track is visible in two frames")
-    result.add("track_error_px", error.px, "no track is visible in two frames")
-
-
-def track_error(scene: Scene, sequence: Sequence) -> metrics.TrackError:
-    """Error of material points carried by the deformation, over all frames where they are visible.
-
-    Each point starts at its true position in the first frame that shows it; that frame does not count.
-    """
-    tracks = sequence.truth and sequence.truth.tracks
-    if not tracks:
-        return metrics.TrackError(math.nan, math.nan)
-    followed = tracks.visible.sum(0) > 1
-    if followed.sum() < MIN_FOLLOWED_POINTS:
-        return metrics.TrackError(math.nan, math.nan)
-    points, visible = tracks.points[:, followed].astype(np.float64), tracks.visible[:, followed].copy()
-    first = visible.argmax(0)
-    columns = np.arange(points.shape[1])
-    cameras = scene.cameras
-    to_world = np.stack([np.linalg.inv(camera.world_to_camera) for camera in cameras])
-    start = np.einsum("pij,pj->pi", to_world[first][:, :3, :3], points[first, columns]) + to_world[first][:, :3, 3]
-    times = [i / len(cameras) for i in range(len(cameras))]
-    carried = carry_points(scene, start, first, times)
-    predicted = np.stack(
-        [
-            p @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-            for p, camera in zip(carried, cameras, strict=True)
-        ]
-    )
-    visible[first, columns] = False
-    return metrics.track_error(predicted, points, visible, cameras[0])
+    for name, value in track_scores(scene, sequence).items():
+        result.add(name, value, "no track is visible in two frames")
 
 
 def frames_per_second(scene: Scene, *, cached: bool = False) -> float:

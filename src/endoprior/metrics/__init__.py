@@ -10,17 +10,28 @@ from __future__ import annotations
 
 from .flow import FlowEstimator, dis_flow, flow_error
 from .frames import mean_over_frames
-from .image import depth_rmse, depth_rmse_endogaussian, psnr, psnr_behind_tool, psnr_tissue, quantize, ssim, to_uint8
+from .image import (
+    depth_rmse,
+    depth_rmse_endogaussian,
+    psnr,
+    psnr_behind_tool,
+    psnr_tissue,
+    quantize,
+    ssim,
+    ssim_tissue,
+    to_uint8,
+)
 from .lpips import LpipsDistance, lpips_distance
 from .raft import RaftFlow, raft_flow
 from .stability import depth_instability
-from .tracks import TrackError, track_error
+from .tracks import NeighborBreaks, TrackError, neighbor_breaks, track_error
 from .weights import FoundWeights, ScoreUnavailable, WeightsMissing
 
 __all__ = [
     "FlowEstimator",
     "FoundWeights",
     "LpipsDistance",
+    "NeighborBreaks",
     "RaftFlow",
     "ScoreUnavailable",
     "TrackError",
@@ -32,12 +43,14 @@ __all__ = [
     "flow_error",
     "lpips_distance",
     "mean_over_frames",
+    "neighbor_breaks",
     "psnr",
     "psnr_behind_tool",
     "psnr_tissue",
     "quantize",
     "raft_flow",
     "ssim",
+    "ssim_tissue",
     "to_uint8",
     "track_error",
 ]

@@ -94,8 +94,20 @@ def ssim(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
         ValueError: as `psnr`.
     """
     _check_images(image, target, mask)
-    if not mask.any():
-        return float("nan")
+    return float(_ssim_map(image, target, mask).mean()) if mask.any() else float("nan")
+
+
+def ssim_tissue(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
+    """Structural similarity averaged over the tissue pixels alone. Window, constants, arguments and errors as `ssim`.
+
+    What windows at the border see outside the mask is black in both images.
+    """
+    _check_images(image, target, mask)
+    return float(_ssim_map(image, target, mask)[mask].mean()) if mask.any() else float("nan")
+
+
+def _ssim_map(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(H, W, 3) structural similarity of the masked images."""
     a = np.where(mask[..., None], image, 0).astype(np.float64)
     b = np.where(mask[..., None], target, 0).astype(np.float64)
     mean_a, mean_b = _window_mean(a), _window_mean(b)
@@ -104,7 +116,7 @@ def ssim(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
     covariance = _window_mean(a * b) - mean_a * mean_b
     luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
     structure = (2 * covariance + SSIM_C2) / (variance_a + variance_b + SSIM_C2)
-    return float((luminance * structure).mean())
+    return luminance * structure
 
 
 def depth_rmse(depth: NDArray, target: NDArray, valid: NDArray[np.bool_]) -> float:

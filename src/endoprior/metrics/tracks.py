@@ -10,10 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..checks import check_shape
 from ..geometry import project
 from ..types import Camera
+
+NEIGHBORS = 4
+"""Neighbors of each point that must stay beside it."""
+TEAR_STRETCH = 2.0
+"""A line between neighbors that is this many times too long is torn."""
 
 
 class TrackError(NamedTuple):
@@ -54,3 +60,45 @@ def track_error(predicted: NDArray, truth: NDArray, visible: NDArray[np.bool_], 
     mm = float(np.linalg.norm(got - want, axis=-1).mean())
     px = float(np.linalg.norm(got_px - want_px, axis=-1).mean()) if (got_z > 0).all() else float("nan")
     return TrackError(mm, px)
+
+
+class NeighborBreaks(NamedTuple):
+    """How often neighbors on the tissue lose each other; NaN where no pair can be judged."""
+
+    fold: float
+    """Share of (frame, pair) in which the predicted line between two neighbors points against the true one."""
+    tear: float
+    """Share of (frame, pair) in which it is more than `TEAR_STRETCH` times as long as the true one."""
+
+
+def neighbor_breaks(
+    predicted: NDArray, truth: NDArray, visible: NDArray[np.bool_], first: NDArray[np.integer]
+) -> NeighborBreaks:
+    """Folds and tears between each point and its nearest neighbors among those that start in the same frame.
+
+    Args:
+        predicted, truth: (T, P, 3) positions, mm. visible: (T, P) True where a point counts.
+        first: (P,) frame each point starts in, where `truth` says where it is.
+    Returns:
+        Both shares over all frames in which both ends of a pair count.
+    """
+    check_shape(
+        "predicted:T,P,3 truth:T,P,3 visible:T,P first:P",
+        predicted=predicted,
+        truth=truth,
+        visible=visible,
+        first=first,
+    )
+    folds = tears = judged = 0
+    for start in np.unique(first):
+        group = np.flatnonzero(first == start)
+        k = min(NEIGHBORS + 1, len(group))
+        _, nearest = cKDTree(truth[start, group]).query(truth[start, group], k=k)
+        a, b = np.repeat(group, k), group[np.reshape(nearest, -1)]
+        a, b = np.unique(np.sort(np.stack([a, b]), 0)[:, a != b], axis=1)  # each pair once
+        both = visible[:, a] & visible[:, b]
+        wanted, got = (truth[:, a] - truth[:, b])[both], (predicted[:, a] - predicted[:, b])[both]
+        folds += int(((wanted * got).sum(-1) < 0).sum())
+        tears += int((np.linalg.norm(got, axis=-1) > TEAR_STRETCH * np.linalg.norm(wanted, axis=-1)).sum())
+        judged += len(wanted)
+    return NeighborBreaks(folds / judged, tears / judged) if judged else NeighborBreaks(float("nan"), float("nan"))
