@@ -42,7 +42,7 @@ def test_missing_fields_keep_their_defaults():
         ({"seed": True}, "config.seed"),
         ({"seed": None}, "config.seed"),
         ({"temporal": {"gradient": "none"}}, "config.temporal.gradient"),
-        ({"deformation": {"hexplane": {"multires": [1, "2"]}}}, "config.deformation.hexplane.multires"),
+        ({"deformation": {"hexplane": {"multires": [1, "2"]}}}, "config.deformation.hexplane.multires[1]"),
         ({"deformation": {"hexplane": {"resolution": [1, 2]}}}, "config.deformation.hexplane.resolution"),
         ({"init": {"budget": 0}}, "config.init"),
         ({"density": {"min_densify_weight": float("nan")}}, "config.density"),

@@ -49,12 +49,21 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return from_dict(hint, value, where)
     origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return value
     if origin is typing.Literal:
         ok, want = value in args, f"one of {', '.join(map(repr, args))}"
     elif origin is tuple:
-        ok = isinstance(value, list | tuple) and all(type(v) is int for v in value)
-        ok, want = ok and (args[-1] is Ellipsis or len(value) == len(args)), "a list of integers"
-        value = tuple(value) if ok else value
+        ok = isinstance(value, list | tuple) and (args[-1] is Ellipsis or len(value) == len(args))
+        if ok:
+            return tuple(_value(args[0], v, f"{where}[{i}]") for i, v in enumerate(value))
+        want = "a list" if args[-1] is Ellipsis else f"a list of {len(args)}"
+    elif origin is dict:
+        ok, want = isinstance(value, dict) and all(type(key) is str for key in value), "named entries"
+        if ok:
+            return {key: _value(args[1], v, f"{where}.{key}") for key, v in value.items()}
+    elif origin is types.UnionType and any(map(dataclasses.is_dataclass, args)):
+        return None if value is None else _value(next(filter(dataclasses.is_dataclass, args)), value, where)
     elif origin is types.UnionType:
         ok, want = value is None or any(type(value) is a for a in args), str(hint)
     elif hint is float:

@@ -18,6 +18,7 @@ COMMANDS = {
     "train": "train one scene and score it",
     "eval": "score a trained scene on a split",
     "render": "draw a trained scene: color, depth, side-by-side, video",
+    "bench": "compare methods on sequences over seeds, under one protocol",
 }
 """Name and one-line description; each lives in the module of this package named like it (`eval` in `evaluate`)."""
 
@@ -48,7 +49,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if name not in COMMANDS:
             raise InputError(f"{name}: no such command; expected one of {', '.join(COMMANDS)}. Try `endoprior --help`.")
-        import_module(f".{MODULES.get(name, name)}", __package__).run(rest)
+        return import_module(f".{MODULES.get(name, name)}", __package__).run(rest) or 0
     except InputError as error:
         print(f"endoprior: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

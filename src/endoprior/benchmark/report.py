@@ -1,0 +1,184 @@
+"""What a benchmark leaves: results.md, results.tex, results.csv, results.json and figures."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from ..atomic import whole_file, write_json
+from ..config_io import to_dict
+from ..run_folder import source_commit
+from .matrix import Matrix, scores_of
+from .results import Results
+from .spec import ClaimSpec
+from .statistics import ABSOLUTE, IN_DB, MIN_PAIRS, Difference
+from .tables import LABELS, csv_lines, latex, markdown, score_table
+
+
+def write_report(matrix: Matrix) -> Path:
+    """Write tables, differences, claims and figures of what is done; names what is not.
+
+    Returns:
+        Path of `results.md`.
+    """
+    results, out = Results.of(matrix), matrix.out
+    figures = _figures(matrix, results)
+    tables = [score_table(results, name) for name in matrix.spec.sequences if name in matrix.data]
+    _write(out / "results.tex", "\n\n".join(latex(table) for table in tables) + "\n")
+    _write(out / "results.csv", csv_lines(results))
+    write_json(out / "results.json", _facts(matrix, results))
+    text = "\n\n".join([*_head(matrix), *_tables(matrix, results), *_claims(results), *_pictures(figures, out)])
+    _write(out / "results.md", text + "\n")
+    return out / "results.md"
+
+
+def _write(path: Path, text: str) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _head(matrix: Matrix) -> list[str]:
+    spec = matrix.spec
+    size = f"{len(spec.methods)} methods x {len(spec.sequences)} sequences"
+    size += f" x {len(spec.budgets)} budgets" if spec.budgets else ""
+    seeds = ", ".join(map(str, spec.seeds))
+    lines = [f"# {spec.title}"]
+    if spec.about:
+        lines.append(spec.about.strip())
+    lines.append(f"{size}, seeds {seeds}; commit {source_commit() or 'unknown'}. Mean ± standard deviation over seeds.")
+    if matrix.missing:
+        missing = "\n".join(f"- `{cell.name}`: {reason}" for cell, reason in matrix.missing.items())
+        lines.append(f"No result for {len(matrix.missing)} cells:\n\n{missing}")
+    if matrix.done:
+        protocol = scores_of(next(iter(matrix.done.values())))["protocol"]
+        shown = {k: v for k, v in protocol.items() if k not in ("frames", "data_fingerprint", "shrink")}
+        lines.append("Protocol:\n\n" + "\n".join(f"- {name}: {value}" for name, value in shown.items()))
+    return lines
+
+
+def _tables(matrix: Matrix, results: Results) -> list[str]:
+    spec, blocks = matrix.spec, []
+    for name in spec.sequences:
+        if name not in matrix.data:
+            continue
+        blocks += [f"## {name}", "Best in bold, second best underlined.", markdown(score_table(results, name))]
+        others = [method for method in spec.methods if method != spec.reference]
+        rows = []
+        for method in others:
+            found = [results.difference(score, method, spec.reference, name) for score in spec.scores]
+            if any(f.count for f in found):
+                rows.append([spec.label(method), *map(change, spec.scores, found)])
+        if rows:
+            lines = [["method", *(LABELS.get(s, s) for s in spec.scores)], ["---"] * (len(spec.scores) + 1), *rows]
+            table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+            than = spec.label(spec.reference)
+            about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over seeds]:"
+            blocks += [about, table]
+    return blocks
+
+
+def change(score: str, found: Difference) -> str:
+    """`+3.1 % [+1.0, +5.2]` or `+0.31 dB [+0.10, +0.52]`; a dash where there is nothing to compare."""
+    if not found.count:
+        return "-"
+    factor, digits, unit = (1, 2, " dB") if score in IN_DB else (1, 4, "") if score in ABSOLUTE else (100, 1, " %")
+    mean, low, high = (f"{factor * value:+.{digits}f}" for value in (found.mean, found.low, found.high))
+    return f"{mean}{unit} [{low}, {high}]" if math.isfinite(found.low) else mean + unit
+
+
+def _amount(score: str, by: float) -> str:
+    return f"{by:g} dB" if score in IN_DB else f"{by:g}" if score in ABSOLUTE else f"{100 * by:g} %"
+
+
+def _claims(results: Results) -> list[str]:
+    if not results.spec.claims:
+        return []
+    lines = []
+    for claim in results.spec.claims:
+        found, said = results.judge(claim)
+        parts = []
+        if len(results.spec.sequences) > 1:
+            for name in results.spec.sequences:
+                alone, alone_said = results.judge(claim, name)
+                if alone.count:
+                    parts.append(f"{name}: {alone_said}, {change(claim.score, alone)}")
+        detail = f" ({'; '.join(parts)})" if parts else ""
+        source = f" [{claim.text}]" if claim.text else ""
+        lines.append(
+            f"- {sentence(results, claim)}{source}: **{said}**, {change(claim.score, found)}, "
+            f"{found.count} pairs{detail}."
+        )
+    note = f"A claim holds, or does not, if the whole interval says so; fewer than {MIN_PAIRS} pairs tell nothing."
+    return ["## Claims", "\n".join(lines), note]
+
+
+def sentence(results: Results, claim: ClaimSpec) -> str:
+    """The claim in words."""
+    ours, theirs = results.spec.label(claim.method), results.spec.label(claim.than)
+    score, by = LABELS.get(claim.score, claim.score), _amount(claim.score, claim.by)
+    at = f" at {claim.budget:,} initial Gaussians" if claim.budget else ""
+    if claim.expect == "better":
+        return f"{ours} is better than {theirs} in {score}" + (f" by at least {by}" if claim.by else "") + at
+    if claim.expect == "no worse":
+        return f"{ours} is no worse than {theirs} in {score}" + (f" by more than {by}" if claim.by else "") + at
+    return f"{ours} and {theirs} differ in {score} by no more than {by}{at}"
+
+
+def _figures(matrix: Matrix, results: Results) -> list[Path]:
+    from .pictures import write_pictures
+    from .plots import budget_figure, curve_figure
+
+    kinds, folder = set(matrix.spec.figures), matrix.out / "figures"
+    if not matrix.done:
+        return []
+    written = []
+    if "budgets" in kinds:
+        budget_figure(results, folder / "budgets.png")
+        written.append(folder / "budgets.png")
+    if "curves" in kinds:
+        curve_figure(results, matrix, folder / "curves.png")
+        written.append(folder / "curves.png")
+    return written + write_pictures(matrix, folder, kinds)
+
+
+def _pictures(figures: list[Path], out: Path) -> list[str]:
+    return ["## Figures", *(f"![{f.stem}]({f.relative_to(out)})" for f in figures)] if figures else []
+
+
+def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
+    """All that is in the tables, for programs."""
+    spec = matrix.spec
+    cells = [
+        {"sequence": c.sequence, "method": c.method, "budget": c.budget, "seed": c.seed} | scores_of(folder)
+        for c, folder in matrix.done.items()
+    ]
+    claims = []
+    for claim in spec.claims:
+        found, said = results.judge(claim)
+        claims.append(
+            to_dict(claim) | {"verdict": said, "difference": _json(found), "sentence": sentence(results, claim)}
+        )
+    differences = [
+        {"sequence": name, "method": method, "than": spec.reference, "score": score}
+        | _json(results.difference(score, method, spec.reference, name))
+        for name in spec.sequences
+        for method in spec.methods
+        if method != spec.reference
+        for score in spec.scores
+    ]
+    missing = {cell.name: reason for cell, reason in matrix.missing.items()}
+    return {
+        "title": spec.title,
+        "commit": source_commit(),
+        "cells": cells,
+        "differences": differences,
+        "claims": claims,
+        "missing": missing,
+    }
+
+
+def _json(found: Difference) -> dict[str, Any]:
+    values = json.loads(json.dumps(vars(found)), parse_constant=lambda _: None)
+    return {"mean": values["mean"], "low": values["low"], "high": values["high"], "pairs": values["count"]}

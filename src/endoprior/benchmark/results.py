@@ -1,0 +1,57 @@
+"""The scores of a matrix in memory, and what they say: means over seeds, paired differences, claims."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .matrix import Matrix, scores_of
+from .spec import Cell, ClaimSpec, Spec
+from .statistics import Difference, Summary, Verdict, difference, gains, summary, verdict
+
+
+@dataclass(frozen=True)
+class Results:
+    """Scores by cell; cells without a result are not in it."""
+
+    spec: Spec
+    scores: dict[Cell, dict[str, float]]
+
+    @staticmethod
+    def of(matrix: Matrix) -> Results:
+        """Read the scores of all finished cells, in the order of the spec."""
+        order = sorted(matrix.done, key=lambda c: (c.sequence, c.budget or 0, c.method, c.seed))
+        return Results(matrix.spec, {cell: scores_of(matrix.done[cell])["scores"] for cell in order})
+
+    def value(self, cell: Cell, score: str) -> float:
+        """A score; NaN where it could not be had."""
+        return float(self.scores.get(cell, {}).get(score, math.nan))
+
+    def summary(self, sequence: str, budget: int | None, method: str, score: str) -> Summary:
+        """Mean and standard deviation over seeds."""
+        return summary([self.value(Cell(sequence, method, budget, seed), score) for seed in self.spec.seeds])
+
+    def gains(
+        self, score: str, method: str, than: str, *, sequence: str | None = None, budget: int | None = None
+    ) -> NDArray:
+        """(K,) paired relative differences over sequences, budgets and seeds, positive where `method` is better."""
+        pairs = [
+            (self.value(Cell(name, method, size, seed), score), self.value(Cell(name, than, size, seed), score))
+            for name in ([sequence] if sequence else self.spec.sequences)
+            for size in ((budget,) if budget else self.spec.budgets or (None,))
+            for seed in self.spec.seeds
+        ]
+        ours, theirs = np.array(pairs).T
+        return gains(score, ours, theirs)
+
+    def difference(self, score: str, method: str, than: str, sequence: str | None = None) -> Difference:
+        """Mean paired difference with its interval."""
+        return difference(self.gains(score, method, than, sequence=sequence))
+
+    def judge(self, claim: ClaimSpec, sequence: str | None = None) -> tuple[Difference, Verdict]:
+        """What the results say of a claim, on one sequence or on all."""
+        found = difference(self.gains(claim.score, claim.method, claim.than, sequence=sequence, budget=claim.budget))
+        return found, verdict(found, claim.expect, claim.by)

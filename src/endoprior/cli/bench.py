@@ -1,0 +1,89 @@
+"""`endoprior bench SPEC OUT`."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..checks import InputError
+from .parsing import parse
+from .progress import say
+
+
+@dataclass
+class Bench:
+    """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
+
+    spec: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="SPEC")]]
+    """What to compare: a .yaml or .toml file; bench/specs/ has those of the paper's tables."""
+    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    """Folder for cells, tables and figures."""
+    cores: int = 0
+    """Cores to use in all; 0 takes those of this machine."""
+    threads: int = 1
+    """Cores of each cell. One is the most for the money; more finish a single cell sooner."""
+    ray: str | None = None
+    """Address of a Ray cluster that shares this file system; `local` starts one."""
+    data: tuple[str, ...] = ()
+    """NAME=FOLDER for sequences that lie elsewhere than the spec says."""
+    weights_dir: Path | None = None
+    """Folder with the weights of RAFT and LPIPS."""
+    report_only: bool = False
+    """Train nothing; write the report of what is there."""
+
+
+def run(argv: list[str]) -> int:
+    """Run the matrix and write its report; 1 if a cell failed."""
+    args = parse(Bench, argv, "bench")
+    from filelock import FileLock, Timeout
+
+    from ..benchmark.execute import local_executor, ray_executor
+    from ..benchmark.matrix import run_matrix
+    from ..benchmark.report import write_report
+    from ..benchmark.spec import load_spec
+
+    if args.threads < 1 or args.cores < 0:
+        raise InputError("--threads, --cores: expected at least 1 thread and no negative cores. Correct them.")
+    if args.weights_dir and not args.weights_dir.is_dir():
+        raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
+    spec = load_spec(args.spec, _folders(args.data))
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{args.out}: expected a place for a folder; got {error.strerror}. Choose another.") from None
+    lock = FileLock(args.out / ".lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InputError(
+            f"{args.out}: expected a folder of our own; another benchmark is running there. Wait."
+        ) from None
+    with lock:
+        shutil.copyfile(args.spec, args.out / f"spec{args.spec.suffix}")
+        if args.report_only:
+            executor = nullcontext(None)
+        elif args.ray:
+            executor = ray_executor(args.ray, args.threads)
+        else:
+            executor = local_executor(max(1, (args.cores or len(os.sched_getaffinity(0))) // args.threads))
+        with executor as execute:
+            matrix = run_matrix(spec, args.out, execute, threads=args.threads, weights_dir=args.weights_dir, say=say)
+        report = write_report(matrix)
+    say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\n{report}")
+    return 1 if matrix.failed else 0
+
+
+def _folders(data: tuple[str, ...]) -> dict[str, Path]:
+    found = {}
+    for item in data:
+        name, separator, folder = item.partition("=")
+        if not separator or not folder:
+            raise InputError(f"--data: expected NAME=FOLDER; got {item!r}. Name a sequence of the spec.")
+        found[name] = Path(folder).expanduser()
+    return found

@@ -1,0 +1,131 @@
+"""Means, paired differences, verdicts and tables against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+
+import numpy as np
+import pytest
+
+from endoprior.benchmark.results import Results
+from endoprior.benchmark.spec import Cell, ClaimSpec, MethodSpec, SequenceSpec, Spec
+from endoprior.benchmark.statistics import Difference, difference, gains, summary, verdict
+from endoprior.benchmark.tables import csv_lines, latex, markdown, number, score_table
+
+
+def test_summary_by_hand():
+    found = summary([1.0, 2.0, 6.0, math.nan])
+    assert (found.mean, found.count) == (3.0, 3) and found.std == pytest.approx(math.sqrt(7))
+    assert math.isnan(summary([4.0]).std) and summary([4.0]).mean == 4
+    assert summary([]).count == 0
+
+
+def test_gains_are_positive_where_better():
+    np.testing.assert_allclose(gains("psnr", [33.0], [30.0]), [3.0])
+    np.testing.assert_allclose(gains("flow_error_dis", [0.5], [1.0]), [0.5])
+    np.testing.assert_allclose(gains("depth_rmse_mm", [3.0], [2.0]), [-0.5])
+
+
+def test_interval_of_two_pairs_are_the_pairs():
+    """All resamples of two values: both low, mixed, both high, in the ratio 1 : 2 : 1."""
+    found = difference([0.1, 0.3])
+    assert (found.mean, found.low, found.high, found.count) == pytest.approx((0.2, 0.1, 0.3, 2))
+
+
+def test_interval_covers_the_mean_about_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    inside = 0
+    for k in range(200):
+        found = difference(rng.normal(0.4, 1, 30), seed=k)
+        inside += found.low <= 0.4 <= found.high
+    assert 0.88 <= inside / 200 <= 0.99
+
+
+def test_few_pairs_say_nothing():
+    found = difference([0.2, math.nan])
+    assert found.count == 1 and found.mean == 0.2 and math.isnan(found.low)
+    assert verdict(found, "better", 0) == verdict(difference([0.2, 0.3]), "better", 0) == "cannot be told"
+    assert verdict(difference([0.2, 0.3, 0.2]), "better", 0) == "holds"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expect", "by", "said"),
+    [
+        (0.28, 0.4, "better", 0.27, "holds"),
+        (0.2, 0.4, "better", 0.27, "cannot be told"),
+        (0.1, 0.2, "better", 0.27, "does not hold"),
+        (0.01, 0.1, "better", 0.0, "holds"),
+        (0.0, 0.0, "better", 0.0, "does not hold"),
+        (-0.1, 0.1, "better", 0.0, "cannot be told"),
+        (0.0, 0.1, "no worse", 0.0, "holds"),
+        (-0.01, 0.1, "no worse", 0.02, "holds"),
+        (-0.05, -0.03, "no worse", 0.02, "does not hold"),
+        (-0.01, 0.01, "no effect", 0.02, "holds"),
+        (0.03, 0.05, "no effect", 0.02, "does not hold"),
+        (-0.01, 0.05, "no effect", 0.02, "cannot be told"),
+    ],
+)
+def test_verdicts(low, high, expect, by, said):
+    assert verdict(Difference((low + high) / 2, low, high, 6), expect, by) == said
+
+
+def results() -> Results:
+    """Two methods, one sequence, three seeds; `b` has one seed only in `lpips`."""
+    spec = Spec(
+        title="t",
+        sequences={"s": SequenceSpec(path="s")},
+        methods={"a_1": MethodSpec(), "b": MethodSpec(label="B & co")},
+        seeds=(0, 1, 2),
+        scores=("psnr", "flow_error_dis", "num_gaussians", "lpips", "fps"),
+        claims=(ClaimSpec("psnr", "b", "a_1"),),
+    )
+    scores = {}
+    for seed in range(3):
+        scores[Cell("s", "a_1", None, seed)] = {"psnr": 30 + seed, "flow_error_dis": 0.5, "num_gaussians": 12345}
+        scores[Cell("s", "b", None, seed)] = {"psnr": 31 + seed, "flow_error_dis": 0.25, "num_gaussians": 9000}
+    scores[Cell("s", "b", None, 0)]["lpips"] = 0.0414
+    return Results(spec, scores)
+
+
+def test_table_ranks_rounds_and_leaves_out_what_nobody_has():
+    table = score_table(results(), "s")
+    assert len(table.columns) == 4  # nobody has fps
+    assert [name for name, _ in table.rows] == ["a_1", "B & co"]
+    (_, a), (_, b) = table.rows
+    assert [e.text for e in a] == ["31.0 ± 1.0", "0.5000 ± 0.0000", "12,345 ± 0", "-"]
+    assert [e.rank for e in a] == [2, 2, 0, 0] and [e.rank for e in b] == [1, 1, 0, 0]
+    assert b[3].text == "0.0414"
+
+
+def test_markdown_and_latex_mark_best_and_second():
+    table = score_table(results(), "s")
+    assert markdown(table).splitlines()[2] == "| a_1 | <u>31.0 ± 1.0</u> | <u>0.5000 ± 0.0000</u> | 12,345 ± 0 | - |"
+    assert markdown(table).splitlines()[3].startswith("| B & co | **32.0 ± 1.0** |")
+    text = latex(table)
+    assert r"a\_1 & \underline{31.0 $\pm$ 1.0}" in text and r"B \& co & \textbf{32.0 $\pm$ 1.0}" in text
+    assert [word for word in (r"\toprule", r"\midrule", r"\bottomrule") if word in text] == [
+        r"\toprule",
+        r"\midrule",
+        r"\bottomrule",
+    ]
+    assert "12{,}345" in text and text.count(r"\\") == 3
+
+
+def test_digits_follow_the_spread():
+    assert number(summary([10.0, 10.2])) == "10.10 ± 0.14"
+    assert number(summary([1000.0, 1200.0])) == "1,100 ± 141"
+    assert number(summary([])) == "-"
+
+
+def test_csv_has_every_value():
+    rows = list(csv.DictReader(io.StringIO(csv_lines(results()))))
+    assert len(rows) == 19
+    assert rows[0] == {"sequence": "s", "method": "a_1", "budget": "", "seed": "0", "score": "psnr", "value": "30"}
+
+
+def test_a_claim_is_judged_on_pairs():
+    found, said = results().judge(results().spec.claims[0])
+    assert said == "holds" and found.count == 3
+    assert found.mean == pytest.approx(1.0)
