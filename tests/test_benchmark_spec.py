@@ -50,6 +50,29 @@ def test_configs_take_presets_then_common_then_own_settings(tmp_path):
     assert spec.reference == "base" and spec.label("ours") == "Ours" and spec.label("base") == "base"
 
 
+def test_settings_by_preset_and_factors(tmp_path):
+    changes = {"set_for": {"default": {"schedule.fine_iterations": 20, "temporal.weight": "x2"}}}
+    methods = {"m": {"set": {"schedule.fine_iterations": "x0.75"}}, "e": {"preset": "endogaussian"}}
+    spec = load_spec(written(tmp_path, methods=methods, **changes))
+    ours, theirs = spec.config("m", "ph", 100, 0), spec.config("e", "ph", 100, 0)
+    assert (ours.schedule.fine_iterations, ours.temporal.weight) == (15, 0.5)
+    assert (theirs.schedule.fine_iterations, theirs.temporal.weight) == (9, 0.25)
+
+
+def test_a_file_extends_others(tmp_path):
+    written(tmp_path)
+    small = {"seeds": [5], "set": {"temporal.weight": 0.125}, "sequences": {"only": {"path": "here"}}}
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(small))
+    top = {"extends": ["spec.yaml", "small.yaml"], "title": "top", "set": {"init.opacity": 0.5}}
+    (tmp_path / "top.yaml").write_text(yaml.safe_dump(top))
+    spec = load_spec(tmp_path / "top.yaml")
+    assert (spec.title, spec.seeds, list(spec.sequences), spec.budgets) == ("top", (5,), ["only"], (100, 200))
+    assert spec.set == {"schedule.fine_iterations": 9, "temporal.weight": 0.125, "init.opacity": 0.5}
+    (tmp_path / "small.yaml").write_text("extends: [top.yaml]")
+    with pytest.raises(InputError, match="extends itself"):
+        load_spec(tmp_path / "top.yaml")
+
+
 def test_places_of_sequences(tmp_path, monkeypatch):
     spec = load_spec(written(tmp_path))
     assert sequence_folder(spec, "clip", tmp_path / "out") == tmp_path / "clips/a"
@@ -88,6 +111,8 @@ def test_toml_says_the_same(tmp_path):
         ({"methods": {"m": {"set": {"init": 3}}}}, "methods.m.set: expected the dotted name"),
         ({"methods": {"m": {"set": {"init.bugdet": 3}}}}, "methods.m.set: expected the dotted name"),
         ({"methods": {"m": {"set": {"init.erosion_px": "big"}}}}, "methods.m.init.erosion_px: expected int"),
+        ({"set_for": {"best": {}}}, "set_for: expected one of default"),
+        ({"extends": "spec.yaml"}, "`extends` a list of files"),
         ({"set": {"density.min_densify_weight": 3.0}}, "min_densify_weight must be in"),
         ({"compare_with": "them"}, "compare_with: expected one of base, ours"),
         ({"claims": [{"score": "psnr", "method": "ours", "than": "nobody"}]}, "expected one of base, ours"),
@@ -110,7 +135,11 @@ def test_unreadable_files_are_named(tmp_path):
         load_spec(written(tmp_path), {"x": tmp_path})
 
 
-@pytest.mark.parametrize("path", sorted(SPECS.glob("*")), ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "path",
+    sorted(path for path in SPECS.rglob("*.yaml") if path.name != "small.yaml"),
+    ids=lambda p: str(p.relative_to(SPECS)),
+)
 def test_ready_specs_can_be_read(path):
     spec = load_spec(path)
     assert cells(spec) and spec.about

@@ -12,16 +12,13 @@ from .checks import InputError
 C = TypeVar("C")
 
 
-def to_dict(cfg: Any) -> dict[str, Any]:
+def to_dict(cfg: Any) -> Any:
     """Nested dict of every field of a config dataclass; tuples become lists, as in JSON."""
-    return {
-        f.name: to_dict(v)
-        if dataclasses.is_dataclass(v := getattr(cfg, f.name))
-        else list(v)
-        if isinstance(v, tuple)
-        else v
-        for f in dataclasses.fields(cfg)
-    }
+    if dataclasses.is_dataclass(cfg):
+        return {field.name: to_dict(getattr(cfg, field.name)) for field in dataclasses.fields(cfg)}
+    if isinstance(cfg, dict):
+        return {key: to_dict(value) for key, value in cfg.items()}
+    return [to_dict(value) for value in cfg] if isinstance(cfg, tuple | list) else cfg
 
 
 def from_dict(cls: type[C], values: Any, where: str = "config") -> C:

@@ -1,6 +1,7 @@
 """The whole matrix: write phantoms, find what is done, run the rest, report what came out.
 
-Below OUT: `sequences/` (phantoms), `cells/SEQUENCE/METHOD@BUDGET/seedK/` (metrics, run folder), and the report.
+Below OUT: `sequences/` (phantoms) and `cells/KEY/` (metrics, run folder). A cell's folder is named by all that makes
+its result, so that equal cells of different specs are run once.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from .execute import Executor
 from .spec import Cell, Spec, cells, sequence_folder
 from .worker import Job, finished
 
+KEY_DIGITS = 16
 SCORES_VERSION = 1
 """Raise it when a score changes its meaning: finished cells are then run again."""
 
@@ -65,18 +67,21 @@ def run_matrix(
     if execute is None:
         matrix.missing |= {cell: "not run yet" for cell in jobs}
         return matrix
-    by_name = {job.name: cell for cell, job in jobs.items()}
+    alike: dict[str, list[Cell]] = {}  # cells of different methods can come to the same thing
+    for cell, job in jobs.items():
+        alike.setdefault(job.folder, []).append(cell)
     began, ended = clock.perf_counter(), 0
-    for outcome in execute(list(jobs.values())):
-        cell, ended = by_name[outcome.job.name], ended + 1
-        if outcome.failure:
-            matrix.missing[cell] = outcome.failure
-            matrix.failed += 1
-        else:
-            matrix.done[cell] = Path(outcome.job.folder)
-        left = (clock.perf_counter() - began) / ended * (len(jobs) - ended)
+    for outcome in execute([jobs[same[0]] for same in alike.values()]):
+        ended += 1
+        for cell in alike[outcome.job.folder]:
+            if outcome.failure:
+                matrix.missing[cell] = outcome.failure
+                matrix.failed += 1
+            else:
+                matrix.done[cell] = Path(outcome.job.folder)
+        left = (clock.perf_counter() - began) / ended * (len(alike) - ended)
         result = f"failed: {outcome.failure}" if outcome.failure else f"done in {outcome.seconds:.0f} s"
-        say(f"[{ended}/{len(jobs)}] {outcome.job.name}: {result}; about {left / 60:.0f} min left")
+        say(f"[{ended}/{len(alike)}] {outcome.job.name}: {result}; about {left / 60:.0f} min left")
     return matrix
 
 
@@ -95,7 +100,7 @@ def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -
         config = to_dict(spec.config(cell.method, cell.sequence, cell.budget, cell.seed))
         facts = [config, fingerprints[cell.sequence], spec.networks, SCORES_VERSION]
         key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
-        folder = (matrix.out / "cells" / cell.name).absolute()
+        folder = (matrix.out / "cells" / key[:KEY_DIGITS]).absolute()
         if finished(folder, key):
             matrix.done[cell] = folder
             continue

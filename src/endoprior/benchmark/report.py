@@ -17,14 +17,14 @@ from .statistics import ABSOLUTE, IN_DB, MIN_PAIRS, Difference
 from .tables import LABELS, csv_lines, latex, markdown, score_table
 
 
-def write_report(matrix: Matrix) -> Path:
-    """Write tables, differences, claims and figures of what is done; names what is not.
+def write_report(matrix: Matrix, out: Path) -> Path:
+    """Write tables, differences, claims and figures of what is done into `out`; names what is not.
 
     Returns:
         Path of `results.md`.
     """
-    results, out = Results.of(matrix), matrix.out
-    figures = _figures(matrix, results)
+    results = Results.of(matrix)
+    figures = _figures(matrix, results, out / "figures")
     tables = [score_table(results, name) for name in matrix.spec.sequences if name in matrix.data]
     _write(out / "results.tex", "\n\n".join(latex(table) for table in tables) + "\n")
     _write(out / "results.csv", csv_lines(results))
@@ -126,11 +126,11 @@ def sentence(results: Results, claim: ClaimSpec) -> str:
     return f"{ours} and {theirs} differ in {score} by no more than {by}{at}"
 
 
-def _figures(matrix: Matrix, results: Results) -> list[Path]:
+def _figures(matrix: Matrix, results: Results, folder: Path) -> list[Path]:
     from .pictures import write_pictures
     from .plots import budget_figure, curve_figure
 
-    kinds, folder = set(matrix.spec.figures), matrix.out / "figures"
+    kinds = set(matrix.spec.figures)
     if not matrix.done:
         return []
     written = []
@@ -151,7 +151,8 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
     """All that is in the tables, for programs."""
     spec = matrix.spec
     cells = [
-        {"sequence": c.sequence, "method": c.method, "budget": c.budget, "seed": c.seed} | scores_of(folder)
+        {"sequence": c.sequence, "method": c.method, "budget": c.budget, "seed": c.seed, "folder": folder.name}
+        | scores_of(folder)
         for c, folder in matrix.done.items()
     ]
     claims = []
@@ -170,7 +171,7 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
     ]
     missing = {cell.name: reason for cell, reason in matrix.missing.items()}
     return {
-        "title": spec.title,
+        "spec": to_dict(spec) | {"folder": None},
         "commit": source_commit(),
         "cells": cells,
         "differences": differences,

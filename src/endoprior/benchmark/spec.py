@@ -22,6 +22,8 @@ from ..presets import PresetName, preset
 Expectation = Literal["better", "no worse", "no effect"]
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 """Names of methods and sequences become folders."""
+FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
+"""A value such as `x0.75` multiplies what the preset and the settings before it say."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class MethodSpec:
 
     preset: str = "default"
     set: dict[str, Any] = field(default_factory=dict)
-    """Config fields by dotted name, on top of the benchmark's own `set`."""
+    """Config fields by dotted name, on top of the benchmark's own `set` and `set_for`."""
     label: str = ""
     """Name in tables; the method's own if empty."""
 
@@ -82,6 +84,8 @@ class Spec:
     seeds: tuple[int, ...] = (0,)
     set: dict[str, Any] = field(default_factory=dict)
     """Config fields by dotted name, for all methods."""
+    set_for: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """The same for all methods of a preset; a method's own `set` comes last."""
     scores: tuple[str, ...] = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis", "num_gaussians")
     """Columns of the tables."""
     claims: tuple[ClaimSpec, ...] = ()
@@ -110,7 +114,11 @@ class Spec:
         """
         chosen, data = self.methods[method], self.sequences[sequence]
         values = to_dict(preset(chosen.preset))
-        for where, overrides in (("set", self.set), (f"methods.{method}.set", chosen.set)):
+        for where, overrides in (
+            ("set", self.set),
+            (f"set_for.{chosen.preset}", self.set_for.get(chosen.preset, {})),
+            (f"methods.{method}.set", chosen.set),
+        ):
             for name, value in overrides.items():
                 _override(values, name, value, where)
         values["data"] |= {"shrink": data.shrink, "first_frames": data.first_frames}
@@ -127,6 +135,8 @@ def _override(values: dict[str, Any], name: str, value: Any, where: str) -> None
             break
     if not isinstance(values, dict) or last not in values or isinstance(values[last], dict):
         raise InputError(f"{where}: expected the dotted name of a config field; got {name}. See `endoprior train -h`.")
+    if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(values[last]) in (int, float):
+        value = type(values[last])(values[last] * float(factor[1]))
     values[last] = value
 
 
@@ -139,18 +149,10 @@ def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
     Raises:
         InputError: naming the file and the field, what was expected and what was found.
     """
-    readers = {".yaml": yaml.safe_load, ".yml": yaml.safe_load, ".toml": tomllib.loads}
-    if path.suffix not in readers:
-        raise InputError(f"{path}: expected a .yaml or .toml file; got {path.suffix or 'no suffix'}. Rename it.")
-    try:
-        values = readers[path.suffix](path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable file; got {error.strerror}. Correct the path.") from None
-    except (yaml.YAMLError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected valid {path.suffix[1:]}; {error}. Correct it.") from None
+    values = _read(path)
     try:
         for name in ("title", "sequences", "methods"):
-            if not isinstance(values, dict) or not values.get(name):
+            if not values.get(name):
                 raise InputError(f"{name}: expected an entry; found none. Add it.")
         spec = replace(from_dict(Spec, values, "spec"), folder=str(path.parent))
         for name, folder in (data or {}).items():
@@ -164,6 +166,33 @@ def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
     return spec
 
 
+def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Entries of a file over those of the files it `extends`: later ones win, `set` and `set_for` are merged.
+
+    Raises:
+        InputError: a file cannot be read, or extends itself.
+    """
+    readers = {".yaml": yaml.safe_load, ".yml": yaml.safe_load, ".toml": tomllib.loads}
+    if path.suffix not in readers:
+        raise InputError(f"{path}: expected a .yaml or .toml file; got {path.suffix or 'no suffix'}. Rename it.")
+    if path.resolve() in chain:
+        raise InputError(f"{path}: expected to end somewhere; it extends itself. Remove one `extends`.")
+    try:
+        values = readers[path.suffix](path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable file; got {error.strerror}. Correct the path.") from None
+    except (yaml.YAMLError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected valid {path.suffix[1:]}; {error}. Correct it.") from None
+    extends = values.pop("extends", []) if isinstance(values, dict) else None
+    if not isinstance(extends, list) or not all(isinstance(name, str) for name in extends):
+        raise InputError(f"{path}: expected named entries, `extends` a list of files; got something else. Correct it.")
+    merged: dict[str, Any] = {}
+    for part in [*(_read(path.parent / name, (*chain, path.resolve())) for name in extends), values]:
+        both = {k for k in ("set", "set_for") if isinstance(merged.get(k), dict) and isinstance(part.get(k), dict)}
+        merged |= {key: merged[key] | value if key in both else value for key, value in part.items()}
+    return merged
+
+
 def _check(spec: Spec) -> None:
     for kind, names in (("sequences", spec.sequences), ("methods", spec.methods)):
         for name in names:
@@ -174,6 +203,9 @@ def _check(spec: Spec) -> None:
             raise InputError(f"sequences.{name}: expected either path or phantom; got both or none. Keep one.")
         if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
             raise InputError(f"sequences.{name}: a phantom is written at its size; remove shrink and first_frames.")
+    for name in spec.set_for:
+        if name not in PresetName.__args__:
+            raise InputError(f"set_for: expected one of {', '.join(PresetName.__args__)}; got {name!r}. Choose one.")
     for name, method in spec.methods.items():
         if method.preset not in PresetName.__args__:
             choice = ", ".join(PresetName.__args__)
@@ -199,7 +231,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Folder below `cells/`, unique in the matrix."""
+        """Unique in the matrix."""
         budget = "" if self.budget is None else f"@{self.budget}"
         return f"{self.sequence}/{self.method}{budget}/seed{self.seed}"
 

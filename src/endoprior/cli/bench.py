@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +20,9 @@ class Bench:
     """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
 
     spec: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="SPEC")]]
-    """What to compare: a .yaml or .toml file; bench/specs/ has those of the paper's tables."""
+    """What to compare: a .yaml or .toml file, or a folder of them; bench/specs/ has those of the paper's tables."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
-    """Folder for cells, tables and figures."""
+    """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0
     """Cores to use in all; 0 takes those of this machine."""
     threads: int = 1
@@ -52,7 +51,8 @@ def run(argv: list[str]) -> int:
         raise InputError("--threads, --cores: expected at least 1 thread and no negative cores. Correct them.")
     if args.weights_dir and not args.weights_dir.is_dir():
         raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
-    spec = load_spec(args.spec, _folders(args.data))
+    specs = _specs(args.spec)
+    loaded = {path: load_spec(path, _folders(args.data)) for path in specs}
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -64,8 +64,8 @@ def run(argv: list[str]) -> int:
         raise InputError(
             f"{args.out}: expected a folder of our own; another benchmark is running there. Wait."
         ) from None
+    failed = 0
     with lock:
-        shutil.copyfile(args.spec, args.out / f"spec{args.spec.suffix}")
         if args.report_only:
             executor = nullcontext(None)
         elif args.ray:
@@ -73,10 +73,26 @@ def run(argv: list[str]) -> int:
         else:
             executor = local_executor(max(1, (args.cores or len(os.sched_getaffinity(0))) // args.threads))
         with executor as execute:
-            matrix = run_matrix(spec, args.out, execute, threads=args.threads, weights_dir=args.weights_dir, say=say)
-        report = write_report(matrix)
-    say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\n{report}")
-    return 1 if matrix.failed else 0
+            for path, spec in loaded.items():
+                folder = args.out / path.stem if args.spec.is_dir() else args.out
+                say(f"{path}: {spec.title}")
+                matrix = run_matrix(
+                    spec, args.out, execute, threads=args.threads, weights_dir=args.weights_dir, say=say
+                )
+                report = write_report(matrix, folder)
+                failed += matrix.failed
+                say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\n{report}")
+    return 1 if failed else 0
+
+
+def _specs(path: Path) -> list[Path]:
+    """The spec, or those of a folder in the order of their names."""
+    if not path.is_dir():
+        return [path]
+    found = sorted(file for file in path.iterdir() if file.suffix in (".yaml", ".yml", ".toml"))
+    if not found:
+        raise InputError(f"{path}: expected .yaml or .toml files; got none. Pass a folder of specs.")
+    return found
 
 
 def _folders(data: tuple[str, ...]) -> dict[str, Path]:
