@@ -41,28 +41,6 @@ def scenes_of(matrix: Matrix, sequence: str) -> dict[str, Scene]:
     return {spec.label(m): load_scene(folder / "run") for m, folder in folders.items() if folder}
 
 
-def write_pictures(matrix: Matrix, folder: Path, kinds: set[str]) -> list[Path]:
-    """Draw the asked-for `kinds` (frames, instability, prior) of every sequence into `folder`; returns the files."""
-    makers: dict[str, Callable[[Sequence, dict[str, Scene]], NDArray[np.uint8]]] = {
-        "frames": frames_picture,
-        "instability": instability_picture,
-        "prior": prior_picture,
-    }
-    written = []
-    for name, data in matrix.data.items():
-        scenes = scenes_of(matrix, name)
-        if not scenes:
-            continue
-        spec = matrix.spec.sequences[name]
-        sequence = load_sequence(data, DataConfig(shrink=spec.shrink, first_frames=spec.first_frames))
-        for kind in makers:
-            if kind in kinds:
-                path = folder / f"{kind}-{name}.png"
-                write_png(path, makers[kind](sequence, scenes))
-                written.append(path)
-    return written
-
-
 def frames_picture(sequence: Sequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
     """The middle held-out frame and its zooms into highlight, dark and boundary; columns: input and each method."""
     test = sequence.frames("test")
@@ -161,3 +139,24 @@ def center_density(scene: Scene, frame: Frame) -> NDArray[np.float32]:
 def _labeled(picture: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
     factor = -(-TILE_WIDTH_PX // picture.shape[1])
     return label(cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST), text)
+
+
+PICTURES: dict[str, Callable[[Sequence, dict[str, Scene]], NDArray[np.uint8]]] = {
+    "frames": frames_picture,
+    "instability": instability_picture,
+    "prior": prior_picture,
+}
+"""Maker of each kind of picture."""
+
+
+def write_pictures(matrix: Matrix, folder: Path, kinds: set[str]) -> None:
+    """Draw the asked-for `kinds` (frames, instability, prior) of every sequence into `folder`."""
+    for name, data in matrix.data.items():
+        scenes = scenes_of(matrix, name)
+        if not scenes:
+            continue
+        spec = matrix.spec.sequences[name]
+        sequence = load_sequence(data, DataConfig(shrink=spec.shrink, first_frames=spec.first_frames))
+        for kind, make in PICTURES.items():
+            if kind in kinds:
+                write_png(folder / f"{kind}-{name}.png", make(sequence, scenes))

@@ -11,6 +11,8 @@ from ..atomic import whole_file, write_json
 from ..config_io import to_dict
 from ..run_folder import source_commit
 from .matrix import Matrix, scores_of
+from .pictures import PICTURES, write_pictures
+from .plots import budget_figure, curve_figure
 from .results import Results
 from .spec import ClaimSpec
 from .statistics import ABSOLUTE, IN_DB, MIN_PAIRS, Difference
@@ -24,14 +26,37 @@ def write_report(matrix: Matrix, out: Path) -> Path:
         Path of `results.md`.
     """
     results = Results.of(matrix)
-    figures = _figures(matrix, results, out / "figures")
+    _figures(matrix, results, out / "figures")
     tables = [score_table(results, name) for name in matrix.spec.sequences if name in matrix.data]
     _write(out / "results.tex", "\n\n".join(latex(table) for table in tables) + "\n")
     _write(out / "results.csv", csv_lines(results))
     write_json(out / "results.json", _facts(matrix, results))
-    text = "\n\n".join([*_head(matrix), *_tables(matrix, results), *_claims(results), *_pictures(figures, out)])
-    _write(out / "results.md", text + "\n")
+    _write(out / "results.md", "\n\n".join([*_body(matrix, results, out, out, 1), *_protocol([matrix], 2)]) + "\n")
     return out / "results.md"
+
+
+def write_overview(reports: dict[Path, Matrix], out: Path) -> Path:
+    """Put the reports of several specs into one `results.md` in `out`.
+
+    Args:
+        reports: matrix by the folder that `write_report` wrote, below `out`.
+    """
+    blocks = ["# Results"]
+    for folder, matrix in reports.items():
+        blocks += _body(matrix, Results.of(matrix), folder, out, 2)
+    _write(out / "results.md", "\n\n".join([*blocks, *_protocol(list(reports.values()), 2)]) + "\n")
+    return out / "results.md"
+
+
+def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int) -> list[str]:
+    """All blocks of one spec, its title at heading `level`; pictures in `folder` are linked from `base`."""
+    below = "#" * (level + 1)
+    return [
+        *_head(matrix, "#" * level),
+        *_tables(matrix, results, below),
+        *_claims(results, below),
+        *_pictures(matrix, folder, base, below),
+    ]
 
 
 def _write(path: Path, text: str) -> None:
@@ -39,31 +64,37 @@ def _write(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _head(matrix: Matrix) -> list[str]:
+def _head(matrix: Matrix, mark: str) -> list[str]:
     spec = matrix.spec
     size = f"{len(spec.methods)} methods x {len(spec.sequences)} sequences"
     size += f" x {len(spec.budgets)} budgets" if spec.budgets else ""
     seeds = ", ".join(map(str, spec.seeds))
-    lines = [f"# {spec.title}"]
+    lines = [f"{mark} {spec.title}"]
     if spec.about:
         lines.append(spec.about.strip())
     lines.append(f"{size}, seeds {seeds}; commit {source_commit() or 'unknown'}. Mean ± standard deviation over seeds.")
     if matrix.missing:
         missing = "\n".join(f"- `{cell.name}`: {reason}" for cell, reason in matrix.missing.items())
         lines.append(f"No result for {len(matrix.missing)} cells:\n\n{missing}")
-    if matrix.done:
-        protocol = scores_of(next(iter(matrix.done.values())))["protocol"]
-        shown = {k: v for k, v in protocol.items() if k not in ("frames", "data_fingerprint", "shrink")}
-        lines.append("Protocol:\n\n" + "\n".join(f"- {name}: {value}" for name, value in shown.items()))
     return lines
 
 
-def _tables(matrix: Matrix, results: Results) -> list[str]:
+def _protocol(matrices: list[Matrix], level: int) -> list[str]:
+    """What the scores mean, from the first finished cell."""
+    folders = [folder for matrix in matrices for folder in matrix.done.values()]
+    if not folders:
+        return []
+    hidden = ("frames", "data_fingerprint", "shrink")
+    shown = {name: text for name, text in scores_of(folders[0])["protocol"].items() if name not in hidden}
+    return [f"{'#' * level} Protocol", "\n".join(f"- `{name}`: {text}" for name, text in shown.items())]
+
+
+def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
     spec, blocks = matrix.spec, []
     for name in spec.sequences:
         if name not in matrix.data:
             continue
-        blocks += [f"## {name}", "Best in bold, second best underlined.", markdown(score_table(results, name))]
+        blocks += [f"{mark} {name}", "Best in bold, second best underlined.", markdown(score_table(results, name))]
         others = [method for method in spec.methods if method != spec.reference]
         rows = []
         for method in others:
@@ -92,7 +123,7 @@ def _amount(score: str, by: float) -> str:
     return f"{by:g} dB" if score in IN_DB else f"{by:g}" if score in ABSOLUTE else f"{100 * by:g} %"
 
 
-def _claims(results: Results) -> list[str]:
+def _claims(results: Results, mark: str) -> list[str]:
     if not results.spec.claims:
         return []
     lines = []
@@ -111,7 +142,7 @@ def _claims(results: Results) -> list[str]:
             f"{found.count} pairs{detail}."
         )
     note = f"A claim holds, or does not, if the whole interval says so; fewer than {MIN_PAIRS} pairs tell nothing."
-    return ["## Claims", "\n".join(lines), note]
+    return [f"{mark} Claims", "\n".join(lines), note]
 
 
 def sentence(results: Results, claim: ClaimSpec) -> str:
@@ -126,25 +157,22 @@ def sentence(results: Results, claim: ClaimSpec) -> str:
     return f"{ours} and {theirs} differ in {score} by no more than {by}{at}"
 
 
-def _figures(matrix: Matrix, results: Results, folder: Path) -> list[Path]:
-    from .pictures import write_pictures
-    from .plots import budget_figure, curve_figure
-
+def _figures(matrix: Matrix, results: Results, folder: Path) -> None:
     kinds = set(matrix.spec.figures)
     if not matrix.done:
-        return []
-    written = []
+        return
     if "budgets" in kinds:
         budget_figure(results, folder / "budgets.png")
-        written.append(folder / "budgets.png")
     if "curves" in kinds:
         curve_figure(results, matrix, folder / "curves.png")
-        written.append(folder / "curves.png")
-    return written + write_pictures(matrix, folder, kinds)
+    write_pictures(matrix, folder, kinds)
 
 
-def _pictures(figures: list[Path], out: Path) -> list[str]:
-    return ["## Figures", *(f"![{f.stem}]({f.relative_to(out)})" for f in figures)] if figures else []
+def _pictures(matrix: Matrix, folder: Path, base: Path, mark: str) -> list[str]:
+    names = ["budgets", "curves", *(f"{kind}-{name}" for name in matrix.data for kind in PICTURES)]
+    drawn = [folder / "figures" / f"{name}.png" for name in names if name.split("-")[0] in matrix.spec.figures]
+    found = [path for path in drawn if path.exists()]
+    return [f"{mark} Figures", *(f"![{f.stem}]({f.relative_to(base).as_posix()})" for f in found)] if found else []
 
 
 def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:

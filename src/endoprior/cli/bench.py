@@ -44,7 +44,7 @@ def run(argv: list[str]) -> int:
 
     from ..benchmark.execute import local_executor, ray_executor
     from ..benchmark.matrix import run_matrix
-    from ..benchmark.report import write_report
+    from ..benchmark.report import write_overview, write_report
     from ..benchmark.spec import load_spec
 
     if args.threads < 1 or args.cores < 0:
@@ -64,7 +64,7 @@ def run(argv: list[str]) -> int:
         raise InputError(
             f"{args.out}: expected a folder of our own; another benchmark is running there. Wait."
         ) from None
-    failed = 0
+    failed, reports = 0, {}
     with lock:
         if args.report_only:
             executor = nullcontext(None)
@@ -80,8 +80,10 @@ def run(argv: list[str]) -> int:
                     spec, args.out, execute, threads=args.threads, weights_dir=args.weights_dir, say=say
                 )
                 report = write_report(matrix, folder)
-                failed += matrix.failed
+                failed, reports[folder] = failed + matrix.failed, matrix
                 say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\n{report}")
+    if args.spec.is_dir():
+        say(str(write_overview(reports, args.out)))
     return 1 if failed else 0
 
 
