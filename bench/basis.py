@@ -19,7 +19,7 @@ MOMENT = 0.4
 
 def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     """Three rows for each number of Gaussians: forward, backward, update."""
-    cfg = preset("default")
+    cfg = preset("default").fitted(68)
     deformation, epsilon = cfg.deformation, cfg.optim.epsilon
     rates = motion_rates(cfg, 1, cfg.optim.decay_iterations)
     measured = []

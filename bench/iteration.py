@@ -89,7 +89,7 @@ def rows(name: str, sequence: Sequence, size: common.Size) -> list[common.Row]:
 
 def config(name: str, num: int) -> Config:
     """The preset with `num` Gaussians, every term active at once, and nothing that changes the number."""
-    cfg = preset(name)
+    cfg = preset(name).fitted(68)
     return replace(
         cfg,
         init=replace(cfg.init, budget=num),

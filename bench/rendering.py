@@ -35,7 +35,7 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     """For each preset and size one row for the whole, then one for each part; last, frames kept for playing."""
     measured = []
     for name in PRESETS:
-        cfg, field = preset(name), None
+        cfg, field = preset(name).fitted(68), None
         for size in sizes:
             splats, camera = scenes.splats(size)
             if cfg.deformation.kind == "hexplane" and field is None:  # the volume is the same at all sizes
@@ -60,7 +60,7 @@ def make_scene(splats: Splats, camera: Camera, cfg: Config, field: HexPlaneField
 def kept_rows(size: common.Size) -> list[common.Row]:
     """One row: a frame that was deformed before. What deformed it does not matter."""
     splats, camera = scenes.splats(size)
-    playback, background = Playback(make_scene(splats, camera, preset("default"), None)), torch.zeros(3)
+    playback, background = Playback(make_scene(splats, camera, preset("default").fitted(68), None)), torch.zeros(3)
 
     @torch.no_grad()
     def draw(_: object) -> RenderOutput:

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from endoprior.checks import InputError
-from endoprior.config import Config, DensityConfig, HexPlaneConfig
+from endoprior.config import BasisConfig, Config, DensityConfig, HexPlaneConfig
 from endoprior.config_io import from_dict, to_dict
+from endoprior.model.basis import identity_motion
 from endoprior.presets import preset
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
@@ -73,3 +74,14 @@ def test_baseline_knows_no_prior():
 def test_only_tuples_lists_and_plain_values_are_configured():
     assert to_dict(HexPlaneConfig())["multires"] == [1, 2, 4, 8]
     assert to_dict(DensityConfig())["prior_prune"] is True
+
+
+def test_bumps_follow_the_length_of_the_sequence():
+    basis = BasisConfig(num_bases=0)
+    assert [basis.fitted(n).num_bases for n in (5, 24, 48, 63, 156)] == [4, 11, 22, 29, 71]
+    assert BasisConfig(num_bases=31).fitted(24).num_bases == 31
+    assert BasisConfig(num_bases=0, frames_per_basis=2.0).fitted(63).num_bases == 32
+    fitted = preset("default").fitted(48)
+    assert fitted.deformation.basis.num_bases == 22 and fitted.fitted(99) == fitted
+    with pytest.raises(ValueError, match=r"Config\.fitted"):
+        identity_motion(3, preset("default").deformation)

@@ -21,7 +21,7 @@ NUM_FRAMES = 5
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A hundred Gaussians that move at random, seen by five cameras."""
-    cfg: Config = preset("default")
+    cfg: Config = preset("default").fitted(20)
     rng = np.random.default_rng(0)
     points = rng.uniform([-15, -12, 50], [15, 12, 60], (100, 3)).astype(np.float32)
     gaussians = create_gaussians(points, rng.random((100, 3), np.float32), np.zeros(100, np.float32), cfg)

@@ -192,6 +192,7 @@ def test_training_starts_along_the_tracks(tmp_path):
     cfg = preset("default")
     trainer = Trainer(sequence, replace(cfg, init=replace(cfg.init, budget=300)))
     trainer.start()
+    cfg = trainer.cfg
     motion = trainer.state.gaussians["motion"].detach()
     assert motion[..., :3].abs().amax() > 0.3  # mm; the plane slides by 3 mm
     assert not motion[..., 3:].any()

@@ -6,7 +6,7 @@ import this module; it imports nothing of ours but `checks`. "mm" below means th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from .checks import InputError, check_range
@@ -146,14 +146,23 @@ class BasisConfig:
     """One coefficient per Gaussian, temporal basis function and channel: a linear map, no network."""
 
     num_bases: int = 31
-    """B: Gaussian bumps over time, centered evenly on [0, 1]."""
+    """B: Gaussian bumps over time, centered evenly on [0, 1]; 0 takes one for every `frames_per_basis` frames."""
+    frames_per_basis: float = 2.2
+    """Frames of the sequence for each bump, where `num_bases` is 0; there are never fewer than 4 bumps."""
     relative_width: float = 1.2
     """Standard deviation of a bump in units of 1 / B."""
     deform_color: bool = True
     """Also let the view-independent color change with time."""
 
     def __post_init__(self) -> None:
-        check_range("num_bases", self.num_bases, 2, 1000)
+        if self.num_bases != 0:
+            check_range("num_bases", self.num_bases, 2, 1000)
+        check_range("frames_per_basis", self.frames_per_basis, 0.5, 1000)
+
+    def fitted(self, num_frames: int) -> BasisConfig:
+        """The same with a number of bumps, chosen for a sequence of `num_frames` if there is none yet."""
+        chosen = min(max(round(num_frames / self.frames_per_basis), 4), 1000)
+        return self if self.num_bases else replace(self, num_bases=chosen)
 
 
 @dataclass(frozen=True)
@@ -360,3 +369,7 @@ class Config:
                 f"init.motion: expected rest with deformation.kind {self.deformation.kind}; got flow, which only the "
                 "temporal basis can start from. Set --init.motion rest."
             )
+
+    def fitted(self, num_frames: int) -> Config:
+        """The config with what it leaves to the length of the sequence filled in."""
+        return replace(self, deformation=replace(self.deformation, basis=self.deformation.basis.fitted(num_frames)))

@@ -84,7 +84,7 @@ def default() -> Config:
     return replace(
         base,
         init=replace(base.init, budget=30_000, motion="flow", opacity=0.3, variance_factor=0.4),
-        deformation=replace(base.deformation, kind="basis"),
+        deformation=replace(base.deformation, kind="basis", basis=replace(base.deformation.basis, num_bases=0)),
         render=replace(base.render, depth_grad_to_means=True),
         loss=replace(base.loss, depth_weight=3.0),
         temporal=replace(

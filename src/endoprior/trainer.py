@@ -38,7 +38,7 @@ class Trainer:
     """One training run; `steps` advances it, `scene` is its result so far."""
 
     def __init__(self, sequence: Sequence, cfg: Config) -> None:
-        self.sequence, self.cfg = sequence, cfg
+        self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
         self.frames = TrainingFrames(sequence, cfg.prior)
         self.rasterize = render.load(cfg.render.backend)
         self.background = torch.zeros(3)

@@ -43,7 +43,13 @@ def motion_layout(cfg: DeformationConfig) -> dict[str, slice]:
 
 
 def identity_motion(num: int, cfg: DeformationConfig) -> Tensor:
-    """Zero coefficients (num, B, channels) float32: Gaussians that stand still."""
+    """Zero coefficients (num, B, channels) float32: Gaussians that stand still.
+
+    Raises:
+        ValueError: the config leaves B to the length of a sequence.
+    """
+    if cfg.basis.num_bases == 0:
+        raise ValueError("num_bases must be known; got 0. Use `Config.fitted(num_frames)` first.")
     return torch.zeros(num, cfg.basis.num_bases, max(part.stop for part in motion_layout(cfg).values()))
 
 
