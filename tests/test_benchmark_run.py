@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -212,7 +212,7 @@ def test_bad_options_are_named(tmp_path, capsys, options, said):
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed")
 def test_ray_runs_the_same_cells(finished, tmp_path):
     write_tiny_sequence(tmp_path / "tiny")
     spec = write_spec(tmp_path, sequences={"tiny": {"path": "tiny"}}, methods={"a": METHODS["a"]}, seeds=[0], claims=[])
@@ -240,3 +240,14 @@ def test_a_folder_of_specs_shares_equal_cells(tmp_path, capsys):
     assert text.startswith("# Results\n\n## Tiny") and text.count("## Tiny") == 2 and text.count("## Protocol") == 1
     assert main(["bench", str(tmp_path / "tiny"), str(tmp_path / "out")]) == 2
     assert "got none. Pass a folder of specs" in capsys.readouterr().err
+
+
+def test_the_overview_can_be_published(finished, tmp_path):
+    spec = importlib.util.spec_from_file_location("publish", Path(__file__).parents[1] / "bench" / "publish.py")
+    publish = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(publish)
+    publish.publish(finished[1], tmp_path)
+    text = (tmp_path / "results.md").read_text()
+    links = publish.FIGURE.findall(text)
+    assert len(links) == 5
+    assert all(cv2.imread(str(tmp_path / link)) is not None for _, link in links)
