@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 
+from endoprior.benchmark.report import change
 from endoprior.benchmark.results import Results
 from endoprior.benchmark.spec import Cell, ClaimSpec, MethodSpec, SequenceSpec, Spec
 from endoprior.benchmark.statistics import Difference, difference, gains, summary, verdict
@@ -26,6 +27,17 @@ def test_gains_are_positive_where_better():
     np.testing.assert_allclose(gains("psnr", [33.0], [30.0]), [3.0])
     np.testing.assert_allclose(gains("flow_error_dis", [0.5], [1.0]), [0.5])
     np.testing.assert_allclose(gains("depth_rmse_mm", [3.0], [2.0]), [-0.5])
+    np.testing.assert_allclose(gains("track_tear_rate", [0.25], [0.0]), [-0.25])
+    np.testing.assert_allclose(gains("num_large_scale", [0.0], [5.0]), [5.0])
+
+
+def test_changes_in_words():
+    found = Difference(0.031, 0.01, 0.052, 3)
+    assert change("flow_error_dis", found) == "+3.1 % [+1.0, +5.2]"
+    assert change("psnr", found) == "+0.03 dB [+0.01, +0.05]"
+    assert change("ssim", found) == "+0.0310 [+0.0100, +0.0520]"
+    assert change("num_large_scale", Difference(-4.0, math.nan, math.nan, 1)) == "-4"
+    assert change("psnr", Difference(math.nan, math.nan, math.nan, 0)) == "-"
 
 
 def test_interval_of_two_pairs_are_the_pairs():

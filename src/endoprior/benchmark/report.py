@@ -15,7 +15,7 @@ from .pictures import PICTURES, write_pictures
 from .plots import budget_figure, curve_figure
 from .results import Results
 from .spec import ClaimSpec
-from .statistics import ABSOLUTE, IN_DB, MIN_PAIRS, Difference
+from .statistics import ABSOLUTE, IN_DB, MIN_PAIRS, RARE, Difference
 from .tables import LABELS, csv_lines, latex, markdown, score_table
 
 
@@ -96,13 +96,11 @@ def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
             continue
         blocks += [f"{mark} {name}", "Best in bold, second best underlined.", markdown(score_table(results, name))]
         others = [method for method in spec.methods if method != spec.reference]
-        rows = []
-        for method in others:
-            found = [results.difference(score, method, spec.reference, name) for score in spec.scores]
-            if any(f.count for f in found):
-                rows.append([spec.label(method), *map(change, spec.scores, found)])
-        if rows:
-            lines = [["method", *(LABELS.get(s, s) for s in spec.scores)], ["---"] * (len(spec.scores) + 1), *rows]
+        found = {s: [results.difference(s, method, spec.reference, name) for method in others] for s in spec.scores}
+        known = [score for score in spec.scores if any(f.count for f in found[score])]
+        rows = [[spec.label(m), *(change(s, found[s][i]) for s in known)] for i, m in enumerate(others)]
+        if known:
+            lines = [["method", *(LABELS.get(s, s) for s in known)], ["---"] * (len(known) + 1), *rows]
             table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
             than = spec.label(spec.reference)
             about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over seeds]:"
@@ -114,7 +112,12 @@ def change(score: str, found: Difference) -> str:
     """`+3.1 % [+1.0, +5.2]` or `+0.31 dB [+0.10, +0.52]`; a dash where there is nothing to compare."""
     if not found.count:
         return "-"
-    factor, digits, unit = (1, 2, " dB") if score in IN_DB else (1, 4, "") if score in ABSOLUTE else (100, 1, " %")
+    if score in IN_DB:
+        factor, digits, unit = 1, 2, " dB"
+    elif score in ABSOLUTE:
+        factor, digits, unit = 1, 0 if score in RARE else 4, ""
+    else:
+        factor, digits, unit = 100, 1, " %"
     mean, low, high = (f"{factor * value:+.{digits}f}" for value in (found.mean, found.low, found.high))
     return f"{mean}{unit} [{low}, {high}]" if math.isfinite(found.low) else mean + unit
 

@@ -15,9 +15,12 @@ from numpy.typing import ArrayLike
 Verdict = Literal["holds", "does not hold", "cannot be told"]
 
 IN_DB = frozenset({"psnr", "psnr_tissue", "psnr_behind_tool", "strict_psnr"})
-ABSOLUTE = IN_DB | {"ssim", "strict_ssim"}
+RATES = frozenset({"ssim", "strict_ssim", "track_fold_rate", "track_tear_rate"})
+RARE = frozenset({"num_low_prior", "num_low_opacity", "num_large_scale"})
+"""Counts that may well be 0."""
+ABSOLUTE = IN_DB | RATES | RARE
 """Scores whose differences mean something as they are; of all others they are relative."""
-HIGHER_IS_BETTER = ABSOLUTE | {"fps", "fps_cached", "iterations_per_second"}
+HIGHER_IS_BETTER = IN_DB | {"ssim", "strict_ssim", "fps", "fps_cached", "iterations_per_second"}
 """Every other score is an error, a count or a time."""
 
 CONFIDENCE = 0.95
