@@ -71,7 +71,7 @@ def run(argv: list[str]) -> int:
         elif args.ray:
             executor = ray_executor(args.ray, args.threads)
         else:
-            executor = local_executor(max(1, (args.cores or len(os.sched_getaffinity(0))) // args.threads))
+            executor = local_executor(max(1, (args.cores or _cores()) // args.threads))
         with executor as execute:
             for path, spec in loaded.items():
                 folder = args.out / path.stem if args.spec.is_dir() else args.out
@@ -85,6 +85,11 @@ def run(argv: list[str]) -> int:
     if args.spec.is_dir():
         say(str(write_overview(reports, args.out)))
     return 1 if failed else 0
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _specs(path: Path) -> list[Path]:
