@@ -99,10 +99,13 @@ def test_a_changed_method_runs_again_and_the_others_do_not(finished):
     assert len(set(after) - set(before)) == 3 and before.items() <= after.items()
 
 
-def test_report_only_trains_nothing(tmp_path):
+def test_report_only_trains_nothing(tmp_path, monkeypatch):
     write_tiny_sequence(tmp_path / "tiny")
-    assert main(["bench", str(write_spec(tmp_path)), str(tmp_path / "out"), "--report-only"]) == 0
+    monkeypatch.delenv("NOWHERE", raising=False)
+    spec = write_spec(tmp_path, sequences={"tiny": {"path": "tiny"}, "unset": {"path": "$NOWHERE/clip"}})
+    assert main(["bench", str(spec), str(tmp_path / "out"), "--report-only"]) == 0
     text = (tmp_path / "out" / "results.md").read_text()
+    assert "expected NOWHERE to be set" in text
     assert "not run yet" in text and not list((tmp_path / "out").glob("cells/**/cell.json"))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -128,6 +129,10 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]
     from ..phantom import write_phantom
 
     folder, chosen = sequence_folder(spec, name, out), spec.sequences[name]
+    if unset := re.search(r"\$\{?(\w+)", str(folder)):
+        raise InputError(
+            f"{chosen.path}: expected {unset[1]} to be set; it is not. Set it, or use --data {name}=FOLDER."
+        )
     if chosen.phantom and write and not folder.is_dir():
         write_phantom(folder, chosen.phantom)
     data = DataConfig(shrink=chosen.shrink, first_frames=chosen.first_frames)

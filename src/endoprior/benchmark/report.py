@@ -18,6 +18,8 @@ from .spec import ClaimSpec
 from .statistics import ABSOLUTE, IN_DB, MIN_PAIRS, RARE, Difference
 from .tables import LABELS, csv_lines, latex, markdown, score_table
 
+SHOWN_NAMES = 6
+
 
 def write_report(matrix: Matrix, out: Path) -> Path:
     """Write tables, differences, claims and figures of what is done into `out`; names what is not.
@@ -74,9 +76,18 @@ def _head(matrix: Matrix, mark: str) -> list[str]:
         lines.append(spec.about.strip())
     lines.append(f"{size}, seeds {seeds}; commit {source_commit() or 'unknown'}. Mean ± standard deviation over seeds.")
     if matrix.missing:
-        missing = "\n".join(f"- `{cell.name}`: {reason}" for cell, reason in matrix.missing.items())
+        by_reason: dict[str, list[str]] = {}
+        for cell, reason in matrix.missing.items():
+            by_reason.setdefault(reason, []).append(f"`{cell.name}`")
+        missing = "\n".join(f"- {_some(names)}: {reason}" for reason, names in by_reason.items())
         lines.append(f"No result for {len(matrix.missing)} cells:\n\n{missing}")
     return lines
+
+
+def _some(names: list[str]) -> str:
+    """The first few names, and how many more there are."""
+    rest = len(names) - SHOWN_NAMES
+    return ", ".join(names[:SHOWN_NAMES]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def _protocol(matrices: list[Matrix], level: int) -> list[str]:
@@ -138,7 +149,7 @@ def _claims(results: Results, mark: str) -> list[str]:
                 alone, alone_said = results.judge(claim, name)
                 if alone.count:
                     parts.append(f"{name}: {alone_said}, {change(claim.score, alone)}")
-        detail = f" ({'; '.join(parts)})" if parts else ""
+        detail = f" ({'; '.join(parts)})" if len(parts) > 1 else ""
         source = f" [{claim.text}]" if claim.text else ""
         lines.append(
             f"- {sentence(results, claim)}{source}: **{said}**, {change(claim.score, found)}, "
