@@ -10,7 +10,7 @@ from torch import Tensor
 from endoprior.config import Config
 from endoprior.model.basis import identity_motion
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.morton import morton_order
+from endoprior.morton import morton_order
 from endoprior.types import Camera, Splats
 
 FOCAL_PER_WIDTH = 0.9

@@ -10,7 +10,7 @@ from endoprior import density
 from endoprior.config import Config, DensityConfig
 from endoprior.density import DensityStats, Plan
 from endoprior.model.gaussians import create_gaussians
-from endoprior.model.morton import morton_order
+from endoprior.morton import morton_order
 from endoprior.optim import Optimizer, split_children
 from endoprior.types import RenderOutput
 

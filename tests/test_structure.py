@@ -11,7 +11,8 @@ SRC = Path(__file__).parents[1] / "src" / "endoprior"
 FILES = sorted(SRC.rglob("*.py"))
 
 LAYERS = [
-    {"checks", "types", "simd", "float64_lanes", "density_kernels"},
+    {"checks", "types", "lane_types", "morton", "density_kernels"},
+    {"simd", "float64_lanes"},
     {"config", "atomic", "adam_kernels", "neighbor_kernels", "temporal_kernels"},
     {"config_io", "presets", "arrays_file", "geometry"},
     {"data", "priors", "render", "losses", "loss_kernels", "temporal", "metrics"},

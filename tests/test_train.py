@@ -15,8 +15,8 @@ import torch
 from endoprior.checks import InputError
 from endoprior.config import Config
 from endoprior.data import load_sequence
-from endoprior.model.morton import morton_order
 from endoprior.model.scene import load_scene
+from endoprior.morton import morton_order
 from endoprior.optim import log_linear
 from endoprior.presets import preset
 from endoprior.train import train

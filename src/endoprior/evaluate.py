@@ -255,10 +255,10 @@ def frames_per_second(scene: Scene, *, cached: bool = False) -> float:
         cached: deform the frames beforehand and draw them from a `Playback`.
     """
     shown = min(len(scene.cameras), FPS_RENDERS)
-    playback = Playback(scene)
+    playback = Playback(scene) if cached else None
 
     def draw(i: int) -> None:
-        if cached:
+        if playback:
             playback.render(i % shown)
         else:
             scene.render(i % shown / len(scene.cameras))

@@ -24,6 +24,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from .float64_lanes import LANES, equal, larger, largest, less, load, pick, splat, store
+from .morton import curve_order
 
 MAX_COORDINATE = 1e150
 """mm; squares of larger ones overflow."""
@@ -31,8 +32,6 @@ MAX_COORDINATE = 1e150
 _BLOCK = 4 * LANES
 _GROUP = 7 * LANES
 _BLOCKS_PER_TASK = 32
-_LONG_RUN = 256  # points in one cell of the curve; all are compared with each other if it has no finer one
-_TINY = 1e-290  # smaller boxes get no curve: its scale would overflow
 
 
 def nearest(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -55,57 +54,6 @@ def nearest(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray[np.float
     indices, distances = np.empty((num, k), np.intp), np.empty((num, k))
     _search(num, blocks, boxes, level_start, indices, distances)
     return indices, distances
-
-
-def curve_order(points: NDArray) -> NDArray[np.int64]:
-    """Indices of the points along a Morton curve.
-
-    A cell of the curve can hold very many points if a few others are far away: it gets a finer curve of its own.
-    """
-    num = len(points)
-    index_bits = max((num - 1).bit_length(), 1)
-    keys = np.empty(num, np.int64)
-    _curve_keys(points, index_bits, (63 - index_bits) // 3, keys)
-    keys.sort()
-    order, cells = keys & ((1 << index_bits) - 1), keys >> index_bits
-    if num > _LONG_RUN and (cells[_LONG_RUN:] == cells[:-_LONG_RUN]).any():
-        ends = np.r_[0, np.flatnonzero(np.diff(cells)) + 1, num]
-        for i in np.flatnonzero(np.diff(ends) > _LONG_RUN):
-            run = order[ends[i] : ends[i + 1]]
-            crowd = points[run]
-            if np.ptp(crowd.astype(np.float64), axis=0).max() > _TINY:
-                run[:] = run[curve_order(crowd)]
-    return order
-
-
-@njit(cache=True, inline="always")
-def _spread(v):
-    # Bits of v, at most 21, moved to every third place.
-    v = (v | (v << 32)) & 0x1F00000000FFFF
-    v = (v | (v << 16)) & 0x1F0000FF0000FF
-    v = (v | (v << 8)) & 0x100F00F00F00F00F
-    v = (v | (v << 4)) & 0x10C30C30C30C30C3
-    return (v | (v << 2)) & 0x1249249249249249
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def _curve_keys(points, index_bits, axis_bits, keys):
-    # Writes cell << index_bits | index for each point; cells are cubes, 2^axis_bits along the longest side.
-    low, high = np.empty(3), np.empty(3)
-    for a in range(3):
-        low[a] = high[a] = np.float64(points[0, a])
-    for i in range(len(points)):
-        for a in range(3):
-            x = np.float64(points[i, a])
-            low[a], high[a] = min(low[a], x), max(high[a], x)
-    span = max(high[0] - low[0], high[1] - low[1], high[2] - low[2])
-    top = np.float64((1 << axis_bits) - 1)
-    scale = top / span if span > _TINY else 0.0
-    for i in prange(len(points)):
-        cell = 0
-        for a in range(3):
-            cell |= _spread(np.int64(min((np.float64(points[i, a]) - low[a]) * scale, top))) << a
-        keys[i] = (cell << index_bits) | i
 
 
 @njit(cache=True, inline="always")

@@ -16,8 +16,8 @@ from .geometry import quaternion_to_matrix
 from .model.basis import RankOneGradient, motion_layout
 from .model.deformation import HexPlaneField
 from .model.gaussians import Gaussians
-from .model.morton import morton_order
 from .model.plane_adam import PlaneAdam
+from .morton import morton_order
 
 BETA1, BETA2 = 0.9, 0.999
 

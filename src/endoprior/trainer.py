@@ -22,9 +22,9 @@ from .model.basis import motion_layout
 from .model.deformation import HexPlaneField, Offsets
 from .model.gaussians import Gaussians, create_gaussians
 from .model.initialize import initial_log_scales, initial_points
-from .model.morton import morton_order
 from .model.scene import Scene, offsets_at
 from .model.tracks import initial_motion
+from .morton import morton_order
 from .optim import Optimizer
 from .train_state import Stage, StepReport, TrainState
 from .training_frames import TrainingFrame, TrainingFrames

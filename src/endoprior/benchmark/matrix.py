@@ -139,6 +139,12 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]
     return folder, load_sequence(folder, data).fingerprint()
 
 
+def commits_of(matrix: Matrix) -> list[str]:
+    """Commits that the finished cells were trained at, sorted; "unknown" for a cell trained outside a checkout."""
+    found = {json.loads((folder / "run" / "config.json").read_text())["commit"] for folder in matrix.done.values()}
+    return sorted(commit or "unknown" for commit in found)
+
+
 def scores_of(folder: Path) -> dict[str, Any]:
     """`scores`, `skipped` and `protocol` of a finished cell."""
     return json.loads((folder / "metrics.json").read_text())

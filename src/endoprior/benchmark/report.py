@@ -9,8 +9,7 @@ from typing import Any
 
 from ..atomic import whole_file, write_json
 from ..config_io import to_dict
-from ..run_folder import source_commit
-from .matrix import Matrix, scores_of
+from .matrix import Matrix, commits_of, scores_of
 from .pictures import PICTURES, write_pictures
 from .plots import budget_figure, curve_figure
 from .results import Results
@@ -74,7 +73,8 @@ def _head(matrix: Matrix, mark: str) -> list[str]:
     lines = [f"{mark} {spec.title}"]
     if spec.about:
         lines.append(spec.about.strip())
-    lines.append(f"{size}, seeds {seeds}; commit {source_commit() or 'unknown'}. Mean ± standard deviation over seeds.")
+    commits = ", ".join(commits_of(matrix)) or "none yet"
+    lines.append(f"{size}, seeds {seeds}; trained at commit {commits}. Mean ± standard deviation over seeds.")
     if matrix.missing:
         by_reason: dict[str, list[str]] = {}
         for cell, reason in matrix.missing.items():
@@ -214,7 +214,7 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
     missing = {cell.name: reason for cell, reason in matrix.missing.items()}
     return {
         "spec": to_dict(spec) | {"folder": None},
-        "commit": source_commit(),
+        "commits": commits_of(matrix),
         "cells": cells,
         "differences": differences,
         "claims": claims,

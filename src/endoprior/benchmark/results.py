@@ -37,7 +37,7 @@ class Results:
     def gains(
         self, score: str, method: str, than: str, *, sequence: str | None = None, budget: int | None = None
     ) -> NDArray:
-        """(K,) paired relative differences over sequences, budgets and seeds, positive where `method` is better."""
+        """(K,) paired `statistics.gains` over sequences, budgets and seeds, positive where `method` is better."""
         pairs = [
             (self.value(Cell(name, method, size, seed), score), self.value(Cell(name, than, size, seed), score))
             for name in ([sequence] if sequence else self.spec.sequences)

@@ -11,7 +11,7 @@ from ..types import Camera, RenderOutput, Splats
 from .scene import Scene
 
 DEFAULT_MAX_BYTES = 1 << 30
-"""Memory that kept frames may take; about 4 MB a frame for 40,000 Gaussians with color of degree 1."""
+"""Memory that kept frames may take; about 2 MB a frame for 40,000 Gaussians of one color each."""
 
 
 class Playback:
