@@ -9,13 +9,14 @@ import torch
 
 from endoprior.cli import main
 from endoprior.data import load_sequence
+from endoprior.data.truth import Tracks
 from endoprior.evaluate import evaluate
 from endoprior.model.carry import carry_points
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.presets import preset
 from endoprior.train import train
 from endoprior.trainer import Trainer
-from endoprior.truth_scores import track_scores
+from endoprior.truth_scores import track_end_error_mm, track_scores
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +58,19 @@ def test_track_error_of_a_still_scene_is_how_far_the_tissue_moved(phantom):
     visible[first, columns] = False
     moved = np.linalg.norm(points - points[first, columns], axis=-1)[visible].mean()
     assert track_scores(still_scene(phantom), phantom)["track_error_mm"] == pytest.approx(moved, rel=1e-3)
+
+
+def test_unpaired_points_are_held_against_the_nearest_end(phantom, monkeypatch):
+    tracks, scene = phantom.truth.tracks, still_scene(phantom)
+    start, end = tracks.points[0, :6], tracks.points[0, :6] + np.float32([0, 0, 3])
+    points = np.zeros((len(phantom), 12, 3), np.float32)
+    visible = np.zeros(points.shape[:2], bool)
+    points[0, :6], points[-1, 6:], visible[0, :6], visible[-1, 6:] = start, end[::-1], True, True
+    unpaired = Tracks(points, visible, paired=False)
+    monkeypatch.setattr(type(phantom.truth), "tracks", property(lambda self: unpaired))
+    nearest = np.linalg.norm(start[:, None] - end, axis=-1).min(1).mean()
+    assert track_end_error_mm(scene, phantom) == pytest.approx(nearest, rel=1e-4)
+    assert np.isnan(track_scores(scene, phantom)["track_error_mm"])
 
 
 def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):

@@ -28,8 +28,16 @@ class DataConfig:
     """Read frames at this fraction of their width and height: 2 averages blocks of 2 x 2 pixels."""
     first_frames: int = 0
     """Read only so many frames from the start of the sequence; 0 reads all."""
+    format: Literal["auto", "scared", "c3vd", "stir", "stereomis", "hamlyn", "endonerf", "plain"] = "auto"
+    """Layout of the folder (docs/datasets.md); `auto` recognizes it."""
+    stride: int = 0
+    """Keep every n-th frame of the folder; 0 takes what is published for the dataset."""
+    depth_unit_mm: float = 0.0
+    """mm per unit of the stored depth; 0 takes what the folder or its format says."""
 
     def __post_init__(self) -> None:
+        check_range("stride", self.stride, 0, 10_000)
+        check_range("depth_unit_mm", self.depth_unit_mm, 0, 1e6)
         check_range("shrink", self.shrink, 1, 64)
         check_range("first_frames", self.first_frames, 0, 10_000_000)
         check_range("depth_clip_low_percentile", self.depth_clip_low_percentile, 0, 100)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +24,7 @@ from .data import Sequence
 from .metrics import ScoreUnavailable
 from .model.playback import Playback
 from .model.scene import Scene
-from .truth_scores import track_scores
+from .truth_scores import track_end_error_mm, track_scores
 from .types import Frame
 
 Split = Literal["train", "test", "video"]
@@ -112,10 +112,17 @@ def evaluate(
 
 def scored_data(trained: DataConfig) -> DataConfig:
     """How frames are read to score a scene: those it was trained on, depth as it was measured."""
-    return DataConfig(use_gt_masks=trained.use_gt_masks, shrink=trained.shrink, first_frames=trained.first_frames)
+    usual = DataConfig()
+    return replace(
+        trained,
+        depth_clip_low_percentile=usual.depth_clip_low_percentile,
+        depth_clip_high_percentile=usual.depth_clip_high_percentile,
+        lift_missing_depth=usual.lift_missing_depth,
+    )
 
 
 def _protocol(sequence: Sequence, split: Split, data: DataConfig) -> dict[str, Any]:
+    relative = "; relative: the depth's scale is assumed, its mm are not mm" if sequence.depth_is_relative else ""
     return {
         "split": split,
         "split_rule": "test iff (i - 1) % 8 == 0",
@@ -125,7 +132,7 @@ def _protocol(sequence: Sequence, split: Split, data: DataConfig) -> dict[str, A
         "masks": f"{'gt_masks/' if data.use_gt_masks else 'masks/'} of the sequence, tissue = not tool",
         "strict_*": "color as drawn, not rounded to 8 bits; tissue pixels only; flow: flow_error_dis_adjacent",
         "depth_rmse_endogaussian": "8-bit depths that wrap, only to compare with that paper's tables",
-        "depth": "sum of weight * z against measured depth on tissue, mm, mean of per-frame RMSE",
+        "depth": "sum of weight * z against measured depth on tissue, mm, mean of per-frame RMSE" + relative,
         "flow_error": "consecutive frames of the split; *_adjacent: all adjacent frames of the video",
         "depth_instability_mm": "all adjacent frames of the video",
         "data_fingerprint": sequence.fingerprint(),
@@ -244,6 +251,8 @@ def _truth_scores(
             depth.append(metrics.depth_rmse(drawn[frame.index].depth, exact, ~frame.tissue_mask & (exact > 0)))
     result.add("psnr_behind_tool", metrics.mean_over_frames(color), "no true picture behind the tool")
     result.add("depth_rmse_behind_tool_mm", metrics.mean_over_frames(depth), "no true depth behind the tool")
+    if sequence.truth.tracks and not sequence.truth.tracks.paired:
+        result.add("track_end_error_mm", track_end_error_mm(scene, sequence), "no point has depth at start and end")
     for name, value in track_scores(scene, sequence).items():
         result.add(name, value, "no track is visible in two frames")
 

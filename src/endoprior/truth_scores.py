@@ -1,6 +1,7 @@
 """Scores that need ground truth: what the tool hid, and where material points really went.
 
-Tracks may be known in all frames, as on a phantom, or in two, as in STIR (start and end).
+Tracks may be known in all frames, as on a phantom; or points are known in the first and, others, in the last frame, as
+in STIR, which does not say which became which.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import metrics
-from .data import Sequence
+from .data import Sequence, nearest_end_errors
 from .model.carry import carry_points
 from .model.scene import Scene
 from .types import Camera
@@ -36,7 +37,7 @@ class Followed:
 def follow_tracks(scene: Scene, sequence: Sequence) -> Followed | None:
     """Carry every true point that two frames show, from the first that shows it; None without such points."""
     tracks = sequence.truth and sequence.truth.tracks
-    if not tracks:
+    if not tracks or not tracks.paired:
         return None
     followed = tracks.visible.sum(0) > 1
     if not followed.any():
@@ -56,6 +57,28 @@ def follow_tracks(scene: Scene, sequence: Sequence) -> Followed | None:
     )
     visible[first, columns] = False
     return Followed(predicted, points, visible, first, cameras[0])
+
+
+def track_end_error_mm(scene: Scene, sequence: Sequence) -> float:
+    """Mean distance of points carried from the first to the last frame to the nearest true point there, mm.
+
+    The error of STIR's benchmark, for tracks that are not paired; NaN if no point is known at start or end.
+    """
+    tracks = sequence.truth and sequence.truth.tracks
+    if not tracks or tracks.paired or not (tracks.visible[0].any() and tracks.visible[-1].any()):
+        return math.nan
+    first, last = scene.cameras[0], scene.cameras[-1]
+    start = _to_world(tracks.points[0, tracks.visible[0]].astype(np.float64), first)
+    ends = _to_world(tracks.points[-1, tracks.visible[-1]].astype(np.float64), last)
+    moment = (len(scene.cameras) - 1) / len(scene.cameras)
+    carried = carry_points(scene, start, np.zeros(len(start), np.intp), [0.0, moment])
+    return float(nearest_end_errors(carried[1], ends).mean())
+
+
+def _to_world(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """(P, 3) points in camera axes, in world axes."""
+    to_world = np.linalg.inv(camera.world_to_camera)
+    return points @ to_world[:3, :3].T + to_world[:3, 3]
 
 
 def track_scores(scene: Scene, sequence: Sequence) -> dict[str, float]:

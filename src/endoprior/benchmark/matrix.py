@@ -135,7 +135,7 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]
         )
     if chosen.phantom and write and not folder.is_dir():
         write_phantom(folder, chosen.phantom)
-    data = DataConfig(shrink=chosen.shrink, first_frames=chosen.first_frames)
+    data = DataConfig(**chosen.reading)
     return folder, load_sequence(folder, data).fingerprint()
 
 

@@ -156,7 +156,7 @@ def write_pictures(matrix: Matrix, folder: Path, kinds: set[str]) -> None:
         if not scenes:
             continue
         spec = matrix.spec.sequences[name]
-        sequence = load_sequence(data, DataConfig(shrink=spec.shrink, first_frames=spec.first_frames))
+        sequence = load_sequence(data, DataConfig(**spec.reading))
         for kind, make in PICTURES.items():
             if kind in kinds:
                 write_png(folder / f"{kind}-{name}.png", make(sequence, scenes))

@@ -38,6 +38,15 @@ class SequenceSpec:
     """Fraction of width and height that is read."""
     first_frames: int = 0
     """Frames that are read; 0 reads all."""
+    stride: int = 0
+    """Every n-th frame is read; 0 takes what is published for the dataset."""
+    format: str = "auto"
+    """Layout of the folder (docs/datasets.md)."""
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """The fields of `DataConfig` that it decides."""
+        return {"shrink": self.shrink, "first_frames": self.first_frames, "stride": self.stride, "format": self.format}
 
 
 @dataclass(frozen=True)
@@ -121,7 +130,7 @@ class Spec:
         ):
             for name, value in overrides.items():
                 _override(values, name, value, where)
-        values["data"] |= {"shrink": data.shrink, "first_frames": data.first_frames}
+        values["data"] |= data.reading
         if budget is not None:
             values["init"]["budget"] = budget
         return replace(from_dict(Config, values, f"methods.{method}"), seed=seed)

@@ -1,12 +1,25 @@
-"""Sequences: folders in the EndoNeRF layout, read lazily, split into training and test frames.
+"""Sequences: folders in the layouts of the public datasets, read lazily, split into training and test frames.
 
 No torch here: images are NumPy arrays.
 """
 
 from .depth import clean_depth
-from .endonerf import load_sequence
+from .depth_files import read_depth_file
+from .load import load_sequence
 from .sequence import FrameList, Sequence, Split
 from .shrink import shrunk
+from .stir import nearest_end_errors, write_stir_tracks
 from .truth import Truth
 
-__all__ = ["FrameList", "Sequence", "Split", "Truth", "clean_depth", "load_sequence", "shrunk"]
+__all__ = [
+    "FrameList",
+    "Sequence",
+    "Split",
+    "Truth",
+    "clean_depth",
+    "load_sequence",
+    "nearest_end_errors",
+    "read_depth_file",
+    "shrunk",
+    "write_stir_tracks",
+]

@@ -1,4 +1,4 @@
-"""PNG files to arrays, with a complaint that names the file when one is not what it should be."""
+"""Image files to arrays, with a complaint that names the file when one is not what it should be."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from ..checks import InputError
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 """First bytes of every PNG file."""
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+"""First and last bytes of every JPEG file; a few bytes of padding may follow."""
 
 
 def complaint(path: Path | str, expected: str, got: str, next_step: str) -> InputError:
@@ -30,9 +32,9 @@ def read_color(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.ui
     Raises:
         InputError: unreadable, not 8-bit color, or of another size.
     """
-    pixels = _decode(path, size)
+    pixels = decode_image(path, size)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
-        raise complaint(path, "an 8-bit RGB image", _describe(pixels), "Convert it to 8-bit RGB.")
+        raise complaint(path, "an 8-bit RGB image", describe_pixels(pixels), "Convert it to 8-bit RGB.")
     return np.ascontiguousarray(pixels[..., 2::-1])
 
 
@@ -48,9 +50,9 @@ def read_tool_mask(path: Path, tool_value: int = 255, size: tuple[int, int] | No
     Raises:
         InputError: unreadable, of another size or depth, or with other values.
     """
-    pixels = _single_channel(path, _decode(path, size))
+    pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype != np.uint8:
-        raise complaint(path, "an 8-bit mask", _describe(pixels), "Save it with values 0 and 255.")
+        raise complaint(path, "an 8-bit mask", describe_pixels(pixels), "Save it with values 0 and 255.")
     high = pixels == 255
     other = pixels[~high & (pixels != 0)]
     if other.size:
@@ -73,21 +75,31 @@ def read_depth(path: Path, scale: float = 1.0, size: tuple[int, int] | None = No
     Raises:
         InputError: unreadable, of another size or depth.
     """
-    pixels = _single_channel(path, _decode(path, size))
+    pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise complaint(path, "an 8-bit or 16-bit depth image", _describe(pixels), "Save it as 16-bit PNG.")
+        raise complaint(path, "an 8-bit or 16-bit depth image", describe_pixels(pixels), "Save it as 16-bit PNG.")
     return pixels.astype(np.float32) * np.float32(scale)
 
 
-def _decode(path: Path, size: tuple[int, int] | None) -> NDArray:
-    """The stored array, channels in OpenCV's order (blue first), checked for its size."""
+def decode_image(path: Path, size: tuple[int, int] | None) -> NDArray:
+    """Decode an image file of any format.
+
+    Args:
+        path: the file.
+        size: (width, height) it must have, px; None accepts any.
+    Returns:
+        The stored array, (H, W) or (H, W, C) with channels in OpenCV's order (blue first).
+    Raises:
+        InputError: unreadable, cut short, or of another size.
+    """
     try:
         encoded = np.fromfile(path, np.uint8)
     except OSError as error:
         got = error.strerror or str(error)
         raise complaint(path, "a readable file", got, "Check the path and the rights.") from None
-    # A PNG that ends early is refused before decoding, which would also let libpng write to stderr.
+    # A file that ends early is refused before decoding, which would also let libpng write to stderr.
     whole = encoded[:8].tobytes() != PNG_SIGNATURE or b"IEND" in encoded.tobytes()
+    whole &= encoded[:2].tobytes() != JPEG_START or JPEG_END in encoded[-1024:].tobytes()
     try:
         pixels = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if encoded.size and whole else None
     except cv2.error:  # such as a header that promises more pixels than OpenCV accepts
@@ -105,7 +117,7 @@ def _decode(path: Path, size: tuple[int, int] | None) -> NDArray:
     return pixels
 
 
-def _single_channel(path: Path, pixels: NDArray) -> NDArray:
+def single_channel(path: Path, pixels: NDArray) -> NDArray:
     """(H, W) view of a gray image, also of one stored with equal color channels."""
     if pixels.ndim == 2:
         return pixels
@@ -115,7 +127,7 @@ def _single_channel(path: Path, pixels: NDArray) -> NDArray:
     return first
 
 
-def _describe(pixels: NDArray) -> str:
+def describe_pixels(pixels: NDArray) -> str:
     """Type and channels of an array in words, such as '16-bit, 1 channel'."""
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     kind = "float" if np.issubdtype(pixels.dtype, np.floating) else f"{8 * pixels.dtype.itemsize}-bit"

@@ -36,6 +36,8 @@ class Sequence:
         truth: Truth | None = None,
         remarks: list[str] | None = None,
         mask_folder: str = "masks",
+        depth_is_relative: bool = False,
+        sources: dict[str, str] | None = None,
     ) -> None:
         """Describe a sequence; nothing is decoded yet.
 
@@ -48,8 +50,12 @@ class Sequence:
             truth: ground truth of a synthetic sequence.
             remarks: what the reader found odd but usable, one line each.
             mask_folder: name of the folder the masks came from; names it in messages.
+            depth_is_relative: the scale of depth is unknown or assumed, so that lengths are not in mm.
+            sources: where each part came from, such as {"depth": "stereo"}.
         """
         self.path = path
+        self.depth_is_relative = depth_is_relative
+        self.sources = dict(sources or {})
         self.frames_per_second = frames_per_second
         self.truth = truth
         self._cameras = cameras
@@ -125,6 +131,8 @@ class Sequence:
         tool = 1 - sum(tissue) / len(tissue)
         if tool > TOOL_FRACTION_WARNING:
             remarks.append(f"{self._masks}: {tool:.0%} of all pixels are tool; the polarity may be inverted")
+        if self.depth_is_relative:
+            remarks.append(f"{self.path}: the scale of its depth is unknown or assumed; lengths in mm mean nothing")
         empty = [frame.index for frame in frames if not (frame.depth_valid & frame.tissue_mask).any()]
         if empty:
             remarks.append(f"{self.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")

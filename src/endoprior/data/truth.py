@@ -21,6 +21,8 @@ class Tracks:
     """(T, P, 3) positions in camera axes, mm."""
     visible: NDArray[np.bool_]
     """(T, P) True where the point is in the picture and nothing hides it."""
+    paired: bool = True
+    """False if nothing says which point of the last frame is which of the first, as in STIR: each is seen once."""
 
 
 class Truth:
@@ -51,7 +53,8 @@ class Truth:
         if not isinstance(stored, dict) or not {"points", "visible"} <= stored.keys():
             got = ", ".join(stored) if isinstance(stored, dict) else "one array"
             raise complaint(path, "arrays points and visible", got, "Write the truth again.")
-        tracks = Tracks(np.asarray(stored["points"], np.float32), np.asarray(stored["visible"], bool))
+        points, visible = np.asarray(stored["points"], np.float32), np.asarray(stored["visible"], bool)
+        tracks = Tracks(points, visible, bool(stored.get("paired", True)))
         frames, count = tracks.visible.shape if tracks.visible.ndim == 2 else (-1, -1)
         if frames != len(self._names) or tracks.points.shape != (frames, count, 3):
             got = f"{tracks.points.shape} and {tracks.visible.shape}"

@@ -1,12 +1,13 @@
-"""Writes a sequence folder (the EndoNeRF layout plus `sequence.json`), whole or not at all.
+"""Writes a sequence folder: the EndoNeRF layout plus `sequence.json`.
 
-Everything goes into a hidden folder beside the target, which takes the target's name when the sequence is complete.
+`FrameFiles` writes into a folder that its owner looks after; `SequenceWriter` makes a sequence that appears whole or
+not at all: everything goes into a hidden folder beside the target, which takes the target's name when it is complete.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -23,7 +24,7 @@ TOOL_VALUE = 255
 
 @dataclass(frozen=True)
 class SequenceMeta:
-    """The facts of a sequence that its pictures do not show. The camera stands still at the origin."""
+    """The facts of a sequence that its pictures do not show."""
 
     width: int
     """px."""
@@ -45,41 +46,20 @@ class SequenceMeta:
     """mm per unit of the 16-bit depth PNG."""
     depth_source: str | None = None
     """Where the depth came from, for example `stereo`; None where there is none."""
+    depth_relative: bool = False
+    """Whether the depth's scale is assumed, so that its mm are not mm."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """Where each part of the sequence came from, for readers; no paths, which may hold names."""
     note: str = ""
     """What a reader should know."""
 
 
-class SequenceWriter:
-    """Collects the frames of one sequence; use it as a context manager.
+class FrameFiles:
+    """Writes the files of one frame after another into a folder, then what describes all of them."""
 
-    Leaving the `with` block normally completes the folder; leaving it by an exception removes what was written.
-    """
-
-    def __init__(self, out: Path, meta: SequenceMeta) -> None:
-        """Prepare to write `out`.
-
-        Raises:
-            InputError: `out` is a file or a folder that is not empty, or cannot be created.
-        """
-        self.out, self.meta, self.count = Path(out), meta, 0
-        refuse_occupied(self.out)
-        self._bounds: list[tuple[float, float]] = []
-        self._folder = whole_folder(self.out)
-        self._partial = self._folder.__enter__()
-
-    def __enter__(self) -> SequenceWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            try:
-                self._finish()
-            except BaseException as error:
-                self._folder.__exit__(type(error), error, error.__traceback__)
-                raise
-        self._folder.__exit__(kind, value, trace)
+    def __init__(self, folder: Path, meta: SequenceMeta, count: int = 0) -> None:
+        """Args: folder: where. meta: the facts. count: frames that are in the folder already, complete."""
+        self.folder, self.meta, self.count = folder, meta, count
 
     def add(
         self,
@@ -102,16 +82,11 @@ class SequenceWriter:
                 raise ValueError(f"{name} must be {size[0]} x {size[1]} pixels; got {array.shape}. Resize it first.")
         self.write_image("images", rgb)
         self.write_image("masks", np.where(tool_mask, TOOL_VALUE, 0).astype(np.uint8))
-        near, far = 0.0, 0.0
         if depth is not None:
-            valid = np.isfinite(depth) & (depth > 0)
-            units = np.where(valid, depth, 0) / self.meta.depth_scale
+            units = np.where(np.isfinite(depth) & (depth > 0), depth, 0) / self.meta.depth_scale
             self.write_image("depth", np.clip(np.round(units), 0, 65535).astype(np.uint16))
-            if valid.any():
-                near, far = float(depth[valid].min()), float(depth[valid].max())
         if right is not None:
             self.write_image("right", right)
-        self._bounds.append((near, far))
         self.count += 1
 
     def write_image(self, folder: str, pixels: NDArray) -> None:
@@ -139,24 +114,27 @@ class SequenceWriter:
         """Write `content` to `name` (relative, `.json`)."""
         self._file(name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
-    def _file(self, name: str) -> Path:
-        """The place of a file in the unfinished folder; its parents exist afterwards."""
-        path = self._partial / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return path
+    def finish(
+        self, camera_to_world: NDArray[np.float64] | None = None, unexplained_frames: list[int] | None = None
+    ) -> None:
+        """Write `poses_bounds.npy` and `sequence.json`.
 
-    def _finish(self) -> None:
-        """Write what describes the whole sequence and give the folder its name."""
+        Args:
+            camera_to_world: (T, 4, 4) mm, OpenCV axes; None for a camera that stands still at the origin.
+            unexplained_frames: those that whoever made the sequence could not account for.
+        """
         if self.count == 0:
             raise ValueError("a sequence must have at least one frame; got none")
         meta = self.meta
         poses = np.zeros((self.count, 17))
-        # 3x5 per frame: camera-to-world [R | t] = identity, then (H, W, focal); row-major, then near and far.
-        camera = np.concatenate([np.eye(3, 4), [[meta.height], [meta.width], [meta.fx]]], 1)
-        poses[:, :15] = camera.ravel()
-        poses[:, 15:] = self._bounds
+        # 3x5 per frame: camera-to-world [R | t], then (H, W, focal); row-major, then near and far.
+        cameras = np.broadcast_to(np.eye(4), (self.count, 4, 4)) if camera_to_world is None else camera_to_world
+        size = np.broadcast_to([[meta.height], [meta.width], [meta.fx]], (self.count, 3, 1))
+        poses[:, :15] = np.concatenate([cameras[:, :3], size], 2).reshape(self.count, 15)
+        poses[:, 15:] = [self._depth_bounds(index) for index in range(self.count)]
         self.write_array("poses_bounds.npy", poses)
         described = {
+            "format_version": 1,
             "width": meta.width,
             "height": meta.height,
             "fx": meta.fx,
@@ -169,6 +147,60 @@ class SequenceWriter:
             "depth_scale": meta.depth_scale,
             "mask_tool_value": TOOL_VALUE,
             "depth_source": meta.depth_source,
+            "depth_relative": meta.depth_relative,
+            "sources": meta.sources,
+            "unexplained_frames": unexplained_frames or [],
             "note": meta.note,
         }
         self.write_json("sequence.json", described)
+
+    def file(self, folder: str, index: int) -> Path:
+        """Path of the picture of frame `index` in `folder`."""
+        return self.folder / folder / f"{index:06d}.png"
+
+    def _depth_bounds(self, index: int) -> tuple[float, float]:
+        """Nearest and farthest depth of a frame that is written, mm; (0, 0) without depth."""
+        path = self.file("depth", index)
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.exists() else np.zeros(0, np.uint16)
+        measured = stored[stored > 0]
+        if not measured.size:
+            return 0.0, 0.0
+        return float(measured.min() * self.meta.depth_scale), float(measured.max() * self.meta.depth_scale)
+
+    def _file(self, name: str) -> Path:
+        """The place of a file in the folder; its parents exist afterwards."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+
+class SequenceWriter(FrameFiles):
+    """Collects the frames of one sequence; use it as a context manager.
+
+    Leaving the `with` block normally completes the folder; leaving it by an exception removes what was written.
+    """
+
+    def __init__(self, out: Path, meta: SequenceMeta) -> None:
+        """Prepare to write `out`.
+
+        Raises:
+            InputError: `out` is a file or a folder that is not empty, or cannot be created.
+        """
+        self.out = Path(out)
+        refuse_occupied(self.out)
+        self._whole = whole_folder(self.out)
+        super().__init__(self._whole.__enter__(), meta)
+
+    def __enter__(self) -> SequenceWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            try:
+                self.finish()
+            except BaseException as error:
+                self._whole.__exit__(type(error), error, error.__traceback__)
+                raise
+        self._whole.__exit__(kind, value, trace)

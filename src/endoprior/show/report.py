@@ -69,7 +69,7 @@ def write_report(scene: Scene, sequence: Sequence, run: Path, path: Path) -> Non
 def _picture_rows(scene: Scene, sequence: Sequence) -> list[list[tuple[str, NDArray[np.uint8]]]]:
     frames = sequence.frames("test")
     shown = sorted({int(k) for k in np.linspace(0, len(frames) - 1, 3)})
-    span = depth_span(scene)
+    span, unit = depth_span(scene), "relative" if sequence.depth_is_relative else "mm"
     rows = []
     for frame in (frames[k] for k in shown):
         drawn = scene.render(frame.time, frame.camera)
@@ -82,7 +82,7 @@ def _picture_rows(scene: Scene, sequence: Sequence) -> list[list[tuple[str, NDAr
         rho = joint_texture_prior(frame.rgb, frame.tissue_mask, PriorConfig())
         cells += [
             (f"error on tissue, 0..{ERROR_FULL_SCALE}", colorize(error, 0, ERROR_FULL_SCALE, frame.tissue_mask)),
-            (f"depth, {span[0]:.0f}..{span[1]:.0f} mm", colorize(depth, *span, depth > 0)),
+            (f"depth, {span[0]:.0f}..{span[1]:.0f} {unit}", colorize(depth, *span, depth > 0)),
             ("joint texture prior", colorize(rho, 0, 1)),
         ]
         rows.append(cells)

@@ -1,0 +1,166 @@
+"""Reader of C3VD's registered videos: colonoscope pictures of a phantom with depth rendered from its registered model.
+
+The pictures are omnidirectional; reading turns them, and their depth, into those of a pinhole camera.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..config import DataConfig
+from ..types import Camera
+from .assemble import Pixels, assemble, kept_frames
+from .depth_files import read_values
+from .files import list_files, read_table
+from .images import complaint, read_color
+from .omnidirectional import Omnidirectional
+from .poses import demand_rotations, world_to_camera
+from .sequence import Sequence
+
+CF_HQ190L = Omnidirectional(
+    width=1350,
+    height=1080,
+    cx=678.544839263292,
+    cy=542.975887548343,
+    a0=769.243600037458,
+    a2=-0.000812770624150226,
+    a3=6.25674244578925e-07,
+    a4=-1.19662182144280e-09,
+    c=0.999986882249990,
+    d=0.00288273829525059,
+    e=-0.00296316513429569,
+)
+"""The endoscope of the first edition, as its authors calibrated it."""
+FARTHEST = 65535
+"""Stored depth of everything at or beyond 100 mm; 0 is outside of the picture or of the model."""
+POSES_HINT = "Take pose.txt of the same video: 16 numbers per frame, camera to world."
+
+
+def is_c3vd(path: Path) -> bool:
+    """Whether a folder has `pose.txt` and pictures called `*_color.png`."""
+    return (path / "pose.txt").exists() and any(path.glob("*_color.png"))
+
+
+def load_c3vd(path: Path, cfg: DataConfig) -> Sequence:
+    """Open a registered video.
+
+    Raises:
+        InputError: files are missing or cannot be used, or the camera of the pictures is unknown.
+    """
+    images = list_files(path, (".png",), "C3VD", "_color")
+    stored = {_number(file): file for file in list_files(path, (".tiff", ".tif"), "C3VD", "_depth")}
+    missing = [file for file in images if _number(file) not in stored]
+    if missing:
+        name = f"{_number(missing[0]):04d}_depth.tiff"
+        raise complaint(path / name, f"the depth of {missing[0].name}", "no such file", "Unpack the video again.")
+    poses = camera_to_world(path / "pose.txt", len(images))
+    calibration = path / "config.ini"
+    lens = read_lens(calibration) if calibration.exists() else CF_HQ190L
+    height, width = read_color(images[0]).shape[:2]
+    if (width, height) != (lens.width, lens.height):
+        hint = "Put the camera's width, height, cx, cy, a0, a2, a3, a4, c, d, e into config.ini beside them."
+        raise complaint(images[0], f"{lens.width}x{lens.height} px, the calibrated size", f"{width}x{height}", hint)
+    undistorter = Undistorter(lens)
+    try:
+        _ = undistorter.maps
+    except ValueError as error:
+        raise complaint(calibration, "the calibration of a camera", str(error), "Correct it or remove it.") from None
+    focal, cx, cy = lens.pinhole()
+    kept = kept_frames(len(images), cfg)
+    images = [images[i] for i in kept]
+    depths = [stored[_number(file)] for file in images]
+    cameras = [
+        Camera(width, height, focal, focal, cx, cy, world_to_camera(poses[i, :3, :3], poses[i, :3, 3])) for i in kept
+    ]
+    mm_per_unit = cfg.depth_unit_mm or 100 / FARTHEST
+
+    def decode(index: int) -> Pixels:
+        units = undistorter.nearest(read_values(depths[index], (width, height)))
+        depth = np.where(units < FARTHEST, units * np.float32(mm_per_unit), np.float32(0))
+        return undistorter.smooth(read_color(images[index], (width, height))), units > 0, depth
+
+    return assemble(
+        path,
+        cfg,
+        cameras,
+        decode,
+        files=[*images, *depths, path / "pose.txt", *([calibration] if calibration.exists() else [])],
+        clip_depth=False,
+        remarks=[f"{path}: omnidirectional pictures, read as those of a pinhole camera of {focal:.1f} px focal length"],
+        mask_folder=".",
+        sources={"depth": "rendered from the registered model", "poses": "registration of the robot's log"},
+    )
+
+
+class Undistorter:
+    """Resamples pictures of an omnidirectional lens to its pinhole camera; the maps are made once, when needed."""
+
+    def __init__(self, lens: Omnidirectional) -> None:
+        """Args: lens: of the pictures to come."""
+        self.lens = lens
+
+    @cached_property
+    def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """See `Omnidirectional.pinhole_maps`."""
+        return self.lens.pinhole_maps()
+
+    def smooth(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(H, W, 3) bilinear; the border's color goes on outside of the original, where there is no tissue anyway."""
+        return cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def nearest(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(H, W) nearest pixel, so that depths never mix across an edge; 0 outside of the original."""
+        return cv2.remap(image, *self.maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+
+
+def camera_to_world(path: Path, count: int) -> NDArray[np.float64]:
+    """(N, 4, 4) poses of `pose.txt`, translation in mm.
+
+    The files are column-major, although C3VD's page says row-major; the place of the row (0, 0, 0, 1) decides.
+
+    Raises:
+        InputError: not `count` rows of 16 numbers, or not rigid.
+    """
+    rows = read_table(path, POSES_HINT)
+    if rows.shape != (count, 16):
+        raise complaint(path, f"{count} rows of 16 numbers, one per picture", f"shape {rows.shape}", POSES_HINT)
+    for poses in (rows.reshape(-1, 4, 4).transpose(0, 2, 1), rows.reshape(-1, 4, 4)):
+        if (poses[:, 3] == (0, 0, 0, 1)).all() and np.isfinite(poses).all():
+            demand_rotations(path, poses[:, :3, :3], "each pose", POSES_HINT)
+            return poses
+    raise complaint(path, "finite rigid transforms", "NaN, infinity or no row 0, 0, 0, 1", POSES_HINT)
+
+
+def read_lens(path: Path) -> Omnidirectional:
+    """The camera in a file of lines `name = number` (or with a colon); other lines are passed over.
+
+    Raises:
+        InputError: unreadable, or a parameter is missing.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise complaint(path, "camera parameters", str(error).split("\n")[0], "Write it again.") from None
+    found = dict(re.findall(r"^\s*(\w+)\s*[=:]\s*([-+.\deE]+)\s*;?\s*$", text, re.MULTILINE))
+    values = {}
+    for name, field in Omnidirectional.__dataclass_fields__.items():
+        try:
+            values[name] = int(found[name]) if field.type == "int" else float(found[name])
+        except (KeyError, ValueError):
+            hint = "Add a line such as a0 = 769.2."
+            raise complaint(path, f"a number {name}", repr(found.get(name, "none")), hint) from None
+    return Omnidirectional(**values)
+
+
+def _number(file: Path) -> int:
+    """Frame number in a name such as `12_color.png` or `0012_depth.tiff`."""
+    digits = re.match(r"[0-9]+", file.name)
+    if not digits:
+        raise complaint(file, "a name that starts with the frame's number", file.name, "Rename or remove it.")
+    return int(digits[0])

@@ -1,0 +1,89 @@
+"""Depth (or disparity) files of any common kind to one float image: PNG, TIFF, NumPy, EXR."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .images import complaint, decode_image, describe_pixels, single_channel
+
+DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
+"""Files this module reads, in lower case."""
+
+
+def read_depth_file(path: Path, mm_per_unit: float = 1.0, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+    """Read a depth image.
+
+    Args:
+        path: PNG or TIFF (8 or 16 bit, TIFF also float), NPY, NPZ with one array, or EXR with one channel.
+        mm_per_unit: what one stored unit is worth.
+        size: (width, height) it must have, px; None accepts any.
+    Returns:
+        (H, W) depth, mm; 0 where the file has NaN, infinity, 0 or less.
+    Raises:
+        InputError: unreadable, of another size or kind, or EXR without the OpenEXR package.
+    """
+    depth = read_values(path, size) * np.float32(mm_per_unit)
+    with np.errstate(invalid="ignore"):  # NaN compares as missing
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def read_values(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+    """(H, W) numbers of a one-channel file as they are stored; kinds, `size` and errors as `read_depth_file`."""
+    suffix = path.suffix.lower()
+    if suffix not in DEPTH_SUFFIXES:
+        raise complaint(path, f"one of {', '.join(DEPTH_SUFFIXES)}", suffix or "no suffix", "Convert the file.")
+    if suffix in (".npy", ".npz"):
+        pixels = _read_numpy(path)
+    elif suffix == ".exr":
+        pixels = _read_exr(path)
+    else:
+        pixels = single_channel(path, decode_image(path, size))
+    if pixels.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
+        kind = describe_pixels(pixels) if pixels.dtype.kind in "iuf" else str(pixels.dtype)
+        raise complaint(path, "8-bit, 16-bit or float values", kind, "Save it as float or 16-bit.")
+    if size is not None and pixels.shape != (size[1], size[0]):
+        got = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        raise complaint(path, f"{size[0]}x{size[1]} px like the first image", got, "Bring all files to one size.")
+    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinity, which is missing
+        return pixels.astype(np.float32)
+
+
+def _read_numpy(path: Path) -> NDArray:
+    """The (H, W) array of an .npy file, or of an .npz file that holds nothing else; no pickles."""
+    hint = "Write it again with numpy.save."
+    try:
+        with path.open("rb") as file:
+            stored = np.load(file, allow_pickle=False)
+            arrays = [stored] if isinstance(stored, np.ndarray) else [stored[name] for name in stored.files]
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise complaint(path, "a NumPy array", str(error).split("\n")[0], hint) from None
+    if len(arrays) != 1:
+        raise complaint(path, "one array", f"{len(arrays)}", hint)
+    array = arrays[0][..., 0] if arrays[0].ndim == 3 and arrays[0].shape[2] == 1 else arrays[0]
+    if array.ndim != 2:
+        raise complaint(path, "an array of shape (H, W)", f"shape {array.shape}", hint)
+    return array
+
+
+def _read_exr(path: Path) -> NDArray:
+    """The (H, W) channel of an EXR file: its only one, `Z`, or several that are equal."""
+    try:
+        import OpenEXR  # optional: OpenCV's own decoder is switched off in its packages
+    except ImportError:
+        raise complaint(path, "the OpenEXR package", "none", "Run pip install 'endoprior[exr]'.") from None
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except Exception as error:  # the library raises its own kinds, RuntimeError among them
+        raise complaint(path, "an EXR image", str(error).split("\n")[0], "Write the file again.") from None
+    if "Z" in channels:
+        return channels["Z"]
+    first, *others = [channels[name] for name in channels if name != "A"] or [None]
+    if first is None or any(not np.array_equal(first, other, equal_nan=True) for other in others):
+        hint = "Save depth alone, as channel Z."
+        raise complaint(path, "one channel, or one called Z", ", ".join(channels) or "none", hint)
+    return first

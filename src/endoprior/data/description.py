@@ -1,0 +1,83 @@
+"""`sequence.json`: what a folder says about itself, checked. Every key is optional."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from .files import read_json
+from .images import complaint
+
+FORMAT_VERSION = 1
+"""Newest `format_version` this program can read; a file without one is of version 1."""
+POSITIVE = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """The checked contents of `sequence.json`, or an empty dict when there is none. Unknown keys are kept.
+
+    Raises:
+        InputError: not a JSON object, or a known key has a value it cannot have.
+    """
+    if not path.exists():
+        return {}
+    described = {key: value for key, value in read_json(path).items() if value is not None}
+    for key in POSITIVE:
+        value = described.get(key, 1)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
+            raise complaint(path, f"{key} to be a number > 0", repr(value), "Correct it or remove it.")
+    if described.get("depth_unit", "mm") != "mm":
+        hint = "Give mm, and mm per stored unit as depth_scale."
+        raise complaint(path, "depth_unit mm", repr(described["depth_unit"]), hint)
+    if described.get("mask_tool_value", 255) not in (0, 255):
+        hint = "Say which of the two marks tools."
+        raise complaint(path, "mask_tool_value 255 or 0", repr(described["mask_tool_value"]), hint)
+    _check_origins(path, described)
+    return described
+
+
+def check_frames(path: Path, described: dict[str, Any], count: int) -> list[str]:
+    """Refuse `unexplained_frames` that the sequence does not have; a remark when there are some."""
+    marked = described.get("unexplained_frames", [])
+    outside = [index for index in marked if not 0 <= index < count]
+    if outside:
+        raise complaint(path, f"unexplained_frames in 0..{count - 1}", str(outside[0]), "Correct it or remove it.")
+    if not marked:
+        return []
+    return [f"{path}: {len(marked)} frames are marked as unexplained, the first is frame {min(marked)}"]
+
+
+def intrinsics_of(
+    path: Path, described: dict[str, Any], width: int, height: int, focal: float
+) -> tuple[float, float, float, float]:
+    """(fx, fy, cx, cy), px: those described, else `focal` and the middle of the picture.
+
+    Raises:
+        InputError: the description is of pictures of another size.
+    """
+    if {"width", "height"} <= described.keys() and (described["width"], described["height"]) != (width, height):
+        got = f"{described['width']}x{described['height']}"
+        hint = "Scale fx, fy, cx, cy to the images, or remove the file."
+        raise complaint(path, f"the images' size {width}x{height}", got, hint)
+    fx = float(described.get("fx", focal))
+    fy = float(described.get("fy", fx))
+    return fx, fy, float(described.get("cx", width / 2)), float(described.get("cy", height / 2))
+
+
+def _check_origins(path: Path, described: dict[str, Any]) -> None:
+    """Refuse wrong values of the keys that say how a sequence was made."""
+    hint = "Correct it or remove it."
+    relative = described.get("depth_relative", False)
+    if not isinstance(relative, bool):
+        raise complaint(path, "depth_relative true or false", repr(relative), hint)
+    sources = described.get("sources", {})
+    if not isinstance(sources, dict) or not all(isinstance(value, str) for value in sources.values()):
+        raise complaint(path, "sources to map names to texts", repr(sources), hint)
+    frames = described.get("unexplained_frames", [])
+    if not isinstance(frames, list) or not all(type(index) is int for index in frames):
+        raise complaint(path, "unexplained_frames to be a list of frame numbers", repr(frames), hint)
+    version = described.get("format_version", FORMAT_VERSION)
+    if type(version) is not int or not 1 <= version <= FORMAT_VERSION:
+        hint = "Update endoprior, or prepare the folder again."
+        raise complaint(path, f"format_version 1 to {FORMAT_VERSION}", repr(version), hint)

@@ -1,0 +1,117 @@
+"""Files of a dataset folder: listed in order, matched with each other, JSON and tables of numbers read.
+
+Every complaint is one line that names the file.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .images import complaint
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+"""Pictures that color readers take."""
+
+
+def natural_order(file: Path) -> list[int | str]:
+    """Sorting key of a file name: runs of digits compare as numbers, 2 before 10."""
+    # Splitting at digits alternates text and number, so that equal positions always compare.
+    return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", file.name)]
+
+
+def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str = "") -> list[Path]:
+    """The files of a folder with one of the suffixes, in natural order; hidden ones do not count.
+
+    Args:
+        folder: where to look.
+        suffixes: in lower case, with the dot.
+        layout: name of the expected layout, for the message.
+        ending: what the stem must end with.
+    Raises:
+        InputError: no such folder, or no such file in it.
+    """
+    kind = "/".join(sorted({suffix.removeprefix(".").upper() for suffix in suffixes} - {"JPEG", "TIF"}, reverse=True))
+    if not folder.is_dir():
+        raise complaint(folder, f"a folder of {kind} files", "no such folder", f"Pass a folder in the {layout} layout.")
+    everything = [file for file in folder.iterdir() if not file.name.startswith(".")]
+    files = [file for file in everything if file.suffix.lower() in suffixes and file.stem.endswith(ending)]
+    if not files:
+        other = sorted({file.suffix for file in everything if file.suffix})
+        got = f"none (only {', '.join(other)})" if other else "none"
+        raise complaint(folder, f"{kind} files", got, f"Put one {kind} per frame there.")
+    return sorted(files, key=natural_order)
+
+
+def demand_count(files: list[Path], folder: Path, count: int) -> None:
+    """Refuse a list of files that are not one per image."""
+    if len(files) != count:
+        raise complaint(folder, f"{count} files, one per image", f"{len(files)}", "Add or remove files to match.")
+
+
+def unequal_names(images: list[Path], others: list[Path]) -> list[str]:
+    """A remark when files matched by order share no number in their names, else nothing."""
+    for image, other in zip(images, others, strict=True):
+        numbers = [{int(digits) for digits in re.findall(r"[0-9]+", file.stem)} for file in (image, other)]
+        if all(numbers) and numbers[0].isdisjoint(numbers[1]):
+            return [f"{other}: matched by order with {image.name}, whose number differs; a frame may be missing"]
+    return []
+
+
+def read_json(path: Path, next_step: str = "Correct it or remove it.") -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        InputError: unreadable, not JSON, or not an object.
+    """
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise complaint(path, "a JSON object", str(error).split("\n")[0], next_step) from None
+    if not isinstance(stored, dict):
+        raise complaint(path, "a JSON object", type(stored).__name__, next_step)
+    return stored
+
+
+def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """The finite matrix `key` of an object read from `path`; dots in the key go into nested objects.
+
+    Raises:
+        InputError: missing, of another shape, or with entries that are not finite numbers.
+    """
+    value: Any = stored
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    want = f"{key}, {shape[0]}x{shape[1]} numbers"
+    if value is None:
+        raise complaint(path, want, "no such key", "Process the dataset again.")
+    try:
+        matrix = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape != shape or not np.isfinite(matrix).all():
+        got = "NaN or infinity" if matrix.shape == shape else f"shape {matrix.shape}"
+        raise complaint(path, want, got, "Process the dataset again.")
+    return matrix
+
+
+def read_table(path: Path, next_step: str) -> NDArray[np.float64]:
+    """(N, K) numbers of a text file, separated by commas or blanks, one row per line; '#' starts a comment.
+
+    Raises:
+        InputError: unreadable, not numbers, or rows of different lengths.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        rows = [re.split(r"[,\s]+", line.split("#")[0].strip(", \t")) for line in lines]
+        numbers = [[float(entry) for entry in row] for row in rows if row != [""]]
+    except (OSError, ValueError) as error:
+        raise complaint(path, "rows of numbers", str(error).split("\n")[0], next_step) from None
+    if not numbers or len({len(row) for row in numbers}) != 1:
+        raise complaint(path, "rows of equally many numbers", "other rows", next_step)
+    return np.array(numbers)

@@ -1,0 +1,125 @@
+"""Reader of Hamlyn sequences in two layouts: Forplane's (`images/ gt_masks/ gt_depth/`) and `rectifiedNN`.
+
+Neither has camera poses: the camera is taken to stand still.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..config import DataConfig
+from ..types import Camera
+from .assemble import Pixels, assemble, kept_frames
+from .depth_files import read_depth_file
+from .endonerf import read_poses_bounds
+from .files import IMAGE_SUFFIXES, demand_count, list_files, read_table, unequal_names
+from .images import complaint, read_color, read_tool_mask
+from .poses import identity_poses
+from .sequence import Sequence
+
+CROP_LEFT_PX = 40
+"""Columns without picture at the left of Forplane's images; its own program cuts them off, too."""
+
+
+def is_hamlyn(path: Path) -> bool:
+    """Whether a folder is a Hamlyn sequence; Forplane's are known by `gt_depth/` or by `hamlyn` in their name."""
+    named = any("hamlyn" in name.lower() for name in (path.name, path.parent.name))
+    # A folder that this program prepared from a Hamlyn video describes itself and has nothing to crop.
+    bare = (path / "poses_bounds.npy").exists() and not (path / "sequence.json").exists()
+    forplane = (path / "images").is_dir() and ((path / "gt_depth").is_dir() or (named and bare))
+    return forplane or _is_rectified(path)
+
+
+def load_hamlyn(path: Path, cfg: DataConfig) -> Sequence:
+    """Open a Hamlyn sequence.
+
+    Raises:
+        InputError: files are missing, their numbers differ, or they cannot be used.
+    """
+    return _load_rectified(path, cfg) if _is_rectified(path) else _load_forplane(path, cfg)
+
+
+def _is_rectified(path: Path) -> bool:
+    return (path / "image01").is_dir() and (path / "depth01").is_dir()
+
+
+def _load_forplane(path: Path, cfg: DataConfig) -> Sequence:
+    """`images/`, `gt_masks/` or `masks/`, `gt_depth/` or `depth/`; size and focal length from `poses_bounds.npy`."""
+    mask_folder = "gt_masks" if (path / "gt_masks").is_dir() else "masks"
+    depth_folder = "gt_depth" if (path / "gt_depth").is_dir() else "depth"
+    folders = ("images", mask_folder, depth_folder)
+    images, masks, depths = (list_files(path / name, (".png",), "Forplane") for name in folders)
+    demand_count(masks, path / mask_folder, len(images))
+    demand_count(depths, path / depth_folder, len(images))
+    height, width = read_color(images[0]).shape[:2]
+    if width <= CROP_LEFT_PX:
+        raise complaint(images[0], f"more than {CROP_LEFT_PX} columns", f"{width}", "Pass images of full size.")
+    # All rows must be there and finite, but only size and focal length are used: Forplane's camera stands still.
+    _, _, focal = read_poses_bounds(path / "poses_bounds.npy", len(images))[0, :, 4]
+    if focal <= 0:
+        raise complaint(path / "poses_bounds.npy", "a focal length > 0 px", f"{focal:g}", "Correct row 0, column 14.")
+    remarks = unequal_names(images, masks) + unequal_names(images, depths)
+    remarks.append(f"{path}: {CROP_LEFT_PX} columns without picture are cut off at the left, as in Forplane")
+    if not cfg.depth_unit_mm:
+        remarks.append(f"{path / depth_folder}: its unit is not documented; taken for mm, set data.depth_unit_mm")
+    kept = kept_frames(len(images), cfg)
+    images, masks, depths = ([files[i] for i in kept] for files in (images, masks, depths))
+    size = (width, height)
+
+    def decode(index: int) -> Pixels:
+        depth = read_depth_file(depths[index], cfg.depth_unit_mm or 1.0, size)
+        pixels = read_color(images[index], size), ~read_tool_mask(masks[index], 255, size), depth
+        return tuple(np.ascontiguousarray(image[:, CROP_LEFT_PX:]) for image in pixels)
+
+    # The principal point moves by the whole crop; Forplane moves it by half of it, which is not the same camera.
+    shape = (width - CROP_LEFT_PX, height, focal, focal, width / 2 - CROP_LEFT_PX, height / 2)
+    return assemble(
+        path,
+        cfg,
+        [Camera(*shape, pose) for pose in identity_poses(len(kept))],
+        decode,
+        files=[*images, *masks, *depths, path / "poses_bounds.npy"],
+        remarks=remarks,
+        mask_folder=mask_folder,
+        depth_is_relative=not cfg.depth_unit_mm,
+        sources={"depth": "stereo matching, by Forplane"},
+    )
+
+
+def _load_rectified(path: Path, cfg: DataConfig) -> Sequence:
+    """`image01/`, `depth01/` in mm, `intrinsics.txt`; no masks."""
+    images = list_files(path / "image01", IMAGE_SUFFIXES, "Hamlyn")
+    depths = list_files(path / "depth01", (".png",), "Hamlyn")
+    demand_count(depths, path / "depth01", len(images))
+    number = path.name[-2:]
+    places = [path / "intrinsics.txt", path.parent / "calibration" / number / "intrinsics.txt"]
+    calibration = next((place for place in places if place.exists()), places[0])
+    hint = "Put the dataset's intrinsics.txt, a 3x3 camera matrix, beside image01/."
+    matrix = read_table(calibration, hint)
+    if matrix.shape not in ((3, 3), (3, 4)) or min(matrix[0, 0], matrix[1, 1]) <= 0 or not np.isfinite(matrix).all():
+        raise complaint(calibration, "a 3x3 camera matrix", f"shape {matrix.shape} or other numbers", hint)
+    height, width = read_color(images[0]).shape[:2]
+    remarks = [*unequal_names(images, depths), f"{path}: no tool masks, every pixel counts as tissue"]
+    remarks.append(f"{path}: no camera poses, the camera is taken to stand still")
+    kept = kept_frames(len(images), cfg)
+    images, depths = ([files[i] for i in kept] for files in (images, depths))
+    size = (width, height)
+
+    def decode(index: int) -> Pixels:
+        depth = read_depth_file(depths[index], cfg.depth_unit_mm or 1.0, size)
+        return read_color(images[index], size), np.ones((height, width), bool), depth
+
+    shape = (width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)
+    return assemble(
+        path,
+        cfg,
+        [Camera(*shape, pose) for pose in identity_poses(len(kept))],
+        decode,
+        # A calibration beside the folder is outside of it and cannot be named below it.
+        files=[*images, *depths, *([calibration] if calibration.parent == path else [])],
+        remarks=remarks,
+        mask_folder="image01",
+        sources={"depth": "stereo matching"},
+    )

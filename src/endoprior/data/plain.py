@@ -1,0 +1,82 @@
+"""Reader of plain folders: pictures, with masks and depth where there are any, from a camera that stands still."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..config import DataConfig
+from ..types import Camera
+from .assemble import Pixels, assemble, kept_frames
+from .depth_files import DEPTH_SUFFIXES, read_depth_file
+from .description import check_frames, intrinsics_of, read_description
+from .files import IMAGE_SUFFIXES, demand_count, list_files, unequal_names
+from .images import read_color, read_tool_mask
+from .poses import identity_poses
+from .sequence import Sequence
+
+ASSUMED_FOCAL = 0.9
+"""Focal length in image widths where none is given: a field of view of 58 degrees, between usual endoscopes."""
+
+
+def is_plain(path: Path) -> bool:
+    """Whether a folder has pictures in `images/`."""
+    folder = path / "images"
+    return folder.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in folder.iterdir())
+
+
+def load_plain(path: Path, cfg: DataConfig) -> Sequence:
+    """Open a folder of pictures. What is missing is assumed, and said in a remark.
+
+    Raises:
+        InputError: no pictures, numbers of files that differ, or files that cannot be used.
+    """
+    images = list_files(path / "images", IMAGE_SUFFIXES, "plain")
+    mask_folder = "gt_masks" if cfg.use_gt_masks else "masks"
+    # A folder that the user asked for by name must be there.
+    masked = cfg.use_gt_masks or (path / mask_folder).is_dir()
+    masks = list_files(path / mask_folder, (".png",), "plain") if masked else []
+    depths = list_files(path / "depth", DEPTH_SUFFIXES, "plain") if (path / "depth").is_dir() else []
+    remarks = [f"{path}: no camera poses, the camera is taken to stand still"]
+    for files, folder in ((masks, mask_folder), (depths, "depth")):
+        if files:
+            demand_count(files, path / folder, len(images))
+            remarks += unequal_names(images, files)
+    described = read_description(path / "sequence.json")
+    remarks += check_frames(path / "sequence.json", described, len(images))
+    if not masks:
+        remarks.append(f"{path / 'masks'}: not there, every pixel counts as tissue")
+    if not depths:
+        remarks.append(f"{path / 'depth'}: not there; endoprior prepare adds it")
+    unit = cfg.depth_unit_mm or described.get("depth_scale")
+    if depths and not unit:
+        remarks.append(f"{path / 'depth'}: no unit given, taken for mm; set data.depth_unit_mm")
+    height, width = read_color(images[0]).shape[:2]
+    if "fx" not in described:
+        focal = ASSUMED_FOCAL * width
+        remarks.append(f"{path}: no focal length given, {ASSUMED_FOCAL:g} image widths ({focal:g} px) are assumed")
+    shape = (width, height, *intrinsics_of(path / "sequence.json", described, width, height, ASSUMED_FOCAL * width))
+    kept = kept_frames(len(images), cfg)
+    images, masks, depths = ([files[i] for i in kept] if files else [] for files in (images, masks, depths))
+    size, tool_value = (width, height), described.get("mask_tool_value", 255)
+
+    def decode(index: int) -> Pixels:
+        tool = read_tool_mask(masks[index], tool_value, size) if masks else np.zeros((height, width), bool)
+        blank = np.zeros((height, width), np.float32)
+        depth = read_depth_file(depths[index], unit or 1.0, size) if depths else blank
+        return read_color(images[index], size), ~tool, depth
+
+    rate = described.get("frames_per_second")
+    return assemble(
+        path,
+        cfg,
+        [Camera(*shape, pose) for pose in identity_poses(len(kept))],
+        decode,
+        files=[*images, *masks, *depths, *([path / "sequence.json"] if described else [])],
+        frames_per_second=float(rate) / (cfg.stride or 1) if rate is not None else None,
+        remarks=remarks,
+        mask_folder=mask_folder,
+        depth_is_relative=described.get("depth_relative", not unit),
+        sources=described.get("sources"),
+    )

@@ -1,0 +1,34 @@
+"""Camera poses as files hold them: checked, and turned into `world_to_camera`. `N` frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .images import complaint
+
+ROTATION_TOLERANCE = 1e-3
+"""Largest entry of R^T R - I that still passes for a rotation: far above float32 rounding, far below a real scale."""
+
+
+def demand_rotations(path: Path, rotations: NDArray[np.float64], where: str, next_step: str) -> None:
+    """Refuse finite (N, 3, 3) matrices that are not rotations; `where` names them in the message."""
+    deviation = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max((1, 2))
+    wrong = np.flatnonzero((deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0))
+    if wrong.size:
+        raise complaint(path, f"rotations in {where}", f"something else in row {wrong[0]}", next_step)
+
+
+def world_to_camera(rotation: NDArray[np.float64], center: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) transform from world to camera axes of a camera at `center`, (3,) mm, with axes as columns (3, 3)."""
+    transform = np.eye(4)
+    transform[:3, :3] = rotation.T
+    transform[:3, 3] = -rotation.T @ center
+    return transform
+
+
+def identity_poses(count: int) -> list[NDArray[np.float64]]:
+    """`world_to_camera` of a camera that stands still at the origin, once per frame."""
+    return [np.eye(4) for _ in range(count)]

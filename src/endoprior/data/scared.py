@@ -1,0 +1,171 @@
+"""Reader of processed SCARED keyframes: rectified left images, disparity, calibration and pose of every frame.
+
+Two kinds of processing are in use. Version 1 (EndoGaussian, EndoSurf) keeps the raw camera `KL` and pose beside
+rectified images. Version 2 (EndoPrior-GS) stores its own rectification, which is then applied to camera and pose.
+Pixel centers of these calibrations are integers, ours are halves: principal points move by 0.5.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..config import DataConfig
+from ..types import Camera
+from .assemble import Pixels, assemble, kept_frames
+from .depth_files import read_values
+from .files import list_files, read_json, read_matrix
+from .images import complaint, read_color
+from .poses import demand_rotations
+from .sequence import Sequence
+
+STRIDES = {1: 2, 2: 1, 3: 4, 6: 8, 7: 8}
+"""Published frame stride of each dataset number."""
+BADLY_CALIBRATED = (4, 5)
+NEAR_MM, FAR_MM = 0.03, 300.0
+"""Depth outside is missing. The near end looks like a slip for 30, but it is the published one."""
+FOLDERS = {"left_finalpass": ".png", "disparity": ".tiff", "reprojection_data": ".json"}
+HINT = "Process the keyframe first, see docs/datasets.md."
+VERSION_2 = ("left_rectification_rotation", "left_projection_matrix", "reprojection_matrix")
+
+
+def is_scared(path: Path) -> bool:
+    """Whether a folder is a SCARED keyframe, processed or raw."""
+    names = ("data/frame_data", "data/frame_data.tar.gz", "point_cloud.obj", "left_point_cloud.obj")
+    return any((path / name).exists() for name in names)
+
+
+def load_scared(path: Path, cfg: DataConfig) -> Sequence:
+    """Open a processed keyframe folder; poses are relative to the first frame.
+
+    Raises:
+        InputError: raw or incomplete data, mixed versions, or files that cannot be used.
+    """
+    data = path / "data"
+    for folder in ("frame_data", *FOLDERS):
+        if not (data / folder).is_dir():
+            raise complaint(data / folder, "a folder of processed SCARED frames", "no such folder", HINT)
+    records = list_files(data / "frame_data", (".json",), "SCARED")
+    for folder, suffix in FOLDERS.items():
+        others = {file.stem for file in list_files(data / folder, (suffix,), "SCARED")}
+        odd = sorted({file.stem for file in records} ^ others)
+        if odd:
+            got = f"{len(others)}; {odd[0]} is in one of the two only"
+            raise complaint(data / folder, f"the {len(records)} frames of frame_data", got, HINT)
+    number = dataset_number(path)
+    remarks = _remarks(path, number, cfg)
+    records = [records[i] for i in kept_frames(len(records), cfg, STRIDES.get(number or 0, 1))]
+    names = [file.stem for file in records]
+    images, disparities, geometries = ([data / f / f"{n}{s}" for n in names] for f, s in FOLDERS.items())
+    height, width = read_color(images[0]).shape[:2]
+    size = (width, height)
+    geometry = [_geometry(*files, size) for files in zip(records, geometries, strict=True)]
+    versions = sorted({version for *_, version in geometry})
+    if len(versions) > 1:
+        hint = "Process all frames by the same program."
+        raise complaint(data / "reprojection_data", "files of one version", "versions 1 and 2", hint)
+    if versions == [1]:
+        remarks.append(f"{data}: version 1, whose camera and pose are those of the images before rectification")
+    to_camera = np.stack([pose for _, pose, _, _ in geometry])
+    demand_rotations(data / "frame_data", to_camera[:, :3, :3], "camera-pose", HINT)
+    first_to_world = np.linalg.inv(to_camera[0])
+    cameras = [
+        Camera(width, height, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, pose @ first_to_world)
+        for k, pose, _, _ in geometry
+    ]
+
+    def decode(index: int) -> Pixels:
+        depth = disparity_to_depth(read_values(disparities[index], size), geometry[index][2])
+        return read_color(images[index], size), tissue_from_depth(depth), depth
+
+    return assemble(
+        path,
+        cfg,
+        cameras,
+        decode,
+        files=[*images, *disparities, *records, *geometries],
+        clip_depth=False,
+        remarks=remarks,
+        mask_folder="data/disparity",
+        sources={"depth": "structured light at the keyframe, carried to other frames by robot kinematics"},
+    )
+
+
+def disparity_to_depth(disparity: NDArray[np.float32], reprojection: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Depth z = Q[2,3] / (Q[3,2] d + Q[3,3]) of disparity d.
+
+    Args:
+        disparity: (H, W) px; missing where 0, negative or not finite.
+        reprojection: (4, 4) Q, for mm.
+    Returns:
+        (H, W) mm; 0 where missing or outside [NEAR_MM, FAR_MM].
+    """
+    known = np.isfinite(disparity) & (disparity > 0)
+    below = np.where(known, reprojection[3, 2] * disparity + reprojection[3, 3], 0)
+    with np.errstate(divide="ignore"):
+        depth = reprojection[2, 3] / below
+    return np.where(known & (depth >= NEAR_MM) & (depth <= FAR_MM), depth, 0).astype(np.float32)
+
+
+def tissue_from_depth(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(H, W) True where depth is known, gaps closed by squares of W / 128 px; there are no tool masks.
+
+    OpenCV's closing with an even square moves the mask by one pixel; the published masks have that, too.
+    """
+    side = max(1, depth.shape[1] // 128)
+    return cv2.morphologyEx((depth != 0).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)) > 0
+
+
+def dataset_number(path: Path) -> int | None:
+    """The k of `dataset_k` among a path's folders, or of a name like `d1k1`; None without one."""
+    for part in reversed(path.resolve().parts):
+        found = re.fullmatch(r"dataset_?(\d+)|d(\d+)_?k\d+", part.lower())
+        if found:
+            return int(found[1] or found[2])
+    return None
+
+
+def _geometry(
+    record: Path, geometry: Path, size: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], int]:
+    """(3, 3) camera matrix, (4, 4) world-to-camera, (4, 4) Q and the version of one frame."""
+    about, stored = read_json(record, HINT), read_json(geometry, HINT)
+    pose = read_matrix(record, about, "camera-pose", (4, 4))
+    version = _version(geometry, stored)
+    if version == 1:
+        intrinsics = read_matrix(record, about, "camera-calibration.KL", (3, 3))
+        reprojection = read_matrix(geometry, stored, "reprojection-matrix", (4, 4))
+    else:
+        rotation = read_matrix(geometry, stored, VERSION_2[0], (3, 3))
+        intrinsics = read_matrix(geometry, stored, VERSION_2[1], (3, 4))[:, :3]
+        reprojection = read_matrix(geometry, stored, VERSION_2[2], (4, 4))
+        if stored.get("image_size", list(size)) != list(size):
+            got = f"{stored['image_size']}"
+            raise complaint(geometry, f"image_size {list(size)} like the image", got, HINT)
+        pose = np.block([[rotation, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]) @ pose
+    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
+        raise complaint(record, "focal lengths > 0 px", f"{intrinsics[0, 0]:g}, {intrinsics[1, 1]:g}", HINT)
+    return intrinsics, pose, reprojection, version
+
+
+def _version(path: Path, stored: dict[str, Any]) -> int:
+    """1 or 2, as the file says or as its keys show."""
+    version = stored.get("schema_version", 2 if VERSION_2[0] in stored else 1)
+    if type(version) is not int or version not in (1, 2):
+        raise complaint(path, "schema_version 1 or 2", repr(version), HINT)
+    return version
+
+
+def _remarks(path: Path, number: int | None, cfg: DataConfig) -> list[str]:
+    """What is odd about the keyframe as a whole."""
+    remarks = []
+    if number is None and not cfg.stride:
+        remarks.append(f"{path}: no folder dataset_k in its path, so every frame is kept; set data.stride")
+    if number in BADLY_CALIBRATED:
+        remarks.append(f"{path}: dataset {number} of SCARED is badly calibrated; its depth does not fit its images")
+    return remarks

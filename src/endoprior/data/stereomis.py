@@ -1,0 +1,76 @@
+"""Reader of prepared StereoMIS sequences: the EndoNeRF layout with `split.json`, as EndoPrior-GS writes it.
+
+Poses are in mm and masks mark tools already. Raw sequences are recognized only to say what to do with them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..config import DataConfig
+from .depth_files import read_values
+from .endonerf import load_endonerf
+from .files import list_files, read_json
+from .images import complaint, decode_image
+from .sequence import Sequence, is_test_frame
+
+RAW_FILE = "StereoCalibration.ini"
+
+
+def is_stereomis(path: Path) -> bool:
+    """Whether a folder is a StereoMIS sequence, prepared or raw."""
+    return (path / RAW_FILE).exists() or ((path / "split.json").exists() and (path / "images").is_dir())
+
+
+def load_stereomis(path: Path, cfg: DataConfig) -> Sequence:
+    """Open a prepared sequence.
+
+    8-bit depth is Omnidata's relative depth, so its scale is unknown; 16-bit depth counts as mm.
+
+    Raises:
+        InputError: a raw sequence, another split than every 8th frame, or files that cannot be used.
+    """
+    if not (path / "images").is_dir():
+        hint = "Run endoprior prepare on its video with this calibration and masks/."
+        raise complaint(path / RAW_FILE, "a prepared sequence", "a raw one", hint)
+    count = len(list_files(path / "images", (".png",), "StereoMIS"))
+    _check_split(path / "split.json", count)
+    depth = decode_image(list_files(path / "depth", (".png",), "StereoMIS")[0], None)
+    facts: dict[str, Any] = {}
+    if depth.dtype == np.uint8:
+        facts = {"depth_relative": True, "sources": {"depth": "Omnidata, relative, 8 bits"}}
+    fact_files = [path / "split.json"]
+    if (path / "intrinsics.npy").exists():
+        facts |= _read_intrinsics(path / "intrinsics.npy")
+        fact_files.append(path / "intrinsics.npy")
+    return load_endonerf(path, cfg, facts=facts, fact_files=fact_files)
+
+
+def _read_intrinsics(path: Path) -> dict[str, float]:
+    """fx, fy, cx, cy of the (3, 3) matrix in `intrinsics.npy`, whose pixel centers are integers."""
+    hint = "Write the 3x3 camera matrix of the rectified images."
+    matrix = read_values(path)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise complaint(path, "a 3x3 camera matrix", f"shape {matrix.shape} or other numbers", hint)
+    fx, fy, cx, cy = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return {"fx": fx, "fy": fy, "cx": cx + 0.5, "cy": cy + 0.5}
+
+
+def _check_split(path: Path, count: int) -> None:
+    """Refuse a stored split that is not the one every sequence of this program has."""
+    split = read_json(path)
+    expected = {
+        "test_indices": [i for i in range(count) if is_test_frame(i)],
+        "train_indices": [i for i in range(count) if not is_test_frame(i)],
+    }
+    for key, indices in expected.items():
+        stored = split.get(key)
+        if not isinstance(stored, list):
+            raise complaint(path, f"a list {key}", repr(stored), "Prepare the sequence again.")
+        if stored != indices:
+            got = f"{len(stored)} frames that differ"
+            want = f"{key} of the rule (i - 1) % 8 == 0, {len(indices)} frames"
+            raise complaint(path, want, got, "Remove split.json to use that rule.")

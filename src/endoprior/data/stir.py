@@ -1,0 +1,140 @@
+"""STIR clips (Surgical Tattoos in Infrared): points tattooed on tissue, seen in infrared before and after a clip.
+
+A clip is a video without depth, so `endoprior prepare` comes first; `write_stir_tracks` then adds its points. STIR
+does not say which point of the end is which point of the start: its benchmark takes, for each predicted end, the
+nearest true one. No pairs are made up here, because pairing by distance would favor scenes that stand still.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import whole_file
+from ..config import DataConfig
+from ..types import Frame
+from .endonerf import load_endonerf
+from .images import complaint, decode_image, single_channel
+from .sequence import Sequence
+from .truth import Tracks
+
+DEPTH_WINDOW_PX = 2
+"""Depth of a point is the median of what was measured up to so many pixels to each side."""
+SEGMENTATIONS = ("segmentation/icgstartseg.png", "segmentation/icgendseg.png")
+ASPECT_TOLERANCE = 0.01
+"""Largest relative difference of the scales of width and height: rounding, not a crop."""
+
+
+def is_stir(path: Path) -> bool:
+    """Whether a folder is a STIR clip (`left/seqNN`), or holds some."""
+    return (path / SEGMENTATIONS[0]).exists() or any(path.glob(f"left*/seq*/{SEGMENTATIONS[0]}"))
+
+
+def load_stir(path: Path, cfg: DataConfig) -> Sequence:
+    """Say how to get a sequence out of a clip.
+
+    Raises:
+        InputError: always.
+    """
+    clips = [path] if (path / SEGMENTATIONS[0]).exists() else sorted(path.glob("left*/seq*"))
+    videos = sorted((clips[0] / "frames").glob("*.mp4")) if clips else []
+    video = videos[0] if videos else clips[0] / "frames" / "*.mp4" if clips else path
+    hint = f"Run endoprior prepare {video} OUT --border keep --stir {clips[0] if clips else path} (docs/datasets.md)."
+    raise complaint(path, "a prepared sequence", "a STIR clip, which has no depth", hint)
+
+
+def tattoo_centers(path: Path) -> NDArray[np.float64]:
+    """Centers of the marked spots of a segmentation image.
+
+    Args:
+        path: image with 0 where there is no tattoo.
+    Returns:
+        (P, 2) x, y of the middle of each connected region's bounding box, as in STIR's benchmark, px of the image.
+        The top-left pixel is centered at (0.5, 0.5).
+    Raises:
+        InputError: unreadable, or with differing color channels.
+    """
+    marked = (single_channel(path, decode_image(path, None)) > 0).astype(np.uint8)
+    _, _, boxes, _ = cv2.connectedComponentsWithStats(marked, connectivity=8)
+    boxes = boxes[1:].astype(np.float64)  # the first is the background
+    return boxes[:, :2] + boxes[:, 2:4] / 2
+
+
+def stir_tracks(
+    start_px: NDArray[np.float64], end_px: NDArray[np.float64], start: Frame, end: Frame, num_frames: int
+) -> Tracks:
+    """Unpaired material points: those of the start are visible in the first frame only, those of the end in the last.
+
+    Args:
+        start_px: (P, 2) x, y in the first frame, px of the frame.
+        end_px: (Q, 2) in the last frame.
+        start, end: the first and the last frame, with depth.
+        num_frames: T of the sequence.
+    Returns:
+        Points (T, P' + Q', 3) in camera axes, mm, 0 where they are not visible; spots without depth are left out.
+    """
+    first, last = _lift(start_px, start), _lift(end_px, end)
+    points = np.zeros((num_frames, len(first) + len(last), 3), np.float32)
+    visible = np.zeros(points.shape[:2], bool)
+    points[0, : len(first)], points[-1, len(first) :] = first, last
+    visible[0, : len(first)], visible[-1, len(first) :] = True, True
+    return Tracks(points, visible)
+
+
+def nearest_end_errors(predicted: NDArray[np.floating], true_ends: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(P,) distance of each predicted end point to the nearest true one: the error of STIR's benchmark.
+
+    Args:
+        predicted: (P, K) where a tracker says the points of the start are at the end; mm for K = 3, px for K = 2.
+        true_ends: (Q, K) Q > 0.
+    """
+    return np.linalg.norm(predicted[:, None] - true_ends[None], axis=-1).min(1)
+
+
+def write_stir_tracks(clip: Path, prepared: Path) -> Path:
+    """Write `truth/tracks.npz` of a prepared clip from its segmentations; returns the file.
+
+    The file also has `paired`, False: nothing says which end belongs to which start.
+
+    Args:
+        clip: STIR's `left/seqNN` folder.
+        prepared: what `endoprior prepare` made of its video, all frames, not cropped.
+    Raises:
+        InputError: no segmentations, no spot with depth, or a cropped picture.
+    """
+    sequence = load_endonerf(Path(prepared), DataConfig(lift_missing_depth=False))
+    frames = sequence.frame(0), sequence.frame(len(sequence) - 1)
+    spots = []
+    for name, frame in zip(SEGMENTATIONS, frames, strict=True):
+        path = Path(clip) / name
+        height, width = decode_image(path, None).shape[:2]
+        scale = np.array([frame.camera.width / width, frame.camera.height / height])
+        if abs(scale[0] / scale[1] - 1) > ASPECT_TOLERANCE:
+            got = f"{frame.camera.width}x{frame.camera.height} px for {width}x{height}"
+            raise complaint(prepared, f"the whole picture of {path}", got, "Prepare the clip with --border keep.")
+        spots.append(tattoo_centers(path) * scale)
+    tracks = stir_tracks(*spots, *frames, len(sequence))
+    for time, name in ((0, SEGMENTATIONS[0]), (-1, SEGMENTATIONS[1])):
+        if not tracks.visible[time].any():
+            got = f"none of {len(spots[time])}"
+            raise complaint(Path(clip) / name, "spots where the frame has depth", got, "Use another clip.")
+    target = Path(prepared) / "truth" / "tracks.npz"
+    target.parent.mkdir(exist_ok=True)
+    with whole_file(target) as part:
+        np.savez_compressed(part, points=tracks.points, visible=tracks.visible, paired=False)
+    return target
+
+
+def _lift(spots: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
+    """(P', 3) points in camera axes, mm, of the (P, 2) spots around which depth was measured."""
+    camera, found = frame.camera, []
+    for x, y in spots:
+        rows, columns = (slice(max(0, int(v) - DEPTH_WINDOW_PX), int(v) + DEPTH_WINDOW_PX + 1) for v in (y, x))
+        measured = frame.depth[rows, columns][frame.depth_valid[rows, columns]]
+        if measured.size:
+            z = float(np.median(measured))
+            found.append(((x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z))
+    return np.array(found).reshape(-1, 3)

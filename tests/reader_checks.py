@@ -1,0 +1,36 @@
+"""What tests of readers share: refusals in one line, and frames compared with what was written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from endoprior.checks import InputError
+from endoprior.config import DataConfig
+from endoprior.data import load_sequence
+
+
+def assert_refused(folder: Path, named: str, words: str, cfg: DataConfig | None = None) -> None:
+    """Loading, or decoding every frame, must fail with one line: PATH: expected X; got Y. Next step."""
+    with pytest.raises(InputError) as caught:
+        load_sequence(folder, cfg).validate()
+    message = str(caught.value)
+    path, rest = message.split(": expected ", 1)
+    assert path.endswith(named) and path.startswith(str(folder)), message
+    assert words in message, message
+    assert "; got " in rest and "\n" not in message and message.endswith(".") and rest.count(". ") >= 1, message
+
+
+def remark_with(folder: Path, words: str, cfg: DataConfig | None = None) -> bool:
+    """Whether a remark of the validated sequence contains `words`."""
+    remarks = load_sequence(folder, cfg).validate()
+    assert all("\n" not in remark for remark in remarks)
+    return any(words in remark for remark in remarks)
+
+
+def edit_json(path: Path, **changes: object) -> None:
+    """Change keys of a JSON file; None removes one."""
+    stored = json.loads(path.read_text()) | changes
+    path.write_text(json.dumps({key: value for key, value in stored.items() if value is not None}))

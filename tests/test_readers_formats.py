@@ -1,0 +1,134 @@
+"""The choice of a layout: the table, the option, the complaint; and EndoNeRF folders read as ever."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import typing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reader_checks import assert_refused, edit_json, remark_with
+
+from endoprior.checks import InputError
+from endoprior.config import DataConfig
+from endoprior.data import load_sequence
+from endoprior.data.formats import FORMATS
+from endoprior.data.load import find_format
+
+NAMES = [layout.name for layout in FORMATS]
+
+
+def touch(root: Path, *names: str) -> Path:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b"")
+    return root
+
+
+LOOKS = {
+    "scared": ("data/frame_data/frame_data000000.json",),
+    "scared raw": ("data/frame_data.tar.gz", "data/rgb.mp4"),
+    "scared by its model": ("left_point_cloud.obj",),
+    "c3vd": ("pose.txt", "0_color.png"),
+    "stir": ("frames/0ms-9ms-visible.mp4", "segmentation/icgstartseg.png"),
+    "stir root": ("calib.json", "left/seq00/segmentation/icgstartseg.png"),
+    "stereomis": ("images/0.png", "masks/0.png", "depth/0.png", "poses_bounds.npy", "split.json"),
+    "stereomis raw": ("P2_7.mp4", "StereoCalibration.ini", "groundtruth.txt", "masks/000001l.png"),
+    "hamlyn": ("images/0.png", "gt_masks/0.png", "gt_depth/0.png", "poses_bounds.npy"),
+    "hamlyn rectified": ("image01/0.jpg", "depth01/0.png", "intrinsics.txt"),
+    "endonerf": ("images/0.png", "masks/0.png", "depth/0.png", "poses_bounds.npy"),
+    "endonerf without images": ("poses_bounds.npy",),
+    "endonerf without poses": ("images/0.png", "masks/0.png", "depth/0.png"),
+    "plain": ("images/0.jpg",),
+    "plain with depth": ("images/0.png", "masks/0.png", "depth/0.npy"),
+}
+
+
+@pytest.mark.parametrize("case", LOOKS)
+def test_layouts_are_recognized_by_names(tmp_path, case):
+    assert find_format(touch(tmp_path, *LOOKS[case]), DataConfig()).name == case.split()[0]
+
+
+def test_option_and_table_have_the_same_names():
+    literal = typing.get_type_hints(DataConfig)["format"]
+    assert list(typing.get_args(literal)) == ["auto", *NAMES]
+
+
+def test_every_layout_is_documented():
+    page = (Path(__file__).parents[1] / "docs" / "datasets.md").read_text()
+    for name in NAMES:
+        assert re.search(rf"^## .*\(`{name}`\)$", page, re.MULTILINE), name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_option_wins_over_what_the_folder_looks_like(tmp_path, name):
+    assert find_format(touch(tmp_path, *LOOKS["plain"]), DataConfig(format=name)).name == name
+
+
+def test_unknown_folder_is_described(tmp_path):
+    known = "scared, c3vd, stir, stereomis, hamlyn, endonerf, plain"
+    assert_refused(tmp_path, tmp_path.name, f"one of the layouts {known}; got an empty folder. See docs/datasets.md.")
+    touch(tmp_path, *"abcdef", "g/x", ".hidden")
+    assert_refused(tmp_path, tmp_path.name, "got a, b, c, d, e and 2 more")
+
+
+def test_missing_folder_and_file(tmp_path):
+    assert_refused(tmp_path / "gone", "gone", "got no such folder")
+    assert_refused(touch(tmp_path, "a.mp4") / "a.mp4", "a.mp4", "got a file")
+
+
+def test_ranges_of_the_options():
+    for wrong in ({"stride": -1}, {"depth_unit_mm": -0.1}, {"depth_unit_mm": float("nan")}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            DataConfig(**wrong)
+
+
+def test_pose_axes_belong_to_the_endonerf_layout(tmp_path):
+    touch(tmp_path, *LOOKS["c3vd"])
+    with pytest.raises(ValueError, match="pose_axes must be opencv for the c3vd layout"):
+        load_sequence(tmp_path, pose_axes="opengl")
+
+
+def test_endonerf_stride_and_unit(tiny_sequence):
+    whole = load_sequence(tiny_sequence)
+    part = load_sequence(tiny_sequence, DataConfig(stride=5, depth_unit_mm=0.02))
+    assert len(part) == 4 and part.frames_per_second == 3
+    np.testing.assert_array_equal(part.frame(2).rgb_u8, whole.frame(10).rgb_u8)
+    np.testing.assert_allclose(part.frame(2).depth, 2 * whole.frame(10).depth, rtol=1e-6)
+    assert part.frame(2).time == 0.5 and part.fingerprint() != whole.fingerprint()
+
+
+def test_stride_leaves_truth_out(tiny_sequence):
+    (tiny_sequence / "truth").mkdir()
+    assert load_sequence(tiny_sequence).truth is not None
+    assert load_sequence(tiny_sequence, DataConfig(stride=2)).truth is None
+
+
+def test_origins_of_an_endonerf_folder(tiny_sequence):
+    seq = load_sequence(tiny_sequence)
+    assert not seq.depth_is_relative and seq.sources == {} and seq.validate() == []
+    sources = {"depth": "DepthAnything", "masks": "none"}
+    edit_json(tiny_sequence / "sequence.json", depth_relative=True, sources=sources, unexplained_frames=[3])
+    seq = load_sequence(tiny_sequence)
+    assert seq.depth_is_relative and seq.sources == sources
+    assert remark_with(tiny_sequence, "scale of its depth is unknown")
+    assert remark_with(tiny_sequence, "1 frames are marked as unexplained, the first is frame 3")
+    edit_json(tiny_sequence / "sequence.json", unexplained_frames=[-1])
+    assert_refused(tiny_sequence, "sequence.json", "unexplained_frames in 0..16; got -1")
+
+
+def test_description_is_checked_before_pictures_are_read(tiny_sequence):
+    (tiny_sequence / "sequence.json").write_text(json.dumps({"format_version": 99}))
+    with pytest.raises(InputError, match="Update endoprior"):
+        load_sequence(tiny_sequence)
+
+
+def test_importing_the_package_is_light():
+    code = "import sys, endoprior; print(sorted({'torch', 'cv2', 'scipy', 'OpenEXR'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
+    code = "import sys, endoprior.data; print(sorted({'torch', 'scipy', 'OpenEXR'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
