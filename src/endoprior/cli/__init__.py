@@ -14,6 +14,8 @@ from ..checks import InputError
 COMMANDS = {
     "demo": "phantom sequence -> train -> eval -> render, with a summary and pictures",
     "phantom": "write a synthetic surgical sequence with full ground truth",
+    "prepare": "write a sequence folder from a video: eyes, borders, depth, tool masks, poses",
+    "check": "look at a sequence before training: facts, findings with their fix, one picture",
     "prior": "draw the cue maps and the joint texture prior of each frame",
     "train": "train one scene and score it",
     "eval": "score a trained scene on a split",

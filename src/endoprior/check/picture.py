@@ -1,0 +1,228 @@
+"""One picture of a sequence: frames with what was found in them, depth, curves over time, and the first points."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.patches import Circle, Rectangle
+from numpy.typing import NDArray
+
+from ..atomic import whole_file
+from ..data import Sequence
+from ..footage.units import FAR_MM, NEAR_MM
+from ..geometry import project
+from ..show.pictures import colorize
+from ..types import Frame
+from .facts import Facts, spread
+from .findings import SEEN_AS_TISSUE, Finding
+from .report import table
+
+SHOWN = 4
+"""Frames shown."""
+RULER_MM = 10.0
+"""Length of the ruler in the pictures, at their median depth."""
+TOOL_COLOR, BORDER_COLOR, FLAG_COLOR = "#ff3b30", "#ffd60a", "#d62728"
+WRAPPED_AT, ROWS = 84, 34
+"""Characters of a line and lines of the panel of findings."""
+SEVERITY_COLOR = {"error": "#b00020", "warning": "#b26a00", "note": "#3a5a78"}
+
+
+def draw_check(sequence: Sequence, facts: Facts, findings: list[Finding], path: Path) -> None:
+    """Write the picture as one PNG.
+
+    Rows: frames with tools outlined in red and borders in yellow; their depth; histogram of depth and curves over
+    time, frames of findings marked; the first points from the camera and from the side, and the findings.
+
+    Args:
+        sequence: what was measured.
+        facts, findings: what came of it.
+        path: the file, whole or not at all.
+    """
+    # A canvas of its own: choosing a backend for the whole process would be the caller's affair.
+    figure = Figure(figsize=(15, 14), layout="constrained", dpi=100)
+    FigureCanvasAgg(figure)
+    camera = facts.camera
+    figure.suptitle(f"{facts.path.name}   {facts.frames} frames of {camera.width} x {camera.height} px", fontsize=13)
+    pictures, curves, space = figure.subfigures(3, 1, height_ratios=[5.6, 3.4, 4.8])
+    _draw_frames(pictures, [sequence.frame(i) for i in spread(len(sequence), SHOWN)], facts)
+    left, right = curves.subfigures(1, 2, width_ratios=[1, 2.4])
+    _draw_histogram(left.subplots(), facts)
+    _draw_curves(right, facts, findings)
+    axes = space.subplots(1, 3, width_ratios=[1, 1.15, 1.45])
+    _draw_cloud(axes[0], axes[1], facts)
+    _draw_findings(axes[2], facts, findings)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary)
+
+
+def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
+    axes = np.atleast_2d(part.subplots(2, len(frames), squeeze=False))
+    low, high = facts.depth.low, facts.depth.high
+    for column, frame in enumerate(frames):
+        top, bottom = axes[:, column]
+        top.imshow(_outlined(frame))
+        tool = 1 - frame.tissue_mask.mean()
+        top.set_title(f"frame {frame.index}: {tool:.0%} tool", fontsize=9)
+        _draw_border(top, facts)
+        if not facts.depth.relative:
+            _draw_ruler(top, frame)
+        bottom.imshow(colorize(frame.depth, low, high, frame.depth_valid))
+        bottom.set_title("depth, black where there is none", fontsize=9)
+        for axis in (top, bottom):
+            axis.set_xlim(0, frame.camera.width)
+            axis.set_ylim(frame.camera.height, 0)
+            axis.set_axis_off()
+    if high <= 0:
+        return
+    bar = part.colorbar(
+        ScalarMappable(Normalize(low, max(high, 1.0001 * low)), "turbo"),
+        ax=axes.ravel().tolist(),
+        location="right",
+        fraction=0.02,
+        pad=0.01,
+        aspect=45,
+    )
+    bar.set_label(f"depth, {_unit(facts)}", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+
+
+def _outlined(frame: Frame) -> NDArray[np.uint8]:
+    """The picture with tools tinted and outlined in red."""
+    picture = frame.rgb_u8.copy()
+    tool = ~frame.tissue_mask
+    red = np.array([int(TOOL_COLOR[i : i + 2], 16) for i in (1, 3, 5)], np.float32)
+    picture[tool] = (0.72 * picture[tool] + 0.28 * red).astype(np.uint8)
+    outlines, _ = cv2.findContours(tool.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, outlines, -1, red.tolist(), max(1, picture.shape[1] // 300))
+    return picture
+
+
+def _draw_border(axis: Axes, facts: Facts) -> None:
+    """Strips, round border and labels, in yellow; dashed where the masks already leave them out."""
+    border, (width, height) = facts.border, (facts.camera.width, facts.camera.height)
+    strips = border.strips
+    for size, at, extent in (
+        (strips.top, (0, 0), (width, strips.top)),
+        (strips.bottom, (0, height - strips.bottom), (width, strips.bottom)),
+        (strips.left, (0, 0), (strips.left, height)),
+        (strips.right, (width - strips.right, 0), (strips.right, height)),
+    ):
+        if size:
+            axis.add_patch(Rectangle(at, *extent, hatch="//", **_line(border.strips_as_tissue > SEEN_AS_TISSUE)))
+    if border.circle:
+        center = border.circle.center_x, border.circle.center_y
+        axis.add_patch(Circle(center, border.circle.radius, **_line(border.outside_as_tissue > SEEN_AS_TISSUE)))
+    for x, y, box_width, box_height in border.overlays:
+        axis.add_patch(Rectangle((x, y), box_width, box_height, **_line(True)))
+
+
+def _line(solid: bool) -> dict[str, object]:
+    return {"fill": False, "edgecolor": BORDER_COLOR, "linewidth": 1.2, "linestyle": "-" if solid else ":"}
+
+
+def _draw_ruler(axis: Axes, frame: Frame) -> None:
+    """A line as long as 10 mm at the frame's median depth: absurd where the unit is wrong."""
+    if not frame.depth_valid.any():
+        return
+    length = RULER_MM * frame.camera.fx / float(np.median(frame.depth[frame.depth_valid]))
+    width, height = frame.camera.width, frame.camera.height
+    left, y = 0.04 * width, 0.94 * height
+    axis.plot([left, left + min(length, 2 * width)], [y, y], color="white", linewidth=3, solid_capstyle="butt")
+    axis.text(left, y - 0.02 * height, f"{RULER_MM:g} mm", color="white", fontsize=8, va="bottom")
+
+
+def _draw_histogram(axis: Axes, facts: Facts) -> None:
+    depth = facts.depth
+    axis.stairs(depth.counts / max(depth.counts.sum(), 1), depth.edges, fill=True, color="#4a7fb5")
+    low, high = depth.edges[0], depth.edges[-1]
+    usual = max(low, NEAR_MM), min(high, FAR_MM)
+    if usual[0] < usual[1]:
+        axis.axvspan(*usual, color="#2e8b57", alpha=0.10, zorder=0)
+    axis.set_xlim(low, high)
+    axis.set_title(f"depth of tissue, green: {NEAR_MM:g}-{FAR_MM:g} mm is usual", fontsize=9)
+    axis.set_xlabel(f"{_unit(facts)}   ({depth.unit.reason})", fontsize=8, wrap=True)
+    axis.set_yticks([])
+    axis.tick_params(labelsize=8)
+
+
+def _draw_curves(part: SubFigure, facts: Facts, findings: list[Finding]) -> None:
+    """Four curves over the frames, each with the frames of its findings marked."""
+    moved = np.arange(1, len(facts.motion.pixels_per_frame) + 1) * facts.motion_step
+    every = np.arange(facts.frames)
+    curves = (
+        ("brightness", every, facts.changes.brightness, {"exposure-jump", "unexplained-frames", "scene-cut"}),
+        ("tool, share of pixels", every, facts.masks.tool_fraction, set()),
+        (f"median depth, {_unit(facts)}", every, facts.depth.median, {"depth-jumps", "no-depth-frames"}),
+        ("motion of the picture, px a frame", moved, facts.motion.pixels_per_frame, {"duplicate-frames"}),
+    )
+    for axis, (title, x, y, codes) in zip(part.subplots(2, 2, sharex=True).flat, curves, strict=True):
+        axis.plot(x, y, color="#30506b", linewidth=1.2)
+        for frame in sorted({frame for finding in findings if finding.code in codes for frame in finding.frames}):
+            axis.axvline(frame, color=FLAG_COLOR, linewidth=0.8, alpha=0.7)
+        axis.set_title(title, fontsize=9)
+        axis.tick_params(labelsize=8)
+        axis.grid(alpha=0.25)
+        axis.set_xlim(0, max(facts.frames - 1, 1))
+        top = float(np.nanmax(y)) if np.isfinite(y).any() else 1.0
+        axis.set_ylim(0, 1.15 * top or 1.0)
+
+
+def _draw_cloud(front: Axes, side: Axes, facts: Facts) -> None:
+    """The first points as the first camera sees them, and from its right, the camera at the left edge."""
+    for axis, title in ((front, "first points, from the camera"), (side, "from the side")):
+        axis.set_facecolor("#101418")
+        axis.set_title(title, fontsize=9)
+        axis.tick_params(labelsize=8)
+    if facts.cloud is None:
+        for axis in (front, side):
+            axis.text(0.5, 0.5, "no points", color="white", ha="center", transform=axis.transAxes)
+            axis.set(xticks=[], yticks=[])
+        return
+    camera = facts.camera
+    points, colors = facts.cloud.points.astype(np.float64), facts.cloud.colors
+    pixels, z = project(points, camera)
+    in_camera = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    far_first = np.argsort(-z)
+    front.scatter(*pixels[far_first].T, s=4, c=colors[far_first], linewidths=0)
+    front.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal", xticks=[], yticks=[])
+    left_first = np.argsort(in_camera[:, 0])
+    side.scatter(z[left_first], in_camera[left_first, 1], s=2.5, c=colors[left_first], linewidths=0)
+    reach = float(np.percentile(z, 99.5)) * 1.08
+    half = camera.height / camera.fy / 2
+    offset = (camera.height / 2 - camera.cy) / camera.fy
+    for edge in (offset - half, offset + half):
+        side.plot([0, reach], [0, edge * reach], color="#8899aa", linewidth=0.7, linestyle=":")
+    side.set(xlim=(0, reach), ylim=((offset + half) * reach, (offset - half) * reach), aspect="equal")
+    side.set_xlabel(f"distance from the camera, {_unit(facts)}", fontsize=8)
+
+
+def _draw_findings(axis: Axes, facts: Facts, findings: list[Finding]) -> None:
+    """The findings and, as far as there is room, the table of facts."""
+    axis.set_axis_off()
+    lines: list[tuple[str, str, str]] = []
+    for finding in findings:
+        lines.append((f"{finding.severity}: {finding.code}", SEVERITY_COLOR[finding.severity], "bold"))
+        lines += [(line, "black", "normal") for line in textwrap.wrap(finding.what, WRAPPED_AT)]
+        fix = textwrap.wrap(f"fix: {finding.fix}", WRAPPED_AT, subsequent_indent="     ")
+        lines += [(line, "#444444", "normal") for line in fix] + [("", "black", "normal")]
+    if not findings:
+        lines += [("nothing suspicious", "#2e8b57", "bold"), ("", "black", "normal")]
+    for name, value in table(facts):
+        rows = textwrap.wrap(value, WRAPPED_AT - 17) or [""]
+        lines += [(f"{name if i == 0 else '':<17}{row}", "#3a5a78", "normal") for i, row in enumerate(rows)]
+    for row, (text, color, weight) in enumerate(lines[:ROWS]):
+        at = {"x": 0, "y": 1 - row / ROWS, "va": "top", "transform": axis.transAxes}
+        axis.text(**at, s=text, color=color, weight=weight, fontsize=7.5, family="monospace")
+
+
+def _unit(facts: Facts) -> str:
+    """Unit of the depth as it is read."""
+    return "relative" if facts.depth.relative else "mm"

@@ -1,0 +1,96 @@
+"""Facts as a table for people and as JSON for programs."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .facts import Facts
+from .findings import Finding
+
+
+def table(facts: Facts) -> list[tuple[str, str]]:
+    """Rows of (what, value), in the order in which they are read."""
+    camera, depth, border, changes = facts.camera, facts.depth, facts.border, facts.changes
+    rate = facts.frames_per_second
+    seconds = f", {facts.frames / rate:.1f} s at {rate:g} frames/s" if rate else ", rate unknown"
+    view = 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx))
+    tool = facts.masks.tool_fraction
+    value = "high" if facts.described.get("mask_tool_value", 255) == 255 else "low"
+    rows = [
+        ("frames", f"{facts.frames}: {facts.train_frames} to train, {facts.test_frames} to test{seconds}"),
+        ("pictures", f"{camera.width} x {camera.height} px{', both eyes' if facts.eyes else ''}"),
+        (
+            "intrinsics",
+            f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px; {view:.0f} degrees",
+        ),
+        ("camera", _camera_words(facts)),
+        ("picture motion", facts.motion.reason),
+        ("tools", f"{tool.mean():.1%} of pixels ({tool.min():.1%} to {tool.max():.1%})"),
+        ("mask polarity", f"read as tool = {value}; {facts.masks.reason}"),
+        ("border", _border_words(facts)),
+        ("labels", f"{len(border.overlays)} burned in and not masked"),
+        (
+            "depth",
+            f"{depth.low:.4g} to {depth.high:.4g}, median {depth.unit.median:.4g}; as read, mm if the unit is right",
+        ),
+        ("depth unit", f"{depth.unit.unit}: {depth.unit.reason}"),
+        (
+            "depth coverage",
+            f"{depth.coverage.mean():.1%} of tissue ({depth.coverage.min():.1%} to {depth.coverage.max():.1%})",
+        ),
+        (
+            "depth resolution",
+            f"steps of {depth.step:.3g}, {f'{depth.bits} bits a value' if depth.bits else 'bits unknown'}",
+        ),
+        (
+            "changes",
+            f"{len(changes.duplicates)} copies, {len(changes.exposure_jumps)} exposure jumps, {len(changes.cuts)} cuts",
+        ),
+        ("first points", f"{len(facts.cloud):,}" if facts.cloud else "none"),
+    ]
+    if facts.eyes:
+        rows.insert(4, ("eyes", facts.eyes.reason))
+    rows += [(f"source of {name}", text) for name, text in facts.sources.items()]
+    return rows
+
+
+def as_json(facts: Facts, findings: list[Finding]) -> dict[str, Any]:
+    """Facts and findings as JSON values; the first points only by their number. NaN becomes None."""
+    return {"facts": _plain(facts), "findings": _plain(findings)}
+
+
+def _camera_words(facts: Facts) -> str:
+    if facts.camera_is_fixed:
+        return "stands still, by the stored poses"
+    return f"moves by up to {facts.camera_path_mm:.3g} mm and {facts.camera_turn_deg:.3g} degrees, by the stored poses"
+
+
+def _border_words(facts: Facts) -> str:
+    strips, circle = facts.border.strips, facts.border.circle
+    sides = {name: getattr(strips, name) for name in ("top", "bottom", "left", "right")}
+    words = [f"strip of {size} px at the {name}" for name, size in sides.items() if size]
+    words += [f"round, radius {circle.radius:.0f} px"] if circle else []
+    return ", ".join(words) or "none"
+
+
+def _plain(value: Any) -> Any:
+    """JSON values of a record, list, array or number."""
+    if type(value).__name__ == "PointCloud":
+        return {"points": len(value)}
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value

@@ -1,0 +1,57 @@
+"""`endoprior check DATA`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..checks import InputError
+from ..config import DataConfig
+from .parsing import parse
+from .progress import say
+
+
+@dataclass
+class Check:
+    """Read a sequence as training would, say what it is and what is suspicious, and draw it."""
+
+    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    """Sequence folder."""
+    out: Path | None = None
+    """PNG to draw."""
+    json: Path | None = None
+    """Also write facts and findings to this file."""
+    strict: bool = False
+    """Exit with status 2 if there is an error; a sequence that cannot be read always does."""
+    data: DataConfig = field(default_factory=DataConfig)
+
+
+def run(argv: list[str]) -> int:
+    """Measure, print, draw; the exit status."""
+    args = parse(Check, argv, "check")
+    if args.out and args.out.suffix.lower() != ".png":
+        raise InputError(f"--out: expected a .png file; got {args.out}. Rename it.")
+    from ..atomic import write_json
+    from ..check import draw_check, find, measure
+    from ..check.report import as_json, table
+    from ..data import load_sequence
+
+    sequence = load_sequence(args.folder, args.data)
+    facts = measure(sequence, args.data)
+    findings = find(facts)
+    say(f"{args.folder}")
+    for name, value in table(facts):
+        say(f"  {name:<18}{value}")
+    for finding in findings:
+        say(str(finding))
+    if not findings:
+        say("nothing suspicious")
+    if args.json:
+        write_json(args.json, as_json(facts, findings))
+    if args.out:
+        draw_check(sequence, facts, findings, args.out)
+        say(f"{args.out}")
+    return 2 if args.strict and any(finding.severity == "error" for finding in findings) else 0

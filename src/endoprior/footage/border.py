@@ -1,0 +1,143 @@
+"""What surrounds the endoscope's picture: black bars, console strips, the round border of a lens.
+
+Shared letters: `K` sample pictures of one clip, (H, W, 3) uint8 each. A picture is never black in the same place for
+long, and never still: what is, does not belong to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+BLACK_LEVEL = 28
+"""Brightest level, 0..255, of what passes for black: limited-range video and its coding noise stay below."""
+MIN_STRIP_PX = 3
+"""Thinner strips are left to the coding noise of border rows."""
+MAX_STRIP_FRACTION = 0.25
+"""A strip never takes more of the picture than this."""
+STILL_RATIO = 0.3
+"""A strip changes less than this share of what the middle of the picture changes ..."""
+STRIP_CHROMA = 40
+"""... and is gray: half of its pixels have channels closer together than this."""
+EDGE_SHARE = 0.55
+"""Share of the strip's edge along which the level must jump: strips end in straight lines, shadows do not."""
+EDGE_STEP = 12
+"""Smallest jump, levels."""
+CIRCLE_RESIDUAL = 0.012
+"""Largest median distance of border points from the fitted circle, in radii."""
+
+
+@dataclass(frozen=True)
+class Strips:
+    """Rows and columns at each side that do not belong to the picture, px."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    def __bool__(self) -> bool:
+        return any((self.top, self.bottom, self.left, self.right))
+
+
+@dataclass(frozen=True)
+class Circle:
+    """The round border of the endoscope's picture, px; the center of the top-left pixel is (0.5, 0.5)."""
+
+    center_x: float
+    center_y: float
+    radius: float
+
+    def mask(self, width: int, height: int, margin_px: float = 0.0) -> NDArray[np.bool_]:
+        """(H, W) True inside the circle drawn `margin_px` smaller."""
+        x = np.arange(width) + 0.5 - self.center_x
+        y = np.arange(height)[:, None] + 0.5 - self.center_y
+        return x * x + y * y < (self.radius - margin_px) ** 2
+
+
+def find_strips(pictures: Sequence[NDArray[np.uint8]]) -> Strips:
+    """Black bars and still, gray console strips at the sides.
+
+    Args:
+        pictures: K of one size, some time apart; one picture alone shows black bars only.
+    """
+    grays = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in pictures]
+    mean = sum(grays) / len(grays)
+    change = np.sqrt(sum((gray - mean) ** 2 for gray in grays) / len(grays))
+    low = np.maximum.reduce([picture.max(-1) for picture in pictures])
+    chroma = sum(picture.max(-1) - picture.min(-1).astype(np.float32) for picture in pictures) / len(pictures)
+    middle = tuple(slice(n // 4, n - n // 4) for n in low.shape)
+    lively = float(np.median(change[middle]))
+    found = []
+    for turns in (0, 2, 1, 3):  # turned so that the side in question is on top: top, bottom, right, left
+        maps = (np.rot90(m, turns) for m in (low, chroma, change, mean))
+        found.append(_strip_on_top(*maps, lively))
+    return Strips(top=found[0], bottom=found[1], left=found[3], right=found[2])
+
+
+def _strip_on_top(low: NDArray[np.uint8], chroma: NDArray, change: NDArray, mean: NDArray, lively: float) -> int:
+    """Number of rows of a strip at the top of these (H, W) maps, 0 for none."""
+    limit = int(MAX_STRIP_FRACTION * len(low))
+    black = np.quantile(low[: limit + 1], 0.98, axis=1) < BLACK_LEVEL
+    still = np.quantile(change[: limit + 1], 0.8, axis=1) < STILL_RATIO * lively  # never, if there is one picture
+    gray = np.median(chroma[: limit + 1], axis=1) < STRIP_CHROMA
+    belongs = black | (still & gray)
+    rows = limit + 1 if belongs.all() else int(np.argmin(belongs))
+    if rows < MIN_STRIP_PX or rows > limit:
+        return 0
+    # A row of coding noise may lie between strip and picture.
+    jumps = [np.abs(mean[rows + d] - mean[rows - 1]) > EDGE_STEP for d in (0, 1) if rows + d < len(mean)]
+    return rows if max(jump.mean() for jump in jumps) > EDGE_SHARE else 0
+
+
+def find_circle(pictures: Sequence[NDArray[np.uint8]]) -> Circle | None:
+    """The round border, if the corners stay black and what is lit ends in a circle.
+
+    Args:
+        pictures: K of one size, some time apart.
+    """
+    low = np.stack(pictures).max(-1).max(0)
+    height, width = low.shape
+    lit = cv2.medianBlur(low, 5) >= BLACK_LEVEL
+    side = max(min(height, width) // 40, 2)
+    corners = [lit[y, x] for y in (slice(side), slice(-side, None)) for x in (slice(side), slice(-side, None))]
+    if sum(not corner.any() for corner in corners) < 2:
+        return None
+    points = _outline(lit)
+    if len(points) < 0.2 * height:
+        return None
+    circle = _fit_circle(points)
+    residuals = np.abs(np.hypot(*(points - circle[:2]).T) - circle[2])
+    points = points[residuals < np.maximum(3 * np.median(residuals), 2)]  # dark tissue reaches the border in places
+    circle = _fit_circle(points)
+    residual = float(np.median(np.abs(np.hypot(*(points - circle[:2]).T) - circle[2])))
+    found = Circle(*(float(v) for v in circle))
+    outside = ~found.mask(width, height, -0.02 * found.radius)
+    diagonal = float(np.hypot(width, height))
+    plausible = 0.25 * min(width, height) < found.radius < diagonal and outside.mean() > 0.01
+    if not plausible or residual > max(CIRCLE_RESIDUAL * found.radius, 1.0) or lit[outside].mean() > 0.05:
+        return None
+    return found
+
+
+def _outline(lit: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(P, 2) x, y where rows of `lit` (H, W) begin and end, and columns likewise, but for where the lit part is cut."""
+    found = []
+    for swapped, image in ((False, lit), (True, lit.T)):
+        some, across = np.flatnonzero(image.any(1)), np.flatnonzero(image.any(0))
+        first, last = image.argmax(1)[some], image.shape[1] - image[:, ::-1].argmax(1)[some]
+        for along, keep in ((first, first > across[0] + 2), (last, last < across[-1] - 1)):
+            pair = np.stack([along[keep], some[keep] + 0.5], 1).astype(np.float64)
+            found.append(pair[:, ::-1] if swapped else pair)
+    return np.concatenate(found)
+
+
+def _fit_circle(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Center x, y and radius of the circle through (P, 2) points, by linear least squares on x^2 + y^2."""
+    a = np.c_[2 * points, np.ones(len(points))]
+    x, y, c = np.linalg.lstsq(a, (points**2).sum(1), rcond=None)[0]
+    return np.array([x, y, np.sqrt(max(c + x * x + y * y, 0.0))])

@@ -1,0 +1,73 @@
+"""Dense matching of a rectified pair, from the left eye and from the right one. `H, W` image size.
+
+The matcher is OpenCV's semi-global one (H. Hirschmüller, "Stereo processing by semiglobal matching and mutual
+information", PAMI 2008, with Birchfield and Tomasi's cost over blocks), along all eight directions.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+SMALL_STEP, LARGE_STEP = 16, 64
+"""Price, per pixel of a block, of a disparity that changes by one px from neighbor to neighbor, and by more."""
+UNIQUENESS_PERCENT = 10
+"""The best match must be better by this much than any that is not beside it."""
+CONTRAST_LIMIT = 31
+"""Slopes of the picture are clipped here, levels, before they are compared."""
+
+
+def match_both_ways(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], lowest: int, highest: int, block: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Disparity x_left - x_right as each eye finds it.
+
+    A pixel whose partner lies outside the other picture still gets a value, which its neighbors suggest.
+
+    Args:
+        left, right: (H, W) gray.
+        lowest, highest: disparities to search, px, negative ones too.
+        block: side of the blocks that are compared, px, odd.
+    Returns:
+        (H, W) disparity at the left picture's pixels and (H, W) at the right one's, px in steps of 1/16; NaN where no
+        match stands out.
+    """
+    # Mirrored and exchanged, the right picture is matched like a left one.
+    mirrored = _match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]), lowest, highest, block)
+    return _match(left, right, lowest, highest, block), np.ascontiguousarray(mirrored[:, ::-1])
+
+
+def disagreement(from_left: NDArray[np.float32], from_right: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) how far the right eye's disparity differs from the left one's at the point it names, px.
+
+    Infinite where either found nothing, and where the partner lies outside the right picture.
+    """
+    height, width = from_left.shape
+    known = np.isfinite(from_left)
+    column = np.rint(np.arange(width) - np.where(known, from_left, 0)).astype(np.intp)
+    known &= (column >= 0) & (column < width)
+    partner = from_right[np.arange(height)[:, None], np.clip(column, 0, width - 1)]
+    return np.where(known & np.isfinite(partner), np.abs(partner - from_left), np.inf).astype(np.float32)
+
+
+def _match(near: NDArray[np.uint8], other: NDArray[np.uint8], lowest: int, highest: int, block: int) -> NDArray:
+    """(H, W) disparity of `near`'s pixels, px; NaN where no match stands out."""
+    count = -(-(highest - lowest + 1) // 16) * 16
+    matcher = cv2.StereoSGBM_create(
+        minDisparity=lowest,
+        numDisparities=count,
+        blockSize=block,
+        P1=SMALL_STEP * block * block,
+        P2=LARGE_STEP * block * block,
+        disp12MaxDiff=-1,
+        preFilterCap=CONTRAST_LIMIT,
+        uniquenessRatio=UNIQUENESS_PERCENT,
+        mode=cv2.STEREO_SGBM_MODE_HH,
+    )
+    # OpenCV gives no value in columns whose partner could fall off the picture: move those into a margin.
+    before, after = max(lowest + count, 0), max(-lowest, 0)
+    wide = [cv2.copyMakeBorder(eye, 0, 0, before, after, cv2.BORDER_REPLICATE) for eye in (near, other)]
+    sixteenths = matcher.compute(*wide)[:, before : before + near.shape[1]]
+    found = sixteenths >= 16 * lowest
+    return np.where(found, sixteenths * np.float32(1 / 16), np.float32(np.nan))

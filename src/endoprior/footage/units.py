@@ -1,0 +1,126 @@
+"""What unit a depth map is in, judged by how far an endoscope is from tissue, and whether it is depth at all.
+
+A laparoscope works 20 to 250 mm away and carries its own light: near tissue is bright, and instruments are nearer than
+the tissue around them. Values that are larger where things are nearer are disparity or inverse depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+Unit = Literal["mm", "m", "cm", "0.1 mm", "0.01 mm", "ambiguous", "disparity", "none"]
+NEAR_MM, FAR_MM = 20.0, 250.0
+"""Usual distances from an endoscope to tissue."""
+RANGES: tuple[tuple[Unit, float, float, float], ...] = (
+    ("mm", NEAR_MM, FAR_MM, 1.0),
+    ("m", NEAR_MM / 1000, FAR_MM / 1000, 1000.0),
+    ("cm", NEAR_MM / 10, NEAR_MM, 10.0),
+    ("0.1 mm", FAR_MM, FAR_MM * 10, 0.1),
+    ("0.01 mm", FAR_MM * 10, FAR_MM * 100, 0.01),
+)
+"""Unit, median it begins at and ends before, mm per unit. Where two units fit, the more common one has the range."""
+SHADING_LIMIT = 0.3
+"""Rank correlation of brightness and value above which larger means nearer."""
+TOOL_LIMIT = 1.1
+"""Value on a tool, divided by that of the tissue around it, above which larger means nearer."""
+SAMPLES = 4000
+"""Pixels of a picture that enter its correlation."""
+MIN_PIXELS = 50
+"""Fewer pixels give no figure."""
+
+
+@dataclass(frozen=True)
+class UnitGuess:
+    """The unit of a depth, and why."""
+
+    unit: Unit
+    """`ambiguous`: no unit puts the tissue at an endoscope's distance; `none`: there is no depth."""
+    mm_per_unit: float | None
+    """Factor that brings the values to mm; None where the unit is not a length, or not known."""
+    median: float
+    """Median of the values, in their own unit; 0 without any."""
+    shading: float
+    """Mean rank correlation of brightness and value on tissue, -1..1: about -0.6 for depth; 0 if unknown."""
+    tool_ratio: float
+    """Median value on tools divided by that of the tissue around them: about 0.6 for depth; NaN if unknown."""
+    reason: str
+    """One line."""
+
+
+def guess_unit(
+    frames: Iterable[tuple[NDArray[np.floating], NDArray[np.bool_], NDArray[np.uint8], NDArray[np.bool_]]],
+) -> UnitGuess:
+    """Guess the unit of a clip's depth from a few frames of it.
+
+    Args:
+        frames: of each frame the values (H, W), where they were measured (H, W), the picture (H, W, 3) and the
+            tissue mask (H, W), True on tissue.
+    """
+    medians, shadings, ratios = [], [], []
+    for values, valid, picture, tissue in frames:
+        on_tissue = valid & tissue if (valid & tissue).any() else valid
+        if not on_tissue.any():
+            continue
+        medians.append(float(np.median(values[on_tissue])))
+        shadings += _shading(values, picture, on_tissue)
+        ratios += _tool_ratio(values, valid, tissue)
+    if not medians:
+        return UnitGuess("none", None, 0.0, 0.0, float("nan"), "no pixel has depth")
+    median = float(np.median(medians))
+    shading = float(np.mean(shadings)) if shadings else 0.0
+    tool = float(np.median(ratios)) if ratios else float("nan")
+    return UnitGuess(*_decide(median, shading, tool), median, shading, tool, _reason(median, shading, tool))
+
+
+def _decide(median: float, shading: float, tool: float) -> tuple[Unit, float | None]:
+    if _larger_is_nearer(shading, tool):
+        return "disparity", None
+    for unit, low, high, factor in RANGES:
+        if low <= median < high:
+            return unit, factor
+    return "ambiguous", None
+
+
+def _larger_is_nearer(shading: float, tool: float) -> bool:
+    """Shading decides where it is clear and tools do not object; where it is weak, tools decide."""
+    if shading > SHADING_LIMIT:
+        return not tool < 1 / TOOL_LIMIT
+    return shading > -SHADING_LIMIT / 2 and tool > TOOL_LIMIT
+
+
+def _reason(median: float, shading: float, tool: float) -> str:
+    unit, factor = _decide(median, shading, tool)
+    if unit == "disparity":
+        tools = "" if np.isnan(tool) else f", tools have {tool:.2f} times the values around them"
+        return f"larger values are nearer: brightness and value correlate by {shading:+.2f}{tools}"
+    if factor is None:
+        return f"the median is {median:.4g}, which no usual unit brings to {NEAR_MM:.0f}-{FAR_MM:.0f} mm"
+    return f"the median is {median:.4g}, which in {unit} is {median * factor:.0f} mm away"
+
+
+def _shading(values: NDArray, picture: NDArray[np.uint8], where: NDArray[np.bool_]) -> list[float]:
+    """Rank correlation of smoothed brightness and value; none where there are few pixels or only one value."""
+    brightness = cv2.GaussianBlur(picture.max(-1).astype(np.float32), (0, 0), max(picture.shape[1] / 80, 1.0))
+    picked = np.flatnonzero(where)
+    picked = picked[:: max(1, len(picked) // SAMPLES)]
+    a, b = brightness.reshape(-1)[picked], values.reshape(-1)[picked]
+    if len(picked) < MIN_PIXELS or a.min() == a.max() or b.min() == b.max():
+        return []
+    return [float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])]
+
+
+def _tool_ratio(values: NDArray, valid: NDArray[np.bool_], tissue: NDArray[np.bool_]) -> list[float]:
+    """Median on tools over median of the tissue around them; none where either has few pixels."""
+    reach = max(3, values.shape[1] // 40)
+    near_tool = cv2.dilate((~tissue).astype(np.uint8), np.ones((reach, reach), np.uint8)).astype(bool)
+    on_tool, around = values[valid & ~tissue], values[valid & tissue & near_tool]
+    if min(len(on_tool), len(around)) < MIN_PIXELS:
+        return []
+    return [float(np.median(on_tool) / max(float(np.median(around)), 1e-12))]

@@ -1,0 +1,99 @@
+"""Copies, exposure jumps, cuts, blur and other places in a clip: each made on purpose, none where there is none."""
+
+import cv2
+import numpy as np
+import pytest
+
+from endoprior.footage.changes import find_changes, find_duplicates
+
+COUNT, HEIGHT, WIDTH = 24, 120, 160
+
+
+def texture(seed: int) -> np.ndarray:
+    """(2H, 2W, 3) smooth reddish blobs, float levels."""
+    noise = np.random.default_rng(seed).normal(size=(2 * HEIGHT, 2 * WIDTH)).astype(np.float32)
+    waves = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 4, 12))
+    return np.clip(130 + 60 * waves / waves.std(), 20, 235)[..., None] * np.array([1.0, 0.5, 0.45])
+
+
+def clip(noise: float = 1.5, step: float = 1.0) -> list[np.ndarray]:
+    """COUNT noisy pictures of tissue that slides by `step` px each."""
+    rng, wide = np.random.default_rng(1), texture(0)
+    pictures = []
+    for i in range(COUNT):
+        shift = np.array([[1, 0, -step * i], [0, 1, 0]], np.float32)
+        moved = cv2.warpAffine(wide, shift, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
+        pictures.append(np.clip(moved + rng.normal(0, noise, moved.shape), 0, 255).astype(np.uint8))
+    return pictures
+
+
+def odd(changes) -> dict[str, tuple[int, ...]]:
+    """What was found, by name, without what was not."""
+    names = ("duplicates", "exposure_jumps", "cuts", "blurred", "off_color")
+    return {name: getattr(changes, name) for name in names if getattr(changes, name)}
+
+
+@pytest.mark.parametrize("options", [{}, {"step": 0.0}, {"step": 3.0}, {"noise": 0.5, "step": 0.2}])
+def test_nothing_is_found_in_a_clean_clip(options):
+    changes = find_changes(clip(**options))
+    assert odd(changes) == {}
+    assert changes.brightness.shape == changes.sharpness.shape == (COUNT,) and changes.difference.shape == (COUNT - 1,)
+
+
+def test_copies_are_found():
+    pictures = clip()
+    pictures[7] = pictures[6]
+    pictures[15] = pictures[14]
+    assert odd(find_changes(pictures)) == {"duplicates": (7, 15)}
+    assert find_changes([p for p in clip() for _ in range(2)]).duplicates == tuple(range(1, 2 * COUNT, 2))
+
+
+def test_copies_survive_video_coding_but_a_scene_at_rest_is_no_copy():
+    pictures = clip(noise=0.5)
+    residue = np.random.default_rng(2).random((HEIGHT, WIDTH, 1)) < 0.06  # what is left after coding, one level
+    pictures[9] = pictures[8] + residue.astype(np.uint8)
+    assert find_changes(pictures).duplicates == (9,)
+    moving_then_resting = np.array([2.0] * 12 + [0.15] * 12)
+    assert find_duplicates(moving_then_resting) == ()
+    assert find_duplicates(np.array([2.0, 2.0, 0.1, 2.0, 2.0])) == (3,)
+    assert find_duplicates(np.zeros(0)) == ()
+
+
+@pytest.mark.parametrize("gain", [0.75, 1.3])
+def test_an_exposure_jump_is_found_where_it_happens(gain):
+    pictures = [np.clip(p * (gain if i >= 10 else 1.0), 0, 255).astype(np.uint8) for i, p in enumerate(clip())]
+    assert odd(find_changes(pictures)) == {"exposure_jumps": (10,)}
+
+
+def test_a_slow_drift_and_a_dark_tool_are_no_exposure_jumps():
+    drifting = [(p * (1 - 0.015 * i)).astype(np.uint8) for i, p in enumerate(clip())]
+    assert odd(find_changes(drifting)) == {}
+    with_tool = clip()
+    for picture in with_tool[10:]:
+        picture[:, :90] = 40
+    assert find_changes(with_tool).exposure_jumps == ()
+
+
+def test_a_cut_is_a_cut_and_not_an_exposure_jump():
+    other = (0.5 * texture(5)[:HEIGHT, :WIDTH]).astype(np.uint8)
+    pictures = clip()[:12] + [np.roll(other, i, 1) for i in range(12)]
+    found = find_changes(pictures)
+    assert found.cuts == (12,) and found.exposure_jumps == ()
+
+
+def test_blur_and_other_colors_are_found():
+    pictures = clip()
+    pictures[6] = cv2.GaussianBlur(pictures[6], (0, 0), 4)
+    pictures[18] = np.ascontiguousarray(pictures[18][..., [1, 0, 2]])
+    found = find_changes(pictures)
+    assert found.blurred == (6,) and found.off_color == (18,)
+
+
+def test_one_picture_has_no_changes():
+    changes = find_changes(clip()[:1])
+    assert odd(changes) == {} and changes.difference.shape == (0,)
+
+
+def test_nothing_is_found_in_the_real_clip(real_clip):
+    pictures = [cv2.imread(str(file))[..., ::-1] for file in sorted((real_clip / "images").iterdir())]
+    assert odd(find_changes(pictures)) == {}

@@ -1,0 +1,291 @@
+"""`endoprior check`: a phantom broken in one way at a time is caught, with the fix to type; a whole one is not."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from sequence_edits import change_poses, describe, write
+
+from endoprior.check import Facts, Finding, find, measure
+from endoprior.cli import main
+from endoprior.config import DataConfig
+from endoprior.data import load_sequence
+from endoprior.footage.units import guess_unit
+from endoprior.phantom import PhantomConfig, write_phantom
+
+FRAMES, WIDTH, HEIGHT = 16, 256, 192
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A phantom of both eyes, left as it is."""
+    folder = tmp_path_factory.mktemp("check") / "phantom"
+    write_phantom(folder, PhantomConfig(frames=FRAMES, width=WIDTH, height=HEIGHT, stereo=True))
+    shutil.rmtree(folder / "truth")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def facts(whole: Path) -> Facts:
+    """What is measured of it."""
+    return measure(load_sequence(whole))
+
+
+@pytest.fixture
+def stereo(whole: Path, tmp_path: Path) -> Path:
+    """A copy of the phantom to break."""
+    return Path(shutil.copytree(whole, tmp_path / "data"))
+
+
+@pytest.fixture
+def data(whole: Path, tmp_path: Path) -> Path:
+    """A copy of the phantom's left eye to break."""
+    return Path(shutil.copytree(whole, tmp_path / "data", ignore=shutil.ignore_patterns("right")))
+
+
+def edit(folder: Path, change: Callable[[np.ndarray, int], np.ndarray]) -> None:
+    """Replace every image of a folder by a function of it and its position."""
+    for position, file in enumerate(sorted(folder.iterdir())):
+        write(file, change(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), position))
+
+
+def findings(folder: Path) -> dict[str, Finding]:
+    """What is found, by code."""
+    found = find(measure(load_sequence(folder)))
+    assert all("\n" not in str(finding) for finding in found)
+    return {finding.code: finding for finding in found}
+
+
+def only(folder: Path, code: str) -> Finding:
+    """The one finding there is."""
+    found = findings(folder)
+    assert list(found) == [code]
+    return found[code]
+
+
+def test_a_whole_sequence_gives_no_findings(facts):
+    assert find(facts) == []
+    assert len(facts.cloud) > 10_000 and facts.eyes.order.as_given > 0.8
+
+
+def test_the_real_clip_gives_no_findings(real_clip):
+    cfg = DataConfig(stride=6)
+    assert find(measure(load_sequence(real_clip, cfg), cfg)) == []
+
+
+def test_inverted_masks(data):
+    edit(data / "masks", lambda mask, _: 255 - mask)
+    finding = only(data, "mask-polarity")
+    assert finding.severity == "error"
+    assert finding.fix == f'set "mask_tool_value": 0 in {data}/sequence.json'
+    describe(data, mask_tool_value=0)
+    assert findings(data) == {}, "the fix does not help"
+
+
+def test_depth_in_metres(data):
+    describe(data, depth_scale=1e-5)
+    finding = only(data, "depth-metres")
+    assert finding.severity == "error"
+    assert finding.what == "depth looks like m, not mm (the median is 0.07749, which in m is 77 mm away)"
+    assert finding.fix == (
+        f'set "depth_scale": 0.01 in {data}/sequence.json, or endoprior train {data} RUN --data.depth-unit-mm 0.01'
+    )
+
+
+@pytest.mark.parametrize(
+    ("factor", "code", "fix"),
+    [(0.1, "depth-centimetres", "0.1"), (10, "depth-unit", "0.001"), (1e-4, "depth-unit", "MM_PER_UNIT")],
+)
+def test_depth_in_other_units(facts, factor, code, fix):
+    everywhere = np.ones((9, 9), bool)
+    guess = guess_unit([(np.full((9, 9), 78 * factor), everywhere, np.zeros((9, 9, 3), np.uint8), everywhere)])
+    (finding,) = find(replace(facts, depth=replace(facts.depth, unit=guess)))
+    assert finding.code == code and f'"depth_scale": {fix} in' in finding.fix
+
+
+def test_disparity_instead_of_depth(data):
+    edit(data / "depth", lambda depth, _: np.where(depth > 0, 4e7 / np.maximum(depth, 1), 0).astype(np.uint16))
+    assert only(data, "depth-disparity").fix == "store depth in mm: focal length (px) x baseline (mm) / disparity (px)"
+
+
+def test_depth_of_8_bits(data):
+    edit(data / "depth", lambda depth, _: np.rint(depth / 100).astype(np.uint8))
+    describe(data, depth_scale=1.0)
+    finding = only(data, "depth-8-bit")
+    assert finding.severity == "warning" and finding.what == "8 bits a value, steps of 1 mm"
+
+
+def test_console_strip(data):
+    def paint(picture: np.ndarray, position: int) -> np.ndarray:
+        picture[-20:] = 45
+        cv2.putText(picture, "OR 2", (150, HEIGHT - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (220, 220, 220), 1)
+        return picture
+
+    edit(data / "images", paint)
+    finding = only(data, "console-strip")
+    assert finding.what == "a bar or console strip of 20 px at the bottom counts as tissue"
+    assert finding.fix == "endoprior prepare CLIP NEW --crop 0,0,256,172, or mark it in the masks"
+    edit(data / "masks", lambda mask, _: np.vstack([mask[:-20], np.full_like(mask[-20:], 255)]))
+    assert findings(data) == {}, "the strip is masked now"
+
+
+def test_round_border(data):
+    inside = np.zeros((HEIGHT, WIDTH, 1), np.uint8)
+    cv2.circle(inside, (WIDTH // 2, HEIGHT // 2), 120, 1, -1)
+    edit(data / "images", lambda picture, _: picture * inside)
+    assert (
+        only(data, "round-border").what == "the picture is round (radius 120 px) and what is outside counts as tissue"
+    )
+
+
+def test_burned_in_writing(data):
+    def paint(picture: np.ndarray, position: int) -> np.ndarray:
+        picture[5:27, 150:240] = 0
+        cv2.putText(picture, "SMITH J", (154, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 2)
+        return picture
+
+    edit(data / "images", paint)
+    assert only(data, "burned-in-text").what.startswith("burned-in writing counts as tissue: ")
+
+
+def test_swapped_eyes(stereo):
+    (stereo / "images").rename(stereo / "left")
+    (stereo / "right").rename(stereo / "images")
+    (stereo / "left").rename(stereo / "right")
+    found = findings(stereo)
+    assert found["swapped-eyes"].severity == "error"
+    assert found["swapped-eyes"].fix == f"swap the folders {stereo}/images and {stereo}/right, and measure depth again"
+
+
+def test_eyes_on_unequal_heights(stereo):
+    edit(stereo / "right", lambda picture, _: np.roll(picture, 4, 0))
+    assert only(stereo, "vertical-offset").what == "the rows of the two eyes are 4.0 px apart"
+
+
+def test_duplicated_frames(data):
+    files = sorted((data / "images").iterdir())
+    for copy in (5, 6, 11):
+        shutil.copy(files[copy - 1], files[copy])
+    finding = only(data, "duplicate-frames")
+    assert finding.frames == (5, 6, 11)
+    assert finding.what == "3 of 16 frames repeat the one before: frames 5-6, 11"
+    assert finding.fix == f"remove them from {data}"
+
+
+def test_a_clip_at_twice_its_rate_names_the_stride(data):
+    files = sorted((data / "images").iterdir())
+    for copy in range(1, FRAMES, 2):
+        shutil.copy(files[copy - 1], files[copy])
+    assert only(data, "duplicate-frames").fix == f"endoprior train {data} RUN --data.stride 2"
+
+
+def test_exposure_jump(data):
+    edit(data / "images", lambda p, i: np.clip(p * (1.4 if i >= 11 else 1.0), 0, 255).astype(np.uint8))
+    finding = only(data, "exposure-jump")
+    assert str(finding) == (
+        "warning: exposure-jump: the brightness of the whole picture jumps at frame 11; "
+        f"fix: endoprior train {data} RUN --data.first-frames 11"
+    )
+
+
+def test_moving_camera_with_resting_poses(data):
+    def pan(picture: np.ndarray, position: int) -> np.ndarray:
+        shift = np.array([[1.15, 0, -16 - 3 * position], [0, 1.15, -14]], np.float32)
+        return cv2.warpAffine(picture, shift, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
+
+    edit(data / "images", pan)
+    finding = findings(data)["camera-moves"]
+    assert finding.severity == "warning" and "--poses estimate" in finding.fix
+
+    def moved(poses: np.ndarray) -> np.ndarray:
+        poses[:, 3] = np.arange(FRAMES)  # x of the camera, mm
+        return poses
+
+    change_poses(data, moved)
+    assert "camera-moves" not in findings(data), "the poses account for it"
+
+
+def test_frames_without_depth(data):
+    edit(data / "depth", lambda depth, i: depth * np.uint16(i not in (3, 4)))
+    finding = only(data, "no-depth-frames")
+    assert finding.frames == (3, 4) and finding.what == "no depth on tissue in frames 3-4"
+    edit(data / "depth", lambda depth, _: np.zeros_like(depth))
+    finding = only(data, "no-depth-frames")
+    assert finding.severity == "error" and finding.what == "no frame has depth"
+
+
+def test_sparse_depth_and_depth_that_jumps(data):
+    keep = np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 4 == 0
+    edit(data / "depth", lambda depth, i: depth * keep * np.uint16(2 if i == 9 else 1))
+    found = findings(data)
+    assert sorted(found) == ["depth-jumps", "depth-sparse"]
+    assert found["depth-jumps"].what == "the median depth jumps at frames 9-10"
+    assert found["depth-sparse"].what == "depth on 24% of the tissue of a usual frame"
+
+
+def test_masks_that_mark_everything_or_nothing(data):
+    edit(data / "masks", lambda mask, _: np.zeros_like(mask))
+    finding = only(data, "tool-fraction")
+    assert finding.severity == "note" and finding.what == "no mask marks a tool"
+
+
+def test_blurred_frames_and_few_frames(data):
+    for folder in ("images", "masks", "depth"):
+        for file in sorted((data / folder).iterdir())[8:]:
+            file.unlink()
+    change_poses(data, lambda poses: poses[:8])
+    edit(data / "images", lambda p, i: cv2.GaussianBlur(p, (0, 0), 5) if i == 4 else p)
+    found = findings(data)
+    assert sorted(found) == ["few-frames", "unexplained-frames"]
+    assert found["few-frames"].what == "8 frames, 1 of them to test"
+    assert found["unexplained-frames"].frames == (4,)
+
+
+def test_intrinsics_of_another_size(facts):
+    (finding,) = find(replace(facts, camera=replace(facts.camera, fx=2880.0, fy=2880.0)))
+    assert finding.code == "intrinsics" and finding.what.startswith("fx 2880, fy 2880, cx 128, cy 96 px see 5 degrees")
+    assert finding.fix == f'set "fx", "fy", "cx", "cy" in {facts.path}/sequence.json, px'
+
+
+def test_what_only_facts_say(facts):
+    relative = find(replace(facts, depth=replace(facts.depth, relative=True)))
+    assert [(f.code, f.severity) for f in relative] == [("relative-depth", "note")]
+    assert [f.code for f in find(replace(facts, remarks=("odd",), cloud=None))] == ["no-points", "reader"]
+    much = find(replace(facts, masks=replace(facts.masks, tool_fraction=np.full(FRAMES, 0.7))))
+    assert [f.what for f in much] == ["70% of all pixels are tool"]
+    cut = find(replace(facts, changes=replace(facts.changes, cuts=(3,))))
+    assert [f.fix for f in cut] == [f"remove frames 0-2 from {facts.path}"]
+
+
+def test_command_prints_draws_and_writes(data, capsys):
+    describe(data, depth_scale=1e-5)
+    out, facts = data.parent / "new" / "check.png", data.parent / "check.json"
+    assert main(["check", str(data), "--out", str(out), "--json", str(facts)]) == 0
+    text = capsys.readouterr().out.splitlines()
+    assert text[0] == str(data) and text[-1] == str(out)
+    assert sum(line.startswith("error: depth-metres: ") for line in text) == 1
+    assert any(line.split()[:2] == ["frames", "16:"] for line in text)
+    assert cv2.imread(str(out)).shape == (1400, 1500, 3)
+    stored = json.loads(facts.read_text())
+    assert stored["facts"]["frames"] == FRAMES and len(stored["facts"]["masks"]["tool_fraction"]) == FRAMES
+    assert [finding["code"] for finding in stored["findings"]] == ["depth-metres"]
+    assert sorted(path.name for path in data.parent.iterdir()) == ["check.json", "data", "new"]
+
+
+def test_exit_statuses(data, tmp_path, capsys):
+    assert main(["check", str(data), "--strict"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "nothing suspicious"
+    assert main(["check", str(data), "--data.depth-unit-mm", "0.00001", "--strict"]) == 2
+    assert "error: depth-metres" in capsys.readouterr().out
+    assert main(["check", str(data), "--out", str(tmp_path / "check.txt")]) == 2
+    assert capsys.readouterr().err == f"endoprior: --out: expected a .png file; got {tmp_path}/check.txt. Rename it.\n"
+    (data / "images" / "000003.png").write_bytes(b"nothing")
+    assert main(["check", str(data)]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1 and "000003.png" in said.err
+    assert main(["check", str(tmp_path / "nowhere")]) == 2
