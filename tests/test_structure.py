@@ -15,7 +15,7 @@ LAYERS = [
     {"simd", "float64_lanes"},
     {"config", "atomic", "adam_kernels", "neighbor_kernels", "temporal_kernels"},
     {"config_io", "presets", "arrays_file", "geometry"},
-    {"data", "priors", "render", "losses", "loss_kernels", "temporal", "metrics"},
+    {"data", "priors", "render", "losses", "loss_kernels", "temporal", "metrics", "footage"},
     {"phantom", "model", "density"},
     {"optim", "training_frames", "truth_scores"},
     {"train_state", "evaluate", "show"},
@@ -23,12 +23,12 @@ LAYERS = [
     {"checkpoint"},
     {"run_folder"},
     {"train"},
-    {"benchmark"},
+    {"benchmark", "check", "prepare"},
     {"cli"},
     {"__init__", "__main__"},
 ]
 ORDER = {name: level for level, names in enumerate(LAYERS) for name in names}
-NO_TORCH = ("priors", "data", "metrics/stability.py", "phantom", "geometry.py")
+NO_TORCH = ("priors", "data", "metrics/stability.py", "phantom", "geometry.py", "footage", "check")
 
 
 def unit(path: Path) -> str:

@@ -205,6 +205,7 @@ def _calibration(cfg: PhantomConfig) -> dict[str, object]:
         "layout": "two folders, images/ for the left eye and right/ for the right one, already rectified",
         "width": cfg.width,
         "height": cfg.height,
+        "pixel_center": 0.5,
         "K_left": matrix,
         "K_right": matrix,
         "distortion_left": [0, 0, 0, 0, 0],

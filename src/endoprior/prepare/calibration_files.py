@@ -1,0 +1,238 @@
+"""Calibration files to `Calibration`: OpenCV's YAML, plain YAML or JSON, NPZ, and the da Vinci's ini.
+
+A file becomes a flat table of names and numbers; names are compared without case and punctuation, and every usual
+spelling of a quantity is known. Nothing in a file is ever executed.
+"""
+
+from __future__ import annotations
+
+import configparser
+import json
+from pathlib import Path
+from typing import Any, Literal
+from zipfile import BadZipFile
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from ..data.images import complaint
+from .calibration import Calibration, Eye
+
+Unit = Literal["auto", "mm", "cm", "m"]
+MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+METERS_BELOW = 0.05
+"""A T shorter than this is in meters: no stereo endoscope has its eyes 0.05 mm apart."""
+
+MATRIX = ("k", "m", "cameramatrix", "mtx", "intrinsics", "intrinsic", "intrinsicmatrix", "cammatrix")
+DISTORTION = ("d", "dist", "distortion", "distcoeffs", "distcoeff", "distortioncoefficients", "distortioncoeffs")
+SIDES = (("left", "right"), ("l", "r"), ("1", "2"), ("0", "1"))
+ROTATION = ("r", "rotation", "rot", "rotationmatrix", "rstereo")
+TRANSLATION = ("t", "translation", "trans", "translationvector", "tvec", "tstereo")
+HINT = "Names: K_left, distortion_left, K_right, distortion_right, R, T_mm, width, height (docs/prepare.md has more)."
+
+Table = dict[str, Any]
+"""Numbers, arrays and texts by name in lower case without punctuation."""
+
+
+def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
+    """Read the calibration of one or two eyes.
+
+    Args:
+        path: .yaml, .yml, .json, .npz or .ini.
+        unit: of T; "auto" believes the file (`T_mm`), else takes mm, and m where T is shorter than 0.05.
+    Raises:
+        InputError: unreadable, a quantity is missing or malformed; one line.
+    """
+    table = _read_table(path)
+    table = {_plain(name): value for name, value in table.items()}
+    size = _size(table, path)
+    # Files of this project count pixel centers from 0.5; OpenCV and all others count them from 0.
+    offset = 0.5 - float(table.get("pixelcenter", 0.0))
+    if "fcxleft" in table:
+        left, right = _da_vinci_eye(table, "left", offset, path), _da_vinci_eye(table, "right", offset, path)
+    else:
+        left, right = _eyes(table, offset, path)
+    if left is None:
+        raise complaint(path, "the left camera matrix", f"only {_some(table)}", HINT)
+    if right is None and (baseline := table.get("baselinemm")) is not None:
+        shift = np.array([-float(baseline), 0.0, 0.0])
+        return Calibration(left, left, np.eye(3), shift, size, _text(table, "layout"))
+    if right is None:
+        return Calibration(left, size=size, layout=_text(table, "layout"))
+    rotation = _find(table, ROTATION, path, (3, 3))
+    in_mm = any(name + "mm" in table for name in TRANSLATION)
+    translation = _find(table, (*(name + "mm" for name in TRANSLATION), *TRANSLATION), path, (3,))
+    if rotation is None or translation is None:
+        missing = "R" if rotation is None else "T"
+        raise complaint(path, "how the eyes stand to each other (R, T)", f"no {missing}", HINT)
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        raise complaint(path, "R to be a rotation", "another matrix", "Write R as 3x3, row by row.")
+    if unit == "auto":
+        unit = "m" if not in_mm and 0 < np.linalg.norm(translation) < METERS_BELOW else "mm"
+    scale = 1.0 if in_mm else MM_PER_UNIT[unit]
+    return Calibration(left, right, rotation, translation * scale, size, _text(table, "layout"))
+
+
+def _read_table(path: Path) -> Table:
+    """The file as a flat table; nested names are joined, matrices with rows, cols and data become arrays."""
+    readers = {".yaml": _read_yaml, ".yml": _read_yaml, ".json": _read_yaml, ".npz": _read_npz, ".ini": _read_ini}
+    if path.suffix.lower() not in readers:
+        raise complaint(path, "a .yaml, .json, .npz or .ini file", path.suffix or "no suffix", "Convert it.")
+    try:
+        content = readers[path.suffix.lower()](path)
+    except OSError as error:
+        raise complaint(path, "a calibration file", error.strerror or str(error), "Check the path.") from None
+    except (ValueError, yaml.YAMLError, configparser.Error, BadZipFile, EOFError, UnicodeDecodeError) as error:
+        raise complaint(path, "a readable calibration", " ".join(str(error).split())[:120], "Correct it.") from None
+    if not isinstance(content, dict) or not content:
+        raise complaint(path, "named quantities", type(content).__name__, HINT)
+    return _flat(content)
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML that also knows OpenCV's matrices."""
+
+
+for _name in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", lambda loader, node: loader.construct_mapping(node, True))
+
+
+def _read_yaml(path: Path) -> Any:
+    text = path.read_text(encoding="utf-8")
+    if path.suffix.lower() == ".json":
+        return json.loads(text)
+    # OpenCV writes "%YAML:1.0", which is not YAML, and tabs or "---" after it.
+    lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
+    return yaml.load("\n".join(lines), _Loader)
+
+
+def _read_npz(path: Path) -> Table:
+    with np.load(path, allow_pickle=False) as stored:
+        if isinstance(stored, np.ndarray):
+            raise ValueError("a single array")
+        return {name: stored[name] for name in stored.files}
+
+
+def _read_ini(path: Path) -> Table:
+    parser = configparser.ConfigParser(interpolation=None)
+    with path.open(encoding="utf-8") as file:
+        parser.read_file(file)
+    table: Table = {}
+    for section in parser.sections():
+        side = "left" if "left" in section.lower() else "right" if "right" in section.lower() else section
+        for name, value in parser.items(section):
+            table[f"{name}_{side}"] = float(value)
+    return table
+
+
+def _flat(content: dict[Any, Any], prefix: str = "") -> Table:
+    table: Table = {}
+    for name, value in content.items():
+        if isinstance(value, dict) and {"rows", "cols", "data"} <= {str(key) for key in value}:
+            table[f"{prefix}{name}"] = np.reshape(value["data"], (int(value["rows"]), int(value["cols"])))
+        elif isinstance(value, dict) and {"sizes", "data"} <= {str(key) for key in value}:
+            table[f"{prefix}{name}"] = np.reshape(value["data"], np.ravel(value["sizes"]))
+        elif isinstance(value, dict):
+            table |= _flat(value, f"{prefix}{name}.")
+        else:
+            table[f"{prefix}{name}"] = value
+    return table
+
+
+def _plain(name: str) -> str:
+    return "".join(c for c in name.lower() if c.isalnum())
+
+
+def _text(table: Table, name: str) -> str | None:
+    return table[name] if isinstance(table.get(name), str) else None
+
+
+def _some(table: Table) -> str:
+    return ", ".join(list(table)[:6]) + (" and more" if len(table) > 6 else "")
+
+
+def _find(table: Table, names: tuple[str, ...], path: Path, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
+    """The first of the named quantities as an array of that shape (-1: any length), None if there is none."""
+    for name in names:
+        if name not in table:
+            continue
+        try:
+            value = np.asarray(table[name], np.float64)
+            value = value.reshape(shape)
+        except (TypeError, ValueError):
+            want = "x".join(map(str, shape)).replace("-1", "k")
+            raise complaint(path, f"{name} to have {want} numbers", repr(table[name])[:60], HINT) from None
+        if not np.isfinite(value).all():
+            raise complaint(path, f"{name} to be finite", "NaN or infinity", "Calibrate again.")
+        return value
+    return None
+
+
+def _eyes(table: Table, offset: float, path: Path) -> tuple[Eye | None, Eye | None]:
+    """Both eyes under the first pair of names that has a left one; a single eye under names without a side."""
+    for left_name, right_name in SIDES:
+        if left := _eye(table, left_name, offset, path):
+            return left, _eye(table, right_name, offset, path)
+    return _eye(table, "", offset, path) or _plain_pinhole(table, offset, path), None
+
+
+def _eye(table: Table, side: str, offset: float, path: Path) -> Eye | None:
+    def spelled(names: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(spelling for name in names for spelling in (name + side, side + name))
+
+    matrix = _find(table, spelled(MATRIX), path, (3, 3))
+    if matrix is None:
+        return None
+    distortion = _find(table, spelled(DISTORTION), path, (-1,))
+    return _checked(matrix, np.zeros(0) if distortion is None else distortion, offset, path)
+
+
+def _checked(matrix: NDArray, distortion: NDArray, offset: float, path: Path) -> Eye:
+    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], (0, 0, 1))):
+        raise complaint(path, "a camera matrix (fx 0 cx; 0 fy cy; 0 0 1)", str(matrix.tolist()), "Correct it.")
+    if len(distortion) not in (0, 1, 2, 3, 4, 5, 8, 12, 14):
+        raise complaint(path, "4, 5, 8, 12 or 14 distortion coefficients", str(len(distortion)), "Correct them.")
+    if len(distortion) < 4:
+        distortion = np.pad(distortion, (0, 4 - len(distortion)))
+    moved = matrix.copy()
+    moved[:2, 2] += offset
+    return Eye(moved, distortion)
+
+
+def _plain_pinhole(table: Table, offset: float, path: Path) -> Eye | None:
+    """fx, fy, cx, cy as `sequence.json` has them."""
+    if not {"fx", "cx", "cy"} <= table.keys():
+        return None
+    fx, cx, cy = (float(table[name]) for name in ("fx", "cx", "cy"))
+    matrix = np.array([[fx, 0, cx], [0, float(table.get("fy", fx)), cy], [0, 0, 1]])
+    return _checked(matrix, np.zeros(4), offset, path)
+
+
+def _da_vinci_eye(table: Table, side: str, offset: float, path: Path) -> Eye:
+    try:
+        fx, fy, cx, cy = (float(table[name + side]) for name in ("fcx", "fcy", "ccx", "ccy"))
+        bent = [float(table.get(f"kc{i}{side}", 0)) for i in range(8)]
+    except KeyError as error:
+        raise complaint(path, "fc_x, fc_y, cc_x, cc_y of both eyes", f"no {error.args[0]}", "Complete it.") from None
+    if side == "right":
+        for name, count in (("r", 9), ("t", 3)):
+            values = [table.get(f"{name}{i}right") for i in range(count)]
+            if None not in values:
+                table[name] = values
+    return _checked(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(bent), offset, path)
+
+
+def _size(table: Table, path: Path) -> tuple[int, int] | None:
+    pairs = [("width", "height"), ("imagewidth", "imageheight"), ("resxleft", "resyleft")]
+    found = [(table[a], table[b]) for a, b in pairs if a in table and b in table]
+    found += [tuple(np.ravel(table[n])) for n in ("imagesize", "resolution", "size") if np.size(table.get(n, 0)) == 2]
+    if not found:
+        return None
+    try:
+        width, height = (int(v) for v in found[0])
+    except (TypeError, ValueError):
+        raise complaint(path, "width and height in px", repr(found[0]), "Correct them.") from None
+    if width < 1 or height < 1:
+        raise complaint(path, "width and height in px", f"{width}x{height}", "Correct them.")
+    return width, height

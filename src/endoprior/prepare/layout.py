@@ -1,0 +1,110 @@
+"""How two eyes share a frame, and how to tell them apart."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.images import complaint
+from .calibration import Calibration
+
+Layout = Literal["auto", "mono", "side-by-side", "top-bottom", "interlaced", "two-files"]
+LOOK_ALIKE = 0.8
+"""Correlation of two halves of a frame above which they are two eyes that see the same."""
+
+
+def split_eyes(frame: NDArray[np.uint8], layout: Layout) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """First and second eye of a frame; the second is None for `mono` and `two-files`.
+
+    Args:
+        frame: (H, W, 3).
+        layout: not `auto`. The eyes of an interlaced frame are its even and odd rows; each comes back with H rows,
+            those in between interpolated, so that both keep their rows' true heights.
+    """
+    height, width = frame.shape[:2]
+    if layout == "side-by-side":
+        return frame[:, : width // 2], frame[:, width // 2 : width // 2 * 2]
+    if layout == "top-bottom":
+        return frame[: height // 2], frame[height // 2 : height // 2 * 2]
+    if layout == "interlaced":
+        return _fill_rows(frame, 0), _fill_rows(frame, 1)
+    return frame, None
+
+
+def _fill_rows(frame: NDArray[np.uint8], parity: int) -> NDArray[np.uint8]:
+    """(H, W, 3) with rows of the other parity replaced by the mean of their neighbors."""
+    filled = frame.copy()
+    own = frame[parity::2].astype(np.uint16)
+    between = ((own[:-1] + own[1:] + 1) // 2).astype(np.uint8)
+    filled[parity + 1 : parity + 1 + 2 * len(between) : 2] = between
+    if parity:
+        filled[0] = frame[1]
+    if (len(frame) - 1) % 2 != parity:
+        filled[-1] = filled[-2]
+    return filled
+
+
+def eye_size(width: int, height: int, layout: Layout) -> tuple[int, int]:
+    """(width, height) of one eye, px."""
+    if layout == "side-by-side":
+        return width // 2, height
+    return (width, height // 2) if layout == "top-bottom" else (width, height)
+
+
+def find_layout(
+    frame: NDArray[np.uint8], calibration: Calibration | None, has_second_source: bool, name: str
+) -> Layout:
+    """How the eyes share this frame, by the calibration's size and by what the frame shows.
+
+    Args:
+        frame: (H, W, 3), one picture of the source.
+        name: of the source, for the complaint.
+    Raises:
+        InputError: it cannot be told.
+    """
+    if has_second_source:
+        return "two-files"
+    height, width = frame.shape[:2]
+    stereo = calibration is not None and calibration.right is not None
+    alike: list[Layout] = [kind for kind in ("side-by-side", "top-bottom", "interlaced") if _alike(frame, kind)]
+    if not stereo:
+        if alike and alike[0] != "interlaced":
+            hint = f"Give --calibration with --layout {alike[0]}, or --layout mono if it is one eye."
+            raise complaint(name, "a calibration for a stereo video", f"none, and a {alike[0]} frame", hint)
+        return "mono"
+    said = calibration.layout or ""
+    for kind in ("side-by-side", "top-bottom", "interlaced"):
+        if kind in said.lower():
+            return kind
+    if calibration.size:
+        across, down = width / calibration.size[0], height / calibration.size[1]
+        if abs(across / down - 2) < 0.02:
+            return "side-by-side"
+        if abs(across / down - 0.5) < 0.005:
+            return "top-bottom"
+        if abs(across / down - 1) < 0.01:
+            return "interlaced"
+    if alike:
+        return alike[0]
+    hint = "Give --layout side-by-side, top-bottom or interlaced, or the second eye's video with --right."
+    raise complaint(name, "two eyes in each frame", f"{width}x{height} px that do not show them", hint)
+
+
+def _alike(frame: NDArray[np.uint8], layout: Layout) -> bool:
+    """Whether the halves show nearly the same: smoothed, and moved along x as two eyes see it."""
+    gray = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+    if layout == "interlaced":
+        rows = gray[: len(gray) // 2 * 2].astype(np.float32)
+        # Rows of one eye continue each other better than they continue those of the other eye.
+        own, other = np.abs(rows[2:] - rows[:-2]).mean(), np.abs(rows[1:] - rows[:-1]).mean()
+        return bool(other > 1.2 * own)
+    first, second = split_eyes(gray[..., None], layout)
+    first, second = (
+        cv2.resize(np.ascontiguousarray(eye), (96, 64), interpolation=cv2.INTER_AREA) for eye in (first, second)
+    )
+    middle = first[:, 16:-16].astype(np.float32)
+    scores = cv2.matchTemplate(second.astype(np.float32), middle, cv2.TM_CCOEFF_NORMED)
+    return bool(scores.max() > LOOK_ALIKE)

@@ -1,0 +1,201 @@
+"""Depth from a rectified pair of pictures. `H, W` image size.
+
+Disparity and depth: x_left - x_right = focal * baseline / z + center_shift, with center_shift = cx_left - cx_right, the
+difference of the rectified eyes' principal points (0 where rectification gave both the same).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..checks import check_range, check_shape
+from ..footage.matching import disagreement, match_both_ways
+from ..priors.specular import specular_likelihood
+from .disparity import drop_speckles, fill_small_holes, refine_disparity, smooth_disparity
+
+MATCHING_WIDTH = 960
+"""Wider pictures are matched at a whole fraction of their size (the refinement sees all of it), px."""
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """Depth from two eyes."""
+
+    near_mm: float = 25.0
+    """Nearest depth to look for, mm, 1..10000; nearer costs time."""
+    far_mm: float = 300.0
+    """Farthest depth to look for, mm, at most 100000."""
+    block_px: int = 7
+    """Side of the blocks that are compared, px, odd, 3..15: larger is smoother."""
+    left_right_px: float = 1.0
+    """The eyes' disparities of a point may differ by this much, px, 0.1..10."""
+    speckle_px: int = 150
+    """Patches of fewer pixels that stand apart from their surroundings are dropped, 0..1000000."""
+    fill_px: int = 400
+    """Holes of at most so many pixels are closed where the surface around them is smooth, 0..1000000."""
+    min_confidence: float = 0.1
+    """Depth that is trusted less is left out, 0..1."""
+
+    def __post_init__(self) -> None:
+        check_range("near_mm", self.near_mm, 1, 1e4)
+        check_range("far_mm", self.far_mm, 1, 1e5)
+        if not self.near_mm < self.far_mm:
+            raise ValueError(f"far_mm must be more than near_mm; got {self.far_mm:g} and {self.near_mm:g}")
+        check_range("block_px", self.block_px, 3, 15)
+        if self.block_px % 2 == 0:
+            raise ValueError(f"block_px must be odd; got {self.block_px}")
+        check_range("left_right_px", self.left_right_px, 0.1, 10)
+        check_range("speckle_px", self.speckle_px, 0, 1_000_000)
+        check_range("fill_px", self.fill_px, 0, 1_000_000)
+        check_range("min_confidence", self.min_confidence, 0, 1)
+
+
+@dataclass(frozen=True)
+class StereoDepth:
+    """What two eyes say of the left one's pixels."""
+
+    depth: NDArray[np.float32]
+    """(H, W) z, mm; 0 where not measured."""
+    confidence: NDArray[np.float32]
+    """(H, W) in [0, 1]; 0 where not measured."""
+
+
+def stereo_depth(
+    left_u8: NDArray[np.uint8],
+    right_u8: NDArray[np.uint8],
+    focal_px: float,
+    baseline_mm: float,
+    cfg: StereoConfig | None = None,
+    center_shift_px: float = 0.0,
+) -> StereoDepth:
+    """Depth of every pixel of the left picture that both eyes agree on.
+
+    What only one eye sees is left out. Highlights slide over the tissue with the eye that looks at them, so their
+    confidence is halved; so is that of small holes, which are closed in smooth surface.
+
+    Args:
+        left_u8, right_u8: (H, W, 3) rectified pictures, 0..255.
+        focal_px: of the rectified pictures, > 0.
+        baseline_mm: distance of the eyes, > 0.
+        cfg: range and thresholds.
+        center_shift_px: cx_left - cx_right, px.
+    Returns:
+        depth within [near_mm, far_mm], and confidence: the product of agreement between the eyes, texture and
+        absence of highlights.
+    Raises:
+        ValueError: other shapes or types, or a range of depths that no pixel of such pictures can have.
+    """
+    cfg = cfg or StereoConfig()
+    check_shape("left_u8:H,W,3 right_u8:H,W,3", left_u8=left_u8, right_u8=right_u8)
+    if left_u8.dtype != np.uint8 or right_u8.dtype != np.uint8:
+        raise ValueError(f"pictures must be 8-bit; got {left_u8.dtype} and {right_u8.dtype}")
+    check_range("focal_px", focal_px, 1, 1e6)
+    check_range("baseline_mm", baseline_mm, 1e-3, 1e4)
+    width = left_u8.shape[1]
+    check_range("center_shift_px", center_shift_px, -width, width)
+    product = focal_px * baseline_mm
+    lowest = product / cfg.far_mm + center_shift_px
+    highest = min(product / cfg.near_mm + center_shift_px, width - 1)
+    if lowest > highest:
+        raise ValueError(
+            f"far_mm must be more than {product / max(width - 1 - center_shift_px, 1e-6):.4g} for "
+            f"focal_px {focal_px:g}, baseline_mm {baseline_mm:g} and pictures {width} px wide; got {cfg.far_mm:g}"
+        )
+    left, right = (cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in (left_u8, right_u8))
+    disparity, apart = _match_consistently(left, right, lowest, highest, cfg)
+    # Smoothed first, because the refinement moves whole windows and leaves the matcher's steps within them.
+    disparity, texture = refine_disparity(left, right, smooth_disparity(disparity))
+    glint = specular_likelihood(left_u8 * np.float32(1 / 255))
+    confidence = texture * np.exp(-((apart / np.float32(cfg.left_right_px)) ** 2)) * (1 - glint / 2)
+    disparity[~(confidence >= cfg.min_confidence)] = np.nan
+    disparity = smooth_disparity(drop_speckles(disparity, cfg.speckle_px))
+    confidence[np.isnan(disparity)] = 0
+    disparity = fill_small_holes(disparity, cfg.fill_px)
+    filled = (confidence == 0) & np.isfinite(disparity)
+    if filled.any():
+        support = np.isfinite(disparity) & ~filled
+        confidence[filled] = _mean_around(confidence, support)[filled] / 2
+    # Written so that NaN and disparities of the wrong sign fail too.
+    seen = (disparity >= lowest) & (disparity <= product / cfg.near_mm + center_shift_px)
+    depth = np.divide(product, disparity - center_shift_px, out=np.zeros_like(disparity), where=seen)
+    return StereoDepth(depth, np.where(seen, confidence, np.float32(0)))
+
+
+def temporal_median(
+    window: Sequence[NDArray[np.float32]], tolerance: float = 0.02, surroundings_px: int = 15
+) -> NDArray[np.float32]:
+    """The middle depth map of a window in time, with its noise reduced where the surface hardly moves.
+
+    Frames count in pairs, one before and one after at equal distance, and only at pixels where both agree with the
+    middle frame: a surface that moves steadily then keeps its place, one that jumps keeps its own value. A hole is
+    closed by the nearest pair if its two frames agree with each other and with the depth around the hole.
+
+    Args:
+        window: an odd number of (H, W) depth maps, mm, 0 where missing; the middle one is wanted.
+        tolerance: largest relative difference that counts as agreement; 0.02 is about half a pixel of disparity at the
+            usual distance of a stereo endoscope.
+        surroundings_px: side of the square around a hole that its filling must agree with.
+    Returns:
+        (H, W) depth, mm; 0 where missing.
+    Raises:
+        ValueError: an even number of maps, or maps of different sizes.
+    """
+    if len(window) % 2 == 0:
+        raise ValueError(f"window must have an odd number of depth maps; got {len(window)}")
+    for depth in window:
+        check_shape("depth:H,W middle:H,W", depth=depth, middle=window[len(window) // 2])
+    half = len(window) // 2
+    middle = window[half]
+    measured = middle > 0
+    votes = [middle]
+    for away in range(1, half + 1):
+        before, after = window[half - away], window[half + away]
+        agree = np.maximum(np.abs(before - middle), np.abs(after - middle)) <= np.float32(tolerance) * middle
+        # A pair of opposite infinities leaves the median to the others.
+        votes += [np.where(agree, before, -np.inf), np.where(agree, after, np.inf)]
+    calm = np.partition(np.stack(votes), half, axis=0)[half] if half else middle
+    result = np.where(measured, calm, 0).astype(np.float32)
+    if half and not measured.all():
+        before, after = window[half - 1], window[half + 1]
+        between = (before + after) / 2
+        around = _mean_around(middle, measured, surroundings_px)
+        steady = np.abs(before - after) <= np.float32(tolerance) * between
+        fits = np.abs(between - around) <= np.float32(2 * tolerance) * around
+        fill = ~measured & (before > 0) & (after > 0) & steady & fits
+        result[fill] = between[fill]
+    return result
+
+
+def _match_consistently(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], lowest: float, highest: float, cfg: StereoConfig
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(H, W) disparity of the left picture, NaN where the eyes disagree, and (H, W) by how much they do, px."""
+    height, width = left.shape
+    times = -(-width // MATCHING_WIDTH)
+    size = (-(-width // times), -(-height // times))
+    scale = width / size[0]
+    if times > 1:
+        left, right = (cv2.resize(eye, size, interpolation=cv2.INTER_AREA) for eye in (left, right))
+    bounds = int(np.floor(lowest / scale)), int(np.ceil(highest / scale))
+    from_left, from_right = match_both_ways(left, right, *bounds, cfg.block_px)
+    apart = disagreement(from_left, from_right)
+    from_left[apart > cfg.left_right_px] = np.nan
+    if times > 1:
+        from_left, apart = (
+            cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST) for values in (from_left, apart)
+        )
+        from_left = from_left * np.float32(scale)
+    return from_left, apart
+
+
+def _mean_around(values: NDArray[np.float32], measured: NDArray[np.bool_], side_px: int = 15) -> NDArray[np.float32]:
+    """(H, W) mean of the measured values in a square around each pixel; 0 where it holds none."""
+    weight = measured.astype(np.float32)
+    total = cv2.blur(values * weight, (side_px, side_px))
+    share = cv2.blur(weight, (side_px, side_px))
+    return np.divide(total, share, out=np.zeros_like(total), where=share > 1e-6)

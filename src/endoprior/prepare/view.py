@@ -1,0 +1,204 @@
+"""From an eye's picture to a frame: rectify, cut to what belongs to the picture, shrink. One camera for all frames.
+
+Rectangles and borders are given in px of one eye's picture as it comes from the source.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.images import complaint
+from ..footage.border import Circle, Strips
+from .calibration import Calibration, check_pair
+from .config import Rectangle
+
+CIRCLE_MARGIN = 0.025
+"""Share of the radius left out: the rim of a round border is dark and blurred, and moves a little with the optics."""
+MIN_SIDE_PX = 32
+Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class View:
+    """How every picture of a source becomes a frame."""
+
+    source_size: tuple[int, int]
+    """(width, height) of one eye's picture, px."""
+    maps: tuple[Maps | None, Maps | None]
+    """Left and right: where each rectified pixel lies in the picture; None if the picture is rectified."""
+    cut: Rectangle
+    """Part of the rectified picture that is kept."""
+    size: tuple[int, int]
+    """(width, height) of a frame, px."""
+    matrix: NDArray[np.float64]
+    """(3, 3) K of the frames, px; the left-most pixel is centered at 0.5."""
+    baseline_mm: float | None
+    """None for one eye."""
+    center_shift_px: float
+    """Principal point x of the left eye minus that of the right one, px: the disparity of a point at infinity."""
+    blank: NDArray[np.bool_]
+    """(h, w) of the source: True where pictures are painted black."""
+    inside: NDArray[np.bool_]
+    """(H, W) of a frame: True where it shows what the lens sees."""
+
+    def picture(self, rgb_u8: NDArray[np.uint8], right: bool = False) -> NDArray[np.uint8]:
+        """The frame's picture (H, W, 3) of an eye's picture (h, w, 3)."""
+        if self.blank.any():
+            rgb_u8 = np.where(self.blank[..., None], np.uint8(0), rgb_u8)
+        maps = self.maps[int(right)]
+        if maps is not None:
+            rgb_u8 = cv2.remap(rgb_u8, *maps, cv2.INTER_CUBIC)
+        return _shrink(_cut(rgb_u8, self.cut), self.size)
+
+    def values(self, image: NDArray) -> NDArray:
+        """A mask or depth map that belongs to the left picture (h, w), or to the frame already, as the frame (H, W).
+
+        Nearest neighbor: values are never mixed.
+        """
+        if image.shape[:2] == self.size[::-1]:
+            return image
+        maps = self.maps[0]
+        stored = image.astype(np.uint8) if image.dtype == bool else image
+        if maps is not None:
+            stored = cv2.remap(stored, *maps, cv2.INTER_NEAREST)
+        stored = cv2.resize(_cut(stored, self.cut), self.size, interpolation=cv2.INTER_NEAREST)
+        return stored.astype(image.dtype)
+
+
+def _cut(image: NDArray, cut: Rectangle) -> NDArray:
+    x, y, width, height = cut
+    return np.ascontiguousarray(image[y : y + height, x : x + width])
+
+
+def _shrink(image: NDArray, size: tuple[int, int]) -> NDArray:
+    return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def make_view(
+    size: tuple[int, int],
+    calibration: Calibration | None,
+    *,
+    stereo: bool,
+    name: str,
+    field_of_view_degrees: float,
+    max_width: int,
+    crop: Rectangle | None = None,
+    blank: Sequence[Rectangle] = (),
+    strips: Strips | None = None,
+    circle: Circle | None = None,
+) -> View:
+    """Decide geometry once for all frames.
+
+    Args:
+        size: (width, height) of one eye's picture.
+        calibration: of the eyes; None assumes a pinhole of `field_of_view_degrees` with its center in the middle.
+        name: of the calibration, for complaints.
+        crop, blank, strips, circle: what to keep and what to paint over.
+    Raises:
+        InputError: nothing is left, or the calibration does not fit.
+    """
+    width, height = size
+    keep = np.ones((height, width), bool)
+    if crop is not None:
+        x, y, w, h = crop
+        if x + w > width or y + h > height:
+            hint = "Choose a part of one eye's picture."
+            raise complaint("--crop", f"a rectangle within {width}x{height} px", ",".join(map(str, crop)), hint)
+        keep[:] = False
+        keep[y : y + h, x : x + w] = True
+    if strips:
+        keep[: strips.top] = keep[height - strips.bottom :] = False
+        keep[:, : strips.left] = keep[:, width - strips.right :] = False
+    if circle:
+        keep &= circle.mask(width, height, CIRCLE_MARGIN * circle.radius)
+    painted = np.zeros_like(keep)
+    for x, y, w, h in blank:
+        painted[y : y + h, x : x + w] = True
+    maps: tuple[Maps | None, Maps | None] = (None, None)
+    baseline = None
+    if calibration is None:
+        matrix = _assumed(width, height, circle, field_of_view_degrees)
+    else:
+        calibration = calibration.for_size(width, height, name)
+        if stereo:
+            baseline = check_pair(calibration, name)
+            matrix, maps = _rectify_pair(calibration, size)
+        else:
+            matrix, maps = _undistort(calibration, size)
+    warped = keep if maps[0] is None else cv2.remap(keep.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
+    cut = _bounding_box(warped)
+    frame = _frame_size(cut, max_width)
+    scale = np.diag([frame[0] / cut[2], frame[1] / cut[3], 1.0])
+    shift = np.array([[1, 0, -cut[0]], [0, 1, -cut[1]], [0, 0, 1.0]])
+    shown = keep & ~painted
+    shown = shown if maps[0] is None else cv2.remap(shown.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
+    inside = _shrink(_cut(shown.astype(np.float32), cut), frame) > 0.999
+    shift_px = 0.0
+    if maps[0] is None and calibration is not None and calibration.right is not None and stereo:
+        shift_px = float(calibration.left.matrix[0, 2] - calibration.right.matrix[0, 2]) * scale[0, 0]
+    return View(size, maps, cut, frame, scale @ shift @ matrix, baseline, shift_px, painted, inside)
+
+
+def _assumed(width: int, height: int, circle: Circle | None, degrees: float) -> NDArray[np.float64]:
+    """K of a lens whose angle is known roughly at best."""
+    half = math.tan(math.radians(degrees / 2))
+    extent, x, y = (width / 2, width / 2, height / 2)
+    if circle is not None:
+        extent, x, y = circle.radius, circle.center_x, circle.center_y
+    return np.array([[extent / half, 0, x], [0, extent / half, y], [0, 0, 1.0]])
+
+
+def _moved(matrix: NDArray, by: float) -> NDArray[np.float64]:
+    """K with its principal point moved: OpenCV counts pixel centers from 0, we from 0.5."""
+    moved = matrix.copy()
+    moved[:2, 2] += by
+    return moved
+
+
+def _rectify_pair(calibration: Calibration, size: tuple[int, int]) -> tuple[NDArray, tuple[Maps | None, Maps | None]]:
+    """K of both rectified eyes and the maps, None where the pictures are rectified already."""
+    left, right = calibration.left, calibration.right
+    assert right is not None and calibration.rotation is not None and calibration.translation_mm is not None
+    if calibration.rectified:
+        return left.matrix, (None, None)
+    k1, k2 = _moved(left.matrix, -0.5), _moved(right.matrix, -0.5)
+    r1, r2, p1, p2 = cv2.stereoRectify(
+        k1, left.distortion, k2, right.distortion, size, calibration.rotation,
+        calibration.translation_mm.reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
+    )[:4]  # fmt: skip
+    maps = (
+        cv2.initUndistortRectifyMap(k1, left.distortion, r1, p1, size, cv2.CV_32FC1),
+        cv2.initUndistortRectifyMap(k2, right.distortion, r2, p2, size, cv2.CV_32FC1),
+    )
+    return _moved(p1[:, :3], 0.5), maps
+
+
+def _undistort(calibration: Calibration, size: tuple[int, int]) -> tuple[NDArray, tuple[Maps | None, None]]:
+    eye = calibration.left
+    if not np.any(eye.distortion):
+        return eye.matrix, (None, None)
+    k = _moved(eye.matrix, -0.5)
+    better, _ = cv2.getOptimalNewCameraMatrix(k, eye.distortion, size, 0)
+    return _moved(better, 0.5), (cv2.initUndistortRectifyMap(k, eye.distortion, None, better, size, cv2.CV_32FC1), None)
+
+
+def _bounding_box(keep: NDArray[np.bool_]) -> Rectangle:
+    rows, columns = np.flatnonzero(keep.any(1)), np.flatnonzero(keep.any(0))
+    if len(rows) < MIN_SIDE_PX or len(columns) < MIN_SIDE_PX:
+        hint = "Give a larger --crop, or --border keep."
+        raise complaint("--crop", f"at least {MIN_SIDE_PX} px to be left", f"{len(columns)}x{len(rows)}", hint)
+    return int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)
+
+
+def _frame_size(cut: Rectangle, max_width: int) -> tuple[int, int]:
+    """Even numbers, as video codecs want them; proportions change by less than a pixel."""
+    width, height = cut[2], cut[3]
+    if max_width and width > max_width:
+        width, height = max_width, round(cut[3] * max_width / cut[2])
+    return max(width // 2 * 2, 2), max(height // 2 * 2, 2)

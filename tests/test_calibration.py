@@ -1,0 +1,157 @@
+"""Calibration files: every spelling gives the same numbers; what is missing or wrong is named."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from endoprior.checks import InputError
+from endoprior.prepare.calibration import check_pair
+from endoprior.prepare.calibration_files import read_calibration
+
+K1 = np.array([[580.0, 0, 318.2], [0, 582.0, 255.1], [0, 0, 1]])
+K2 = np.array([[575.0, 0, 322.4], [0, 577.0, 251.9], [0, 0, 1]])
+D1, D2 = np.array([-0.1, 0.02, 0.001, -0.002, 0.003]), np.array([-0.12, 0.03, 0, 0, 0])
+R = cv2.Rodrigues(np.array([0.002, -0.01, 0.003]))[0]
+T = np.array([-4.2, 0.05, -0.03])
+
+
+def opencv_yaml(path, **items):
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in items.items():
+        storage.write(name, value)
+    storage.release()
+    return path
+
+
+def as_json(path, **items):
+    path.write_text(json.dumps({name: np.asarray(value).tolist() for name, value in items.items()}))
+    return path
+
+
+def da_vinci(path):
+    lines = []
+    for side, matrix, bent in (("Left", K1, D1), ("Right", K2, D2)):
+        lines += [f"[Stereo{side}]", "res_x=640", "res_y=512"]
+        values = {"fc_x": matrix[0, 0], "fc_y": matrix[1, 1], "cc_x": matrix[0, 2], "cc_y": matrix[1, 2]}
+        lines += [f"{name}={value!r}" for name, value in values.items() for value in [float(value)]]
+        lines += [f"kc_{i}={float(k)!r}" for i, k in enumerate(bent)]
+        if side == "Right":
+            lines += [f"R_{i}={float(r)!r}" for i, r in enumerate(R.ravel())]
+            lines += [f"T_{i}={float(t)!r}" for i, t in enumerate(T)]
+    path.write_text("\n".join(lines))
+    return path
+
+
+FORMS = {
+    "opencv yaml": lambda d: opencv_yaml(
+        d / "c.yaml", M1=K1, D1=D1, M2=K2, D2=D2, R=R, T=T, image_width=640, image_height=512
+    ),
+    "opencv yml": lambda d: opencv_yaml(
+        d / "c.yml",
+        cameraMatrix1=K1,
+        distCoeffs1=D1,
+        cameraMatrix2=K2,
+        distCoeffs2=D2,
+        R=R,
+        T=T,
+        imageSize=np.array([640, 512]),
+    ),
+    "json": lambda d: as_json(
+        d / "c.json", K_left=K1, distortion_left=D1, K_right=K2, distortion_right=D2, R=R, T_mm=T, width=640, height=512
+    ),
+    "npz": lambda d: (
+        np.savez(
+            d / "c.npz",
+            left_camera_matrix=K1,
+            left_dist_coeffs=D1,
+            right_camera_matrix=K2,
+            right_dist_coeffs=D2,
+            rotation=R,
+            translation=T,
+            resolution=[640, 512],
+        )
+        or d / "c.npz"
+    ),
+    "meters": lambda d: as_json(d / "c.json", K1=K1, dist1=D1, K2=K2, dist2=D2, R=R, T=T / 1000, width=640, height=512),
+    "ini": lambda d: da_vinci(d / "StereoCalibration.ini"),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_spelling_gives_the_same_numbers(tmp_path, form):
+    found = read_calibration(FORMS[form](tmp_path))
+    half = np.zeros((3, 3))
+    half[:2, 2] = 0.5  # OpenCV counts pixel centers from 0, we from 0.5
+    assert np.allclose(found.left.matrix, K1 + half) and np.allclose(found.right.matrix, K2 + half)
+    assert np.allclose(found.left.distortion[:5], D1) and np.allclose(found.right.distortion[:5], D2)
+    assert np.allclose(found.rotation, R) and np.allclose(found.translation_mm, T)
+    assert found.size == (640, 512) and not found.rectified
+    assert check_pair(found, "c") == pytest.approx(np.linalg.norm(T))
+
+
+def test_one_eye(tmp_path):
+    found = read_calibration(opencv_yaml(tmp_path / "c.yaml", camera_matrix=K1, distortion_coefficients=D1))
+    assert found.right is None and np.allclose(found.left.distortion, D1) and found.size is None
+    with pytest.raises(InputError, match=r"expected both eyes, R and T; got one eye.*--layout mono"):
+        check_pair(found, "c.yaml")
+
+
+def test_other_pictures_of_the_same_proportions_scale_it(tmp_path):
+    found = read_calibration(FORMS["json"](tmp_path)).for_size(1280, 1024, "c")
+    assert found.left.matrix[0, 0] == 1160 and found.left.matrix[0, 2] == pytest.approx(2 * 318.7)
+    with pytest.raises(InputError, match="expected pictures of 640x512 px, or the same proportions; got 720x480"):
+        read_calibration(FORMS["json"](tmp_path)).for_size(720, 480, "c")
+
+
+def test_a_unit_can_be_given(tmp_path):
+    path = as_json(tmp_path / "c.json", K1=K1, K2=K2, R=R, T=T / 10)
+    assert np.allclose(read_calibration(path, "cm").translation_mm, T)
+    with pytest.raises(InputError, match=r"baseline of 1 to 30 mm; got 0\.42.*--calibration-unit"):
+        check_pair(read_calibration(path), "c.json")
+
+
+BROKEN = {
+    "no suffix": ("c", "x", "a .yaml, .json, .npz or .ini file"),
+    "not json": ("c.json", "{", "a readable calibration"),
+    "a list": ("c.json", "[1]", "named quantities"),
+    "pickle in npz": ("c.npz", "x", "a readable calibration"),
+    "python in yaml": ("c.yaml", "K_left: !!python/object/apply:os.system ['true']", "a readable calibration"),
+    "no matrix": ("c.json", '{"R": 1}', "the left camera matrix"),
+    "no R": ("c.json", json.dumps({"K1": K1.tolist(), "K2": K2.tolist()}), "how the eyes stand to each other"),
+    "short T": (
+        "c.json",
+        json.dumps({"K1": K1.tolist(), "K2": K2.tolist(), "R": R.tolist(), "T": [1]}),
+        "t to have 3 numbers",
+    ),
+    "NaN": ("c.json", '{"K1": [[NaN,0,0],[0,1,0],[0,0,1]]}', "k1 to be finite"),
+    "no rotation": (
+        "c.json",
+        json.dumps({"K1": K1.tolist(), "K2": K2.tolist(), "R": K1.tolist(), "T": [1, 2, 3]}),
+        "R to be a rotation",
+    ),
+    "no focal length": ("c.json", '{"K1": [[0,0,0],[0,1,0],[0,0,1]]}', "a camera matrix"),
+    "coefficients": ("c.json", json.dumps({"K1": K1.tolist(), "D1": [0] * 7}), "distortion coefficients"),
+    "ini without focal length": ("c.ini", "[StereoLeft]\nfc_x=1\n[StereoRight]\n", "fc_x, fc_y, cc_x, cc_y"),
+    "size": ("c.json", json.dumps({"K1": K1.tolist(), "width": 0, "height": 3}), "width and height in px"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_broken_files_are_refused_in_one_line(tmp_path, kind):
+    name, content, says = BROKEN[kind]
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError) as error:
+        read_calibration(tmp_path / name)
+    assert says in str(error.value) and str(tmp_path / name) in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("shift", "says"),
+    [((4.2, 0, 0), "left and right are swapped"), ((0, -4.2, 0), "T along x"), ((-90, 0, 0), "got 90 mm")],
+)
+def test_implausible_pairs_are_refused(tmp_path, shift, says):
+    path = as_json(tmp_path / "c.json", K1=K1, K2=K2, R=np.eye(3), T=shift)
+    with pytest.raises(InputError, match=says):
+        check_pair(read_calibration(path), "c.json")

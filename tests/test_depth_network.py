@@ -1,0 +1,145 @@
+"""The depth network: a tiny one with random weights stands for the real one; nothing is downloaded."""
+
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from endoprior.checks import InputError
+from endoprior.metrics.torchvision_compat import import_torchvision
+from endoprior.prepare import depth_network
+from endoprior.prepare.depth_network import FILES, DepthNetwork
+
+needs_transformers = pytest.mark.skipif(
+    find_spec("transformers") is None, reason="transformers is not installed: pip install endoprior[mono]"
+)
+# The library's own warnings are not ours to fix.
+pytestmark = pytest.mark.filterwarnings("default")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A Depth Anything model of 40 thousand random weights, as the library saves it."""
+    import torch
+
+    if find_spec("torchvision") is not None:
+        import_torchvision()
+    from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
+
+    backbone = Dinov2Config(
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        image_size=56,
+        patch_size=14,
+        out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=False,
+    )
+    config = DepthAnythingConfig(
+        backbone_config=backbone,
+        patch_size=14,
+        reassemble_hidden_size=16,
+        neck_hidden_sizes=[8, 8, 8, 8],
+        fusion_hidden_size=8,
+        head_hidden_size=8,
+    )
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        network = DepthAnythingForDepthEstimation(config)
+        for weights in network.parameters():  # the library's own start is so small that nothing comes out
+            torch.nn.init.normal_(weights, std=0.2)
+    out = tmp_path_factory.mktemp("tiny_depth_anything")
+    network.save_pretrained(out)
+    return out
+
+
+@needs_transformers
+def test_a_folder_is_loaded_and_looks_at_a_picture_of_any_size(folder, monkeypatch):
+    monkeypatch.setattr(depth_network, "SHORT_SIDE_PX", 56)
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
+    network = DepthNetwork(folder)
+    picture = np.random.default_rng(0).integers(0, 256, (45, 71, 3), np.uint8)
+    inverse = network.inverse_depth(picture)
+    assert inverse.shape == (45, 71) and inverse.dtype == np.float32
+    assert np.isfinite(inverse).all() and inverse.min() >= 0 and inverse.std() > 0
+    assert (network.inverse_depth(picture) == inverse).all()
+    assert not np.array_equal(network.inverse_depth(picture[..., ::-1].copy()), inverse)
+    with pytest.raises(ValueError, match="rgb_u8"):
+        network.inverse_depth(picture[..., 0])
+    with pytest.raises(ValueError, match="8-bit"):
+        network.inverse_depth(picture / 255)
+
+
+@needs_transformers
+@pytest.mark.parametrize("missing", FILES)
+def test_a_folder_without_a_file_is_refused(missing, tmp_path):
+    for file in set(FILES) - {missing}:
+        (tmp_path / file).write_bytes(b"{}")
+    with pytest.raises(InputError, match=f"{tmp_path}: expected .*no {missing}"):
+        DepthNetwork(tmp_path)
+
+
+@needs_transformers
+def test_files_of_something_else_are_refused(folder, tmp_path):
+    for config, weights in ((b"{}", b"broken"), ((folder / "config.json").read_bytes(), b"broken")):
+        (tmp_path / "config.json").write_bytes(config)
+        (tmp_path / "model.safetensors").write_bytes(weights)
+        with pytest.raises(InputError, match="Depth Anything") as caught:
+            DepthNetwork(tmp_path)
+        assert "\n" not in str(caught.value)
+
+
+@needs_transformers
+def test_weights_of_another_network_are_refused(folder, tmp_path):
+    from safetensors.numpy import save_file
+
+    (tmp_path / "config.json").write_bytes((folder / "config.json").read_bytes())
+    save_file({"other": np.zeros(3, np.float32)}, tmp_path / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(InputError, match="no weights for"):
+        DepthNetwork(tmp_path)
+
+
+@needs_transformers
+@pytest.mark.parametrize("name", ["/nowhere/at-all", "some_folder", "./a/b"])
+def test_what_is_neither_folder_nor_hub_name_asks_nobody(name, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
+    with pytest.raises(InputError, match="model folder") as caught:
+        DepthNetwork(name)
+    assert name in str(caught.value) and "Download" in str(caught.value)
+
+
+@needs_transformers
+def test_a_hub_name_is_looked_for_in_the_cache_first(folder, monkeypatch):
+    asked = []
+
+    def fetch(name, allow_patterns, local_files_only=False):
+        asked.append(local_files_only)
+        assert name == "someone/model" and set(allow_patterns) == set(FILES)
+        if local_files_only and len(asked) == 1:
+            return str(folder)
+        raise ConnectionError("no network\nsecond line")
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", fetch)
+    DepthNetwork("someone/model")
+    assert asked == [True]
+    with pytest.raises(InputError, match=r"someone/model.*no network") as caught:
+        DepthNetwork("someone/model")
+    assert asked == [True, True, False] and "\n" not in str(caught.value)
+
+
+def test_without_the_package_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr(depth_network, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install endoprior\[mono\]"):
+        DepthNetwork()
+
+
+def test_importing_the_module_loads_neither_torch_nor_transformers():
+    import subprocess
+
+    code = (
+        "import sys, endoprior.prepare.depth_network; "
+        "assert not {'torch', 'transformers', 'huggingface_hub'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,305 @@
+"""From video files to sequence folders: a stereo phantom in every layout, one eye, bad input, interruption."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from video_files import write_video
+
+from endoprior.checks import InputError
+from endoprior.cli import main
+from endoprior.data import load_sequence
+from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.prepare import PrepareConfig, prepare, work_folder
+
+FRAMES, WIDTH, HEIGHT = 5, 256, 192
+
+
+@pytest.fixture(scope="module")
+def phantom(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stereo") / "phantom"
+    write_phantom(folder, PhantomConfig(frames=FRAMES, width=WIDTH, height=HEIGHT, stereo=True, principal_x=120.0))
+    return folder
+
+
+def eyes(phantom):
+    def read(name):
+        return [cv2.imread(str(file))[..., ::-1] for file in sorted((phantom / name).glob("*.png"))]
+
+    return read("images"), read("right")
+
+
+def options(phantom, **changed):
+    return PrepareConfig(**({"calibration": phantom / "calibration.json", "masks": str(phantom / "masks")} | changed))
+
+
+def depth_error(folder, phantom):
+    """Median |depth - truth| on tissue, mm, and the share of tissue that has a depth."""
+    errors, shares = [], []
+    for frame in load_sequence(folder).frames("video"):
+        truth = np.load(phantom / f"truth/depth/{frame.index:06d}.npy")
+        tissue = cv2.erode(frame.tissue_mask.astype(np.uint8), np.ones((5, 5))) > 0
+        errors.append(np.median(np.abs(frame.depth - truth)[tissue & frame.depth_valid]))
+        shares.append(frame.depth_valid[tissue].mean())
+    return float(np.median(errors)), float(np.median(shares))
+
+
+def interlaced(left, right):
+    frame = np.empty_like(left)
+    frame[::2], frame[1::2] = left[::2], right[1::2]
+    return frame
+
+
+LAYOUTS = {
+    "top-bottom": lambda left, right: np.vstack([left, right]),
+    "side-by-side": lambda left, right: np.hstack([left, right]),
+    "interlaced": interlaced,
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_stereo_video_becomes_a_sequence(tmp_path, phantom, layout):
+    frames = [LAYOUTS[layout](*pair) for pair in zip(*eyes(phantom), strict=True)]
+    video = write_video(tmp_path / "v.mp4", frames, rate=15)
+    done = prepare(video, tmp_path / "out", options(phantom, keep_right=True))
+    sequence = load_sequence(done.out)
+    assert (done.num_frames, done.size, sequence.frames_per_second) == (FRAMES, (WIDTH, HEIGHT), 15)
+    camera, true = sequence.camera(0), load_sequence(phantom).camera(0)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (true.fx, true.fy, true.cx, true.cy)
+    error, share = depth_error(done.out, phantom)
+    assert error < (1.0 if layout != "interlaced" else 2.0) and share > 0.8  # half of the rows are made up
+    for frame, original in zip(sequence.frames("video"), load_sequence(phantom).frames("video"), strict=True):
+        assert np.array_equal(frame.tissue_mask, original.tissue_mask)
+        if layout != "interlaced":
+            assert np.abs(frame.rgb_u8.astype(int) - original.rgb_u8).mean() < 2  # H.264
+    assert len(list((done.out / "right").glob("*.png"))) == FRAMES
+    assert not sequence.depth_is_relative and "stereo" in sequence.sources["depth"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "v.mp4"]
+
+
+def test_two_folders_of_pictures_and_a_part_of_them(tmp_path, phantom):
+    cfg = options(phantom, right=phantom / "right", start=1 / 25, end=4 / 25, border="keep")
+    done = prepare(phantom / "images", tmp_path / "out", cfg)
+    assert done.num_frames == 3
+    for mine, original in zip(load_sequence(done.out).frames("video"), (1, 2, 3), strict=True):
+        true = load_sequence(phantom).frame(original)
+        assert np.array_equal(mine.rgb_u8, true.rgb_u8) and np.array_equal(mine.tissue_mask, true.tissue_mask)
+
+
+def test_a_distorted_pair_is_rectified(tmp_path, phantom):
+    """Both eyes seen through lenses with distortion, the right one turned: depth is the same as before."""
+    focal, center = 0.9 * WIDTH, (120.0 - 0.5, HEIGHT / 2 - 0.5)
+    matrix = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]])
+    bent, turn = np.array([-0.12, 0.03, 0, 0, 0]), cv2.Rodrigues(np.array([0.0, 0.01, 0.02]))[0]
+    shift = turn @ np.array([-4.2, 0, 0])
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+
+    def through(picture, rotation):  # where each pixel of the lens's picture lies in the pinhole's
+        straight = cv2.undistortPoints(np.stack([x, y], -1).reshape(-1, 1, 2), matrix, bent, R=rotation.T, P=matrix)
+        at = straight.reshape(HEIGHT, WIDTH, 2).astype(np.float32)
+        return cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_CUBIC)
+
+    pairs = zip(*eyes(phantom), strict=True)
+    frames = [np.hstack([through(left, np.eye(3)), through(right, turn)]) for left, right in pairs]
+    storage = cv2.FileStorage(str(tmp_path / "c.yaml"), cv2.FILE_STORAGE_WRITE)
+    for name, value in {"M1": matrix, "D1": bent, "M2": matrix, "D2": bent, "R": turn, "T": shift}.items():
+        storage.write(name, value)
+    storage.release()
+    cfg = PrepareConfig(calibration=tmp_path / "c.yaml", masks="none", border="keep")
+    done = prepare(write_video(tmp_path / "v.mkv", frames), tmp_path / "out", cfg)
+    # The rectified camera is turned against the phantom's: compare clouds of points, in the phantom's axes.
+    sequence = load_sequence(done.out)
+    frame, camera = sequence.frame(2), sequence.camera(2)
+    rows, columns = np.nonzero(frame.depth_valid)
+    rays = np.stack(
+        [(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(rows))], 1
+    )
+    left_turn = cv2.stereoRectify(
+        matrix, bent, matrix, bent, (WIDTH, HEIGHT), turn, shift.reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
+    )[0]
+    points = rays * frame.depth[rows, columns, None] @ left_turn
+    at_x = np.round(points[:, 0] / points[:, 2] * focal + center[0]).astype(int)
+    at_y = np.round(points[:, 1] / points[:, 2] * focal + center[1]).astype(int)
+    inside = (at_x >= 0) & (at_x < WIDTH) & (at_y >= 0) & (at_y < HEIGHT)
+    true = np.load(phantom / "truth/depth/000002.npy")
+    tissue = load_sequence(phantom).frame(2).tissue_mask
+    inside[inside] = tissue[at_y[inside], at_x[inside]]
+    assert inside.sum() > 20000
+    assert np.median(np.abs(points[inside, 2] - true[at_y[inside], at_x[inside]])) < 1.2
+
+
+def test_one_eye_and_nothing_else(tmp_path, phantom):
+    done = prepare(write_video(tmp_path / "v.mp4", eyes(phantom)[0]), tmp_path / "out")
+    sequence = load_sequence(done.out)
+    assert sequence.depth_is_relative and sequence.frame(0).depth_valid.mean() > 0.9
+    tissue = [frame.depth[frame.tissue_mask] for frame in sequence.frames("video")]
+    assert np.median(np.concatenate(tissue)) == pytest.approx(70, rel=0.1)
+    text = " ".join(done.remarks)
+    assert "no calibration" in text and "relative (shading)" in text and "stands still" in text
+    assert sequence.validate() is not None
+
+
+@pytest.mark.parametrize("kind", ["npy", "png", "tiff"])
+def test_depth_of_the_user_with_a_unit(tmp_path, phantom, kind):
+    (tmp_path / "depth").mkdir()
+    for index, frame in enumerate(load_sequence(phantom).frames("video")):
+        meters = (frame.depth / 1000).astype(np.float32)
+        file = tmp_path / f"depth/{index:03d}.{kind}"
+        if kind == "npy":
+            np.save(file, np.where(frame.depth_valid, meters, np.nan))
+        else:
+            cv2.imwrite(str(file), np.round(frame.depth * 100).astype(np.uint16) if kind == "png" else meters)
+    cfg = options(
+        phantom, depth=str(tmp_path / "depth"), depth_unit_mm=0.01 if kind == "png" else 1000.0, layout="mono"
+    )
+    done = prepare(phantom / "images", tmp_path / "out", cfg)
+    for mine, true in zip(load_sequence(done.out).frames("video"), load_sequence(phantom).frames("video"), strict=True):
+        assert np.abs(mine.depth - true.depth).max() < 0.02 and np.array_equal(mine.depth_valid, true.depth_valid)
+    with pytest.raises(InputError, match="--depth-unit-mm: expected mm per unit of the files in"):
+        prepare(phantom / "images", tmp_path / "no", options(phantom, depth=str(tmp_path / "depth"), layout="mono"))
+
+
+def test_relative_disparity_of_a_network(tmp_path, phantom):
+    (tmp_path / "disparity").mkdir()
+    for index in range(FRAMES):
+        true = np.load(phantom / f"truth/depth/{index:06d}.npy")
+        np.save(tmp_path / f"disparity/{index}.npy", (3000 / true - 7).astype(np.float32))
+    cfg = options(phantom, depth=str(tmp_path / "disparity"), depth_relative="disparity", layout="mono")
+    done = prepare(phantom / "images", tmp_path / "out", cfg)
+    sequence = load_sequence(done.out)
+    frame, true = sequence.frame(0), np.load(phantom / "truth/depth/000000.npy")
+    assert sequence.depth_is_relative
+    assert np.corrcoef(1 / frame.depth[frame.tissue_mask], 1 / true[frame.tissue_mask])[0, 1] > 0.99
+
+
+def test_inverted_masks_are_turned(tmp_path, phantom):
+    (tmp_path / "masks").mkdir()
+    for file in (phantom / "masks").glob("*.png"):
+        cv2.imwrite(str(tmp_path / "masks" / file.name), 255 - cv2.imread(str(file), 0))
+    cfg = options(phantom, masks=str(tmp_path / "masks"), layout="mono")
+    done = prepare(phantom / "images", tmp_path / "out", cfg)
+    assert any("low values mark tools" in remark for remark in done.remarks)
+    for mine, true in zip(load_sequence(done.out).frames("video"), load_sequence(phantom).frames("video"), strict=True):
+        assert np.array_equal(mine.tissue_mask, true.tissue_mask)
+
+
+def test_names_are_painted_over_and_nothing_of_the_file_is_copied(tmp_path, phantom):
+    cfg = options(phantom, layout="mono", blank=("10,20,50,15",))
+    done = prepare(write_video(tmp_path / "SMITH_John.mkv", eyes(phantom)[0]), tmp_path / "out", cfg)
+    frame = load_sequence(done.out).frame(1)
+    assert not frame.rgb_u8[20:35, 10:60].any() and not frame.tissue_mask[20:35, 10:60].any()
+    for file in done.out.rglob("*"):
+        assert "SMITH" not in file.name and (file.is_dir() or b"SMITH" not in file.read_bytes())
+
+
+def test_frames_out_of_the_body_can_be_dropped(tmp_path, phantom):
+    pictures = eyes(phantom)[0]
+    pictures.insert(2, np.full_like(pictures[0], (90, 140, 160)))
+    video = write_video(tmp_path / "v.mkv", pictures)
+    kept = prepare(video, tmp_path / "kept", PrepareConfig(layout="mono"))
+    assert json.loads((kept.out / "sequence.json").read_text())["unexplained_frames"] == [2]
+    assert any("1 frames are not explained: 2" in remark for remark in kept.remarks)
+    dropped = prepare(video, tmp_path / "dropped", PrepareConfig(layout="mono", drop_out_of_body=True))
+    assert dropped.num_frames == FRAMES
+
+
+def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, phantom):
+    cfg = options(phantom, right=phantom / "right")
+    want = prepare(phantom / "images", tmp_path / "want", cfg).out
+
+    def stop(what, done, total):
+        if what == "writing frames" and done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        prepare(phantom / "images", tmp_path / "out", cfg, stop)
+    assert not (tmp_path / "out").exists()
+    written = []
+    done = prepare(phantom / "images", tmp_path / "out", cfg, lambda what, done, total: written.append((what, done)))
+    assert ("writing frames", 3) in written and ("writing frames", 2) not in written
+    names = sorted(path.relative_to(want) for path in want.rglob("*") if path.is_file())
+    assert names == sorted(path.relative_to(done.out) for path in done.out.rglob("*") if path.is_file())
+    assert all((want / name).read_bytes() == (done.out / name).read_bytes() for name in names)
+
+
+def cut_short(folder, phantom):
+    video = write_video(folder / "v.mp4", [np.hstack(pair) for pair in zip(*eyes(phantom), strict=True)] * 8)
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+    return video
+
+
+def smaller_masks(folder, phantom):
+    (folder / "masks").mkdir()
+    for file in (phantom / "masks").glob("*.png"):
+        cv2.imwrite(str(folder / "masks" / file.name), cv2.imread(str(file), 0)[::2, ::2])
+    return folder / "masks"
+
+
+def without(folder, phantom, key):
+    content = json.loads((phantom / "calibration.json").read_text())
+    del content[key]
+    (folder / "c.json").write_text(json.dumps(content))
+    return folder / "c.json"
+
+
+BAD = {
+    "zero-length video": lambda d, p: ((d / "v.mp4").touch(), d / "v.mp4", {}, "an empty file")[1:],
+    "truncated video": lambda d, p: (cut_short(d, p), {"layout": "side-by-side"}, "--end"),
+    "no such video": lambda d, p: (d / "no.mp4", {}, "no such file"),
+    "swapped eyes": lambda d, p: (p / "right", {"right": p / "images"}, "--swap-eyes"),
+    "missing calibration key": lambda d, p: (
+        p / "images",
+        {"right": p / "right", "calibration": without(d, p, "R")},
+        "no R",
+    ),
+    "second eye missing": lambda d, p: (p / "images", {"layout": "two-files"}, "--right"),
+    "sgbm with one eye": lambda d, p: (p / "images", {"layout": "mono", "depth": "sgbm"}, "expected two eyes"),
+    "mask of another size": lambda d, p: (
+        p / "images",
+        {"layout": "mono", "masks": str(smaller_masks(d, p))},
+        "px like the pictures",
+    ),
+    "no mask folder": lambda d, p: (p / "images", {"layout": "mono", "masks": "nowhere"}, "a folder of masks"),
+    "no depth folder": lambda d, p: (p / "images", {"layout": "mono", "depth": "nowhere"}, "a folder of depth"),
+    "too many frames": lambda d, p: (p / "images", {"layout": "mono", "max_frames": 3}, "at most 3 frames"),
+    "nothing selected": lambda d, p: (p / "images", {"layout": "mono", "start": 9.0}, "at least 2 frames"),
+    "no poses": lambda d, p: (p / "images", {"layout": "mono", "poses": "nowhere.npy"}, "camera poses"),
+    "crop outside": lambda d, p: (p / "images", {"layout": "mono", "crop": "0,0,999,9"}, "--crop"),
+    "calibration of another camera": lambda d, p: (p / "images", {"layout": "side-by-side"}, "the same proportions"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_input_gives_one_line_and_leaves_nothing(tmp_path, phantom, kind):
+    video, changed, says = BAD[kind](tmp_path, phantom)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(InputError) as error:
+        prepare(video, tmp_path / "out", options(phantom, **changed))
+    assert says in str(error.value) and "\n" not in str(error.value)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_the_command(tmp_path, phantom, capsys):
+    frames = [np.vstack(pair) for pair in zip(*eyes(phantom), strict=True)]
+    video = write_video(tmp_path / "v.mp4", frames, rate=15)
+    calibration = str(phantom / "calibration.json")
+    assert main(["prepare", str(video), str(tmp_path / "out"), "--calibration", calibration]) == 0
+    said = capsys.readouterr().out
+    assert f"{FRAMES} frames of {WIDTH}x{HEIGHT}" in said and "note: tools found by color and depth" in said
+    assert main(["check", str(tmp_path / "out"), "--out", str(tmp_path / "check.png")]) == 0
+    assert main(["prepare", str(video), str(tmp_path / "out"), "--calibration", calibration]) == 2
+    assert "expected a new or empty folder" in capsys.readouterr().err
+    assert main(["prepare", str(video), str(tmp_path / "new"), "--end", "-1"]) == 2
+
+
+def test_the_hidden_folder_is_the_only_thing_an_interruption_leaves(tmp_path, phantom):
+    def stop(what, done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        prepare(phantom / "images", tmp_path / "out", options(phantom, layout="mono"), stop)
+    assert [path.name for path in tmp_path.iterdir()] == [".out.preparing"]
+    assert (tmp_path / ".out.preparing" / work_folder.PLAN).exists()
+    shutil.rmtree(tmp_path / ".out.preparing")

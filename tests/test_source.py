@@ -1,0 +1,118 @@
+"""Pictures from files: every one, in order, at its moment; damaged files named in one line."""
+
+import cv2
+import numpy as np
+import pytest
+from video_files import write_video
+
+from endoprior.checks import InputError
+from endoprior.prepare.selection import Selection
+from endoprior.prepare.source import Picture, open_source
+
+
+def pictures_of(count, height=24, width=32):
+    rng = np.random.default_rng(0)
+    return [rng.integers(0, 256, (height, width, 3), np.uint8) for _ in range(count)]
+
+
+def test_video_gives_back_every_pixel(tmp_path):
+    written = pictures_of(7)
+    source = open_source(write_video(tmp_path / "a.mkv", written, rate=10))
+    assert (source.width, source.height, source.frames_per_second) == (32, 24, 10)
+    for _ in range(2):  # as often as needed
+        found = list(source)
+        assert [p.index for p in found] == list(range(7))
+        assert np.allclose([p.seconds for p in found], np.arange(7) / 10)
+        assert all(np.array_equal(p.rgb_u8, want) for p, want in zip(found, written, strict=True))
+
+
+def test_odd_sizes_are_kept(tmp_path):
+    source = open_source(write_video(tmp_path / "a.mkv", pictures_of(3, 25, 33)))
+    assert (source.width, source.height) == (33, 25)
+
+
+def test_folder_in_numeric_order(tmp_path):
+    for number, picture in zip((1, 2, 10), pictures_of(3), strict=True):
+        cv2.imwrite(str(tmp_path / f"f{number}.png"), picture[..., ::-1])
+    source = open_source(tmp_path, 5.0)
+    found = list(source)
+    assert [p.seconds for p in found] == [0, 0.2, 0.4]
+    assert all(np.array_equal(p.rgb_u8, want) for p, want in zip(found, pictures_of(3), strict=True))
+
+
+def cut(path, share):
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    return path
+
+
+BROKEN = {
+    "missing": (lambda d: d / "no.mp4", "no such file"),
+    "empty": (lambda d: (d / "e.mp4").touch() or d / "e.mp4", "an empty file"),
+    "text": (lambda d: (d / "t.mp4").write_text("not a video") and d / "t.mp4", "Invalid data"),
+    "no pictures": (lambda d: d, "none"),
+    "header only": (lambda d: cut(write_video(d / "h.mp4", pictures_of(20)), 0.05), ""),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_broken_sources_are_refused_in_one_line(tmp_path, kind):
+    make, says = BROKEN[kind]
+    path = make(tmp_path)
+    with pytest.raises(InputError) as error:
+        list(open_source(path))
+    assert str(path) in str(error.value) and says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_truncated_video_says_how_to_use_what_is_there(tmp_path):
+    path = cut(write_video(tmp_path / "cut.mp4", pictures_of(40)), 0.6)
+    seen = []
+    with pytest.raises(InputError, match=r"cut\.mp4: expected 40 pictures; got .*--end"):
+        for picture in open_source(path):
+            seen.append(picture)
+    assert 0 < len(seen) < 40
+
+
+def test_a_picture_of_another_size_is_named(tmp_path):
+    for number, size in enumerate((32, 32, 30)):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((24, size, 3), np.uint8))
+    with pytest.raises(InputError, match=r"2\.png: expected 32x24 px like the first picture; got 30x24"):
+        list(open_source(tmp_path))
+
+
+def taken(times, **options):
+    selection = Selection(**options)
+    shots = list(selection.pick(Picture(i, t, np.zeros((1, 1, 3), np.uint8)) for i, t in enumerate(times)))
+    return [shot.index for shot in shots], selection
+
+
+def test_an_even_clip_is_taken_whole():
+    found, selection = taken(np.arange(50) / 30, frames_per_second=30, source_rate=30)
+    assert found == list(range(50)) and selection.gaps == selection.uneven_steps == 0
+
+
+def test_range_and_rate():
+    assert taken(np.arange(60) / 30, frames_per_second=10, start=0.5, end=1.5, source_rate=30)[0] == list(
+        range(15, 45, 3)
+    )
+
+
+def test_a_rate_that_does_not_divide_takes_the_nearest():
+    found, selection = taken(np.arange(300) / 30, frames_per_second=25, source_rate=30)
+    wanted = np.arange(len(found)) / 25
+    assert np.abs(np.array(found) / 30 - wanted).max() <= 0.5 / 30 + 1e-9 and selection.gaps == 0
+
+
+def test_variable_rate_is_counted_and_no_picture_is_taken_twice():
+    times = np.r_[np.arange(10) / 25, 0.4 + 0.2 + np.arange(10) / 25]  # five pictures dropped in the middle
+    found, selection = taken(times, frames_per_second=25, source_rate=25)
+    assert found == list(range(20))
+    assert selection.gaps == 5 and selection.uneven_steps == 1
+
+
+def test_jitter_within_half_a_step_loses_nothing():
+    rng = np.random.default_rng(1)
+    times = np.arange(200) / 25 + rng.uniform(-0.4, 0.4, 200) / 25
+    times[0] = 0
+    found, _ = taken(times, frames_per_second=25, source_rate=25)
+    assert found == list(range(200))
