@@ -26,6 +26,7 @@ import losses
 import optimizer
 import projection
 import rendering
+import stereo
 import temporal
 from common import Row
 
@@ -40,6 +41,7 @@ STAGES: dict[str, common.Measure] = {
     "losses": losses.measure,
     "optimizer": optimizer.measure,
     "rendering": rendering.measure,
+    "stereo": stereo.measure,
     "iteration": iteration.measure,
 }
 Ratios = dict[tuple[Any, ...], float]

@@ -10,7 +10,7 @@ import torch
 from endoprior.cli import main
 from endoprior.data import load_sequence
 from endoprior.data.truth import Tracks
-from endoprior.evaluate import evaluate
+from endoprior.evaluate import Evaluation, evaluate
 from endoprior.model.carry import carry_points
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.presets import preset
@@ -113,3 +113,11 @@ def test_demo_leaves_what_it_promises(tmp_path, monkeypatch):
     ):
         assert (tmp_path / "demo" / part).stat().st_size > 0
     assert "track_error_mm" in json.loads((tmp_path / "demo" / "run" / "metrics.json").read_text())["scores"]
+
+
+def test_frames_far_below_the_median_are_named():
+    rows = [
+        {"index": i, "psnr_tissue": value} for i, value in ((1, 34.0), (9, 33.0), (17, 29.9), (25, None), (33, 35.0))
+    ]
+    assert Evaluation({}, per_frame=rows).badly_explained() == [17]
+    assert Evaluation({}).badly_explained() == []

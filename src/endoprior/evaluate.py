@@ -30,6 +30,8 @@ from .types import Frame
 Split = Literal["train", "test", "video"]
 LOW_PRIOR, LOW_PRIOR_OBSERVATIONS, LOW_OPACITY, LARGE_SCALE_MM = 0.2, 20, 0.01, 40.0
 """Thresholds of the paper's primitive diagnostics."""
+BAD_FRAME_DB = 3.0
+"""A frame this far below the median PSNR of its split was not explained: something happened there."""
 FPS_WARM_UP, FPS_RENDERS = 10, 60
 
 
@@ -48,6 +50,12 @@ class Evaluation:
             self.scores[name] = float(value)
         else:
             self.skipped[name] = reason_if_nan
+
+    def badly_explained(self) -> list[int]:
+        """Frames whose `psnr_tissue` lies more than `BAD_FRAME_DB` below the median of the split."""
+        scored = [(row["index"], row["psnr_tissue"]) for row in self.per_frame if row.get("psnr_tissue") is not None]
+        usual = float(np.median([value for _, value in scored])) if scored else 0.0
+        return [index for index, value in scored if value < usual - BAD_FRAME_DB]
 
     def save(self, folder: Path) -> None:
         """Write `metrics.json` and `per_frame.json`."""

@@ -70,6 +70,10 @@ def evaluate_run(
         say(f"  {name:<28}{value:.4g}" if isinstance(value, float) else f"  {name:<28}{value}")
     for name, reason in result.skipped.items():
         say(f"  {name:<28}skipped: {reason}")
+    if bad := result.badly_explained():
+        say(
+            f"note: frames {', '.join(map(str, bad))} lie more than 3 dB below the median; `endoprior render` shows why"
+        )
     if sequence.depth_is_relative:
         say("note: the sequence's depth is relative: scores in mm tell runs on it apart, they are not mm")
     say(f"{out / 'metrics.json'}")

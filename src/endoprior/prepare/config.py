@@ -82,7 +82,7 @@ class PrepareConfig:
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
     masks: str = "auto"
-    """`auto` (found by color, motion and depth), `none`, or a folder of masks."""
+    """`auto` (found by color and depth), `none`, or a folder of masks."""
     mask_tool_value: Literal["auto", "high", "low"] = "auto"
     """Which value marks tools in the mask folder."""
 
