@@ -13,7 +13,7 @@ import pytest
 from endoprior.checks import InputError
 from endoprior.geometry import bilinear
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.phantom.generate import visible_points
+from endoprior.phantom.generate import build_scene, visible_points
 from endoprior.phantom.instrument import JAW_MM, draw_tools, pack_tool
 from endoprior.phantom.motion import ToolPose, build_motion, smooth_step
 from endoprior.phantom.noise import cells, fractal
@@ -373,3 +373,12 @@ def test_fractal_slow_loop_and_continuity():
     noise = fractal(*grid, 3, 9)
     assert abs(noise.mean()) < 0.05 and 0.15 < noise.std() < 0.5
     assert cells(*grid, 1).min() >= 0 and 0.1 < cells(*grid, 1).mean() < 0.6
+
+
+def test_no_sample_falls_between_triangles():
+    cfg = PhantomConfig(frames=16, width=320, height=256)
+    scene, size = build_scene(cfg), (2 * cfg.width, 2 * cfg.height)
+    center = (2 * cfg.center[0], 2 * cfg.center[1])
+    for index in (5, 10):  # where rounding once left a sample on an edge to neither side
+        hits = rasterize(scene.vertices(index / 15), 2 * cfg.focal, center, *size)
+        assert hits[..., 2].max() < FAR

@@ -65,6 +65,11 @@ class Sequence:
         self._masks = path / mask_folder
         self._cache: dict[int, Frame] = {}
 
+    @property
+    def remarks(self) -> list[str]:
+        """What the reader found odd but usable, one line each."""
+        return list(self._remarks)
+
     def __len__(self) -> int:
         return len(self._cameras)
 
@@ -127,7 +132,7 @@ class Sequence:
         if not any((frame.depth_valid & frame.tissue_mask).any() for frame in self.frames("train")):
             hint = "The mask's polarity may be inverted, or the depth may be of the tool only."
             raise complaint(self.path / "depth", "depth on tissue in a training frame", "none", hint)
-        remarks = list(self._remarks)
+        remarks = self.remarks
         tool = 1 - sum(tissue) / len(tissue)
         if tool > TOOL_FRACTION_WARNING:
             remarks.append(f"{self._masks}: {tool:.0%} of all pixels are tool; the polarity may be inverted")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .noise import FAST
 
 _BANDS = 16
+_RIM = np.float32(1e-4)  # by which triangles are widened: a sample on a shared edge must not fall between the two
 FAR = np.float32(1e9)
 """Depth where nothing was drawn."""
 
@@ -53,7 +54,7 @@ def _rasterize(x, y, inverse_z, row_low, row_high, out):
                             la = ((bx - sx) * (cy - sy) - (by - sy) * (cx - sx)) * scale
                             lb = ((cx - sx) * (ay - sy) - (cy - sy) * (ax - sx)) * scale
                             lc = one - la - lb
-                            if la < zero or lb < zero or lc < zero:
+                            if la < -_RIM or lb < -_RIM or lc < -_RIM:
                                 continue
                             w = la * wa + lb * wb + lc * wc
                             z = one / w
