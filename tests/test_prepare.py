@@ -161,6 +161,22 @@ def test_depth_of_the_user_with_a_unit(tmp_path, phantom, kind):
         prepare(phantom / "images", tmp_path / "no", options(phantom, depth=str(tmp_path / "depth"), layout="mono"))
 
 
+def test_depth_in_another_unit_than_declared(tmp_path, phantom):
+    (tmp_path / "depth").mkdir()
+    for index, frame in enumerate(load_sequence(phantom).frames("video")):
+        np.save(tmp_path / f"depth/{index}.npy", frame.depth / 1000)
+    before = options(phantom, depth=str(tmp_path / "depth"), depth_unit_mm=1.0, layout="mono")
+    with pytest.raises(
+        InputError, match=r"--depth-unit-mm: expected tissue 20 to 250 mm away.*look like m: multiply it by 1000"
+    ):
+        prepare(phantom / "images", tmp_path / "out", before)
+    for index, frame in enumerate(load_sequence(phantom).frames("video")):
+        cv2.imwrite(str(tmp_path / f"depth/{index}.png"), frame.depth.astype(np.uint8))
+        (tmp_path / f"depth/{index}.npy").unlink()
+    done = prepare(phantom / "images", tmp_path / "out", before)
+    assert any("8-bit files are too coarse" in remark for remark in done.remarks)
+
+
 def test_relative_disparity_of_a_network(tmp_path, phantom):
     (tmp_path / "disparity").mkdir()
     for index in range(FRAMES):

@@ -14,6 +14,7 @@ from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_values
 from ..data.images import complaint
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.eyes import eye_order, vertical_offset_px
+from ..footage.units import guess_unit
 from .aligned_depth import Kind, fit_reference, relative_to_mm
 from .clip import Clip
 from .config import PrepareConfig
@@ -31,6 +32,9 @@ FITTED_SAMPLES = 16
 MAX_ROW_OFFSET_PX = 1.5
 """Rows of the two eyes further apart than this cannot be matched well."""
 NETWORK = "depth-anything"
+USER_FILES = "user's files"
+FEWEST_STEPS = 256
+"""Depth with no more different values than this was stored in 8 bits."""
 Measure = Callable[[Developed], Depth]
 Shade = Callable[[NDArray[np.uint8], Mask], Depth]
 
@@ -75,6 +79,8 @@ def choose_makers(cfg: PrepareConfig, clip: Clip, survey: Survey) -> Chosen:
             f"depth is relative ({source}), scaled to a median of {cfg.working_distance_mm:g} mm: "
             "its mm, and those of every score, are not mm"
         )
+    elif source == USER_FILES:
+        said += _doubts(samples, [measure(frame) for frame in samples], view, kind)
     wanted = _inside_body([frame.rgb_u8 for frame in samples]) if cfg.drop_out_of_body else lambda rgb_u8: True
     makers = Makers(measure, shade, tools, kind == "sgbm", wanted)
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
@@ -125,7 +131,7 @@ def _measured_depth(kind: str, cfg: PrepareConfig, clip: Clip, survey: Survey) -
             return read_values(path, size)
         return read_depth_file(path, cfg.depth_unit_mm, size)
 
-    return lambda frame: view.values(_of_either_size(read, files[frame.index], view)), "user's files"
+    return lambda frame: view.values(_of_either_size(read, files[frame.index], view)), USER_FILES
 
 
 def _scaled(measure: Measure, samples: list[Developed], usable: list[Mask], cfg: PrepareConfig) -> Measure:
@@ -133,6 +139,20 @@ def _scaled(measure: Measure, samples: list[Developed], usable: list[Mask], cfg:
     kind: Kind = "depth" if cfg.depth_relative == "depth" else "disparity"
     reference = fit_reference([measure(frame) for frame in samples], usable, kind, cfg.working_distance_mm)
     return lambda frame: relative_to_mm(measure(frame), kind, reference)
+
+
+def _doubts(samples: list[Developed], depths: list[Depth], view: View, folder: str) -> list[str]:
+    """Refuse depth that no endoscope can have measured; remarks about depth that it hardly can."""
+    guess = guess_unit((d, d > 0, f.rgb_u8, view.inside) for f, d in zip(samples, depths, strict=True))
+    if guess.unit in ("m", "0.01 mm"):
+        hint = (
+            f"Is the unit right? Values as they are now look like {guess.unit}: multiply it by {guess.mm_per_unit:g}."
+        )
+        raise complaint("--depth-unit-mm", "tissue 20 to 250 mm away", f"{guess.median:g} mm in {folder}", hint)
+    remarks = [] if guess.unit == "mm" else [f"is the depth's unit right? {guess.reason}"]
+    if max(len(np.unique(depth)) for depth in depths) <= FEWEST_STEPS:
+        remarks.append("the depth has no more than 256 steps: 8-bit files are too coarse for motion in mm")
+    return remarks
 
 
 def _of_either_size(read: Callable[[Path, tuple[int, int]], NDArray], path: Path, view: View) -> NDArray:

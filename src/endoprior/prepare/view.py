@@ -197,8 +197,7 @@ def _bounding_box(keep: NDArray[np.bool_]) -> Rectangle:
 
 
 def _frame_size(cut: Rectangle, max_width: int) -> tuple[int, int]:
-    """Even numbers, as video codecs want them; proportions change by less than a pixel."""
     width, height = cut[2], cut[3]
     if max_width and width > max_width:
-        width, height = max_width, round(cut[3] * max_width / cut[2])
-    return max(width // 2 * 2, 2), max(height // 2 * 2, 2)
+        return max_width, max(round(height * max_width / width), 1)
+    return width, height
