@@ -319,3 +319,19 @@ def test_the_hidden_folder_is_the_only_thing_an_interruption_leaves(tmp_path, ph
     assert [path.name for path in tmp_path.iterdir()] == [".out.preparing"]
     assert (tmp_path / ".out.preparing" / work_folder.PLAN).exists()
     shutil.rmtree(tmp_path / ".out.preparing")
+
+
+def test_a_moving_camera_with_one_eye(tmp_path):
+    rng = np.random.default_rng(0)
+    noise = cv2.GaussianBlur(rng.random((500, 700, 3), np.float32), (0, 0), 2)
+    wall = (60 + 150 * (noise - noise.min()) / np.ptp(noise) * np.array([1, 0.5, 0.45])).astype(np.uint8)
+    pictures = [np.ascontiguousarray(wall[100 + 2 * i : 292 + 2 * i, 50 + 6 * i : 306 + 6 * i]) for i in range(16)]
+    done = prepare(write_video(tmp_path / "v.mkv", pictures), tmp_path / "out", PrepareConfig(masks="none"))
+    sequence = load_sequence(done.out)
+    centers = np.array([sequence.camera(i).center for i in range(16)])
+    assert any("the camera moves" in remark for remark in done.remarks)
+    # 6 px a frame at a working distance of 70 mm.
+    step = 70 / sequence.camera(0).fx * np.array([6, 2])
+    assert np.allclose(np.diff(centers[:, :2], axis=0).mean(0), step, rtol=0.25)
+    still = prepare(tmp_path / "v.mkv", tmp_path / "still", PrepareConfig(masks="none", poses="still"))
+    assert np.array_equal(load_sequence(still.out).camera(9).world_to_camera, np.eye(4))

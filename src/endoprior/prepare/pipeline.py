@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from ..data import write_stir_tracks
@@ -21,7 +22,7 @@ from .makers import Chosen, choose_makers
 from .poses import PosePath, Seen, estimate_poses, read_poses
 from .survey import look_through, source_facts
 from .view import View
-from .work_folder import frames_done, work_folder
+from .work_folder import forget_plan, frames_done, work_folder
 
 DEPTH_SCALE = 0.01
 """mm per unit of the 16-bit depth files: up to 655 mm."""
@@ -78,6 +79,8 @@ def prepare(
         progress("following the camera", 0, files.count)
         path, said = _camera_path(cfg, files, meta)
         unexplained = _unexplained(path, files)
+        if path is not None and meta.depth_relative:
+            _scale_depth(files, path)
         files.finish(None if path is None else path.camera_to_world, unexplained)
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
@@ -132,6 +135,15 @@ def _camera_path(cfg: PrepareConfig, files: FrameFiles, meta: SequenceMeta) -> t
     way = np.linalg.norm(path.camera_to_world[:, :3, 3], axis=1).max()
     unit = "mm (relative)" if meta.depth_relative else "mm"
     return path, [f"the camera moves: {motion.reason}; estimated path reaches {way:.0f} {unit} from its start"]
+
+
+def _scale_depth(files: FrameFiles, path: PosePath) -> None:
+    """Bring each frame's relative depth to the scale of the points that the camera's path was found by."""
+    forget_plan(files.folder)
+    for index, scale in enumerate(path.depth_scale):
+        file = files.file("depth", index)
+        stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.float64) * scale
+        cv2.imwrite(str(file), np.clip(np.round(stored), 0, 65535).astype(np.uint16))
 
 
 def _unexplained(path: PosePath | None, files: FrameFiles) -> list[int]:

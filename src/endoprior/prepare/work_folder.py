@@ -48,7 +48,7 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
             folder.mkdir()
             write_json(folder / PLAN, plan)
         yield folder
-        (folder / PLAN).unlink()
+        forget_plan(folder)
         refuse_occupied(out)
         os.replace(folder, out)
     except InputError:
@@ -57,6 +57,11 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
     finally:
         lock.release()
         Path(lock.lock_file).unlink(missing_ok=True)
+
+
+def forget_plan(folder: Path) -> None:
+    """From now on an interrupted run starts from nothing: what follows cannot be done twice."""
+    (folder / PLAN).unlink(missing_ok=True)
 
 
 def _plan_of(folder: Path) -> Any:
