@@ -121,7 +121,8 @@ class Video:
                     began = seconds if began is None else began
                     # Cameras held upside down write a rotation beside the pictures.
                     turns = round(getattr(frame, "rotation", 0) / 90) % 4
-                    yield Picture(index, seconds - began, np.rot90(frame.to_ndarray(format="rgb24"), turns))
+                    rgb_u8 = np.rot90(frame.to_ndarray(format="rgb24"), turns)
+                    yield Picture(index, seconds - began, np.ascontiguousarray(rgb_u8))
                     index += 1
             except av.error.FFmpegError as error:
                 broken = error.strerror or str(error)
