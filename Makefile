@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench figures clean
 
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
@@ -20,6 +20,10 @@ lint: $(VENV)/.test-installed
 
 bench: $(VENV)/.installed
 	$(BIN)/python bench/run.py --baseline bench/baseline.json $(BENCH)
+
+# The documentation's pictures; ENDOPRIOR_DATA holds the two clips.
+figures: $(VENV)/.installed
+	$(BIN)/python bench/figures.py figures
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

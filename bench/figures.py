@@ -1,0 +1,76 @@
+"""Make the pictures of the documentation again: `make figures`, or `python bench/figures.py WORK`.
+
+Writes docs/images/report.jpg from the demo, and docs/images/own_video.jpg from the two clips that `ENDOPRIOR_DATA`
+holds (`bowel_lift_stereo_sbs.mp4` with its .json, `mono_endo.mp4`). WORK keeps sequences and runs; what is there is not made
+again. Pictures of benchmarks come from bench/publish.py.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+IMAGES = Path(__file__).parents[1] / "docs" / "images"
+WIDTH_PX = 1280
+JPEG_QUALITY = 85
+CLIPS = {
+    "stereo": ("bowel_lift_stereo_sbs.mp4", "bowel_lift_stereo.json", 97),
+    "mono": ("mono_endo.mp4", None, 169),
+}
+"""Video, calibration and the held-out frame that is shown."""
+
+
+def endoprior(*args: object) -> None:
+    """Run one command of the program."""
+    subprocess.run([sys.executable, "-m", "endoprior", *map(str, args)], check=True)
+
+
+def save(name: str, picture: np.ndarray) -> None:
+    """Write (H, W, 3) BGR as docs/images/`name`, at most `WIDTH_PX` wide."""
+    factor = min(1.0, WIDTH_PX / picture.shape[1])
+    small = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(IMAGES / name), small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    print(IMAGES / name)
+
+
+def report(work: Path) -> None:
+    """The demo's report."""
+    if not (work / "demo" / "report.png").exists():
+        endoprior("demo", work / "demo")
+    save("report.jpg", cv2.imread(str(work / "demo" / "report.png")))
+
+
+def own_video(work: Path, data: Path) -> None:
+    """Input, model and depth of a held-out frame of each clip, one below the other."""
+    rows = []
+    for name, (video, calibration, frame) in CLIPS.items():
+        sequence, run, renders = (work / f"{name}_{part}" for part in ("sequence", "run", "renders"))
+        if not sequence.exists():
+            options = ["--calibration", data / calibration] if calibration else []
+            endoprior("prepare", data / video, sequence, *options)
+        if not (run / "metrics.json").exists():
+            endoprior("train", sequence, run, "--no-networks")
+        if not renders.exists():
+            endoprior("render", run, renders, "--split", "test")
+        rows.append(cv2.imread(str(renders / "side_by_side" / f"{frame:06d}.png")))
+    save("own_video.jpg", np.vstack(rows))
+
+
+def main() -> None:
+    """Make what can be made."""
+    work, data = Path(sys.argv[1] if len(sys.argv) > 1 else "figures"), os.environ.get("ENDOPRIOR_DATA")
+    work.mkdir(parents=True, exist_ok=True)
+    report(work)
+    if data and all((Path(data) / video).exists() for video, _, _ in CLIPS.values()):
+        own_video(work, Path(data))
+    else:
+        print("own_video.jpg: left as it is, because ENDOPRIOR_DATA does not hold the two clips")
+
+
+if __name__ == "__main__":
+    main()
