@@ -1,8 +1,8 @@
 """Make the pictures of the documentation again: `make figures`, or `python bench/figures.py WORK`.
 
 Writes docs/images/report.jpg from the demo, and docs/images/own_video.jpg from the two clips that `ENDOPRIOR_DATA`
-holds (`bowel_lift_stereo_sbs.mp4` with its .json, `mono_endo.mp4`). WORK keeps sequences and runs; what is there is not made
-again. Pictures of benchmarks come from bench/publish.py.
+holds (`bowel_lift_stereo_sbs.mp4` with its .json, `mono_endo.mp4`). WORK keeps sequences and runs; what is there is
+not made again. Pictures of benchmarks come from bench/publish.py.
 """
 
 from __future__ import annotations
