@@ -123,6 +123,9 @@ def test_a_failing_cell_is_reported_and_does_not_stop_the_rest(tmp_path, capsys)
     assert len(done_times(tmp_path / "out")) == 1
 
 
+QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_killed_half_way_it_loses_no_finished_cell(tmp_path, how):
     write_tiny_sequence(tmp_path / "tiny")
@@ -130,7 +133,9 @@ def test_killed_half_way_it_loses_no_finished_cell(tmp_path, how):
     spec = write_spec(tmp_path, methods=endless, seeds=[0], figures=["curves"], claims=[])
     out = tmp_path / "out"
     command = [sys.executable, "-m", "endoprior", "bench", str(spec), str(out), "--cores", "1"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+    # A background shell has its children ignore Ctrl-C; this one must not.
+    process = subprocess.Popen(command, **QUIET, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    try:
         for _ in range(600):
             logs = [path for path in out.glob("cells/*/run/log.jsonl") if len(done_times(out)) == 2]
             logs = [path for path in logs if not (path.parents[1] / "cell.json").exists() and path.stat().st_size]
@@ -140,6 +145,8 @@ def test_killed_half_way_it_loses_no_finished_cell(tmp_path, how):
         (log,) = logs
         process.send_signal(how)
         code = process.wait(timeout=60)
+    finally:
+        process.kill()
     assert code == (130 if how == signal.SIGINT else -signal.SIGKILL)
     before = done_times(out)
     assert len(before) == 2
