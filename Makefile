@@ -6,17 +6,25 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test lint bench figures clean
+.PHONY: demo test lint browser bench figures clean
 
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
 
-test: $(VENV)/.test-installed lint
+test: $(VENV)/.test-installed lint browser
 	$(BIN)/python -m pytest
 
 lint: $(VENV)/.test-installed
 	$(BIN)/ruff check src tests bench
 	$(BIN)/ruff format --check src tests bench
+
+# The viewer and the player are tested in headless Chromium. Where there is none, Debian's package is installed if that is
+# possible without asking; otherwise those tests are skipped, and say so.
+browser:
+	@command -v chromium >/dev/null || command -v google-chrome >/dev/null || test -n "$$ENDOPRIOR_CHROMIUM" || \
+	  { test "$$(id -u)" = 0 && command -v apt-get >/dev/null && apt-get -qq update && \
+	    DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends chromium >/dev/null; } || \
+	  echo "No Chromium here and none could be installed: browser tests will be skipped."
 
 bench: $(VENV)/.installed
 	$(BIN)/python bench/run.py --baseline bench/baseline.json $(BENCH)

@@ -19,7 +19,7 @@ LAYERS = [
     {"phantom", "model", "density"},
     {"optim", "training_frames", "truth_scores"},
     {"train_state", "evaluate", "show"},
-    {"trainer"},
+    {"trainer", "export"},
     {"checkpoint"},
     {"run_folder"},
     {"train"},

@@ -20,6 +20,7 @@ COMMANDS = {
     "train": "train one scene and score it",
     "eval": "score a trained scene on a split",
     "render": "draw a trained scene: color, depth, side-by-side, video",
+    "export": "write open formats: PLY, splat, SPZ, glTF, mesh, points, tracks, depth, video",
     "bench": "compare methods on sequences over seeds, under one protocol",
 }
 """Name and one-line description; each lives in the module of this package named like it (`eval` in `evaluate`)."""

@@ -30,6 +30,36 @@ def training_progress() -> Iterator:
         yield _PlainLines()
 
 
+class Counting:
+    """Work that counts: a line every few seconds, or one line that is written over on a terminal."""
+
+    def __enter__(self) -> Counting:
+        self._terminal, self._what, self._first = sys.stderr.isatty(), "", 0
+        self._began = self._last = clock.monotonic()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._terminal and self._what:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Say how far `what` has come; a `total` of 0 is not known."""
+        now = clock.monotonic()
+        if what != self._what:
+            self._what, self._began, self._first = what, now, done
+        elif not self._terminal and now - self._last < PLAIN_EVERY_SECONDS:
+            return
+        self._last = now
+        rate = (done - self._first) / max(now - self._began, 1e-9)
+        line = f"{what} {done}/{total or '?'}"
+        if rate > 0 and total:
+            line += f"  {rate:.1f}/s  {(total - done) / rate:.0f} s left"
+        if self._terminal:
+            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+        else:
+            say(line)
+
+
 class _PlainLines:
     """A line every few seconds, for log files."""
 

@@ -1,0 +1,97 @@
+"""Axes of exported coordinates: proper rotations of positions, orientations and direction-dependent color.
+
+World axes are OpenCV's, those of the stored poses: x right, y down, z forward (away from the viewer). Without
+registration to a patient, the anatomical axes assume the view that an anatomical atlas has: the picture's right is the
+patient's left, up is superior, forward is posterior. Nothing is scaled or moved.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from ..render import sh as harmonics
+from ..types import Splats
+from .options import Axes
+
+ROTATIONS: dict[str, NDArray[np.float64]] = {
+    "opencv": np.eye(3),
+    "opengl": np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]),  # right, up, back
+    "lps": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),  # left = x, posterior = z, superior = -y
+    "ras": np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]]),  # right = -x, anterior = -z, superior = -y
+}
+"""(3, 3) from OpenCV axes to each of the others; determinant +1."""
+
+
+def turned_points(points: NDArray, axes: Axes) -> NDArray:
+    """(..., 3) positions or directions in OpenCV axes, in `axes`; same type of numbers."""
+    return points @ ROTATIONS[axes].T.astype(points.dtype)
+
+
+def turned(splats: Splats, axes: Axes) -> Splats:
+    """Gaussians of OpenCV axes in `axes`: the same bodies, the same colors from the same sides."""
+    return rotated(splats, ROTATIONS[axes])
+
+
+def rotated(splats: Splats, rotation: NDArray[np.float64]) -> Splats:
+    """Gaussians turned about the origin by a (3, 3) proper rotation; the identity leaves every bit."""
+    if np.array_equal(rotation, np.eye(3)):
+        return splats
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    matrix = torch.from_numpy(rotation)
+    return Splats(
+        means=(splats.means.double() @ matrix.T).to(splats.means.dtype),
+        quats=multiplied(torch.tensor([w, x, y, z]), splats.quats.double()).to(splats.quats.dtype),
+        scales=splats.scales,
+        opacities=splats.opacities,
+        sh=rotated_sh(splats.sh, rotation),
+    )
+
+
+def multiplied(left: Tensor, right: Tensor) -> Tensor:
+    """Hamilton product of quaternions (w, x, y, z), shapes (..., 4): first `right` turns, then `left`."""
+    a, b, c, d = left.unbind(-1)
+    w, x, y, z = right.unbind(-1)
+    return torch.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        -1,
+    )
+
+
+def rotated_sh(sh: Tensor, rotation: NDArray[np.float64]) -> Tensor:
+    """Coefficients (N, K, 3) of colors turned with their Gaussians: what was seen along d is seen along R d."""
+    matrix = torch.from_numpy(sh_rotation(harmonics.degree_of(sh.shape[1]), rotation.tobytes()))
+    return torch.einsum("kj,njc->nkc", matrix, sh.double()).to(sh.dtype)
+
+
+@cache
+def sh_rotation(degree: int, rotation: bytes) -> NDArray[np.float64]:
+    """(K, K) matrix that turns spherical-harmonic coefficients up to `degree`.
+
+    Each degree turns within itself. Its block solves Y(R d) block = Y(d) over directions d, more than there are
+    unknowns, spread evenly on a spiral; the equations have an exact solution.
+
+    Args:
+        rotation: (3, 3) float64 as bytes.
+    """
+    k = np.arange(64)
+    height, angle = 1 - (2 * k + 1) / 64, k * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - height**2)
+    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1)
+    moved = directions @ np.frombuffer(rotation).reshape(3, 3).T
+    before, after = (harmonics.basis(torch.from_numpy(d.copy()), degree).numpy() for d in (directions, moved))
+    matrix = np.zeros(((degree + 1) ** 2,) * 2)
+    for band in range(degree + 1):
+        own = slice(band**2, (band + 1) ** 2)
+        matrix[own, own] = np.linalg.lstsq(after[:, own], before[:, own], rcond=None)[0]
+    return matrix

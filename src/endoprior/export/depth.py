@@ -1,0 +1,35 @@
+"""Depth images: 16-bit PNG in steps of 0.01 mm, and float32 NPY in mm."""
+
+from __future__ import annotations
+
+import io
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.scene import Scene
+from .moments import Moment
+from .options import ExportOptions
+from .surface import seen_surface
+
+PNG_STEPS_PER_MM = 100
+"""Depth in a PNG is counted in 0.01 mm, so 65535 is 655.35 mm."""
+
+
+def files(scene: Scene, moment: Moment, options: ExportOptions) -> dict[str, bytes]:
+    """Expected depth from the moment's own camera, as .png and .npy; 0 where there is no surface."""
+    depth = seen_surface(scene, moment.time, moment.camera(scene), options.min_alpha).depth
+    stored = io.BytesIO()
+    np.save(stored, depth)
+    return {".png": depth_png(depth), ".npy": stored.getvalue()}
+
+
+def depth_png(depth: NDArray[np.float32]) -> bytes:
+    """A 16-bit gray PNG of (H, W) depth, mm; what is deeper than 655.35 mm does not fit and becomes 0, missing."""
+    steps = np.rint(depth * np.float32(PNG_STEPS_PER_MM))
+    fits = (steps > 0) & (steps <= 65535)
+    done, png = cv2.imencode(".png", np.where(fits, steps, 0).astype(np.uint16))
+    if not done:
+        raise OSError("could not encode a depth image")
+    return png.tobytes()

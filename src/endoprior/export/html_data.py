@@ -1,0 +1,186 @@
+"""The moving Gaussians of a scene as small integers, coded over time: what the HTML player carries.
+
+Every Gaussian has 14 channels, each `low + step * q` with q a 16-bit integer: center x, y, z (mm), quaternion w, x, y,
+z, the logarithms of the three scales (mm), opacity, red, green, blue. A channel that never changes is stored once. The
+others store frame 0 and then the residual of a prediction from one frame before (q[t-1]) or two (2 q[t-1] - q[t-2]),
+whichever leaves less. Arithmetic is modulo 2**16, so that unpacking is exact. Shared letters: `T` frames, `N`
+Gaussians, `C = 14` channels.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..checks import InputError
+from ..model.scene import Scene
+from ..render.constants import ALPHA_MIN, NEAR_Z
+from ..render.sh import colors
+from ..types import Camera, Splats
+
+CHANNELS = ("x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz", "opacity", "r", "g", "b")
+LARGEST = 65535
+"""Largest stored integer."""
+MAX_STEP_MM = 0.1
+"""Centers are off by half a step: never by more than 0.05 mm ..."""
+STEP_PX = 0.25
+"""... nor, at the working distance, by more than an eighth of a pixel on each axis."""
+QUAT_STEP = 1 / 255
+"""Of a component of the unit quaternion; turns a Gaussian by less than half a degree."""
+LOG_SCALE_STEP = 0.02
+"""A scale is off by at most 1 %."""
+SMALLEST_SCALE_PX = 0.02
+"""Scales below this at the working distance are stored as this: the renderer's blur is 27 times wider."""
+OPACITY_STEP = 1 / 1020
+COLOR_STEP = 1 / 255
+NOTHING_SEEN = "scene: expected Gaussians in front of the camera; found none that can be drawn. Train it again."
+
+
+@dataclass(frozen=True)
+class Quantized:
+    """A scene at some moments, as integers."""
+
+    values: NDArray[np.uint16]
+    """(C, T, N)."""
+    low: NDArray[np.float64]
+    """(C,) what q = 0 stands for."""
+    step: NDArray[np.float64]
+    """(C,)."""
+    working_distance: float
+    """Nearest depth that matters: 1st percentile of z of what is in front of the cameras, mm."""
+    depth_range: tuple[float, float]
+    """1st and 99th percentile of z, widened to be apart, mm."""
+    focus: float
+    """Median z, mm: what a free view turns around."""
+
+
+def quantize(scene: Scene, times: list[float]) -> Quantized:
+    """The Gaussians of `scene` at `times`, without those that are never drawn.
+
+    Colors are those seen from the recorded camera of each moment, all degrees of the harmonics included. An opacity
+    below 1/255 is stored as 0, and a Gaussian that is so at every moment is left out; so is, at a moment, one that is
+    not finite or too far away for 16 bits.
+
+    Args:
+        times: T moments in [0, 1].
+    Raises:
+        ValueError: a time is not in [0, 1].
+        InputError: nothing is left to be drawn.
+    """
+    raw, depths = _sample(scene, times)
+    opacity = raw[CHANNELS.index("opacity")]
+    finite = np.isfinite(raw).all(0)
+    seen = depths[finite & (depths > NEAR_Z) & (opacity >= ALPHA_MIN)]
+    if not len(seen):
+        raise InputError(NOTHING_SEEN)
+    near, focus, far = (float(v) for v in np.percentile(seen, [1, 50, 99]))
+    focal = max(max(camera.fx, camera.fy) for camera in scene.cameras)
+    step = np.array(
+        [min(MAX_STEP_MM, STEP_PX * near / focal)] * 3
+        + [QUAT_STEP] * 4
+        + [LOG_SCALE_STEP] * 3
+        + [OPACITY_STEP]
+        + [COLOR_STEP] * 3
+    )
+    raw[:, ~finite] = 0
+    centers = raw[:3].reshape(3, -1)
+    middle = np.median(centers[:, finite.ravel()], axis=1)
+    within = (np.abs(centers - middle[:, None]) < step[:3, None] * (LARGEST // 2)).all(0).reshape(finite.shape)
+    drawn = finite & within & (opacity >= ALPHA_MIN)
+    kept = drawn.any(0)
+    if not kept.any():
+        raise InputError(NOTHING_SEEN)
+    raw, drawn = raw[:, :, kept], drawn[:, kept]
+
+    low = np.zeros(len(CHANNELS))
+    low[:3] = np.where(drawn, raw[:3], np.inf).min((1, 2))
+    low[3:7] = -1
+    low[7:10] = np.log(SMALLEST_SCALE_PX * near / focal)
+    raw[CHANNELS.index("opacity")] *= drawn
+    values = np.empty(raw.shape, np.uint16)
+    for c in range(len(CHANNELS)):
+        values[c] = np.rint((raw[c] - float(low[c])) / float(step[c])).clip(0, LARGEST)
+    _hold_hidden(values, drawn)
+    return Quantized(values, low, step, near, (near, max(far, near * 1.01)), focus)
+
+
+def pack(values: NDArray[np.uint16], level: int = 9) -> tuple[bytes, list[dict[str, int]]]:
+    """Code (C, T, N) integers over time and deflate them, one zlib stream per channel.
+
+    A stream unpacks to a plane of low bytes and one of high bytes, Gaussian by Gaussian: the first frame, then T - 1
+    residuals r, each as the unsigned 2 r (r >= 0) or -2 r - 1.
+
+    Returns:
+        the streams one after the other, and for each channel its number of `bytes` and its `order`: 0 for a channel
+        that never changes (N values), 1 and 2 for the two predictions (N * T values).
+    """
+    streams, table = [], []
+    for plane in values:
+        order, coded = _predict(plane)
+        by_gaussian = np.ascontiguousarray(coded.T)
+        low, high = (by_gaussian & 255).astype(np.uint8), (by_gaussian >> 8).astype(np.uint8)
+        streams.append(zlib.compress(low.tobytes() + high.tobytes(), level))
+        table.append({"order": order, "bytes": len(streams[-1])})
+    return b"".join(streams), table
+
+
+def _predict(plane: NDArray[np.uint16]) -> tuple[int, NDArray[np.uint16]]:
+    """Order of the prediction, and (T, N) first frame and residuals; (1, N) where nothing changes."""
+    if (plane == plane[:1]).all():
+        return 0, plane[:1]
+    velocity = np.diff(plane, axis=0)
+    first, second = _zigzag(velocity), _zigzag(np.diff(velocity, axis=0))
+    # Bits follow the logarithm. The first step has no velocity before it to be predicted from.
+    if (
+        len(plane) > 2
+        and np.log2(1 + second.astype(np.float32)).sum() < np.log2(1 + first[1:].astype(np.float32)).sum()
+    ):
+        return 2, np.concatenate([plane[:1], first[:1], second])
+    return 1, np.concatenate([plane[:1], first])
+
+
+def _sample(scene: Scene, times: list[float]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(C, T, N) channels before rounding, and (T, N) z in the camera of each moment, mm."""
+    raw = np.empty((len(CHANNELS), len(times), len(scene)), np.float32)
+    depths = np.empty((len(times), len(scene)), np.float32)
+    for t, time in enumerate(times):
+        splats, camera = scene.at(time), scene.camera_at(time)
+        raw[:, t], depths[t] = _channels(splats, camera)
+        if t:  # q and -q are one rotation: take the one that continues
+            raw[3:7, t] *= np.where((raw[3:7, t] * raw[3:7, t - 1]).sum(0) < 0, -1, 1)
+    return raw, depths
+
+
+def _channels(splats: Splats, camera: Camera) -> tuple[NDArray, NDArray]:
+    pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float32)
+    towards = splats.means - torch.as_tensor(camera.center, dtype=torch.float32)
+    towards = towards / towards.norm(dim=-1, keepdim=True)
+    quats = splats.quats / splats.quats.norm(dim=-1, keepdim=True)
+    quats = torch.where(quats[:, :1] < 0, -quats, quats)
+    parts = [
+        splats.means,
+        quats,
+        splats.scales.clamp(min=1e-30).log(),
+        splats.opacities[:, None],
+        colors(splats.sh, towards),
+    ]
+    return torch.cat(parts, 1).T.numpy(), (splats.means @ pose[2, :3] + pose[2, 3]).numpy()
+
+
+def _hold_hidden(values: NDArray[np.uint16], drawn: NDArray[np.bool_]) -> None:
+    """Give Gaussians that are not drawn at a moment the numbers of the moment before, which cost nothing."""
+    opacity = CHANNELS.index("opacity")
+    for t in range(1, values.shape[1]):
+        hidden = ~drawn[t]
+        values[:opacity, t, hidden] = values[:opacity, t - 1, hidden]
+        values[opacity + 1 :, t, hidden] = values[opacity + 1 :, t - 1, hidden]
+
+
+def _zigzag(residual: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Residuals modulo 2**16 as small unsigned numbers: 0, -1, 1, -2 ... become 0, 1, 2, 3 ..."""
+    signed = residual.view(np.int16)
+    return ((signed << 1) ^ (signed >> 15)).view(np.uint16)

@@ -1,0 +1,55 @@
+"""Triangle meshes as PLY, Wavefront OBJ and binary STL.
+
+Sources: Turk, "The PLY Polygon File Format", 1994; Wavefront, "Object Files (.obj)", with colors after the coordinates
+as is customary; 3D Systems, "StereoLithography Interface Specification", 1989.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .options import Axes
+from .ply import ply_bytes, vertex_table
+
+
+def encode_mesh(
+    vertices: NDArray[np.float32], triangles: NDArray[np.int32], colors: NDArray[np.uint8], suffix: str, axes: Axes
+) -> bytes:
+    """A mesh as the bytes of a file.
+
+    Args:
+        vertices: (V, 3) mm, in `axes`. triangles: (F, 3) vertex numbers. colors: (V, 3), 0..255.
+        suffix: ply, obj or stl.
+    """
+    if suffix == "ply":
+        columns = {name: vertices[:, i] for i, name in enumerate("xyz")}
+        columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
+        return ply_bytes(vertex_table(columns), axes, triangles)
+    return _obj(vertices, triangles, colors, axes) if suffix == "obj" else _stl(vertices, triangles, axes)
+
+
+def _about(axes: Axes) -> str:
+    """Header text; `SPACE=LPS` or `SPACE=RAS` is what 3D Slicer looks for."""
+    return f"endoprior, axes {axes}, unit mm" + (f", SPACE={axes.upper()}" if axes in ("lps", "ras") else "")
+
+
+def _obj(vertices: NDArray, triangles: NDArray, colors: NDArray, axes: Axes) -> bytes:
+    text = io.StringIO()
+    text.write(f"# {_about(axes)}\n")
+    np.savetxt(text, np.column_stack([vertices, colors / 255]), "v %.6g %.6g %.6g %.4f %.4f %.4f")
+    np.savetxt(text, triangles + 1, "f %d %d %d")
+    return text.getvalue().encode()
+
+
+def _stl(vertices: NDArray, triangles: NDArray, axes: Axes) -> bytes:
+    corners = vertices[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    facets = np.zeros(len(triangles), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    facets["normal"], facets["corners"] = normals / np.where(length > 0, length, 1), corners
+    # A header that began with "solid" would be taken for the format's text form.
+    return _about(axes).encode().ljust(80) + struct.pack("<I", len(triangles)) + facets.tobytes()

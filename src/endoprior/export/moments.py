@@ -1,0 +1,70 @@
+"""Which moments of a scene to export, and the Gaussians of one of them in the axes asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..checks import InputError
+from ..data.sequence import Split, is_test_frame
+from ..model.scene import Scene
+from ..types import Camera, Splats
+from .axes import turned
+from .options import Axes, ExportOptions
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One state of a scene."""
+
+    name: str
+    """Of its files, without suffix: the frame's index, or the position in --times, in six digits."""
+    time: float | None
+    """In [0, 1]; None is the canonical state."""
+    frame: int | None = None
+    """Index of the frame in the sequence, if it is one."""
+
+    def splats(self, scene: Scene, axes: Axes) -> Splats:
+        """The Gaussians, activated, in `axes`."""
+        if self.time is None:
+            found = scene.gaussians.splats(None, scene.config.schedule.sh_degree)
+        else:
+            found = scene.at(self.time)
+        # What no deformation touches is the trained tensor itself, and tied to its gradient.
+        return turned(Splats(**{name: value.detach() for name, value in vars(found).items()}), axes)
+
+    def camera(self, scene: Scene) -> Camera:
+        """The sequence's camera of this moment; the first one for the canonical state."""
+        return scene.camera_at(self.time or 0.0)
+
+    def facts(self) -> dict[str, Any]:
+        """What the index says about it."""
+        return {"time": self.time} | ({} if self.frame is None else {"frame": self.frame})
+
+
+def frame_indices(num_frames: int, split: Split) -> list[int]:
+    """Ascending indices of the frames of a split, as `Sequence.indices` without a sequence.
+
+    Raises:
+        InputError: there are none.
+    """
+    found = [i for i in range(num_frames) if split == "video" or is_test_frame(i) == (split == "test")]
+    if not found:
+        raise InputError(f"--split: expected one with frames; {split} has none of {num_frames}. Choose another.")
+    return found
+
+
+def chosen_moments(scene: Scene, options: ExportOptions) -> list[Moment]:
+    """The moments that `options` asks for: canonical, some times, or the frames of a split.
+
+    Raises:
+        InputError: two of these were asked for, or the split is empty.
+    """
+    if options.canonical + bool(options.times) + (options.split != "video") > 1:
+        raise InputError("--canonical, --times, --split: expected one of them; got several. Leave the others out.")
+    if options.canonical:
+        return [Moment("canonical", None)]
+    if options.times:
+        return [Moment(f"{k:06d}", time) for k, time in enumerate(options.times)]
+    total = len(scene.cameras)
+    return [Moment(f"{i:06d}", i / total, i) for i in frame_indices(total, options.split)]

@@ -1,0 +1,67 @@
+"""What can be asked of an export: the options of `endoprior export`, with their ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from ..checks import check_range
+
+FormatName = Literal["ply", "splat", "spz", "gltf", "points", "mesh", "depth", "tracks", "video", "scene", "html"]
+Axes = Literal["opencv", "opengl", "ras", "lps"]
+"""Axes that exported coordinates refer to; docs/format.md defines them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Options of an export. Each format takes some of them and refuses the others."""
+
+    format: FormatName
+    """What to write."""
+    times: tuple[float, ...] = ()
+    """Moments in [0, 1] in place of a split; frame i of T is at i / T."""
+    split: Literal["video", "test", "train"] = "video"
+    """Frames of the sequence, one set of files each; `video` is all of them."""
+    canonical: bool = False
+    """The Gaussians as they are stored, before any motion, in place of moments."""
+    frame: Axes | None = None
+    """Axes of the coordinates: opencv (x right, y down, z forward), opengl (y up, z back), ras or lps (for 3D Slicer).
+    If not given: opengl for spz and gltf, whose specifications demand it, else opencv."""
+    min_alpha: float = 0.5
+    """A pixel shows a surface if its accumulated opacity is at least this (depth, mesh, tracks)."""
+    min_opacity: float = 0.5
+    """Least opacity of a Gaussian that becomes a point (points)."""
+    mesh_format: Literal["ply", "obj", "stl"] = "ply"
+    """File format of a mesh; STL has no colors."""
+    mesh_method: Literal["grid", "tsdf"] = "grid"
+    """`grid`: a net over the depth that the moment's camera sees; `tsdf`: the depths of all camera positions fused."""
+    mesh_step: int = 2
+    """Pixels between the vertices of a depth grid."""
+    max_slope: float = 5.0
+    """Depth change per mm sideways above which a depth grid is torn."""
+    voxel_mm: float = 1.0
+    """Edge of a voxel of the fusion, mm."""
+    points: Path | None = None
+    """CSV with columns x, y, frame: pixels to follow; a grid on the first frame if not given (tracks)."""
+    grid_px: int = 32
+    """Pixels between the points of that grid."""
+    title: str = ""
+    """Shown above the player (html)."""
+    max_mb: float = 20.0
+    """Largest player to write, MB (html)."""
+
+    def __post_init__(self) -> None:
+        for time in self.times:
+            check_range("times", time, 0, 1)
+        check_range("min_alpha", self.min_alpha, 0.01, 1)
+        check_range("min_opacity", self.min_opacity, 0, 1)
+        check_range("mesh_step", self.mesh_step, 1, 1000)
+        check_range("max_slope", self.max_slope, 0.01, 1000)
+        check_range("voxel_mm", self.voxel_mm, 0.01, 1000)
+        check_range("grid_px", self.grid_px, 1, 100_000)
+        check_range("max_mb", self.max_mb, 0.1, 1000)
+
+
+DEFAULTS = ExportOptions(format="ply")
+"""To tell which options were given."""

@@ -1,0 +1,346 @@
+// The page: what is shown (one state), and the buttons, keys and hands that change it.
+
+const NEAR_Z = 0.2; // mm
+const MOST_PIXELS_PER_PIXEL = 2; // drawn per recorded one; more shows nothing new
+const LONGEST_STEP = 0.25; // s that playing may jump when the browser was busy
+const BUDGET = 60; // ms for a picture in motion: fewer pixels where it takes longer, all of them once it rests
+const COARSEST = 0.25; // of the full width
+const REST = 250; // ms after the last change
+
+const byId = (id) => document.getElementById(id);
+const stage = byId("stage");
+const canvas = byId("picture");
+const about = JSON.parse(byId("about").textContent);
+const numFrames = about.seconds.length;
+const state = { frame: 0, clock: 0, playing: false, speed: 1, loop: true, free: false, depth: false, base: 0 };
+const hand = new FreeCamera(about.focus);
+let painter = null;
+let sorter = null;
+let stale = true;
+let changedAt = 0; // ms, by hand
+let quality = 1; // share of the full width that can be drawn within the budget
+let drawnQuality = 0;
+
+function changed() {
+  stale = true;
+  changedAt = performance.now();
+}
+
+function fail(text) {
+  byId("message").firstElementChild.textContent = text;
+  document.body.dataset.state = "failed";
+  stage.removeAttribute("aria-busy");
+}
+
+// ---- what is drawn
+
+// Places the canvas: the recorded frame as large as it fits, or for the free view the whole stage at the same scale.
+function layOut(share) {
+  const { clientWidth: width, clientHeight: height } = stage;
+  const { scale } = fit();
+  const [w, h] = state.free ? [width, height] : [Math.round(about.width * scale), Math.round(about.height * scale)];
+  Object.assign(canvas.style, {
+    width: `${w}px`,
+    height: `${h}px`,
+    left: `${Math.floor((width - w) / 2)}px`,
+    top: `${Math.floor((height - h) / 2)}px`,
+  });
+  const density = share * Math.min(window.devicePixelRatio || 1, MOST_PIXELS_PER_PIXEL / scale);
+  const buffer = [w, h].map((length) => Math.max(1, Math.round(length * density)));
+  if (canvas.width !== buffer[0]) canvas.width = buffer[0];
+  if (canvas.height !== buffer[1]) canvas.height = buffer[1];
+}
+
+// The stage's scale (CSS px per recorded one) and its size in recorded px.
+function fit() {
+  const { clientWidth: width, clientHeight: height } = stage;
+  const scale = Math.max(Math.min(width / about.width, height / about.height), 0.01);
+  return { scale, size: [width / scale, height / scale] };
+}
+
+function requestPicture(share) {
+  stale = false;
+  const { free, depth, frame } = state;
+  const view = free ? hand.view(recordedView(about, state.base), fit().size) : recordedView(about, frame);
+  sorter.ask({ frame, weights: depthWeights(about, view), nearZ: NEAR_Z, view, depth, share });
+}
+
+// Called by the sorter with what it was asked.
+function drawAnswer(order, { frame, view, depth, share }) {
+  layOut(share);
+  painter.draw(frame, order, view, depth);
+  drawnQuality = share;
+  canvas.dataset.frame = frame;
+  canvas.dataset.drawn = Number(canvas.dataset.drawn || 0) + 1;
+  if (document.body.dataset.state === "loading") document.body.dataset.state = "ready";
+}
+
+// ---- time
+
+const lastStep = numFrames > 1 ? (about.seconds[numFrames - 1] - about.seconds[0]) / (numFrames - 1) : 0;
+const ending = about.seconds[numFrames - 1] + lastStep;
+
+function frameAt(clock) {
+  let frame = 0;
+  while (frame + 1 < numFrames && about.seconds[frame + 1] <= clock + 1e-9) frame++;
+  return frame;
+}
+
+function showFrame(frame) {
+  state.frame = Math.max(0, Math.min(numFrames - 1, frame));
+  state.clock = about.seconds[state.frame];
+  changed();
+  tellWhere();
+}
+
+function setPlaying(playing) {
+  state.playing = playing && numFrames > 1;
+  if (state.playing && state.frame === numFrames - 1) showFrame(0);
+  document.body.classList.toggle("playing", state.playing);
+  byId("play").setAttribute("aria-label", state.playing ? "Pause" : "Play");
+}
+
+function advance(seconds) {
+  state.clock += Math.min(seconds, LONGEST_STEP) * state.speed;
+  if (state.clock >= ending) {
+    if (!state.loop) {
+      showFrame(numFrames - 1);
+      setPlaying(false);
+      return;
+    }
+    state.clock = about.seconds[0] + ((state.clock - about.seconds[0]) % (ending - about.seconds[0]));
+  }
+  const frame = frameAt(state.clock);
+  if (frame === state.frame) return;
+  state.frame = frame;
+  stale = true;
+  tellWhere();
+}
+
+function tellWhere() {
+  const counter = `Frame ${state.frame + 1} / ${numFrames}`;
+  const seconds = `${about.seconds[state.frame].toFixed(2)} s`;
+  byId("counter").textContent = counter;
+  byId("seconds").textContent = seconds;
+  byId("slider").value = state.frame;
+  byId("slider").setAttribute("aria-valuetext", `${counter}, ${seconds}`);
+}
+
+// ---- view
+
+function setFree(free) {
+  if (free && !state.free) state.base = state.frame;
+  state.free = free;
+  byId("endoscope").setAttribute("aria-pressed", !free);
+  byId("free").setAttribute("aria-pressed", free);
+  byId("reset").disabled = !free;
+  changed();
+}
+
+function setDepth(depth) {
+  state.depth = depth;
+  byId("depth").setAttribute("aria-pressed", depth);
+  byId("scale").hidden = !depth;
+  changed();
+}
+
+function resetView() {
+  hand.reset();
+  changed();
+}
+
+function setLoop(loop) {
+  state.loop = loop;
+  byId("loop").setAttribute("aria-pressed", loop);
+}
+
+// ---- hands: one finger or button turns, two fingers or another button move, wheel and pinch zoom
+
+const touching = new Map();
+
+function middleAndSpread() {
+  const points = [...touching.values()];
+  const middle = [0, 1].map((i) => points.reduce((sum, p) => sum + p[i], 0) / points.length);
+  const spread = points.length < 2 ? 0 : Math.hypot(points[0][0] - points[1][0], points[0][1] - points[1][1]);
+  return { middle, spread };
+}
+
+function onDown(event) {
+  canvas.setPointerCapture(event.pointerId);
+  touching.set(event.pointerId, [event.clientX, event.clientY]);
+  canvas.classList.add("turning");
+}
+
+function onMove(event) {
+  if (!touching.has(event.pointerId)) return;
+  const before = middleAndSpread();
+  touching.set(event.pointerId, [event.clientX, event.clientY]);
+  const after = middleAndSpread();
+  const { scale } = fit();
+  const [dx, dy] = [0, 1].map((i) => (after.middle[i] - before.middle[i]) / scale);
+  if (!dx && !dy && before.spread === after.spread) return;
+  if (!state.free) setFree(true);
+  if (touching.size > 1 || event.buttons & 6 || event.shiftKey) hand.move(dx, dy, recordedView(about, state.base));
+  else hand.turn(dx, dy);
+  if (before.spread > 0 && after.spread > 0) hand.approach(before.spread / after.spread);
+  changed();
+}
+
+function onUp(event) {
+  touching.delete(event.pointerId);
+  if (!touching.size) canvas.classList.remove("turning");
+}
+
+function onWheel(event) {
+  event.preventDefault();
+  if (!state.free) setFree(true);
+  const lines = event.deltaMode === 1 ? 30 : 1;
+  hand.approach(Math.exp(Math.max(-200, Math.min(200, event.deltaY * lines)) * 0.0015));
+  changed();
+}
+
+// ---- keys
+
+const KEYS = {
+  " ": () => setPlaying(!state.playing),
+  ArrowLeft: () => step(-1),
+  ArrowRight: () => step(1),
+  Home: () => showFrame(0),
+  End: () => showFrame(numFrames - 1),
+  e: () => setFree(false),
+  f: () => setFree(true),
+  d: () => setDepth(!state.depth),
+  l: () => setLoop(!state.loop),
+  r: resetView,
+  "+": () => zoom(0.9),
+  "=": () => zoom(0.9),
+  "-": () => zoom(1 / 0.9),
+};
+const TURNS = { ArrowLeft: [-20, 0], ArrowRight: [20, 0], ArrowUp: [0, -20], ArrowDown: [0, 20] };
+
+function step(by) {
+  setPlaying(false);
+  showFrame(state.frame + by);
+}
+
+function zoom(factor) {
+  if (!state.free) setFree(true);
+  hand.approach(factor);
+  changed();
+}
+
+function onKey(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select")) return;
+  if (event.key === " " && event.target.closest("button")) return; // presses that button
+  const turn = event.shiftKey && TURNS[event.key];
+  const act = turn ? () => hand.turn(...turn) : KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+  if (!act) return;
+  event.preventDefault();
+  if (turn && !state.free) setFree(true);
+  act();
+  changed();
+}
+
+// ---- start
+
+function connect() {
+  byId("controls").inert = false;
+  const slider = byId("slider");
+  slider.max = numFrames - 1;
+  slider.addEventListener("input", () => {
+    setPlaying(false);
+    showFrame(Number(slider.value));
+  });
+  const clicks = {
+    play: () => setPlaying(!state.playing),
+    previous: () => step(-1),
+    next: () => step(1),
+    loop: () => setLoop(!state.loop),
+    endoscope: () => setFree(false),
+    free: () => setFree(true),
+    depth: () => setDepth(!state.depth),
+    reset: resetView,
+  };
+  for (const [id, act] of Object.entries(clicks)) {
+    byId(id).addEventListener("click", (event) => {
+      act();
+      if (event.detail) event.currentTarget.blur(); // by mouse: leave the space bar to playing
+    });
+  }
+  byId("speed").addEventListener("change", (event) => {
+    state.speed = Number(event.target.value);
+    event.target.blur();
+  });
+  for (const id of ["slider", "play", "previous", "next", "loop", "speed"]) byId(id).disabled = numFrames < 2;
+  canvas.addEventListener("pointerdown", onDown);
+  canvas.addEventListener("pointermove", onMove);
+  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, onUp);
+  canvas.addEventListener("wheel", onWheel, { passive: false });
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+  canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+  canvas.addEventListener("webglcontextrestored", () => {
+    painter.start();
+    stale = true;
+  });
+  document.addEventListener("keydown", onKey);
+  new ResizeObserver(() => { stale = true; }).observe(stage);
+}
+
+function describe() {
+  const size = `${about.width} × ${about.height} px`;
+  const frames = numFrames === 1 ? "1 frame" : `${numFrames} frames`;
+  byId("facts").textContent = `${about.gaussians.toLocaleString("en")} Gaussians · ${size} · ${frames}`;
+  const [near, far] = about.depth_range;
+  byId("scale-near").textContent = near.toFixed(0);
+  byId("scale-far").textContent = far.toFixed(0);
+  document.querySelector(".ramp").style.background =
+    `linear-gradient(${DEPTH_COLORS.map((c) => `rgb(${c})`).join(",")})`;
+}
+
+// How fast pictures can be had decides how fine they are while things move.
+function learnFrom(took) {
+  const full = took / drawnQuality ** 2; // ms, were all pixels drawn
+  const wanted = Math.max(COARSEST, Math.min(1, Math.sqrt(BUDGET / full)));
+  quality = Math.abs(wanted - quality) < 0.1 ? quality : wanted;
+}
+
+function run() {
+  let before = performance.now();
+  const tick = (now) => {
+    if (state.playing) advance((now - before) / 1000);
+    before = now;
+    const took = painter.finished();
+    if (took > 0) learnFrom(took);
+    if (!painter.busy && !sorter.asked) {
+      const share = state.playing || touching.size || now - changedAt < REST ? quality : 1;
+      const fine = !stale && drawnQuality >= share;
+      canvas.dataset.settled = fine && share === 1;
+      if (!fine) requestPicture(share);
+    }
+    requestAnimationFrame(tick);
+  };
+  requestAnimationFrame(tick);
+}
+
+async function start() {
+  describe();
+  tellWhere();
+  setFree(false);
+  if (!("DecompressionStream" in window)) {
+    throw new Error("This browser cannot unpack the scene. Chrome or Edge 80, Firefox 113, Safari 16.4 or later can.");
+  }
+  const planes = await unpack(about, byId("data").textContent, (share) => {
+    byId("message").firstElementChild.textContent = `Unpacking… ${Math.round(100 * share)} %`;
+  });
+  byId("data").remove();
+  painter = new Painter(canvas, about, planes);
+  sorter = new Sorter(planes.slice(0, 3), about.gaussians, drawAnswer);
+  connect();
+  stage.removeAttribute("aria-busy");
+  run();
+}
+
+start().catch((error) => {
+  console.error(error);
+  fail(error.message);
+});

@@ -1,0 +1,36 @@
+"""The .splat format of antimatter15's viewer: 32 bytes per Gaussian, no header, no direction-dependent color.
+
+Source: https://github.com/antimatter15/splat.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..model.gaussians import SH_C0
+from ..model.scene import Scene
+from ..types import Splats
+from .moments import Moment
+from .options import ExportOptions
+
+RECORD = np.dtype([("center", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+"""Center (mm), standard deviations (mm), color and opacity (0..255), quaternion w, x, y, z (128 + 128 q)."""
+
+
+def files(scene: Scene, moment: Moment, options: ExportOptions) -> dict[str, bytes]:
+    """The .splat file of one moment."""
+    return {".splat": encode_splat(moment.splats(scene, options.frame))}
+
+
+def encode_splat(splats: Splats) -> bytes:
+    """Records sorted by opacity times volume, largest first, so that a viewer can show a file half read."""
+    scales, opacities = splats.scales.numpy(), splats.opacities.numpy()
+    order = np.argsort(-scales.prod(1) * opacities, kind="stable")
+    rgba = np.column_stack([splats.sh.numpy()[:, 0] * SH_C0 + 0.5, opacities])
+    quats = splats.quats.numpy()
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    records = np.empty(len(scales), RECORD)
+    records["center"], records["scale"] = splats.means.numpy(), scales
+    records["rgba"] = np.rint(rgba * 255).clip(0, 255)
+    records["rotation"] = np.rint(unit * 128 + 128).clip(0, 255)
+    return records[order].tobytes()

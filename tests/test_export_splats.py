@@ -1,0 +1,224 @@
+"""Splat containers, each read back by a reader that shares nothing with its writer."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import struct
+
+import numpy as np
+import pytest
+import torch
+from export_scenes import covariances, random_splats
+from plyfile import PlyData
+from pygltflib import GLTF2
+from scipy.spatial.transform import Rotation
+
+from endoprior.checks import InputError
+from endoprior.export.gltf import encode_glb
+from endoprior.export.ply import encode_ply
+from endoprior.export.splat import encode_splat
+from endoprior.export.spz import encode_spz
+from endoprior.types import Splats
+
+DC = 0.28209479177387814
+
+
+def one_splat(**changes) -> Splats:
+    """A Gaussian longest along its first axis, which a quarter turn about z brings to y."""
+    values = {
+        "means": [[1.0, 2.0, 3.0]],
+        "quats": [[2**0.5, 0.0, 0.0, 2**0.5]],
+        "scales": [[4.0, 2.0, 0.5]],
+        "opacities": [0.25],
+        "sh": [[[0.5, -0.5, 0.1]]],
+    }
+    return Splats(**{name: torch.tensor(value) for name, value in (values | changes).items()})
+
+
+def columns(vertex, *names: str) -> np.ndarray:
+    """(N, len(names)) of a PLY element."""
+    return np.column_stack([vertex[name] for name in names])
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_ply_has_the_layout_of_3dgs(degree):
+    splats = random_splats(degree=degree)
+    data = PlyData.read(io.BytesIO(encode_ply(splats, "lps")))
+    vertex = data["vertex"]
+    num_rest = 3 * ((degree + 1) ** 2 - 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(num_rest)] + ["opacity"]
+    names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    assert [p.name for p in vertex.properties] == names and {p.val_dtype for p in vertex.properties} == {"f4"}
+    assert "SPACE=LPS" in data.comments
+    assert np.array_equal(columns(vertex, "x", "y", "z"), splats.means.numpy())
+    assert not columns(vertex, "nx", "ny", "nz").any()
+    assert np.array_equal(columns(vertex, "f_dc_0", "f_dc_1", "f_dc_2"), splats.sh[:, 0].numpy())
+    for k in range(num_rest // 3):
+        for channel in range(3):  # all of red, then green, then blue
+            stored = vertex[f"f_rest_{channel * (num_rest // 3) + k}"]
+            assert np.array_equal(stored, splats.sh[:, k + 1, channel].numpy())
+    assert 1 / (1 + np.exp(-vertex["opacity"])) == pytest.approx(splats.opacities.numpy(), rel=1e-6)
+    assert np.exp(columns(vertex, "scale_0", "scale_1", "scale_2")) == pytest.approx(splats.scales.numpy(), rel=1e-6)
+    rotation = columns(vertex, "rot_0", "rot_1", "rot_2", "rot_3")
+    assert np.linalg.norm(rotation, axis=1) == pytest.approx(1, abs=1e-6)
+    assert rotation * np.linalg.norm(splats.quats, axis=1)[:, None] == pytest.approx(splats.quats.numpy(), abs=1e-6)
+
+
+def test_ply_of_opacities_at_the_end_is_finite():
+    splats = one_splat(opacities=[1.0])
+    assert 10 < PlyData.read(io.BytesIO(encode_ply(splats)))["vertex"]["opacity"][0] < 20
+
+
+def read_splat(data: bytes) -> dict[str, np.ndarray]:
+    """Decode .splat: 3 floats center, 3 floats scale, 4 bytes color, 4 bytes rotation."""
+    rows = [struct.unpack("<3f3f4B4B", data[i : i + 32]) for i in range(0, len(data), 32)]
+    table = np.array(rows)
+    return {"centers": table[:, :3], "scales": table[:, 3:6], "rgba": table[:, 6:10], "quats": table[:, 10:] / 128 - 1}
+
+
+def test_splat_records():
+    splats = random_splats()
+    data = encode_splat(splats)
+    assert len(data) == 32 * 50
+    found = read_splat(data)
+    order = np.argsort(-splats.scales.numpy().prod(1) * splats.opacities.numpy())
+    assert np.array_equal(found["centers"].astype(np.float32), splats.means.numpy()[order])
+    assert np.array_equal(found["scales"].astype(np.float32), splats.scales.numpy()[order])
+    color = (splats.sh[:, 0].numpy() * DC + 0.5)[order]
+    assert found["rgba"][:, :3] / 255 == pytest.approx(color, abs=0.5 / 255 + 1e-6)
+    assert found["rgba"][:, 3] / 255 == pytest.approx(splats.opacities.numpy()[order], abs=0.5 / 255 + 1e-6)
+    unit = (splats.quats / splats.quats.norm(dim=1, keepdim=True)).numpy()[order]
+    assert found["quats"] == pytest.approx(unit, abs=1 / 128)  # 255 stands for +1
+
+
+def read_spz(data: bytes) -> dict[str, np.ndarray]:
+    """Decode SPZ version 2 from its specification."""
+    plain = gzip.decompress(data)
+    magic, version, num, degree, fractional_bits, flags, reserved = struct.unpack_from("<IIIBBBB", plain)
+    assert (magic, version, flags, reserved) == (0x5053474E, 2, 0, 0)
+    num_rest = (degree + 1) ** 2 - 1
+    blocks, at = [], 16
+    for width in (9, 1, 3, 3, 3, 3 * num_rest):
+        blocks.append(np.frombuffer(plain, np.uint8, num * width, at).reshape(num, width).astype(np.int64))
+        at += num * width
+    assert at == len(plain)
+    positions, alphas, colors, scales, rotations, rest = blocks
+    positions = positions.reshape(num, 3, 3) @ [1, 1 << 8, 1 << 16]
+    positions = np.where(positions >= 1 << 23, positions - (1 << 24), positions)
+    xyz = rotations / 127.5 - 1
+    w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True)))
+    return {
+        "means": positions / 2.0**fractional_bits,
+        "opacities": alphas[:, 0] / 255,
+        "dc": (colors / 255 - 0.5) / 0.15,
+        "scales": np.exp(scales / 16 - 10),
+        "quats": np.concatenate([w, xyz], 1),
+        "rest": (rest.reshape(num, num_rest, 3) - 128) / 128,
+        "bits": fractional_bits,
+    }
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_spz_within_its_precision(degree):
+    splats = random_splats(degree=degree)
+    found = read_spz(encode_spz(splats))
+    assert found["means"] == pytest.approx(splats.means.numpy(), abs=0.5 / 4096 + 1e-9)
+    assert found["opacities"] == pytest.approx(splats.opacities.numpy(), abs=0.5 / 255 + 1e-6)
+    assert found["dc"] == pytest.approx(splats.sh[:, 0].numpy(), abs=0.5 / (255 * 0.15) + 1e-6)
+    assert np.log(found["scales"]) == pytest.approx(splats.scales.log().numpy(), abs=0.5 / 16 + 1e-6)
+    assert found["rest"] == pytest.approx(splats.sh[:, 1:].numpy(), abs=0.5 / 128 + 1e-6)
+    # x, y, z within 1/255 and w at least 1/2 turn by less than 2.5 degrees
+    turns = (
+        covariances(found["quats"], np.array([[4.0, 2.0, 1.0]])),
+        covariances(splats.quats.double().numpy(), np.array([[4.0, 2.0, 1.0]])),
+    )
+    assert turns[0] == pytest.approx(turns[1], abs=15 * np.deg2rad(2.5))
+    assert (found["quats"][:, 0] > 0.49).all()
+
+
+def test_spz_turns_are_exact_where_w_is_small():
+    """Half a turn about x has w = 0, the worst case of the format; the same ellipsoid has a quaternion with w = 1."""
+    splats = one_splat(quats=[[0.02, 1.0, 0.03, -0.01]])
+    found = read_spz(encode_spz(splats))
+    got = covariances(found["quats"], splats.scales.numpy())
+    assert got == pytest.approx(
+        covariances(splats.quats.numpy(), splats.scales.numpy()), abs=0.15
+    )  # 1/255 of 16 - 0.25
+
+
+def test_spz_of_a_large_scene_keeps_its_positions():
+    found = read_spz(encode_spz(one_splat(means=[[9000.0, -8000.0, 5.0]])))
+    assert found["bits"] == 9 and found["means"][0] == pytest.approx([9000, -8000, 5], abs=1 / 1024)
+    with pytest.raises(InputError, match="finite"):
+        encode_spz(one_splat(means=[[np.inf, 0.0, 0.0]]))
+
+
+def read_glb(data: bytes, tmp_path) -> tuple[GLTF2, dict[str, np.ndarray]]:
+    """The document and the arrays of its only primitive."""
+    file = tmp_path / "a.glb"
+    file.write_bytes(data)
+    gltf = GLTF2().load(str(file))
+    blob = gltf.binary_blob()
+    (primitive,) = gltf.meshes[0].primitives
+    arrays = {}
+    for name, index in vars(primitive.attributes).items():
+        if index is None:
+            continue
+        accessor = gltf.accessors[index]
+        view = gltf.bufferViews[accessor.bufferView]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type]
+        assert accessor.componentType == 5126 and view.byteOffset % 4 == 0
+        arrays[name] = np.frombuffer(blob, "<f4", accessor.count * width, view.byteOffset).reshape(-1, width)
+    return gltf, arrays
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_glb_follows_the_ratified_extension(degree, tmp_path):
+    splats = random_splats(degree=degree)
+    gltf, arrays = read_glb(encode_glb(splats, {"time": 0.5}), tmp_path)
+    (primitive,) = gltf.meshes[0].primitives
+    assert gltf.extensionsUsed == ["KHR_gaussian_splatting"] and primitive.mode == 0
+    assert primitive.extensions["KHR_gaussian_splatting"] == {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+    }
+    assert gltf.nodes[gltf.scenes[gltf.scene].nodes[0]].scale == [0.001] * 3 and gltf.asset.extras == {"time": 0.5}
+    position = gltf.accessors[primitive.attributes.POSITION]
+    assert position.min == splats.means.amin(0).tolist() and position.max == splats.means.amax(0).tolist()
+    assert np.array_equal(arrays["POSITION"], splats.means.numpy())
+    prefix = "KHR_gaussian_splatting:"
+    assert np.array_equal(arrays[prefix + "SCALE"], splats.scales.numpy())
+    assert np.array_equal(arrays[prefix + "OPACITY"][:, 0], splats.opacities.numpy())
+    stored = Rotation.from_quat(arrays[prefix + "ROTATION"])  # x, y, z, w
+    assert np.linalg.norm(arrays[prefix + "ROTATION"], axis=1) == pytest.approx(1, abs=1e-6)
+    matrix = stored.as_matrix() * splats.scales.numpy()[:, None]
+    want = covariances(splats.quats.double().numpy(), splats.scales.double().numpy())
+    assert matrix @ matrix.transpose(0, 2, 1) == pytest.approx(want, rel=1e-4, abs=1e-4)
+    for band in range(degree + 1):
+        for m in range(2 * band + 1):
+            name = f"{prefix}SH_DEGREE_{band}_COEF_{m}"
+            assert np.array_equal(arrays[name], splats.sh[:, band * band + m].numpy())
+    assert f"{prefix}SH_DEGREE_{degree + 1}_COEF_0" not in arrays
+    encoded = np.clip(splats.sh[:, 0].numpy() * DC + 0.5, 0, 1)
+    back = arrays["COLOR_0"][:, :3].astype(np.float64)
+    back = np.where(back <= 0.0031308, 12.92 * back, 1.055 * back ** (1 / 2.4) - 0.055)
+    assert back == pytest.approx(encoded, abs=1e-5)
+    assert np.array_equal(arrays["COLOR_0"][:, 3], splats.opacities.numpy())
+
+
+def test_quaternion_order_of_every_format(tmp_path):
+    """Its longest axis lies along y in each of them."""
+    splats = one_splat()
+    vertex = PlyData.read(io.BytesIO(encode_ply(splats)))["vertex"]
+    _, arrays = read_glb(encode_glb(splats), tmp_path)
+    found = {
+        "ply": columns(vertex, "rot_0", "rot_1", "rot_2", "rot_3"),
+        "splat": read_splat(encode_splat(splats))["quats"],
+        "spz": read_spz(encode_spz(splats))["quats"],
+        "gltf": arrays["KHR_gaussian_splatting:ROTATION"][:, [3, 0, 1, 2]],
+    }
+    for name, quats in found.items():
+        covariance = covariances(quats.astype(np.float64), np.array([[4.0, 2.0, 0.5]]))[0]
+        assert np.diag(covariance) == pytest.approx([4, 16, 0.25], abs=0.05), name
