@@ -28,6 +28,7 @@ import projection
 import rendering
 import stereo
 import temporal
+import viewer
 from common import Row
 
 STAGES: dict[str, common.Measure] = {
@@ -42,6 +43,7 @@ STAGES: dict[str, common.Measure] = {
     "optimizer": optimizer.measure,
     "rendering": rendering.measure,
     "stereo": stereo.measure,
+    "viewer": viewer.measure,
     "iteration": iteration.measure,
 }
 Ratios = dict[tuple[Any, ...], float]

@@ -23,7 +23,7 @@ LAYERS = [
     {"checkpoint"},
     {"run_folder"},
     {"train"},
-    {"benchmark", "check", "prepare"},
+    {"benchmark", "check", "prepare", "view"},
     {"cli"},
     {"__init__", "__main__"},
 ]

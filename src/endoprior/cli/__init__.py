@@ -21,6 +21,7 @@ COMMANDS = {
     "eval": "score a trained scene on a split",
     "render": "draw a trained scene: color, depth, side-by-side, video",
     "export": "write open formats: PLY, splat, SPZ, glTF, mesh, points, tracks, depth, video",
+    "view": "look at a trained scene, or a sequence before training, in a web browser",
     "bench": "compare methods on sequences over seeds, under one protocol",
 }
 """Name and one-line description; each lives in the module of this package named like it (`eval` in `evaluate`)."""

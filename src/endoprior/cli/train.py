@@ -7,7 +7,7 @@ import json
 import time as clock
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
@@ -16,11 +16,16 @@ from ..config import Config
 from ..presets import PresetName, preset
 from .parsing import parse
 from .progress import say, training_progress
+from .view import live_view
+
+if TYPE_CHECKING:
+    from ..train_state import StepReport
+    from ..trainer import Trainer
 
 
 @dataclass
 class Train:
-    """Train one scene and score it. Every option below --resume is a field of the config; the preset sets it."""
+    """Train one scene and score it. Every option below --view-port is a field of the config; the preset sets it."""
 
     data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
     """Sequence folder: images/, masks/, depth/, poses_bounds.npy."""
@@ -38,6 +43,10 @@ class Train:
     """Also score with RAFT and LPIPS where their weights can be had."""
     resume: bool = False
     """Continue the run in OUT from its checkpoint."""
+    view: bool = False
+    """Show the scene in a web browser while it trains, at 127.0.0.1 and --view-port. Takes time from the training."""
+    view_port: int = 8080
+    """Port of --view; 0 takes any free one."""
     config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
 
 
@@ -51,13 +60,24 @@ def run(argv: list[str]) -> None:
         raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
     if args.init_budget is not None:
         cfg = dataclasses.replace(cfg, init=dataclasses.replace(cfg.init, budget=args.init_budget))
-    train_and_evaluate(args.data, cfg, args.out, args.resume, args.networks, args.weights_dir)
+    port = args.view_port if args.view else None
+    train_and_evaluate(args.data, cfg, args.out, args.resume, args.networks, args.weights_dir, port)
 
 
 def train_and_evaluate(
-    data: Path, cfg: Config, out: Path, resume: bool, networks: bool, weights_dir: Path | None
+    data: Path,
+    cfg: Config,
+    out: Path,
+    resume: bool,
+    networks: bool,
+    weights_dir: Path | None,
+    view_port: int | None = None,
 ) -> None:
-    """Train on the folder `data` into the run folder `out`, score the test split there, print the scores."""
+    """Train on the folder `data` into the run folder `out`, score the test split there, print the scores.
+
+    Args:
+        view_port: serve a live view of the training there; None does not.
+    """
     from ..data import load_sequence
     from ..run_folder import prepare_run_folder
     from ..train import train
@@ -70,7 +90,12 @@ def train_and_evaluate(
         say(f"note: {remark}")
     began = clock.perf_counter()
     try:
-        with training_progress() as on_step:
+        with training_progress() as show_progress, live_view(view_port) as show_scene:
+
+            def on_step(report: StepReport, trainer: Trainer) -> None:
+                show_progress(report, trainer)
+                show_scene(report, trainer)
+
             scene = train(sequence, cfg, out, resume=resume, on_step=on_step)
     except KeyboardInterrupt:
         say(f"Stopped; the state is saved. Go on with the same command and --resume ({out}).")

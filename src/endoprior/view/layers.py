@@ -1,0 +1,63 @@
+"""What each layer looks like, as an (H, W, 3) 8-bit picture."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..show.pictures import colorize, to_u8
+from ..types import Camera
+
+LARGEST_DIFFERENCE = 0.25
+"""Mean absolute difference of the three colors that is drawn red."""
+SOLID_ALPHA = 0.5
+"""Where the Gaussians cover less than this there is no surface."""
+OUTLINE = (0, 255, 255)
+
+
+def fitted(image: NDArray, camera: Camera) -> NDArray:
+    """An image of a frame, resized to the picture of `camera`, which sees the same; masks stay masks."""
+    if image.shape[:2] == (camera.height, camera.width):
+        return image
+    if image.dtype == np.bool_:
+        return cv2.resize(image.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0
+    nearest = image.dtype.kind == "f"  # between a depth and a missing one there is nothing
+    how = cv2.INTER_NEAREST if nearest else cv2.INTER_AREA
+    return cv2.resize(image, (camera.width, camera.height), interpolation=how)
+
+
+def surface_depth(depth: NDArray, alpha: NDArray) -> NDArray[np.float32]:
+    """(H, W) expected z of what is drawn, mm: rendered depth over alpha; 0 where there is no surface."""
+    return np.where(alpha > SOLID_ALPHA, depth / np.maximum(alpha, 1e-6), 0).astype(np.float32)
+
+
+def depth_picture(depth: NDArray, span: tuple[float, float]) -> NDArray[np.uint8]:
+    """Turbo colors from the nearest to the farthest depth of `span`, mm; black where there is none."""
+    return colorize(depth, *span, depth > 0)
+
+
+def value_picture(value: NDArray, alpha: NDArray) -> NDArray[np.uint8]:
+    """Turbo colors of composited values in [0, 1]; black where there is no surface."""
+    return colorize(value / np.maximum(alpha, 1e-6), 0, 1, alpha > SOLID_ALPHA)
+
+
+def gray_picture(value: NDArray) -> NDArray[np.uint8]:
+    """Values in [0, 1] as gray."""
+    return np.repeat(to_u8(value)[..., None], 3, -1)
+
+
+def difference_picture(drawn: NDArray[np.uint8], original: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Turbo colors of the mean absolute difference of two (H, W, 3) pictures."""
+    difference = cv2.absdiff(drawn, original).mean(-1) / 255
+    return colorize(difference, 0, LARGEST_DIFFERENCE)
+
+
+def with_tool(
+    picture: NDArray[np.uint8], original: NDArray[np.uint8], tissue_mask: NDArray[np.bool_]
+) -> NDArray[np.uint8]:
+    """A copy with the tool of the original laid over it, outlined."""
+    picture = np.where(tissue_mask[..., None], picture, original)
+    outlines, _ = cv2.findContours((~tissue_mask).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, outlines, -1, OUTLINE, 1)
+    return picture

@@ -1,0 +1,50 @@
+"""Screenshots and films as bytes, and keeping them in a folder."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import whole_file
+from ..show.video import write_video
+
+
+def png_bytes(rgb_u8: NDArray[np.uint8]) -> bytes:
+    """An (H, W, 3) picture as a PNG file."""
+    done, encoded = cv2.imencode(".png", np.ascontiguousarray(rgb_u8[..., ::-1]))
+    if not done:
+        raise OSError("could not encode the picture")
+    return encoded.tobytes()
+
+
+def mp4_bytes(pictures: list[NDArray[np.uint8]], frames_per_second: float) -> bytes:
+    """Pictures (H, W, 3) of one size as an H.264 film."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "film.mp4"
+        write_video(file, pictures, frames_per_second)
+        return file.read_bytes()
+
+
+def keep(folder: Path, name: str, content: bytes) -> Path:
+    """Write a file under the first free name `stem_N.suffix` in `folder`; never over another file.
+
+    Args:
+        name: a plain file name.
+    Returns:
+        Where it is.
+    Raises:
+        ValueError: `name` has a folder in it, or no ending.
+    """
+    if Path(name).name != name or not Path(name).suffix:
+        raise ValueError(f"name must be a plain file name with an ending; got {name!r}.")
+    stem, suffix = Path(name).stem, Path(name).suffix
+    number = 1
+    while (file := folder / f"{stem}_{number}{suffix}").exists():
+        number += 1
+    with whole_file(file) as temporary:
+        temporary.write_bytes(content)
+    return file

@@ -1,0 +1,200 @@
+"""A trained scene as the viewer sees it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .. import render
+from ..data import Sequence
+from ..geometry import back_project, quaternion_to_matrix
+from ..model.carry import carry_points
+from ..model.gaussians import SH_C0
+from ..model.playback import Playback
+from ..model.scene import Scene
+from ..show.frames import depth_span
+from ..show.pictures import to_u8
+from ..types import Camera, RenderOutput, Splats
+from . import layers
+from .session import Layer, Look
+from .subject import Cloud
+
+BROWSER_LAYERS = ("color", "motion", "prior")
+"""Layers that are a color of each Gaussian."""
+DOT_PX = 0.6
+"""Standard deviation of a dot in the endoscope's picture."""
+DOT_OPACITY = 0.98
+TRACK_COLUMNS = 16
+"""Material points across the picture."""
+MOTION_SAMPLES = 8
+"""Moments from which the scale of the motion's colors is taken."""
+
+
+class SceneSubject:
+    """A scene and, if it is there, the sequence it was trained on."""
+
+    def __init__(self, scene: Scene, title: str, sequence: Sequence | None = None) -> None:
+        """Draw nothing yet.
+
+        Args:
+            sequence: of as many frames as the scene has cameras; None leaves out original, difference and tool.
+        """
+        self.scene, self.title, self.sequence = scene, title, sequence
+        self.layers: tuple[Layer, ...] = ("color", "depth", "alpha", "motion", "prior")
+        if sequence is not None:
+            self.layers += ("frame", "difference")
+        self.cameras = scene.cameras
+        self.frames_per_second = scene.frames_per_second
+        self.relative = sequence is not None and sequence.depth_is_relative
+        self.has_tool = sequence is not None
+        self._playback = Playback(scene)
+        self._rasterize = render.load(scene.config.render.backend)
+
+    @cached_property
+    def span(self) -> tuple[float, float]:
+        """Depths, mm, between which nearly all of the first frame lies."""
+        return depth_span(self.scene)
+
+    def picture(self, look: Look, camera: Camera) -> NDArray[np.uint8]:
+        """See `Subject.picture`. Without the endoscope's view, originals do not fit, and rendered color is shown."""
+        kind = look.layer if look.endoscope or look.layer not in ("frame", "difference") else "color"
+        picture = self._layer(kind, look, camera)
+        if look.tool and look.endoscope and self.sequence is not None:
+            frame = self.sequence.frame(look.frame)
+            original, mask = layers.fitted(frame.rgb_u8, camera), layers.fitted(frame.tissue_mask, camera)
+            picture = layers.with_tool(picture, original, mask)
+        return picture
+
+    def _layer(self, kind: Layer, look: Look, camera: Camera) -> NDArray[np.uint8]:
+        if kind == "frame":
+            return layers.fitted(self.sequence.frame(look.frame).rgb_u8, camera)
+        out = self._draw(look, camera, None if kind not in ("motion", "prior") else self._values(look))
+        alpha = out.alpha.numpy()
+        if kind == "depth":
+            return layers.depth_picture(layers.surface_depth(out.depth.numpy(), alpha), self.span)
+        if kind == "alpha":
+            return layers.gray_picture(alpha)
+        if kind in ("motion", "prior"):
+            return layers.value_picture(out.color[..., 0].numpy(), alpha)
+        color = to_u8(out.color.numpy())
+        if kind == "difference":
+            return layers.difference_picture(color, layers.fitted(self.sequence.frame(look.frame).rgb_u8, camera))
+        return color
+
+    def surface(self, look: Look, camera: Camera) -> NDArray[np.float32]:
+        """See `Subject.surface`."""
+        out = self._draw(look, camera)
+        return layers.surface_depth(out.depth.numpy(), out.alpha.numpy())
+
+    @torch.no_grad()
+    def _draw(self, look: Look, camera: Camera, values: Tensor | None = None) -> RenderOutput:
+        """Composite the chosen Gaussians; `values` (N,) in [0, 1] in place of their colors."""
+        splats = self._splats(look)
+        if values is not None:
+            splats = replace(splats, sh=_gray_sh(values))
+        return self._rasterize(_clipped(splats, camera, look.near, look.far), camera, background=torch.zeros(3))
+
+    def _splats(self, look: Look) -> Splats:
+        splats = self._playback.splats(look.frame)
+        if not look.points:
+            return splats
+        scales = torch.full_like(splats.scales, self._dot_mm)
+        return replace(splats, scales=scales, opacities=torch.full_like(splats.opacities, DOT_OPACITY))
+
+    @property
+    def _dot_mm(self) -> float:
+        return DOT_PX * sum(self.span) / 2 / self.cameras[0].fy
+
+    def _values(self, look: Look) -> Tensor:
+        """(N,) in [0, 1] what the layer shows of each Gaussian."""
+        if look.layer == "prior":
+            return self.scene.prior_score.clamp(0, 1)
+        return (self._moved(look.frame) / self.largest_motion).clamp(max=1)
+
+    def _moved(self, frame: int) -> Tensor:
+        """(N,) distance of each center from where it is in the first frame, mm."""
+        return (self._playback.splats(frame).means - self._playback.splats(0).means).norm(dim=-1)
+
+    @cached_property
+    def largest_motion(self) -> float:
+        """Nearly the largest motion since the first frame, mm: the red end of the motion's colors."""
+        frames = np.linspace(0, len(self.cameras) - 1, min(MOTION_SAMPLES, len(self.cameras))).astype(int)
+        return max(*(float(np.percentile(self._moved(int(i)).numpy(), 98)) for i in frames), 1e-3)
+
+    def sent(self, look: Look) -> bool:
+        """See `Subject.sent`: layers that are no color of the Gaussians stay with our renderer."""
+        return look.in_browser and look.layer in BROWSER_LAYERS
+
+    @torch.no_grad()
+    def cloud(self, look: Look) -> Cloud:
+        """See `Subject.cloud`: view-dependent color is left out."""
+        splats = _clipped(self._splats(look), self.cameras[look.frame], look.near, look.far)
+        if look.layer == "color":
+            colors = to_u8((splats.sh[:, 0] * SH_C0 + 0.5).numpy())
+        else:
+            values = _rows(self._values(look), self._splats(look), self.cameras[look.frame], look.near, look.far)
+            colors = layers.colorize(values.numpy()[None], 0, 1)[0]
+        points = splats.means.numpy()
+        if look.points:
+            return Cloud(points, colors, None, None, 3 * self._dot_mm)
+        return Cloud(points, colors, _covariances(splats), splats.opacities.numpy(), 0.0)
+
+    def carry(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
+        """See `Subject.carry`: the Gaussians around a point take it along."""
+        times = [i / len(self.cameras) for i in range(len(self.cameras))]
+        return carry_points(self.scene, np.asarray(points), np.array(frames), times).astype(np.float64)
+
+    def tracks(self) -> NDArray[np.float64]:
+        """See `Subject.tracks`: a grid on the surface of the first frame, off the tool."""
+        camera, look = self.cameras[0], Look()
+        depth = self.surface(look, camera)
+        if self.sequence is not None:
+            depth = depth * self.sequence.frame(0).tissue_mask
+        step = max(camera.width // TRACK_COLUMNS, 1)
+        y, x = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
+        y, x = (values[depth[y, x] > 0] for values in (y, x))
+        points = back_project(np.stack([x, y], -1) + 0.5, depth[y, x].astype(np.float64), camera)
+        if not len(points):
+            return np.zeros((len(self.cameras), 0, 3))
+        return self.carry(points, [0] * len(points))
+
+    def legend(self, look: Look) -> str:
+        """See `Subject.legend`."""
+        unit = "(relative)" if self.relative else "mm"
+        return {
+            "depth": f"blue {self.span[0]:.1f} to red {self.span[1]:.1f} {unit}",
+            "alpha": "black 0 to white 1: how much the Gaussians cover",
+            "motion": f"moved since frame 0: blue 0 to red {self.largest_motion:.1f} {unit}",
+            "prior": "texture-prior score of the Gaussians: blue 0 to red 1",
+            "difference": f"rendered minus original: blue 0 to red {layers.LARGEST_DIFFERENCE:.0%}",
+        }.get(look.layer, "")
+
+
+def _gray_sh(values: Tensor) -> Tensor:
+    """(N, 1, 3) coefficients that draw (N,) `values` as gray."""
+    return ((values - 0.5) / SH_C0)[:, None, None].expand(-1, 1, 3).contiguous()
+
+
+def _clipped(splats: Splats, camera: Camera, near: float, far: float) -> Splats:
+    """The Gaussians whose centers lie between two depths of `camera`, mm."""
+    if near <= 0 and far == float("inf"):
+        return splats
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return Splats(*(_rows(getattr(splats, name), splats, camera, near, far) for name in names))
+
+
+def _rows(values: Tensor, splats: Splats, camera: Camera, near: float, far: float) -> Tensor:
+    pose = torch.from_numpy(camera.world_to_camera[2]).to(splats.means)
+    z = splats.means @ pose[:3] + pose[3]
+    return values[(z >= near) & (z <= far)]
+
+
+def _covariances(splats: Splats) -> NDArray[np.float32]:
+    """(N, 3, 3) second moments, mm^2."""
+    axes = quaternion_to_matrix(splats.quats.numpy()) * splats.scales.numpy()[:, None, :]
+    return (axes @ np.swapaxes(axes, 1, 2)).astype(np.float32)

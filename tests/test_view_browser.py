@@ -1,0 +1,209 @@
+"""The viewer in headless Chromium on a trained phantom: what a person would do, and what the page shows then.
+
+The pictures are kept in `build/view/` (or in the folder ENDOPRIOR_TEST_PICTURES) to be looked at.
+"""
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import open_page, require_chromium
+from view_client import at_work
+
+from endoprior.cli.view import open_subject
+from endoprior.data import load_sequence
+from endoprior.geometry import back_project
+from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.presets import preset
+from endoprior.train import train
+from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT
+from endoprior.view.scene_subject import SceneSubject
+from endoprior.view.server import Viewer
+from endoprior.view.viewport import bounded_aspect, endoscope_viewport
+
+PICTURES = Path(os.environ.get("ENDOPRIOR_TEST_PICTURES", Path(__file__).parents[1] / "build" / "view"))
+WIDTH, HEIGHT = 1100, 760
+FRAME = 3
+KNOWN = ("THREE.Clock", "GPU stall due to ReadPixels", "GL Driver Message", "Automatic fallback to software WebGL")
+"""What viser's own page says in any software-drawn browser: notes on speed and on an old name."""
+SPLAT_NOTE = "computeBoundingSphere"
+"""viser 1.1.1 gives its splats corners of two coordinates; three.js complains when it is asked for their extent."""
+
+
+@pytest.fixture(scope="module")
+def phantom(tmp_path_factory):
+    """A small phantom."""
+    require_chromium()
+    out = tmp_path_factory.mktemp("view") / "phantom"
+    write_phantom(out, PhantomConfig(frames=10, width=192, height=160))
+    return load_sequence(out)
+
+
+@pytest.fixture(scope="module")
+def scene(phantom):
+    """That phantom, trained for a few seconds."""
+    cfg = preset("default")
+    schedule = replace(cfg.schedule, coarse_iterations=0, fine_iterations=250, half_resolution_iterations=0)
+    return train(phantom, replace(cfg, init=replace(cfg.init, budget=6000), schedule=schedule))
+
+
+@pytest.fixture
+def viewer(scene, phantom, tmp_path):
+    """A viewer of the trained phantom, at work."""
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    with at_work(Viewer(SceneSubject(scene, "phantom", phantom), out=tmp_path / "view")) as viewer:
+        yield viewer
+
+
+@pytest.fixture
+def page(viewer):
+    """The page, once it shows a picture. Afterwards its console must hold no complaint."""
+    with open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
+        page.wait_for("document.querySelector('[role=slider]') !== null")
+        end = time.monotonic() + 30
+        while canvas(page).std() < 20 and time.monotonic() < end:
+            time.sleep(0.2)
+        yield page
+    assert not unexpected(page.problems)
+
+
+def unexpected(problems: list[str], *more: str) -> list[str]:
+    """What is not known to be viser's own."""
+    return [problem for problem in problems if not any(known in problem for known in (*KNOWN, *more))]
+
+
+def canvas(page, name: str = "") -> np.ndarray:
+    """(H, W, 3) the 3D canvas as it is shown, without the note about software WebGL; kept under `name`."""
+    left, top, width, height = (round(v) for v in page.box("canvas"))
+    shown = page.screenshot(PICTURES / f"{name}.png" if name else None)
+    return shown[top : top + height, left : left + width].astype(float)[height // 3 :]
+
+
+def settled(page, name: str = "") -> np.ndarray:
+    """The canvas, once it has stopped to change."""
+    before, end = canvas(page), time.monotonic() + 15
+    while time.monotonic() < end:
+        time.sleep(0.5)
+        now = canvas(page)
+        if np.abs(now - before).mean() < 0.05:
+            break
+        before = now
+    return canvas(page, name)
+
+
+def press_button(page, text: str) -> None:
+    """Press the button that says so."""
+    found = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {text!r})"
+    page.wait_for(f"{found} !== undefined")
+    page.evaluate(f"{found}.click()")
+
+
+def wait_until(condition, seconds: float = 15) -> None:
+    """Until it is true."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
+
+
+def choose(viewer, handle, value) -> None:
+    """Set a control as a browser would; the page's own drop-downs are viser's matter."""
+    client = next(iter(viewer._server.get_clients().values()))
+    handle.value = value
+    viewer._jobs.put(viewer._read_panel if handle is not viewer.panel.measure else viewer._read_measuring)
+    client.flush()
+
+
+def test_the_slider_changes_the_picture_and_play_advances(viewer, page, scene):
+    first = settled(page, "first_frame")
+    page.evaluate("document.querySelector('[role=slider]').focus()")
+    for _ in range(FRAME):
+        page.press("ArrowRight")
+    wait_until(lambda: viewer.look.frame == FRAME)
+    assert np.abs(settled(page, "slider_moved") - first).mean() > 2
+    press_button(page, "Play")
+    seen = set()
+    wait_until(lambda: seen.add(viewer.look.frame) or len(seen) > 5)
+    press_button(page, "Pause")
+    wait_until(lambda: viewer._playing is None)
+    settled(page, "played")
+
+
+def test_two_clicks_measure_the_true_distance(viewer, page, phantom):
+    page.evaluate("document.querySelector('[role=slider]').focus()")
+    for _ in range(FRAME):
+        page.press("ArrowRight")
+    wait_until(lambda: viewer.look.frame == FRAME)
+    choose(viewer, viewer.panel.measure, True)
+    settled(page)
+    left, top, width, height = page.box("canvas")
+    frame, truth = phantom.frame(FRAME), phantom.truth.depth(FRAME)
+    viewport = endoscope_viewport(frame.camera, bounded_aspect(width, height))
+    for pair in (((60, 80), (120, 130)), ((40, 110), (150, 120)), ((96, 60), (96, 140))):
+        points = []
+        for column, row in pair:
+            assert truth[row, column] > 0
+            points.append(back_project(np.array([column + 0.5, row + 0.5]), truth[row, column], frame.camera))
+            before = viewer.measured
+            x, y = viewport.screen((column + 0.5, row + 0.5))
+            page.click_at(left + x * width, top + y * height)
+            wait_until(lambda before=before: viewer.measured is not before)
+        true = float(np.linalg.norm(points[1] - points[0]))
+        assert viewer.measured.distances[FRAME] == pytest.approx(true, abs=1.0)
+        page.wait_for(f"document.body.innerText.includes('{viewer.measured.distances[FRAME]:.2f} mm')")
+    settled(page, "measured")
+
+
+def test_layers_tracks_tool_and_orbit(viewer, page):
+    page.evaluate("document.querySelector('[role=slider]').focus()")
+    for _ in range(FRAME):
+        page.press("ArrowRight")
+    wait_until(lambda: viewer.look.frame == FRAME)
+    pictures = {}
+    for layer, name in LAYER_NAMES.items():
+        choose(viewer, viewer.panel.layer, name)
+        wait_until(lambda layer=layer: viewer.look.layer == layer)
+        pictures[layer] = settled(page, f"layer_{layer}")
+    for a in pictures:
+        assert all(a == b or np.abs(pictures[a] - pictures[b]).mean() > 1 for b in pictures), a
+    choose(viewer, viewer.panel.layer, LAYER_NAMES["color"])
+    choose(viewer, viewer.panel.tool, True)
+    choose(viewer, viewer.panel.tracks, True)
+    marked = settled(page, "tool_and_tracks")
+    assert np.abs(marked - pictures["color"]).mean() > 1
+    choose(viewer, viewer.panel.camera, ORBIT)
+    before = settled(page)
+    left, top, width, height = page.box("canvas")
+    middle = left + width / 2, top + height / 2
+    page.drag([middle] + [(middle[0] + 10 * k, middle[1] + 4 * k) for k in range(12)])
+    assert np.abs(settled(page, "orbit") - before).mean() > 2
+
+
+def test_the_browser_draws_what_the_server_draws(viewer):
+    with open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
+        page.wait_for("document.querySelector('[role=slider]') !== null")
+        wait_until(lambda: canvas(page).std() > 20, 30)
+        ours = settled(page)
+        choose(viewer, viewer.panel.drawn_by, BROWSER)
+        wait_until(lambda: viewer.look.in_browser)
+        time.sleep(2)
+        theirs = settled(page, "browser_splats")
+    margin = round(0.2 * ours.shape[1])  # the server's picture ends where the endoscope's does
+    assert np.abs(ours - theirs)[:, margin:-margin].mean() < 12
+    assert not unexpected(page.problems, SPLAT_NOTE)
+
+
+def test_a_raw_sequence(phantom):
+    subject, _ = open_subject(phantom.path, None)
+    with at_work(Viewer(subject)) as viewer, open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
+        page.wait_for("document.querySelector('[role=slider]') !== null")
+        wait_until(lambda: canvas(page).std() > 20, 30)
+        seen = settled(page, "sequence_frame")
+        choose(viewer, viewer.panel.camera, ORBIT)
+        time.sleep(2)
+        points = settled(page, "sequence_points")
+        assert np.abs(points - seen).mean() > 1 and points.std() > 20
+        assert not unexpected(page.problems)

@@ -1,0 +1,186 @@
+"""The viewer's pure parts: clock, canvas, marks, measuring, paths, dots, who may connect, files."""
+
+import socket
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from endoprior.checks import InputError
+from endoprior.geometry import project
+from endoprior.types import Camera
+from endoprior.view.dots import draw_dots
+from endoprior.view.guard import check_address, trusted
+from endoprior.view.marks import draw_marks, joined, no_marks, ruler, trails
+from endoprior.view.measure import Measurement, pick, sentence
+from endoprior.view.path import Place, sweep, through
+from endoprior.view.saving import keep, mp4_bytes, png_bytes
+from endoprior.view.session import frame_due, shrink_factor
+from endoprior.view.viewport import bounded_aspect, endoscope_viewport, free_viewport
+
+CAMERA = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
+OFF_CENTER = Camera(64, 48, 80.0, 80.0, 30.0, 27.0, np.eye(4))
+
+
+def test_the_film_repeats_at_its_rate():
+    assert [frame_due(8, seconds, 10.0, 12) for seconds in (0, 0.09, 0.1, 0.35, 0.4, 1.25)] == [8, 8, 9, 11, 0, 8]
+
+
+def test_only_a_slow_picture_that_moves_is_halved():
+    assert [shrink_factor(0.0, 30.0), shrink_factor(0.0, 90.0), shrink_factor(1.0, 90.0)] == [1, 2, 1]
+
+
+@pytest.mark.parametrize("camera", (CAMERA, OFF_CENTER))
+@pytest.mark.parametrize("aspect", (0.5, 4 / 3, 2.5))
+@pytest.mark.parametrize("shrink", (1, 2))
+def test_the_canvas_holds_the_picture_and_has_its_principal_point_in_the_middle(camera, aspect, shrink):
+    viewport = endoscope_viewport(camera, aspect, shrink)
+    assert viewport.pixel((0.5, 0.5)) == pytest.approx((viewport.camera.cx, viewport.camera.cy), abs=0.51)
+    assert viewport.width / viewport.height == pytest.approx(aspect, rel=0.06)  # sizes are whole even numbers
+    assert viewport.camera.width == 64 // shrink and viewport.fov == pytest.approx(
+        2 * np.arctan(viewport.height / 2 / (80 / shrink))
+    )
+    picture = np.full((48 // shrink, 64 // shrink, 3), 200, np.uint8)
+    canvas = viewport.paste(picture)
+    assert canvas.shape == (viewport.height, viewport.width, 3)
+    assert (canvas == 200).sum() == picture.size
+    screen = viewport.screen((3.5, 5.5))
+    x, y = (int(share * size) for share, size in zip(screen, (viewport.width, viewport.height), strict=True))
+    assert canvas[y, x].tolist() == [200] * 3 and viewport.pixel(screen) == pytest.approx((3.5, 5.5))
+
+
+def test_pixels_that_are_not_square_become_square():
+    viewport = endoscope_viewport(replace(CAMERA, fx=40.0), 1.5)
+    assert (viewport.camera.width, viewport.camera.fx, viewport.camera.cx) == (128, 80.0, 64.0)
+
+
+def test_a_browsers_camera_sees_what_it_looks_at():
+    half = np.sqrt(0.5)
+    viewport = free_viewport(np.array([half, 0, half, 0]), np.array([1.0, 2, 3]), 0.8, 1.5, 100)
+    pixels, z = project(np.array([[11.0, 2, 3]]), viewport.camera)  # turned by 90 degrees about y: looks along +x
+    assert z[0] == pytest.approx(10) and pixels[0] == pytest.approx([75, 50])
+    assert viewport.fov == pytest.approx(0.8) and (viewport.width, viewport.height) == (150, 100)
+
+
+@pytest.mark.parametrize(
+    "wxyz, position, fov",
+    (([np.nan, 0, 0, 0], [0, 0, 0], 1.0), ([0, 0, 0, 0], [0, 0, 0], 1.0), ([1, 0, 0, 0], [0, np.inf, 0], 1.0)),
+)
+def test_a_camera_that_is_none_draws_nothing(wxyz, position, fov):
+    assert free_viewport(np.array(wxyz), np.array(position), fov, 1.0, 100) is None
+    assert free_viewport(np.array([1.0, 0, 0, 0]), np.zeros(3), -2.0, 1.0, 100) is None
+
+
+def test_canvases_of_no_size_have_an_aspect():
+    assert [bounded_aspect(0, 10), bounded_aspect(10, 0), bounded_aspect(1000, 1), bounded_aspect(3, 2)] == [
+        1,
+        1,
+        4,
+        1.5,
+    ]
+
+
+def test_trails_end_at_the_frame_and_leave_out_what_is_unknown():
+    paths = np.zeros((12, 2, 3))
+    paths[:, 0, 0] = np.arange(12)
+    paths[5, 1] = np.nan
+    marks = trails(paths, 10)
+    first = marks.segments[(marks.colors == marks.colors[0]).all(1)]
+    assert len(first) == 8 and first[-1, 1, 0] == 10 and first[0, 0, 0] == 2
+    assert np.isfinite(marks.segments).all() and len(marks) == 8 + 6
+    assert marks.knobs.sum() == 2 and len(trails(paths, 0)) == 2
+
+
+def test_marks_are_drawn_where_they_project():
+    ends = np.array([[-5.0, 0, 50], [5, 0, 50]])
+    marks = joined(no_marks(), ruler(ends))
+    picture = draw_marks(np.zeros((48, 64, 3), np.uint8), CAMERA, marks)
+    rows, columns = np.nonzero(picture.any(-1))
+    assert abs(rows.mean() - 23.5) < 0.6 and 19 <= columns.min() and columns.max() <= 44
+    assert picture[23:25, 25:40].any(0).any(-1).all()
+    behind = replace(marks, segments=marks.segments * [1, 1, -1])
+    assert not draw_marks(np.zeros((48, 64, 3), np.uint8), CAMERA, behind).any()
+    assert len(ruler(ends[:0])) == 0 and len(ruler(ends[:1])) == 1
+
+
+def test_a_click_finds_the_point_behind_it():
+    depth = np.zeros((48, 64), np.float32)
+    depth[10, 20] = 40
+    assert pick(depth, CAMERA, (20.5, 10.5)) == pytest.approx([(20.5 - 32) / 80 * 40, (10.5 - 24) / 80 * 40, 40])
+    for nowhere in ((21.5, 10.5), (-1.0, 3.0), (70.0, 3.0), (np.nan, 3.0), (np.inf, 3.0)):
+        assert pick(depth, CAMERA, nowhere) is None
+
+
+def test_a_measurement_says_distance_and_change():
+    paths = np.zeros((3, 2, 3))
+    paths[:, 1, 0] = 4, 5, 7
+    measured = Measurement(1, paths)
+    assert measured.distances.tolist() == [4, 5, 7]
+    text = sentence(measured, 2, relative=False)
+    assert "7.00 mm" in text and "+2.00 since frame 1" in text and "4.00 to 7.00" in text
+    assert "relative" in sentence(measured, 2, relative=True) and "7.00 mm" not in sentence(measured, 2, relative=True)
+    paths[[0, 2]] = np.nan
+    assert "**5.00 mm**" == sentence(measured, 1, relative=False)
+    assert "frame 1" in sentence(measured, 0, relative=False) and len(measured.ends(0)) == 0
+    assert "second" in sentence(Measurement(0, paths[:, :1]), 0, relative=False)
+
+
+def test_a_film_follows_the_frames_or_the_places_kept():
+    cameras = (CAMERA, OFF_CENTER)
+    assert [place.camera for place in sweep(cameras, None)] == list(cameras)
+    assert {place.camera.cx for place in sweep(cameras, OFF_CENTER)} == {30.0}
+    away = np.eye(4)
+    away[:3, 3] = -10, 0, 0
+    path = through([Place(2, CAMERA), Place(6, replace(CAMERA, world_to_camera=away)), Place(5, CAMERA)])
+    assert [place.frame for place in path] == [2, 3, 4, 5, 6, 5]
+    assert [place.camera.center[0] for place in path] == pytest.approx([0, 2.5, 5, 7.5, 10, 0])
+    assert len({(place.camera.width, place.camera.height) for place in path}) == 1
+
+
+def test_the_nearest_dot_is_on_top():
+    points = np.array([[0.0, 0, 60], [0, 0, 50], [0, 0, -5]], np.float32)
+    colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
+    for order in ([0, 1, 2], [2, 1, 0]):
+        picture, depth = draw_dots(points[order], colors[order], 1.0, CAMERA)
+        assert picture[24, 32].tolist() == [0, 255, 0] and depth[24, 32] == 50
+        assert (depth > 0).sum() < 16
+    assert not draw_dots(points[2:], colors[2:], 1.0, CAMERA)[0].any()
+
+
+@pytest.mark.parametrize(
+    "origin, asked, bound, admitted",
+    (
+        (None, "127.0.0.1:1", "127.0.0.1", True),
+        ("http://127.0.0.1:80", "127.0.0.1:80", "127.0.0.1", True),
+        ("http://localhost:80", "localhost:80", "127.0.0.1", True),
+        ("http://evil.example", "127.0.0.1:80", "127.0.0.1", False),
+        ("http://127.0.0.1:81", "127.0.0.1:80", "127.0.0.1", False),
+        ("http://evil.example:80", "evil.example:80", "127.0.0.1", False),
+        ("http://server.example:80", "server.example:80", "0.0.0.0", True),
+        ("null", "127.0.0.1:80", "127.0.0.1", False),
+    ),
+)
+def test_pages_of_other_sites_are_not_served(origin, asked, bound, admitted):
+    assert trusted(origin, asked, bound) is admitted
+
+
+def test_an_address_that_cannot_be_had_is_refused():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(InputError, match="--port 0"):
+            check_address("127.0.0.1", taken.getsockname()[1])
+    for host, port in (("127.0.0.1", 70000), ("192.0.2.7", 0), ("no such host", 0), ("x" * 300, 0)):
+        with pytest.raises(InputError):
+            check_address(host, port)
+    check_address("127.0.0.1", 0)
+
+
+def test_files_are_kept_beside_each_other_and_nowhere_else(tmp_path):
+    picture = np.zeros((8, 8, 3), np.uint8)
+    first, second = (keep(tmp_path / "view", "a.png", png_bytes(picture)) for _ in range(2))
+    assert first != second and first.read_bytes() == second.read_bytes()
+    assert b"ftyp" in mp4_bytes([picture] * 3, 10.0)[:32]
+    for name in ("../a.png", "/etc/a.png", "b/a.png", ".."):
+        with pytest.raises(ValueError, match="plain file name"):
+            keep(tmp_path / "view", name, b"")

@@ -1,0 +1,306 @@
+"""The viewer spoken to over its own protocol: pictures, clicks, garbage, foreign pages; scenes, sequences, training."""
+
+import hashlib
+import json
+import socket
+import threading
+import time
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from view_client import Client, at_work
+from websockets.exceptions import ConnectionClosed
+
+from endoprior.cli import main
+from endoprior.cli.view import live_view, open_subject
+from endoprior.config import Config
+from endoprior.data import load_sequence
+from endoprior.model.gaussians import create_gaussians
+from endoprior.model.scene import Scene
+from endoprior.presets import preset
+from endoprior.show.pictures import to_u8
+from endoprior.train import train
+from endoprior.types import Camera
+from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT, POINTS
+from endoprior.view.scene_subject import SceneSubject
+from endoprior.view.sequence_subject import SequenceSubject
+from endoprior.view.server import Viewer
+from endoprior.view.session import Look
+
+NUM_FRAMES = 6
+CAMERA = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A wall of Gaussians at 50 mm that slides 2 mm to the right over the film."""
+    cfg: Config = preset("default").fitted(20)
+    x, y = np.meshgrid(np.linspace(-24, 24, 40), np.linspace(-18, 18, 30))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, 50.0)], -1).astype(np.float32)
+    colors = np.random.default_rng(0).random((len(points), 3), np.float32)
+    gaussians = create_gaussians(points, colors, np.full(len(points), np.log(0.8), np.float32), cfg)
+    with torch.no_grad():
+        gaussians["opacity_logits"].fill_(3.0)
+        gaussians["motion"][:, :, 0] = torch.linspace(0, 2, gaussians["motion"].shape[1])
+    score = torch.linspace(0, 1, len(points))
+    return Scene(gaussians, None, cfg, (CAMERA,) * NUM_FRAMES, 25.0, score, torch.ones(len(points)))
+
+
+@pytest.fixture
+def viewer(scene, tmp_path):
+    """A viewer of that scene, at work."""
+    with at_work(Viewer(SceneSubject(scene, "wall"), out=tmp_path / "view")) as viewer:
+        yield viewer
+
+
+@pytest.fixture
+def client(viewer):
+    """A connected stand-in for a browser, past its first picture."""
+    client = Client(viewer.port)
+    client.look()
+    client.picture()
+    yield client
+    client.socket.close()
+
+
+def close(a, b, levels: float = 3.0) -> bool:
+    """Whether two pictures agree but for JPEG."""
+    return a.shape == b.shape and np.abs(a.astype(float) - b).mean() < levels
+
+
+def test_the_picture_is_the_scenes_own(scene):
+    look, subject = Look(frame=3), SceneSubject(scene, "wall")
+    assert np.array_equal(subject.picture(look, CAMERA), to_u8(scene.render(3 / NUM_FRAMES).color.numpy()))
+    assert subject.surface(look, CAMERA)[24, 32] == pytest.approx(50, abs=1e-3)
+
+
+def test_the_slider_changes_the_picture(viewer, client, scene):
+    client.set(viewer.panel.frame, 5)
+    expected = to_u8(scene.render(5 / NUM_FRAMES).color.numpy())
+    canvas = client.picture()
+    assert viewer.look.frame == 5 and canvas.shape[:2] == (52, 64)  # 600 x 480 is narrower than 64 x 48
+    assert np.array_equal(canvas[2:50], expected) and not canvas[0].any()
+
+
+def test_every_layer_is_a_different_picture(viewer, client):
+    client.set(viewer.panel.frame, 4)
+    pictures = {"color": client.picture()}
+    for layer in ("depth", "alpha", "motion", "prior"):
+        client.set(viewer.panel.layer, LAYER_NAMES[layer])
+        pictures[layer] = client.picture()
+    for a in pictures:
+        assert all(a == b or not close(pictures[a], pictures[b]) for b in pictures)
+
+
+def test_the_free_camera_and_clipping(viewer, client):
+    client.set(viewer.panel.camera, ORBIT)
+    client.picture()
+    client.look()
+    facing = client.picture()
+    client.look(position=(0, 0, -50))
+    assert not close(client.picture(), facing)
+    client.set(viewer.panel.clip, (0.0, 40.0))
+    assert client.picture().max() < 10  # the wall is behind the far end
+    client.look(position=(np.nan, 0, 0))
+    client.set(viewer.panel.clip, (0.0, viewer.panel.clip_end))
+    with pytest.raises(AssertionError, match="no picture"):
+        client.picture(timeout=1)  # nothing can be drawn from nowhere
+    client.look()
+    assert np.array_equal(client.picture(), facing)
+
+
+def test_two_clicks_measure_and_the_distance_follows_the_tissue(viewer, client, scene):
+    client.set(viewer.panel.measure, True)
+    client.set(viewer.panel.tracks, True)
+    time.sleep(0.3)
+    for x in (0.25, 0.75):
+        client.click(x, 0.5)
+    client.picture()
+    assert viewer.measured.distances == pytest.approx(np.full(NUM_FRAMES, 32 / 80 * 50), abs=0.05)
+    assert "mm" in viewer.panel.distance.content
+    shift = viewer.measured.paths[-1, 0, 0] - viewer.measured.paths[0, 0, 0]
+    moved = scene.at((NUM_FRAMES - 1) / NUM_FRAMES).means - scene.at(0).means
+    assert shift == pytest.approx(float(moved[0, 0]), abs=1e-3) and shift > 1
+    client.click(1.5, 0.5)
+    client.click(np.nan, 0.5)
+    time.sleep(0.5)
+    assert viewer.measured.paths.shape[1] == 2  # clicks on nothing change nothing
+
+
+def test_play_advances_and_pauses(viewer, client):
+    client.set(viewer.panel.speed, "0.5x")
+    client.set(viewer.panel.play, True)
+    seen, end = set(), time.monotonic() + 3
+    while len(seen) < 4 and time.monotonic() < end:
+        seen.add(viewer.look.frame)
+        time.sleep(0.01)
+    assert len(seen) >= 4
+    client.set(viewer.panel.play, True)
+    client.picture()
+    at = viewer.look.frame
+    time.sleep(0.4)
+    assert viewer.look.frame == at == viewer.panel.frame.value
+
+
+def test_a_browser_can_draw_the_gaussians_itself(viewer, client):
+    def nodes(handle, value):
+        client.set(handle, value)
+        kinds, end = set(), time.monotonic() + 2
+        while time.monotonic() < end:
+            try:
+                kinds |= {message["type"] for message in client.read(0.5)}
+            except TimeoutError:
+                break
+        return kinds
+
+    kinds = nodes(viewer.panel.drawn_by, BROWSER)
+    assert "GaussianSplatsMessage" in kinds and "BackgroundImageMessage" in kinds
+    assert "PointCloudMessage" in nodes(viewer.panel.drawn_as, POINTS)
+    assert "BackgroundImageMessage" in nodes(viewer.panel.layer, LAYER_NAMES["depth"])  # no color of a Gaussian
+
+
+def test_screenshot_and_film_are_kept_in_the_run(viewer, client):
+    client.set(viewer.panel.screenshot, True)
+    client.set(viewer.panel.camera, ORBIT)
+    client.set(viewer.panel.keep, True)
+    client.picture()
+    client.look(position=(2, 0, 0))
+    client.set(viewer.panel.frame, 3)
+    client.set(viewer.panel.keep, True)
+    client.set(viewer.panel.film, True)
+    end = time.monotonic() + 20
+    while not list(viewer.out.glob("*.mp4")) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert sorted(path.name for path in viewer.out.iterdir()) == ["color_000000_1.png", "color_1.mp4"]
+
+
+def test_garbage_ends_its_own_connection_only(viewer, client, capfd):
+    for raw in (b"", b"\xff" * 100, b"\x81\xa4type\xa3foo", "text"):
+        stranger = Client(viewer.port)
+        stranger.socket.send(raw)
+        with pytest.raises(ConnectionClosed):
+            while True:
+                stranger.socket.recv(timeout=5)
+    for request in (b"\0" * 1000, b"GET /../../etc/passwd HTTP/1.1\r\nHost: x\r\n\r\n", b"\x16\x03\x01" * 50):
+        with socket.create_connection(("127.0.0.1", viewer.port)) as plain:
+            plain.sendall(request)
+            plain.settimeout(1)
+            with suppress(TimeoutError):  # it may wait for the rest of a request
+                assert b"root:" not in plain.recv(4000)
+    for handle, value in ((viewer.panel.frame, "x"), (viewer.panel.layer, "no such layer"), (viewer.panel.clip, [1])):
+        client.set(handle, value)
+    client.send("GuiUpdateMessage", uuid="nobody", updates={"value": 1})
+    client.send("ShareUrlRequest")
+    viewer.panel.layer.value = LAYER_NAMES["color"]
+    viewer.panel.clip.value = (0.0, viewer.panel.clip_end)
+    time.sleep(0.5)
+    client.set(viewer.panel.frame, 2)
+    client.picture()
+    assert viewer.look.frame == 2
+    capfd.readouterr()  # what the server said about it
+
+
+def test_a_page_of_another_site_sees_nothing(viewer):
+    stranger = Client(viewer.port, origin="http://evil.example")
+    with pytest.raises(ConnectionClosed):
+        stranger.socket.recv(timeout=5)
+    own = Client(viewer.port, origin=f"http://127.0.0.1:{viewer.port}")
+    own.look()
+    assert own.picture().any()
+    own.socket.close()
+
+
+def test_only_this_machine_is_listened_to(viewer):
+    listening = viewer._server._websock_server
+    assert listening._host == "127.0.0.1" and viewer._server.request_share_url() is None
+
+
+def test_a_raw_sequence_is_shown_before_training(tiny_sequence):
+    sequence = load_sequence(tiny_sequence)
+    subject = SequenceSubject(sequence)
+    frame, camera = sequence.frame(2), sequence.camera(2)
+    assert np.array_equal(subject.picture(Look(frame=2, layer="frame"), camera), frame.rgb_u8)
+    kinds = [subject.picture(Look(frame=2, layer=layer), camera) for layer in subject.layers]
+    assert len({kind.tobytes() for kind in kinds}) == 3
+    cloud = subject.cloud(Look(frame=2, layer="frame", endoscope=False))
+    assert len(cloud.points) == (frame.depth_valid & frame.tissue_mask).sum()
+    free = Look(frame=2, layer="frame", endoscope=False)
+    seen = subject.surface(free, camera)
+    both = (seen > 0) & frame.depth_valid & frame.tissue_mask
+    assert both.sum() > 1000 and np.median(np.abs(seen - frame.depth)[both]) < 0.2
+    with at_work(Viewer(subject)) as viewer:
+        client = Client(viewer.port)
+        client.look()
+        first = client.picture()
+        client.set(viewer.panel.layer, LAYER_NAMES["depth"])
+        assert not close(client.picture(), first)
+        client.set(viewer.panel.camera, ORBIT)
+        client.set(viewer.panel.measure, True)
+        time.sleep(0.5)
+        for x in (0.45, 0.55):
+            client.click(x, 0.7)
+        time.sleep(0.5)
+        assert np.isfinite(viewer.measured.distances).sum() == 1  # nothing says where the points go
+        client.socket.close()
+
+
+def test_lengths_of_relative_depth_are_not_called_mm(tiny_sequence):
+    file = tiny_sequence / "sequence.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"depth_relative": True}))
+    subject, out = open_subject(tiny_sequence, None)
+    assert subject.relative and out is None and "mm" not in subject.legend(Look(layer="depth"))
+    viewer = Viewer(subject)
+    assert "not mm" in viewer.panel.status.content and "relative" in viewer.panel.clip.label
+    viewer.close()
+
+
+def short_config() -> Config:
+    """Few Gaussians, few iterations."""
+    cfg = preset("default")
+    schedule = replace(cfg.schedule, coarse_iterations=0, fine_iterations=12)
+    return replace(cfg, init=replace(cfg.init, budget=300), schedule=schedule)
+
+
+def test_watching_does_not_change_the_training(tiny_sequence, tmp_path):
+    digests, shown = [], []
+    for watched in (False, True):
+        out, client = tmp_path / f"run{watched}", None
+        with live_view(0 if watched else None) as on_step:
+
+            def step(report, trainer, on_step=on_step, watched=watched):
+                nonlocal client
+                on_step(report, trainer)
+                if watched:
+                    if client is None:
+                        client = Client(on_step.viewer.port)
+                        client.look()
+                        threading.Event().wait(0.3)
+                    on_step._due = 0.0
+                    client.set(on_step.viewer.panel.layer, LAYER_NAMES["motion" if report.iteration % 2 else "prior"])
+                    threading.Event().wait(0.05)
+                    shown.append(on_step.viewer.panel.status.content)
+
+            train(load_sequence(tiny_sequence), short_config(), out, on_step=step)
+            if client:
+                assert client.picture(timeout=5, quiet=0.2).any()
+                client.socket.close()
+        digests.append(hashlib.sha256((out / "scene.safetensors").read_bytes()).hexdigest())
+    assert digests[0] == digests[1]
+    assert "iteration 11" in shown[-1] or "iteration 12" in shown[-1]
+
+
+def test_wrong_input_is_one_line(tmp_path, capsys, tiny_sequence):
+    assert main(["view", str(tmp_path / "nothing")]) == 2
+    assert main(["view", str(tiny_sequence), "--port", "99999"]) == 2
+    assert main(["view", str(tiny_sequence), "--host", "192.0.2.7"]) == 2
+    running = tmp_path / "running"
+    running.mkdir()
+    for name in ("config.json", "log.jsonl"):
+        (running / name).write_text("{}")
+    assert main(["view", str(running)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 4 and all(line.startswith("endoprior: ") for line in lines)
+    assert "train --view" in lines[3]

@@ -1,0 +1,90 @@
+"""A program that speaks viser's protocol in place of a browser, and a viewer at work in a thread."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+from websockets.sync.client import connect
+
+VISER = "viser-v1.1.1"
+
+
+class Client:
+    """The browser's side of one connection: a canvas of 600 x 480 px."""
+
+    def __init__(self, port: int, **options: Any) -> None:
+        self.socket = connect(
+            f"ws://127.0.0.1:{port}", subprotocols=[VISER], max_size=None, compression=None, **options
+        )
+
+    def look(self, **changes: Any) -> None:
+        """Say where its camera is."""
+        camera = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "look_at": (0, 0, 60), "up_direction": (0, -1, 0)}
+        camera |= {"fov": 0.9, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 600}
+        self.send("ViewerCameraMessage", **camera | changes)
+
+    def send(self, kind: str, **fields: Any) -> None:
+        """Send one message."""
+        self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def set(self, handle: Any, value: Any) -> None:
+        """Change a control of the panel."""
+        self.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
+
+    def click(self, x: float, y: float) -> None:
+        """Click the canvas; (0, 0) is its upper left corner, (1, 1) its lower right."""
+        ray = {"ray_origin": (0, 0, 0), "ray_direction": (0, 0, 1)}
+        self.send("ScenePointerMessage", event_type="click", screen_pos=((x, y),), modifier=None, **ray)
+
+    def read(self, timeout: float) -> list[dict]:
+        """The next messages; of a picture the pixels, (H, W, 3) RGB, under `picture`."""
+        raw = self.socket.recv(timeout=timeout)
+        length = int.from_bytes(raw[8:16], "little")
+        messages = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(raw[16 : 16 + length]))["messages"]
+        for message in messages:
+            if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
+                message["picture"] = _decoded(message["rgb_data"])
+        return messages
+
+    def picture(self, timeout: float = 20, quiet: float = 0.8) -> NDArray[np.uint8]:
+        """The last picture, once nothing comes for `quiet` seconds."""
+        found, wait = None, timeout
+        while True:
+            try:
+                for message in self.read(wait):
+                    found = message.get("picture", found)
+            except TimeoutError:
+                assert found is not None, "no picture came"
+                return found
+            wait = timeout if found is None else quiet
+
+
+def _decoded(data: bytes) -> NDArray[np.uint8]:
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+@contextmanager
+def at_work(viewer: Any) -> Iterator[Any]:
+    """The viewer, working in a thread until the end."""
+    stop = threading.Event()
+
+    def work() -> None:
+        while not stop.is_set():
+            viewer.work(0.1)
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    try:
+        yield viewer
+    finally:
+        stop.set()
+        worker.join()
+        viewer.close()
