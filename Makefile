@@ -30,7 +30,7 @@ bench: $(VENV)/.installed
 	$(BIN)/python bench/run.py --baseline bench/baseline.json $(BENCH)
 
 # The documentation's pictures; ENDOPRIOR_DATA holds the two clips.
-figures: $(VENV)/.installed
+figures: $(VENV)/.test-installed browser
 	$(BIN)/python bench/figures.py figures
 
 $(VENV)/bin/python:

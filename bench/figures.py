@@ -1,8 +1,9 @@
 """Make the pictures of the documentation again: `make figures`, or `python bench/figures.py WORK`.
 
-Writes docs/images/report.jpg from the demo, and docs/images/own_video.jpg from the two clips that `ENDOPRIOR_DATA`
-holds (`bowel_lift_stereo_sbs.mp4` with its .json, `mono_endo.mp4`). WORK keeps sequences and runs; what is there is
-not made again. Pictures of benchmarks come from bench/publish.py.
+Writes docs/images/report.jpg from the demo, player.jpg and viewer.jpg from its scene in headless Chromium, and
+own_video.jpg from the two clips that `ENDOPRIOR_DATA` holds (`bowel_lift_stereo_sbs.mp4` with its .json,
+`mono_endo.mp4`). WORK keeps sequences and runs; what is there is not made again. Pictures of benchmarks come from
+bench/publish.py.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -18,6 +20,9 @@ import numpy as np
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 WIDTH_PX = 1280
 JPEG_QUALITY = 85
+PORT = 8199
+PAGE_SECONDS = 12.0
+"""A page drawn without a graphics card takes its time."""
 CLIPS = {
     "stereo": ("bowel_lift_stereo_sbs.mp4", "bowel_lift_stereo.json", 97),
     "mono": ("mono_endo.mp4", None, 169),
@@ -61,11 +66,40 @@ def own_video(work: Path, data: Path) -> None:
     save("own_video.jpg", np.vstack(rows))
 
 
+def pages(work: Path) -> None:
+    """The player and the viewer in headless Chromium, both with the demo's scene."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    from browser import chromium_path, open_page
+
+    if chromium_path() is None:
+        print("player.jpg, viewer.jpg: left as they are, because there is no Chromium")
+        return
+    run, player = work / "demo" / "run", (work / "player.html").absolute()
+    if not player.exists():
+        endoprior("export", run, player, "--format", "html", "--title", "Phantom")
+    with open_page(player.as_uri(), width=1100, height=760) as page:
+        page.wait_for("document.readyState == 'complete'")
+        time.sleep(PAGE_SECONDS)
+        page.screenshot(work / "player.png")
+    command = [sys.executable, "-m", "endoprior", "view", str(run), "--port", str(PORT)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as viewer:
+        try:
+            print(viewer.stdout.readline().strip())
+            with open_page(f"http://127.0.0.1:{PORT}", width=1100, height=760) as page:
+                time.sleep(PAGE_SECONDS)
+                page.screenshot(work / "viewer.png")
+        finally:
+            viewer.terminate()
+    save("player.jpg", cv2.imread(str(work / "player.png")))
+    save("viewer.jpg", cv2.imread(str(work / "viewer.png")))
+
+
 def main() -> None:
     """Make what can be made."""
     work, data = Path(sys.argv[1] if len(sys.argv) > 1 else "figures"), os.environ.get("ENDOPRIOR_DATA")
     work.mkdir(parents=True, exist_ok=True)
     report(work)
+    pages(work)
     if data and all((Path(data) / video).exists() for video, _, _ in CLIPS.values()):
         own_video(work, Path(data))
     else:

@@ -50,6 +50,13 @@ HARMLESS = ("GPU stall due to ReadPixels",)  # Chromium's own remark when it dra
 KEY_CODES = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Home": 36, "End": 35, " ": 32}
 
 
+def pictures_folder(name: str) -> Path:
+    """Where pictures that tests make are kept to be looked at: below `build/`, or ENDOPRIOR_TEST_PICTURES."""
+    folder = Path(os.environ.get("ENDOPRIOR_TEST_PICTURES", Path(__file__).parents[1] / "build")) / name
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def chromium_path() -> Path | None:
     """The browser: `ENDOPRIOR_CHROMIUM` or the first of the usual names on the path; None where there is none."""
     for name in (os.environ.get("ENDOPRIOR_CHROMIUM", ""), *NAMES):

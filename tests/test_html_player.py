@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from browser import Page, open_page, require_chromium
+from browser import Page, open_page, pictures_folder, require_chromium
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -213,13 +213,19 @@ def rendered(scene: Scene, time: float) -> NDArray[np.float64]:
     return 255.0 * scene.render(time).color.numpy().clip(0, 1)
 
 
-def test_draws_what_the_renderer_draws(scene, page, tmp_path):
+@pytest.fixture
+def kept():
+    """Folder whose pictures stay, to be looked at."""
+    return pictures_folder("player")
+
+
+def test_draws_what_the_renderer_draws(scene, page, kept):
     for frame in (0, 3):
         page.evaluate(f"slider.value = {frame}; slider.dispatchEvent(new Event('input'))")
         settle(page, frame)
-        got, want = picture(page, tmp_path / f"frame{frame}.png"), rendered(scene, frame / NUM_FRAMES)
+        got, want = picture(page, kept / f"frame{frame}.png"), rendered(scene, frame / NUM_FRAMES)
         both = np.concatenate([got, want], 1).round().astype(np.uint8)
-        cv2.imwrite(str(tmp_path / f"frame{frame}_player_renderer.png"), both[..., ::-1])
+        cv2.imwrite(str(kept / f"frame{frame}_player_renderer.png"), both[..., ::-1])
         assert got.shape == want.shape
         error = np.abs(got - want)
         print(f"frame {frame}: mean difference {error.mean():.3f} levels, largest {error.max():.0f}")
@@ -230,12 +236,12 @@ def test_draws_what_the_renderer_draws(scene, page, tmp_path):
     assert all(address.startswith(("file://", "blob:")) for address in page.requests)
 
 
-def test_the_slider_and_the_keys_choose_the_frame(scene, page, tmp_path):
-    before = picture(page, tmp_path / "first.png")
+def test_the_slider_and_the_keys_choose_the_frame(scene, page, kept):
+    before = picture(page, kept / "first.png")
     left, top, width, height = page.box("#slider")
     page.click_at(left + width - 4, top + height / 2)
     settle(page, NUM_FRAMES - 1)
-    after = picture(page, tmp_path / "last.png")
+    after = picture(page, kept / "last.png")
     assert np.abs(after - before).mean() > 3
     assert np.abs(after - rendered(scene, (NUM_FRAMES - 1) / NUM_FRAMES)).mean() < 0.65
     assert page.evaluate("counter.textContent + ', ' + seconds.textContent") == "Frame 6 / 6, 0.50 s"
@@ -244,7 +250,7 @@ def test_the_slider_and_the_keys_choose_the_frame(scene, page, tmp_path):
     settle(page, NUM_FRAMES - 2)
     page.press("Home")
     settle(page, 0)
-    assert np.array_equal(picture(page, tmp_path / "home.png"), before)
+    assert np.array_equal(picture(page, kept / "home.png"), before)
     assert not page.problems
 
 
@@ -265,37 +271,37 @@ def test_play_goes_on_and_pauses(page):
     assert not page.problems
 
 
-def test_the_free_view_turns_zooms_and_comes_back(page, tmp_path):
-    recorded = picture(page, tmp_path / "recorded.png")
+def test_the_free_view_turns_zooms_and_comes_back(page, kept):
+    recorded = picture(page, kept / "recorded.png")
     page.press("f")
     settle(page)
-    wide = picture(page, tmp_path / "free.png")
+    wide = picture(page, kept / "free.png")
     margin = (wide.shape[1] - WIDTH) // 2
     assert margin > 0 and np.abs(wide[:, margin : margin + WIDTH] - recorded).mean() < 1  # nothing jumps
     page.drag([(320, 180), (350, 190), (380, 200)])
     settle(page)
-    turned = picture(page, tmp_path / "turned.png")
+    turned = picture(page, kept / "turned.png")
     page.wheel(320, 180, -300)
     settle(page)
-    near = picture(page, tmp_path / "near.png")
+    near = picture(page, kept / "near.png")
     page.drag([(320, 180), (340, 190)], button="right")
     settle(page)
-    moved = picture(page, tmp_path / "moved.png")
+    moved = picture(page, kept / "moved.png")
     views = [wide, turned, near, moved]
     assert all(np.abs(a - b).mean() > 3 for i, a in enumerate(views) for b in views[:i])
     page.click("#reset")
     settle(page)
-    assert np.array_equal(picture(page, tmp_path / "reset.png"), wide)
+    assert np.array_equal(picture(page, kept / "reset.png"), wide)
     page.click("#endoscope")
     settle(page)
-    assert np.array_equal(picture(page, tmp_path / "again.png"), recorded)
+    assert np.array_equal(picture(page, kept / "again.png"), recorded)
     assert not page.problems
 
 
-def test_depth_is_shown_near_bright_far_dark(scene, page, tmp_path):
+def test_depth_is_shown_near_bright_far_dark(scene, page, kept):
     page.click("#depth")
     settle(page)
-    shown = picture(page, tmp_path / "depth.png").sum(-1)
+    shown = picture(page, kept / "depth.png").sum(-1)
     out = scene.render(0.0)
     opaque = out.alpha.numpy() > 0.9
     opaque[:, -60:] = False  # the bar
@@ -306,9 +312,9 @@ def test_depth_is_shown_near_bright_far_dark(scene, page, tmp_path):
     assert not page.problems
 
 
-def test_one_frame_is_a_still(scene, browser, tmp_path):
-    open_player(browser, write_html(scene, tmp_path / "still.html", times=[0.5]))
-    assert np.abs(picture(browser, tmp_path / "still.png") - rendered(scene, 0.5)).mean() < 0.65
+def test_one_frame_is_a_still(scene, browser, kept):
+    open_player(browser, write_html(scene, kept / "still.html", times=[0.5]))
+    assert np.abs(picture(browser, kept / "still.png") - rendered(scene, 0.5)).mean() < 0.65
     assert browser.evaluate("[slider.disabled, play.disabled, counter.textContent, seconds.textContent]") == [
         True,
         True,
@@ -333,21 +339,21 @@ DYING = "terminate() {} postMessage() { setTimeout(() => this.onerror(new Event(
     ],
     ids=["refused", "dies"],
 )
-def test_without_workers_the_page_sorts_by_itself(scene, browser, player, tmp_path, code):
+def test_without_workers_the_page_sorts_by_itself(scene, browser, player, kept, code):
     script = browser.send(BEFORE, source=code)["identifier"]
     try:
         open_player(browser, player)
         browser.press("End")
         settle(browser, NUM_FRAMES - 1)
         want = rendered(scene, (NUM_FRAMES - 1) / NUM_FRAMES)
-        assert np.abs(picture(browser, tmp_path / "alone.png") - want).mean() < 0.65
+        assert np.abs(picture(browser, kept / "alone.png") - want).mean() < 0.65
         assert not browser.problems
     finally:
         browser.send("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
 
 
-def test_a_lost_graphics_card_comes_back(page, tmp_path):
-    before = picture(page, tmp_path / "before.png")
+def test_a_lost_graphics_card_comes_back(page, kept):
+    before = picture(page, kept / "before.png")
     page.evaluate(
         "window.lose = picture.getContext('webgl2').getExtension('WEBGL_lose_context'); lose.loseContext();"
         "new Promise(f => setTimeout(f, 100))"
@@ -356,7 +362,7 @@ def test_a_lost_graphics_card_comes_back(page, tmp_path):
     page.evaluate("lose.restoreContext(); new Promise(f => picture.addEventListener('webglcontextrestored', f))")
     page.press("Home")
     settle(page, 0)
-    assert np.array_equal(picture(page, tmp_path / "after.png"), before)
+    assert np.array_equal(picture(page, kept / "after.png"), before)
     assert all("context" in problem.lower() for problem in page.problems)
 
 
@@ -367,12 +373,12 @@ def test_a_lost_graphics_card_comes_back(page, tmp_path):
         ("HTMLCanvasElement.prototype.getContext = () => null;", "has no WebGL 2"),
     ],
 )
-def test_a_browser_that_cannot_says_so_on_the_page(browser, player, tmp_path, code, says):
+def test_a_browser_that_cannot_says_so_on_the_page(browser, player, kept, code, says):
     script = browser.send(BEFORE, source=code)["identifier"]
     try:
         browser.go(player.as_uri())
         browser.wait_for("document.body.dataset.state == 'failed'")
-        browser.screenshot(tmp_path / "failed.png")
+        browser.screenshot(kept / "failed.png")
         assert says in browser.evaluate("message.textContent")
     finally:
         browser.send("Page.removeScriptToEvaluateOnNewDocument", identifier=script)

@@ -1,16 +1,14 @@
 """The viewer in headless Chromium on a trained phantom: what a person would do, and what the page shows then.
 
-The pictures are kept in `build/view/` (or in the folder ENDOPRIOR_TEST_PICTURES) to be looked at.
+The pictures are kept in `build/view/` to be looked at.
 """
 
-import os
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import open_page, require_chromium
+from browser import open_page, pictures_folder, require_chromium
 from view_client import at_work
 
 from endoprior.cli.view import open_subject
@@ -24,7 +22,7 @@ from endoprior.view.scene_subject import SceneSubject
 from endoprior.view.server import Viewer
 from endoprior.view.viewport import bounded_aspect, endoscope_viewport
 
-PICTURES = Path(os.environ.get("ENDOPRIOR_TEST_PICTURES", Path(__file__).parents[1] / "build" / "view"))
+PICTURES = pictures_folder("view")
 WIDTH, HEIGHT = 1100, 760
 FRAME = 3
 KNOWN = ("THREE.Clock", "GPU stall due to ReadPixels", "GL Driver Message", "Automatic fallback to software WebGL")
@@ -53,7 +51,6 @@ def scene(phantom):
 @pytest.fixture
 def viewer(scene, phantom, tmp_path):
     """A viewer of the trained phantom, at work."""
-    PICTURES.mkdir(parents=True, exist_ok=True)
     with at_work(Viewer(SceneSubject(scene, "phantom", phantom), out=tmp_path / "view")) as viewer:
         yield viewer
 
