@@ -81,12 +81,14 @@ def pages(work: Path) -> None:
         page.wait_for("document.readyState == 'complete'")
         time.sleep(PAGE_SECONDS)
         page.screenshot(work / "player.png")
-    command = [sys.executable, "-m", "endoprior", "view", str(run), "--port", str(PORT)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as viewer:
+    command = [sys.executable, "-m", "endoprior", "view", "demo/run", "--port", str(PORT)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=work) as viewer:
         try:
             print(viewer.stdout.readline().strip())
             with open_page(f"http://127.0.0.1:{PORT}", width=1100, height=760) as page:
                 time.sleep(PAGE_SECONDS)
+                page.evaluate("document.querySelectorAll('[class*=Notification-close]').forEach(b => b.click())")
+                time.sleep(1.0)
                 page.screenshot(work / "viewer.png")
         finally:
             viewer.terminate()
