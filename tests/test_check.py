@@ -277,9 +277,11 @@ def test_command_prints_draws_and_writes(data, capsys):
     assert sorted(path.name for path in data.parent.iterdir()) == ["check.json", "data", "new"]
 
 
-def test_exit_statuses(data, tmp_path, capsys):
+def test_exit_statuses(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     assert main(["check", str(data), "--strict"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "nothing suspicious"
+    assert capsys.readouterr().out.splitlines()[-2:] == ["nothing suspicious", "check.png"]
+    assert (tmp_path / "check.png").exists()
     assert main(["check", str(data), "--data.depth-unit-mm", "0.00001", "--strict"]) == 2
     assert "error: depth-metres" in capsys.readouterr().out
     assert main(["check", str(data), "--out", str(tmp_path / "check.txt")]) == 2

@@ -94,7 +94,7 @@ AT_LOAD = {
     "poses of other count": (poses(lambda p: p[:5]), "poses_bounds.npy", "expected shape (17, 17); got (5, 17)"),
     "poses of other width": (poses(lambda p: p[:, :15]), "poses_bounds.npy", "got (17, 15)"),
     "poses not numbers": (poses(lambda p: p.astype(str)), "poses_bounds.npy", "finite numbers"),
-    "poses not an array": (lambda f: (f / "poses_bounds.npy").write_text("x"), "poses_bounds.npy", "a NumPy array"),
+    "poses not an array": (lambda f: (f / "poses_bounds.npy").write_text("x"), "poses_bounds.npy", "a NumPy file"),
     "pose NaN": (pose_entry(3, 7, np.nan), "poses_bounds.npy", "finite numbers"),
     "pose not a rotation": (pose_entry(3, 0, 1.1), "poses_bounds.npy", "something else in row 3"),
     "pose mirrored": (pose_entry(2, 0, -1), "poses_bounds.npy", "something else in row 2"),

@@ -102,7 +102,7 @@ def unusable(folder):
         "got 1 NaN or infinite": save(folder / "nan.npy", holed),
         "cannot be decoded": folder / "broken.png",
         "a NumPy file": folder / "broken.npy",
-        "Object arrays": folder / "objects.npy",
+        "pickled objects": folder / "objects.npy",
         "one array; got 2": folder / "two.npz",
         "many colors": save(folder / "photo.png", photo),
         "No such file": folder / "absent.png",

@@ -190,6 +190,18 @@ def test_relative_disparity_of_a_network(tmp_path, phantom):
     assert np.corrcoef(1 / frame.depth[frame.tissue_mask], 1 / true[frame.tissue_mask])[0, 1] > 0.99
 
 
+def test_a_folder_is_known_by_more_than_its_name(tmp_path, phantom, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "depth-anything-maps"
+    folder.mkdir()
+    for index in range(FRAMES):
+        np.save(folder / f"{index}.npy", np.load(phantom / f"truth/depth/{index:06d}.npy"))
+    cfg = options(phantom, depth="depth-anything-maps", depth_unit_mm=1.0, layout="mono")
+    done = prepare(phantom / "images", tmp_path / "out", cfg)
+    assert not load_sequence(done.out).depth_is_relative
+    assert np.median(np.abs(load_sequence(done.out).frame(1).depth - np.load(folder / "1.npy"))) < 0.01
+
+
 def test_inverted_masks_are_turned(tmp_path, phantom):
     (tmp_path / "masks").mkdir()
     for file in (phantom / "masks").glob("*.png"):
@@ -216,7 +228,7 @@ def test_frames_out_of_the_body_can_be_dropped(tmp_path, phantom):
     video = write_video(tmp_path / "v.mkv", pictures)
     kept = prepare(video, tmp_path / "kept", PrepareConfig(layout="mono"))
     assert json.loads((kept.out / "sequence.json").read_text())["unexplained_frames"] == [2]
-    assert any("1 frames are not explained: 2" in remark for remark in kept.remarks)
+    assert any("not explained" in remark and "frames 2;" in remark for remark in kept.remarks)
     dropped = prepare(video, tmp_path / "dropped", PrepareConfig(layout="mono", drop_out_of_body=True))
     assert dropped.num_frames == FRAMES
 
@@ -281,6 +293,11 @@ BAD = {
     "no depth folder": lambda d, p: (p / "images", {"layout": "mono", "depth": "nowhere"}, "a folder of depth"),
     "too many frames": lambda d, p: (p / "images", {"layout": "mono", "max_frames": 3}, "at most 3 frames"),
     "nothing selected": lambda d, p: (p / "images", {"layout": "mono", "start": 9.0}, "at least 2 frames"),
+    "relative what": lambda d, p: (
+        p / "images",
+        {"layout": "mono", "depth_relative": "depth"},
+        "a folder with --depth",
+    ),
     "no poses": lambda d, p: (p / "images", {"layout": "mono", "poses": "nowhere.npy"}, "camera poses"),
     "crop outside": lambda d, p: (p / "images", {"layout": "mono", "crop": "0,0,999,9"}, "--crop"),
     "calibration of another camera": lambda d, p: (p / "images", {"layout": "side-by-side"}, "the same proportions"),

@@ -15,6 +15,8 @@ import torch
 from endoprior.checks import InputError
 from endoprior.config import Config
 from endoprior.data import load_sequence
+from endoprior.export import export
+from endoprior.export.options import ExportOptions
 from endoprior.model.scene import load_scene
 from endoprior.morton import morton_order
 from endoprior.optim import log_linear
@@ -250,3 +252,13 @@ def test_ctrl_c_on_the_command_line_saves_and_says_how_to_go_on(tiny_sequence, t
         said, complaint = process.communicate(timeout=60)
     assert process.returncode == 130, complaint
     assert "--resume" in said and (out / "checkpoint.safetensors").is_file()
+
+
+def test_a_scene_knows_that_its_lengths_are_relative(tiny_sequence, tmp_path):
+    file = tiny_sequence / "sequence.json"
+    assert not train(load_sequence(tiny_sequence), tiny_config("basis")).lengths_are_relative
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"depth_relative": True}))
+    scene = train(load_sequence(tiny_sequence), tiny_config("basis"), tmp_path / "run")
+    assert scene.lengths_are_relative and load_scene(tmp_path / "run").lengths_are_relative
+    export(scene, tmp_path / "ply", ExportOptions(format="ply", split="test"))
+    assert json.loads((tmp_path / "ply/index.json").read_text())["lengths_are_relative"]

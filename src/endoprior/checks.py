@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 
 class InputError(ValueError):
     """The caller's data or options cannot be used. The command line prints it as one line and exits with status 2."""
+
+
+def runs(numbers: Iterable[int], most: int = 8) -> str:
+    """Ascending numbers in words: `3-5, 9` of 3, 4, 5, 9, and how many runs there are beyond `most`."""
+    found: list[list[int]] = []
+    for number in numbers:
+        if found and number == found[-1][1] + 1:
+            found[-1][1] = number
+        else:
+            found.append([number, number])
+    words = ", ".join(f"{first}" if first == last else f"{first}-{last}" for first, last in found[:most])
+    return words + (f" and {len(found) - most} more places" if len(found) > most else "")
 
 
 def check_shape(spec: str, **arrays: Any) -> dict[str, int]:

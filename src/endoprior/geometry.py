@@ -53,6 +53,12 @@ def back_project(pixels: NDArray, depth: NDArray, camera: Camera) -> NDArray:
     return (in_camera - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
 
 
+def expected_depth(depth: NDArray, alpha: NDArray, min_alpha: float = 0.5) -> NDArray[np.float32]:
+    """(H, W) z of the surface that is drawn, mm: the sum of weight * z over alpha; 0 where alpha < `min_alpha`."""
+    shown = alpha >= min_alpha
+    return np.where(shown, depth / np.where(shown, alpha, 1), 0).astype(np.float32)
+
+
 def bilinear(image: NDArray, pixels: NDArray) -> NDArray:
     """Bilinear interpolation with values at pixel centers; the border value is held outside them.
 

@@ -213,6 +213,7 @@ class Trainer:
             frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
             prior_score=state.stats.score(self.cfg.density.unobserved_score),
             num_valid=state.stats.num_valid.clone(),
+            lengths_are_relative=self.sequence.depth_is_relative,
         )
 
 

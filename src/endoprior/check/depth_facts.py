@@ -82,7 +82,7 @@ def measure_depth(
         stored_bits(sequence.path / "depth"),
         float(cfg.depth_unit_mm or described.get("depth_scale") or 1.0),
         guess_unit((frame.depth, frame.depth_valid, frame.rgb_u8, mask) for frame, mask in looked_at),
-        bool(getattr(sequence, "depth_is_relative", False)),
+        sequence.depth_is_relative,
     )
 
 

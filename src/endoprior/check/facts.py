@@ -5,8 +5,6 @@ Shared letters: `T` frames, `H, W` image size. Cheap curves cover every frame; d
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence as ReadOnlyList
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 from ..checks import InputError
 from ..config import DataConfig
 from ..data import Sequence
+from ..data.description import read_description
 from ..footage.border import Circle, Strips, find_circle, find_strips
 from ..footage.camera_motion import CameraMotion, camera_motion
 from ..footage.changes import Changes, find_changes
@@ -131,7 +130,7 @@ def measure(sequence: Sequence, cfg: DataConfig | None = None) -> Facts:
         InputError: a file cannot be used.
     """
     count = len(sequence)
-    frames = _Frames(sequence)
+    frames = sequence.frames("video")
     few = [sequence.frame(int(i)) for i in spread(count, LOOKED_AT)]
     pictures = [frame.rgb_u8 for frame in few]
     polarity = mask_polarity([~frame.tissue_mask for frame in few], pictures)
@@ -139,7 +138,7 @@ def measure(sequence: Sequence, cfg: DataConfig | None = None) -> Facts:
     step = -(-count // FOLLOWED)
     followed = [sequence.frame(i) for i in range(0, count, step)]
     distance, turn = _camera_path([sequence.camera(i) for i in range(count)])
-    described = read_described(sequence.path)
+    described = read_description(sequence.path / "sequence.json")
     return Facts(
         path=sequence.path,
         frames=count,
@@ -148,7 +147,7 @@ def measure(sequence: Sequence, cfg: DataConfig | None = None) -> Facts:
         frames_per_second=sequence.frames_per_second,
         camera=sequence.camera(0),
         described=described,
-        sources=dict(getattr(sequence, "sources", {})),
+        sources=dict(sequence.sources),
         remarks=tuple(sequence.remarks),
         camera_path_mm=distance,
         camera_turn_deg=turn,
@@ -166,25 +165,6 @@ def measure(sequence: Sequence, cfg: DataConfig | None = None) -> Facts:
 def spread(count: int, wanted: int) -> list[int]:
     """At most `wanted` positions of 0..count-1, evenly spread, both ends included."""
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, wanted)).round()})
-
-
-def read_described(path: Path) -> dict[str, Any]:
-    """`sequence.json` of a folder; empty where there is none. The reader has already checked it."""
-    file = path / "sequence.json"
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-
-
-class _Frames(ReadOnlyList):
-    """All frames of a sequence, for loops."""
-
-    def __init__(self, sequence: Sequence) -> None:
-        self.sequence = sequence
-
-    def __len__(self) -> int:
-        return len(self.sequence)
-
-    def __getitem__(self, index: int) -> Frame:
-        return self.sequence.frame(index)
 
 
 def _camera_path(cameras: list[Camera]) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from ..checks import runs
 from ..footage.camera_motion import MOVING_FRACTION
 from .facts import Facts
 
@@ -153,8 +154,8 @@ def _set_scale(facts: Facts, factor: float | None) -> str:
 def _border(facts: Facts) -> Iterator[Finding]:
     border, camera = facts.border, facts.camera
     strips = border.strips
-    if border.strips_as_tissue > SEEN_AS_TISSUE and any(_sides(facts).values()):
-        sides = " and ".join(f"{size} px at the {name}" for name, size in _sides(facts).items() if size)
+    if border.strips_as_tissue > SEEN_AS_TISSUE and strips:
+        sides = " and ".join(f"{size} px at the {name}" for name, size in vars(strips).items() if size)
         what = f"a bar or console strip of {sides} counts as tissue"
         width = camera.width - strips.left - strips.right
         height = camera.height - strips.top - strips.bottom
@@ -167,11 +168,6 @@ def _border(facts: Facts) -> Iterator[Finding]:
         places = ", ".join(f"{width}x{height} px at {x}, {y}" for x, y, width, height in border.overlays[:3])
         what = f"burned-in writing counts as tissue: {places}{' and more' if len(border.overlays) > 3 else ''}"
         yield Finding("burned-in-text", "warning", what, "mark it in the masks; endoprior prepare does")
-
-
-def _sides(facts: Facts) -> dict[str, int]:
-    strips = facts.border.strips
-    return {"top": strips.top, "bottom": strips.bottom, "left": strips.left, "right": strips.right}
 
 
 def _motion(facts: Facts) -> Iterator[Finding]:
@@ -248,15 +244,7 @@ LOOKS: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
 
 def _frames(frames: tuple[int, ...]) -> str:
     """Frame numbers in words, at most six, runs shortened: `frames 3-7 and 9`."""
-    runs: list[list[int]] = []
-    for frame in frames:
-        if runs and frame == runs[-1][1] + 1:
-            runs[-1][1] = frame
-        else:
-            runs.append([frame, frame])
-    words = [f"{first}" if first == last else f"{first}-{last}" for first, last in runs]
-    more = f" and {len(words) - 6} more places" if len(words) > 6 else ""
-    return f"frame{'s' if len(frames) > 1 else ''} {', '.join(words[:6])}{more}"
+    return f"frame{'s' if len(frames) > 1 else ''} {runs(frames, 6)}"
 
 
 def _until(facts: Facts, first: int) -> str:

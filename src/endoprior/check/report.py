@@ -71,8 +71,7 @@ def _camera_words(facts: Facts) -> str:
 
 def _border_words(facts: Facts) -> str:
     strips, circle = facts.border.strips, facts.border.circle
-    sides = {name: getattr(strips, name) for name in ("top", "bottom", "left", "right")}
-    words = [f"strip of {size} px at the {name}" for name, size in sides.items() if size]
+    words = [f"strip of {size} px at the {name}" for name, size in vars(strips).items() if size]
     words += [f"round, radius {circle.radius:.0f} px"] if circle else []
     return ", ".join(words) or "none"
 

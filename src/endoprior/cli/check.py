@@ -20,7 +20,7 @@ class Check:
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
     """Sequence folder."""
-    out: Path | None = None
+    out: Path = Path("check.png")
     """PNG to draw."""
     json: Path | None = None
     """Also write facts and findings to this file."""
@@ -32,7 +32,7 @@ class Check:
 def run(argv: list[str]) -> int:
     """Measure, print, draw; the exit status."""
     args = parse(Check, argv, "check")
-    if args.out and args.out.suffix.lower() != ".png":
+    if args.out.suffix.lower() != ".png":
         raise InputError(f"--out: expected a .png file; got {args.out}. Rename it.")
     from ..atomic import write_json
     from ..check import draw_check, find, measure
@@ -51,7 +51,6 @@ def run(argv: list[str]) -> int:
         say("nothing suspicious")
     if args.json:
         write_json(args.json, as_json(facts, findings))
-    if args.out:
-        draw_check(sequence, facts, findings, args.out)
-        say(f"{args.out}")
+    draw_check(sequence, facts, findings, args.out)
+    say(f"{args.out}")
     return 2 if args.strict and any(finding.severity == "error" for finding in findings) else 0

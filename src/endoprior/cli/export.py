@@ -31,7 +31,10 @@ def run(argv: list[str]) -> None:
     from ..model.scene import load_scene
 
     options = ExportOptions(**{field.name: getattr(args, field.name) for field in fields(ExportOptions)})
+    scene = load_scene(args.run)
     with Counting() as progress:
-        written = export(load_scene(args.run), args.out, options, partial(progress, "exporting"))
+        written = export(scene, args.out, options, partial(progress, "exporting"))
     for path in written:
         say(f"{path}")
+    if scene.lengths_are_relative:
+        say("note: the scale of this scene was assumed: its mm are not mm")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .files import read_only_array
 from .images import complaint, decode_image, describe_pixels, single_channel
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
@@ -55,15 +55,8 @@ def read_values(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.f
 def _read_numpy(path: Path) -> NDArray:
     """The (H, W) array of an .npy file, or of an .npz file that holds nothing else; no pickles."""
     hint = "Write it again with numpy.save."
-    try:
-        with path.open("rb") as file:
-            stored = np.load(file, allow_pickle=False)
-            arrays = [stored] if isinstance(stored, np.ndarray) else [stored[name] for name in stored.files]
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise complaint(path, "a NumPy array", str(error).split("\n")[0], hint) from None
-    if len(arrays) != 1:
-        raise complaint(path, "one array", f"{len(arrays)}", hint)
-    array = arrays[0][..., 0] if arrays[0].ndim == 3 and arrays[0].shape[2] == 1 else arrays[0]
+    array = read_only_array(path, hint)
+    array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
     if array.ndim != 2:
         raise complaint(path, "an array of shape (H, W)", f"shape {array.shape}", hint)
     return array

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from ..config import DataConfig
 from ..types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .description import check_frames, intrinsics_of, read_description
-from .files import demand_count, list_files, unequal_names
+from .files import demand_count, list_files, read_numpy, unequal_names
 from .images import complaint, read_color, read_depth, read_tool_mask
 from .poses import demand_rotations, world_to_camera
 from .sequence import Sequence
@@ -104,11 +103,7 @@ def read_poses_bounds(path: Path, num_frames: int) -> NDArray[np.float64]:
     """
     if not path.exists():
         raise complaint(path, "camera poses", "no such file", STILL_HINT)
-    try:
-        with path.open("rb") as file:
-            stored = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise complaint(path, "a NumPy array", str(error).split("\n")[0], POSES_HINT) from None
+    stored = read_numpy(path, "a NumPy file", POSES_HINT)
     if not isinstance(stored, np.ndarray) or stored.shape != (num_frames, 17):
         raise complaint(path, f"shape ({num_frames}, 17)", str(getattr(stored, "shape", "an archive")), POSES_HINT)
     if not np.issubdtype(stored.dtype, np.number) or not np.isfinite(stored[:, :15].astype(np.float64)).all():

@@ -9,6 +9,7 @@ import json
 import re
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +77,31 @@ def read_json(path: Path, next_step: str = "Correct it or remove it.") -> dict[s
     if not isinstance(stored, dict):
         raise complaint(path, "a JSON object", type(stored).__name__, next_step)
     return stored
+
+
+def read_numpy(path: Path, expected: str, next_step: str) -> NDArray | dict[str, NDArray]:
+    """The array of an .npy file, or the named arrays of an .npz file; no pickles.
+
+    Raises:
+        InputError: unreadable, or not NumPy's; `expected` says what should be there.
+    """
+    try:
+        with path.open("rb") as file:
+            stored = np.load(file, allow_pickle=False)
+            return stored if isinstance(stored, np.ndarray) else {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        # NumPy takes every unknown file for a pickle, and recommends to load it unsafely.
+        found = "pickled objects or something else" if "allow_pickle" in str(error) else str(error).split("\n")[0]
+        raise complaint(path, expected, found, next_step) from None
+
+
+def read_only_array(path: Path, next_step: str) -> NDArray:
+    """The array of an .npy file, or the only one of an .npz file; otherwise as `read_numpy`."""
+    stored = read_numpy(path, "a NumPy file", next_step)
+    arrays = [stored] if isinstance(stored, np.ndarray) else list(stored.values())
+    if len(arrays) != 1:
+        raise complaint(path, "one array", f"{len(arrays)}", next_step)
+    return arrays[0]
 
 
 def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, int]) -> NDArray[np.float64]:

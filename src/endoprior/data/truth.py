@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .files import read_numpy
 from .images import complaint, read_color
+
+_FILE = ("a NumPy file", "Write the truth again.")
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Truth:
     def depth(self, index: int) -> NDArray[np.float32] | None:
         """(H, W) exact z of the tissue of frame `index`, tool ignored, mm."""
         path = self.folder / "depth" / f"{self._names[index]}.npy"
-        return np.asarray(_load(path), np.float32) if path.parent.is_dir() else None
+        return np.asarray(read_numpy(path, *_FILE), np.float32) if path.parent.is_dir() else None
 
     @cached_property
     def tracks(self) -> Tracks | None:
@@ -49,7 +51,7 @@ class Truth:
         path = self.folder / "tracks.npz"
         if not path.exists():
             return None
-        stored = _load(path)
+        stored = read_numpy(path, *_FILE)
         if not isinstance(stored, dict) or not {"points", "visible"} <= stored.keys():
             got = ", ".join(stored) if isinstance(stored, dict) else "one array"
             raise complaint(path, "arrays points and visible", got, "Write the truth again.")
@@ -61,13 +63,3 @@ class Truth:
             want = f"shapes (T, P, 3) and (T, P) with T = {len(self._names)}"
             raise complaint(path, want, got, "Write the truth again.")
         return tracks
-
-
-def _load(path: Path) -> NDArray | dict[str, NDArray]:
-    """The array of an .npy file or the named arrays of an .npz file; no pickles. A complaint names the file."""
-    try:
-        with path.open("rb") as file:
-            stored = np.load(file, allow_pickle=False)
-            return stored if isinstance(stored, np.ndarray) else {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise complaint(path, "a NumPy file", str(error).split("\n")[0], "Write the truth again.") from None

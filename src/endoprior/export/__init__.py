@@ -125,6 +125,7 @@ def _index(scene: Scene, written: list[dict], options: ExportOptions) -> dict:
     about = {"format": options.format, "axes": options.frame, "unit": "mm"}
     if options.format == "depth":
         about = {"format": "depth", "png_unit_mm": 0.01, "npy_unit_mm": 1.0, "missing": 0}
+    about |= {"lengths_are_relative": scene.lengths_are_relative}
     return about | {"frames_per_second": scene.frames_per_second, "moments": written}
 
 

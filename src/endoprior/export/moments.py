@@ -26,12 +26,7 @@ class Moment:
 
     def splats(self, scene: Scene, axes: Axes) -> Splats:
         """The Gaussians, activated, in `axes`."""
-        if self.time is None:
-            found = scene.gaussians.splats(None, scene.config.schedule.sh_degree)
-        else:
-            found = scene.at(self.time)
-        # What no deformation touches is the trained tensor itself, and tied to its gradient.
-        return turned(Splats(**{name: value.detach() for name, value in vars(found).items()}), axes)
+        return turned(scene.canonical() if self.time is None else scene.at(self.time), axes)
 
     def camera(self, scene: Scene) -> Camera:
         """The sequence's camera of this moment; the first one for the canonical state."""

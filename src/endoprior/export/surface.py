@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry import expected_depth
 from ..model.scene import Scene
 from ..types import Camera
 
@@ -26,8 +27,7 @@ def seen_surface(scene: Scene, time: float, camera: Camera, min_alpha: float) ->
     """Draw `scene` and divide depth and color by the accumulated opacity where that is at least `min_alpha`."""
     drawn = scene.render(time, camera)
     alpha = drawn.alpha.numpy()
-    shown = alpha >= min_alpha
-    share = np.where(shown, alpha, 1)
-    depth = np.where(shown, drawn.depth.numpy() / share, 0)
-    color = np.where(shown[..., None], drawn.color.numpy() / share[..., None], 0)
-    return Surface(depth.astype(np.float32), color.clip(0, 1).astype(np.float32), camera)
+    shown = alpha[..., None] >= min_alpha
+    color = np.where(shown, drawn.color.numpy() / np.where(shown, alpha[..., None], 1), 0)
+    depth = expected_depth(drawn.depth.numpy(), alpha, min_alpha)
+    return Surface(depth, color.clip(0, 1).astype(np.float32), camera)

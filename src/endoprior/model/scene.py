@@ -53,6 +53,8 @@ class Scene:
     """(N,) texture-prior score of each Gaussian."""
     num_valid: Tensor
     """(N,) projections that score was averaged over."""
+    lengths_are_relative: bool = False
+    """Whether the scale of the sequence's depth was assumed: then what is called mm is not mm."""
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -66,8 +68,17 @@ class Scene:
         """
         if not 0 <= time <= 1:
             raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
-        offsets = offsets_at(self.gaussians, self.field, time, self.config)
-        return self.gaussians.splats(offsets, self.config.schedule.sh_degree)
+        return self._splats(offsets_at(self.gaussians, self.field, time, self.config))
+
+    @torch.no_grad()
+    def canonical(self) -> Splats:
+        """The Gaussians as they are stored, before any motion, activated."""
+        return self._splats(None)
+
+    def _splats(self, offsets: Offsets | None) -> Splats:
+        found = self.gaussians.splats(offsets, self.config.schedule.sh_degree)
+        # What no deformation touches is the trained tensor itself, and tied to its gradient.
+        return Splats(**{name: value.detach() for name, value in vars(found).items()})
 
     @torch.no_grad()
     def render(self, time: float, camera: Camera | None = None) -> RenderOutput:
@@ -93,6 +104,7 @@ class Scene:
             arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
         first = self.cameras[0]
         about = {"config": to_dict(self.config), "frames_per_second": self.frames_per_second}
+        about |= {"lengths_are_relative": self.lengths_are_relative}
         about |= {"width": first.width, "height": first.height}
         save_arrays(path, arrays, about, FORMAT)
 
@@ -127,7 +139,8 @@ def _from_arrays(arrays: dict[str, Tensor], about: dict, where: str) -> Scene:
     cameras = tuple(
         Camera(about["width"], about["height"], *map(float, k), pose) for k, pose in zip(intrinsics, poses, strict=True)
     )
-    return Scene(gaussians, field, cfg, cameras, about["frames_per_second"], arrays["prior_score"], arrays["num_valid"])
+    rate, relative = about["frames_per_second"], bool(about.get("lengths_are_relative", False))
+    return Scene(gaussians, field, cfg, cameras, rate, arrays["prior_score"], arrays["num_valid"], relative)
 
 
 def _camera_arrays(cameras: tuple[Camera, ...]) -> tuple[NDArray, NDArray]:

@@ -94,15 +94,13 @@ def write_frames(
     *,
     keep_right: bool,
     on_frame: Callable[[int], None] = lambda count: None,
-) -> list[int]:
+) -> None:
     """Write every wanted shot that `files` does not have yet.
 
     Args:
         on_frame: called with the number of frames written after each.
-    Returns:
-        Indices in the source of the frames written now.
     """
-    done, written = files.count, []
+    done = files.count
     # Frames before the first one due are measured again, because their depth is compared with.
     for window in with_neighbors(develop(shots, view, makers, max(done - REACH, 0))):
         frame = window[len(window) // 2]
@@ -118,6 +116,4 @@ def write_frames(
             depth = np.where(view.inside, depth, np.float32(0))
         rgb_u8 = np.where(view.inside[..., None], frame.rgb_u8, np.uint8(0))
         files.add(rgb_u8, tools, depth, frame.right_u8 if keep_right else None)
-        written.append(frame.index)
         on_frame(files.count)
-    return written

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +33,9 @@ FITTED_SAMPLES = 16
 MAX_ROW_OFFSET_PX = 1.5
 """Rows of the two eyes further apart than this cannot be matched well."""
 NETWORK = "depth-anything"
-USER_FILES = "user's files"
 FEWEST_STEPS = 256
 """Depth with no more different values than this was stored in 8 bits."""
+DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[Developed], Depth]
 Shade = Callable[[NDArray[np.uint8], Mask], Depth]
 
@@ -63,9 +64,9 @@ def choose_makers(cfg: PrepareConfig, clip: Clip, survey: Survey) -> Chosen:
         right = None if shot.right is None else view.picture(shot.right, right=True)
         samples.append(Developed(0, shot.index, view.picture(shot.left), right, None))
     remarks = _look_at_eyes(samples, view, clip) if clip.stereo else []
-    kind = ("sgbm" if clip.stereo else "shading") if cfg.depth == "auto" else cfg.depth
-    relative = kind.startswith(("shading", NETWORK)) or cfg.depth_relative != "no"
-    measure, source = _measured_depth(kind, cfg, clip, survey) if kind not in ("none", "shading") else (None, kind)
+    kind = _depth_kind(cfg, clip)
+    relative = kind in ("shading", "network") or cfg.depth_relative != "no"
+    measure, source = (None, kind) if kind in ("none", "shading") else _measured_depth(kind, cfg, clip, survey)
     near = [measure(frame) for frame in samples] if measure and not relative and cfg.masks == "auto" else None
     tools, mask_source, said = _tools(cfg, survey, samples, near)
     shade: Shade | None = None
@@ -79,8 +80,8 @@ def choose_makers(cfg: PrepareConfig, clip: Clip, survey: Survey) -> Chosen:
             f"depth is relative ({source}), scaled to a median of {cfg.working_distance_mm:g} mm: "
             "its mm, and those of every score, are not mm"
         )
-    elif source == USER_FILES:
-        said += _doubts(samples, [measure(frame) for frame in samples], view, kind)
+    elif kind == "folder":
+        said += _doubts(samples, [measure(frame) for frame in samples], view, cfg.depth)
     wanted = _inside_body([frame.rgb_u8 for frame in samples]) if cfg.drop_out_of_body else lambda rgb_u8: True
     makers = Makers(measure, shade, tools, kind == "sgbm", wanted)
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
@@ -101,7 +102,24 @@ def _look_at_eyes(samples: list[Developed], view: View, clip: Clip) -> list[str]
     return []
 
 
-def _measured_depth(kind: str, cfg: PrepareConfig, clip: Clip, survey: Survey) -> tuple[Measure, str]:
+def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
+    """What --depth asks for.
+
+    Raises:
+        InputError: --depth-relative is given with anything but a folder.
+    """
+    if cfg.depth == "auto":
+        kind: DepthKind = "sgbm" if clip.stereo else "shading"
+    elif cfg.depth in ("none", "sgbm", "shading"):
+        kind = cfg.depth
+    else:
+        kind = "network" if cfg.depth.partition(":")[0] == NETWORK else "folder"
+    if cfg.depth_relative != "no" and kind != "folder":
+        raise complaint("--depth-relative", "a folder with --depth", cfg.depth, "Leave it out.")
+    return kind
+
+
+def _measured_depth(kind: DepthKind, cfg: PrepareConfig, clip: Clip, survey: Survey) -> tuple[Measure, str]:
     """What is measured on a frame without a mask (depth in mm, or a network's relative values), and its source."""
     view = survey.view
     if kind == "sgbm":
@@ -116,22 +134,22 @@ def _measured_depth(kind: str, cfg: PrepareConfig, clip: Clip, survey: Survey) -
             return stereo_depth(*pair, focal, baseline, cfg.stereo, view.center_shift_px).depth
 
         return match, "stereo: semi-global matching"
-    if kind == NETWORK or kind.startswith(NETWORK + ":"):
+    if kind == "network":
         from .depth_network import DEFAULT_MODEL, DepthNetwork
 
-        network = DepthNetwork(kind.partition(":")[2] or DEFAULT_MODEL)
+        network = DepthNetwork(cfg.depth.partition(":")[2] or DEFAULT_MODEL)
         return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2"
-    files = match_files(Path(kind), DEPTH_SUFFIXES, "depth", survey.indices)
+    files = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", survey.indices)
     if cfg.depth_relative == "no" and not cfg.depth_unit_mm:
         hint = "1 for mm, 0.01 for hundredths, 1000 for m; or --depth-relative depth or disparity."
-        raise complaint("--depth-unit-mm", f"mm per unit of the files in {kind}", "none", hint)
+        raise complaint("--depth-unit-mm", f"mm per unit of the files in {cfg.depth}", "none", hint)
 
     def read(path: Path, size: tuple[int, int]) -> NDArray:
         if cfg.depth_relative != "no":
             return read_values(path, size)
         return read_depth_file(path, cfg.depth_unit_mm, size)
 
-    return lambda frame: view.values(_of_either_size(read, files[frame.index], view)), USER_FILES
+    return lambda frame: view.values(_of_either_size(read, files[frame.index], view)), "user's files"
 
 
 def _scaled(measure: Measure, samples: list[Developed], usable: list[Mask], cfg: PrepareConfig) -> Measure:
@@ -145,9 +163,7 @@ def _doubts(samples: list[Developed], depths: list[Depth], view: View, folder: s
     """Refuse depth that no endoscope can have measured; remarks about depth that it hardly can."""
     guess = guess_unit((d, d > 0, f.rgb_u8, view.inside) for f, d in zip(samples, depths, strict=True))
     if guess.unit in ("m", "0.01 mm"):
-        hint = (
-            f"Is the unit right? Values as they are now look like {guess.unit}: multiply it by {guess.mm_per_unit:g}."
-        )
+        hint = f"Is the unit right? The values look like {guess.unit}: multiply it by {guess.mm_per_unit:g}."
         raise complaint("--depth-unit-mm", "tissue 20 to 250 mm away", f"{guess.median:g} mm in {folder}", hint)
     remarks = [] if guess.unit == "mm" else [f"is the depth's unit right? {guess.reason}"]
     if max(len(np.unique(depth)) for depth in depths) <= FEWEST_STEPS:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
-from zipfile import BadZipFile
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.files import read_only_array
 from ..data.images import PNG_SIGNATURE, complaint
 from ..footage.polarity import Polarity, mask_polarity
 
@@ -97,15 +97,7 @@ def _load_image(path: Path) -> NDArray:
 def _load_array(path: Path) -> NDArray:
     """(H, W) numbers; a stack of bool masks becomes their union."""
     hint = "Save one array of shape (height, width)."
-    try:
-        with path.open("rb") as file:
-            stored = np.load(file, allow_pickle=False)
-            arrays = [stored] if isinstance(stored, np.ndarray) else list(dict(stored).values())
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise complaint(path, "a NumPy file", str(error).split("\n")[0], hint) from None
-    if len(arrays) != 1:
-        raise complaint(path, "one array", f"{len(arrays)}", hint)
-    loaded = arrays[0]
+    loaded = read_only_array(path, hint)
     if loaded.dtype == bool and loaded.ndim == 3 and 1 not in loaded.shape:
         loaded = loaded.any(0)
     values = np.squeeze(loaded)

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ..checks import runs
 from ..data import write_stir_tracks
 from ..data.images import complaint, read_color, read_depth, read_tool_mask
 from ..data.writer import FrameFiles, SequenceMeta
@@ -54,7 +55,7 @@ def prepare(
         InputError: the video, or anything that the options name, cannot be used; nothing is left behind.
     """
     cfg = cfg or PrepareConfig()
-    named = [video, cfg.right, cfg.calibration, Path(cfg.masks), Path(cfg.depth), Path(cfg.poses)]
+    named = [video, cfg.right, cfg.calibration, cfg.stir, Path(cfg.masks), Path(cfg.depth), Path(cfg.poses)]
     plan = {"config": repr(cfg), "sources": [source_facts(path) for path in named if path and path.exists()]}
     with work_folder(out, plan) as folder:
         calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
@@ -86,7 +87,7 @@ def prepare(
             write_stir_tracks(cfg.stir, folder)
         remarks = [*survey.remarks, *chosen.remarks, *said]
         if len(unexplained):
-            which = f"{len(unexplained)} frames are not explained: {_ranges(unexplained)}"
+            which = f"not explained by the camera or by what the rest shows: frames {runs(unexplained)}"
             remarks.append(f"{which}; --start and --end leave them out, if they stand together")
     return Prepared(out, files.count, survey.view.size, remarks)
 
@@ -151,15 +152,3 @@ def _unexplained(path: PosePath | None, files: FrameFiles) -> list[int]:
     lost = set() if path is None else set(np.flatnonzero(~path.explained).tolist())
     changes = find_changes(read_color(files.file("images", i)) for i in range(files.count))
     return sorted(lost | set(changes.off_color))
-
-
-def _ranges(numbers: list[int]) -> str:
-    """`3-5, 9` of 3, 4, 5, 9; at most eight ranges."""
-    parts: list[list[int]] = []
-    for number in numbers:
-        if parts and number == parts[-1][-1] + 1:
-            parts[-1] = [parts[-1][0], number]
-        else:
-            parts.append([number])
-    shown = ", ".join("-".join(map(str, part)) for part in parts[:8])
-    return shown + (f" and {len(parts) - 8} more ranges" if len(parts) > 8 else "")

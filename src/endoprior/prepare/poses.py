@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.files import read_numpy
 from ..data.images import complaint
 from ..data.poses import demand_rotations
 
@@ -98,11 +98,7 @@ def read_poses(path: Path, count: int) -> PosePath:
         InputError: unreadable, another shape, not finite, or no rotations.
     """
     hint = "Write (T, 4, 4) camera-to-world matrices in mm, OpenCV axes."
-    try:
-        with path.open("rb") as file:
-            stored = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise complaint(path, "camera poses", str(error).split("\n")[0], hint) from None
+    stored = read_numpy(path, "camera poses", hint)
     shape = getattr(stored, "shape", None)
     if shape not in ((count, 4, 4), (count, 3, 4), (count, 17)):
         raise complaint(path, f"shape ({count}, 4, 4), one pose per frame", str(shape or "an archive"), hint)

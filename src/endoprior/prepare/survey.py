@@ -29,10 +29,6 @@ class Survey:
     samples: list[Shot]
     """At most `SAMPLES` of them, evenly spread."""
     view: View
-    strips: Strips | None
-    circle: Circle | None
-    labels: list[Rectangle]
-    """Burned-in labels that are painted over."""
     remarks: list[str] = field(default_factory=list)
     """What the user should know, one line each."""
 
@@ -84,7 +80,7 @@ def look_through(clip: Clip, cfg: PrepareConfig, calibration: Calibration | None
             f"no calibration: a field of view of {cfg.field_of_view_degrees:g} degrees is assumed "
             f"(f = {view.matrix[0, 0]:.0f} px); --calibration or --field-of-view-degrees corrects it"
         )
-    return Survey(indices, spread.kept, view, strips, circle, labels, remarks)
+    return Survey(indices, spread.kept, view, remarks)
 
 
 def _without(picture: NDArray[np.uint8], strips: Strips | None) -> NDArray[np.uint8]:

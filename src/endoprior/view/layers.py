@@ -27,11 +27,6 @@ def fitted(image: NDArray, camera: Camera) -> NDArray:
     return cv2.resize(image, (camera.width, camera.height), interpolation=how)
 
 
-def surface_depth(depth: NDArray, alpha: NDArray) -> NDArray[np.float32]:
-    """(H, W) expected z of what is drawn, mm: rendered depth over alpha; 0 where there is no surface."""
-    return np.where(alpha > SOLID_ALPHA, depth / np.maximum(alpha, 1e-6), 0).astype(np.float32)
-
-
 def depth_picture(depth: NDArray, span: tuple[float, float]) -> NDArray[np.uint8]:
     """Turbo colors from the nearest to the farthest depth of `span`, mm; black where there is none."""
     return colorize(depth, *span, depth > 0)

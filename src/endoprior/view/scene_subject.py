@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .. import render
 from ..data import Sequence
-from ..geometry import back_project, quaternion_to_matrix
+from ..geometry import back_project, expected_depth, quaternion_to_matrix
 from ..model.carry import carry_points
 from ..model.gaussians import SH_C0
 from ..model.playback import Playback
@@ -50,7 +50,7 @@ class SceneSubject:
             self.layers += ("frame", "difference")
         self.cameras = scene.cameras
         self.frames_per_second = scene.frames_per_second
-        self.relative = sequence is not None and sequence.depth_is_relative
+        self.relative = scene.lengths_are_relative
         self.has_tool = sequence is not None
         self._playback = Playback(scene)
         self._rasterize = render.load(scene.config.render.backend)
@@ -76,7 +76,7 @@ class SceneSubject:
         out = self._draw(look, camera, None if kind not in ("motion", "prior") else self._values(look))
         alpha = out.alpha.numpy()
         if kind == "depth":
-            return layers.depth_picture(layers.surface_depth(out.depth.numpy(), alpha), self.span)
+            return layers.depth_picture(expected_depth(out.depth.numpy(), alpha), self.span)
         if kind == "alpha":
             return layers.gray_picture(alpha)
         if kind in ("motion", "prior"):
@@ -89,7 +89,7 @@ class SceneSubject:
     def surface(self, look: Look, camera: Camera) -> NDArray[np.float32]:
         """See `Subject.surface`."""
         out = self._draw(look, camera)
-        return layers.surface_depth(out.depth.numpy(), out.alpha.numpy())
+        return expected_depth(out.depth.numpy(), out.alpha.numpy())
 
     @torch.no_grad()
     def _draw(self, look: Look, camera: Camera, values: Tensor | None = None) -> RenderOutput:
