@@ -1,4 +1,4 @@
-"""SPZ version 2: a gzipped header and one block per attribute, about a tenth of the PLY.
+"""SPZ version 2: a gzipped header and one block per attribute, several times smaller than the PLY.
 
 Source: https://github.com/nianticlabs/spz. Coordinates are right, up, back (OpenGL).
 """
