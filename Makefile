@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test lint browser bench figures clean
+.PHONY: demo test test-faults lint browser bench figures clean
 
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
@@ -14,9 +14,13 @@ demo: $(VENV)/.installed
 test: $(VENV)/.test-installed lint browser
 	$(BIN)/python -m pytest
 
+# Kills, full disks, little memory, hostile input, long and large sequences: docs/reliability.md.
+test-faults: $(VENV)/.test-installed
+	$(BIN)/python faults/run.py $(FAULTS)
+
 lint: $(VENV)/.test-installed
-	$(BIN)/ruff check src tests bench
-	$(BIN)/ruff format --check src tests bench
+	$(BIN)/ruff check src tests bench faults
+	$(BIN)/ruff format --check src tests bench faults
 
 # The viewer and the player are tested in headless Chromium. Where there is none, Debian's package is installed if that is
 # possible without asking; otherwise those tests are skipped, and say so.

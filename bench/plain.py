@@ -221,6 +221,10 @@ class Adam:
     def __init__(self, parameters: list[Tensor], epsilon: float) -> None:
         self.adam = torch.optim.Adam(parameters, lr=1e-4, eps=epsilon)
 
+    def count_unusable(self) -> dict[str, int]:
+        """Plain torch looks at no gradient before it applies it."""
+        return {}
+
     def step(self, iteration: int = 0) -> None:
         """Apply the gradients and clear them."""
         self.adam.step()

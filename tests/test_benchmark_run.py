@@ -211,7 +211,7 @@ def test_two_benchmarks_do_not_share_a_folder(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--threads", "0"], "at least 1 thread"),
+        (["--threads", "0"], "--threads: expected 1 to 4096"),
         (["--data", "tiny"], "NAME=FOLDER"),
         (["--data", "x=y"], "no such sequence"),
         (["--weights-dir", "nowhere"], "expected a folder with weights"),

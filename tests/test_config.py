@@ -46,7 +46,8 @@ def test_missing_fields_keep_their_defaults():
         ({"deformation": {"hexplane": {"multires": [1, "2"]}}}, "config.deformation.hexplane.multires[1]"),
         ({"deformation": {"hexplane": {"resolution": [1, 2]}}}, "config.deformation.hexplane.resolution"),
         ({"init": {"budget": 0}}, "config.init"),
-        ({"density": {"min_densify_weight": float("nan")}}, "config.density"),
+        ({"density": {"min_densify_weight": float("nan")}}, "config.density.min_densify_weight"),
+        ({"density": {"min_densify_weight": 2}}, "config.density"),
         ([], "config"),
     ],
 )

@@ -101,8 +101,16 @@ AT_LOAD = {
     "focal zero": (without_fx(pose_entry(0, 14, 0)), "poses_bounds.npy", "focal length > 0"),
     "description broken": (lambda f: (f / "sequence.json").write_text("{"), "sequence.json", "a JSON object"),
     "description a list": (lambda f: (f / "sequence.json").write_text("[1]"), "sequence.json", "got list"),
-    "description fx": (lambda f: describe(f, fx="586"), "sequence.json", "fx to be a number > 0; got '586'"),
-    "description scale": (lambda f: describe(f, depth_scale=0), "sequence.json", "depth_scale to be a number > 0"),
+    "description fx": (
+        lambda f: describe(f, fx="586"),
+        "sequence.json",
+        "fx to be a number in [1e-06",
+    ),
+    "description scale": (
+        lambda f: describe(f, depth_scale=0),
+        "sequence.json",
+        "depth_scale to be a number in [",
+    ),
     "description unit": (lambda f: describe(f, depth_unit="m"), "sequence.json", "depth_unit mm; got 'm'"),
     "description polarity": (lambda f: describe(f, mask_tool_value=1), "sequence.json", "mask_tool_value 255 or 0"),
     "description size": (lambda f: describe(f, width=640), "sequence.json", "size 48x40; got 640x40"),

@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from endoprior.checks import InputError
 from endoprior.config import HexPlaneConfig
 from endoprior.model import hexplane_lookup
 from endoprior.model.hexplane import PLANE_NAMES, PlaneGrid, mapped_zeros
-from endoprior.model.hexplane_kernels import FRESH, TOUCHED
+from endoprior.model.hexplane_kernels import FRESH, MAX_CHANNELS, TOUCHED
 from endoprior.model.plane_adam import PlaneAdam, plane_adam_step
 
 SMALL = HexPlaneConfig(resolution=(5, 4, 6), time_resolution=7, channels=20, multires=(1, 3))
@@ -368,11 +367,19 @@ def test_adam_state_resumes_bit_for_bit() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"channels": 0}, {"channels": 257}, {"multires": ()}, {"time_resolution": 1}, {"resolution": (1, 4, 4)}]
+    "change",
+    [
+        {"channels": 0},
+        {"channels": MAX_CHANNELS + 1},
+        {"multires": ()},
+        {"time_resolution": 1},
+        {"resolution": (1, 4, 4)},
+        {"resolution": (2000, 2000, 2000)},  # of which there would be 64 GB
+    ],
 )
 def test_impossible_grids_are_refused(change: dict) -> None:
-    with pytest.raises(InputError, match="expected"):
-        PlaneGrid(HexPlaneConfig(**change))
+    with pytest.raises(ValueError, match="must be in"):
+        HexPlaneConfig(**change)
 
 
 def test_bad_calls_are_refused() -> None:

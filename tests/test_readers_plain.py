@@ -117,7 +117,7 @@ BAD = {
         "cannot be decoded",
     ),
     "size": (describe(width=31, height=20), "sequence.json", "size 30x20; got 31x20"),
-    "fx": (describe(fx=-1), "sequence.json", "fx to be a number > 0"),
+    "fx": (describe(fx=-1), "sequence.json", "fx to be a number in [1e-06, 1e+06]"),
     "relative": (describe(depth_relative=1), "sequence.json", "depth_relative true or false; got 1"),
     "sources": (describe(sources={"depth": 1}), "sequence.json", "sources to map names to texts"),
     "sources list": (describe(sources=["a"]), "sequence.json", "sources to map names to texts"),

@@ -11,15 +11,16 @@ SRC = Path(__file__).parents[1] / "src" / "endoprior"
 FILES = sorted(SRC.rglob("*.py"))
 
 LAYERS = [
-    {"checks", "types", "lane_types", "morton", "density_kernels"},
+    {"checks", "types", "lane_types", "morton", "memory", "density_kernels"},
     {"simd", "float64_lanes"},
     {"config", "atomic", "adam_kernels", "neighbor_kernels", "temporal_kernels"},
-    {"config_io", "presets", "arrays_file", "geometry"},
+    {"config_io", "presets", "arrays_file", "geometry", "divergence"},
     {"data", "priors", "render", "losses", "loss_kernels", "temporal", "metrics", "footage"},
     {"phantom", "model", "density"},
     {"optim", "training_frames", "truth_scores"},
     {"train_state", "evaluate", "show"},
-    {"trainer", "export"},
+    {"trainer", "training_memory", "export"},
+    {"run_identity"},
     {"checkpoint"},
     {"run_folder"},
     {"train"},

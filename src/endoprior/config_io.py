@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 import types
 import typing
 from typing import Any, TypeVar
@@ -10,6 +12,7 @@ from typing import Any, TypeVar
 from .checks import InputError
 
 C = TypeVar("C")
+_hints = functools.cache(typing.get_type_hints)
 
 
 def to_dict(cfg: Any) -> Any:
@@ -24,6 +27,8 @@ def to_dict(cfg: Any) -> Any:
 def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     """Build a config dataclass from a nested dict; unknown fields and wrong types are refused, missing ones default.
 
+    Numbers must be finite: JSON as Python reads it has NaN and infinity.
+
     Raises:
         InputError: naming the field, what was expected and what was found.
     """
@@ -31,10 +36,11 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
         raise InputError(
             f"{where}: expected an object of fields; got {type(values).__name__}. Use a file this program wrote."
         )
-    hints = typing.get_type_hints(cls)
-    unknown = sorted(set(values) - set(hints))
+    hints = _hints(cls)
+    unknown = sorted(map(str, set(values) - set(hints)))
     if unknown:
-        raise InputError(f"{where}.{unknown[0]}: no such field. Fields: {', '.join(hints)}.")
+        name = unknown[0] if unknown[0].isidentifier() else repr(unknown[0])
+        raise InputError(f"{where}.{name[:80]}: no such field. Fields: {', '.join(hints)}.")
     built = {name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()}
     try:
         return cls(**built)
@@ -62,11 +68,28 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     elif origin is types.UnionType and any(map(dataclasses.is_dataclass, args)):
         return None if value is None else _value(next(filter(dataclasses.is_dataclass, args)), value, where)
     elif origin is types.UnionType:
-        ok, want = value is None or any(type(value) is a for a in args), str(hint)
+        ok, want = value is None or (any(type(value) is a for a in args) and _is_usable(value)), str(hint)
     elif hint is float:
-        ok, want = type(value) in (int, float), "a number"
+        ok, want = type(value) in (int, float) and _is_usable(value), "a finite number"
+    elif hint is int:
+        ok, want = type(value) is int and _is_usable(value), "an integer below 2^63"
     else:
         ok, want = type(value) is hint, hint.__name__
     if not ok:
-        raise InputError(f"{where}: expected {want}; got {value!r}. Correct the value.")
+        raise InputError(f"{where}: expected {want}; got {_shown(value)}. Correct the value.")
     return value
+
+
+def _is_usable(value: Any) -> bool:
+    """Whether arithmetic can go on with it, if it is a number."""
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return not isinstance(value, int) or abs(value) < 2**63
+
+
+def _shown(value: Any) -> str:
+    """A value in a message: one line, not too long, however it was nested."""
+    if isinstance(value, dict | list | tuple):
+        return f"{type(value).__name__} of {len(value)}"
+    text = "a larger one" if isinstance(value, int) and not _is_usable(value) else repr(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."

@@ -153,10 +153,10 @@ def scene_extent(camera_centers: Tensor, points: Tensor, cfg: DensityConfig) -> 
     """Length that separates small from large Gaussians, mm.
 
     `camera`: 1.1 times the radius of the camera centers, as 3DGS has it; 0 for a still camera, so nothing is cloned.
-    `scene`: 1.1 times the largest distance of a point from the points' centroid.
+    `scene`: 1.1 times the largest distance of a point from the points' centroid; 0 without points.
 
     Args:
         camera_centers: (T, 3). points: (N, 3).
     """
     cloud = camera_centers if cfg.extent_mode == "camera" else points
-    return 1.1 * float((cloud - cloud.mean(0)).norm(dim=-1).max())
+    return 1.1 * float((cloud - cloud.mean(0)).norm(dim=-1).max()) if len(cloud) else 0.0

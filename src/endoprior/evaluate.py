@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable
+from collections.abc import Sequence as ReadOnlyList
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,6 +22,7 @@ from .atomic import write_json
 from .checks import InputError
 from .config import DataConfig
 from .data import Sequence
+from .memory import BoundedCache, cache_bytes
 from .metrics import ScoreUnavailable
 from .model.playback import Playback
 from .model.scene import Scene
@@ -33,6 +35,8 @@ LOW_PRIOR, LOW_PRIOR_OBSERVATIONS, LOW_OPACITY, LARGE_SCALE_MM = 0.2, 20, 0.01, 
 BAD_FRAME_DB = 3.0
 """A frame this far below the median PSNR of its split was not explained: something happened there."""
 FPS_WARM_UP, FPS_RENDERS = 10, 60
+EXACT = "infinite: the frames that count equal the truth to the last bit"
+"""Why there is no PSNR where every frame is drawn without any error, black ones for example."""
 
 
 @dataclass
@@ -63,6 +67,21 @@ class Evaluation:
         write_json(folder / "per_frame.json", self.per_frame)
 
 
+class Drawn:
+    """Frames as the scene shows them, by index: drawn when first asked for, kept as memory allows."""
+
+    def __init__(self, scene: Scene, sequence: Sequence, split: Split) -> None:
+        self._scene, self._sequence = scene, sequence
+        self._scored = set(sequence.indices(split))
+        self._kept: BoundedCache[Rendered] = BoundedCache(cache_bytes(), lambda rendered: rendered.nbytes)
+
+    def __getitem__(self, index: int) -> Rendered:
+        def draw() -> Rendered:
+            return _draw(self._scene, self._sequence.frame(index), index in self._scored)
+
+        return self._kept.get(index, draw)
+
+
 @dataclass(frozen=True)
 class Rendered:
     """One frame as the scene shows it."""
@@ -73,6 +92,11 @@ class Rendered:
     """(H, W, 3): the protocol scores 8-bit images, as the released code does."""
     depth: NDArray[np.float32]
     """(H, W) sum of weight * z, mm."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory it takes."""
+        return sum(array.nbytes for array in (self.color, self.rgb_u8, self.depth) if array is not None)
 
 
 def evaluate(
@@ -99,9 +123,7 @@ def evaluate(
         )
     result = Evaluation(_protocol(sequence, split, scene.config.data))
     progress("drawing")
-    scored = set(sequence.indices(split))
-    drawn = {frame.index: _draw(scene, frame, frame.index in scored) for frame in sequence.frames("video")}
-    frames = list(sequence.frames(split))
+    drawn, frames = Drawn(scene, sequence, split), sequence.frames(split)
     progress("images and depth")
     _image_scores(result, frames, drawn)
     progress("flow")
@@ -153,7 +175,8 @@ def _draw(scene: Scene, frame: Frame, scored: bool) -> Rendered:
     return Rendered(np.clip(color, 0, 1) if scored else None, metrics.to_uint8(color), out.depth.numpy())
 
 
-def _image_scores(result: Evaluation, frames: list[Frame], drawn: dict[int, Rendered]) -> None:
+def _image_scores(result: Evaluation, frames: ReadOnlyList[Frame], drawn: Drawn) -> None:
+    rows = []
     for frame in frames:
         image, target = drawn[frame.index].rgb_u8 / np.float32(255), frame.rgb
         mask = frame.tissue_mask
@@ -166,18 +189,19 @@ def _image_scores(result: Evaluation, frames: list[Frame], drawn: dict[int, Rend
             "strict_psnr": metrics.psnr_tissue(drawn[frame.index].color, target, mask),
             "strict_ssim": metrics.ssim_tissue(drawn[frame.index].color, target, mask),
         }
+        rows.append(row)
         result.per_frame.append({"index": frame.index, "time": frame.time} | _finite(row))
-    for name in row:
-        mean = metrics.mean_over_frames([row.get(name, math.nan) for row in result.per_frame])
+    for name in rows[0]:
+        values = [row[name] for row in rows]
         reason = "no tissue with measured depth" if name.startswith("depth") else "no tissue in the split"
-        result.add(name, mean, reason)
+        result.add(name, metrics.mean_over_frames(values), EXACT if math.inf in values else reason)
 
 
 def _flow_scores(
     result: Evaluation,
     sequence: Sequence,
-    frames: list[Frame],
-    drawn: dict[int, Rendered],
+    frames: ReadOnlyList[Frame],
+    drawn: Drawn,
     networks: bool,
     weights_dir: Path | None,
 ) -> None:
@@ -195,23 +219,23 @@ def _flow_scores(
             continue
         result.add(name, metrics.mean_over_frames(values), "no two consecutive frames share tissue")
     try:
-        values = _flow_errors(list(sequence.frames("video")), drawn, metrics.dis_flow())
+        values = _flow_errors(sequence.frames("video"), drawn, metrics.dis_flow())
         result.add("flow_error_dis_adjacent", metrics.mean_over_frames(values), "no two adjacent frames share tissue")
     except ScoreUnavailable as reason:
         result.skipped["flow_error_dis_adjacent"] = str(reason)
 
 
-def _flow_errors(frames: list[Frame], drawn: dict[int, Rendered], estimator: metrics.FlowEstimator) -> NDArray:
-    return metrics.flow_error(
-        [drawn[frame.index].rgb_u8 for frame in frames],
-        [frame.rgb_u8 for frame in frames],
-        [frame.tissue_mask for frame in frames],
-        estimator,
-    )
+def _flow_errors(frames: ReadOnlyList[Frame], drawn: Drawn, estimator: metrics.FlowEstimator) -> list[float]:
+    """One error for each pair of neighbors; two frames at a time, so that a long film needs no more memory."""
+    errors = []
+    for pair in pairwise(frames):
+        shown, true = [drawn[frame.index].rgb_u8 for frame in pair], [frame.rgb_u8 for frame in pair]
+        errors += list(metrics.flow_error(shown, true, [frame.tissue_mask for frame in pair], estimator))
+    return errors
 
 
 def _lpips_scores(
-    result: Evaluation, frames: list[Frame], drawn: dict[int, Rendered], networks: bool, weights_dir: Path | None
+    result: Evaluation, frames: ReadOnlyList[Frame], drawn: Drawn, networks: bool, weights_dir: Path | None
 ) -> None:
     if not networks:
         result.skipped["lpips"] = "network scores were not asked for"
@@ -226,8 +250,8 @@ def _lpips_scores(
         result.add(name, metrics.mean_over_frames(values), "no tissue in the split")
 
 
-def _depth_instability(result: Evaluation, sequence: Sequence, drawn: dict[int, Rendered]) -> None:
-    frames = list(sequence.frames("video"))
+def _depth_instability(result: Evaluation, sequence: Sequence, drawn: Drawn) -> None:
+    frames = sequence.frames("video")
     values = [
         metrics.depth_instability(drawn[a.index].depth, drawn[b.index].depth, a.tissue_mask, b.tissue_mask)
         for a, b in pairwise(frames)
@@ -246,7 +270,7 @@ def _primitive_counts(result: Evaluation, scene: Scene) -> None:
 
 
 def _truth_scores(
-    result: Evaluation, scene: Scene, sequence: Sequence, frames: list[Frame], drawn: dict[int, Rendered]
+    result: Evaluation, scene: Scene, sequence: Sequence, frames: ReadOnlyList[Frame], drawn: Drawn
 ) -> None:
     truth = sequence.truth
     color, depth = [], []
@@ -257,7 +281,8 @@ def _truth_scores(
             color.append(metrics.psnr_behind_tool(image, tissue / np.float32(255), frame.tissue_mask))
         if exact is not None:
             depth.append(metrics.depth_rmse(drawn[frame.index].depth, exact, ~frame.tissue_mask & (exact > 0)))
-    result.add("psnr_behind_tool", metrics.mean_over_frames(color), "no true picture behind the tool")
+    reason = EXACT if math.inf in color else "no true picture behind the tool"
+    result.add("psnr_behind_tool", metrics.mean_over_frames(color), reason)
     result.add("depth_rmse_behind_tool_mm", metrics.mean_over_frames(depth), "no true depth behind the tool")
     if sequence.truth.tracks and not sequence.truth.tracks.paired:
         result.add("track_end_error_mm", track_end_error_mm(scene, sequence), "no point has depth at start and end")

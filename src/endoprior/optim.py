@@ -12,10 +12,12 @@ from torch import Tensor
 from .adam_kernels import adam_flat, adam_outer
 from .config import Config, OptimConfig
 from .density import DensityStats, Plan
+from .divergence import ADVICE, Diverged, count_unusable, count_unusable_rows
 from .geometry import quaternion_to_matrix
 from .model.basis import RankOneGradient, motion_layout
 from .model.deformation import HexPlaneField
 from .model.gaussians import Gaussians
+from .model.hexplane_kernels import FRESH
 from .model.plane_adam import PlaneAdam
 from .morton import morton_order
 
@@ -114,14 +116,33 @@ class Optimizer:
                 self.plane_adam.step(planes)
         self.clear_gradients()
 
+    def count_unusable(self) -> dict[str, int]:
+        """How many entries of each gradient `step` must not be given: not finite, or too large to be squared."""
+        found = {name: value.grad for name, value in self.gaussians.tensors.items()}
+        moments = self.gaussians.motion_gradients
+        found |= {f"motion, moment {i}": torch.from_numpy(moment.v_offsets) for i, moment in enumerate(moments)}
+        if self.field is not None:
+            found |= {name: value.grad for name, value in _field_parameters(self.field).items()}
+        counts = {name: count_unusable(grad) for name, grad in found.items() if grad is not None}
+        if self.field is not None:
+            grid = self.field.grid
+            counts["planes"] = count_unusable_rows(grid.grads, grid.marks, FRESH)
+        return counts
+
     def clear_gradients(self) -> None:
-        """Drop every gradient."""
+        """Drop every gradient but those of the planes, which their own step clears."""
         for param in self.gaussians.tensors.values():
             param.grad = None
         self.gaussians.motion_gradients.clear()
         if self.field is not None:
             for param in _field_parameters(self.field).values():
                 param.grad = None
+
+    def drop_gradients(self) -> None:
+        """Drop every gradient of an iteration that is not to be applied, those of the planes included."""
+        self.clear_gradients()
+        if self.field is not None:
+            self.field.grid.clear_grads()
 
     def _rate(self, name: str, decay: dict) -> float:
         optim = self.cfg.optim
@@ -143,10 +164,14 @@ class Optimizer:
 
         Returns:
             The statistics of the new set.
+        Raises:
+            Diverged: a new Gaussian would not be finite; nothing was changed.
         """
         tensors = self.gaussians.tensors
         children = split_children(self.gaussians, plan.split, self.cfg.density.split_shrink, rng)
         added = {name: torch.cat([value.detach()[plan.clone], children[name]]) for name, value in tensors.items()}
+        if not all(bool(value.isfinite().all()) for value in added.values()):
+            raise Diverged(f"expected Gaussians of a finite size to split; got others. {ADVICE}")
         staying = (~(plan.remove | plan.split)).nonzero()[:, 0]
         rows = torch.cat([staying, len(plan.split) + torch.arange(len(added["means"]))])
         means = torch.cat([tensors["means"].detach(), added["means"]])[rows]

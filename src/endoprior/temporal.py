@@ -31,7 +31,8 @@ def motion_weight(score: NDArray, threshold: float, temperature: float) -> NDArr
     Returns:
         (N,) in (0, 1).
     """
-    return 1 / (1 + np.exp(-(score - threshold) / temperature))
+    with np.errstate(over="ignore"):  # 1 / infinity is the right weight of a score far below the threshold
+        return 1 / (1 + np.exp(-(score - threshold) / temperature))
 
 
 def effective_size(weights: NDArray) -> float:

@@ -8,9 +8,10 @@ from pathlib import Path
 from .config import Config
 from .data import Sequence
 from .model.scene import Scene
-from .run_folder import train_in_folder
+from .run_folder import CHECKPOINT_SECONDS, RunOptions, train_in_folder
 from .train_state import StepReport
 from .trainer import Trainer
+from .training_memory import refuse_too_large
 
 
 def train(
@@ -19,6 +20,7 @@ def train(
     out: str | Path | None = None,
     *,
     resume: bool = False,
+    checkpoint_seconds: float = CHECKPOINT_SECONDS,
     on_step: Callable[[StepReport, Trainer], None] | None = None,
 ) -> Scene:
     """Train one scene.
@@ -27,16 +29,20 @@ def train(
         sequence: from `load_sequence`.
         cfg: from `preset`.
         out: run folder for config, log, checkpoints and `scene.safetensors`; None keeps everything in memory.
-        resume: continue from the checkpoint in `out`.
+        resume: continue the run in `out`, from its last checkpoint if there is one.
+        checkpoint_seconds: time between two checkpoints.
         on_step: called after each iteration.
     Raises:
-        InputError: the sequence cannot be used, or `out` holds another run.
+        InputError: the sequence cannot be used, needs more memory than there is, or `out` holds another run.
+        Diverged: the loss or a gradient is not finite, or the pictures show nothing; `out` keeps the state before.
+        CannotWrite: the disk does not take what is written; the last whole state is kept.
         KeyboardInterrupt: the user stopped; a checkpoint has been written.
     """
+    refuse_too_large(sequence, cfg)
     sequence.validate()
     trainer = Trainer(sequence, cfg)
     if out is not None:
-        return train_in_folder(trainer, Path(out), resume=resume, on_step=on_step)
+        return train_in_folder(trainer, Path(out), RunOptions(resume, checkpoint_seconds), on_step=on_step)
     trainer.start()
     while not trainer.finished:
         report = trainer.step()

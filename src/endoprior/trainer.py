@@ -13,16 +13,18 @@ import torch
 from torch import Tensor
 
 from . import density, render, temporal
+from .checks import InputError
 from .config import Config
 from .data import Sequence
 from .density import DensityStats
+from .divergence import ADVICE, Diverged, Watch, check_step
 from .geometry import project
 from .loss_kernels import supervised_losses
 from .model.basis import motion_layout
 from .model.deformation import HexPlaneField, Offsets
 from .model.gaussians import Gaussians, create_gaussians
 from .model.initialize import initial_log_scales, initial_points
-from .model.scene import Scene, offsets_at
+from .model.scene import Scene, check_cameras, offsets_at
 from .model.tracks import initial_motion
 from .morton import morton_order
 from .optim import Optimizer
@@ -43,8 +45,13 @@ class Trainer:
         self.rasterize = render.load(cfg.render.backend)
         self.background = torch.zeros(3)
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
+        try:
+            check_cameras(self.cameras)
+        except InputError as error:
+            raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
         self.spatial_scale = spatial_scale(self.camera_centers, cfg)
         self.state: TrainState | None = None
+        self._watch = Watch()
 
     @property
     def camera_centers(self) -> Tensor:
@@ -84,7 +91,12 @@ class Trainer:
         return state.stage is Stage.FINE and state.iteration >= self.stage_length(Stage.FINE)
 
     def step(self) -> StepReport:
-        """One iteration: draw, compare, differentiate, grow or prune, update."""
+        """One iteration: draw, compare, differentiate, grow or prune, update.
+
+        Raises:
+            Diverged: the loss or a gradient is not finite, the pictures show nothing, or no Gaussian is left. Nothing
+                infinite has reached the state.
+        """
         began = clock.perf_counter()
         state = self.state
         if state.stage is Stage.COARSE and state.iteration >= self.stage_length(Stage.COARSE):
@@ -113,6 +125,13 @@ class Trainer:
         if before_frame is not None:
             terms |= self._temporal_terms(splats.means, means_before, out, frame, before_frame)
         sum(terms.values()).backward()
+        told = {name: float(value.detach()) for name, value in terms.items()}
+        try:
+            check_step(told, state.optimizer.count_unusable())
+            self._watch.see(told["color"], frame.brightness)
+        except Diverged:
+            state.optimizer.drop_gradients()
+            raise
 
         with torch.no_grad():
             self._observe(out, position, frame, iteration)
@@ -121,8 +140,7 @@ class Trainer:
             if density.due(iteration, last, cfg.density):
                 self._control_density(rng)
         state.iteration = iteration
-        report = {name: float(value.detach()) for name, value in terms.items()}
-        return StepReport(state.stage, iteration, report, len(state.gaussians), clock.perf_counter() - began)
+        return StepReport(state.stage, iteration, told, len(state.gaussians), clock.perf_counter() - began)
 
     def _sh_degree(self, iteration: int) -> int:
         """Degree in use: +1 per `sh_every` iterations of each stage, never falling back (method of 3DGS)."""
@@ -200,6 +218,8 @@ class Trainer:
         state, cfg = self.state, self.cfg.density
         extent = density.scene_extent(self.camera_centers, state.gaussians["means"], cfg)
         planned = density.plan(state.stats, state.gaussians.scales, state.gaussians.opacities, extent, cfg)
+        if bool(planned.remove.all()):
+            raise Diverged(f"expected Gaussians that explain the frames; all {len(planned.remove):,} faded. {ADVICE}")
         state.stats = state.optimizer.apply_plan(planned, state.stats, rng)
 
     def scene(self) -> Scene:

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from .config import PriorConfig
 from .data import Sequence, shrunk
+from .memory import BoundedCache, cache_bytes
+from .model.initialize import has_surface
 from .priors import joint_texture_prior
 from .types import Camera, Frame
 
@@ -29,6 +31,8 @@ class TrainingFrame:
     """(H, W) 1 / mm; 0 where there is no depth."""
     measured: Tensor
     """(H, W) bool, True where tissue has a depth."""
+    brightness: float
+    """Mean color over tissue, in [0, 1]; 0 without tissue."""
 
     @property
     def rgb(self) -> Tensor:
@@ -37,25 +41,25 @@ class TrainingFrame:
 
 
 class TrainingFrames:
-    """Training frames of a sequence by position; built when first used and kept."""
+    """Training frames of a sequence by position; built when first used, kept as memory allows."""
 
     def __init__(self, sequence: Sequence, prior_cfg: PriorConfig) -> None:
         self.sequence = sequence
         self.indices = sequence.indices("train")
         self._prior_cfg = prior_cfg
-        self._frames: dict[tuple[int, bool], TrainingFrame] = {}
-        self._priors: dict[int, Tensor] = {}
+        self._frames: BoundedCache[TrainingFrame] = BoundedCache(cache_bytes(), _frame_bytes)
+        self._priors: BoundedCache[Tensor] = BoundedCache(cache_bytes() // 4, lambda prior: prior.nbytes)
 
     def __len__(self) -> int:
         return len(self.indices)
 
     def frame(self, position: int, *, half: bool = False) -> TrainingFrame:
         """Training frame number `position`, at full or at half width and height."""
-        key = (position, half)
-        if key not in self._frames:
-            frame = self.sequence.frame(self.indices[position])
-            self._frames[key] = _training_frame(shrunk(frame, 2 if half else 1))
-        return self._frames[key]
+
+        def build() -> TrainingFrame:
+            return _training_frame(shrunk(self.sequence.frame(self.indices[position]), 2 if half else 1))
+
+        return self._frames.get((position, half), build)
 
     def before(self, position: int) -> TrainingFrame | None:
         """The frame just before in the sequence if it is itself a training frame (released code), else None."""
@@ -65,17 +69,17 @@ class TrainingFrames:
 
     def prior(self, position: int) -> tuple[Tensor, Tensor]:
         """rho (H, W) in [0, 1] and the tissue mask (H, W) bool, at full resolution."""
-        if position not in self._priors:
+
+        def build() -> Tensor:
             frame = self.sequence.frame(self.indices[position])
-            self._priors[position] = torch.from_numpy(
-                joint_texture_prior(frame.rgb, frame.tissue_mask, self._prior_cfg)
-            )
-        return self._priors[position], self.frame(position).tissue_mask
+            return torch.from_numpy(joint_texture_prior(frame.rgb, frame.tissue_mask, self._prior_cfg))
+
+        return self._priors.get(position, build), self.frame(position).tissue_mask
 
 
 def _training_frame(frame: Frame) -> TrainingFrame:
-    depth = frame.depth
-    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+    depth, usable = frame.depth, has_surface(frame)
+    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=usable)
     return TrainingFrame(
         index=frame.index,
         time=frame.time,
@@ -83,5 +87,10 @@ def _training_frame(frame: Frame) -> TrainingFrame:
         rgb_u8=torch.from_numpy(frame.rgb_u8),
         tissue_mask=torch.from_numpy(frame.tissue_mask),
         inverse_depth=torch.from_numpy(inverse),
-        measured=torch.from_numpy(frame.tissue_mask & frame.depth_valid),
+        measured=torch.from_numpy(frame.tissue_mask & usable),
+        brightness=float(frame.rgb_u8[frame.tissue_mask].mean()) / 255 if frame.tissue_mask.any() else 0.0,
     )
+
+
+def _frame_bytes(frame: TrainingFrame) -> int:
+    return sum(t.nbytes for t in (frame.rgb_u8, frame.tissue_mask, frame.inverse_depth, frame.measured))

@@ -73,7 +73,7 @@ class Splats:
     means: Tensor
     """(N, 3) centers, world axes, mm."""
     quats: Tensor
-    """(N, 4) rotations (w, x, y, z); any non-zero length, the renderer normalizes."""
+    """(N, 4) rotations (w, x, y, z); any length from 1e-12, the renderer normalizes; shorter ones are culled."""
     scales: Tensor
     """(N, 3) standard deviations along the local axes, mm, > 0."""
     opacities: Tensor

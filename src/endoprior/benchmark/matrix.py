@@ -17,6 +17,7 @@ from typing import Any
 
 from ..checks import InputError
 from ..config_io import to_dict
+from ..data.files import read_json
 from .execute import Executor
 from .spec import Cell, Spec, cells, sequence_folder
 from .worker import Job, finished
@@ -141,10 +142,10 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]
 
 def commits_of(matrix: Matrix) -> list[str]:
     """Commits that the finished cells were trained at, sorted; "unknown" for a cell trained outside a checkout."""
-    found = {json.loads((folder / "run" / "config.json").read_text())["commit"] for folder in matrix.done.values()}
+    found = {read_json(folder / "run" / "config.json").get("commit") for folder in matrix.done.values()}
     return sorted(commit or "unknown" for commit in found)
 
 
 def scores_of(folder: Path) -> dict[str, Any]:
     """`scores`, `skipped` and `protocol` of a finished cell."""
-    return json.loads((folder / "metrics.json").read_text())
+    return read_json(folder / "metrics.json")

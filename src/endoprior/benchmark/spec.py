@@ -16,12 +16,16 @@ import yaml
 from ..checks import InputError
 from ..config import Config
 from ..config_io import from_dict, to_dict
+from ..data.reading import read_text
+from ..data.yaml_text import load_yaml
 from ..phantom import PhantomConfig
 from ..presets import PresetName, preset
 
 Expectation = Literal["better", "no worse", "no effect"]
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 """Names of methods and sequences become folders."""
+MOST_EXTENDED = 8
+MOST_CELLS = 100_000
 FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
 """A value such as `x0.75` multiplies what the preset and the settings before it say."""
 
@@ -133,7 +137,8 @@ class Spec:
         values["data"] |= data.reading
         if budget is not None:
             values["init"]["budget"] = budget
-        return replace(from_dict(Config, values, f"methods.{method}"), seed=seed)
+        values["seed"] = seed
+        return from_dict(Config, values, f"methods.{method}")
 
 
 def _override(values: dict[str, Any], name: str, value: Any, where: str) -> None:
@@ -181,16 +186,17 @@ def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
     Raises:
         InputError: a file cannot be read, or extends itself.
     """
-    readers = {".yaml": yaml.safe_load, ".yml": yaml.safe_load, ".toml": tomllib.loads}
+    readers = {".yaml": load_yaml, ".yml": load_yaml, ".toml": tomllib.loads}
     if path.suffix not in readers:
         raise InputError(f"{path}: expected a .yaml or .toml file; got {path.suffix or 'no suffix'}. Rename it.")
+    text = read_text(path, "a readable file", "Correct the path.")
     if path.resolve() in chain:
         raise InputError(f"{path}: expected to end somewhere; it extends itself. Remove one `extends`.")
+    if len(chain) >= MOST_EXTENDED:
+        raise InputError(f"{path}: expected at most {MOST_EXTENDED} files that extend each other. Merge some.")
     try:
-        values = readers[path.suffix](path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable file; got {error.strerror}. Correct the path.") from None
-    except (yaml.YAMLError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        values = readers[path.suffix](text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a number of 5000 digits is a plain ValueError
         raise InputError(f"{path}: expected valid {path.suffix[1:]}; {error}. Correct it.") from None
     extends = values.pop("extends", []) if isinstance(values, dict) else None
     if not isinstance(extends, list) or not all(isinstance(name, str) for name in extends):
@@ -225,6 +231,9 @@ def _check(spec: Spec) -> None:
             raise InputError(f"claims, compare_with: expected one of {', '.join(spec.methods)}; got {name!r}.")
     if not spec.seeds or len(set(spec.seeds)) < len(spec.seeds):
         raise InputError(f"seeds: expected different numbers; got {list(spec.seeds)}. Correct them.")
+    count = len(spec.seeds) * len(spec.sequences) * max(len(spec.budgets), 1) * len(spec.methods)
+    if count > MOST_CELLS:
+        raise InputError(f"methods x sequences x budgets x seeds: expected at most {MOST_CELLS}; got {count}. Split.")
     for cell in cells(spec):
         spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
 

@@ -18,6 +18,7 @@ from typing import Any
 
 from ..atomic import write_json
 from ..checks import InputError
+from ..data.files import read_json
 
 DONE = "cell.json"
 """Written last: a folder that has it, with the same key, needs no work."""
@@ -47,10 +48,11 @@ class Job:
 
 
 def finished(folder: Path, key: str) -> bool:
-    """Whether the cell in `folder` is done and its result is the one that `key` stands for."""
+    """Whether the cell in `folder` is done, its result is the one that `key` stands for, and can be read."""
     try:
-        return json.loads((folder / DONE).read_text())["key"] == key
-    except (OSError, ValueError, KeyError, TypeError):
+        scores = read_json(folder / "metrics.json").get("scores")
+        return read_json(folder / DONE).get("key") == key and isinstance(scores, dict)
+    except InputError:
         return False
 
 

@@ -218,7 +218,8 @@ def _eyes(facts: Facts) -> Iterator[Finding]:
 
 
 def _points(facts: Facts) -> Iterator[Finding]:
-    if facts.cloud is None and facts.depth.unit.unit != "none" and not facts.masks.inverted:
+    explained = facts.depth.unit.unit in ("none", "m", "0.01 mm") or facts.masks.inverted
+    if facts.cloud is None and not explained:
         what = "training finds no pixel that is tissue and has depth to start from"
         yield Finding("no-points", "error", what, "look at masks and depth in the picture")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import textwrap
 from pathlib import Path
 
@@ -50,7 +51,10 @@ def draw_check(sequence: Sequence, facts: Facts, findings: list[Finding], path: 
     figure = Figure(figsize=(15, 14), layout="constrained", dpi=100)
     FigureCanvasAgg(figure)
     camera = facts.camera
-    figure.suptitle(f"{facts.path.name}   {facts.frames} frames of {camera.width} x {camera.height} px", fontsize=13)
+    # A name may hold bytes that are no text, and signs that Matplotlib would take for formulas.
+    name = os.fsencode(facts.path.name).decode("utf-8", "backslashreplace")
+    title = f"{name}   {facts.frames} frames of {camera.width} x {camera.height} px"
+    figure.suptitle(title, fontsize=13, parse_math=False)
     pictures, curves, space = figure.subfigures(3, 1, height_ratios=[5.6, 3.4, 4.8])
     _draw_frames(pictures, [sequence.frame(i) for i in spread(len(sequence), SHOWN)], facts)
     left, right = curves.subfigures(1, 2, width_ratios=[1, 2.4])
@@ -220,7 +224,7 @@ def _draw_findings(axis: Axes, facts: Facts, findings: list[Finding]) -> None:
         lines += [(f"{name if i == 0 else '':<17}{row}", "#3a5a78", "normal") for i, row in enumerate(rows)]
     for row, (text, color, weight) in enumerate(lines[:ROWS]):
         at = {"x": 0, "y": 1 - row / ROWS, "va": "top", "transform": axis.transAxes}
-        axis.text(**at, s=text, color=color, weight=weight, fontsize=7.5, family="monospace")
+        axis.text(**at, s=text, parse_math=False, color=color, weight=weight, fontsize=7.5, family="monospace")
 
 
 def _unit(facts: Facts) -> str:

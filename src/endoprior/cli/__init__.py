@@ -27,6 +27,8 @@ COMMANDS = {
 """Name and one-line description; each lives in the module of this package named like it (`eval` in `evaluate`)."""
 
 MODULES = {"eval": "evaluate"}
+NO_MEMORY = ("can't allocate memory", "not enough memory", "Insufficient memory", "bad_alloc", "can't start new thread")
+"""What torch, OpenCV and the system say when they get none; none of them raises MemoryError."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -62,7 +64,26 @@ def main(argv: list[str] | None = None) -> int:
         return 130
     except BrokenPipeError:  # the reader of a pipe, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except Exception as error:
+        if (words := unforeseen(error)) is None:
+            raise
+        print(f"endoprior: {words}", file=sys.stderr)
+        return 2
     return 0
+
+
+def unforeseen(error: Exception) -> str | None:
+    """The line for what no command could foresee, memory and files of the system; None for a failure of ours."""
+    text = " ".join(str(error).split())[-160:]
+    if isinstance(error, MemoryError) or any(words in text for words in NO_MEMORY):
+        return (
+            f"expected enough memory; got {text or 'none'}. Free some, or ask for less, such as smaller frames; the "
+            "last checkpoint of a run is whole, go on with --resume."
+        )
+    if isinstance(error, OSError) and error.filename is not None:
+        named = ascii(os.fsdecode(error.filename))[1:-1][-160:]
+        return f"{named}: expected a usable file; got {error.strerror}. Check the path, the rights and the disk."
+    return None
 
 
 def overview() -> str:

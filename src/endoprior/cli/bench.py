@@ -14,6 +14,9 @@ from ..checks import InputError
 from .parsing import parse
 from .progress import say
 
+MOST_CORES = 4096
+"""Of one machine."""
+
 
 @dataclass
 class Bench:
@@ -46,13 +49,16 @@ def run(argv: list[str]) -> int:
     from ..benchmark.matrix import run_matrix
     from ..benchmark.report import write_overview, write_report
     from ..benchmark.spec import load_spec
+    from .places import demand_folder_place
 
-    if args.threads < 1 or args.cores < 0:
-        raise InputError("--threads, --cores: expected at least 1 thread and no negative cores. Correct them.")
+    for option, value, least in (("--threads", args.threads, 1), ("--cores", args.cores, 0)):
+        if not least <= value <= MOST_CORES:
+            raise InputError(f"{option}: expected {least} to {MOST_CORES}; got {value}. Correct it.")
     if args.weights_dir and not args.weights_dir.is_dir():
         raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
     specs = _specs(args.spec)
     loaded = {path: load_spec(path, _folders(args.data)) for path in specs}
+    demand_folder_place("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -25,15 +25,20 @@ class Check:
     json: Path | None = None
     """Also write facts and findings to this file."""
     strict: bool = False
-    """Exit with status 2 if there is an error; a sequence that cannot be read always does."""
+    """Exit with status 2 if there is an error, as for a sequence that cannot be read."""
     data: DataConfig = field(default_factory=DataConfig)
 
 
-def run(argv: list[str]) -> int:
-    """Measure, print, draw; the exit status."""
+def run(argv: list[str]) -> None:
+    """Measure, print, draw."""
     args = parse(Check, argv, "check")
     if args.out.suffix.lower() != ".png":
         raise InputError(f"--out: expected a .png file; got {args.out}. Rename it.")
+    from .places import demand_file_place
+
+    for option, file in (("--out", args.out), ("--json", args.json)):
+        if file is not None:
+            demand_file_place(option, file, args.folder)
     from ..atomic import write_json
     from ..check import draw_check, find, measure
     from ..check.report import as_json, table
@@ -53,4 +58,6 @@ def run(argv: list[str]) -> int:
         write_json(args.json, as_json(facts, findings))
     draw_check(sequence, facts, findings, args.out)
     say(f"{args.out}")
-    return 2 if args.strict and any(finding.severity == "error" for finding in findings) else 0
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if args.strict and errors:
+        raise InputError(f"{args.folder}: expected no errors with --strict; got {len(errors)}: {errors[0]}")

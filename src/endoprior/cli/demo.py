@@ -41,13 +41,13 @@ def run(argv: list[str]) -> None:
     from .render import Render, draw
     from .train import train_and_evaluate
 
+    phantom, cfg = PhantomConfig(frames=args.frames, seed=args.seed), replace(preset(args.preset), seed=args.seed)
     prepare_run_folder(args.out, resume=False)
     began = clock.perf_counter()
     data, folder = args.out / "sequence", args.out / "run"
     say(f"1/4  a phantom of {args.frames} frames: {data}")
-    write_phantom(data, PhantomConfig(frames=args.frames, seed=args.seed))
+    write_phantom(data, phantom)
     say("2/4  training")
-    cfg = replace(preset(args.preset), seed=args.seed)
     # Network scores may want large downloads, which a demo should not start unasked.
     train_and_evaluate(data, cfg, folder, resume=False, networks=False, weights_dir=None)
     say("\n3/4  drawing")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -39,8 +38,14 @@ def run(argv: list[str]) -> None:
     """Score and print."""
     args = parse(Eval, argv, "eval")
     from ..model.scene import load_scene
+    from .places import demand_folder_place
 
+    if args.weights_dir and not args.weights_dir.is_dir():
+        raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
     scene = load_scene(args.run)
+    demand_folder_place(
+        "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
+    )
     data = args.data or sequence_of_run(args.run)
     evaluate_run(scene, data, args.out or args.run, args.split, args.networks, args.weights_dir, extra={})
 
@@ -85,11 +90,15 @@ def sequence_of_run(run_folder: Path) -> Path:
     Raises:
         InputError: config.json is missing or says nothing, or the folder has gone.
     """
-    file = run_folder / "config.json"
-    try:
-        data = Path(json.loads(file.read_text())["data"]["path"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file}: expected the path of the sequence; {error!r}. Pass --data FOLDER.") from None
-    if not data.is_dir():
+    from ..data.files import read_json
+    from ..data.reading import kind_of
+
+    file, hint = run_folder / "config.json", "Pass --data FOLDER."
+    facts = read_json(file, hint).get("data")
+    path = facts.get("path") if isinstance(facts, dict) else None
+    if not isinstance(path, str) or not path:
+        raise InputError(f"{file}: expected the path of the sequence; got {path!r}. {hint}")
+    data = Path(path)
+    if kind_of(data) != "a folder":
         raise InputError(f"{data}: the sequence this run was trained on is not there. Pass --data FOLDER.")
     return data

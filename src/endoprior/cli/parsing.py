@@ -21,6 +21,9 @@ def parse(cls: type[A], argv: list[str], command: str, default: A | None = None)
     Raises:
         InputError: an unknown option, a missing argument, or a value of the wrong kind or range.
     """
+    if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in argv):
+        said = "expected a name or a value in each place; got an empty one. Is a variable of the shell not set?"
+        raise InputError(f"endoprior {command}: {said}")
     said = io.StringIO()
     extra = {} if default is None else {"default": default}
     try:
@@ -31,7 +34,7 @@ def parse(cls: type[A], argv: list[str], command: str, default: A | None = None)
             raise
         raise InputError(f"{_one_line(said.getvalue())}. Try `endoprior {command} --help`.") from None
     except ValueError as error:  # a range check of the config
-        raise InputError(f"{error}. Try `endoprior {command} --help`.") from None
+        raise InputError(f"{str(error).removesuffix('.')}. Try `endoprior {command} --help`.") from None
 
 
 def _one_line(page: str) -> str:

@@ -17,7 +17,8 @@ from .progress import Counting, say
 class Prepare:
     """Write a sequence folder from an endoscope video: eyes split and rectified, borders cut, depth, tool masks, poses.
 
-    Give the same command again to go on after an interruption. Nothing is sent anywhere (`--depth depth-anything` downloads its network); no metadata is copied.
+    Give the same command again to go on after an interruption. Nothing is sent anywhere, and no metadata is
+    copied; `--depth depth-anything` downloads its network.
     """
 
     video: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIDEO")]]

@@ -47,6 +47,9 @@ def run(argv: list[str]) -> None:
 
 def draw(scene: Scene, args: Render) -> None:
     """Draw what `args` asks for and say where it is."""
+    from .places import demand_folder_place
+
+    demand_folder_place("OUT" if args.out else "RUN", args.out or args.run)
     from ..data import load_sequence
     from ..evaluate import scored_data
     from ..show.camera_paths import read_path, sway_path, times_path
@@ -66,8 +69,8 @@ def draw(scene: Scene, args: Render) -> None:
                 raise InputError(
                     f"{sequence.path}: expected {total} frames; got {len(sequence)}. Pass the run's sequence."
                 )
-            frames = list(sequence.frames(args.split))
-            times = [frame.time for frame in frames]
+            frames = sequence.frames(args.split)
+            times = [index / total for index in sequence.indices(args.split)]
         if args.camera == "sway":
             frames = None
             views = sway_path(times, scene.cameras, sum(depth_span(scene)) / 2)
@@ -75,5 +78,7 @@ def draw(scene: Scene, args: Render) -> None:
             views = times_path(times, scene.cameras)
     out = args.out or args.run / "renders"
     video = args.out / "video.mp4" if args.out else args.run / "video.mp4"
+    if not args.out and out.is_symlink():  # a run from a stranger could point it anywhere
+        raise InputError(f"{out}: expected a folder; got a link to one. Remove it, or name OUT.")
     write_views(scene, views, out, video, frames)
     say(f"{len(views)} views: {out}\n{video}")

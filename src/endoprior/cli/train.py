@@ -42,7 +42,9 @@ class Train:
     networks: bool = True
     """Also score with RAFT and LPIPS where their weights can be had."""
     resume: bool = False
-    """Continue the run in OUT from its checkpoint."""
+    """Continue the run in OUT, after Ctrl-C or a crash, to the same bits."""
+    checkpoint_seconds: float = 60.0
+    """Time between two checkpoints: the longest that a crash can cost."""
     view: bool = False
     """Show the scene in a web browser while it trains, at 127.0.0.1 and --view-port. Takes time from the training."""
     view_port: int = 8080
@@ -59,32 +61,45 @@ def run(argv: list[str]) -> None:
     if args.weights_dir and not args.weights_dir.is_dir():
         raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
     if args.init_budget is not None:
-        cfg = dataclasses.replace(cfg, init=dataclasses.replace(cfg.init, budget=args.init_budget))
+        try:
+            cfg = dataclasses.replace(cfg, init=dataclasses.replace(cfg.init, budget=args.init_budget))
+        except ValueError as error:
+            raise InputError(f"--init-budget: {error}. Correct it.") from None
     port = args.view_port if args.view else None
-    train_and_evaluate(args.data, cfg, args.out, args.resume, args.networks, args.weights_dir, port)
+    if not args.checkpoint_seconds >= 0:
+        raise InputError(
+            f"--checkpoint-seconds: expected at least 0; got {args.checkpoint_seconds}. Leave it out for 60."
+        )
+    kept = {"resume": args.resume, "checkpoint_seconds": args.checkpoint_seconds}
+    train_and_evaluate(args.data, cfg, args.out, args.networks, args.weights_dir, port, **kept)
 
 
 def train_and_evaluate(
     data: Path,
     cfg: Config,
     out: Path,
-    resume: bool,
     networks: bool,
     weights_dir: Path | None,
     view_port: int | None = None,
+    *,
+    resume: bool = False,
+    checkpoint_seconds: float = 60.0,
 ) -> None:
     """Train on the folder `data` into the run folder `out`, score the test split there, print the scores.
 
     Args:
         view_port: serve a live view of the training there; None does not.
+        resume, checkpoint_seconds: as `train.train` has them.
     """
     from ..data import load_sequence
-    from ..run_folder import prepare_run_folder
+    from ..run_folder import refuse_unusable_folder
     from ..train import train
+    from ..training_memory import refuse_too_large
     from .evaluate import evaluate_run
 
     sequence = load_sequence(data, cfg.data)
-    prepare_run_folder(out, resume=resume)
+    refuse_unusable_folder(out, resume=resume)
+    refuse_too_large(sequence, cfg)
     say(f"{data}: {len(sequence)} frames; backend {cfg.render.backend}")
     for remark in sequence.validate():
         say(f"note: {remark}")
@@ -96,14 +111,18 @@ def train_and_evaluate(
                 show_progress(report, trainer)
                 show_scene(report, trainer)
 
-            scene = train(sequence, cfg, out, resume=resume, on_step=on_step)
+            scene = train(sequence, cfg, out, resume=resume, checkpoint_seconds=checkpoint_seconds, on_step=on_step)
     except KeyboardInterrupt:
         say(f"Stopped; the state is saved. Go on with the same command and --resume ({out}).")
         raise
     seconds = clock.perf_counter() - began
     done = _logged_seconds(out / "log.jsonl")
     speed = {"train_seconds": seconds, "iterations_per_second": done}
-    evaluate_run(scene, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
+    try:
+        evaluate_run(scene, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
+    except KeyboardInterrupt:
+        say(f"Stopped; the trained scene is saved. Score it with `endoprior eval {out}`.")
+        raise
 
 
 def _logged_seconds(log: Path) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -96,7 +97,7 @@ def open_subject(path: Path, data: Path | None) -> tuple[Subject, Path | None]:
     from ..view.sequence_subject import SequenceSubject
 
     folder = path.parent if path.name == "scene.safetensors" else path
-    if not (folder / "scene.safetensors").is_file():
+    if not os.path.isfile(folder / "scene.safetensors"):  # of a name too long for the system pathlib would raise
         if (folder / "config.json").is_file() and (folder / "log.jsonl").is_file():
             hint = "It appears when training is done; `endoprior train --view` shows a scene while it trains."
             raise InputError(f"{folder / 'scene.safetensors'}: expected a trained scene; found none yet. {hint}")

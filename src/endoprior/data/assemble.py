@@ -11,13 +11,18 @@ from numpy.typing import NDArray
 from ..config import DataConfig
 from ..types import Camera, Frame
 from .depth import clean_depth
-from .images import complaint
+from .reading import complaint
 from .sequence import Sequence
 from .shrink import shrunk, shrunk_camera
 from .truth import Truth
 
 Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]]
 """(H, W, 3) color 0..255, (H, W) True on usable tissue, (H, W) depth in mm with 0 where it is missing."""
+
+LEAST_FOCAL_PX, MOST_PX = 1e-2, 1e6
+"""Of a lens."""
+FARTHEST_MM = 1e6
+"""Of a camera: a kilometer."""
 
 
 def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1) -> range:
@@ -59,12 +64,14 @@ def assemble(
             rendered, so that its extremes are real.
         frames_per_second, truth, remarks, mask_folder, depth_is_relative, sources: see `Sequence`.
     Raises:
-        InputError: fewer than 2 frames, or no pixel, would be left.
+        InputError: fewer than 2 frames, or no pixel, would be left, or a camera has numbers that no lens has.
     """
     count, width, height = len(cameras), cameras[0].width, cameras[0].height
     if count < 2 or min(width, height) // cfg.shrink < 1:
         hint = "Lower data.shrink or data.stride, or raise data.first_frames."
         raise complaint(path, "2 frames of 1x1 px to be left", f"{count} of {width}x{height} / {cfg.shrink}", hint)
+
+    _demand_usable(path, cameras)
 
     def read_frame(index: int) -> Frame:
         rgb_u8, tissue_mask, measured = decode(index)
@@ -87,3 +94,16 @@ def assemble(
         depth_is_relative=depth_is_relative,
         sources=sources,
     )
+
+
+def _demand_usable(path: Path, cameras: list[Camera]) -> None:
+    """Refuse lenses and places that would overflow in the renderer: finite is not enough."""
+    for index, camera in enumerate(cameras):
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        if not (all(abs(value) <= MOST_PX for value in lens) and min(camera.fx, camera.fy) >= LEAST_FOCAL_PX):
+            got = ", ".join(f"{value:g}" for value in lens)
+            want = f"fx, fy, cx, cy up to {MOST_PX:g} px, fx and fy at least {LEAST_FOCAL_PX:g}"
+            raise complaint(path, want, f"{got} in frame {index}", "Correct the intrinsics.")
+        if not np.abs(camera.world_to_camera[:3, 3]).max() <= FARTHEST_MM:
+            got = f"{np.abs(camera.world_to_camera[:3, 3]).max():g} mm in frame {index}"
+            raise complaint(path, f"cameras within {FARTHEST_MM:g} mm of the origin", got, "Correct the poses.")

@@ -18,9 +18,10 @@ from ..types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import read_values
 from .files import list_files, read_table
-from .images import complaint, read_color
+from .images import read_color
 from .omnidirectional import Omnidirectional
 from .poses import demand_rotations, world_to_camera
+from .reading import complaint, read_text
 from .sequence import Sequence
 
 CF_HQ190L = Omnidirectional(
@@ -143,10 +144,7 @@ def read_lens(path: Path) -> Omnidirectional:
     Raises:
         InputError: unreadable, or a parameter is missing.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise complaint(path, "camera parameters", str(error).split("\n")[0], "Write it again.") from None
+    text = read_text(path, "camera parameters", "Write it again.")
     found = dict(re.findall(r"^\s*(\w+)\s*[=:]\s*([-+.\deE]+)\s*;?\s*$", text, re.MULTILINE))
     values = {}
     for name, field in Omnidirectional.__dataclass_fields__.items():

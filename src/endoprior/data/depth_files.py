@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .files import read_only_array
-from .images import complaint, decode_image, describe_pixels, single_channel
+from .images import MOST_PIXELS, decode_image, describe_pixels, single_channel
+from .numpy_files import read_only_array
+from .reading import complaint, demand_file
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
 """Files this module reads, in lower case."""
@@ -68,7 +69,12 @@ def _read_exr(path: Path) -> NDArray:
         import OpenEXR  # optional: OpenCV's own decoder is switched off in its packages
     except ImportError:
         raise complaint(path, "the OpenEXR package", "none", "Run pip install 'endoprior[exr]'.") from None
+    demand_file(path, "an EXR image", "Write the file again.")
     try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            (left, top), (right, bottom) = (np.asarray(corner, int).tolist() for corner in file.header()["dataWindow"])
+        if (right - left + 1) * (bottom - top + 1) > MOST_PIXELS:
+            raise ValueError(f"{right - left + 1}x{bottom - top + 1} px by its header")
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # the library raises its own kinds, RuntimeError among them

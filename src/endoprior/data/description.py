@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
 from .files import read_json
-from .images import complaint
+from .reading import complaint
 
+LEAST, MOST = 1e-6, 1e6
+"""Of every measure in the file."""
 FORMAT_VERSION = 1
 """Newest `format_version` this program can read; a file without one is of version 1."""
 POSITIVE = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")
@@ -25,8 +26,9 @@ def read_description(path: Path) -> dict[str, Any]:
     described = {key: value for key, value in read_json(path).items() if value is not None}
     for key in POSITIVE:
         value = described.get(key, 1)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
-            raise complaint(path, f"{key} to be a number > 0", repr(value), "Correct it or remove it.")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not LEAST <= value <= MOST:
+            want = f"{key} to be a number in [{LEAST:g}, {MOST:g}]"
+            raise complaint(path, want, repr(value)[:60], "Correct it or remove it.")
     if described.get("depth_unit", "mm") != "mm":
         hint = "Give mm, and mm per stored unit as depth_scale."
         raise complaint(path, "depth_unit mm", repr(described["depth_unit"]), hint)

@@ -15,9 +15,11 @@ from ..config import DataConfig
 from ..types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .description import check_frames, intrinsics_of, read_description
-from .files import demand_count, list_files, read_numpy, unequal_names
-from .images import complaint, read_color, read_depth, read_tool_mask
+from .files import demand_count, list_files, unequal_names
+from .images import read_color, read_depth, read_tool_mask
+from .numpy_files import read_numpy
 from .poses import demand_rotations, world_to_camera
+from .reading import complaint
 from .sequence import Sequence
 from .truth import Truth
 

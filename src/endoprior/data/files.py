@@ -9,21 +9,33 @@ import json
 import re
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .images import complaint
+from ..checks import InputError
+from .reading import ACCESS_HINT, complaint, read_text
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 """Pictures that color readers take."""
 
 
+def entries(folder: Path) -> list[Path]:
+    """What is in a folder, in no order.
+
+    Raises:
+        InputError: the folder may not be read.
+    """
+    try:
+        return list(folder.iterdir())
+    except OSError as error:
+        raise complaint(folder, "a readable folder", error.strerror or str(error), ACCESS_HINT) from None
+
+
 def natural_order(file: Path) -> list[int | str]:
     """Sorting key of a file name: runs of digits compare as numbers, 2 before 10."""
     # Splitting at digits alternates text and number, so that equal positions always compare.
-    return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", file.name)]
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", file.name))]
 
 
 def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str = "") -> list[Path]:
@@ -40,7 +52,7 @@ def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str
     kind = "/".join(sorted({suffix.removeprefix(".").upper() for suffix in suffixes} - {"JPEG", "TIF"}, reverse=True))
     if not folder.is_dir():
         raise complaint(folder, f"a folder of {kind} files", "no such folder", f"Pass a folder in the {layout} layout.")
-    everything = [file for file in folder.iterdir() if not file.name.startswith(".")]
+    everything = [file for file in entries(folder) if not file.name.startswith(".")]
     files = [file for file in everything if file.suffix.lower() in suffixes and file.stem.endswith(ending)]
     if not files:
         other = sorted({file.suffix for file in everything if file.suffix})
@@ -71,37 +83,14 @@ def read_json(path: Path, next_step: str = "Correct it or remove it.") -> dict[s
         InputError: unreadable, not JSON, or not an object.
     """
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        stored = json.loads(read_text(path, "a JSON object", next_step))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
         raise complaint(path, "a JSON object", str(error).split("\n")[0], next_step) from None
     if not isinstance(stored, dict):
         raise complaint(path, "a JSON object", type(stored).__name__, next_step)
     return stored
-
-
-def read_numpy(path: Path, expected: str, next_step: str) -> NDArray | dict[str, NDArray]:
-    """The array of an .npy file, or the named arrays of an .npz file; no pickles.
-
-    Raises:
-        InputError: unreadable, or not NumPy's; `expected` says what should be there.
-    """
-    try:
-        with path.open("rb") as file:
-            stored = np.load(file, allow_pickle=False)
-            return stored if isinstance(stored, np.ndarray) else {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        # NumPy takes every unknown file for a pickle, and recommends to load it unsafely.
-        found = "pickled objects or something else" if "allow_pickle" in str(error) else str(error).split("\n")[0]
-        raise complaint(path, expected, found, next_step) from None
-
-
-def read_only_array(path: Path, next_step: str) -> NDArray:
-    """The array of an .npy file, or the only one of an .npz file; otherwise as `read_numpy`."""
-    stored = read_numpy(path, "a NumPy file", next_step)
-    arrays = [stored] if isinstance(stored, np.ndarray) else list(stored.values())
-    if len(arrays) != 1:
-        raise complaint(path, "one array", f"{len(arrays)}", next_step)
-    return arrays[0]
 
 
 def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -118,7 +107,7 @@ def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, 
         raise complaint(path, want, "no such key", "Process the dataset again.")
     try:
         matrix = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape != shape or not np.isfinite(matrix).all():
         got = "NaN or infinity" if matrix.shape == shape else f"shape {matrix.shape}"
@@ -132,11 +121,11 @@ def read_table(path: Path, next_step: str) -> NDArray[np.float64]:
     Raises:
         InputError: unreadable, not numbers, or rows of different lengths.
     """
+    lines = read_text(path, "rows of numbers", next_step).splitlines()
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
         rows = [re.split(r"[,\s]+", line.split("#")[0].strip(", \t")) for line in lines]
         numbers = [[float(entry) for entry in row] for row in rows if row != [""]]
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise complaint(path, "rows of numbers", str(error).split("\n")[0], next_step) from None
     if not numbers or len({len(row) for row in numbers}) != 1:
         raise complaint(path, "rows of equally many numbers", "other rows", next_step)

@@ -15,8 +15,9 @@ from .assemble import Pixels, assemble, kept_frames
 from .depth_files import read_depth_file
 from .endonerf import read_poses_bounds
 from .files import IMAGE_SUFFIXES, demand_count, list_files, read_table, unequal_names
-from .images import complaint, read_color, read_tool_mask
+from .images import read_color, read_tool_mask
 from .poses import identity_poses
+from .reading import complaint
 from .sequence import Sequence
 
 CROP_LEFT_PX = 40

@@ -8,17 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError
+from .image_header import is_whole, stored_size
+from .reading import complaint, read_bytes
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-"""First bytes of every PNG file."""
-JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-"""First and last bytes of every JPEG file; a few bytes of padding may follow."""
-
-
-def complaint(path: Path | str, expected: str, got: str, next_step: str) -> InputError:
-    """The error for a file or folder that cannot be used, on one line."""
-    return InputError(f"{path}: expected {expected}; got {got}. {next_step}")
+MOST_PIXELS = 64_000_000
+"""Of one picture; 7680x4320 has half as many."""
 
 
 def read_color(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
@@ -81,31 +75,32 @@ def read_depth(path: Path, scale: float = 1.0, size: tuple[int, int] | None = No
     return pixels.astype(np.float32) * np.float32(scale)
 
 
-def decode_image(path: Path, size: tuple[int, int] | None) -> NDArray:
-    """Decode an image file of any format.
+def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray:
+    """Decode a PNG, JPEG, TIFF, BMP or WebP file.
 
     Args:
         path: the file.
         size: (width, height) it must have, px; None accepts any.
+        flags: `cv2.imdecode`'s: as stored, or turned into something else.
     Returns:
-        The stored array, (H, W) or (H, W, C) with channels in OpenCV's order (blue first).
+        The array, (H, W) or (H, W, C) with channels in OpenCV's order (blue first).
     Raises:
-        InputError: unreadable, cut short, or of another size.
+        InputError: unreadable, of another kind, cut short, of more than `MOST_PIXELS`, or of another size.
     """
+    encoded = read_bytes(path)
+    data = encoded.tobytes()
+    promised = stored_size(data)
+    if promised and promised[0] * promised[1] > MOST_PIXELS:
+        got = f"{promised[0]}x{promised[1]} px by its header"
+        raise complaint(path, f"a picture of at most {MOST_PIXELS // 1_000_000} Mpx", got, "Scale it down.")
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is said below, on one line
     try:
-        encoded = np.fromfile(path, np.uint8)
-    except OSError as error:
-        got = error.strerror or str(error)
-        raise complaint(path, "a readable file", got, "Check the path and the rights.") from None
-    # A file that ends early is refused before decoding, which would also let libpng write to stderr.
-    whole = encoded[:8].tobytes() != PNG_SIGNATURE or b"IEND" in encoded.tobytes()
-    whole &= encoded[:2].tobytes() != JPEG_START or JPEG_END in encoded[-1024:].tobytes()
-    try:
-        pixels = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if encoded.size and whole else None
-    except cv2.error:  # such as a header that promises more pixels than OpenCV accepts
+        pixels = cv2.imdecode(encoded, flags) if promised and is_whole(data) else None
+    except cv2.error:
         pixels = None
     if pixels is None:
-        raise complaint(path, "an image", f"{encoded.size} bytes that cannot be decoded", "Write the file again.")
+        got = f"{encoded.size} bytes that cannot be decoded"
+        raise complaint(path, "an image (PNG, JPEG, TIFF, BMP, WebP)", got, "Write the file again.")
     got = (pixels.shape[1], pixels.shape[0])
     if size is not None and got != size:
         raise complaint(

@@ -7,8 +7,9 @@ from typing import Literal
 
 from ..config import DataConfig
 from .endonerf import load_endonerf
+from .files import entries
 from .formats import FORMATS, Format
-from .images import complaint
+from .reading import complaint, kind_of
 from .sequence import Sequence
 
 
@@ -29,8 +30,8 @@ def load_sequence(
         raise ValueError(f"pose_axes must be opencv or opengl; got {pose_axes!r}")
     cfg = cfg or DataConfig()
     path = Path(path).expanduser()
-    if not path.is_dir():
-        got = "a file" if path.exists() else "no such folder"
+    if (kind := kind_of(path)) != "a folder":
+        got = "no such folder" if kind == "nothing" else kind
         raise complaint(path, "a sequence folder", got, "Pass the folder that holds images/, masks/ and depth/.")
     chosen = find_format(path, cfg)
     if pose_axes == "opencv":
@@ -49,7 +50,7 @@ def find_format(path: Path, cfg: DataConfig) -> Format:
     for candidate in FORMATS:
         if cfg.format == candidate.name or (cfg.format == "auto" and candidate.recognizes(path)):
             return candidate
-    entries = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir() if not entry.name.startswith("."))
-    got = ", ".join(entries[:5]) + (f" and {len(entries) - 5} more" if len(entries) > 5 else "")
+    names = sorted(entry.name + "/" * entry.is_dir() for entry in entries(path) if not entry.name.startswith("."))
+    got = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     known = ", ".join(candidate.name for candidate in FORMATS)
     raise complaint(path, f"one of the layouts {known}", got or "an empty folder", "See docs/datasets.md.")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .images import complaint
+from .reading import complaint
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R^T R - I that still passes for a rotation: far above float32 rounding, far below a real scale."""

@@ -20,8 +20,9 @@ from ..types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import read_values
 from .files import list_files, read_json, read_matrix
-from .images import complaint, read_color
+from .images import read_color
 from .poses import demand_rotations
+from .reading import complaint
 from .sequence import Sequence
 
 STRIDES = {1: 2, 2: 1, 3: 4, 6: 8, 7: 8}

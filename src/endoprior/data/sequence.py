@@ -6,24 +6,28 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from collections.abc import Sequence as ReadOnlyList
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, overload
 
+from ..memory import BoundedCache, cache_bytes, workers
 from ..types import Camera, Frame
 from .images import complaint
 from .truth import Truth
 
 Split = Literal["train", "test", "video"]
 TEST_EVERY = 8
+DECODING_BYTES = 40
+"""Per pixel, while a frame is read."""
 TOOL_FRACTION_WARNING = 0.6
 """A larger share of tool pixels than this is more often an inverted mask than a picture of tools."""
 
 
 class Sequence:
-    """Frames of one scene. Each is decoded once and kept: about 2.9 MB a frame at 640 x 512."""
+    """Frames of one scene, decoded when they are asked for; as many are kept as memory allows, 1 MB per 110,000 px."""
 
     def __init__(
         self,
@@ -44,7 +48,7 @@ class Sequence:
         Args:
             path: folder the sequence came from; names it in messages.
             cameras: the camera of each frame.
-            read_frame: decodes frame i; called once per frame.
+            read_frame: decodes frame i; called again where the frame was not kept.
             frames_per_second: of the video, None if unknown.
             files: every file that makes up the sequence, for `fingerprint`.
             truth: ground truth of a synthetic sequence.
@@ -63,7 +67,7 @@ class Sequence:
         self._files = files or []
         self._remarks = remarks or []
         self._masks = path / mask_folder
-        self._cache: dict[int, Frame] = {}
+        self._cache: BoundedCache[Frame] = BoundedCache(cache_bytes(), _frame_bytes)
 
     @property
     def remarks(self) -> list[str]:
@@ -86,9 +90,7 @@ class Sequence:
         """
         if not 0 <= index < len(self):
             raise IndexError(f"frame must be in 0..{len(self) - 1}; got {index}")
-        if index not in self._cache:
-            self._cache[index] = self._read_frame(index)
-        return self._cache[index]
+        return self._cache.get(index, lambda: self._read_frame(index))
 
     def indices(self, split: Split) -> list[int]:
         """Ascending frame indices of a split: `test` has (i - 1) % 8 == 0, `train` the others, `video` all.
@@ -108,7 +110,7 @@ class Sequence:
         """SHA-256, in hex, of the names (below the folder) and contents of all files of the sequence."""
         digest = hashlib.sha256()
         for file in sorted(self._files):
-            digest.update(str(file.relative_to(self.path).as_posix()).encode() + b"\0")
+            digest.update(os.fsencode(file.relative_to(self.path).as_posix()) + b"\0")
             digest.update(hashlib.sha256(file.read_bytes()).digest())
         return digest.hexdigest()
 
@@ -120,16 +122,18 @@ class Sequence:
         Raises:
             InputError: a file cannot be used, or no frame has tissue, or no tissue pixel has depth.
         """
-        with ThreadPoolExecutor() as pool:  # decoding releases the interpreter lock
-            frames = list(pool.map(self.frame, range(len(self))))
-        tissue = [frame.tissue_mask.mean() for frame in frames]
+        camera = self.camera(0)
+        threads = workers(DECODING_BYTES * camera.width * camera.height)
+        with ThreadPoolExecutor(threads) as pool:  # decoding releases the interpreter lock
+            seen = list(pool.map(lambda index: _contents(self.frame(index)), range(len(self))))
+        tissue = [share for share, _, _ in seen]
         if not any(tissue):
             hint = "The polarity may be inverted: masks are 255 on tools."
             raise complaint(self._masks, "tissue in at least one frame", "tool everywhere", hint)
-        if not any(frame.depth_valid.any() for frame in frames):
+        if not any(has_depth for _, has_depth, _ in seen):
             hint = "Provide depth in mm, 0 where it is missing."
             raise complaint(self.path / "depth", "depth > 0 in at least one frame", "0 everywhere", hint)
-        if not any((frame.depth_valid & frame.tissue_mask).any() for frame in self.frames("train")):
+        if not any(seen[index][2] for index in self.indices("train")):
             hint = "The mask's polarity may be inverted, or the depth may be of the tool only."
             raise complaint(self.path / "depth", "depth on tissue in a training frame", "none", hint)
         remarks = self.remarks
@@ -138,10 +142,20 @@ class Sequence:
             remarks.append(f"{self._masks}: {tool:.0%} of all pixels are tool; the polarity may be inverted")
         if self.depth_is_relative:
             remarks.append(f"{self.path}: the scale of its depth is unknown or assumed; lengths in mm mean nothing")
-        empty = [frame.index for frame in frames if not (frame.depth_valid & frame.tissue_mask).any()]
+        empty = [index for index, (_, _, has_tissue_depth) in enumerate(seen) if not has_tissue_depth]
         if empty:
             remarks.append(f"{self.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")
         return remarks
+
+
+def _contents(frame: Frame) -> tuple[float, bool, bool]:
+    """Share of tissue; whether any pixel has depth; whether one of tissue has."""
+    measured = frame.depth_valid & frame.tissue_mask
+    return float(frame.tissue_mask.mean()), bool(frame.depth_valid.any()), bool(measured.any())
+
+
+def _frame_bytes(frame: Frame) -> int:
+    return sum(array.nbytes for array in (frame.rgb_u8, frame.tissue_mask, frame.depth, frame.depth_valid))
 
 
 class FrameList(ReadOnlyList[Frame]):

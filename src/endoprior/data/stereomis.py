@@ -14,7 +14,8 @@ from ..config import DataConfig
 from .depth_files import read_values
 from .endonerf import load_endonerf
 from .files import list_files, read_json
-from .images import complaint, decode_image
+from .images import decode_image
+from .reading import complaint
 from .sequence import Sequence, is_test_frame
 
 RAW_FILE = "StereoCalibration.ini"

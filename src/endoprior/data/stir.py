@@ -17,7 +17,8 @@ from ..atomic import whole_file
 from ..config import DataConfig
 from ..types import Frame
 from .endonerf import load_endonerf
-from .images import complaint, decode_image, single_channel
+from .images import decode_image, single_channel
+from .reading import complaint, kind_of
 from .sequence import Sequence
 from .truth import Tracks
 
@@ -92,6 +93,13 @@ def nearest_end_errors(predicted: NDArray[np.floating], true_ends: NDArray[np.fl
         true_ends: (Q, K) Q > 0.
     """
     return np.linalg.norm(predicted[:, None] - true_ends[None], axis=-1).min(1)
+
+
+def demand_stir_clip(clip: Path) -> None:
+    """Refuse a folder that is no `left/seqNN` of STIR, before work that would be lost."""
+    for name in SEGMENTATIONS:
+        if kind_of(clip / name) != "a file":
+            raise complaint(clip / name, "a clip of STIR", "no such file", "Pass its folder left/seqNN.")
 
 
 def write_stir_tracks(clip: Path, prepared: Path) -> Path:

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .files import read_numpy
-from .images import complaint, read_color
+from .images import read_color
+from .numpy_files import read_numpy
+from .reading import complaint
 
 _FILE = ("a NumPy file", "Write the truth again.")
 

@@ -83,7 +83,8 @@ class FrameFiles:
         self.write_image("images", rgb)
         self.write_image("masks", np.where(tool_mask, TOOL_VALUE, 0).astype(np.uint8))
         if depth is not None:
-            units = np.where(np.isfinite(depth) & (depth > 0), depth, 0) / self.meta.depth_scale
+            held = np.minimum(depth, 65535 * self.meta.depth_scale)
+            units = np.where(np.isfinite(depth) & (depth > 0), held, 0) / self.meta.depth_scale
             self.write_image("depth", np.clip(np.round(units), 0, 65535).astype(np.uint16))
         if right is not None:
             self.write_image("right", right)

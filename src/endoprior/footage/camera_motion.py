@@ -50,7 +50,8 @@ def camera_motion(
     for picture in pictures:
         factor = min(1.0, WORK_WIDTH / picture.shape[1])
         gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-        gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        fy = max(factor, 1 / gray.shape[0])  # a strip keeps its one row
+        gray = cv2.resize(gray, None, fx=factor, fy=fy, interpolation=cv2.INTER_AREA)
         allowed = None
         if masks is not None:
             mask = next(masks).astype(np.uint8)

@@ -104,7 +104,7 @@ def find_duplicates(difference: NDArray[np.floating]) -> tuple[int, ...]:
 def _exposure_jumps(pairs: list[tuple[NDArray, NDArray]]) -> list[int]:
     changes, agreements = [], []
     for before, now in pairs:
-        small = [cv2.resize(thumb, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA) for thumb in (before, now)]
+        small = [_reduced(thumb, 0.25) for thumb in (before, now)]
         usable = (np.minimum(*small) > 8) & (np.maximum(*small) < 245)  # neither black nor saturated
         if usable.mean() < 0.1:
             changes.append(0.0)
@@ -120,8 +120,15 @@ def _exposure_jumps(pairs: list[tuple[NDArray, NDArray]]) -> list[int]:
 
 def _sharpness(picture: NDArray[np.uint8]) -> float:
     """RMS of the Laplacian at half size, divided by brightness: exposure does not change it."""
-    gray = cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    gray = _reduced(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 0.5)
     return float(cv2.Laplacian(gray, cv2.CV_32F).std() / max(float(gray.mean()), 1.0)) + 1e-6
+
+
+def _reduced(image: NDArray, share: float) -> NDArray:
+    """The image at a share of its size, of 1 px at least."""
+    height, width = image.shape[:2]
+    fx, fy = max(share, 1 / width), max(share, 1 / height)
+    return cv2.resize(image, None, fx=fx, fy=fy, interpolation=cv2.INTER_AREA)
 
 
 def _blurred(sharpness: NDArray[np.float64]) -> tuple[int, ...]:

@@ -30,7 +30,7 @@ def to_uint8(image: NDArray) -> NDArray[np.uint8]:
         ValueError: the image is not a finite floating-point array.
     """
     _check_finite_float("image", image)
-    return np.clip(image * 255 + 0.5, 0, 255).astype(np.uint8)
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def quantize(image: NDArray) -> NDArray[np.float32]:
@@ -156,8 +156,8 @@ def depth_rmse_endogaussian(depth: NDArray, target: NDArray, mask: NDArray[np.bo
     _valid_differences(depth, target, mask)
     if not mask.any():
         return float("nan")
-    # Through int64 first: casting a float above 255 straight to uint8 is undefined.
-    a, b = (np.where(mask, z, 0).astype(np.int64).astype(np.uint8) for z in (depth, target))
+    # The remainder first: casting a float above 255 straight to uint8 is undefined, one above 2^63 to any integer.
+    a, b = (np.fmod(np.where(mask, z, 0), 256).astype(np.int64).astype(np.uint8) for z in (depth, target))
     difference = a - b
     return float(np.sqrt(np.sum(difference * difference, dtype=np.int64) / mask.size))
 

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ..checks import InputError, check_shape
 from ..config import DeformationConfig
-from .heads import OffsetHeads
-from .hexplane import PLANE_NAMES, PlaneGrid
+from .heads import OUTPUT_WIDTH, OffsetHeads
+from .hexplane import PLANE_NAMES, PlaneGrid, plane_shapes
 
 
 @dataclass(frozen=True)
@@ -50,17 +50,19 @@ class HexPlaneField:
     `grid` and its `PlaneAdam` own the planes; `parameters_by_group` names what autograd trains.
     """
 
-    def __init__(self, box: Tensor, cfg: DeformationConfig, generator: torch.Generator) -> None:
+    def __init__(self, box: Tensor, cfg: DeformationConfig, generator: torch.Generator, *, draw: bool = True) -> None:
         """Start a field.
 
         Args:
             box: (2, 3) corners, mm, in the order [max, min]; `box_of_points` makes one.
             generator: source of all random numbers: space planes first, then trunk and heads.
+            draw: False leaves the planes at 1.
         """
         check_shape("box:2,3", box=box)
         self.cfg = cfg
         self.grid = PlaneGrid(cfg.hexplane)
-        self.grid.initialize(generator)
+        if draw:
+            self.grid.initialize(generator)
         self.box = box.detach().to(torch.float32).clone().requires_grad_(cfg.hexplane.learn_box)
         self.heads = OffsetHeads(
             self.grid.num_features, cfg.hexplane.width, offset_names(cfg), cfg.hexplane.bias_init, generator
@@ -70,6 +72,17 @@ class HexPlaneField:
     def from_points(cls, points: Tensor, cfg: DeformationConfig, generator: torch.Generator) -> HexPlaneField:
         """A field whose box holds the initial points (N, 3), mm."""
         return cls(box_of_points(points), cfg, generator)
+
+    @classmethod
+    def from_state_arrays(cls, arrays: Mapping[str, Tensor], cfg: DeformationConfig) -> HexPlaneField:
+        """The field whose `state_arrays` these are.
+
+        Raises:
+            InputError: an array is missing or has another shape.
+        """
+        field = cls(torch.tensor([[1.0] * 3, [0.0] * 3]), cfg, torch.Generator(), draw=False)
+        field.load_state_arrays(arrays)
+        return field
 
     @property
     def num_plane_values(self) -> int:
@@ -130,6 +143,20 @@ class HexPlaneField:
                     "Load the scene with the configuration it was trained with."
                 )
             target.copy_(found)
+
+
+def state_shapes(cfg: DeformationConfig) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of `HexPlaneField.state_arrays`, all float32, in the same order; nothing is allocated."""
+    planes, width = cfg.hexplane, cfg.hexplane.width
+    shapes: dict[str, tuple[int, ...]] = {"hexplane.box": (2, 3)}
+    for scale, rows_and_columns in enumerate(plane_shapes(planes)):
+        shapes |= {f"hexplane.{scale}.{name}": (*size, planes.channels) for name, size in rows_and_columns.items()}
+    layers = {"trunk": (width, len(planes.multires) * planes.channels)}
+    for name in offset_names(cfg):
+        layers |= {f"{name}.hidden": (width, width), f"{name}.output": (OUTPUT_WIDTH[name], width)}
+    for name, weight in layers.items():
+        shapes |= {f"heads.{name}.weight": weight, f"heads.{name}.bias": weight[:1]}
+    return shapes
 
 
 def box_of_points(points: Tensor) -> Tensor:

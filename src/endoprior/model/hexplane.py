@@ -16,14 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError, check_shape
+from ..checks import check_shape
 from ..config import HexPlaneConfig
 from . import hexplane_kernels as kernels
 from .hexplane_lookup import Linear, Sample
 
 PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
-_COLUMN_AXES = (0, 0, 1, 0, 1, 2)
-_SPACE_ROW_AXES = (1, 2, 2)
 _CACHE_LINE = 64
 """Bytes."""
 
@@ -36,6 +34,18 @@ def mapped_zeros(*shape: int) -> Tensor:
     return torch.from_numpy(room[start : start + size]).view(shape)
 
 
+def plane_shapes(cfg: HexPlaneConfig) -> list[dict[str, tuple[int, int]]]:
+    """Rows and columns of each plane of each scale, by name; nothing is allocated.
+
+    Columns run along the first letter of a name, rows along the second.
+    """
+    scales = [
+        {**dict(zip("xyz", (r * m for r in cfg.resolution), strict=True)), "t": cfg.time_resolution}
+        for m in cfg.multires
+    ]
+    return [{name: (cells[name[1]], cells[name[0]]) for name in PLANE_NAMES} for cells in scales]
+
+
 class PlaneGrid:
     """Plane values, their gradients and which cells were ever used.
 
@@ -44,27 +54,13 @@ class PlaneGrid:
     """
 
     def __init__(self, cfg: HexPlaneConfig) -> None:
-        """Allocate planes filled with 1. `initialize` draws the starting values of the space planes.
-
-        Raises:
-            InputError: a resolution below 2, no scale, or channels outside 1..256.
-        """
-        if not 1 <= cfg.channels <= kernels.MAX_CHANNELS:
-            raise InputError(
-                f"deformation.hexplane.channels: expected 1 to {kernels.MAX_CHANNELS}; got {cfg.channels}. "
-                "Choose fewer channels or more scales."
-            )
+        """Allocate planes filled with 1. `initialize` draws the starting values of the space planes."""
         space = np.array([[r * m for r in cfg.resolution] for m in cfg.multires], dtype=np.int64).reshape(-1, 3)
-        if not len(space) or min(space.min(), cfg.time_resolution) < 2:
-            raise InputError(
-                "deformation.hexplane: expected at least one scale and two cells along every axis; "
-                f"got {cfg.resolution} x {cfg.multires}, {cfg.time_resolution} in time. Raise the resolution."
-            )
         self.resolution = space
         self.time_resolution = cfg.time_resolution
         self.time_map = cfg.time_map
         self.channels = cfg.channels
-        self._shapes = [[self._plane_shape(s, p) for p in range(6)] for s in range(len(space))]
+        self._shapes = [[shapes[name] for name in PLANE_NAMES] for shapes in plane_shapes(cfg)]
         sizes = np.array([[rows * columns for rows, columns in scale] for scale in self._shapes], dtype=np.int64)
         starts = (np.cumsum(sizes) - sizes.ravel()).reshape(-1, 6)
         self.space_start, self.time_start = starts[:, :3].copy(), starts[:, 3:].copy()
@@ -89,11 +85,6 @@ class PlaneGrid:
     def num_values(self) -> int:
         """Trained numbers in all planes."""
         return self.num_cells * self.channels
-
-    def _plane_shape(self, scale: int, plane: int) -> tuple[int, int]:
-        """Rows and columns of a plane."""
-        rows = self.resolution[scale, _SPACE_ROW_AXES[plane]] if plane < 3 else self.time_resolution
-        return int(rows), int(self.resolution[scale, _COLUMN_AXES[plane]])
 
     def plane(self, scale: int, name: str, of: Tensor | None = None) -> Tensor:
         """View (rows, columns, C) of one plane of `values`, or of another tensor with one row per cell.

@@ -18,7 +18,9 @@ from scipy.spatial import cKDTree
 from ..checks import InputError, check_shape
 from ..config import InitConfig, PriorConfig
 from ..geometry import back_project
+from ..memory import workers
 from ..priors import joint_texture_prior
+from ..render.constants import NEAR_Z
 from ..types import Frame
 from .point_cleanup import PointCloud, joined, merge_voxels, remove_outliers
 
@@ -28,8 +30,12 @@ MIN_SQUARED_SPACING = 1e-7
 """mm^2; initial scale of points that coincide, as EndoGaussian sets it."""
 ADAPTIVE_PERCENTILE = 97.0
 """Percentile of brightness that raises tau_v under `adaptive_specular`."""
+PRIOR_BYTES = 200
+"""Per pixel, while the points of a frame are drawn."""
 MIN_POINTS = 4
 """A scale needs three neighbors."""
+FARTHEST_MM = 1e9
+"""A depth from here on is no measurement; the squares of such lengths would soon leave float32."""
 
 log = logging.getLogger(__name__)
 
@@ -60,23 +66,32 @@ def initial_points(
         rng = np.random.default_rng([seed, position])
         return _draw_points(frames[position], position, shares[position], cfg, prior_cfg, rng)
 
-    with ThreadPoolExecutor() as pool:  # NumPy and OpenCV release the interpreter lock
+    threads = workers(PRIOR_BYTES * frames[0].tissue_mask.size) if len(frames) else 1
+    with ThreadPoolExecutor(threads) as pool:  # NumPy and OpenCV release the interpreter lock
         found = list(pool.map(drawn, range(len(frames))))
     cloud, missing = joined([points for points, _ in found]), sum(missed for _, missed in found)
     if cfg.sampler == "pool" and len(cloud):
         cloud = cloud.taken(np.random.default_rng(seed).integers(len(cloud), size=cfg.budget))
-    if missing:
-        log.warning("initialization: %d of %d points could not be drawn, too few tissue pixels", missing, cfg.budget)
     if cfg.cleanup:
         num_drawn = len(cloud)
         cloud = remove_outliers(merge_voxels(cloud, cfg.voxel_divisions), cfg.outlier_neighbors, cfg.outlier_std)
         log.info("initialization: %d of %d points left after clean-up", len(cloud), num_drawn)
     if len(cloud) < MIN_POINTS:
         raise InputError(
-            f"initialization: expected at least {MIN_POINTS} tissue pixels with depth in the training frames; "
-            f"got {len(cloud)}. Check masks, depth and the budget."
+            f"initialization: expected at least {MIN_POINTS} tissue pixels with depth between {NEAR_Z:g} and "
+            f"{FARTHEST_MM:g} mm in the training frames; got {len(cloud)}. Check masks, depth and its unit, and budget."
         )
+    if missing:
+        log.warning("initialization: %d of %d points could not be drawn, too few tissue pixels", missing, cfg.budget)
     return cloud
+
+
+def has_surface(frame: Frame) -> NDArray[np.bool_]:
+    """(H, W) True where depth was measured and a Gaussian there can be drawn: beyond the renderer's near plane.
+
+    Depth in meters that passes for millimeters lies in front of it: nothing would ever be seen.
+    """
+    return frame.depth_valid & (frame.depth > NEAR_Z) & (frame.depth < FARTHEST_MM)
 
 
 def _draw_points(
@@ -91,19 +106,19 @@ def _draw_points(
 
 
 def pixel_probability(frame: Frame, cfg: InitConfig, prior_cfg: PriorConfig) -> NDArray[np.float64]:
-    """(H, W) weight >= 0 with which the sampler named by `cfg` draws each pixel; 0 without tissue or depth.
+    """(H, W) weight >= 0 with which the sampler named by `cfg` draws each pixel; 0 without tissue or `has_surface`.
 
     For `uniform` and `pool` every tissue pixel weighs the same, the rim that Eq. (6) erodes included.
     """
     if cfg.sampler != "prior":
-        return (frame.tissue_mask & frame.depth_valid).astype(np.float64)
+        return (frame.tissue_mask & has_surface(frame)).astype(np.float64)
     eroded = eroded_mask(frame.tissue_mask, cfg.erosion_px)
     if cfg.adaptive_specular and eroded.any():
         bright = float(np.percentile(frame.rgb.max(-1)[eroded], ADAPTIVE_PERCENTILE))
         threshold = max(prior_cfg.specular.value_threshold, bright)
         prior_cfg = replace(prior_cfg, specular=replace(prior_cfg.specular, value_threshold=threshold))
     rho = joint_texture_prior(frame.rgb, eroded if cfg.salience_on_eroded_mask else frame.tissue_mask, prior_cfg)
-    return np.where(frame.depth_valid, sampling_distribution(rho, frame.tissue_mask, cfg), 0.0)
+    return np.where(has_surface(frame), sampling_distribution(rho, frame.tissue_mask, cfg), 0.0)
 
 
 def sampling_distribution(

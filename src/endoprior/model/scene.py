@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -11,17 +14,27 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
-from ..arrays_file import load_arrays, part, save_arrays
-from ..checks import InputError
-from ..config import Config
+from ..arrays_file import ArraySpec, load_arrays, part, refusing, save_arrays
+from ..checks import InputError, check_range
+from ..config import Checked, Config, Range
 from ..config_io import from_dict, to_dict
 from ..types import Camera, RenderOutput, Splats
 from .basis import basis_offsets
 from .deformation import HexPlaneField, Offsets
 from .gaussians import Gaussians
+from .schema import model_schema
 
 FORMAT = "endoprior-scene-1"
 """Name and version of the file format, in the file's metadata."""
+LARGEST_SIDE = 2**16
+"""Of a picture, px."""
+LARGEST_PICTURE = 2**26
+"""Pixels that are drawn at most: 8192 x 8192."""
+MOST_GAUSSIANS, MOST_FRAMES = 10_000_000, 1_000_000
+FARTHEST_MM = 1e9
+"""Lengths beyond it come from no endoscope, in whatever unit, and their squares leave float32."""
+LARGEST_DEVIATION = 5e-3
+"""Largest entry of R R^T - I that still passes for a rotation; readers accept 1e-3 of R^T R."""
 
 
 def offsets_at(
@@ -116,31 +129,110 @@ def load_scene(path: str | Path) -> Scene:
         InputError: there is no such file, or it is not a scene this version can read.
     """
     path = Path(path)
-    file = path / "scene.safetensors" if path.is_dir() else path
-    if not file.is_file():
+    file = path / "scene.safetensors" if os.path.isdir(path) else path
+    if not os.path.isfile(file):  # of a name too long for the system pathlib would raise
         raise InputError(f"{file}: expected a trained scene; found none. Train one with `endoprior train DATA {path}`.")
-    arrays, about = load_arrays(file, FORMAT, "Train the scene again.")
-    try:
-        return _from_arrays(arrays, about, str(file))
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{file}: expected every array of a scene; {error!r}. Train the scene again.") from error
+    next_step = "Train the scene again."
+    arrays, about = load_arrays(file, FORMAT, scene_schema, next_step)
+    with refusing(file, "a scene", next_step):
+        facts = from_dict(SceneFacts, {name: value for name, value in about.items() if name != "format"}, "about")
+        check_values(arrays)
+        return _from_arrays(arrays, facts)
 
 
-def _from_arrays(arrays: dict[str, Tensor], about: dict, where: str) -> Scene:
-    cfg = from_dict(Config, about["config"], f"{where}: config")
-    gaussians = Gaussians(part(arrays, "gaussians."))
+@dataclass(frozen=True)
+class SceneFacts(Checked):
+    """The description in a scene's file."""
+
+    config: Config
+    width: Annotated[int, Range(1, LARGEST_SIDE)]
+    height: Annotated[int, Range(1, LARGEST_SIDE)]
+    frames_per_second: Annotated[float, Range(1e-3, 1e6)]
+    lengths_are_relative: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range("width times height", self.width * self.height, 1, LARGEST_PICTURE)
+
+
+def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
+    """The arrays of a scene's file of this description; `N` Gaussians, `T` frames."""
+    per_gaussian = {name: ArraySpec("float32", ("N",)) for name in ("prior_score", "num_valid")}
+    cameras = {
+        "camera.intrinsics": ArraySpec("float64", ("T", 4)),
+        "camera.world_to_camera": ArraySpec("float64", ("T", 4, 4)),
+    }
+    return model_schema(from_dict(Config, about["config"])) | per_gaussian | cameras
+
+
+def check_values(arrays: Mapping[str, Tensor]) -> None:
+    """Refuse arrays of a scene, finite and of the right shapes, that no scene can have.
+
+    Raises:
+        InputError: naming the array.
+    """
+    num, quats = len(arrays["gaussians.means"]), arrays["gaussians.quats"]
+    _demand(
+        ("gaussians", num <= MOST_GAUSSIANS, f"at most {MOST_GAUSSIANS:,} Gaussians"),
+        ("gaussians.quats", bool((quats.abs().amax(1) >= 1e-12).all()) if num else True, "no quaternion of length 0"),
+        ("num_valid", bool((arrays["num_valid"] >= 0).all()), "counts"),
+    )
+    _check_cameras(arrays["camera.intrinsics"].numpy(), arrays["camera.world_to_camera"].numpy())
+
+
+def check_cameras(cameras: tuple[Camera, ...]) -> None:
+    """Refuse cameras that no scene can be loaded with again.
+
+    Raises:
+        InputError: naming what is wrong with them.
+    """
+    first = cameras[0]
+    _demand(
+        ("width and height", max(first.width, first.height) <= LARGEST_SIDE, f"at most {LARGEST_SIDE:,} px"),
+        ("pictures", first.width * first.height <= LARGEST_PICTURE, f"at most {LARGEST_PICTURE:,} px"),
+    )
+    _check_cameras(*_camera_arrays(cameras))
+
+
+def _check_cameras(intrinsics: NDArray, poses: NDArray) -> None:
+    deviation = poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
+    rigid = (np.abs(deviation) <= LARGEST_DEVIATION).all((1, 2)) & (np.linalg.det(poses[:, :3, :3]) > 0)
+    rigid &= (poses[:, 3] == (0, 0, 0, 1)).all(1) & (np.abs(poses[:, :3, 3]) <= FARTHEST_MM).all(1)
+    focal = (intrinsics[:, :2] >= 1e-3) & (intrinsics[:, :2] <= 1e7)
+    _demand(
+        ("camera.intrinsics", 1 <= len(intrinsics) <= MOST_FRAMES, f"1 to {MOST_FRAMES:,} frames"),
+        ("camera.intrinsics", focal.all(), "focal lengths of 0.001 to 1e7 px"),
+        ("camera.intrinsics", (np.abs(intrinsics[:, 2:]) <= 1e7).all(), "principal points within 1e7 px"),
+        ("camera.world_to_camera", rigid.all(), f"rigid transforms within {FARTHEST_MM:g} mm"),
+    )
+
+
+def _demand(*facts: tuple[str, Any, str]) -> None:
+    """Raise InputError at the first (name, whether it is so, what was expected) that is not so."""
+    for name, so, expected in facts:
+        if not so:
+            raise InputError(f"expected {expected} in {name}; got something else.")
+
+
+def _from_arrays(arrays: dict[str, Tensor], facts: SceneFacts) -> Scene:
+    cfg = facts.config
     field = None
     if cfg.deformation.kind == "hexplane":
-        field = HexPlaneField(torch.tensor([[1.0] * 3, [0.0] * 3]), cfg.deformation, torch.Generator())
-        field.load_state_arrays(part(arrays, "field."))
+        field = HexPlaneField.from_state_arrays(part(arrays, "field."), cfg.deformation)
     intrinsics, poses = arrays["camera.intrinsics"].numpy(), arrays["camera.world_to_camera"].numpy()
     cameras = tuple(
-        Camera(about["width"], about["height"], *map(float, k), pose) for k, pose in zip(intrinsics, poses, strict=True)
+        Camera(facts.width, facts.height, *map(float, k), pose) for k, pose in zip(intrinsics, poses, strict=True)
     )
-    rate, relative = about["frames_per_second"], bool(about.get("lengths_are_relative", False))
-    return Scene(gaussians, field, cfg, cameras, rate, arrays["prior_score"], arrays["num_valid"], relative)
+    return Scene(
+        Gaussians(part(arrays, "gaussians.")),
+        field,
+        cfg,
+        cameras,
+        facts.frames_per_second,
+        arrays["prior_score"],
+        arrays["num_valid"],
+        facts.lengths_are_relative,
+    )
 
 
 def _camera_arrays(cameras: tuple[Camera, ...]) -> tuple[NDArray, NDArray]:

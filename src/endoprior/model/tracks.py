@@ -10,6 +10,7 @@ Shared letters: `T` training frames, `N` points, `B` basis functions.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from collections.abc import Sequence as ReadOnlyList
 from concurrent.futures import ThreadPoolExecutor
 
@@ -19,9 +20,11 @@ from numpy.typing import NDArray
 
 from ..config import BasisConfig
 from ..geometry import back_project, bilinear, project
+from ..memory import BoundedCache, cache_bytes, workers
 from ..types import Camera, Frame
 from . import track_kernels as kernels
 from .basis import basis_weights
+from .initialize import has_surface
 from .point_cleanup import PointCloud
 
 MIN_SIZE_PX = 32
@@ -34,6 +37,10 @@ STILL_MARGIN = 1.1
 """A point stands still if its color explains the frames there, up to this factor as well as along its track."""
 BLUR_PX = 1.5
 """Standard deviation of the blur under which colors are compared."""
+FLOW_BYTES = 40
+"""Per pixel of a frame, while the flow of a pair is computed."""
+FLOW_CHUNK = 16
+"""Pairs of frames whose flow is computed, kept and forgotten together."""
 RIDGE = 1e-2
 """Of the least squares that turn tracks into coefficients; frames count 1 each."""
 
@@ -78,33 +85,46 @@ def follow(frames: ReadOnlyList[Frame], points: NDArray, origins: NDArray[np.int
     for position in np.unique(origins):
         own = origins == position
         pixels[position, own] = project(points[own], frames[position].camera)[0]
-    flows, limits = _flows(frames), (RETURN_PX, RETURN_SHARE)
+    flow, limits = _flows(frames), (RETURN_PX, RETURN_SHARE)
     for k in range(len(frames) - 1):
-        kernels.advance(pixels[k], origins <= k, *flows[k], frames[k + 1].tissue_mask, *limits, pixels[k + 1])
+        kernels.advance(pixels[k], origins <= k, *flow(k), frames[k + 1].tissue_mask, *limits, pixels[k + 1])
     for k in range(len(frames) - 1, 0, -1):
-        forward, backward = flows[k - 1]
+        forward, backward = flow(k - 1)
         kernels.advance(pixels[k], origins >= k, backward, forward, frames[k - 1].tissue_mask, *limits, pixels[k - 1])
     return pixels
 
 
-def _flows(frames: ReadOnlyList[Frame]) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Flow (h, w, 2) from each frame to the next and back, in px of the image it was computed on."""
+FlowPair = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Flow (h, w, 2) from a frame to the next and back, in px of the image it was computed on."""
+
+
+def _flows(frames: ReadOnlyList[Frame]) -> Callable[[int], FlowPair]:
+    """A function that gives the flows between frames k and k + 1; as many are kept as memory allows."""
     height, width = frames[0].tissue_mask.shape
     shrink = 2 if min(height, width) >= HALVED_FROM_PX else 1
     size = (width // shrink, height // shrink)
-    grays = [
-        cv2.resize(cv2.cvtColor(frame.rgb_u8, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
-        for frame in frames
-    ]
 
-    def both_ways(k: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        # A new estimator for each pair: it keeps buffers, and a pair must not depend on the one before.
-        estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        forward = estimator.calc(grays[k], grays[k + 1], None)
-        return forward, estimator.calc(grays[k + 1], grays[k], None)
+    def gray(k: int) -> NDArray[np.uint8]:
+        full = cv2.cvtColor(frames[k].rgb_u8, cv2.COLOR_RGB2GRAY)
+        return cv2.resize(full, size, interpolation=cv2.INTER_AREA)
 
-    with ThreadPoolExecutor() as pool:  # OpenCV releases the interpreter lock
-        return list(pool.map(both_ways, range(len(grays) - 1)))
+    def chunk(number: int) -> list[FlowPair]:
+        first = number * FLOW_CHUNK
+        grays = [gray(k) for k in range(first, min(first + FLOW_CHUNK + 1, len(frames)))]
+
+        def both_ways(k: int) -> FlowPair:
+            # A new estimator for each pair: it keeps buffers, and a pair must not depend on the one before.
+            estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+            forward = estimator.calc(grays[k], grays[k + 1], None)
+            return forward, estimator.calc(grays[k + 1], grays[k], None)
+
+        with ThreadPoolExecutor(workers(FLOW_BYTES * width * height)) as pool:  # OpenCV releases the interpreter lock
+            return list(pool.map(both_ways, range(len(grays) - 1)))
+
+    kept: BoundedCache[list[FlowPair]] = BoundedCache(
+        cache_bytes(), lambda pairs: sum(flow.nbytes for pair in pairs for flow in pair)
+    )
+    return lambda k: kept.get(k // FLOW_CHUNK, lambda: chunk(k // FLOW_CHUNK))[k % FLOW_CHUNK]
 
 
 def stands_still(
@@ -117,12 +137,16 @@ def stands_still(
     Args:
         points: (N, 3) world, mm. origins: (N,) positions in `frames`. pixels: (T, N, 2) from `follow`.
     """
-    blurred = [cv2.GaussianBlur(cv2.cvtColor(f.rgb_u8, cv2.COLOR_RGB2GRAY), (0, 0), BLUR_PX) for f in frames]
+
+    def blurred(position: int) -> NDArray[np.uint8]:
+        return cv2.GaussianBlur(cv2.cvtColor(frames[position].rgb_u8, cv2.COLOR_RGB2GRAY), (0, 0), BLUR_PX)
+
     own_gray, along_track, at_rest = np.zeros((3, len(points)))
-    for position, image in enumerate(blurred):
+    for position in np.unique(origins):
         own = origins == position
-        own_gray[own] = bilinear(image, pixels[position, own])
-    for position, image in enumerate(blurred):
+        own_gray[own] = bilinear(blurred(position), pixels[position, own])
+    for position in range(len(frames)):
+        image = blurred(position)
         resting = _project_in_front(points, frames[position].camera)
         kernels.add_mismatch(image, pixels[position], origins != position, resting, own_gray, along_track, at_rest)
     return at_rest <= STILL_MARGIN * along_track
@@ -141,7 +165,7 @@ def lift(frames: ReadOnlyList[Frame], pixels: NDArray) -> NDArray[np.float64]:
         known = np.flatnonzero(np.isfinite(pixels[position, :, 0]))
         height, width = frame.tissue_mask.shape
         x, y = _nearest(pixels[position, known], width, height)
-        measured = frame.depth_valid[y, x]
+        measured = has_surface(frame)[y, x]
         depth = frame.depth[y, x].astype(np.float64)[measured]
         found[position, known[measured]] = back_project(pixels[position, known[measured]], depth, frame.camera)
     return found

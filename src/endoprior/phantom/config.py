@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 from ..checks import InputError
 
+MOST_PIXELS = 3840 * 2160
+GB_PER_PIXEL = 1.3e-6
+"""Memory that writing takes, measured at 1920x1080."""
+
 
 def _require(name: str, value: float, low: float, high: float) -> None:
     """Raise InputError unless low <= value <= high (NaN fails)."""
@@ -20,7 +24,7 @@ class PhantomConfig:
     frames: int = 48
     """Number of frames, 2..10000; the tool grasps, pulls and releases about once every 48 of them."""
     width: int = 640
-    """Image width, 32..4096 px."""
+    """Image width, 32..4096 px; width x height at most 3840 x 2160, which takes 11 GB."""
     height: int = 512
     """Image height, 32..4096 px."""
     seed: int = 0
@@ -64,6 +68,9 @@ class PhantomConfig:
             ("tracks", 1, 20000),
         ):
             _require(name, getattr(self, name), low, high)
+        if self.width * self.height > MOST_PIXELS:
+            got = f"{self.width}x{self.height}, which takes about {self.width * self.height * GB_PER_PIXEL:.0f} GB"
+            raise InputError(f"`width`, `height`: expected at most 3840x2160 px in all; got {got}. Choose less.")
         _require("width / height", self.width / self.height, 0.6, 2.0)
         # A principal point far off center would look past the modeled tissue.
         _require("principal_x", self.center[0], 0.35 * self.width, 0.65 * self.width)

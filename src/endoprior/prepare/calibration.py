@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.images import complaint
+from ..data.reading import complaint
 
 MIN_BASELINE_MM, MAX_BASELINE_MM = 1.0, 30.0
 """Stereo endoscopes have their eyes 3 to 6 mm apart; 30 mm leaves room for rigs on the bench."""

@@ -8,19 +8,24 @@ from __future__ import annotations
 
 import configparser
 import json
+import math
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ..data.images import complaint
+from ..checks import InputError
+from ..data.numpy_files import read_numpy
+from ..data.reading import complaint, read_text
+from ..data.yaml_text import BoundedLoader, load_yaml
 from .calibration import Calibration, Eye
 
 Unit = Literal["auto", "mm", "cm", "m"]
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+MOST_PX = 1e6
+"""Of a size, a focal length or a principal point."""
 METERS_BELOW = 0.05
 """A T shorter than this is in meters: no stereo endoscope has its eyes 0.05 mm apart."""
 
@@ -48,15 +53,15 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     table = {_plain(name): value for name, value in table.items()}
     size = _size(table, path)
     # Files of this project count pixel centers from 0.5; OpenCV and all others count them from 0.
-    offset = 0.5 - float(table.get("pixelcenter", 0.0))
+    offset = 0.5 - _number(table, "pixelcenter", path, 0.0)
     if "fcxleft" in table:
         left, right = _da_vinci_eye(table, "left", offset, path), _da_vinci_eye(table, "right", offset, path)
     else:
         left, right = _eyes(table, offset, path)
     if left is None:
         raise complaint(path, "the left camera matrix", f"only {_some(table)}", HINT)
-    if right is None and (baseline := table.get("baselinemm")) is not None:
-        shift = np.array([-float(baseline), 0.0, 0.0])
+    if right is None and table.get("baselinemm") is not None:
+        shift = np.array([-_number(table, "baselinemm", path), 0.0, 0.0])
         return Calibration(left, left, np.eye(3), shift, size, _text(table, "layout"))
     if right is None:
         return Calibration(left, size=size, layout=_text(table, "layout"))
@@ -81,16 +86,16 @@ def _read_table(path: Path) -> Table:
         raise complaint(path, "a .yaml, .json, .npz or .ini file", path.suffix or "no suffix", "Convert it.")
     try:
         content = readers[path.suffix.lower()](path)
-    except OSError as error:
-        raise complaint(path, "a calibration file", error.strerror or str(error), "Check the path.") from None
-    except (ValueError, yaml.YAMLError, configparser.Error, BadZipFile, EOFError, UnicodeDecodeError) as error:
+        if isinstance(content, dict) and content:
+            return _flat(content)
+    except InputError:
+        raise
+    except (ValueError, TypeError, OverflowError, RecursionError, yaml.YAMLError, configparser.Error) as error:
         raise complaint(path, "a readable calibration", " ".join(str(error).split())[:120], "Correct it.") from None
-    if not isinstance(content, dict) or not content:
-        raise complaint(path, "named quantities", type(content).__name__, HINT)
-    return _flat(content)
+    raise complaint(path, "named quantities", type(content).__name__, HINT)
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(BoundedLoader):
     """Safe YAML that also knows OpenCV's matrices."""
 
 
@@ -99,25 +104,24 @@ for _name in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def _read_yaml(path: Path) -> Any:
-    text = path.read_text(encoding="utf-8")
+    text = read_text(path, "a calibration file", "Check the path.")
     if path.suffix.lower() == ".json":
         return json.loads(text)
     # OpenCV writes "%YAML:1.0", which is not YAML, and tabs or "---" after it.
     lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
-    return yaml.load("\n".join(lines), _Loader)
+    return load_yaml("\n".join(lines), _Loader)
 
 
 def _read_npz(path: Path) -> Table:
-    with np.load(path, allow_pickle=False) as stored:
-        if isinstance(stored, np.ndarray):
-            raise ValueError("a single array")
-        return {name: stored[name] for name in stored.files}
+    stored = read_numpy(path, "a readable calibration", "Save it again with numpy.savez.")
+    if isinstance(stored, np.ndarray):
+        raise ValueError("a single array")
+    return stored
 
 
 def _read_ini(path: Path) -> Table:
     parser = configparser.ConfigParser(interpolation=None)
-    with path.open(encoding="utf-8") as file:
-        parser.read_file(file)
+    parser.read_string(read_text(path, "a calibration file", "Check the path."))
     table: Table = {}
     for section in parser.sections():
         side = "left" if "left" in section.lower() else "right" if "right" in section.lower() else section
@@ -160,7 +164,7 @@ def _find(table: Table, names: tuple[str, ...], path: Path, shape: tuple[int, ..
         try:
             value = np.asarray(table[name], np.float64)
             value = value.reshape(shape)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             want = "x".join(map(str, shape)).replace("-1", "k")
             raise complaint(path, f"{name} to have {want} numbers", repr(table[name])[:60], HINT) from None
         if not np.isfinite(value).all():
@@ -189,7 +193,8 @@ def _eye(table: Table, side: str, offset: float, path: Path) -> Eye | None:
 
 
 def _checked(matrix: NDArray, distortion: NDArray, offset: float, path: Path) -> Eye:
-    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], (0, 0, 1))):
+    sane = np.isfinite(matrix).all() and np.isfinite(distortion).all() and np.abs(matrix).max() < MOST_PX
+    if not (sane and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], (0, 0, 1))):
         raise complaint(path, "a camera matrix (fx 0 cx; 0 fy cy; 0 0 1)", str(matrix.tolist()), "Correct it.")
     if len(distortion) not in (0, 1, 2, 3, 4, 5, 8, 12, 14):
         raise complaint(path, "4, 5, 8, 12 or 14 distortion coefficients", str(len(distortion)), "Correct them.")
@@ -204,23 +209,35 @@ def _plain_pinhole(table: Table, offset: float, path: Path) -> Eye | None:
     """fx, fy, cx, cy as `sequence.json` has them."""
     if not {"fx", "cx", "cy"} <= table.keys():
         return None
-    fx, cx, cy = (float(table[name]) for name in ("fx", "cx", "cy"))
-    matrix = np.array([[fx, 0, cx], [0, float(table.get("fy", fx)), cy], [0, 0, 1]])
+    fx, cx, cy = (_number(table, name, path) for name in ("fx", "cx", "cy"))
+    matrix = np.array([[fx, 0, cx], [0, _number(table, "fy", path, fx), cy], [0, 0, 1]])
     return _checked(matrix, np.zeros(4), offset, path)
 
 
 def _da_vinci_eye(table: Table, side: str, offset: float, path: Path) -> Eye:
-    try:
-        fx, fy, cx, cy = (float(table[name + side]) for name in ("fcx", "fcy", "ccx", "ccy"))
-        bent = [float(table.get(f"kc{i}{side}", 0)) for i in range(8)]
-    except KeyError as error:
-        raise complaint(path, "fc_x, fc_y, cc_x, cc_y of both eyes", f"no {error.args[0]}", "Complete it.") from None
+    names = [name + side for name in ("fcx", "fcy", "ccx", "ccy")]
+    if missing := [name for name in names if name not in table]:
+        raise complaint(path, "fc_x, fc_y, cc_x, cc_y of both eyes", f"no {missing[0]}", "Complete it.")
+    fx, fy, cx, cy = (_number(table, name, path) for name in names)
+    bent = [_number(table, f"kc{i}{side}", path, 0.0) for i in range(8)]
     if side == "right":
         for name, count in (("r", 9), ("t", 3)):
             values = [table.get(f"{name}{i}right") for i in range(count)]
             if None not in values:
                 table[name] = values
     return _checked(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(bent), offset, path)
+
+
+def _number(table: Table, name: str, path: Path, otherwise: float | None = None) -> float:
+    """A finite number of the table."""
+    value = table.get(name, otherwise)
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise complaint(path, f"{name} to be a number", repr(value)[:60], "Correct it.")
+    return number
 
 
 def _size(table: Table, path: Path) -> tuple[int, int] | None:
@@ -231,8 +248,8 @@ def _size(table: Table, path: Path) -> tuple[int, int] | None:
         return None
     try:
         width, height = (int(v) for v in found[0])
-    except (TypeError, ValueError):
-        raise complaint(path, "width and height in px", repr(found[0]), "Correct them.") from None
-    if width < 1 or height < 1:
+    except (TypeError, ValueError, OverflowError):
+        raise complaint(path, "width and height in px", repr(found[0])[:60], "Correct them.") from None
+    if not (1 <= width < MOST_PX and 1 <= height < MOST_PX):
         raise complaint(path, "width and height in px", f"{width}x{height}", "Correct them.")
     return width, height

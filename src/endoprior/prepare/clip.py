@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.images import complaint
+from ..data.reading import complaint
 from .calibration import Calibration
 from .config import PrepareConfig
 from .layout import Layout, eye_size, find_layout, split_eyes
 from .selection import Selection
 from .source import Picture, Source, open_source
+from .view import MIN_SIDE_PX
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,9 @@ class Clip:
         self.second: Source | None = open_source(cfg.right, rate) if cfg.right else None
         self.swap = cfg.swap_eyes
         first = next(iter(self.source)).rgb_u8
+        if min(first.shape[:2]) < MIN_SIDE_PX:
+            got = f"{first.shape[1]}x{first.shape[0]}"
+            raise complaint(video, f"pictures of at least {MIN_SIDE_PX}x{MIN_SIDE_PX} px", got, "Give the full size.")
         if cfg.layout == "auto":
             self.layout: Layout = find_layout(first, calibration, self.second is not None, str(video))
         else:

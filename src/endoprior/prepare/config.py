@@ -95,6 +95,8 @@ class PrepareConfig:
     """Also write the second eye's pictures to `right/`."""
 
     def __post_init__(self) -> None:
+        if self.stir is not None and self.depth == "none":
+            raise ValueError("stir needs depth, which --depth none leaves out")
         check_range("field_of_view_degrees", self.field_of_view_degrees, 10, 170)
         check_range("start", self.start, 0, 1e9)
         if not self.end > self.start:

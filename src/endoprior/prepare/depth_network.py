@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..checks import InputError, check_shape
-from ..data.images import complaint
+from ..data.reading import complaint
 
 if TYPE_CHECKING:
     from torch.nn import Module

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..data.files import natural_order
-from ..data.images import complaint
+from ..data.reading import complaint
 
 
 def match_files(folder: Path, suffixes: Sequence[str], what: str, indices: Sequence[int]) -> dict[int, Path]:

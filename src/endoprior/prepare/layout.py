@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.images import complaint
+from ..data.reading import complaint
 from .calibration import Calibration
 
 Layout = Literal["auto", "mono", "side-by-side", "top-bottom", "interlaced", "two-files"]

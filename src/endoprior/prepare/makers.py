@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..checks import InputError
 from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_values
-from ..data.images import complaint
+from ..data.reading import complaint
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.eyes import eye_order, vertical_offset_px
 from ..footage.units import guess_unit

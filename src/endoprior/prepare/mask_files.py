@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.files import read_only_array
-from ..data.images import PNG_SIGNATURE, complaint
+from ..data.images import decode_image
+from ..data.numpy_files import read_only_array
+from ..data.reading import complaint
 from ..footage.polarity import Polarity, mask_polarity
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz")
@@ -40,7 +40,7 @@ def read_user_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
     Raises:
         InputError: unreadable, of another size, not finite, or no mask.
     """
-    values = _load_array(path) if path.suffix.lower() in (".npy", ".npz") else _load_image(path)
+    values = _load_array(path) if path.suffix.lower() in (".npy", ".npz") else decode_image(path, None)
     high = _high_of_colors(path, values) if values.ndim == 3 else _high_of_numbers(path, values)
     if high.shape != size[::-1]:
         got = f"{high.shape[1]}x{high.shape[0]}"
@@ -73,25 +73,6 @@ def tool_polarity(
     return Polarity(
         seen.tool_is_high, seen.certainty, f"{'high' if seen.tool_is_high else 'low'} values mark tools: {seen.reason}"
     )
-
-
-def _load_image(path: Path) -> NDArray:
-    """(H, W) numbers or (H, W, 3 or 4) colors, blue first."""
-    try:
-        encoded = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise complaint(
-            path, "a readable file", error.strerror or str(error), "Check the path and the rights."
-        ) from None
-    # A PNG that ends early is refused before decoding, which would write to stderr.
-    whole = encoded[:8].tobytes() != PNG_SIGNATURE or b"IEND" in encoded.tobytes()
-    try:
-        pixels = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if encoded.size and whole else None
-    except cv2.error:
-        pixels = None
-    if pixels is None:
-        raise complaint(path, "an image", f"{encoded.size} bytes that cannot be decoded", "Write the file again.")
-    return pixels
 
 
 def _load_array(path: Path) -> NDArray:

@@ -11,7 +11,9 @@ import numpy as np
 
 from ..checks import runs
 from ..data import write_stir_tracks
-from ..data.images import complaint, read_color, read_depth, read_tool_mask
+from ..data.images import read_color, read_depth, read_tool_mask
+from ..data.reading import complaint, kind_of
+from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
 from ..footage.camera_motion import camera_motion
 from ..footage.changes import find_changes
@@ -56,7 +58,10 @@ def prepare(
     """
     cfg = cfg or PrepareConfig()
     named = [video, cfg.right, cfg.calibration, cfg.stir, Path(cfg.masks), Path(cfg.depth), Path(cfg.poses)]
-    plan = {"config": repr(cfg), "sources": [source_facts(path) for path in named if path and path.exists()]}
+    there = [path for path in named if path and kind_of(path) != "nothing"]
+    if cfg.stir is not None:
+        demand_stir_clip(cfg.stir)
+    plan = {"config": repr(cfg), "sources": [source_facts(path) for path in there]}
     with work_folder(out, plan) as folder:
         calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
         clip = Clip(video, cfg, calibration)

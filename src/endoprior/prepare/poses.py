@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.files import read_numpy
-from ..data.images import complaint
+from ..data.numpy_files import read_numpy
 from ..data.poses import demand_rotations
+from ..data.reading import complaint
 
 MAX_CORNERS = 800
 MIN_POINTS = 30
@@ -102,6 +102,8 @@ def read_poses(path: Path, count: int) -> PosePath:
     shape = getattr(stored, "shape", None)
     if shape not in ((count, 4, 4), (count, 3, 4), (count, 17)):
         raise complaint(path, f"shape ({count}, 4, 4), one pose per frame", str(shape or "an archive"), hint)
+    if stored.dtype.kind not in "iuf":
+        raise complaint(path, "numbers", str(stored.dtype), hint)
     values = stored.astype(np.float64)
     if shape == (count, 17):
         values = values[:, :15].reshape(count, 3, 5)

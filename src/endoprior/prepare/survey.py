@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.images import complaint
+from ..data.reading import complaint
 from ..footage.border import Circle, Strips, find_circle, find_strips
 from ..footage.text import find_static_overlays
 from .calibration import Calibration

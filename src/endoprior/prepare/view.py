@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.images import complaint
+from ..data.reading import complaint
 from ..footage.border import Circle, Strips
 from .calibration import Calibration, check_pair
 from .config import Rectangle

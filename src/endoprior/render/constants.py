@@ -18,5 +18,7 @@ ALPHA_MIN = 1.0 / 255.0
 """A Gaussian is not drawn at a pixel where its alpha would be below this: the exact edge of its footprint."""
 STOP_TRANSMITTANCE = 1e-4
 """The Gaussian that would bring a pixel's transmittance below this is not drawn there, nor any behind it."""
+MIN_QUAT = 1e-12
+"""A Gaussian whose quaternion is shorter is culled: its gradient, which grows with 1 / length, would overflow."""
 OVERFLOW = 3.4e38
 """A Gaussian is culled when one of its projected numbers reaches this, the end of float32."""

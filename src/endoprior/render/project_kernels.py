@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from .constants import ALPHA_MIN, BLUR_PX2, NEAR_Z, OVERFLOW
+from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
 from .sh_kernels import direction_gradient, write_basis
 
 f4 = np.float32
@@ -80,7 +80,7 @@ def project_forward(
                 continue
             x = view[0, 0] * wx + view[0, 1] * wy + view[0, 2] * wz + view[0, 3]
             y = view[1, 0] * wx + view[1, 1] * wy + view[1, 2] * wz + view[1, 3]
-            _axes(view, quats[g], scales[g], axes)
+            length = _axes(view, quats[g], scales[g], axes)
             _, _, b0, b1, b2, c0, c1, c2 = _spread(lens, x, y, z, axes)
             xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
             px, py = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
@@ -93,9 +93,9 @@ def project_forward(
                 red += values[i] * sh[g, i, 0]
                 green += values[i] * sh[g, i, 1]
                 blue += values[i] * sh[g, i, 2]
-            # One sum notices every NaN and infinity; a quaternion of length 0 gives NaN.
+            # One sum notices every NaN and infinity.
             size = abs(px) + abs(py) + z + xx * yy + abs(red) + abs(green) + abs(blue) + abs(opacities[g])
-            if not size < OVERFLOW:
+            if not (size < OVERFLOW and length >= MIN_QUAT):
                 continue
             means2d[g, 0], means2d[g, 1], z_out[g] = px, py, z
             row_forms[g, 0], row_forms[g, 1], row_forms[g, 2] = yy / det, -xy / yy, 1.0 / yy

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..checks import check_shape
 from ..types import Camera, Splats
 from . import sh
-from .constants import ALPHA_MIN, BLUR_PX2, JACOBIAN_MARGIN, NEAR_Z, OVERFLOW
+from .constants import ALPHA_MIN, BLUR_PX2, JACOBIAN_MARGIN, MIN_QUAT, NEAR_Z, OVERFLOW
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -34,6 +34,8 @@ class Projected:
     """(N, 3) color seen from the camera, >= 0."""
     radii: Tensor
     """(N,) int32 ceil(3 sigma) along the long axis, px; 0 where nothing of it can reach a pixel."""
+    det: Tensor | None = None
+    """(N,) determinant of `cov2d`, px^4, as `project` gives it: of a needle `xx yy - xy^2` keeps no digit."""
 
 
 def check(splats: Splats, background: Tensor) -> int:
@@ -66,7 +68,7 @@ def jacobian_limits(camera: Camera) -> tuple[float, float, float, float]:
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """(N, 3, 3) rotations of (N, 4) quaternions (w, x, y, z) of any length but zero."""
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    w, x, y, z = _unit(quats).unbind(-1)
     entries = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -78,8 +80,8 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def project(splats: Splats, camera: Camera) -> Projected:
     """Project every Gaussian, and find out which of them can be drawn.
 
-    Culled are: center at or behind `NEAR_Z`; any number not finite, or a result that overflows; a quaternion of length
-    0; a footprint (where alpha >= `ALPHA_MIN`) that misses every pixel center's bounding box.
+    Culled are: center at or behind `NEAR_Z`; any number not finite, or a result that overflows; a quaternion shorter
+    than `MIN_QUAT`; a footprint (where alpha >= `ALPHA_MIN`) that misses every pixel center's bounding box.
     """
     with torch.no_grad():  # decide first; a `where` after the fact would let NaN into the gradients
         usable = _usable(splats, camera)
@@ -89,12 +91,12 @@ def project(splats: Splats, camera: Camera) -> Projected:
         values = getattr(splats, name)
         keep = usable.reshape(-1, *(1,) * (values.dim() - 1))
         safe[name] = torch.where(keep, values, placeholder[name])
-    means2d, cov2d, z, colors = _project(Splats(**safe), camera)
-    return Projected(means2d, cov2d, z, colors, _radii(means2d, cov2d, safe["opacities"], usable, camera))
+    means2d, cov2d, det, z, colors = _project(Splats(**safe), camera)
+    return Projected(means2d, cov2d, z, colors, _radii(means2d, cov2d, safe["opacities"], usable, camera), det)
 
 
-def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Means, covariances, z and colors of Gaussians trusted to be in front of the camera."""
+def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Means, covariances and their determinants, z and colors of Gaussians trusted to be in front of the camera."""
     view = torch.as_tensor(camera.world_to_camera, dtype=splats.means.dtype)
     x, y, z = (splats.means @ view[:3, :3].T + view[:3, 3]).unbind(-1)
     left, right, top, bottom = jacobian_limits(camera)
@@ -102,26 +104,29 @@ def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Te
     axes = view[:3, :3] @ rotation_matrices(splats.quats) * splats.scales[:, None, :]  # columns: the axes, camera frame
     spread_x = (camera.fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])  # rows of J times the axes
     spread_y = (camera.fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
-    cov2d = torch.stack(
-        [
-            (spread_x * spread_x).sum(-1) + BLUR_PX2,
-            (spread_x * spread_y).sum(-1),
-            (spread_y * spread_y).sum(-1) + BLUR_PX2,
-        ],
-        -1,
-    )
+    xx, xy, yy = (spread_x * spread_x).sum(-1), (spread_x * spread_y).sum(-1), (spread_y * spread_y).sum(-1)
+    cov2d = torch.stack([xx + BLUR_PX2, xy, yy + BLUR_PX2], -1)
+    # Of the blurred product B B^T + b I of a 2x3 matrix with rows r1, r2: |r1 x r2|^2 + b (|r1|^2 + |r2|^2) + b^2.
+    det = torch.linalg.cross(spread_x, spread_y).square().sum(-1) + BLUR_PX2 * (xx + yy) + BLUR_PX2**2
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
     towards = splats.means - torch.as_tensor(camera.center, dtype=splats.means.dtype)
-    return means2d, cov2d, z, sh.colors(splats.sh, towards / towards.norm(dim=-1, keepdim=True))
+    return means2d, cov2d, det, z, sh.colors(splats.sh, _unit(towards))
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    """(N, C) vectors at length 1. They are brought near it first, so that no square vanishes or overflows."""
+    vectors = vectors / vectors.detach().abs().amax(-1, keepdim=True)
+    return vectors / vectors.norm(dim=-1, keepdim=True)
 
 
 def _usable(splats: Splats, camera: Camera) -> Tensor:
     """(N,) True where the Gaussian is finite, in front of the camera, and stays finite when projected."""
     per_gaussian = [splats.means, splats.quats, splats.scales, splats.opacities[:, None], splats.sh.flatten(1)]
     usable = torch.cat(per_gaussian, -1).isfinite().all(-1)
-    means2d, cov2d, z, colors = _project(splats, camera)
+    means2d, cov2d, _, z, colors = _project(splats, camera)
     largest = torch.cat([means2d, z[:, None], (cov2d[:, :1] * cov2d[:, 2:]), colors], -1).abs().sum(-1)
-    return usable & (z > NEAR_Z) & (largest < OVERFLOW)  # False for NaN, as a quaternion of length 0 gives
+    length = splats.quats.norm(dim=-1)
+    return usable & (z > NEAR_Z) & (length >= MIN_QUAT) & (largest < OVERFLOW)  # False for NaN
 
 
 def _placeholder(splats: Splats, camera: Camera) -> dict[str, Tensor]:

@@ -22,7 +22,7 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
     seen = project(splats, camera)
     order = seen.z.argsort(stable=True)
     order = order[seen.radii[order] > 0]
-    alpha = _alpha(seen.means2d[order], seen.cov2d[order], splats.opacities[order], camera)
+    alpha = _alpha(seen.means2d[order], seen.cov2d[order], seen.det[order], splats.opacities[order], camera)
     alpha = alpha * _drawn(alpha)
     behind = torch.cumprod(torch.cat([alpha.new_ones((*alpha.shape[:2], 1)), 1 - alpha], -1), -1)
     weights, transmittance = alpha * behind[..., :-1], behind[..., -1]
@@ -36,12 +36,13 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
     )
 
 
-def _alpha(means2d: Tensor, cov2d: Tensor, opacities: Tensor, camera: Camera) -> Tensor:
+def _alpha(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, camera: Camera) -> Tensor:
     """(H, W, N) opacity times the 2D Gaussian, at most ALPHA_MAX, exactly 0 below ALPHA_MIN."""
     pixels = torch.as_tensor(pixel_centers(camera.width, camera.height), dtype=means2d.dtype)
     dx, dy = (pixels[:, :, None] - means2d).unbind(-1)
-    xx, xy, yy = cov2d.unbind(-1)
-    squared_distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)  # Mahalanobis
+    _, xy, yy = cov2d.unbind(-1)
+    # Mahalanobis: (yy dx^2 - 2 xy dx dy + xx dy^2) / det, as a sum of squares, which nothing can make negative.
+    squared_distance = (dx - xy / yy * dy).square() * (yy / det) + dy * dy / yy
     alpha = (opacities * torch.exp(-0.5 * squared_distance)).clamp(max=ALPHA_MAX)
     return torch.where(alpha >= ALPHA_MIN, alpha, 0)
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..checks import InputError
+from ..data.reading import read_text
 from ..types import Camera
 
 View = tuple[float, Camera]
@@ -55,9 +56,11 @@ def read_path(file: Path, cameras: tuple[Camera, ...]) -> list[View]:
         InputError: the file is missing, is not such a list, or a matrix is not a rigid motion.
     """
     try:
-        entries = json.loads(file.read_text())
+        entries = json.loads(read_text(file, "a camera path", "Correct the file."))
         views = [_view(entry, cameras) for entry in entries]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(
             f'{file}: expected a JSON list of {{"time": .., "world_to_camera": 4 x 4}}; {error!r}. Correct the file.'
         ) from None

@@ -1,13 +1,30 @@
-"""Who may talk to the viewer: a port that is free, and pages that came from the viewer itself."""
+"""Who may talk to the viewer, and what may be said: its own pages, and messages that make sense.
+
+Any program of this machine can connect, and the library behind the page takes what it is sent at its word: it would set
+any attribute of a control, or keep the parts of an upload that nobody asked for.
+"""
 
 from __future__ import annotations
 
+import math
 import socket
+from collections.abc import Callable, Mapping
+from typing import Any
 from urllib.parse import urlsplit
 
 from ..checks import InputError
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
+LARGEST_MESSAGE = 2**16
+"""Bytes a browser may send at once; what it does send has some hundreds."""
+MOST_BROWSERS = 32
+"""Connections at a time."""
+MOST_PER_SECOND = 500
+"""Messages of one connection; dragging sends as many as the screen draws pictures."""
+FARTHEST_MM = 1e7
+"""From the origin that a camera may be."""
+LARGEST_CANVAS = 100_000
+"""Pixels along a side."""
 
 
 def check_address(host: str, port: int) -> None:
@@ -40,8 +57,68 @@ def trusted(origin: str | None, asked_host: str | None, bound_host: str) -> bool
     """
     if origin is None:
         return True
-    if urlsplit(origin).netloc != asked_host:
+    try:
+        same, name = urlsplit(origin).netloc == asked_host, urlsplit(f"//{asked_host}").hostname
+    except ValueError:
         return False
     # A foreign name that was made to point at this machine is not us either.
-    name = urlsplit(f"//{asked_host}").hostname
-    return name in LOOPBACK if bound_host in LOOPBACK else True
+    return same and (name in LOOPBACK if bound_host in LOOPBACK else True)
+
+
+class Pace:
+    """How much one connection says."""
+
+    def __init__(self) -> None:
+        self._since, self._said = 0.0, 0
+
+    def exceeded(self, now: float) -> bool:
+        """Count a message that came at `now`, s; whether that makes more than `MOST_PER_SECOND` in this second."""
+        if now - self._since >= 1:
+            self._since, self._said = now, 0
+        self._said += 1
+        return self._said > MOST_PER_SECOND
+
+
+def sensible(kind: str, message: Mapping[str, Any], accepts: Callable[[str, Any], bool]) -> bool:
+    """Whether a browser that shows the viewer's page could have sent this.
+
+    Args:
+        kind: name of the message's type.
+        message: its fields.
+        accepts: whether the control of this id can have this value.
+    """
+    if kind == "ViewerCameraMessage":
+        return is_camera(message) and _is_canvas(message)
+    if kind == "ScenePointerMessage":
+        return _is_click(message)
+    if kind == "GuiUpdateMessage":
+        updates, uuid = message["updates"], message["uuid"]
+        # Anything else in there would be set as well: what listens to the control, whether it is there at all.
+        return isinstance(updates, dict) and updates.keys() == {"value"} and accepts(str(uuid), updates["value"])
+    return False
+
+
+def is_camera(fields: Mapping[str, Any]) -> bool:
+    """Whether `wxyz`, `position`, `look_at`, `up_direction` and `fov` describe a camera near the tissue."""
+    places = (fields["position"], fields["look_at"], fields["up_direction"])
+    turned = are_numbers(fields["wxyz"], 4, 1e3) and math.hypot(*fields["wxyz"]) > 1e-6
+    return turned and all(are_numbers(place, 3, FARTHEST_MM) for place in places) and are_numbers([fields["fov"]], 1, 4)
+
+
+def are_numbers(values: Any, count: int, largest: float) -> bool:
+    """Whether these are `count` finite numbers, none beyond `largest` on either side of 0."""
+    if not isinstance(values, list | tuple) or len(values) != count:
+        return False
+    return all(type(v) in (int, float) and -largest <= v <= largest for v in values)
+
+
+def _is_canvas(fields: Mapping[str, Any]) -> bool:
+    sides = [fields["image_width"], fields["image_height"]]
+    return are_numbers(sides, 2, LARGEST_CANVAS) and min(sides) >= 0
+
+
+def _is_click(fields: Mapping[str, Any]) -> bool:
+    places, ray = fields["screen_pos"], (fields["ray_origin"], fields["ray_direction"])
+    clicked = fields["event_type"] == "click" and isinstance(places, list | tuple) and len(places) == 1
+    known = fields["modifier"] is None or isinstance(fields["modifier"], str)
+    return clicked and known and are_numbers(places[0], 2, 1e3) and all(are_numbers(v, 3, FARTHEST_MM) for v in ray)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .guard import are_numbers
 from .session import Layer, Look
 from .subject import Subject
 
@@ -69,6 +72,33 @@ class Panel:
             self.forget = gui.add_button("Forget the views")
             self.film = gui.add_button("Film (MP4)", hint="All frames from here, or through the views kept.")
 
+        self._allowed = self._values()
+
+    def _values(self) -> dict[str, Callable[[Any], bool]]:
+        """By the id of a control, whether it can have a value."""
+        found: dict[str, Callable[[Any], bool]] = {}
+
+        def allow(rule: Callable[[Any], bool], *handles: Any) -> None:
+            found.update({handle._impl.uuid: rule for handle in handles})
+
+        def choice(handle: Any) -> None:
+            allow(lambda value: isinstance(value, str) and value in handle.options, handle)
+
+        last, end = self.frame.max, self.clip_end
+        allow(lambda value: are_numbers([value], 1, last) and value >= 0, self.frame)
+        allow(lambda value: are_numbers(value, 2, end) and min(value) >= 0, self.clip)
+        allow(lambda value: isinstance(value, bool), self.tool, self.tracks, self.measure)
+        allow(lambda value: isinstance(value, bool), self.play, self.clear, self.screenshot, self.keep, self.forget)
+        allow(lambda value: isinstance(value, bool), self.film)
+        for handle in (self.speed, self.layer, self.camera, self.drawn_by, self.drawn_as):
+            choice(handle)
+        return found
+
+    def accepts(self, uuid: str, value: Any) -> bool:
+        """Whether the control of this id can have this value; False if there is no such control."""
+        rule = self._allowed.get(uuid)
+        return rule is not None and rule(value)
+
     @property
     def rate(self) -> float:
         """How many times faster than it was filmed."""
@@ -91,9 +121,15 @@ class Panel:
         )
 
 
+def plain(text: str) -> str:
+    """Text as it is, in the page's Markdown: the name of a folder must not become a picture, a link or a script."""
+    shown = "".join(letter if letter.isprintable() else " " for letter in text)
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", shown)
+
+
 def status(subject: Subject, look: Look, num_kept: int) -> str:
     """What is shown, in a few lines."""
-    lines = [f"**{subject.title}**", f"frame {look.frame} of {len(subject.cameras)}"]
+    lines = [f"**{plain(subject.title)}**", f"frame {look.frame} of {len(subject.cameras)}"]
     if legend := subject.legend(look):
         lines.append(legend)
     if look.in_browser and not subject.sent(look):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import whole_file
+from ..checks import InputError
 from ..show.video import write_video
 
 
@@ -21,7 +23,7 @@ def png_bytes(rgb_u8: NDArray[np.uint8]) -> bytes:
     return encoded.tobytes()
 
 
-def mp4_bytes(pictures: list[NDArray[np.uint8]], frames_per_second: float) -> bytes:
+def mp4_bytes(pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> bytes:
     """Pictures (H, W, 3) of one size as an H.264 film."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "film.mp4"
@@ -38,7 +40,10 @@ def keep(folder: Path, name: str, content: bytes) -> Path:
         Where it is.
     Raises:
         ValueError: `name` has a folder in it, or no ending.
+        InputError: `folder` is a link: a run from a stranger could point it anywhere.
     """
+    if folder.is_symlink():
+        raise InputError(f"{folder}: expected a folder; got a link to one. Remove it.")
     if Path(name).name != name or not Path(name).suffix:
         raise ValueError(f"name must be a plain file name with an ending; got {name!r}.")
     stem, suffix = Path(name).stem, Path(name).suffix

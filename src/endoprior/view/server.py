@@ -6,22 +6,28 @@ loop, or a training run between two iterations - runs the jobs and draws, so tha
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
-import queue
+import logging
 import sys
 import time as clock
 import traceback
-from collections.abc import Callable
+import warnings
+from collections import defaultdict
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from ..checks import InputError
 from . import panel, saving
-from .guard import check_address, trusted
+from .guard import LARGEST_MESSAGE, MOST_BROWSERS, Pace, check_address, sensible, trusted
+from .jobs import Jobs
 from .marks import Marks, joined, no_marks, ruler, trails
 from .measure import Measurement, pick, sentence
 from .path import Place, sweep, through
@@ -29,6 +35,11 @@ from .session import REST_SECONDS, Look, frame_due
 from .stage import Stage, marked_picture, stance
 from .subject import Subject
 from .viewport import endoscope_viewport
+
+MOST_KEPT = 100
+"""Views that a film goes through."""
+MOST_PICTURES = 10_000
+"""Pictures of one film."""
 
 
 class _LocalServer(viser.ViserServer):
@@ -52,9 +63,10 @@ class Viewer:
             InputError: the address cannot be listened on.
         """
         check_address(host, port)
+        warnings.filterwarnings("ignore", "Queued a", UserWarning)  # viser's, of every browser that leaves
         self.subject, self.look, self.out, self.host = subject, Look(layer=subject.layers[0]), out, host
         self.measured: Measurement | None = None
-        self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._jobs = Jobs()
         self._playing: tuple[int, float] | None = None
         """Frame and moment from which the film runs."""
         self._picked: list[tuple[NDArray, int]] = []
@@ -64,7 +76,7 @@ class Viewer:
         self._version, self._moved_at = 0, clock.monotonic() - REST_SECONDS
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
             self._server = _LocalServer(host=host, port=port, label="EndoPrior-GS", verbose=False)
-        self._server._websock_server.on_client_connect(self._admit)
+        self._keep_out()
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.gui.main_panel.dock_right()
         self._server.scene.set_up_direction("-y")
@@ -118,11 +130,8 @@ class Viewer:
             wait: the longest to wait for something to do, s.
         """
         wait = min(wait, self._seconds_to_next())
-        with contextlib.suppress(queue.Empty):
-            job = self._jobs.get(timeout=wait) if wait > 0 else self._jobs.get_nowait()
-            while True:
-                self._attempt(job)
-                job = self._jobs.get_nowait()
+        for job in self._jobs.take(wait):
+            self._attempt(job)
         self._attempt(self._advance)
         self._attempt(self._draw)
 
@@ -137,6 +146,9 @@ class Viewer:
         """Run a job; a failure is told to the browsers and on stderr, and ends neither the viewer nor a training."""
         try:
             job()
+        except InputError as error:
+            print(f"view: {error}", file=sys.stderr)
+            self._stage.notify("That did not work", str(error))
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
             self._stage.notify("That did not work", f"{type(error).__name__}: {error}")
@@ -148,7 +160,7 @@ class Viewer:
 
         def on_change(job: Callable[[], None], *handles: viser.GuiInputHandle) -> None:
             for handle in handles:  # values that the viewer itself sets come back without a client
-                handle.on_update(lambda event: ask(job) if event.client is not None else None)
+                handle.on_update(lambda event: ask(job, job) if event.client is not None else None)
 
         def on_press(handle: viser.GuiButtonHandle, job: Callable[[viser.ClientHandle], None]) -> None:
             handle.on_click(lambda event: ask(lambda: job(event.client)) if event.client is not None else None)
@@ -164,22 +176,67 @@ class Viewer:
         on_press(controls.forget, lambda _: self._forget_views())
         on_press(controls.screenshot, self._screenshot)
         on_press(controls.film, self._film)
-        self._server.on_client_connect(lambda client: ask(lambda: self._welcome(client)))
+        self._server.on_client_connect(lambda client: ask(lambda: self._welcome(client), surely=True))
         self._server.on_client_disconnect(self._goodbye)
 
     async def _goodbye(self, client: viser.ClientHandle) -> None:  # async: viser's own threads may have ended by then
-        self._jobs.put(lambda: self._stage.leave(client))
+        self._jobs.put(lambda: self._stage.leave(client), surely=True)
 
-    async def _admit(self, connection: object) -> None:
-        """Close the connection of a page that is not ours, before anything is sent to it."""
-        socket = self._server._websock_server._live_connections[connection.client_id]
-        headers = socket.request.headers
-        if not trusted(headers.get("Origin"), headers.get("Host"), self.host):
-            await socket.close(1008, "not this viewer's page")
+    # Who is let in, and what is listened to of what they say.
+
+    def _keep_out(self) -> None:
+        """Put the guard between the socket and everything else."""
+        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a traceback for each stranger's garbage
+        server = self._server._websock_server
+        server._handle_incoming_message = self._guarded(server._handle_incoming_message)
+        server.on_client_connect(self._admit)
+        for client_id in tuple(server._live_connections):  # who was faster than the line above
+            asyncio.run_coroutine_threadsafe(self._judge(client_id), self._server._event_loop)
+
+    async def _admit(self, connection: Any) -> None:
+        """Before anything is sent to a connection, or read from it."""
+        connection._handle_incoming_message = self._guarded(connection._handle_incoming_message)
+        await self._judge(connection.client_id)
+
+    async def _judge(self, client_id: int) -> None:
+        """Close the connection of a page that is not ours, and one too many."""
+        connections = self._server._websock_server._live_connections
+        if (connection := connections.get(client_id)) is None:
+            return
+        connection.protocol.max_message_size = LARGEST_MESSAGE
+        if not self._trusts(client_id):
+            await connection.close(1008, "not this viewer's page")
+        elif len(connections) > MOST_BROWSERS:
+            await connection.close(1013, "too many browsers")
+
+    def _trusts(self, client_id: int) -> bool:
+        """Whether a connection that is open may be served."""
+        connection = self._server._websock_server._live_connections.get(client_id)
+        if connection is None:
+            return False
+        origins, hosts = (connection.request.headers.get_all(name) for name in ("Origin", "Host"))
+        return len(origins) < 2 and trusted(next(iter(origins), None), next(iter(hosts), None), self.host)
+
+    def _guarded(self, handle: Callable[[int, Any], Awaitable[None]]) -> Callable[[int, Any], Awaitable[None]]:
+        """`handle` of those messages only that make sense and come from our pages; a flood ends its connection."""
+        paces: defaultdict[int, Pace] = defaultdict(Pace)
+
+        async def guarded(client_id: int, message: Any) -> None:
+            controls = getattr(self, "panel", None)  # there are none yet while the viewer starts
+            accepts = controls.accepts if controls else lambda uuid, value: False
+            connection = self._server._websock_server._live_connections.get(client_id)
+            if connection is None:
+                paces.pop(client_id, None)
+            elif paces[client_id].exceeded(clock.monotonic()):
+                connection.transport.abort()
+            elif self._trusts(client_id) and sensible(type(message).__name__, vars(message), accepts):
+                await handle(client_id, message)
+
+        return guarded
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         self._stage.join(client)
-        client.camera.on_update(lambda _: self._jobs.put(self._camera_moved))
+        client.camera.on_update(lambda _: self._jobs.put(self._camera_moved, self._camera_moved))
 
     def _camera_moved(self) -> None:
         if not self.look.endoscope:
@@ -268,7 +325,9 @@ class Viewer:
 
     def _keep_view(self, client: viser.ClientHandle) -> None:
         viewport = self._stage.viewport(client, self.subject, self.look)
-        if viewport is not None:
+        if len(self._kept) >= MOST_KEPT:
+            self._stage.notify("Not kept", f"{MOST_KEPT} views are enough for one film.")
+        elif viewport is not None:
             self._kept.append(Place(self.look.frame, viewport.camera))
         self._say()
 
@@ -290,12 +349,15 @@ class Viewer:
         look, places = self.look, sweep(self.subject.cameras, None if self.look.endoscope else viewport.camera)
         if len(self._kept) > 1:
             look, places = replace(look, endoscope=False), through(self._kept)
+        if len(places) > MOST_PICTURES:
+            self._stage.notify("No film", f"Expected at most {MOST_PICTURES} pictures; got {len(places)}.")
+            return
         self._stage.notify("Drawing the film", f"{len(places)} pictures")
         looks = [replace(look, frame=place.frame) for place in places]
-        pictures = [
+        pictures = (  # one at a time: all of them may not fit into memory
             marked_picture(self.subject, look, place.camera, self._marks(look))
             for look, place in zip(looks, places, strict=True)
-        ]
+        )
         self._offer(client, f"{look.layer}.mp4", saving.mp4_bytes(pictures, self.subject.frames_per_second))
 
     def _offer(self, client: viser.ClientHandle, name: str, content: bytes) -> None:

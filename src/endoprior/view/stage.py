@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Camera
+from .guard import is_camera
 from .marks import Marks, draw_marks
 from .session import REST_SECONDS, Look, shrink_factor
 from .subject import Subject
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 HASTY_QUALITY = 80
 """JPEG quality of pictures while something moves; those that stay are PNG, exact to the bit."""
+CAMERA_FIELDS = ("wxyz", "position", "look_at", "up_direction", "fov")
 SPLATS_NODE, POINTS_NODE, MARKS_NODE = "/splats", "/points", "/marks"
 
 
@@ -53,8 +55,13 @@ class Stage:
 
     def notify(self, title: str, body: str) -> None:
         """Show a note in every browser for a few seconds."""
-        for browser in self._browsers.values():
+        for browser in self._connected():
             browser.client.add_notification(title, body, auto_close_seconds=5.0)
+
+    def _connected(self) -> list[_Browser]:
+        """Those of whom we do not know yet that they have left may have left."""
+        clients = self._server.get_clients()
+        return [browser for number, browser in list(self._browsers.items()) if number in clients]
 
     def return_to_endoscope(self) -> None:
         """The browsers' cameras were moved away and are to be put back."""
@@ -67,6 +74,8 @@ class Stage:
         aspect = bounded_aspect(camera.image_width, camera.image_height)
         if look.endoscope:
             return endoscope_viewport(own, aspect, shrink)
+        if not is_camera({name: np.asarray(getattr(camera, name)).tolist() for name in CAMERA_FIELDS}):
+            return None
         return free_viewport(camera.wxyz, camera.position, camera.fov, aspect, own.height, shrink)
 
     def draw(self, subject: Subject, version: int, look: Look, marks: Marks, still_seconds: float) -> None:
@@ -78,7 +87,7 @@ class Stage:
         """
         sent = subject.sent(look)
         self._send_nodes(subject, version, look, marks, sent)
-        for browser in list(self._browsers.values()):
+        for browser in self._connected():
             if look.endoscope:
                 self._follow_endoscope(browser, subject, look)
             if not sent:

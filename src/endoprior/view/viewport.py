@@ -90,8 +90,9 @@ def free_viewport(
 
 def bounded_aspect(width: float, height: float) -> float:
     """width / height of a canvas, held in a sane range; 1 for a canvas of no size."""
-    aspect = width / height if width > 0 and height > 0 else 1.0
-    return float(np.clip(aspect, LEAST_ASPECT, LARGEST_ASPECT))
+    if not (0 < width < float("inf") and 0 < height < float("inf")):
+        return 1.0
+    return min(max(width / height, LEAST_ASPECT), LARGEST_ASPECT)
 
 
 def square_pixels(camera: Camera) -> Camera:

@@ -1,0 +1,109 @@
+"""Every fault test, one after the other: `python faults/run.py [--only PART ...] [--write docs/reliability.md]`.
+
+Prints a table as it goes; with --write it also replaces the one in that file. Exit status 1 if anything failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import disk
+import kills
+import limits
+import memory
+import soak
+from harness import ENVIRONMENT, Row
+
+ROOT = Path(__file__).parents[1]
+BEGIN, END = "<!-- figures: make test-faults -->", "<!-- end of figures -->"
+
+
+def properties(work: Path) -> list[Row]:
+    """The property-based tests with random seeds and many examples, and those of divergence and hostile files."""
+    files = sorted((ROOT / "tests").glob("test_properties_*.py"))
+    files += [ROOT / "tests" / f"test_{name}.py" for name in ("divergence", "hostile_state", "hostile_viewer")]
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *map(str, files)]
+    return [
+        _subprocess_row("properties", "property-based tests, thorough, and hostile files", words, _last_pytest_line)
+    ]
+
+
+def corpus(work: Path) -> list[Row]:
+    """The bad-input corpus, every case a process of its own under limits."""
+    words = [sys.executable, str(ROOT / "faults" / "corpus.py")]
+    return [_subprocess_row("bad input", "corpus", words, lambda out: out.strip().splitlines()[-1])]
+
+
+def _subprocess_row(part: str, what: str, words: list[str], told: Callable[[str], str]) -> Row:
+    environment = ENVIRONMENT | {"ENDOPRIOR_HYPOTHESIS": "thorough"}
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        print(done.stdout[-6000:], done.stderr[-3000:], sep="\n", file=sys.stderr)
+    return Row(part, what, told(done.stdout or "no output\n"), done.returncode == 0)
+
+
+def _last_pytest_line(out: str) -> str:
+    """`n passed ...` without the time."""
+    lines = [line for line in out.splitlines() if " passed" in line or " failed" in line or " error" in line]
+    return lines[-1].strip("= ").split(" in ")[0] if lines else out.strip().splitlines()[-1]
+
+
+PARTS: dict[str, Callable[[Path], list[Row]]] = {
+    "kills": kills.main,
+    "disk": disk.main,
+    "memory": memory.main,
+    "bad input": corpus,
+    "properties": properties,
+    "soak": soak.main,
+    "limits": limits.main,
+}
+
+
+def table(rows: list[Row], minutes: float) -> str:
+    """The rows as Markdown, with what they were measured on."""
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty=+"], cwd=ROOT, capture_output=True, text=True, check=False
+    ).stdout.strip()
+    lines = ["| part | what | found | |", "|---|---|---|---|"]
+    lines += [f"| {row.part} | {row.what} | {row.figure} | {'ok' if row.passed else '**failed**'} |" for row in rows]
+    about = f"Commit {commit}, Python {platform.python_version()}, {os.cpu_count()} cores, {minutes:.0f} minutes."
+    return "\n".join([*lines, "", about])
+
+
+def main() -> int:
+    """Run the parts and print; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="*", choices=list(PARTS), default=list(PARTS))
+    parser.add_argument("--write", type=Path, help="file whose table is replaced")
+    chosen = parser.parse_args()
+    began, rows = time.monotonic(), []
+    for name in chosen.only:
+        with tempfile.TemporaryDirectory(prefix="faults-") as work:
+            part_began = time.monotonic()
+            try:
+                found = PARTS[name](Path(work))
+            except Exception as error:  # the other parts still run
+                found = [Row(name, "the test itself", f"{type(error).__name__}: {error}", False)]
+            for row in found:
+                print(f"{'ok    ' if row.passed else 'FAILED'} {row.part}: {row.what}: {row.figure}", flush=True)
+            print(f"       {name}: {time.monotonic() - part_began:.0f} s", flush=True)
+            rows += found
+    text = table(rows, (time.monotonic() - began) / 60)
+    if chosen.write:
+        page = chosen.write.read_text()
+        before, after = page.split(BEGIN)[0], page.split(END)[1]
+        chosen.write.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}")
+    print(f"\n{text}")
+    return 0 if all(row.passed for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

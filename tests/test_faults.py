@@ -1,0 +1,185 @@
+"""Kills, full disks and closed terminals, in short; `make test-faults` has the long ones."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from test_train import tiny_config
+
+from endoprior import atomic
+from endoprior.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder
+from endoprior.checks import InputError
+from endoprior.data import load_sequence
+from endoprior.run_folder import deferred_interrupt
+from endoprior.train import train
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
+
+from harness import Program, differences, leftovers, run
+
+SHORT = [
+    "--init-budget", "300", "--schedule.coarse-iterations", "5", "--schedule.fine-iterations", "250",
+    "--density.start-iteration", "20", "--density.every", "20", "--no-networks",
+]  # fmt: skip
+
+
+class Broken(Exception):
+    """A library's error with the system's words inside."""
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "new" / "file.txt"
+    with whole_file(path) as temporary:
+        temporary.write_text("first")
+        assert not path.exists()
+    with pytest.raises(ZeroDivisionError), whole_file(path) as temporary:
+        temporary.write_text("half")
+        raise ZeroDivisionError
+    assert path.read_text() == "first" and list(path.parent.iterdir()) == [path]
+
+
+def test_files_get_the_usual_permissions(tmp_path):
+    with whole_file(tmp_path / "a") as temporary:
+        temporary.touch(mode=0o600)
+    (tmp_path / "b").touch()
+    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(28, "No space left on device"), "No space left"),
+        (OSError(27, "File too large"), "File too large"),
+        (Broken("I/O error: No space left on device (os error 28)"), "No space left"),
+    ],
+)
+def test_a_disk_that_refuses_is_named_with_its_reason(tmp_path, error, words):
+    for whole in (whole_file, whole_folder):
+        with pytest.raises(CannotWrite) as caught, whole(tmp_path / "out"):
+            raise error
+        text = str(caught.value)
+        assert text.startswith(f"{tmp_path / 'out'}: expected") and words in text and "\n" not in text
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_an_encoder_that_only_stops_is_asked_for_the_disk(tmp_path, monkeypatch):
+    with pytest.raises(CannotWrite, match="an encoder that stopped"), whole_file(tmp_path / "film.mp4"):
+        raise BrokenPipeError("the encoder stopped")
+    monkeypatch.setattr(atomic, "FULL_BYTES", 1 << 62)
+    with pytest.raises(CannotWrite, match="No space left"), whole_file(tmp_path / "film.mp4"):
+        raise BrokenPipeError("the encoder stopped")
+
+
+def test_an_unreadable_input_is_not_blamed_on_the_output(tmp_path):
+    with pytest.raises(PermissionError), whole_folder(tmp_path / "a" / "out"):
+        raise PermissionError(13, "Permission denied", str(tmp_path / "input.png"))
+
+
+def test_leftovers_of_the_dead_go_and_those_of_the_living_stay(tmp_path):
+    child = os.spawnlp(os.P_WAIT, "true", "true")
+    assert child == 0
+    dead = 2**22 - 3  # beyond what Linux gives to processes
+    for owner in (dead, os.getpid()):
+        (tmp_path / f".a.{owner}.partial.png").touch()
+        (tmp_path / f".b.{owner}.partial").mkdir()
+    remove_leftovers(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [f".a.{os.getpid()}.partial.png", f".b.{os.getpid()}.partial"]
+
+
+def test_training_goes_on_after_kills_to_the_same_bytes(tiny_sequence, tmp_path):
+    words, parts = ["train", tiny_sequence, tmp_path / "parts", *SHORT], tmp_path / "parts"
+    assert run("train", tiny_sequence, tmp_path / "whole", *SHORT).status == 0
+    for attempt in range(2):
+        resume = ["--resume"] if (parts / "config.json").exists() else []
+        program = Program(*words, "--checkpoint-seconds", "0.05", *resume)
+        while program.running and not list(parts.glob(".checkpoint*.partial*")):  # strike while one is written
+            time.sleep(0.0005)
+        program.kill()
+        assert program.wait().status == -9, f"ended before kill {attempt}"
+    assert run(*words, "--resume").status == 0
+    assert differences(parts, tmp_path / "whole") + leftovers(parts) == []
+
+
+def test_a_run_killed_before_its_first_checkpoint_starts_again(tiny_sequence, tmp_path):
+    cfg, out = tiny_config("basis"), tmp_path / "run"
+    whole = train(load_sequence(tiny_sequence), cfg, tmp_path / "whole")
+
+    def stop(report, trainer):
+        raise SystemExit  # nothing is saved
+
+    with pytest.raises(SystemExit):
+        train(load_sequence(tiny_sequence), cfg, out, on_step=stop)
+    assert not (out / "checkpoint.safetensors").exists()
+    with pytest.raises(InputError, match=r"config differs at seed"):
+        train(load_sequence(tiny_sequence), tiny_config("basis").__class__(seed=5), out, resume=True)
+    train(load_sequence(tiny_sequence), cfg, out, resume=True)
+    assert differences(out, tmp_path / "whole") == [] and len(whole)
+
+
+def test_two_processes_do_not_train_in_one_folder(tiny_sequence, tmp_path):
+    cfg, out = tiny_config("basis"), tmp_path / "run"
+    refused = []
+
+    def intrude(report, trainer):
+        if not refused:
+            with pytest.raises(InputError, match="no other process") as caught:
+                train(load_sequence(tiny_sequence), cfg, out, resume=True)
+            refused.append(caught)
+
+    train(load_sequence(tiny_sequence), cfg, out, on_step=intrude)
+    assert refused and not (out / ".lock").exists()
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_schedulers_and_closing_terminals_are_heard(tiny_sequence, tmp_path, name):
+    cfg, out, sent = tiny_config("basis"), tmp_path / "run", []
+
+    def end(report, trainer):
+        if not sent:
+            sent.append(signal.raise_signal(getattr(signal, name)))
+
+    with pytest.raises(KeyboardInterrupt):
+        train(load_sequence(tiny_sequence), cfg, out, on_step=end)
+    assert (out / "checkpoint.safetensors").is_file()
+    train(load_sequence(tiny_sequence), cfg, out, resume=True)
+
+
+def test_nohup_is_respected_and_a_second_ctrl_c_does_not_wait():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with deferred_interrupt() as pressed:
+            signal.raise_signal(signal.SIGHUP)
+            assert not pressed()
+            signal.raise_signal(signal.SIGINT)
+            assert pressed()
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_signals_are_left_alone_outside_the_main_thread():
+    seen = []
+    thread = threading.Thread(target=lambda: seen.append(deferred_interrupt().__enter__()()))
+    thread.start()
+    thread.join()
+    assert seen == [False]
+
+
+def test_a_limit_for_files_stops_training_in_one_line_and_keeps_the_checkpoint(tiny_sequence, tmp_path):
+    out = tmp_path / "run"
+    words = ["train", tiny_sequence, out, *SHORT]
+    assert run(*words).status == 0
+    (out / "scene.safetensors").unlink()
+    kept = (out / "checkpoint.safetensors").read_bytes()
+    done = run(*words, "--resume", limits={resource.RLIMIT_FSIZE: 50_000})
+    assert done.one_line and "File too large" in done.err, done.err
+    assert (out / "checkpoint.safetensors").read_bytes() == kept and not leftovers(out)

@@ -1,0 +1,359 @@
+"""What strangers can do to a viewer that is listening: nothing. One server takes it all, then serves a picture."""
+
+import base64
+import os
+import socket
+import struct
+import threading
+import time
+from contextlib import suppress
+
+import msgspec
+import numpy as np
+import pytest
+from export_scenes import moving_scene
+from view_client import Client, at_work
+from websockets.exceptions import ConnectionClosed
+
+from endoprior.checks import InputError
+from endoprior.view import panel as panels
+from endoprior.view.guard import LARGEST_MESSAGE, MOST_BROWSERS, sensible, trusted
+from endoprior.view.jobs import MOST_WAITING, Jobs
+from endoprior.view.panel import ORBIT
+from endoprior.view.saving import keep
+from endoprior.view.scene_subject import SceneSubject
+from endoprior.view.server import MOST_KEPT, Viewer
+from endoprior.view.viewport import bounded_aspect
+
+pytestmark = pytest.mark.filterwarnings("ignore:Queued a:UserWarning")  # to a browser that has just left
+KEY = base64.b64encode(b"0123456789abcdef").decode()
+UPGRADE = (
+    "GET / HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    "Sec-WebSocket-Key: " + KEY + "\r\nSec-WebSocket-Protocol: viser-v1.1.1\r\n{more}\r\n"
+)
+
+
+@pytest.fixture(scope="module")
+def viewer(tmp_path_factory):
+    """A viewer of a small scene, at work during all of these tests."""
+    out = tmp_path_factory.mktemp("run") / "view"
+    with at_work(Viewer(SceneSubject(moving_scene(), "wall"), out=out)) as viewer:
+        yield viewer
+
+
+@pytest.fixture
+def good(viewer):
+    """A proper browser: it was there before, and is served afterwards."""
+    client = Client(viewer.port)
+    client.look()
+    client.picture(quiet=0.1)
+    yield client
+    client.set(viewer.panel.frame, 1 + (viewer.look.frame % 8))
+    assert client.picture(quiet=0.1).any()
+    client.socket.close()
+    late = Client(viewer.port)  # what is replayed to newcomers must have stayed whole, too
+    late.look()
+    assert late.picture(quiet=0.1).any()
+    late.socket.close()
+
+
+def raw(viewer, data: bytes, wait: float = 0.3) -> bytes:
+    """What comes back over a plain socket for these bytes."""
+    found = b""
+    with socket.create_connection(("127.0.0.1", viewer.port)) as plain, suppress(OSError):
+        plain.settimeout(wait)
+        plain.sendall(data)
+        while len(found) < 10_000 and (more := plain.recv(4096)):
+            found += more
+    return found
+
+
+def frame(payload: bytes, opcode: int = 2, length: int | None = None, final: bool = True) -> bytes:
+    """A masked frame of the WebSocket protocol that says it is `length` long."""
+    length = len(payload) if length is None else length
+    size = bytes([0x80 | length]) if length < 126 else bytes([0x80 | 127]) + struct.pack(">Q", length)
+    return bytes([(0x80 if final else 0) | opcode]) + size + b"\0\0\0\0" + payload
+
+
+def upgraded(viewer, more: str = "") -> bytes:
+    """A request that the viewer answers with a WebSocket."""
+    return UPGRADE.format(host=f"127.0.0.1:{viewer.port}", more=more).encode()
+
+
+def resident_mb() -> float:
+    """Memory of this process."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def test_requests_that_are_none(viewer, good):
+    rng = np.random.default_rng(0)
+    requests = [b"", b"\0" * 10_000, rng.bytes(5000), b"GET", b"GET / HTTP/1.1\r\nHost: x\r\n", b"\x16\x03\x01" * 50]
+    requests += [b"GET / HTTP/1.1\r\n" + b"X: " + b"a" * 10**6, b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 100_000]
+    requests += [
+        b"GET /" + b"a" * 10**6 + b" HTTP/1.1\r\n\r\n",
+        b"POST / HTTP/1.1\r\nContent-Length: 99999999999\r\n\r\n",
+    ]
+    for request in requests:
+        assert b"Traceback" not in raw(viewer, request)
+
+
+@pytest.mark.parametrize("secret", ["etc/passwd", "proc/self/environ"])
+def test_no_path_leads_out_of_the_page(viewer, good, secret):
+    up = "../" * 12
+    paths = [f"/{up}{secret}", f"//{secret}", f"/{'..%2f' * 12}{secret}", f"/{'%2e%2e/' * 12}{secret}"]
+    paths += [f"/assets/{up}{secret}", f"/{'..%5c' * 12}{secret}", f"/%00/{secret}", f"/index.html%00/{secret}"]
+    paths += [f"/{'%252e%252e/' * 12}{secret}", f"/./{'.%2e/' * 12}{secret}", f"file:///{secret}", f"http://x/{secret}"]
+    for path in paths:
+        answer = raw(viewer, f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{viewer.port}\r\n\r\n".encode())
+        assert b"root:" not in answer and b"PATH=" not in answer and b"200 OK" not in answer.split(b"\r\n")[0], path
+
+
+def test_frames_that_are_none(viewer, good):
+    before = resident_mb()
+    bombs = [b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\x91" * 60_000]
+    frames = [
+        b"\xff" * 1000,
+        frame(b"", length=2**63 - 1),
+        frame(b"x", length=2**40),
+        frame(b"x" * (LARGEST_MESSAGE + 1)),
+    ]
+    frames += [frame(b"x" * 60_000, final=False) + frame(b"x" * 60_000, 0, final=False) * 100]
+    frames += [frame(b"text", 1), frame(b"ping" * 10, 9), frame(b"", 8), frame(b"\x03", 8), *map(frame, bombs)]
+    for sent in frames:
+        raw(viewer, upgraded(viewer) + sent)
+    assert resident_mb() - before < 100
+
+
+def messages(viewer, client) -> list[dict]:
+    """Well-formed messages that no browser would send."""
+    odd = [
+        "x",
+        None,
+        [],
+        {},
+        [1],
+        True,
+        2**63,
+        -(2**63),
+        1e308,
+        np.nan,
+        np.inf,
+        -1,
+        [np.nan] * 2,
+        "x" * 10_000,
+        [[]] * 50,
+    ]
+    ids = {name: handle._impl.uuid for name, handle in vars(viewer.panel).items() if hasattr(handle, "_impl")}
+    found = [{"type": kind} for kind in ("", "Message", "GuiUpdateMessage", "RunJavascriptMessage", "ShareUrlRequest")]
+    for number, (name, uuid) in enumerate(ids.items()):
+        pressed = [True] if hasattr(getattr(viewer.panel, name), "on_click") else []  # which is what a button is for
+        found += [gui(uuid, value=value) for value in odd[number % 2 :: 2] if value not in pressed]
+    for name in ("update_cb", "sync_cb", "removed", "is_button", "props", "gui_api", "uuid", "__class__", "no_such"):
+        found += [gui(ids["frame"], **{name: value}) for value in ([], None, True, "x")]
+    found += [
+        gui("nobody", value=1),
+        gui([1], value=1),
+        {"type": "GuiUpdateMessage", "uuid": ids["frame"], "updates": 3},
+    ]
+    for name in ("wxyz", "position", "up_direction", "fov", "image_height", "image_width"):
+        found += [client.camera(**{name: value}) for value in odd[len(name) % 2 :: 2]]
+    found += [client.camera(wxyz=[0] * 4), client.camera(position=[1e308] * 3), client.camera(fov=0)]
+    found += [client.camera(image_width=10**9, image_height=1), client.camera(image_width=0, image_height=0)]
+    ray = {"ray_origin": [0, 0, 0], "ray_direction": [0, 0, 1], "modifier": None}
+    for place in ([], [[]], [[np.nan, 0]], [[1e308, 1e308]], [["x", "y"]], [[0.5, 0.5]] * 1000, 3, None):
+        for kind in ("click", "rect-select", "no such", 3):
+            found.append({"type": "ScenePointerMessage", "event_type": kind, "screen_pos": place, **ray})
+    found.append(
+        {"type": "ScenePointerMessage", "event_type": "click", "screen_pos": [[0.5, 0.5]], **ray, "ray_origin": None}
+    )
+    for uuid in (ids["screenshot"], "nobody"):
+        start = {"source_component_uuid": uuid, "transfer_uuid": "t", "filename": "../../pwned", "mime_type": "x"}
+        found.append({"type": "FileTransferStartUpload", **start, "part_count": 10**6, "size_bytes": 10**12})
+        part = {"source_component_uuid": uuid, "transfer_uuid": "t", "content": b"x" * 50_000}
+        found += [{"type": "FileTransferPart", **part, "part_index": i} for i in range(50)]
+    return found
+
+
+def gui(control, **updates) -> dict:
+    """A change of a control."""
+    return {"type": "GuiUpdateMessage", "uuid": control, "updates": updates}
+
+
+class Stranger(Client):
+    """A client that sends whatever it likes, and connects again when it is thrown out."""
+
+    def __init__(self, port: int, **options) -> None:
+        self.again = lambda: Client.__init__(self, port, close_timeout=0.01, **options)
+        self.again()
+
+    def camera(self, **changes) -> dict:
+        """The message that says where the camera is."""
+        place = {"wxyz": [1, 0, 0, 0], "position": [0, 0, 0], "look_at": [0, 0, 60], "up_direction": [0, -1, 0]}
+        size = {"fov": 0.9, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 600}
+        return {"type": "ViewerCameraMessage", **place, **size, **changes}
+
+    def say(self, message: dict) -> None:
+        try:
+            raw = msgspec.msgpack.encode(message)
+        except OverflowError:  # msgpack has no such integer
+            return
+        try:
+            self.socket.send(raw)
+        except ConnectionClosed:
+            self.again()
+            self.look()
+            self.socket.send(raw)
+
+
+@pytest.mark.parametrize("orbit", [False, True])
+def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
+    if orbit:
+        good.set(viewer.panel.camera, ORBIT)
+        good.picture(quiet=0.2)
+    state = {name: handle.value for name, handle in vars(viewer.panel).items() if hasattr(handle, "value")}
+    before, stranger = resident_mb(), Stranger(viewer.port)
+    stranger.look()
+    for message in messages(viewer, stranger):
+        if not orbit or message["type"] == "ViewerCameraMessage":
+            stranger.say(message)
+    stranger.say(stranger.camera())
+    time.sleep(0.5)
+    stranger.socket.close()
+    allowed = {"measure", "tool", "tracks", "frame", "clip"}  # true and 1 are values some of them can have
+    now = {name: getattr(viewer.panel, name).value for name in state}
+    assert {name for name in state if state[name] != now[name]} <= allowed
+    assert now["clip"] == state["clip"] and 0 <= now["frame"] <= 9
+    assert viewer.panel.frame._impl.update_cb and not viewer.panel.frame._impl.removed
+    assert not viewer._server.gui._current_file_upload_states
+    assert resident_mb() - before < 100
+    for name in ("measure", "tool", "tracks"):
+        getattr(viewer.panel, name).value = False
+    viewer._jobs.put(viewer._read_panel)
+    viewer._jobs.put(viewer._read_measuring)
+    if orbit:
+        good.set(viewer.panel.camera, panels.ENDOSCOPE)
+        good.picture(quiet=0.2)
+    assert "view/" not in capfd.readouterr().err  # what viser says about broken messages is its own matter
+
+
+def test_only_the_folder_for_pictures_is_written_to(viewer, good):
+    files = {path for path in viewer.out.parent.rglob("*") if viewer.out not in path.parents}
+    assert files <= {viewer.out} and not list(viewer.out.parent.parent.rglob("*pwned*"))
+
+
+ORIGINS = ("http://evil.example", "null", "http://127.0.0.1:1", "http://localhost.evil:{port}", "http://[", "x" * 999)
+
+
+def test_a_foreign_page_neither_sees_nor_commands(viewer, good):
+    """Browsers let any page open a WebSocket to this machine; what it sends at once must not be carried out."""
+    at, own = viewer.look.frame, f"Origin: http://127.0.0.1:{viewer.port}\r\n"
+    orders = [Stranger.camera(good), gui(viewer.panel.frame._impl.uuid, value=(at + 3) % 9)] * 2
+    said = b"".join(frame(msgspec.msgpack.encode(order)) for order in orders)
+    headers = [f"Origin: {origin.format(port=viewer.port)}\r\n" for origin in ORIGINS]
+    requests = [upgraded(viewer, header) for header in [*headers, own + headers[0], headers[0] + own]]
+    rebound = f"evil.example:{viewer.port}"  # a name that was made to point here
+    requests.append(UPGRADE.format(host=rebound, more=f"Origin: http://{rebound}\r\n").encode())
+    for request in requests:
+        assert len(raw(viewer, request + said)) < 1000, request
+        assert viewer.look.frame == at
+    raw(viewer, upgraded(viewer, own) + said)
+    end = time.monotonic() + 5
+    while viewer.look.frame == at and time.monotonic() < end:
+        time.sleep(0.01)
+    assert viewer.look.frame == (at + 3) % 9  # and our own page's is
+
+
+def test_no_more_browsers_than_there_can_be(viewer, good):
+    crowd = []
+    for _ in range(MOST_BROWSERS + 8):
+        with suppress(ConnectionClosed):
+            crowd.append(Client(viewer.port, close_timeout=0.2))
+    time.sleep(0.3)
+    assert len(viewer._server._websock_server._live_connections) <= MOST_BROWSERS
+    for client in crowd:
+        client.socket.close()
+    end = time.monotonic() + 10
+    while len(viewer._server._websock_server._live_connections) > 1 and time.monotonic() < end:
+        time.sleep(0.05)
+
+
+def test_a_flood_neither_stops_the_work_nor_fills_the_memory(viewer, good):
+    """Training calls `work` between two iterations: it must come back however much is asked for."""
+    before, stop, ended = resident_mb(), threading.Event(), []
+
+    def flood():
+        stranger, k = Client(viewer.port, close_timeout=0.2), 0
+        stranger.look()
+        with suppress(ConnectionClosed):
+            while not stop.is_set():
+                k += 1
+                stranger.look(position=[k % 7, 0, 0])
+                stranger.set(viewer.panel.frame, k % 9)
+                stranger.set(viewer.panel.clear, True)
+        ended.append(not stop.is_set())
+        stranger.socket.close()
+
+    threads = [threading.Thread(target=flood) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    end = time.monotonic() + 3
+    while len(ended) < 2 and time.monotonic() < end:
+        with suppress(TimeoutError):
+            good.read(0.1)
+    stop.set()
+    for thread in threads:
+        thread.join()
+    assert ended == [True, True] and resident_mb() - before < 150
+
+
+def test_jobs_are_bounded_and_state_is_not_lost():
+    jobs, done = Jobs(), []
+    for k in range(10 * MOST_WAITING):
+        jobs.put(lambda k=k: done.append(k))
+        jobs.put(lambda: done.append("state"), "key")
+    jobs.put(lambda: done.append("sure"), surely=True)
+    for job in jobs.take(0):
+        job()
+    assert len(done) <= MOST_WAITING + 2 and done.count("state") == 1 and done[-1] == "sure"
+    jobs.put(lambda: None, "key")
+    assert len(jobs.take(0)) == 1 and jobs.take(0) == []
+
+
+def test_views_for_a_film_are_bounded(viewer, good):
+    for _ in range(MOST_KEPT + 5):
+        good.set(viewer.panel.keep, True)
+        time.sleep(0.002)
+    end = time.monotonic() + 5
+    while len(viewer._kept) < MOST_KEPT and time.monotonic() < end:
+        time.sleep(0.05)
+    time.sleep(0.2)
+    assert len(viewer._kept) == MOST_KEPT
+    good.set(viewer.panel.forget, True)
+
+
+def test_messages_are_judged():
+    camera = {k: v for k, v in Stranger.camera(None).items() if k != "type"}
+
+    def sane(**changes):
+        return sensible("ViewerCameraMessage", camera | changes, lambda *_: True)
+
+    assert sane() and sane(image_width=0) and not sane(fov=np.nan) and not sane(position=(np.inf, 0, 0))
+    assert not sensible("RemoveSceneNodeMessage", {}, lambda *_: True)
+    assert not trusted("http://[", "127.0.0.1", "127.0.0.1") and trusted(None, None, "127.0.0.1")
+    assert bounded_aspect(1e300, 1) == 4 and bounded_aspect(np.nan, 1) == bounded_aspect(0, 0) == 1
+
+
+def test_names_of_folders_are_text(viewer):
+    assert panels.plain("a_b/c![x](http://evil){alert(1)}<img src=x>") == (
+        r"a\_b\/c\!\[x\]\(http\:\/\/evil\)\{alert\(1\)\}\<img src\=x\>"
+    )
+    assert "\n" not in panels.plain("a\nb") and panels.plain("größe 2") == "größe 2"
+
+
+def test_a_link_in_a_run_from_a_stranger_is_not_followed(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "view").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="got a link"):
+        keep(tmp_path / "view", "color.png", b"x")
+    assert not list((tmp_path / "elsewhere").iterdir())

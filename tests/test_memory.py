@@ -1,0 +1,69 @@
+"""Memory: what is free, and a cache that keeps to its size."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from endoprior.data import load_sequence
+from endoprior.memory import LEAST_CACHE, BoundedCache, available_bytes, cache_bytes
+from endoprior.train import train
+
+
+def test_what_is_free_is_between_nothing_and_all():
+    assert 0 < available_bytes() <= os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_a_limit_of_the_process_counts():
+    code = "from endoprior.memory import available_bytes; print(available_bytes())"
+    limit = 2 * 2**30
+
+    def limited():
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+    told = subprocess.run([sys.executable, "-c", code], preexec_fn=limited, capture_output=True, text=True, check=True)
+    assert 0 < int(told.stdout) < limit
+
+
+@pytest.mark.parametrize(
+    ("value", "wanted"), [("2", 2_000_000_000), ("0", 0), ("-1", 0), ("lots", None), ("nan", None), ("inf", None)]
+)
+def test_the_size_of_caches_can_be_set(monkeypatch, value, wanted):
+    monkeypatch.setenv("ENDOPRIOR_CACHE_GB", value)
+    assert cache_bytes() == wanted if wanted is not None else cache_bytes() >= LEAST_CACHE
+
+
+def test_the_least_recently_used_goes_first():
+    made = []
+    cache = BoundedCache(30, len)
+
+    def get(key, size):
+        return cache.get(key, lambda: made.append(key) or bytes(size))
+
+    for key in "abc":
+        get(key, 10)
+    get("a", 10)
+    get("d", 10)  # the oldest use is that of b
+    assert made == ["a", "b", "c", "d"] and len(cache) == 3
+    get("a", 10)
+    get("b", 10)
+    assert made == ["a", "b", "c", "d", "b"]
+    assert len(get("large", 100)) == 100 and len(cache) == 1  # the newest stays whatever its size
+
+
+def test_a_small_cache_changes_speed_and_nothing_else(tiny_sequence, tmp_path, monkeypatch):
+    from test_train import tiny_config
+
+    files = []
+    for size in ("1", "0"):
+        monkeypatch.setenv("ENDOPRIOR_CACHE_GB", size)
+        sequence = load_sequence(tiny_sequence)
+        train(sequence, tiny_config("basis"), tmp_path / size)
+        files.append((tmp_path / size / "scene.safetensors").read_bytes())
+        assert np.isfinite(sequence.frame(3).depth).all()
+    assert files[0] == files[1]

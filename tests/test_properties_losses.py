@@ -1,0 +1,167 @@
+"""The objective on generated pictures and points: finite, zero where it should be, equal to its definition."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from frame_strategies import SEEDS, SIDES, masks, pictures
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis_profiles import examples
+
+from endoprior import losses, temporal
+from endoprior.config import TemporalConfig
+from endoprior.loss_kernels import supervised_losses
+from endoprior.temporal_kernels import median
+
+
+@st.composite
+def comparisons(draw):
+    """Rendered color and depth, and what they are compared with: empty masks, no depth, nothing drawn included."""
+    height, width = draw(SIDES), draw(SIDES)
+    rng = np.random.default_rng(draw(SEEDS))
+    color = rng.uniform(-0.2, 1.4, (height, width, 3)).astype(np.float32)
+    depth = rng.uniform(30, 90, (height, width)).astype(np.float32) * (rng.random((height, width)) < 0.8)
+    kind = draw(st.sampled_from(["usual", "nothing drawn", "flat", "thin"]))
+    if kind == "nothing drawn":
+        color[:], depth[:] = 0, 0
+    elif kind == "flat":
+        color[:], depth[:] = 0.5, 50
+    elif kind == "thin":  # the least the renderer can give: one Gaussian at ALPHA_MIN behind a nearly full pixel
+        depth[:] = 1e-7
+    target = draw(pictures(height, width))
+    mask, known = draw(masks(height, width)), draw(masks(height, width))
+    inverse = np.where(known, 1 / rng.uniform(0.2, 1e9, (height, width)), 0).astype(np.float32)
+    return [torch.from_numpy(a) for a in (color, depth, target, inverse, mask, known & mask)]
+
+
+@given(comparisons(), st.sampled_from([(1.0, 1.0, 0.03), (1.0, 0.0, 0.0), (0.0, 1.0, 1.0)]))
+def test_supervised_terms_are_finite_and_those_of_the_definition(made, weights):
+    color, depth, target, inverse, mask, measured = made
+    color.requires_grad_(), depth.requires_grad_()
+    terms = supervised_losses(color, depth, target, inverse, mask, measured, weights)
+    terms.sum().backward()
+    assert torch.isfinite(terms).all() and (terms >= 0).all()
+    assert torch.isfinite(color.grad).all() and torch.isfinite(depth.grad).all()
+    c, d = (t.detach().double().requires_grad_() for t in (color, depth))
+    shown = losses.inverse_depth(d)
+    want = torch.stack([
+        weights[0] * losses.color_l1(c, target.double() / 255, mask),
+        weights[1] * losses.inverse_depth_l1(shown, inverse.double(), measured, min_pixels=1),
+        weights[2] * (losses.total_variation(c) + losses.total_variation(shown)),
+    ])  # fmt: skip
+    want.sum().backward()
+    # Each row is summed in float32.
+    np.testing.assert_allclose(terms.detach(), want.detach(), rtol=1e-5, atol=1e-9)
+    if not mask.any():
+        assert terms[0] == 0
+    if not measured.any():
+        assert terms[1] == 0
+    if c.grad is not None:  # signs flip where color and target agree to the last bit
+        assert ((color.grad - c.grad).abs() <= 1e-6 + 1e-5 * c.grad.abs()).double().mean() > 0.9
+
+
+@given(comparisons())
+def test_a_perfect_picture_of_one_color_costs_nothing(made):
+    _, _, target, _, mask, _ = made
+    color = torch.full(target.shape, 0.2)
+    depth = torch.full(mask.shape, 50.0)
+    same = torch.full(target.shape, 51, dtype=torch.uint8)
+    terms = supervised_losses(color, depth, same, 1 / depth, mask, mask, (1.0, 1.0, 0.03))
+    assert terms.abs().max() < 1e-6
+
+
+@st.composite
+def clouds(draw):
+    """(P, 3) points: spread, in a line, on a grid, or all at one place; P from 2."""
+    rng, num = np.random.default_rng(draw(SEEDS)), draw(st.integers(2, 60))
+    kind, size = draw(st.sampled_from(["spread", "line", "grid", "one place"])), draw(st.sampled_from([1e-6, 1.0, 1e6]))
+    points = rng.normal(size=(num, 3))
+    if kind == "line":
+        points[:, 1:] = 0
+    elif kind == "grid":
+        points = np.rint(points)
+    elif kind == "one place":
+        points[:] = points[0]
+    return points * size
+
+
+@examples(30)
+@given(clouds(), st.integers(1, 8), st.sampled_from(["literal", "released"]), SEEDS)
+def test_the_temporal_term_is_finite_and_that_of_the_definition(points, k, huber, seed):
+    cfg = replace(TemporalConfig(), huber_scale=huber)
+    if k >= len(points):
+        with pytest.raises(ValueError, match="k must be in"):
+            temporal.neighbors(points, k)
+        return
+    indices, distances = temporal.neighbors(points, k)
+    weights = np.random.default_rng(seed).random(len(points))
+    pair_weights = temporal.affinity(distances, indices, weights)
+    assert np.isfinite(pair_weights).all() and (pair_weights >= 1e-8).all()
+    scale = np.abs(points).max()
+    moved = points + np.random.default_rng(seed).normal(size=points.shape) * 0.1 * scale
+    results = []
+    for function in (temporal.local_motion_loss, temporal.local_motion_definition):
+        now, before = (torch.tensor(p).requires_grad_() for p in (moved, points))
+        terms = function(now, before, indices, pair_weights, cfg)
+        sum(terms).backward()
+        assert all(torch.isfinite(t) and t >= 0 for t in terms)
+        assert torch.isfinite(now.grad).all() and torch.isfinite(before.grad).all()
+        results.append([*(t.detach().numpy() for t in terms), now.grad.numpy(), before.grad.numpy()])
+    for got, want in zip(*results, strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-9)
+
+
+@given(clouds(), SEEDS)
+def test_what_moves_as_one_costs_nothing(points, seed):
+    """Eq. (11): a common translation has no displacement part but its floor, a rigid motion no distance part."""
+    k = min(4, len(points) - 1)
+    indices, distances = temporal.neighbors(points, k)
+    pair_weights = temporal.affinity(distances, indices, np.ones(len(points)))
+    size = np.abs(points).max()
+    shift = np.random.default_rng(seed).normal(size=3) * size
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    before = torch.tensor(points)
+    displacement, distance = temporal.local_motion_loss(
+        before + torch.tensor(shift), before, indices, pair_weights, TemporalConfig()
+    )
+    assert displacement == pytest.approx(1e-4, abs=1e-6 + 1e-9 * size)
+    turned = torch.tensor(points @ turn.T + shift)
+    assert distance < 1e-9 * (1 + size)
+    assert temporal.local_motion_loss(turned, before, indices, pair_weights, TemporalConfig())[1] < 1e-9 * (1 + size)
+
+
+@given(SEEDS, st.integers(1, 400), st.integers(1, 8), st.sampled_from(["random", "equal", "two values", "sorted"]))
+def test_the_median_has_the_bits_of_numpys(seed, rows, columns, kind):
+    rng = np.random.default_rng(seed)
+    values = rng.random((rows, columns))
+    if kind == "equal":
+        values[:] = 0.25
+    elif kind == "two values":
+        values = np.rint(values)
+    elif kind == "sorted":
+        values = np.sort(values, axis=None).reshape(rows, columns)
+    assert median(values) == float(np.median(values))
+
+
+@given(SEEDS, st.integers(0, 300), st.integers(1, 100), st.sampled_from([0.0, -300.0, 30.0]))
+def test_chosen_gaussians_are_distinct_and_have_weight(seed, num, count, exponent):
+    rng = np.random.default_rng(seed)
+    weights = rng.random(num) * (rng.random(num) < 0.7) * 10.0**exponent
+    chosen = temporal.systematic_sample(weights, count)
+    assert len(chosen) <= count or len(chosen) == 0
+    assert (np.diff(chosen) > 0).all() and (weights[chosen] > 0).all()
+    assert len(chosen) > 0 or not (weights > 0).any()
+
+
+@given(SEEDS, st.integers(0, 300), st.sampled_from([1e-5, 0.08, 10.0]), st.booleans())
+def test_motion_weights_are_in_0_to_1_and_rise_with_the_score(seed, num, temperature, adaptive):
+    cfg = TemporalConfig(motion_temperature=temperature, adaptive_motion_weight=adaptive)
+    score = np.sort(np.random.default_rng(seed).random(num)).astype(np.float32)
+    weights = temporal.relaxed_motion_weight(score, cfg)
+    assert ((weights >= 0) & (weights <= 1)).all() and (np.diff(weights) >= 0).all()
+    chosen, taken = temporal.choose(score, np.ones(num, bool), cfg)
+    assert len(chosen) == len(taken) and (len(chosen) == 0 or len(chosen) >= cfg.min_points)
