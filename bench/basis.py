@@ -9,9 +9,10 @@ import common
 import plain
 import torch
 
+from endoprior.adam import AdamState
 from endoprior.model.basis import RankOneGradient, basis_offsets, identity_motion
 from endoprior.model.deformation import Offsets
-from endoprior.optim import AdamState, motion_rates
+from endoprior.optim import motion_rates
 from endoprior.presets import preset
 
 MOMENT = 0.4

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample, linear, relu
 
-from endoprior import losses
 from endoprior.config import DeformationConfig
+from endoprior.losses import supervised as supervised_losses  # noqa: F401
 from endoprior.model.basis import basis_weights, motion_layout
 from endoprior.model.deformation import HexPlaneField, Offsets
 from endoprior.model.hexplane import PLANE_NAMES, PlaneGrid
@@ -194,25 +194,6 @@ def affinity(distances: NDArray, indices: NDArray, weights: NDArray) -> NDArray:
     sigma = near.median().clamp(min=1e-8)
     pairs = (-(near**2) / (2 * sigma**2)).exp() * weight[:, None] * weight[index]
     return pairs.clamp(min=SUM_EPS).numpy()
-
-
-def supervised_losses(
-    color: Tensor,
-    depth: Tensor,
-    target_u8: Tensor,
-    target_inverse: Tensor,
-    tissue_mask: Tensor,
-    measured: Tensor,
-    weights: tuple[float, float, float],
-) -> Tensor:
-    """See `loss_kernels.supervised_losses`: the definitions of `losses`, weighted."""
-    drawn = losses.inverse_depth(depth)
-    terms = [
-        losses.color_l1(color, target_u8.float() / 255, tissue_mask),
-        losses.inverse_depth_l1(drawn, target_inverse, measured, 0),
-        losses.total_variation(color) + losses.total_variation(drawn),
-    ]
-    return torch.stack(terms) * torch.tensor(weights)
 
 
 class Adam:

@@ -66,9 +66,8 @@ def full_disk(work: Path) -> list[Row]:
 
 def _writers(data: Path, trained: Path, disk: Path) -> list[tuple[object, ...]]:
     """Commands whose results do not fit into 100 KB."""
-    exports = [
-        ("export", trained, disk / f"out_{name}", "--format", name) for name in ("ply", "scene", "html", "video")
-    ]
+    names = {"ply": "tissue", "scene": "tissue.safetensors", "html": "tissue.html", "video": "tissue.mp4"}
+    exports = [("export", trained, disk / name, "--format", kind) for kind, name in names.items()]
     return [
         ("phantom", disk / "phantom", "--frames", 8, "--width", 160, "--height", 128),
         ("prepare", data / "images", disk / "prepared", "--layout", "mono"),

@@ -150,5 +150,6 @@ def differences(run_folder: Path, reference: Path) -> list[str]:
 
 
 def leftovers(folder: Path) -> list[str]:
-    """Names of half-written files and folders below a folder: all that is hidden, but the lock of a run."""
-    return sorted(file.name for file in folder.rglob(".*") if file.name != ".lock")
+    """Names of half-written files below a folder: what is hidden, but for locks and what `prepare` resumes."""
+    hidden = (file.relative_to(folder) for file in folder.rglob(".*"))
+    return sorted(str(path) for path in hidden if not path.name.endswith(".lock") and ".preparing" not in str(path))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from harness import Program, Row, demand, differences, leftovers, run, small_sequence
 
+PARTIAL_CHECKPOINT = ".checkpoint.*.partial*"
 QUICK_CHECKPOINTS = ("--checkpoint-seconds", "0.2")
 
 
@@ -35,7 +36,7 @@ def kill_once(program: Program, out: Path, when: str, rng: random.Random) -> str
     until = time.monotonic() + (rng.uniform(0, 6) if when == "anywhere" else 600)
     in_loop_until = None
     while program.running and time.monotonic() < until:
-        partial = list(out.glob(".*.partial*"))
+        partial = list(out.glob(PARTIAL_CHECKPOINT))
         if when == "writing" and partial:
             time.sleep(rng.uniform(0, 0.02))
             break
@@ -47,7 +48,7 @@ def kill_once(program: Program, out: Path, when: str, rng: random.Random) -> str
     if not program.running:
         return "done"
     program.kill()
-    writing = bool(list(out.glob(".*.partial*")))
+    writing = bool(list(out.glob(PARTIAL_CHECKPOINT)))
     return "writing" if writing else "loop" if in_loop_until else "start"
 
 
@@ -68,7 +69,12 @@ def main(work: Path, kills: int = 50, iterations: int = 3500, seed: int = 0) -> 
     demand(run(*arguments(data, parts, iterations), "--resume"))
     different = differences(parts, whole) + leftovers(parts)
     told = ", ".join(f"{count} {name}" for name, count in sorted(seen.items()))
+    # Kernels are compiled for the first run and loaded by all others.
+    demand(run(*arguments(data, work / "later", 300)))
+    demand(run(*arguments(data, work / "first", 300), NUMBA_CACHE_DIR=str(work / "kernels")))
+    first = differences(work / "first", work / "later")
     return [
         Row("kills", f"{kills} SIGKILLs ({told}): runs that could not go on", str(len(refused)), not refused),
         Row("kills", "files that differ from an uninterrupted run", ", ".join(different) or "none", not different),
+        Row("kills", "... of the first run after installation from a later one", ", ".join(first) or "none", not first),
     ]

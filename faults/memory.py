@@ -8,8 +8,8 @@ from pathlib import Path
 from harness import Row, demand, differences, leftovers, run, small_sequence
 from kills import arguments
 
-LIMITS_MB = (200, 400, 600, 800, 1000, 1300, 1600, 2000)
-"""Of what the process may write to; below a few hundred MB not even the libraries load."""
+LIMITS_MB = (200, 500, 600, 700, 800, 900, 1000, 1300)
+"""Of what the process may write to (`ulimit -d`), which counts stacks of threads and buffers that are never touched."""
 
 
 def main(work: Path) -> list[Row]:

@@ -38,6 +38,17 @@ def test_the_size_of_caches_can_be_set(monkeypatch, value, wanted):
     assert cache_bytes() == wanted if wanted is not None else cache_bytes() >= LEAST_CACHE
 
 
+@pytest.mark.parametrize(("kind", "option"), [(resource.RLIMIT_DATA, "-d"), (resource.RLIMIT_AS, "-v")])
+def test_a_limit_under_which_nothing_loads_is_refused_at_once(kind, option):
+    def limited():
+        resource.setrlimit(kind, (400 * 2**20, 400 * 2**20))
+
+    words = [sys.executable, "-m", "endoprior", "train", "nowhere", "out"]
+    done = subprocess.run(words, preexec_fn=limited, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert f"ulimit {option}: expected at least" in done.stderr and "400 MB" in done.stderr
+
+
 def test_the_least_recently_used_goes_first():
     made = []
     cache = BoundedCache(30, len)

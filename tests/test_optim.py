@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from endoprior.adam import AdamState
 from endoprior.config import Config
 from endoprior.model.basis import RankOneGradient, motion_layout
-from endoprior.optim import AdamState, log_linear, motion_rates
+from endoprior.optim import log_linear, motion_rates
 from endoprior.presets import preset
 
 
@@ -30,11 +31,8 @@ def test_outer_product_gradients_are_the_written_out_ones():
     dense = motion.detach().clone().requires_grad_()
     state, adam = AdamState(motion, 4), AdamState(dense)
     for _ in range(5):
-        gradients = [
-            RankOneGradient(rng.random(4).astype(np.float32), rng.normal(size=(6, 3)).astype(np.float32))
-            for _ in range(2)
-        ]
-        dense.grad = torch.from_numpy(sum(np.einsum("b,nc->nbc", g.weights, g.v_offsets) for g in gradients))
+        gradients = [RankOneGradient(rng.random(4).astype(np.float32), torch.randn(6, 3)) for _ in range(2)]
+        dense.grad = torch.from_numpy(sum(np.einsum("b,nc->nbc", g.weights, g.v_offsets.numpy()) for g in gradients))
         state.update_bases(motion, gradients, np.full(3, 1e-2), 1e-15)
         adam.update(dense, 1e-2, 1e-15)
     torch.testing.assert_close(motion, dense, rtol=1e-5, atol=1e-6)  # float32 sums in another order
@@ -44,7 +42,7 @@ def test_bases_out_of_sight_stay_where_they_are():
     motion = torch.zeros(2, 4, 3).requires_grad_()
     state = AdamState(motion, 4)
     for weights in ([1.0, 0.5, 0, 0], [0, 0, 0.5, 1.0]):
-        gradient = RankOneGradient(np.array(weights, np.float32), np.ones((2, 3), np.float32))
+        gradient = RankOneGradient(np.array(weights, np.float32), torch.ones(2, 3))
         state.update_bases(motion, [gradient], np.array([1e-2, 1e-2, 0.0]), 1e-15)
     # Each was stepped once, so Adam's first step, of length lr, is all that happened; the last channel has rate 0.
     torch.testing.assert_close(motion.detach()[..., :2], torch.full((2, 4, 2), -1e-2))

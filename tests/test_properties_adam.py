@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
+from endoprior.adam import AdamState
+from endoprior.adam_kernels import BETA1, BETA2
 from endoprior.model.basis import RankOneGradient
-from endoprior.optim import BETA1, BETA2, AdamState
 
 LONGEST_STEP = (1 - BETA1) / np.sqrt(1 - BETA2)
 """In learning rates; Kingma and Ba 2015, section 2.1. Zero gradients followed by one reach it."""
@@ -45,7 +46,7 @@ def test_a_step_along_a_basis_is_that_of_the_whole_gradient(seed, num, bases, mo
     offsets = [rng.normal(size=(num, 3)).astype(np.float32) for _ in range(moments)]
     outer, flat = (torch.zeros(num, bases, 3, requires_grad=True) for _ in range(2))
     state, plain = AdamState(outer, bases), AdamState(flat)
-    found = [RankOneGradient(w, v) for w, v in zip(weights, offsets, strict=True)]
+    found = [RankOneGradient(w, torch.from_numpy(v)) for w, v in zip(weights, offsets, strict=True)]
     for _ in range(3):
         state.update_bases(outer, found, np.full(3, 1e-2), 1e-15)
         whole = sum(np.einsum("b,nc->nbc", w, v) for w, v in zip(weights, offsets, strict=True))

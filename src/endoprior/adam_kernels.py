@@ -7,13 +7,36 @@ pass is several times faster. Every element is independent: results do not depen
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numba import njit, prange
+from torch import Tensor
 
 from .simd import LANES, prefetch
 
+BETA1, BETA2 = 0.9, 0.999
 FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
 CHUNK = 128  # rows per task
 _AHEAD = 4  # rows between asking for the bases of one and updating them
+
+
+@torch.no_grad()
+def adam_definition(
+    param: Tensor,
+    grad: Tensor,
+    first: Tensor,
+    second: Tensor,
+    rate: float | Tensor,
+    root_scale: float | Tensor,
+    epsilon: float,
+) -> None:
+    """p -= rate * m / (sqrt(v) * root_scale + epsilon), after both moments took in the gradient; all in place.
+
+    Args:
+        param, grad, first, second: of one shape. rate, root_scale: corrected for young moments, broadcast.
+    """
+    first.mul_(BETA1).add_(grad, alpha=1 - BETA1)
+    second.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
+    param.sub_(rate * first / (second.sqrt() * root_scale + epsilon))
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS)

@@ -63,7 +63,7 @@ def save_arrays(path: Path, arrays: Mapping[str, Tensor], about: Mapping[str, An
         staging.mkdir()
         try:
             file = staging / "arrays"
-            save_file({name: value.detach().contiguous() for name, value in arrays.items()}, file, {KEY: text})
+            save_file({name: value.detach().cpu().contiguous() for name, value in arrays.items()}, file, {KEY: text})
             file.replace(temporary)
         finally:
             shutil.rmtree(staging, ignore_errors=True)

@@ -106,13 +106,18 @@ def whole_folder(path: Path) -> Iterator[Path]:
         with writing(path):
             yield temporary
             refuse_occupied(path)
-            for place, _, files in os.walk(temporary):
-                for name in (*files, "."):
-                    _to_disk(Path(place, name))
+            flush_folder(temporary)
             os.replace(temporary, path)
             _to_disk(path.absolute().parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def flush_folder(folder: Path) -> None:
+    """Wait until everything in a folder is on the disk: a power cut must not leave names of empty files."""
+    for place, _, files in os.walk(folder):
+        for name in (*files, "."):
+            _to_disk(Path(place, name))
 
 
 def _usual_mode(path: Path) -> int:

@@ -74,13 +74,13 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
                 f"expected {expected} as iteration of the {stage.name.lower()} stage; got {iteration!r:.80}."
             )
         check_state(arrays, iteration)
-    gaussians = Gaussians(part(arrays, "gaussians."))
+    gaussians = Gaussians(part(arrays, "gaussians.")).to(trainer.device)
     field = None
     if cfg.deformation.kind == "hexplane":
-        field = HexPlaneField.from_state_arrays(part(arrays, "field."), cfg.deformation)
+        field = HexPlaneField.from_state_arrays(part(arrays, "field."), cfg.deformation).to(trainer.device)
     optimizer = Optimizer(gaussians, field, cfg, trainer.spatial_scale)
     optimizer.load_state_arrays(part(arrays, "optimizer."))
-    stats = DensityStats(**part(arrays, "stats."))
+    stats = DensityStats(**{name: value.to(trainer.device) for name, value in part(arrays, "stats.").items()})
     trainer.state = TrainState(stage, iteration, gaussians, field, optimizer, stats)
 
 

@@ -11,8 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from . import density_kernels as kernels
+from .compiled import compiled
 from .config import DensityConfig
 from .types import RenderOutput
 
@@ -36,9 +38,9 @@ class DensityStats:
     """(N,) sum of the opacity at those moments."""
 
     @staticmethod
-    def zeros(num: int) -> DensityStats:
+    def zeros(num: int, device: torch.device | str = "cpu") -> DensityStats:
         """Statistics of `num` Gaussians of which nothing is known."""
-        return DensityStats(*(torch.zeros(num) for _ in range(5)))
+        return DensityStats(*(torch.zeros(num, device=device) for _ in range(5)))
 
     def tensors(self) -> dict[str, Tensor]:
         """The sums by name."""
@@ -55,6 +57,12 @@ class DensityStats:
 
     def add_gradient(self, out: RenderOutput, width: int, height: int) -> None:
         """Add one rendering's screen-space gradient, after backward; Gaussians that were not drawn are left alone."""
+        if not compiled(out.radii):
+            drawn = (out.radii > 0).float()
+            x, y = out.means2d.grad.unbind(-1)
+            self.grad2d_ndc_sum += drawn * torch.hypot(x * (width / 2), y * (height / 2))
+            self.num_seen += drawn
+            return
         gradient = out.means2d.grad.contiguous().numpy()
         half = np.float32(width / 2), np.float32(height / 2)
         kernels.add_gradient(out.radii.numpy(), gradient, *half, self.grad2d_ndc_sum.numpy(), self.num_seen.numpy())
@@ -68,6 +76,13 @@ class DensityStats:
             prior: (H, W) rho in [0, 1]. tissue_mask: (H, W) bool, True on tissue. opacities: (N,) canonical.
             scale: pixels of `prior` per pixel of the rendering.
         """
+        if not compiled(out.radii):
+            at = scale * out.means2d.detach()
+            counts = valid_projection(at, out.radii, tissue_mask).float()
+            self.score_sum += counts * torch.where(counts > 0, _sample(prior, at), 0)
+            self.opacity_sum += counts * opacities.detach()
+            self.num_valid += counts
+            return
         kernels.add_score(
             *_projections(out.means2d, out.radii), np.float32(scale), prior.numpy(), tissue_mask.numpy(),
             opacities.detach().numpy(), self.score_sum.numpy(), self.opacity_sum.numpy(), self.num_valid.numpy(),
@@ -85,9 +100,23 @@ def valid_projection(means2d: Tensor, radii: Tensor, tissue_mask: Tensor) -> Ten
     Args:
         means2d: (N, 2) px. radii: (N,) px, 0 where not drawn. tissue_mask: (H, W) bool, True on tissue.
     """
+    if not compiled(radii):
+        height, width = tissue_mask.shape
+        x, y = means2d.detach().unbind(-1)
+        inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
+        return (radii > 0) & inside & (_sample(tissue_mask.float(), means2d.detach()) > 0.5)
     found = np.empty(len(radii), np.bool_)
     kernels.valid(*_projections(means2d, radii), tissue_mask.numpy(), found)
     return torch.from_numpy(found)
+
+
+def _sample(image: Tensor, means2d: Tensor) -> Tensor:
+    """(N,) bilinear values of an (H, W) image at (N, 2) px; centers at half integers, border repeated, NaN for NaN."""
+    height, width = image.shape
+    x, y = means2d.unbind(-1)
+    where = torch.stack([2 * x / width - 1, 2 * y / height - 1], -1)
+    found = grid_sample(image[None, None], where[None, None], padding_mode="border", align_corners=False)
+    return found[0, 0, 0]
 
 
 def _projections(means2d: Tensor, radii: Tensor) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

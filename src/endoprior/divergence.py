@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit, prange
 
 from .checks import InputError
+from .compiled import compiled
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -54,6 +55,8 @@ def check_step(terms: Mapping[str, float], unusable: Mapping[str, int]) -> None:
 
 def count_unusable(gradient: Tensor) -> int:
     """Number of entries of a float32 tensor that are NaN, infinite, or beyond `LARGEST_GRADIENT`."""
+    if not compiled(gradient):
+        return int((~(gradient.detach().abs() <= float(LARGEST_GRADIENT))).sum())
     return int(_count(gradient.detach().contiguous().reshape(-1).numpy(), LARGEST_GRADIENT))
 
 

@@ -171,8 +171,8 @@ def _protocol(sequence: Sequence, split: Split, data: DataConfig) -> dict[str, A
 
 def _draw(scene: Scene, frame: Frame, scored: bool) -> Rendered:
     out = scene.render(frame.time, frame.camera)
-    color = out.color.numpy()
-    return Rendered(np.clip(color, 0, 1) if scored else None, metrics.to_uint8(color), out.depth.numpy())
+    color = out.color.cpu().numpy()
+    return Rendered(np.clip(color, 0, 1) if scored else None, metrics.to_uint8(color), out.depth.cpu().numpy())
 
 
 def _image_scores(result: Evaluation, frames: ReadOnlyList[Frame], drawn: Drawn) -> None:

@@ -15,6 +15,9 @@ from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from . import losses
+from .compiled import compiled
+
 FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
 
 
@@ -37,6 +40,8 @@ def supervised_losses(
     Returns:
         (3,) the weighted terms.
     """
+    if not compiled(color):
+        return losses.supervised(color, depth, target_u8, target_inverse, tissue_mask, measured, weights)
     return _SupervisedLosses.apply(color, depth, target_u8, target_inverse, tissue_mask, measured, weights)
 
 

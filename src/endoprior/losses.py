@@ -33,9 +33,9 @@ def inverse_depth_l1(inverse: Tensor, target: Tensor, measured: Tensor, min_pixe
         min_pixels: with fewer measured pixels the loss is 0.
     """
     count = measured.sum()
-    if count < min_pixels:
+    if min_pixels and count < min_pixels:
         return inverse.new_zeros(())
-    return ((inverse - target).abs() * measured).sum() / count
+    return ((inverse - target).abs() * measured).sum() / count.clamp(min=1)
 
 
 def total_variation(image: Tensor) -> Tensor:
@@ -47,3 +47,22 @@ def total_variation(image: Tensor) -> Tensor:
     down = (image[1:] - image[:-1]).abs().sum()
     right = (image[:, 1:] - image[:, :-1]).abs().sum()
     return (down + right) / image.numel()
+
+
+def supervised(
+    color: Tensor,
+    depth: Tensor,
+    target_u8: Tensor,
+    target_inverse: Tensor,
+    tissue_mask: Tensor,
+    measured: Tensor,
+    weights: tuple[float, float, float],
+) -> Tensor:
+    """(3,) weighted color, depth and total-variation terms: the definition of `loss_kernels.supervised_losses`."""
+    drawn = inverse_depth(depth)
+    terms = [
+        color_l1(color, target_u8.float() / 255, tissue_mask),
+        inverse_depth_l1(drawn, target_inverse, measured, 0),
+        total_variation(color) + total_variation(drawn),
+    ]
+    return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)])

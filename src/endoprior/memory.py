@@ -9,10 +9,14 @@ from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Generic, TypeVar
 
+from .checks import InputError
+
 CACHE_SHARE = 0.1
 """Each cache of frames may take this share of what is free when it is made..."""
 LEAST_CACHE = 256 * 2**20
 """... but at least so many bytes."""
+LEAST_DATA, LEAST_SPACE = 600 * 2**20, 1500 * 2**20
+"""Of memory to write to and of addresses, for the libraries alone, bytes (docs/reliability.md)."""
 VARIABLE = "ENDOPRIOR_CACHE_GB"
 """Environment variable that sets the size of each cache instead, GB."""
 
@@ -32,6 +36,25 @@ def cache_bytes() -> int:
         return max(int(float(os.environ[VARIABLE]) * 1e9), 0)
     except (KeyError, ValueError, OverflowError):
         return max(int(CACHE_SHARE * (available_bytes() or 0)), LEAST_CACHE)
+
+
+def refuse_small_limits() -> None:
+    """Refuse limits of the process under which not even the libraries load: some of them wait for memory for ever.
+
+    Raises:
+        InputError: with the limit and what it should be.
+    """
+    try:
+        import resource
+    except ImportError:  # a system without such limits
+        return
+    for kind, option, least in ((resource.RLIMIT_DATA, "-d", LEAST_DATA), (resource.RLIMIT_AS, "-v", LEAST_SPACE)):
+        limit = resource.getrlimit(kind)[0]
+        if limit != resource.RLIM_INFINITY and limit < least:
+            raise InputError(
+                f"ulimit {option}: expected at least {least >> 20} MB to load the libraries; got {limit >> 20} MB. "
+                "Raise it."
+            )
 
 
 class BoundedCache(Generic[Value]):

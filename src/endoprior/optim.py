@@ -9,73 +9,23 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .adam_kernels import adam_flat, adam_outer
+from .adam import AdamState
 from .config import Config, OptimConfig
 from .density import DensityStats, Plan
 from .divergence import ADVICE, Diverged, count_unusable, count_unusable_rows
 from .geometry import quaternion_to_matrix
-from .model.basis import RankOneGradient, motion_layout
+from .model.basis import motion_layout
 from .model.deformation import HexPlaneField
 from .model.gaussians import Gaussians
 from .model.hexplane_kernels import FRESH
 from .model.plane_adam import PlaneAdam
 from .morton import morton_order
 
-BETA1, BETA2 = 0.9, 0.999
-
 
 def log_linear(start: float, end: float, iteration: int, steps: int) -> float:
     """Learning rate that falls from `start` to `end` over `steps` iterations, linearly in its logarithm, then holds."""
     share = min(max(iteration / steps, 0.0), 1.0)
     return math.exp(math.log(start) * (1 - share) + math.log(end) * share)
-
-
-class AdamState:
-    """Moments of one parameter, and how often it was stepped: a temporal basis counts each of its functions."""
-
-    def __init__(self, param: Tensor, num_counts: int = 1) -> None:
-        self.first = torch.zeros_like(param, requires_grad=False)
-        self.second = torch.zeros_like(param, requires_grad=False)
-        self.steps = np.zeros(num_counts, np.int64)
-
-    def update(self, param: Tensor, rate: float, epsilon: float) -> None:
-        """One step of the whole parameter, a leaf with `.grad`; without a gradient nothing happens."""
-        if param.grad is None or param.numel() == 0:
-            return
-        self.steps += 1
-        rates, root_scale = _corrected(np.array([rate]), self.steps)
-        tensors = (param, param.grad.contiguous(), self.first, self.second)
-        adam_flat(*(t.detach().reshape(-1).numpy() for t in tensors), rates[0], root_scale[0], *_constants(epsilon))
-
-    def update_bases(self, param: Tensor, gradients: list[RankOneGradient], rates: NDArray, epsilon: float) -> None:
-        """One step of the basis functions that any of the gradients reaches; the others keep value, moments and count.
-
-        Stepping the others on momentum alone would move the tissue at moments that were not looked at.
-
-        Args:
-            param: (N, B, C). rates: (C,) learning rate of each channel.
-        """
-        if not gradients or param.numel() == 0:
-            return
-        weights = np.stack([gradient.weights for gradient in gradients]).astype(np.float32)
-        active = np.flatnonzero(weights.any(0))
-        if len(active) == 0:
-            return
-        begin, end = active[0], active[-1] + 1
-        self.steps[begin:end] += 1
-        scaled, root_scale = _corrected(rates[None, :], self.steps[begin:end, None])
-        v_offsets = np.stack([gradient.v_offsets for gradient in gradients])
-        views = (param.detach().numpy(), weights, v_offsets, self.first.numpy(), self.second.numpy())
-        adam_outer(*views, begin, scaled, root_scale[:, 0], *_constants(epsilon))
-
-
-def _corrected(rates: NDArray, steps: NDArray) -> tuple[NDArray, NDArray]:
-    """Learning rates over 1 - beta1^steps, and 1 / sqrt(1 - beta2^steps): Adam's corrections of its young moments."""
-    return (rates / (1 - BETA1**steps)).astype(np.float32), (1 / np.sqrt(1 - BETA2**steps)).astype(np.float32)
-
-
-def _constants(epsilon: float) -> tuple[np.float32, np.float32, np.float32]:
-    return np.float32(BETA1), np.float32(BETA2), np.float32(epsilon)
 
 
 class Optimizer:
@@ -120,7 +70,7 @@ class Optimizer:
         """How many entries of each gradient `step` must not be given: not finite, or too large to be squared."""
         found = {name: value.grad for name, value in self.gaussians.tensors.items()}
         moments = self.gaussians.motion_gradients
-        found |= {f"motion, moment {i}": torch.from_numpy(moment.v_offsets) for i, moment in enumerate(moments)}
+        found |= {f"motion, moment {i}": moment.v_offsets for i, moment in enumerate(moments)}
         if self.field is not None:
             found |= {name: value.grad for name, value in _field_parameters(self.field).items()}
         counts = {name: count_unusable(grad) for name, grad in found.items() if grad is not None}
@@ -173,9 +123,9 @@ class Optimizer:
         if not all(bool(value.isfinite().all()) for value in added.values()):
             raise Diverged(f"expected Gaussians of a finite size to split; got others. {ADVICE}")
         staying = (~(plan.remove | plan.split)).nonzero()[:, 0]
-        rows = torch.cat([staying, len(plan.split) + torch.arange(len(added["means"]))])
+        rows = torch.cat([staying, len(plan.split) + torch.arange(len(added["means"]), device=staying.device)])
         means = torch.cat([tensors["means"].detach(), added["means"]])[rows]
-        rows = rows[torch.from_numpy(morton_order(means.numpy()))]
+        rows = rows[torch.from_numpy(morton_order(means.cpu().numpy())).to(rows.device)]
         for name, value in tensors.items():
             tensors[name] = torch.cat([value.detach(), added[name]])[rows].requires_grad_()
             state = self.states[name]
@@ -195,7 +145,8 @@ class Optimizer:
     def load_state_arrays(self, arrays: dict[str, Tensor]) -> None:
         """Inverse of `state_arrays`."""
         for name, state in self.states.items():
-            state.first, state.second = arrays[f"{name}.first"].clone(), arrays[f"{name}.second"].clone()
+            for moment in ("first", "second"):
+                getattr(state, moment).copy_(arrays[f"{name}.{moment}"])
             state.steps = arrays[f"{name}.steps"].numpy().copy()
         if self.plane_adam:
             self.plane_adam.load_state_arrays(arrays)
@@ -227,10 +178,10 @@ def split_children(gaussians: Gaussians, split: Tensor, shrink: float, rng: np.r
     """Two children for each Gaussian marked in `split` (N,): centers drawn from it, scales divided by `shrink`."""
     tensors = {name: value.detach()[split] for name, value in gaussians.tensors.items()}
     children = {name: torch.cat([value, value]) for name, value in tensors.items()}
-    scales, quats = children["log_scales"].exp().numpy(), children["quats"].numpy()
+    scales, quats = children["log_scales"].exp().cpu().numpy(), children["quats"].cpu().numpy()
     offsets = rng.normal(size=scales.shape) * scales
     turned = np.einsum("nij,nj->ni", quaternion_to_matrix(quats.astype(np.float64)), offsets)
-    children["means"] = children["means"] + torch.from_numpy(turned.astype(np.float32))
+    children["means"] = children["means"] + torch.from_numpy(turned.astype(np.float32)).to(children["means"].device)
     children["log_scales"] = children["log_scales"] - math.log(shrink)
     return children
 

@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .checks import check_shape
+from .compiled import compiled
 from .config import TemporalConfig
 from .neighbor_kernels import MAX_COORDINATE, nearest
 from .temporal_kernels import SQRT_EPS, SUM_EPS, local_motion, median, weigh_pairs
 
+NEIGHBOR_CHUNK = 4096
+"""Points whose distances to all others are held at a time, where no kernel searches."""
 MIN_WEIGHT = 1e-4
 """Motion weights up to this are treated as zero (released code)."""
 
@@ -110,6 +113,27 @@ def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
     return nearest(np.ascontiguousarray(points), k)
 
 
+def neighbors_definition(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """`neighbors` in plain torch, on any device: all distances, some points at a time. Ties may fall otherwise."""
+    found = []
+    for start in range(0, len(points), NEIGHBOR_CHUNK):
+        distances = torch.cdist(
+            points[start : start + NEIGHBOR_CHUNK], points, compute_mode="donot_use_mm_for_euclid_dist"
+        )
+        own = torch.arange(len(distances), device=points.device)
+        distances[own, own + start] = torch.inf
+        found.append(distances.topk(k, largest=False))
+    return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
+
+
+def affinity_definition(distances: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
+    """`affinity` in plain torch, on any device; (P, K) pair weights."""
+    # The median of an even number of distances lies between the middle two, as NumPy has it.
+    sigma = distances.flatten().quantile(0.5).clamp(min=1e-8)
+    pairs = (-(distances**2) / (2 * sigma**2)).exp() * weights[:, None] * weights[indices]
+    return pairs.clamp(min=SUM_EPS)
+
+
 def affinity(distances: NDArray, indices: NDArray, weights: NDArray) -> NDArray:
     """w_ij = exp(-|mu_i - mu_j|^2 / (2 sigma_loc^2)) w_i w_j, Eq. (10), floored at 1e-8.
 
@@ -156,12 +180,29 @@ def local_motion_loss(
     return local_motion(now, before, indices, pair_weights, cfg.huber_delta, factor)
 
 
+def local_consistency(now: Tensor, before: Tensor, weights: NDArray, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
+    """L_local, Eq. (11), of chosen Gaussians: neighbors found and weighed at t - dt, then compared; on any device.
+
+    Args:
+        now, before: (P, 3) deformed centers, mm; `before` detached trains one end only.
+        weights: (P,) motion weights from `choose`.
+    Returns:
+        Displacement and distance term, as `local_motion_loss`.
+    """
+    if compiled(now):
+        indices, distances = neighbors(before.detach().numpy(), cfg.num_neighbors)
+        return local_motion_loss(now, before, indices, affinity(distances, indices, weights), cfg)
+    index, apart = neighbors_definition(before.detach(), cfg.num_neighbors)
+    counted = torch.from_numpy(weights).to(now.device, now.dtype)
+    return local_motion_definition(now, before, index, affinity_definition(apart, index, counted), cfg)
+
+
 def local_motion_definition(
     now: Tensor, before: Tensor, indices: NDArray, pair_weights: NDArray, cfg: TemporalConfig
 ) -> tuple[Tensor, Tensor]:
     """`local_motion_loss` in plain torch: same arguments, same result but for rounding, more passes."""
-    index = torch.from_numpy(indices)
-    weight = torch.from_numpy(pair_weights).to(now.dtype)
+    index = torch.as_tensor(indices, device=now.device)
+    weight = torch.as_tensor(pair_weights, device=now.device).to(now.dtype)
     weight = weight / weight.sum().clamp(min=SUM_EPS)
     displacement = now - before
     difference = displacement[:, None] - displacement[index]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 
+from . import kernel_cache
 from .config import Config
 from .data import Sequence
 from .model.scene import Scene
@@ -12,6 +14,8 @@ from .run_folder import CHECKPOINT_SECONDS, RunOptions, train_in_folder
 from .train_state import StepReport
 from .trainer import Trainer
 from .training_memory import refuse_too_large
+
+log = logging.getLogger(__name__)
 
 
 def train(
@@ -39,6 +43,7 @@ def train(
         KeyboardInterrupt: the user stopped; a checkpoint has been written.
     """
     refuse_too_large(sequence, cfg)
+    kernel_cache.fill(cfg, log.info)
     sequence.validate()
     trainer = Trainer(sequence, cfg)
     if out is not None:

@@ -41,9 +41,10 @@ class Trainer:
 
     def __init__(self, sequence: Sequence, cfg: Config) -> None:
         self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
-        self.frames = TrainingFrames(sequence, cfg.prior)
+        self.device = torch.device("cuda" if cfg.render.backend == "cuda" else "cpu")
+        self.frames = TrainingFrames(sequence, cfg.prior, self.device)
         self.rasterize = render.load(cfg.render.backend)
-        self.background = torch.zeros(3)
+        self.background = torch.zeros(3, device=self.device)
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
         try:
             check_cameras(self.cameras)
@@ -73,11 +74,11 @@ class Trainer:
             generator = torch.Generator().manual_seed(cfg.seed)
             field = HexPlaneField.from_points(gaussians["means"].detach(), cfg.deformation, generator)
         first = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
-        self._enter(first, gaussians, field)
+        self._enter(first, gaussians.to(self.device), field and field.to(self.device))
 
     def _enter(self, stage: Stage, gaussians: Gaussians, field: HexPlaneField | None) -> None:
         optimizer = Optimizer(gaussians, field, self.cfg, self.spatial_scale)
-        self.state = TrainState(stage, 0, gaussians, field, optimizer, DensityStats.zeros(len(gaussians)))
+        self.state = TrainState(stage, 0, gaussians, field, optimizer, DensityStats.zeros(len(gaussians), self.device))
 
     def stage_length(self, stage: Stage) -> int:
         """Iterations of a stage."""
@@ -175,19 +176,17 @@ class Trainer:
             drawn = density.valid_projection(out.means2d, out.radii, frame.tissue_mask)
         eligible = drawn & (stats.num_valid >= cfg.min_valid)
         score = stats.score(self.cfg.density.unobserved_score)
-        chosen, weights = temporal.choose(score.numpy(), eligible.numpy(), cfg)
+        chosen, weights = temporal.choose(score.cpu().numpy(), eligible.cpu().numpy(), cfg)
         if len(chosen) == 0:
             return {}
-        index = torch.from_numpy(chosen)
+        index = torch.from_numpy(chosen).to(self.device)
         before = self._means_before(before_frame.time, index) if means_before is None else means_before[index]
         if cfg.valid_at_both:
             kept = on_tissue(before.detach(), before_frame)
-            index, weights, before = index[kept], weights[kept.numpy()], before[kept]
+            index, weights, before = index[kept], weights[kept.cpu().numpy()], before[kept]
             if len(index) < max(cfg.min_points, cfg.num_neighbors + 1):
                 return {}
-        indices, distances = temporal.neighbors(before.detach().numpy(), cfg.num_neighbors)
-        pair_weights = temporal.affinity(distances, indices, weights)
-        displacement, distance = temporal.local_motion_loss(means[index], before, indices, pair_weights, cfg)
+        displacement, distance = temporal.local_consistency(means[index], before, weights, cfg)
         return {
             "displacement": cfg.weight * cfg.displacement_weight * displacement,
             "distance": cfg.weight * cfg.distance_weight * distance,
@@ -226,13 +225,13 @@ class Trainer:
         """The scene as it stands."""
         state = self.state
         return Scene(
-            gaussians=state.gaussians,
-            field=state.field,
+            gaussians=state.gaussians.to("cpu"),
+            field=state.field and state.field.to("cpu"),
             config=self.cfg,
             cameras=self.cameras,
             frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
-            prior_score=state.stats.score(self.cfg.density.unobserved_score),
-            num_valid=state.stats.num_valid.clone(),
+            prior_score=state.stats.score(self.cfg.density.unobserved_score).cpu(),
+            num_valid=state.stats.num_valid.cpu().clone(),
             lengths_are_relative=self.sequence.depth_is_relative,
         )
 
@@ -240,7 +239,7 @@ class Trainer:
 def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: Config) -> dict[str, Tensor]:
     """Weighted color, depth and total-variation terms of Eq. (12)."""
     depth = out.depth / out.alpha.clamp(min=1e-6) if cfg.loss.depth_mode == "expected" else out.depth
-    enough = float(frame.measured.sum()) >= cfg.loss.min_depth_pixels
+    enough = frame.num_measured >= cfg.loss.min_depth_pixels
     weights = (1.0, cfg.loss.depth_weight if enough else 0.0, cfg.loss.tv_weight)
     terms = supervised_losses(
         out.color, depth, frame.rgb_u8, frame.inverse_depth, frame.tissue_mask, frame.measured, weights
@@ -250,9 +249,9 @@ def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: Config) -> di
 
 def on_tissue(points: Tensor, frame: TrainingFrame) -> Tensor:
     """(P,) bool: whether world points (P, 3) mm project in front of the camera, into the image, onto tissue."""
-    pixels, z = project(points.numpy(), frame.camera)
-    means2d = torch.from_numpy(pixels.astype(np.float32))
-    return density.valid_projection(means2d, torch.from_numpy(z > 0).int(), frame.tissue_mask)
+    pixels, z = project(points.cpu().numpy(), frame.camera)
+    means2d, in_front = torch.from_numpy(pixels.astype(np.float32)), torch.from_numpy(z > 0).int()
+    return density.valid_projection(means2d.to(points.device), in_front.to(points.device), frame.tissue_mask)
 
 
 def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:

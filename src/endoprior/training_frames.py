@@ -31,6 +31,8 @@ class TrainingFrame:
     """(H, W) 1 / mm; 0 where there is no depth."""
     measured: Tensor
     """(H, W) bool, True where tissue has a depth."""
+    num_measured: int
+    """Pixels of `measured`."""
     brightness: float
     """Mean color over tissue, in [0, 1]; 0 without tissue."""
 
@@ -43,8 +45,9 @@ class TrainingFrame:
 class TrainingFrames:
     """Training frames of a sequence by position; built when first used, kept as memory allows."""
 
-    def __init__(self, sequence: Sequence, prior_cfg: PriorConfig) -> None:
-        self.sequence = sequence
+    def __init__(self, sequence: Sequence, prior_cfg: PriorConfig, device: torch.device | str = "cpu") -> None:
+        """Args: sequence: where frames come from. prior_cfg: of the prior. device: where the tensors are wanted."""
+        self.sequence, self.device = sequence, torch.device(device)
         self.indices = sequence.indices("train")
         self._prior_cfg = prior_cfg
         self._frames: BoundedCache[TrainingFrame] = BoundedCache(cache_bytes(), _frame_bytes)
@@ -57,7 +60,8 @@ class TrainingFrames:
         """Training frame number `position`, at full or at half width and height."""
 
         def build() -> TrainingFrame:
-            return _training_frame(shrunk(self.sequence.frame(self.indices[position]), 2 if half else 1))
+            frame = shrunk(self.sequence.frame(self.indices[position]), 2 if half else 1)
+            return _training_frame(frame, self.device)
 
         return self._frames.get((position, half), build)
 
@@ -72,22 +76,24 @@ class TrainingFrames:
 
         def build() -> Tensor:
             frame = self.sequence.frame(self.indices[position])
-            return torch.from_numpy(joint_texture_prior(frame.rgb, frame.tissue_mask, self._prior_cfg))
+            prior = joint_texture_prior(frame.rgb, frame.tissue_mask, self._prior_cfg)
+            return torch.from_numpy(prior).to(self.device)
 
         return self._priors.get(position, build), self.frame(position).tissue_mask
 
 
-def _training_frame(frame: Frame) -> TrainingFrame:
+def _training_frame(frame: Frame, device: torch.device) -> TrainingFrame:
     depth, usable = frame.depth, has_surface(frame)
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=usable)
     return TrainingFrame(
         index=frame.index,
         time=frame.time,
         camera=frame.camera,
-        rgb_u8=torch.from_numpy(frame.rgb_u8),
-        tissue_mask=torch.from_numpy(frame.tissue_mask),
-        inverse_depth=torch.from_numpy(inverse),
-        measured=torch.from_numpy(frame.tissue_mask & usable),
+        rgb_u8=torch.from_numpy(frame.rgb_u8).to(device),
+        tissue_mask=torch.from_numpy(frame.tissue_mask).to(device),
+        inverse_depth=torch.from_numpy(inverse).to(device),
+        measured=torch.from_numpy(frame.tissue_mask & usable).to(device),
+        num_measured=int(np.count_nonzero(frame.tissue_mask & usable)),
         brightness=float(frame.rgb_u8[frame.tissue_mask].mean()) / 255 if frame.tissue_mask.any() else 0.0,
     )
 

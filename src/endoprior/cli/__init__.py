@@ -10,6 +10,7 @@ import sys
 from importlib import import_module
 
 from ..checks import InputError
+from ..memory import refuse_small_limits
 
 COMMANDS = {
     "demo": "phantom sequence -> train -> eval -> render, with a summary and pictures",
@@ -22,6 +23,7 @@ COMMANDS = {
     "render": "draw a trained scene: color, depth, side-by-side, video",
     "export": "write open formats: PLY, splat, SPZ, glTF, mesh, points, tracks, depth, video",
     "view": "look at a trained scene, or a sequence before training, in a web browser",
+    "doctor": "say whether this machine can use CUDA, and what to install for it",
     "bench": "compare methods on sequences over seeds, under one protocol",
 }
 """Name and one-line description; each lives in the module of this package named like it (`eval` in `evaluate`)."""
@@ -55,6 +57,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if name not in COMMANDS:
             raise InputError(f"{name}: no such command; expected one of {', '.join(COMMANDS)}. Try `endoprior --help`.")
+        refuse_small_limits()
         return import_module(f".{MODULES.get(name, name)}", __package__).run(rest) or 0
     except InputError as error:
         print(f"endoprior: {' '.join(str(error).split())}", file=sys.stderr)

@@ -36,7 +36,7 @@ class Train:
     init_budget: int | None = None
     """Short for --init.budget."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute; this version computes on the CPU only, which is what auto takes."""
+    """Where to compute; auto takes CUDA only where all of it works (`endoprior doctor`)."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     networks: bool = True
@@ -54,10 +54,14 @@ class Train:
 
 def run(argv: list[str]) -> None:
     """Train, score, and print where the results are."""
+    from ..device import choose_here
+
     args = parse(Train, argv, "train", default=_preset_defaults(argv))
     cfg = args.config
-    if args.device == "cuda":
-        raise InputError("--device: expected auto or cpu; got cuda, not supported yet. Leave the option out.")
+    choice = choose_here(args.device)
+    say(choice.why)
+    if choice.device == "cuda":
+        cfg = dataclasses.replace(cfg, render=dataclasses.replace(cfg.render, backend="cuda"))
     if args.weights_dir and not args.weights_dir.is_dir():
         raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
     if args.init_budget is not None:
@@ -91,6 +95,7 @@ def train_and_evaluate(
         view_port: serve a live view of the training there; None does not.
         resume, checkpoint_seconds: as `train.train` has them.
     """
+    from .. import kernel_cache
     from ..data import load_sequence
     from ..run_folder import refuse_unusable_folder
     from ..train import train
@@ -100,6 +105,7 @@ def train_and_evaluate(
     sequence = load_sequence(data, cfg.data)
     refuse_unusable_folder(out, resume=resume)
     refuse_too_large(sequence, cfg)
+    kernel_cache.fill(cfg, say)
     say(f"{data}: {len(sequence)} frames; backend {cfg.render.backend}")
     for remark in sequence.validate():
         say(f"note: {remark}")

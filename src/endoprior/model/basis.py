@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..checks import check_shape
+from ..compiled import compiled
 from ..config import BasisConfig, DeformationConfig
 from ..simd import LANES, prefetch
 from .deformation import Offsets, offset_names
@@ -66,7 +67,7 @@ class RankOneGradient:
     """Gradient of `motion` from one moment, weights (B,) times v_offsets (N, channels): never written out in full."""
 
     weights: NDArray[np.float32]
-    v_offsets: NDArray[np.float32]
+    v_offsets: Tensor
 
 
 def basis_offsets(
@@ -98,11 +99,14 @@ class _WeightedSum(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, motion: Tensor, weights: NDArray[np.float64], sink: list[RankOneGradient] | None) -> Tensor:
-        coefficients = motion.detach().contiguous().numpy()
-        weights = weights.astype(coefficients.dtype)
+        weights = weights.astype(np.float64 if motion.dtype == torch.float64 else np.float32)
         band = np.flatnonzero(weights)
         ctx.band = (int(band[0]), int(band[-1]) + 1) if len(band) else (0, 0)
-        ctx.weights, ctx.shape, ctx.sink = weights, coefficients.shape, sink
+        ctx.weights, ctx.shape, ctx.sink = weights, motion.shape, sink
+        if not compiled(motion):
+            first, stop = ctx.band
+            return torch.einsum("nbc,b->nc", motion.detach()[:, first:stop], _on(motion, weights[first:stop]))
+        coefficients = motion.detach().contiguous().numpy()
         out = np.empty((len(coefficients), coefficients.shape[2]), dtype=coefficients.dtype)
         _weighted_sum(coefficients, weights, *ctx.band, out)
         return torch.from_numpy(out)
@@ -111,11 +115,18 @@ class _WeightedSum(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, None, None]:
         if ctx.sink is not None:
-            ctx.sink.append(RankOneGradient(ctx.weights, v_out.contiguous().numpy()))
+            ctx.sink.append(RankOneGradient(ctx.weights, v_out.contiguous()))
             return None, None, None
+        if not compiled(v_out):
+            return v_out[:, None] * _on(v_out, ctx.weights)[:, None], None, None
         v_motion = np.zeros(ctx.shape, dtype=ctx.weights.dtype)
         _weighted_sum_backward(v_out.contiguous().numpy(), ctx.weights, *ctx.band, v_motion)
         return torch.from_numpy(v_motion), None, None
+
+
+def _on(like: Tensor, weights: NDArray) -> Tensor:
+    """The weights where `like` is; the copy is queued, nobody waits for it."""
+    return torch.from_numpy(weights).to(like.device, non_blocking=True)
 
 
 @njit(parallel=True, cache=True)

@@ -6,6 +6,7 @@ Offsets are added to the raw parameters: centers (mm), log scales, quaternions b
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -83,6 +84,16 @@ class HexPlaneField:
         field = cls(torch.tensor([[1.0] * 3, [0.0] * 3]), cfg, torch.Generator(), draw=False)
         field.load_state_arrays(arrays)
         return field
+
+    def to(self, device: torch.device | str) -> HexPlaneField:
+        """This field on a device; itself if it is there. A copy starts without gradients."""
+        device = torch.device(device)
+        if self.box.device.type == device.type:
+            return self
+        moved = copy(self)
+        moved.grid, moved.heads = self.grid.to(device), self.heads.to(device)
+        moved.box = self.box.detach().to(device).requires_grad_(self.box.requires_grad)
+        return moved
 
     @property
     def num_plane_values(self) -> int:

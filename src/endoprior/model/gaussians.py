@@ -34,6 +34,13 @@ class Gaussians:
         self.motion_gradients: list[RankOneGradient] = []
         """Gradient of `motion` since the last optimizer step, one entry per moment."""
 
+    def to(self, device: torch.device | str) -> Gaussians:
+        """These Gaussians on a device; themselves if they are there."""
+        device = torch.device(device)
+        if self["means"].device.type == device.type:
+            return self
+        return Gaussians({name: value.detach().to(device) for name, value in self.tensors.items()})
+
     def __len__(self) -> int:
         return len(self.tensors["means"])
 

@@ -7,6 +7,7 @@ uniform, so the offsets are not zero at the start.
 from __future__ import annotations
 
 import math
+from copy import copy
 from typing import Literal
 
 import torch
@@ -48,6 +49,14 @@ class OffsetHeads:
                 bias.uniform_(-1 / math.sqrt(fan_in), 1 / math.sqrt(fan_in), generator=generator)
             self.parameters[f"{layer}.weight"] = weight.requires_grad_(True)
             self.parameters[f"{layer}.bias"] = bias.requires_grad_(True)
+
+    def to(self, device: torch.device) -> OffsetHeads:
+        """A copy on a device."""
+        moved = copy(self)
+        moved.parameters = {
+            name: value.detach().to(device).requires_grad_(True) for name, value in self.parameters.items()
+        }
+        return moved
 
     @property
     def trunk(self) -> tuple[Tensor, Tensor]:

@@ -11,12 +11,17 @@ of the scales concatenated (EndoGaussian; Cao and Johnson, "HexPlane", CVPR 2023
 from __future__ import annotations
 
 import math
+from copy import copy
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import grid_sample, linear
 
 from ..checks import check_shape
+from ..compiled import compiled
 from ..config import HexPlaneConfig
 from . import hexplane_kernels as kernels
 from .hexplane_lookup import Linear, Sample
@@ -68,7 +73,7 @@ class PlaneGrid:
         self.table_start = (np.cumsum(space) - space.ravel()).reshape(-1, 3)
         self.num_cells = int(sizes.sum())
         self.values = torch.ones(self.num_cells, self.channels)
-        self.grads = mapped_zeros(self.num_cells, self.channels)
+        self.grads = self.zeros()
         self.marks = torch.zeros(self.num_cells, dtype=torch.uint8)
 
     @property
@@ -105,6 +110,18 @@ class PlaneGrid:
             for name in PLANE_NAMES[3:]:
                 self.plane(scale, name).fill_(1)
 
+    def to(self, device: torch.device) -> PlaneGrid:
+        """A copy on a device, without gradients."""
+        moved = copy(self)
+        moved.values, moved.marks = self.values.detach().to(device), self.marks.to(device)
+        moved.grads = moved.zeros()
+        return moved
+
+    def zeros(self) -> Tensor:
+        """Zeros like `values`, where they are; on the CPU they take memory only once written."""
+        on_cpu = self.values.device.type == "cpu"
+        return mapped_zeros(self.num_cells, self.channels) if on_cpu else torch.zeros_like(self.values)
+
     def clear_grads(self) -> None:
         """Forget gradients that no optimizer step consumed; cells stay marked as touched."""
         fresh = (self.marks & kernels.FRESH).nonzero()[:, 0]
@@ -139,6 +156,22 @@ class PlaneGrid:
             unit = unit.detach().requires_grad_(True)
         return Sample.apply(unit, time, self)
 
+    def sample_definition(self, unit: Tensor, time: float) -> Tensor:
+        """`sample` in plain torch, on any device; backward adds to `grads` and marks every cell."""
+        values = _Planes.apply(self.values, unit.new_zeros((), requires_grad=True), self)
+        moment = 2 * time - 1 if self.time_map == "full" else time
+        where = torch.cat([unit * 2 - 1, torch.full_like(unit[:, :1], moment)], -1)
+        features = []
+        for scale in range(self.num_scales):
+            product: Tensor | float = 1.0
+            for name in PLANE_NAMES:
+                plane = self.plane(scale, name, values).permute(2, 0, 1)[None]
+                axes = where[:, ["xyzt".index(axis) for axis in name]][None, None]
+                found = grid_sample(plane, axes, mode="bilinear", padding_mode="border", align_corners=True)
+                product = product * found[0, :, 0]
+            features.append(product.T)
+        return torch.cat(features, -1)
+
     def linear(self, unit: Tensor, times: tuple[float, ...], weight: Tensor, bias: Tensor) -> tuple[Tensor, ...]:
         """A linear layer on the features of one or more moments.
 
@@ -156,9 +189,28 @@ class PlaneGrid:
         """
         self._check(unit, times)
         check_shape(f"weight:W,{self.num_features} bias:W", weight=weight, bias=bias)
+        if not compiled(unit):
+            return tuple(linear(self.sample_definition(unit, time), weight, bias) for time in times)
         return Linear.apply(unit, weight, bias, times, self)
 
     def _check(self, unit: Tensor, times: tuple[float, ...]) -> None:
         check_shape("unit:N,3", unit=unit)
         if not np.isfinite(times).all():
             raise ValueError(f"time must be finite; got {times!r}")
+
+
+class _Planes(torch.autograd.Function):
+    """The planes as autograd sees them: their gradient goes to `grads`, as that of the kernels does."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, wanted: Tensor, grid: PlaneGrid) -> Tensor:
+        """`wanted` needs a gradient, so that this is differentiated although `values` does not."""
+        ctx.grid = grid
+        return values.view_as(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_values: Tensor) -> tuple[None, None, None]:
+        ctx.grid.grads += v_values
+        ctx.grid.marks.fill_(kernels.TOUCHED | kernels.FRESH)
+        return None, None, None

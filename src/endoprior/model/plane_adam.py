@@ -15,7 +15,9 @@ import numpy as np
 from numba import njit, prange
 from torch import Tensor, from_numpy
 
-from .hexplane import PlaneGrid, mapped_zeros
+from ..adam_kernels import adam_definition
+from ..compiled import compiled
+from .hexplane import PlaneGrid
 from .hexplane_kernels import FRESH, TOUCHED
 
 _GROUP = 32  # cells in a row that one task takes at a time: a few kilobytes of each array
@@ -29,14 +31,21 @@ class PlaneAdam:
 
     def __init__(self, grid: PlaneGrid, *, epsilon: float = 1e-15, betas: tuple[float, float] = (0.9, 0.999)) -> None:
         """Start with zero moments at step 0. Moments take memory only where cells are touched."""
-        shape = (grid.num_cells, grid.channels)
         self.grid, self.epsilon, self.betas, self.steps = grid, epsilon, betas, 0
-        self.exp_avg, self.exp_avg_sq = mapped_zeros(*shape), mapped_zeros(*shape)
+        self.exp_avg, self.exp_avg_sq = grid.zeros(), grid.zeros()
 
     def step(self, lr: float) -> None:
         """Apply one step with learning rate `lr`, then clear the gradients."""
         self.steps += 1
         grid = self.grid
+        if not compiled(grid.values):
+            beta1, beta2 = self.betas
+            rate, root_scale = lr / (1 - beta1**self.steps), 1 / math.sqrt(1 - beta2**self.steps)
+            moments = self.exp_avg, self.exp_avg_sq
+            adam_definition(grid.values, grid.grads, *moments, rate, root_scale, self.epsilon)
+            grid.grads.zero_()
+            grid.marks.fill_(TOUCHED)
+            return
         plane_adam_step(
             grid.values, grid.grads, self.exp_avg, self.exp_avg_sq, grid.marks, self.steps, lr, self.betas, self.epsilon
         )
@@ -58,8 +67,8 @@ class PlaneAdam:
         touched = self.grid.marks.nonzero()[:, 0]
         self.exp_avg.zero_()
         self.exp_avg_sq.zero_()
-        self.exp_avg[touched] = arrays["plane_adam.exp_avg"]
-        self.exp_avg_sq[touched] = arrays["plane_adam.exp_avg_sq"]
+        self.exp_avg[touched] = arrays["plane_adam.exp_avg"].to(touched.device)
+        self.exp_avg_sq[touched] = arrays["plane_adam.exp_avg_sq"].to(touched.device)
         self.steps = int(arrays["plane_adam.steps"][0])
 
 

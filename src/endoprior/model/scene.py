@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -100,8 +100,29 @@ class Scene:
         Returns:
             color (H, W, 3), depth (H, W) mm as the sum of weight * z, alpha (H, W).
         """
-        rasterize = render.load(self.config.render.backend)
-        return rasterize(self.at(time), camera or self.camera_at(time), background=torch.zeros(3))
+        splats = self.at(time)
+        rasterize = render.load(self.backend)
+        return rasterize(splats, camera or self.camera_at(time), background=splats.means.new_zeros(3))
+
+    @property
+    def backend(self) -> render.Backend:
+        """What draws it: the backend it was trained with, if its Gaussians lie there; else that of their device."""
+        chosen, on_cpu = self.config.render.backend, self.gaussians["means"].device.type == "cpu"
+        return chosen if on_cpu == (chosen != "cuda") else "cpu" if on_cpu else "cuda"
+
+    def to(self, device: torch.device | str) -> Scene:
+        """This scene on a device: what it is asked is computed and drawn there; itself if it is there."""
+        gaussians = self.gaussians.to(device)
+        if gaussians is self.gaussians:
+            return self
+        field = self.field and self.field.to(device)
+        return replace(
+            self,
+            gaussians=gaussians,
+            field=field,
+            prior_score=self.prior_score.to(device),
+            num_valid=self.num_valid.to(device),
+        )
 
     def camera_at(self, time: float) -> Camera:
         """Camera of the frame nearest in time."""

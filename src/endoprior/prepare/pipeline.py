@@ -149,7 +149,8 @@ def _scale_depth(files: FrameFiles, path: PosePath) -> None:
     for index, scale in enumerate(path.depth_scale):
         file = files.file("depth", index)
         stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.float64) * scale
-        cv2.imwrite(str(file), np.clip(np.round(stored), 0, 65535).astype(np.uint16))
+        if not cv2.imwrite(str(file), np.clip(np.round(stored), 0, 65535).astype(np.uint16)):
+            raise OSError(f"could not write {file}")
 
 
 def _unexplained(path: PosePath | None, files: FrameFiles) -> list[int]:

@@ -12,7 +12,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from ..atomic import refuse_occupied, write_json
+from ..atomic import CannotWrite, flush_folder, refuse_occupied, write_json, writing
 from ..checks import InputError
 
 PLAN = "plan.json"
@@ -24,7 +24,7 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
     """Yield the hidden folder for `out`, with what an interrupted run of the same plan left in it.
 
     When the block ends normally the folder takes the name `out`. On `InputError` it is removed; on anything else,
-    such as Ctrl-C, it stays for the next run.
+    such as Ctrl-C or a full disk, it stays for the next run.
 
     Args:
         plan: JSON values that decide every byte that will be written.
@@ -49,10 +49,14 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             write_json(folder / PLAN, plan)
-        yield folder
-        forget_plan(folder)
-        refuse_occupied(out)
-        os.replace(folder, out)
+        with writing(out):
+            yield folder
+            forget_plan(folder)
+            refuse_occupied(out)
+            flush_folder(folder)
+            os.replace(folder, out)
+    except CannotWrite:
+        raise
     except InputError:
         shutil.rmtree(folder, ignore_errors=True)
         raise

@@ -1,7 +1,7 @@
 """Splats + Camera -> RenderOutput. Knows nothing of time, priors or losses.
 
 `reference` is the definition: dense, slow, plain torch, any floating type. `cpu` is the fast one: Numba kernels,
-float32.
+float32. `cuda` draws on an NVIDIA GPU, through gsplat, float32; what it does otherwise stands at the top of its file.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from ..types import Camera, RenderOutput, Splats
 
-Backend = Literal["cpu", "reference"]
+Backend = Literal["cpu", "cuda", "reference"]
 
 
 class Rasterizer(Protocol):
@@ -41,7 +41,7 @@ def load(backend: Backend) -> Rasterizer:
     """Import one backend. There is no fallback: the caller gets the one it named, or an error.
 
     Raises:
-        InputError: there is no backend of that name.
+        InputError: there is no backend of that name, or it is `cuda` and gsplat is not installed.
     """
     if backend not in get_args(Backend):
         names = ", ".join(get_args(Backend))

@@ -53,7 +53,7 @@ class SceneSubject:
         self.relative = scene.lengths_are_relative
         self.has_tool = sequence is not None
         self._playback = Playback(scene)
-        self._rasterize = render.load(scene.config.render.backend)
+        self._rasterize = render.load(scene.backend)
 
     @cached_property
     def span(self) -> tuple[float, float]:

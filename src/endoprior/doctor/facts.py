@@ -1,0 +1,226 @@
+"""Look at this machine. Every look is on its own: one that fails, hangs or finds garbage leaves the others alone."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ..memory import available_bytes
+from .ask import MARK, Answer, ask, clean
+from .driver import driver_answers, driver_files
+from .records import Builders, Driver, Facts, Gpu, Gsplat, System, Toolkit, Torch
+from .toolchain import look_for_builders, look_for_toolkit
+
+TORCH_LIMIT_S = 90.0
+"""Longest wait for torch, s: a first import from a slow disk, and a context on each of many cards, take time."""
+LOAD_LIMIT_S = 60.0
+COMPILE_LIMIT_S = 3600.0
+PACKAGES = ("OpenEXR", "transformers", "torchvision", "lpips", "ray")
+"""What the optional parts import."""
+VARIABLES = (
+    "CUDA_HOME", "CUDA_PATH", "CUDA_VISIBLE_DEVICES", "CUDA_INC_PATH", "TORCH_CUDA_ARCH_LIST", "TORCH_EXTENSIONS_DIR",
+    "MAX_JOBS", "CC", "CXX", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS",
+)  # fmt: skip
+"""Shown when set, besides our own: they change what is found, or how fast it is."""
+PACKAGE_MANAGERS = ("apt-get", "dnf", "zypper", "pacman")
+
+T = TypeVar("T")
+
+
+def glance() -> Facts:
+    """What can be seen without running anything, in milliseconds; enough to know that there is no CUDA here."""
+    return Facts(system=_or(System(), _system), driver=_or(Driver(), driver_files), torch=_or(Torch(), _torch_files))
+
+
+def look(torch_limit_s: float = TORCH_LIMIT_S) -> Facts:
+    """Everything, in the time of one import of torch; never raises.
+
+    Args:
+        torch_limit_s: longest wait for torch.
+    """
+    seen = glance()
+    with ThreadPoolExecutor(3) as pool:
+        driver = pool.submit(_or, seen.driver, driver_answers, seen.driver)
+        toolkit = pool.submit(_or, Toolkit(), look_for_toolkit)
+        builders = pool.submit(_or, Builders(), look_for_builders)
+        # Torch takes longest, and is asked from this thread: Ctrl-C then ends it at once.
+        silent: tuple[Torch, dict[str, str], str] = (seen.torch, {}, "torch was not asked")
+        torch, weights, weights_error = _or(silent, _ask_torch, torch_limit_s)
+        return replace(
+            seen,
+            torch=torch,
+            driver=driver.result(),
+            toolkit=toolkit.result(),
+            builders=builders.result(),
+            gsplat=_or(Gsplat(), _gsplat, torch),
+            packages={name: _package(name) for name in PACKAGES},
+            weights=weights,
+            weights_error=weights_error,
+            variables=_variables(),
+        )
+
+
+def compile_gsplat(facts: Facts, limit_s: float = COMPILE_LIMIT_S) -> Facts:
+    """Have gsplat compile itself, which takes minutes, and draw with it; the facts with what came of it."""
+    said = _run("gsplat_probe", ["compile"], limit_s)
+    found = _after(said)
+    gsplat = _or(facts.gsplat, _gsplat_files, facts.torch)
+    if found is None:
+        return replace(facts, gsplat=replace(gsplat, loads=False, error=f"{said.problem} {clean(said.text[-300:])}"))
+    seconds = found.get("seconds")
+    loads, error = found.get("loads") is True, clean(str(found.get("error", "")), 600)
+    kept = seconds if isinstance(seconds, int | float) else None
+    return replace(facts, gsplat=replace(gsplat, loads=loads, error=error, compile_seconds=kept))
+
+
+def _or(otherwise: T, look_: Callable[..., T], *arguments: Any) -> T:
+    """What the look returns; what is known without it if it fails in a way nobody thought of."""
+    try:
+        return look_(*arguments)
+    except Exception:
+        return otherwise
+
+
+def _system() -> System:
+    free = available_bytes()
+    return System(
+        name=platform.system(),
+        release=_release(),
+        machine=platform.machine(),
+        python=platform.python_version(),
+        cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        free_gb=None if free is None else free / 1e9,
+        container=any(Path(file).exists() for file in ("/.dockerenv", "/run/.containerenv", "/.singularity.d")),
+        packages=next((name for name in PACKAGE_MANAGERS if shutil.which(name)), ""),
+    )
+
+
+def _release() -> str:
+    try:
+        return clean(platform.freedesktop_os_release().get("PRETTY_NAME", ""), 60)
+    except (OSError, AttributeError):
+        return clean(platform.release(), 60)
+
+
+def _torch_files() -> Torch:
+    """Version and build of torch from its files: importing it takes seconds."""
+    spec = importlib.util.find_spec("torch")
+    if spec is None or not spec.submodule_search_locations:
+        return Torch()
+    text = (Path(next(iter(spec.submodule_search_locations))) / "version.py").read_text(encoding="utf-8")
+
+    def value(name: str) -> str:
+        found = re.search(rf"^{name}\b[^=\n]*=\s*['\"]([^'\"\n]*)['\"]", text, re.MULTILINE)
+        return clean(found[1], 40) if found else ""
+
+    return Torch(version=value("__version__"), cuda=value("cuda"), hip=value("hip"))
+
+
+def _ask_torch(limit_s: float) -> tuple[Torch, dict[str, str], str]:
+    """Torch, the weights it found, and why it could not look for them."""
+    seen = _or(Torch(), _torch_files)
+    said = _run("torch_probe", [], limit_s)
+    found = _after(said)
+    if found is None:
+        reason = f"{said.problem or 'no answer'} {clean(said.text[-160:])}".strip()
+        return (replace(seen, error=reason) if seen.version else seen), {}, "torch gave no answer"
+    if not seen.version and "version" not in found:
+        return seen, {}, "torch is not installed"
+    texts = {name: clean(str(found.get(name, ""))) for name in ("error", "reason", "extensions", "triton")}
+    torch = Torch(
+        version=str(found.get("version", seen.version)),
+        cuda=str(found.get("cuda", seen.cuda)),
+        hip=str(found.get("hip", seen.hip)),
+        available=found.get("available"),
+        gpus=tuple(_gpu(entry) for entry in found.get("gpus", ())),
+        architectures=tuple(map(str, found.get("architectures", ()))),
+        host_compilers=found.get("host_compilers", {}),
+        **texts,
+    )
+    return torch, found.get("weights", {}), clean(str(found.get("weights_error", "")))
+
+
+def _gpu(entry: Mapping[str, Any]) -> Gpu:
+    known = {field.name for field in fields(Gpu)}
+    values = {name: value for name, value in entry.items() if name in known}
+    if capability := values.get("capability"):
+        values["capability"] = (int(capability[0]), int(capability[1]))
+    return Gpu(**values | {"error": clean(str(values.get("error", "")))})
+
+
+def _gsplat(torch: Torch, limit_s: float = LOAD_LIMIT_S) -> Gsplat:
+    """Version, compiled files, and whether they load; nothing is compiled."""
+    gsplat = _gsplat_files(torch)
+    name, file = ("csrc", gsplat.prebuilt) if gsplat.prebuilt else ("gsplat_cuda", gsplat.cached)
+    if not file or not torch.cuda or torch.error:
+        return gsplat
+    gsplat = _tried(gsplat, name, file, limit_s)
+    if not gsplat.loads and gsplat.prebuilt and gsplat.cached:  # as gsplat itself goes on to its own compiled code
+        gsplat = _tried(replace(gsplat, prebuilt=""), "gsplat_cuda", gsplat.cached, limit_s)
+    return gsplat
+
+
+def _tried(gsplat: Gsplat, name: str, file: str, limit_s: float) -> Gsplat:
+    said = _run("gsplat_probe", ["load", name, file], limit_s)
+    found = _after(said) or {"error": said.problem}
+    return replace(gsplat, loads=found.get("loads") is True, error=clean(str(found.get("error", ""))))
+
+
+def _gsplat_files(torch: Torch) -> Gsplat:
+    """Where gsplat and its compiled code are, by their files: importing it could compile."""
+    spec = importlib.util.find_spec("gsplat")
+    if spec is None or not spec.submodule_search_locations:
+        return Gsplat()
+    package = Path(next(iter(spec.submodule_search_locations)))
+    ending = "pyd" if os.name == "nt" else "so"
+    built = Path(torch.extensions) / "gsplat_cuda" / f"gsplat_cuda.{ending}" if torch.extensions else None
+    return Gsplat(
+        version=_package("gsplat") or "?",
+        prebuilt=next((str(file) for file in sorted(package.glob(f"csrc*.{ending}"))), ""),
+        cached=str(built) if built and built.is_file() else "",
+    )
+
+
+def _package(name: str) -> str:
+    """Version of an installed package, "" if it is not there; nothing is imported."""
+    try:
+        if importlib.util.find_spec(name) is None:
+            return ""
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "?"
+    except (ImportError, ValueError):
+        return ""
+
+
+def _variables() -> dict[str, str]:
+    ours = sorted(name for name in os.environ if name.startswith("ENDOPRIOR_"))
+    return {clean(name, 60): clean(os.environ[name], 120) for name in (*ours, *VARIABLES) if name in os.environ}
+
+
+def _run(module: str, arguments: list[str], limit_s: float) -> Answer:
+    # -P: the folder one happens to be in must not stand in for packages, as it does not for `endoprior` itself.
+    return ask([sys.executable, "-P", "-m", f"{__package__}.{module}", *arguments], limit_s)
+
+
+def _after(said: Answer) -> dict[str, Any] | None:
+    """The JSON object behind the last `MARK` in what a probe printed, whatever else was printed around it."""
+    for line in reversed(said.text.splitlines()):
+        if line.startswith(MARK):
+            try:
+                found = json.loads(line.removeprefix(MARK))
+            except ValueError:
+                return None
+            return found if isinstance(found, dict) else None
+    return None

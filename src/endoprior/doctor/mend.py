@@ -1,0 +1,185 @@
+"""The command that mends each thing: which build of torch, which toolkit, which package."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import PurePath
+
+from .records import Facts, number
+
+WHEELS = "https://download.pytorch.org/whl"
+LEAST_CAPABILITY = (7, 0)
+"""gsplat uses cooperative groups by label, which older cards lack."""
+LEAST_TORCH = (2, 4)
+LEAST_GSPLAT = (1, 5, 3)
+NVCC_FOR = {
+    (8, 0): (11, 0), (8, 6): (11, 1), (8, 7): (11, 5), (8, 9): (11, 8), (9, 0): (11, 8), (10, 0): (12, 8),
+    (10, 3): (12, 9), (12, 0): (12, 8), (12, 1): (12, 9),
+}  # fmt: skip
+"""Compute capability -> first nvcc that knows it."""
+
+
+def torch_builds(facts: Facts) -> list[tuple[str, str]]:
+    """Builds of torch that serve this driver and this card, best first: (CUDA, requirement for pip).
+
+    A driver serves every minor version of its major one and all older ones (NVIDIA, "CUDA compatibility"). CUDA 13 has
+    no kernels for cards before 7.5; the wheels for 12.6 and 11.8 have none for cards after 9.0; those for 12.8 end with
+    torch 2.11, those for 11.8 with 2.7, which knows no Python after 3.13.
+    """
+    card = capability(facts) or (8, 0)
+    serves = number(facts.driver.cuda) or ((12, 6) if card < (10,) else (13, 0))
+    builds = []
+    if card < LEAST_CAPABILITY:
+        return builds
+    if serves >= (13,) and card >= (7, 5):
+        builds.append(("13.0", "torch"))
+    if serves >= (12, 8) and card >= (10,):
+        builds.append(("12.8", "torch<2.12"))
+    if serves >= (12,) and card < (10,):
+        builds.append(("12.6", "torch"))
+    if serves >= (11,) and card < (10,) and number(facts.system.python) < (3, 14):
+        builds.append(("11.8", "torch<2.8"))
+    nvcc = number(facts.toolkit.nvcc)
+    if nvcc >= (12,) and knows_card(facts, facts.toolkit.nvcc):  # one that fits the toolkit that is here
+        builds.sort(key=lambda build: number(build[0])[0] != nvcc[0])
+    return builds
+
+
+def capability(facts: Facts) -> tuple[int, int] | None:
+    """Compute capability of the card that would be used."""
+    return next((gpu.capability for gpu in (*facts.torch.gpus, *facts.driver.gpus) if gpu.capability), None)
+
+
+def install_torch(facts: Facts, major: int | None = None, again: bool = False) -> str:
+    """The command that installs a torch for this driver and card, "" if there is none.
+
+    Args:
+        major: only builds for this CUDA.
+        again: also the build for the CUDA that is there.
+    """
+    for cuda, torch in torch_builds(facts):
+        if (major is None or number(cuda)[0] == major) and (again or cuda != facts.torch.cuda):
+            vision = " torchvision" if facts.packages.get("torchvision") else ""
+            install = f"pip install {shlex.quote(torch)}{vision} --index-url {WHEELS}/cu{cuda.replace('.', '')}"
+            # pip takes an installed build for another CUDA, or none, as good enough.
+            return f"pip uninstall -y torch{vision} && {install}" if facts.torch.version else install
+    return ""
+
+
+def install_driver(facts: Facts) -> str:
+    """How to get NVIDIA's driver."""
+    if facts.system.name == "Windows":
+        return "install NVIDIA's driver, 580 or newer, from https://www.nvidia.com/drivers"
+    if facts.system.container:
+        return "install NVIDIA's driver, 580 or newer, on the host, and start the container with --gpus all"
+    if "Ubuntu" in facts.system.release:
+        return "sudo ubuntu-drivers install && sudo reboot"
+    if facts.system.packages == "apt-get":
+        return "sudo apt-get install nvidia-driver && sudo reboot (section non-free; 580 or newer is best)"
+    return "install NVIDIA's driver, 580 or newer, from https://www.nvidia.com/drivers, and restart"
+
+
+def planned_cuda(facts: Facts) -> str:
+    """The CUDA of torch: of the one that is here, or of the one that `install_torch` would install; "" if neither."""
+    served = facts.driver.cuda or capability(facts)
+    return facts.torch.cuda or (next((cuda for cuda, _ in torch_builds(facts)), "") if served else "")
+
+
+def install_toolkit(facts: Facts) -> str:
+    """How to get an nvcc that fits torch and knows the card."""
+    wanted = number(planned_cuda(facts))[:2]
+    least = nvcc_needed(facts)
+    version = ".".join(map(str, max(wanted, least if least[:1] == wanted[:1] else ())))
+    if other := fitting_toolkit(facts):
+        return set_variable(facts, "CUDA_HOME", other)
+    if facts.system.name == "Windows":
+        return f"winget install Nvidia.CUDA --version {version}"
+    if facts.system.packages == "apt-get":
+        name = f"cuda-toolkit-{version.replace('.', '-')}"
+        return f"sudo apt-get install {name} (from NVIDIA's packages: https://developer.nvidia.com/cuda-downloads)"
+    return f"install the CUDA toolkit {version} from https://developer.nvidia.com/cuda-toolkit-archive"
+
+
+def fitting_toolkit(facts: Facts) -> str:
+    """A toolkit that is here already, of torch's CUDA, which torch does not look at; "" if there is none."""
+    wanted = number(planned_cuda(facts))
+    fitting = [
+        entry for entry in facts.toolkit.others if number(entry[1])[:1] == wanted[:1] and knows_card(facts, entry[1])
+    ]
+    same = [folder for folder, version in fitting if number(version) == wanted]
+    return (same or [folder for folder, _ in fitting] or [""])[0]
+
+
+def nvcc_needed(facts: Facts) -> tuple[int, ...]:
+    """First nvcc that compiles for the card, () if any does."""
+    card = capability(facts) or (0, 0)
+    return max((need for least, need in NVCC_FOR.items() if card[0] == least[0] and card >= least), default=())
+
+
+def knows_card(facts: Facts, nvcc: str) -> bool:
+    """Whether an nvcc of this version compiles for the card."""
+    card = capability(facts)
+    return card is None or (number(nvcc) >= nvcc_needed(facts) and not (number(nvcc) >= (13,) and card < (7, 5)))
+
+
+def install_compiler(facts: Facts) -> str:
+    """How to get a C++ compiler."""
+    if facts.system.name == "Windows":
+        return "winget install Microsoft.VisualStudio.2022.BuildTools, then use its x64 Native Tools prompt"
+    names = {"apt-get": "install g++", "dnf": "install gcc-c++", "zypper": "install gcc-c++", "pacman": "-S gcc"}
+    manager = facts.system.packages
+    return f"sudo {manager} {names[manager]}" if manager in names else "install g++"
+
+
+def older_compiler(facts: Facts, too_new: int) -> str:
+    """How to use a gcc older than `too_new`: one that is here, or one to install."""
+    here = [major for major in facts.builders.other_gcc if major < too_new]
+    major = max(here, default=too_new - 1)
+    use = f"export CC=gcc-{major} CXX=g++-{major}"
+    if here:
+        return use
+    manager = facts.system.packages
+    return (
+        f"sudo {manager} install g++-{major} && {use}" if manager == "apt-get" else f"install g++ {major}, then {use}"
+    )
+
+
+def install_python_headers(facts: Facts) -> str:
+    """How to get Python.h."""
+    short = ".".join(facts.system.python.split(".")[:2])
+    if facts.system.packages == "apt-get":
+        return f"sudo apt-get install python{short}-dev"
+    if facts.system.packages == "dnf":
+        return f"sudo dnf install python{short}-devel"
+    return f"install the headers of Python {short}, or use a Python that has them"
+
+
+def set_variable(facts: Facts, name: str, value: str) -> str:
+    """The shell's command for an environment variable."""
+    if facts.system.name == "Windows":
+        return f"set {name}={value}"
+    return f"export {name}={shlex.quote(value)}"
+
+
+def unset_variable(facts: Facts, name: str) -> str:
+    """The shell's command that removes an environment variable."""
+    return f"set {name}=" if facts.system.name == "Windows" else f"unset {name}"
+
+
+def use_ninja(facts: Facts) -> str:
+    """How to get ninja onto PATH."""
+    beside = facts.builders.ninja_beside_python
+    if not beside:
+        return "pip install ninja"
+    if facts.system.name == "Windows":
+        return f"set PATH={beside};%PATH%"
+    return f'export PATH={shlex.quote(str(PurePath(beside)))}:"$PATH"'
+
+
+def compile_again(facts: Facts) -> str:
+    """Compile gsplat; what was compiled and does not load is removed first."""
+    if not facts.gsplat.cached or facts.gsplat.loads is not False:
+        return "endoprior doctor --compile"
+    folder = str(PurePath(facts.gsplat.cached).parent)
+    remove = f'rmdir /s /q "{folder}"' if facts.system.name == "Windows" else f"rm -r {shlex.quote(folder)}"
+    return f"{remove} && endoprior doctor --compile"

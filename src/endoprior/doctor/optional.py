@@ -1,0 +1,90 @@
+"""Lines about the computer itself, and about what is good to have and never needed."""
+
+from __future__ import annotations
+
+from .lines import Line, State
+from .records import Facts
+
+PARTS = {
+    "exr": ("depth in OpenEXR files", ("OpenEXR",)),
+    "mono": ("depth by a network", ("transformers",)),
+    "networks": ("network scores", ("torchvision", "lpips")),
+    "ray": ("benchmarks on a cluster", ("ray",)),
+}
+"""Optional part of the package -> what it is for, and the packages it needs."""
+OURS = ("ENDOPRIOR_WEIGHTS", "ENDOPRIOR_CACHE_GB")
+"""Variables the program reads."""
+TESTS = ("ENDOPRIOR_DATA", "ENDOPRIOR_CHROMIUM", "ENDOPRIOR_HYPOTHESIS", "ENDOPRIOR_TEST_PICTURES")
+"""Variables its tests read."""
+
+
+def machine_lines(facts: Facts) -> list[Line]:
+    """The computer and its Python."""
+    system = facts.system
+    inside = ", in a container" if system.container else ""
+    free = "unknown" if system.free_gb is None else f"{system.free_gb:.1f} GB free"
+    return [
+        Line("machine", "computer", "ok", f"{system.release or system.name}, {system.machine}{inside}"),
+        Line("machine", "Python", "ok", system.python),
+        Line("machine", "cores", "ok", f"{system.cores}"),
+        Line("machine", "memory", "ok", free),
+    ]
+
+
+def optional_lines(facts: Facts) -> list[Line]:
+    """What else a user may wonder about."""
+    lines = [_triton(facts)]
+    for part, (purpose, packages) in PARTS.items():
+        absent = [name for name in packages if not facts.packages.get(name)]
+        there = ", ".join(f"{name} {facts.packages[name]}" for name in packages if name not in absent)
+        state: State = "missing" if absent else "ok"
+        found = f"{purpose}: {'no ' + ', '.join(absent) if absent else there}"
+        lines.append(Line("also", part, state, found, f"pip install 'endoprior[{part}]'" if absent else ""))
+    lines += _weights(facts)
+    lines.append(Line("also", "browser", "ok", "any serves `endoprior view`; Chromium is for the tests only"))
+    lines += _variables(facts)
+    return lines
+
+
+def _triton(facts: Facts) -> Line:
+    if facts.torch.triton:
+        return Line("also", "triton", "ok", facts.torch.triton)
+    ships = facts.torch.cuda and facts.system.name == "Linux"
+    return Line(
+        "also", "triton", "missing", "comes with torch for CUDA on Linux", "pip install triton" if ships else ""
+    )
+
+
+def _weights(facts: Facts) -> list[Line]:
+    if facts.weights_error and not facts.weights:
+        named = "ENDOPRIOR_WEIGHTS" in facts.weights_error
+        repair = "unset ENDOPRIOR_WEIGHTS, or name a folder" if named else ""
+        return [Line("also", "weights", "wrong" if named else "missing", facts.weights_error, repair)]
+    here = [f"{network} ({place})" for network, place in facts.weights.items() if place]
+    absent = [network for network, place in facts.weights.items() if not place]
+    found = ", ".join(here) or "none here"
+    if not absent:
+        return [Line("also", "weights", "ok", found)]
+    found += f"; not here: {', '.join(absent)}"
+    repair = "name a folder with their files in ENDOPRIOR_WEIGHTS; until then their scores are skipped"
+    return [Line("also", "weights", "missing", found, repair)]
+
+
+def _variables(facts: Facts) -> list[Line]:
+    """Variables that are set; those of our own that nothing reads, or that are no number, are wrong."""
+    lines = []
+    for name, value in facts.variables.items():
+        found, repair = value or "(empty)", ""
+        if name.startswith("ENDOPRIOR_") and name not in (*OURS, *TESTS):
+            found, repair = f"{found}: nothing reads it; known are {', '.join(OURS)}", f"unset {name}"
+        elif name == "ENDOPRIOR_CACHE_GB" and not _is_number(value):
+            found, repair = f"{found}: expected a number of GB", f"unset {name}"
+        lines.append(Line("also", name, "wrong" if repair else "ok", found, repair))
+    return lines
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return float(text) >= 0
+    except ValueError:
+        return False

@@ -1,0 +1,69 @@
+"""Made-up machines for the tests of the doctor: one with everything, and kinds of every part."""
+
+from dataclasses import replace
+
+from hypothesis import strategies as st
+
+from endoprior.doctor import Facts
+from endoprior.doctor.records import Builders, Driver, Gpu, Gsplat, System, Toolkit, Torch
+
+H200 = Gpu("NVIDIA H200", (9, 0), 139.0, True)
+NEW_CARD = Gpu("NVIDIA B200", (10, 0), 180.0, True)
+OLD_CARD = Gpu("Quadro P2000", (6, 1), 5.0, True)
+NO_KERNEL = Gpu("NVIDIA B200", (10, 0), 180.0, False, "CUDA error: no kernel image is available for execution")
+WORKING = Facts(
+    driver=Driver(1, "580.65.06", True, "nvidia-smi", "580.65.06", "13.0", (H200,)),
+    torch=Torch(
+        "2.13.0+cu130", "13.0", available=True, gpus=(H200,), extensions="cache", host_compilers={"13.0": [16]}
+    ),
+    gsplat=Gsplat("1.5.3", cached="cache/gsplat_cuda/gsplat_cuda.so", loads=True),
+    toolkit=Toolkit("/usr/local/cuda", "default", "13.0", "", True),
+    builders=Builders("c++", "12.2.0", True, ninja="1.11.1", python_headers=True),
+)
+"""A machine with everything."""
+CHOICES = {
+    "system": [System(), System(name="Windows"), System(name="Darwin"), System(container=True, packages="apt-get")],
+    "driver": [
+        Driver(), Driver(0), Driver(2), WORKING.driver, Driver(1, "550.1", False, "", "550.1", "12.4"),
+        Driver(1, "570.1", True, "nvidia-smi", "570.1", "12.8", (replace(NEW_CARD, computes=None),)),
+        Driver(1, "470.1", True, "nvidia-smi", "470.1", "11.4", (H200,)), Driver(0, tool="nvidia-smi", error="failed"),
+        Driver(1, "580.1", True, "nvidia-smi", error="nvidia-smi gave no answer in 10 s"),
+        Driver(None, "580.1", True, "nvidia-smi", "580.1", "13.0", (OLD_CARD,)), Driver(None, device_files=True),
+        Driver(1, "390.1", True, "nvidia-smi", "390.1", "9.1"),
+    ],
+    "torch": [
+        Torch(), Torch("2.13.0+cpu"), Torch("2.13.0+rocm7", hip="7.2"), Torch("2.13.0", "13.0", error="libcudart.so"),
+        Torch("2.3.0", "12.1", available=True, gpus=(H200,)), WORKING.torch, Torch("2.13.0", "13.0", available=False),
+        Torch("2.13.0", "12.6", available=True, gpus=(NO_KERNEL,)), Torch("2.13.0", "12.6", available=False),
+        Torch("2.13.0", "13.0", available=True, gpus=(replace(NO_KERNEL, error="out of memory"), H200)),
+        Torch("2.13.0", "13.0", available=True), Torch("2.13.0", "13.0", error="python gave no answer in 90 s"),
+        Torch("2.13.0", "13.0", available=True, gpus=(OLD_CARD, H200)),
+    ],
+    "gsplat": [
+        Gsplat(), Gsplat("1.5.2"), Gsplat("1.5.3"), WORKING.gsplat, Gsplat("1.5.3", prebuilt="csrc.so", loads=True),
+        Gsplat("1.5.3", prebuilt="csrc.so", loads=False, error="undefined symbol"),
+        replace(WORKING.gsplat, loads=False, error="undefined symbol"), Gsplat("1.5.3", loads=False, error="nvcc died"),
+    ],
+    "toolkit": [
+        Toolkit(), WORKING.toolkit,
+        Toolkit("/usr/local", "PATH", "13.0", "", False, "", (("/usr/local/cuda-13.0", "13.0"),)),
+        Toolkit("/usr", "PATH", "11.5", "", True),
+        Toolkit("/usr", "PATH", "12.0", "", True, "", (("/opt/cuda-13.0", "13.0"),)),
+        Toolkit("/gone", "CUDA_HOME", "", "no /gone/bin/nvcc"),
+        Toolkit("/c", "PATH", "13.1", "", False, "/c/targets/x/include"),
+        Toolkit("/usr", "PATH", "12.8", "", True),
+    ],
+    "builders": [
+        Builders(), WORKING.builders, Builders("g++", "13.1", True),
+        Builders("c++", "16.1.0", True, other_gcc=(13,), ninja="1.11", python_headers=True),
+        Builders("c++", "13.1.0", True, ninja_beside_python="/venv/bin", python_headers=True),
+    ],
+}  # fmt: skip
+
+
+def machines():
+    """Facts of every kind of machine above; all pairs of kinds are met many times."""
+    names = list(CHOICES)
+    return st.tuples(*(st.sampled_from(CHOICES[name]) for name in names)).map(
+        lambda picked: Facts(**dict(zip(names, picked, strict=True)), variables={})
+    )

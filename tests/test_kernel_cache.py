@@ -1,0 +1,65 @@
+"""Kernels come from the cache in every run: filled once by a process of its own, by what decides which there are."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from dataclasses import replace
+
+import pytest
+
+from endoprior import kernel_cache
+from endoprior.config_io import to_dict
+from endoprior.presets import preset
+from endoprior.trainer import Trainer
+from endoprior.warm_up import shortened, tiny_sequence
+
+
+@pytest.fixture
+def cold(tmp_path, monkeypatch):
+    """An empty cache, and a list of the warm-ups that were asked for; they succeed at once."""
+    asked = []
+
+    def instead(words, **options):
+        asked.append(json.loads(options["input"]))
+        return subprocess.CompletedProcess(words, instead.status, "", "")
+
+    instead.status = 0
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(kernel_cache, "_filled", set())
+    monkeypatch.setattr(kernel_cache.subprocess, "run", instead)
+    return asked, instead
+
+
+def test_it_is_filled_once_for_what_needs_the_same_kernels(cold, monkeypatch):
+    asked, _ = cold
+    cfg, said = preset("default"), []
+    kernel_cache.fill(cfg, said.append)
+    kernel_cache.fill(replace(cfg, seed=7, init=replace(cfg.init, budget=99)), said.append)
+    assert asked == [json.loads(json.dumps(to_dict(cfg)))] and len(said) == 1
+    monkeypatch.setattr(kernel_cache, "_filled", set())  # as in the next process
+    kernel_cache.fill(cfg, said.append)
+    assert len(asked) == 1 and len(said) == 1
+    kernel_cache.fill(preset("paper"), said.append)
+    assert len(asked) == 2
+
+
+def test_a_warm_up_that_fails_is_tried_again_by_the_next_process(cold, monkeypatch):
+    asked, instead = cold
+    instead.status = 1
+    kernel_cache.fill(preset("default"))
+    monkeypatch.setattr(kernel_cache, "_filled", set())
+    kernel_cache.fill(preset("default"))
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize("name", ["default", "paper", "released", "endogaussian"])
+def test_the_warm_up_reaches_every_part_of_a_preset(name):
+    cfg = shortened(preset(name))
+    trainer = Trainer(tiny_sequence(), cfg)
+    trainer.start()
+    reports = []
+    while not trainer.finished:
+        reports.append(trainer.step())
+    assert len({report.num_gaussians for report in reports}) > 1
+    assert any("distance" in report.terms for report in reports) == (cfg.temporal.weight > 0)
