@@ -10,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from test_train import tiny_config
 
@@ -18,6 +19,7 @@ from endoprior.atomic import CannotWrite, remove_leftovers, whole_file, whole_fo
 from endoprior.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.run_folder import deferred_interrupt
+from endoprior.show.video import _num_frames, write_video
 from endoprior.train import train
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
@@ -140,6 +142,8 @@ def test_two_processes_do_not_train_in_one_folder(tiny_sequence, tmp_path):
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_schedulers_and_closing_terminals_are_heard(tiny_sequence, tmp_path, name):
     cfg, out, sent = tiny_config("basis"), tmp_path / "run", []
+    # Under `nohup` the test would be told to ignore it.
+    before = signal.signal(getattr(signal, name), signal.SIG_DFL)
 
     def end(report, trainer):
         if not sent:
@@ -147,6 +151,7 @@ def test_schedulers_and_closing_terminals_are_heard(tiny_sequence, tmp_path, nam
 
     with pytest.raises(KeyboardInterrupt):
         train(load_sequence(tiny_sequence), cfg, out, on_step=end)
+    signal.signal(getattr(signal, name), before)
     assert (out / "checkpoint.safetensors").is_file()
     train(load_sequence(tiny_sequence), cfg, out, resume=True)
 
@@ -183,3 +188,18 @@ def test_a_limit_for_files_stops_training_in_one_line_and_keeps_the_checkpoint(t
     done = run(*words, "--resume", limits={resource.RLIMIT_FSIZE: 50_000})
     assert done.one_line and "File too large" in done.err, done.err
     assert (out / "checkpoint.safetensors").read_bytes() == kept and not leftovers(out)
+
+
+def test_a_film_that_was_cut_short_is_noticed(tmp_path):
+    path = tmp_path / "film.mp4"
+    write_video(path, [np.full((33, 48, 3), 20 * i, np.uint8) for i in range(7)], 10.0)
+    assert _num_frames(path) == 7
+    (tmp_path / "cut.mp4").write_bytes(path.read_bytes()[:-200])  # the table at its end is missing
+    assert _num_frames(tmp_path / "cut.mp4") == 0
+
+
+def test_an_encoder_that_dies_leaves_no_film(tmp_path, monkeypatch):
+    monkeypatch.setattr("endoprior.show.video._num_frames", lambda path: 3)
+    with pytest.raises(CannotWrite, match="an encoder that stopped"):
+        write_video(tmp_path / "film.mp4", [np.zeros((32, 32, 3), np.uint8)] * 7, 10.0)
+    assert list(tmp_path.iterdir()) == []

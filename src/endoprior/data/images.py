@@ -112,6 +112,20 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
     return pixels
 
 
+def save_png(path: Path, pixels: NDArray, compression: int = 1) -> None:
+    """Write a PNG; encoded in memory first, because libpng's own writer would tell of a full disk on stderr.
+
+    Args:
+        pixels: (H, W) 8- or 16-bit, or (H, W, 3) 8-bit red, green, blue.
+        compression: 0 to 9.
+    Raises:
+        OSError: the disk does not take it.
+    """
+    stored = np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels
+    encoded = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, compression])[1]
+    path.write_bytes(encoded.tobytes())
+
+
 def single_channel(path: Path, pixels: NDArray) -> NDArray:
     """(H, W) view of a gray image, also of one stored with equal color channels."""
     if pixels.ndim == 2:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import refuse_occupied, whole_folder
+from .images import save_png
 
 TOOL_VALUE = 255
 """Value of tool pixels in `masks/`; tissue is 0."""
@@ -98,10 +99,8 @@ class FrameFiles:
             pixels: (H, W, 3) RGB 8-bit, or (H, W) 8- or 16-bit.
         """
         path = self._file(f"{folder}/{self.count:06d}.png")
-        stored = np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels
         # Fast compression: a sequence is written once and read many times, and noise does not compress anyway.
-        if not cv2.imwrite(str(path), stored, [cv2.IMWRITE_PNG_COMPRESSION, 2]):
-            raise OSError(f"could not write {path}")
+        save_png(path, pixels, 2)
 
     def write_array(self, name: str, array: NDArray) -> None:
         """Write `name` (relative, `.npy`)."""

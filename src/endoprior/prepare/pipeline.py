@@ -11,7 +11,7 @@ import numpy as np
 
 from ..checks import runs
 from ..data import write_stir_tracks
-from ..data.images import read_color, read_depth, read_tool_mask
+from ..data.images import read_color, read_depth, read_tool_mask, save_png
 from ..data.reading import complaint, kind_of
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
@@ -149,8 +149,7 @@ def _scale_depth(files: FrameFiles, path: PosePath) -> None:
     for index, scale in enumerate(path.depth_scale):
         file = files.file("depth", index)
         stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.float64) * scale
-        if not cv2.imwrite(str(file), np.clip(np.round(stored), 0, 65535).astype(np.uint16)):
-            raise OSError(f"could not write {file}")
+        save_png(file, np.clip(np.round(stored), 0, 65535).astype(np.uint16))
 
 
 def _unexplained(path: PosePath | None, files: FrameFiles) -> list[int]:

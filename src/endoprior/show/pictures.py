@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import whole_file
+from ..data.images import save_png
 
 
 def write_png(path: Path, rgb_u8: NDArray[np.uint8]) -> None:
     """Write an (H, W, 3) RGB or (H, W) gray 8-bit picture, whole or not at all."""
     with whole_file(path) as temporary:
-        pixels = rgb_u8[..., ::-1] if rgb_u8.ndim == 3 else rgb_u8
-        if not cv2.imwrite(str(temporary), pixels):
-            raise OSError(f"{path}: could not write the picture")
+        save_png(temporary, rgb_u8)
 
 
 def to_u8(unit: NDArray) -> NDArray[np.uint8]:
