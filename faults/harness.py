@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -47,7 +48,9 @@ class Done:
 
     @property
     def in_words(self) -> str:
-        """Status and the end of what it said, for a row."""
+        """What it said, for a row: the reason of a refusal, else status and the end of the complaint."""
+        if self.one_line and (reason := re.search(r"; got (.*?)\. ", self.err)):
+            return f"refused: {reason[1]}"
         return f"exit {self.status}: {' '.join(self.err.split())[-160:] or 'nothing on stderr'}"
 
 

@@ -21,6 +21,7 @@ from endoprior.data import load_sequence
 from endoprior.run_folder import deferred_interrupt
 from endoprior.show.video import _num_frames, write_video
 from endoprior.train import train
+from endoprior.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
 
@@ -123,6 +124,31 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again(tiny_sequence, tm
         train(load_sequence(tiny_sequence), tiny_config("basis").__class__(seed=5), out, resume=True)
     train(load_sequence(tiny_sequence), cfg, out, resume=True)
     assert differences(out, tmp_path / "whole") == [] and len(whole)
+
+
+def test_a_run_killed_while_it_finds_its_first_points_starts_again(tiny_sequence, tmp_path, monkeypatch):
+    def die(trainer):
+        raise SystemExit
+
+    with monkeypatch.context() as patched, pytest.raises(SystemExit):
+        patched.setattr(Trainer, "start", die)
+        train(load_sequence(tiny_sequence), tiny_config("basis"), tmp_path / "run")
+    train(load_sequence(tiny_sequence), tiny_config("basis"), tmp_path / "run", resume=True)
+    assert (tmp_path / "run" / "scene.safetensors").is_file()
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_run_that_cannot_begin_leaves_the_folder_as_it_was(tiny_sequence, tmp_path, monkeypatch, there):
+    def refuse(trainer):
+        raise InputError("no points")
+
+    out = tmp_path / "run"
+    if there:
+        out.mkdir()
+    monkeypatch.setattr(Trainer, "start", refuse)
+    with pytest.raises(InputError):
+        train(load_sequence(tiny_sequence), tiny_config("basis"), out)
+    assert out.exists() == there and not (out / "config.json").exists()
 
 
 def test_two_processes_do_not_train_in_one_folder(tiny_sequence, tmp_path):

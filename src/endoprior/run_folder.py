@@ -96,6 +96,8 @@ def train_in_folder(
         except InputError:
             if made:  # nothing was begun
                 shutil.rmtree(out, ignore_errors=True)
+            elif not options.resume:
+                (out / "config.json").unlink(missing_ok=True)
             raise
         try:
             _advance(trainer, out, options, fingerprint, on_step)
@@ -122,13 +124,12 @@ def _begin(trainer: Trainer, out: Path, resume: bool, fingerprint: str) -> None:
         data = stored.get("data")
         known = data.get("fingerprint") if isinstance(data, dict) else None
         refuse_other_run(about, stored.get("config"), known, trainer.cfg, fingerprint, trainer.sequence.path)
-        trainer.start()
     elif resume:
         raise InputError(f"{checkpoint}: expected a checkpoint to resume from; found none. Start without --resume.")
-    else:
+    write_json(about, run_facts(trainer, fingerprint))
+    if trainer.state is None:
         trainer.start()
     _cut_log(out / "log.jsonl", int(trainer.state.stage), trainer.state.iteration)
-    write_json(about, run_facts(trainer, fingerprint))
 
 
 def _advance(
