@@ -14,6 +14,8 @@ from harness import Row, demand, run
 
 LONG_FRAMES, LARGE_FRAMES = 1000, 24
 LONG_LIMIT_MB, LARGE_LIMIT_MB = 6000, 6000
+CACHE_GB = "0.5"
+"""Of each cache; what they may take otherwise depends on the machine."""
 LONG_ITERATIONS, LARGE_ITERATIONS = 200, 40
 
 
@@ -54,7 +56,7 @@ def _few(iterations: int) -> list[object]:
 
 
 def _trained(what: str, iterations: int, data: Path, out: Path, limit_mb: float) -> Row:
-    done = run("train", data, out, *_few(iterations), timeout=1200)
+    done = run("train", data, out, *_few(iterations), timeout=1200, ENDOPRIOR_CACHE_GB=CACHE_GB)
     figure = f"{done.peak_mb / 1000:.1f} GB, {done.seconds:.0f} s" if done.status == 0 else done.in_words
     return Row(
         "limits", f"{what}, {iterations} iterations and scores", figure, done.status == 0 and done.peak_mb < limit_mb
@@ -66,10 +68,10 @@ def main(work: Path) -> list[Row]:
     source = work / "phantom"
     demand(run("phantom", source, "--frames", 48, "--width", 640, "--height", 512))
     long = long_sequence(source, work / "long", LONG_FRAMES)
-    what = f"{LONG_FRAMES:,} frames of 640x512"
+    what = f"{LONG_FRAMES:,} frames of 640x512, {CACHE_GB} GB a cache"
     rows = [_trained(what, LONG_ITERATIONS, long, work / "long_run", LONG_LIMIT_MB)]
     large = enlarged(source, work / "large", LARGE_FRAMES, 3840, 2160)
-    what = f"{LARGE_FRAMES} frames of 3840x2160"
+    what = f"{LARGE_FRAMES} frames of 3840x2160, {CACHE_GB} GB a cache"
     rows.append(_trained(what, LARGE_ITERATIONS, large, work / "large_run", LARGE_LIMIT_MB))
     done = run("train", large, work / "refused", *_few(1), limits={resource.RLIMIT_DATA: 1500 * 2**20})
     told = done.one_line and "GB" in done.err

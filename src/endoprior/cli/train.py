@@ -122,6 +122,7 @@ def train_and_evaluate(
         say(f"Stopped; the state is saved. Go on with the same command and --resume ({out}).")
         raise
     seconds = clock.perf_counter() - began
+    del sequence  # and with it the frames it keeps: scoring reads its own
     done = _logged_seconds(out / "log.jsonl")
     speed = {"train_seconds": seconds, "iterations_per_second": done}
     try:
