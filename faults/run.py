@@ -29,7 +29,10 @@ BEGIN, END = "<!-- figures: make test-faults -->", "<!-- end of figures -->"
 def properties(work: Path) -> list[Row]:
     """The property-based tests with random seeds and many examples, and those of divergence and hostile files."""
     files = sorted((ROOT / "tests").glob("test_properties_*.py"))
-    files += [ROOT / "tests" / f"test_{name}.py" for name in ("divergence", "hostile_state", "hostile_viewer")]
+    files += [
+        ROOT / "tests" / f"test_{name}.py"
+        for name in ("divergence", "hostile_state", "hostile_checkpoint", "hostile_viewer")
+    ]
     words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *map(str, files)]
     return [
         _subprocess_row("properties", "property-based tests, thorough, and hostile files", words, _last_pytest_line)

@@ -91,8 +91,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
         InputError: `path` is in use, or no folder can be made there.
         CannotWrite: the disk does not take what is written.
     """
-    if path.resolve() in (Path.cwd(), *Path.cwd().parents):
-        raise InputError(f"{path}: expected the name of a new folder; got one that is in use. Choose a name in it.")
+    refuse_current(path)
     refuse_occupied(path)
     temporary = path.absolute().with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -155,6 +154,12 @@ def _alive(process: int) -> bool:
     except OSError:  # somebody else's process
         return True
     return True
+
+
+def refuse_current(path: Path) -> None:
+    """Raise InputError if `path` is the current folder or one above: it cannot be replaced by another one."""
+    if path.resolve() in (Path.cwd(), *Path.cwd().parents):
+        raise InputError(f"{path}: expected the name of a new folder; got one that is in use. Choose a name in it.")
 
 
 def refuse_occupied(path: Path, otherwise: str = "", *, spare: str | None = None) -> None:

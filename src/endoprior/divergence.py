@@ -62,6 +62,8 @@ def count_unusable(gradient: Tensor) -> int:
 
 def count_unusable_rows(gradients: Tensor, marks: Tensor, mark: int) -> int:
     """The same over the rows (n, C) float32, contiguous, whose entry of `marks` (n,) uint8 has the bits of `mark`."""
+    if not compiled(gradients):  # other rows hold zeros
+        return count_unusable(gradients)
     return int(_count_rows(gradients.detach().numpy(), marks.numpy(), mark, LARGEST_GRADIENT))
 
 

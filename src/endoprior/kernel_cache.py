@@ -35,6 +35,8 @@ def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
     Args:
         say: told once if there is something to wait for.
     """
+    if cfg.render.backend == "cuda":  # which needs no kernels of ours
+        return
     key = _key(cfg)
     if key in _filled:
         return

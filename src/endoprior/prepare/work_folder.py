@@ -12,7 +12,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from ..atomic import CannotWrite, flush_folder, refuse_occupied, write_json, writing
+from ..atomic import CannotWrite, flush_folder, refuse_current, refuse_occupied, write_json, writing
 from ..checks import InputError
 
 PLAN = "plan.json"
@@ -32,8 +32,7 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
         InputError: `out` is in use, or another process is writing it, or no folder can be made there.
     """
     refuse_occupied(out)
-    if out.resolve() in (Path.cwd(), *Path.cwd().parents):
-        raise InputError(f"{out}: expected the name of a new folder; got one that is in use. Choose a name in it.")
+    refuse_current(out)
     folder = out.absolute().with_name(f".{out.name}.preparing")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

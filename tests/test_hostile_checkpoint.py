@@ -1,0 +1,99 @@
+"""Checkpoints from strangers: one line that names the file, and the trainer is left as it was."""
+
+import numpy as np
+import pytest
+import torch
+from state_files import StateFile
+
+from endoprior.checkpoint import check_state, checkpoint_schema, load_checkpoint
+from endoprior.checks import InputError
+from endoprior.data import load_sequence
+from endoprior.train import train
+from endoprior.trainer import Trainer
+
+
+@pytest.fixture(scope="module", params=["basis", "hexplane"])
+def run(request, tmp_path_factory):
+    """A short training: what made it, and its checkpoint taken apart."""
+    from conftest import write_tiny_sequence
+    from test_train import tiny_config
+
+    folder = tmp_path_factory.mktemp("checkpoint")
+    sequence = load_sequence(write_tiny_sequence(folder / "data"))
+    cfg = tiny_config(request.param, coarse=2, fine=3)
+    train(sequence, cfg, folder / "run")
+    file = folder / "run" / "checkpoint.safetensors"
+    return Trainer(sequence, cfg), file, StateFile.read(file)
+
+
+def resume(run) -> Trainer:
+    """A trainer that took over the checkpoint in the folder."""
+    trainer, file, _ = run
+    trainer.state = None
+    try:
+        load_checkpoint(trainer, file, trainer.sequence.fingerprint())
+    except InputError:
+        assert trainer.state is None
+        raise
+    return trainer
+
+
+def test_the_schema_is_what_a_checkpoint_holds(run):
+    trainer, file, stored = run
+    stored.write(file)
+    assert resume(run).finished
+    assert set(checkpoint_schema(trainer.cfg)) == set(stored.arrays)
+
+
+def test_each_array_of_a_checkpoint_is_checked(run):
+    _, file, stored = run
+    for name, values in stored.arrays.items():
+        wrong = "<i8" if values.dtype.kind == "f" else np.float32
+        for changed in (None, values.astype(wrong), values[..., None], np.concatenate([values, values])):
+            if changed is not None and changed.size == 0 == values.size and changed.dtype == values.dtype:
+                continue
+            arrays = {k: v for k, v in stored.arrays.items() if k != name} | (
+                {} if changed is None else {name: changed}
+            )
+            StateFile(stored.about, arrays).write(file)
+            with pytest.raises(InputError, match=r"checkpoint\.safetensors: expected"):
+                resume(run)
+        spoiled = {"f": np.nan, "i": -1, "u": 7}[values.dtype.kind]
+        if values.size:
+            arrays = stored.arrays | {name: values.copy()}
+            arrays[name].flat[-1] = spoiled
+            StateFile(stored.about, arrays).write(file)
+            with pytest.raises(InputError, match=r"checkpoint\.safetensors: expected"):
+                resume(run)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"iteration": -1}, {"iteration": 4}, {"iteration": "3"}, {"iteration": True}, {"iteration": [[]]},
+        {"stage": 2}, {"stage": None}, {"stage": {}}, {"config": None}, {"config": {}}, {"fingerprint": 3},
+    ],
+)  # fmt: skip
+def test_facts_of_a_checkpoint_that_cannot_be(run, change):
+    _, file, stored = run
+    StateFile(stored.about | change, stored.arrays).write(file)
+    with pytest.raises(InputError, match=r"checkpoint\.safetensors: "):
+        resume(run)
+    about = {name: value for name, value in stored.about.items() if name not in change}
+    StateFile(about, stored.arrays).write(file)
+    with pytest.raises(InputError, match=r"checkpoint\.safetensors: "):
+        resume(run)
+
+
+def test_moments_and_counts_that_cannot_be(run):
+    stored = run[2]
+    arrays = {name: torch.from_numpy(value.copy()) for name, value in stored.arrays.items()}
+    check_state(arrays, stored.about["iteration"])
+    changes = {"optimizer.means.second": -1e-9, "optimizer.means.steps": 4, "stats.num_valid": -1}
+    if "optimizer.plane_adam.marks" in arrays:
+        changes |= {"optimizer.plane_adam.marks": 2, "optimizer.plane_adam.exp_avg_sq": -1}
+    for name, value in changes.items():
+        spoiled = arrays[name].clone()
+        spoiled.view(-1)[0] = value
+        with pytest.raises(InputError, match=name):
+            check_state(arrays | {name: spoiled}, stored.about["iteration"])
