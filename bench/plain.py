@@ -206,7 +206,7 @@ class Adam:
         """Plain torch looks at no gradient before it applies it."""
         return {}
 
-    def step(self, iteration: int = 0) -> None:
+    def step(self, iteration: int = 0, frozen: Tensor | None = None) -> None:
         """Apply the gradients and clear them."""
         self.adam.step()
         self.adam.zero_grad()

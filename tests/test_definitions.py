@@ -51,7 +51,7 @@ def test_the_temporal_term_agrees(kind):
     generator = torch.Generator().manual_seed(1)
     before = torch.randn(200, 3, generator=generator) * 20
     now = (before + torch.randn(200, 3, generator=generator)).requires_grad_()
-    weights = np.random.default_rng(0).random(200).astype(np.float32)
+    weights = torch.from_numpy(np.random.default_rng(0).random(200).astype(np.float32))
     cfg = tiny_config(kind).temporal
     kernels = temporal.local_consistency(now, before, weights, cfg)
     (kernel_grad,) = torch.autograd.grad(sum(kernels), now)

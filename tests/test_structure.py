@@ -22,6 +22,7 @@ LAYERS = [
     {"adam"},
     {"optim", "training_frames", "truth_scores"},
     {"train_state", "evaluate", "show"},
+    {"inspector"},
     {"trainer", "training_memory", "export", "kernel_cache"},
     {"warm_up"},
     {"run_identity"},

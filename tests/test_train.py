@@ -199,7 +199,7 @@ def test_both_moments_at_once_have_the_gradients_of_one_after_the_other(tiny_seq
         field.grid.values.uniform_(0.2, 1.2, generator=torch.Generator().manual_seed(1))  # so that something moves
 
         # In place of a step, which would amplify noise.
-        def observe(iteration, trainer=trainer, field=field, seen=seen):
+        def observe(iteration, frozen, trainer=trainer, field=field, seen=seen):
             network = [value.grad.clone() for value in field.parameters_by_group()["network"] if value.grad is not None]
             means = trainer.state.gaussians["means"].grad.clone()
             seen.append([means, field.box.grad.clone(), field.grid.grads.clone(), *network])

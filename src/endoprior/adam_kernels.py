@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 from torch import Tensor
+from torch.optim.adam import adam
 
 from .simd import LANES, prefetch
 
@@ -28,15 +29,44 @@ def adam_definition(
     rate: float | Tensor,
     root_scale: float | Tensor,
     epsilon: float,
+    live: Tensor | None = None,
 ) -> None:
     """p -= rate * m / (sqrt(v) * root_scale + epsilon), after both moments took in the gradient; all in place.
 
     Args:
         param, grad, first, second: of one shape. rate, root_scale: corrected for young moments, broadcast.
+        live: () bool where `grad` is; where it is False nothing changes, whatever `grad` holds.
     """
-    first.mul_(BETA1).add_(grad, alpha=1 - BETA1)
-    second.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
+    blend1, blend2 = 1 - BETA1, 1 - BETA2
+    if live is not None:
+        grad, rate, blend1, blend2 = torch.where(live, grad, 0), rate * live, blend1 * live, blend2 * live
+    first.lerp_(grad, blend1)
+    second.lerp_(grad.square(), blend2)
     param.sub_(rate * first / (second.sqrt() * root_scale + epsilon))
+
+
+@torch.no_grad()
+def fused_step(
+    param: Tensor,
+    grad: Tensor,
+    first: Tensor,
+    second: Tensor,
+    steps: Tensor,
+    rate: float,
+    epsilon: float,
+    frozen: Tensor | None = None,
+) -> None:
+    """One step of Adam in place, in one pass over memory, by torch's own kernel.
+
+    Args:
+        param, grad, first, second: of one shape, contiguous. steps: () float32, counted up.
+        frozen: () float32 on the same device; where it is not 0, nothing changes.
+    """
+    adam(
+        [param], [grad], [first], [second], [], [steps],
+        fused=True, found_inf=frozen, amsgrad=False, beta1=BETA1, beta2=BETA2, lr=rate, weight_decay=0.0, eps=epsilon,
+        maximize=False,
+    )  # fmt: skip
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS)

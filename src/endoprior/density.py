@@ -55,33 +55,45 @@ class DensityStats:
         """(N,) running mean opacity; the `current` one where nothing was sampled."""
         return torch.where(self.num_valid > 0, self.opacity_sum / self.num_valid.clamp(min=1), current)
 
-    def add_gradient(self, out: RenderOutput, width: int, height: int) -> None:
-        """Add one rendering's screen-space gradient, after backward; Gaussians that were not drawn are left alone."""
+    def add_gradient(self, out: RenderOutput, width: int, height: int, frozen: Tensor | None = None) -> None:
+        """Add one rendering's screen-space gradient, after backward; Gaussians that were not drawn are left alone.
+
+        Args:
+            width, height: of the picture, px.
+            frozen: () on a device; where it is not 0, nothing is added.
+        """
         if not compiled(out.radii):
-            drawn = (out.radii > 0).float()
+            counted = _counted(out.radii > 0, frozen)
             x, y = out.means2d.grad.unbind(-1)
-            self.grad2d_ndc_sum += drawn * torch.hypot(x * (width / 2), y * (height / 2))
-            self.num_seen += drawn
+            self.grad2d_ndc_sum += torch.where(counted, torch.hypot(x * (width / 2), y * (height / 2)), 0)
+            self.num_seen += counted
             return
         gradient = out.means2d.grad.contiguous().numpy()
         half = np.float32(width / 2), np.float32(height / 2)
         kernels.add_gradient(out.radii.numpy(), gradient, *half, self.grad2d_ndc_sum.numpy(), self.num_seen.numpy())
 
     def add_score(
-        self, out: RenderOutput, prior: Tensor, tissue_mask: Tensor, opacities: Tensor, scale: float = 1.0
+        self,
+        out: RenderOutput,
+        prior: Tensor,
+        tissue_mask: Tensor,
+        opacities: Tensor,
+        scale: float = 1.0,
+        frozen: Tensor | None = None,
     ) -> None:
         """Sample rho where the drawn centers fall on tissue: s_it and m_it of Eq. (7).
 
         Args:
             prior: (H, W) rho in [0, 1]. tissue_mask: (H, W) bool, True on tissue. opacities: (N,) canonical.
             scale: pixels of `prior` per pixel of the rendering.
+            frozen: as in `add_gradient`.
         """
         if not compiled(out.radii):
             at = scale * out.means2d.detach()
-            counts = valid_projection(at, out.radii, tissue_mask).float()
-            self.score_sum += counts * torch.where(counts > 0, _sample(prior, at), 0)
-            self.opacity_sum += counts * opacities.detach()
-            self.num_valid += counts
+            counted = _counted(valid_projection(at, out.radii, tissue_mask), frozen)
+            self.score_sum += torch.where(counted, _sample(prior, at), 0)
+            self.opacity_sum += torch.where(counted, opacities.detach(), 0)
+            self.num_valid += counted
             return
         kernels.add_score(
             *_projections(out.means2d, out.radii), np.float32(scale), prior.numpy(), tissue_mask.numpy(),
@@ -108,6 +120,11 @@ def valid_projection(means2d: Tensor, radii: Tensor, tissue_mask: Tensor) -> Ten
     found = np.empty(len(radii), np.bool_)
     kernels.valid(*_projections(means2d, radii), tissue_mask.numpy(), found)
     return torch.from_numpy(found)
+
+
+def _counted(drawn: Tensor, frozen: Tensor | None) -> Tensor:
+    """(N,) bool `drawn`, or False everywhere when the run is frozen."""
+    return drawn if frozen is None else drawn & (frozen == 0)
 
 
 def _sample(image: Tensor, means2d: Tensor) -> Tensor:

@@ -35,7 +35,10 @@ ADVICE = "Lower the learning rates (--optim...), or look for wrong depth and pos
 
 
 class Diverged(InputError):
-    """Training cannot go on; the state before this iteration is untouched."""
+    """Training cannot go on; the state before the iteration it is about is untouched."""
+
+    ago: int = 0
+    """Iterations that were begun after that one: on a device the host looks only now and then."""
 
 
 def check_step(terms: Mapping[str, float], unusable: Mapping[str, int]) -> None:
@@ -47,8 +50,18 @@ def check_step(terms: Mapping[str, float], unusable: Mapping[str, int]) -> None:
     Raises:
         Diverged: a term is not finite, or a gradient has such an entry.
     """
-    found = [f"{name} {value}" for name, value in terms.items() if not math.isfinite(value)]
-    found += [f"{count:,} unusable entries in the gradient of {name}" for name, count in unusable.items() if count]
+    counted = [f"{count:,} unusable entries in the gradient of {name}" for name, count in unusable.items() if count]
+    _refuse(terms, counted)
+
+
+def check_largest(terms: Mapping[str, float], largest: Mapping[str, float]) -> None:
+    """`check_step`, where of each gradient the largest magnitude is known; NaN stands for any NaN."""
+    limit = float(LARGEST_GRADIENT)
+    _refuse(terms, [f"{value:.3g} in the gradient of {name}" for name, value in largest.items() if not value <= limit])
+
+
+def _refuse(terms: Mapping[str, float], unusable: list[str]) -> None:
+    found = [f"{name} {value}" for name, value in terms.items() if not math.isfinite(value)] + unusable
     if found:
         raise Diverged(f"expected a finite loss and gradient; got {', '.join(found)}. {ADVICE}")
 

@@ -42,42 +42,52 @@ class Optimizer:
             self.states |= {name: AdamState(value) for name, value in _field_parameters(field).items()}
             self.plane_adam = PlaneAdam(field.grid, epsilon=cfg.optim.epsilon)
 
-    def step(self, iteration: int) -> None:
+    def step(self, iteration: int, frozen: Tensor | None = None) -> None:
         """Apply the gradients and clear them. What got no gradient is left alone, momentum and all.
 
         Args:
             iteration: 1-based, within the stage.
+            frozen: () float32 on a device; where it is not 0 the gradients are only cleared.
         """
         optim = self.cfg.optim
         decay = {"iteration": iteration, "steps": optim.decay_iterations}
         for name, param in self.gaussians.tensors.items():
             if name == "motion":
                 gradients = self.gaussians.motion_gradients
-                self.states[name].update_bases(param, gradients, motion_rates(self.cfg, **decay), optim.epsilon)
+                self.states[name].update_bases(param, gradients, motion_rates(self.cfg, **decay), optim.epsilon, frozen)
             else:
-                self.states[name].update(param, self._rate(name, decay), optim.epsilon)
+                self.states[name].update(param, self._rate(name, decay), optim.epsilon, frozen)
         if self.field is not None:
             network = self.spatial_scale * log_linear(optim.network_lr, optim.network_lr_final, **decay)
             planes = self.spatial_scale * log_linear(optim.planes_lr, optim.planes_lr_final, **decay)
             parameters = _field_parameters(self.field)
             for name, param in parameters.items():
-                self.states[name].update(param, planes if name == "box" else network, optim.epsilon)
+                self.states[name].update(param, planes if name == "box" else network, optim.epsilon, frozen)
             if any(param.grad is not None for param in parameters.values()):
-                self.plane_adam.step(planes)
+                self.plane_adam.step(planes, frozen)
         self.clear_gradients()
 
-    def count_unusable(self) -> dict[str, int]:
-        """How many entries of each gradient `step` must not be given: not finite, or too large to be squared."""
+    def gradients(self) -> dict[str, Tensor]:
+        """The gradients that `step` will use, by name; those of the planes are `field.grid.grads`."""
         found = {name: value.grad for name, value in self.gaussians.tensors.items()}
         moments = self.gaussians.motion_gradients
         found |= {f"motion, moment {i}": moment.v_offsets for i, moment in enumerate(moments)}
         if self.field is not None:
             found |= {name: value.grad for name, value in _field_parameters(self.field).items()}
-        counts = {name: count_unusable(grad) for name, grad in found.items() if grad is not None}
+        return {name: grad for name, grad in found.items() if grad is not None}
+
+    def count_unusable(self) -> dict[str, int]:
+        """How many entries of each gradient `step` must not be given: not finite, or too large to be squared."""
+        counts = {name: count_unusable(grad) for name, grad in self.gradients().items()}
         if self.field is not None:
             grid = self.field.grid
             counts["planes"] = count_unusable_rows(grid.grads, grid.marks, FRESH)
         return counts
+
+    def largest_gradients(self) -> dict[str, Tensor]:
+        """Largest magnitude in each gradient, () where it lies, NaN if there is any: nobody waits for a device."""
+        found = self.gradients() | ({"planes": self.field.grid.grads} if self.field is not None else {})
+        return {name: torch.linalg.vector_norm(grad, torch.inf) for name, grad in found.items() if grad.numel()}
 
     def clear_gradients(self) -> None:
         """Drop every gradient but those of the planes, which their own step clears."""
@@ -139,7 +149,7 @@ class Optimizer:
         arrays = {}
         for name, state in self.states.items():
             arrays |= {f"{name}.first": state.first, f"{name}.second": state.second}
-            arrays[f"{name}.steps"] = torch.from_numpy(state.steps)
+            arrays[f"{name}.steps"] = state.steps.to(torch.int64)
         return arrays | (self.plane_adam.state_arrays() if self.plane_adam else {})
 
     def load_state_arrays(self, arrays: dict[str, Tensor]) -> None:
@@ -147,7 +157,7 @@ class Optimizer:
         for name, state in self.states.items():
             for moment in ("first", "second"):
                 getattr(state, moment).copy_(arrays[f"{name}.{moment}"])
-            state.steps = arrays[f"{name}.steps"].numpy().copy()
+            state.steps.copy_(arrays[f"{name}.steps"])
         if self.plane_adam:
             self.plane_adam.load_state_arrays(arrays)
 

@@ -151,6 +151,7 @@ def _advance(
                 on_step(report, trainer)
             if interrupted() or clock.monotonic() >= due_at:
                 began = clock.monotonic()
+                trainer.settle()
                 save_checkpoint(trainer, checkpoint, fingerprint)
                 taken = clock.monotonic() - began
                 due_at = clock.monotonic() + max(options.checkpoint_seconds, taken / CHECKPOINT_SHARE)

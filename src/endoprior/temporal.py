@@ -90,9 +90,64 @@ def choose(score: NDArray, eligible: NDArray, cfg: TemporalConfig) -> tuple[NDAr
     weights = np.where(eligible, weights, 0)
     count = cfg.max_points or len(weights)
     chosen = systematic_sample(weights, count)
-    if len(chosen) < max(cfg.min_points, cfg.num_neighbors + 1):
+    if len(chosen) < least_points(cfg):
         chosen = chosen[:0]
     return chosen, weights[chosen]
+
+
+def least_points(cfg: TemporalConfig) -> int:
+    """With fewer Gaussians a step goes without the term."""
+    return max(cfg.min_points, cfg.num_neighbors + 1)
+
+
+def choose_on(score: Tensor, eligible: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
+    """`choose`, of tensors and where they lie.
+
+    On a device the result has the length min(max_points, N) whatever was found, so that the host need not know it; who
+    takes no part has weight 0.
+
+    Args:
+        score: (N,) in [0, 1]. eligible: (N,) bool.
+    Returns:
+        (P,) int64 indices and (P,) float32 weights; P may be too small for the term.
+    """
+    if compiled(score):
+        chosen, weights = choose(score.numpy(), eligible.numpy(), cfg)
+        return torch.from_numpy(chosen), torch.from_numpy(weights)
+    weights = relaxed_definition(score, cfg) if cfg.pair_weights else torch.ones_like(score)
+    weights = torch.where(eligible, weights, 0)
+    count = cfg.max_points
+    if not 0 < count < len(weights):
+        return torch.arange(len(weights), device=score.device), weights
+    index, taken = systematic_definition(weights, count)
+    return index, torch.where(taken, weights[index], 0)
+
+
+def relaxed_definition(score: Tensor, cfg: TemporalConfig) -> Tensor:
+    """`relaxed_motion_weight` in plain torch, on any device: all tries are made, and the first that does is kept."""
+    threshold, temperature = cfg.motion_threshold, cfg.motion_temperature
+    weights = ((score - threshold) / temperature).sigmoid()
+    for _ in range(RELAX_TRIES if cfg.adaptive_motion_weight else 0):
+        square = weights.square().sum()
+        size = torch.where(square > 0, weights.sum().square() / square, 0)
+        threshold = max(threshold - RELAX_THRESHOLD_STEP, RELAX_THRESHOLD_FLOOR)
+        temperature = min(temperature * RELAX_TEMPERATURE_FACTOR, RELAX_TEMPERATURE_CAP)
+        weights = torch.where(size >= cfg.min_effective, weights, ((score - threshold) / temperature).sigmoid())
+    return torch.where(weights > MIN_WEIGHT, weights, 0)
+
+
+def systematic_definition(weights: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """`systematic_sample` in plain torch, on any device: always `count` < N indices, and which of them are taken."""
+    positive = weights > 0
+    cumulative = weights.double().cumsum(0)
+    marks = (torch.arange(count, device=weights.device) + 0.5) / count * cumulative[-1]
+    index = torch.searchsorted(cumulative, marks).clamp(max=len(weights) - 1)
+    first = torch.ones_like(index[:1], dtype=torch.bool)
+    several = torch.cat([first, index[1:] != index[:-1]]) & positive[index]
+    few = (~positive).to(torch.uint8).argsort(stable=True)[:count]  # the positive ones first
+    all_fit = positive.sum() <= count
+    index = torch.where(all_fit, few, index)
+    return index, torch.where(all_fit, positive[few], several)
 
 
 def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
@@ -113,25 +168,33 @@ def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
     return nearest(np.ascontiguousarray(points), k)
 
 
-def neighbors_definition(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """`neighbors` in plain torch, on any device: all distances, some points at a time. Ties may fall otherwise."""
+def neighbors_definition(points: Tensor, k: int, taking_part: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """`neighbors` in plain torch, on any device: all distances, some points at a time. Ties may fall otherwise.
+
+    Args:
+        taking_part: (P,) bool; the others are nobody's neighbors, unless fewer than k + 1 take part: then infinitely
+            far ones.
+    """
     found = []
     for start in range(0, len(points), NEIGHBOR_CHUNK):
         distances = torch.cdist(
             points[start : start + NEIGHBOR_CHUNK], points, compute_mode="donot_use_mm_for_euclid_dist"
         )
-        own = torch.arange(len(distances), device=points.device)
-        distances[own, own + start] = torch.inf
+        distances.diagonal(start).fill_(torch.inf)
+        if taking_part is not None:
+            distances.masked_fill_(~taking_part, torch.inf)
         found.append(distances.topk(k, largest=False))
     return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
 
 
 def affinity_definition(distances: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
-    """`affinity` in plain torch, on any device; (P, K) pair weights."""
+    """`affinity` in plain torch, on any device; (P, K) pair weights. Who has no weight is in no pair."""
+    pairs = (weights[:, None] > 0) & (weights[indices] > 0) & distances.isfinite()
+    distances = torch.where(pairs, distances, torch.nan)
     # The median of an even number of distances lies between the middle two, as NumPy has it.
-    sigma = distances.flatten().quantile(0.5).clamp(min=1e-8)
-    pairs = (-(distances**2) / (2 * sigma**2)).exp() * weights[:, None] * weights[indices]
-    return pairs.clamp(min=SUM_EPS)
+    sigma = distances.flatten().nanquantile(0.5).clamp(min=1e-8)
+    weighed = (-(distances**2) / (2 * sigma**2)).exp() * weights[:, None] * weights[indices]
+    return torch.where(pairs, weighed.clamp(min=SUM_EPS), 0)
 
 
 def affinity(distances: NDArray, indices: NDArray, weights: NDArray) -> NDArray:
@@ -180,21 +243,24 @@ def local_motion_loss(
     return local_motion(now, before, indices, pair_weights, cfg.huber_delta, factor)
 
 
-def local_consistency(now: Tensor, before: Tensor, weights: NDArray, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
+def local_consistency(now: Tensor, before: Tensor, weights: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
     """L_local, Eq. (11), of chosen Gaussians: neighbors found and weighed at t - dt, then compared; on any device.
 
     Args:
         now, before: (P, 3) deformed centers, mm; `before` detached trains one end only.
-        weights: (P,) motion weights from `choose`.
+        weights: (P,) motion weights from `choose_on`; on a device, 0 for who takes no part, and both terms are 0 unless
+            enough do. On the CPU there are enough, all of positive weight.
     Returns:
         Displacement and distance term, as `local_motion_loss`.
     """
     if compiled(now):
         indices, distances = neighbors(before.detach().numpy(), cfg.num_neighbors)
-        return local_motion_loss(now, before, indices, affinity(distances, indices, weights), cfg)
-    index, apart = neighbors_definition(before.detach(), cfg.num_neighbors)
-    counted = torch.from_numpy(weights).to(now.device, now.dtype)
-    return local_motion_definition(now, before, index, affinity_definition(apart, index, counted), cfg)
+        return local_motion_loss(now, before, indices, affinity(distances, indices, weights.numpy()), cfg)
+    taking_part = weights > 0
+    enough = taking_part.sum() >= least_points(cfg)
+    index, apart = neighbors_definition(before.detach(), cfg.num_neighbors, taking_part)
+    terms = local_motion_definition(now, before, index, affinity_definition(apart, index, weights), cfg)
+    return enough * terms[0], enough * terms[1]
 
 
 def local_motion_definition(

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
+
+import torch
+from torch import Tensor
 
 from .density import DensityStats
 from .model.deformation import HexPlaneField
@@ -31,13 +36,33 @@ class TrainState:
     stats: DensityStats
 
 
+class Losses:
+    """Weighted terms of Eq. (12) that took part in one iteration; asking for `numbers` waits for a device."""
+
+    def __init__(self, terms: Mapping[str, Tensor]) -> None:
+        """Args: terms: () each, by name, on one device."""
+        self.names = tuple(terms)
+        self.values = torch.stack([value.detach() for value in terms.values()])
+        """(len(names),)."""
+
+    @cached_property
+    def numbers(self) -> dict[str, float]:
+        """The terms by name."""
+        return dict(zip(self.names, self.values.tolist(), strict=True))
+
+
 @dataclass(frozen=True)
 class StepReport:
     """What one iteration did."""
 
     stage: Stage
     iteration: int
-    terms: dict[str, float]
-    """Weighted terms of Eq. (12) that took part."""
+    losses: Losses
     num_gaussians: int
     seconds: float
+    """That it took; on a device a mean over some before it."""
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """Weighted terms of Eq. (12) that took part."""
+        return self.losses.numbers

@@ -14,11 +14,13 @@ from torch import Tensor
 
 from . import density, render, temporal
 from .checks import InputError
+from .compiled import compiled
 from .config import Config
 from .data import Sequence
 from .density import DensityStats
-from .divergence import ADVICE, Diverged, Watch, check_step
+from .divergence import ADVICE, Diverged
 from .geometry import project
+from .inspector import Inspector
 from .loss_kernels import supervised_losses
 from .model.basis import motion_layout
 from .model.deformation import HexPlaneField, Offsets
@@ -28,7 +30,7 @@ from .model.scene import Scene, check_cameras, offsets_at
 from .model.tracks import initial_motion
 from .morton import morton_order
 from .optim import Optimizer
-from .train_state import Stage, StepReport, TrainState
+from .train_state import Losses, Stage, StepReport, TrainState
 from .training_frames import TrainingFrame, TrainingFrames
 from .types import RenderOutput
 
@@ -52,7 +54,7 @@ class Trainer:
             raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
         self.spatial_scale = spatial_scale(self.camera_centers, cfg)
         self.state: TrainState | None = None
-        self._watch = Watch()
+        self._inspector = Inspector(self.device, waits=compiled(self.background))
 
     @property
     def camera_centers(self) -> Tensor:
@@ -94,9 +96,11 @@ class Trainer:
     def step(self) -> StepReport:
         """One iteration: draw, compare, differentiate, grow or prune, update.
 
+        On a device it only queues the work: the host waits where it must, every 20 iterations or so.
+
         Raises:
             Diverged: the loss or a gradient is not finite, the pictures show nothing, or no Gaussian is left. Nothing
-                infinite has reached the state.
+                infinite has reached the state, and `state.iteration` is the last one that counts.
         """
         began = clock.perf_counter()
         state = self.state
@@ -126,22 +130,35 @@ class Trainer:
         if before_frame is not None:
             terms |= self._temporal_terms(splats.means, means_before, out, frame, before_frame)
         sum(terms.values()).backward()
-        told = {name: float(value.detach()) for name, value in terms.items()}
+        losses, ending = Losses(terms), iteration == self.stage_length(state.stage)
+        crowd_changes = density.due(iteration, fine and ending, cfg.density)
         try:
-            check_step(told, state.optimizer.count_unusable())
-            self._watch.see(told["color"], frame.brightness)
-        except Diverged:
+            self._inspector.see(losses, state.optimizer, frame.brightness, look=ending or crowd_changes)
+        except Diverged as error:
             state.optimizer.drop_gradients()
+            state.iteration -= error.ago
             raise
 
         with torch.no_grad():
             self._observe(out, position, frame, iteration)
-            state.optimizer.step(iteration)
-            last = fine and iteration == self.stage_length(Stage.FINE)
-            if density.due(iteration, last, cfg.density):
+            state.optimizer.step(iteration, self._inspector.frozen)
+            if crowd_changes:
                 self._control_density(rng)
         state.iteration = iteration
-        return StepReport(state.stage, iteration, told, len(state.gaussians), clock.perf_counter() - began)
+        seconds = self._inspector.seconds(began)
+        return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds)
+
+    def settle(self) -> None:
+        """Wait for a device and judge what it did, so that the state is known to be good; on the CPU it always is.
+
+        Raises:
+            Diverged: as `step`.
+        """
+        try:
+            self._inspector.look()
+        except Diverged as error:
+            self.state.iteration -= error.ago + 1
+            raise
 
     def _sh_degree(self, iteration: int) -> int:
         """Degree in use: +1 per `sh_every` iterations of each stage, never falling back (method of 3DGS)."""
@@ -176,16 +193,18 @@ class Trainer:
             drawn = density.valid_projection(out.means2d, out.radii, frame.tissue_mask)
         eligible = drawn & (stats.num_valid >= cfg.min_valid)
         score = stats.score(self.cfg.density.unobserved_score)
-        chosen, weights = temporal.choose(score.cpu().numpy(), eligible.cpu().numpy(), cfg)
-        if len(chosen) == 0:
+        index, weights = temporal.choose_on(score, eligible, cfg)
+        if len(index) < temporal.least_points(cfg):
             return {}
-        index = torch.from_numpy(chosen).to(self.device)
         before = self._means_before(before_frame.time, index) if means_before is None else means_before[index]
         if cfg.valid_at_both:
             kept = on_tissue(before.detach(), before_frame)
-            index, weights, before = index[kept], weights[kept.cpu().numpy()], before[kept]
-            if len(index) < max(cfg.min_points, cfg.num_neighbors + 1):
-                return {}
+            if not compiled(weights):
+                weights = torch.where(kept, weights, 0)
+            else:
+                index, weights, before = index[kept], weights[kept], before[kept]
+                if len(index) < temporal.least_points(cfg):
+                    return {}
         displacement, distance = temporal.local_consistency(means[index], before, weights, cfg)
         return {
             "displacement": cfg.weight * cfg.displacement_weight * displacement,
@@ -207,11 +226,12 @@ class Trainer:
         """Feed the running statistics: the gradient always, the prior's score when the config says so."""
         cfg, state = self.cfg.density, self.state
         camera = frame.camera
-        state.stats.add_gradient(out, camera.width, camera.height)
+        frozen = self._inspector.frozen
+        state.stats.add_gradient(out, camera.width, camera.height, frozen)
         if cfg.score_mode == "every" or density.due(iteration, False, cfg):
             prior, tissue_mask = self.frames.prior(position)
             scale = prior.shape[1] / camera.width
-            state.stats.add_score(out, prior, tissue_mask, state.gaussians.opacities, scale)
+            state.stats.add_score(out, prior, tissue_mask, state.gaussians.opacities, scale, frozen)
 
     def _control_density(self, rng: np.random.Generator) -> None:
         state, cfg = self.state, self.cfg.density
@@ -249,9 +269,15 @@ def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: Config) -> di
 
 def on_tissue(points: Tensor, frame: TrainingFrame) -> Tensor:
     """(P,) bool: whether world points (P, 3) mm project in front of the camera, into the image, onto tissue."""
-    pixels, z = project(points.cpu().numpy(), frame.camera)
+    if not compiled(points):
+        camera = frame.camera
+        view = torch.from_numpy(camera.world_to_camera.astype(np.float32)).to(points.device, non_blocking=True)
+        x, y, z = (points @ view[:3, :3].T + view[:3, 3]).unbind(-1)
+        means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
+        return density.valid_projection(means2d, (z > 0).int(), frame.tissue_mask)
+    pixels, z = project(points.numpy(), frame.camera)
     means2d, in_front = torch.from_numpy(pixels.astype(np.float32)), torch.from_numpy(z > 0).int()
-    return density.valid_projection(means2d.to(points.device), in_front.to(points.device), frame.tissue_mask)
+    return density.valid_projection(means2d, in_front, frame.tissue_mask)
 
 
 def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:

@@ -12,18 +12,18 @@ from __future__ import annotations
 
 import math
 from copy import copy
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
-from torch.nn.functional import grid_sample, linear
+from torch.nn.functional import linear
 
 from ..checks import check_shape
 from ..compiled import compiled
 from ..config import HexPlaneConfig
 from . import hexplane_kernels as kernels
+from .hexplane_definition import Layout, features, layout_of
 from .hexplane_lookup import Linear, Sample
 
 PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
@@ -115,7 +115,13 @@ class PlaneGrid:
         moved = copy(self)
         moved.values, moved.marks = self.values.detach().to(device), self.marks.to(device)
         moved.grads = moved.zeros()
+        moved.__dict__.pop("layout", None)
         return moved
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Where the planes lie, for look-ups off the CPU."""
+        return layout_of(self)
 
     def zeros(self) -> Tensor:
         """Zeros like `values`, where they are; on the CPU they take memory only once written."""
@@ -154,23 +160,7 @@ class PlaneGrid:
         self._check(unit, (time,))
         if torch.is_grad_enabled() and not unit.requires_grad:
             unit = unit.detach().requires_grad_(True)
-        return Sample.apply(unit, time, self)
-
-    def sample_definition(self, unit: Tensor, time: float) -> Tensor:
-        """`sample` in plain torch, on any device; backward adds to `grads` and marks every cell."""
-        values = _Planes.apply(self.values, unit.new_zeros((), requires_grad=True), self)
-        moment = 2 * time - 1 if self.time_map == "full" else time
-        where = torch.cat([unit * 2 - 1, torch.full_like(unit[:, :1], moment)], -1)
-        features = []
-        for scale in range(self.num_scales):
-            product: Tensor | float = 1.0
-            for name in PLANE_NAMES:
-                plane = self.plane(scale, name, values).permute(2, 0, 1)[None]
-                axes = where[:, ["xyzt".index(axis) for axis in name]][None, None]
-                found = grid_sample(plane, axes, mode="bilinear", padding_mode="border", align_corners=True)
-                product = product * found[0, :, 0]
-            features.append(product.T)
-        return torch.cat(features, -1)
+        return Sample.apply(unit, time, self) if compiled(unit) else features(self, unit, (time,))[0]
 
     def linear(self, unit: Tensor, times: tuple[float, ...], weight: Tensor, bias: Tensor) -> tuple[Tensor, ...]:
         """A linear layer on the features of one or more moments.
@@ -190,27 +180,10 @@ class PlaneGrid:
         self._check(unit, times)
         check_shape(f"weight:W,{self.num_features} bias:W", weight=weight, bias=bias)
         if not compiled(unit):
-            return tuple(linear(self.sample_definition(unit, time), weight, bias) for time in times)
+            return tuple(linear(found, weight, bias) for found in features(self, unit, times))
         return Linear.apply(unit, weight, bias, times, self)
 
     def _check(self, unit: Tensor, times: tuple[float, ...]) -> None:
         check_shape("unit:N,3", unit=unit)
         if not np.isfinite(times).all():
             raise ValueError(f"time must be finite; got {times!r}")
-
-
-class _Planes(torch.autograd.Function):
-    """The planes as autograd sees them: their gradient goes to `grads`, as that of the kernels does."""
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, wanted: Tensor, grid: PlaneGrid) -> Tensor:
-        """`wanted` needs a gradient, so that this is differentiated although `values` does not."""
-        ctx.grid = grid
-        return values.view_as(values)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, v_values: Tensor) -> tuple[None, None, None]:
-        ctx.grid.grads += v_values
-        ctx.grid.marks.fill_(kernels.TOUCHED | kernels.FRESH)
-        return None, None, None

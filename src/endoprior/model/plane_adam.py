@@ -12,10 +12,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
 from numba import njit, prange
-from torch import Tensor, from_numpy
+from torch import Tensor
 
-from ..adam_kernels import adam_definition
+from ..adam_kernels import BETA1, BETA2, fused_step
 from ..compiled import compiled
 from .hexplane import PlaneGrid
 from .hexplane_kernels import FRESH, TOUCHED
@@ -29,26 +30,24 @@ _TINY = np.float32(np.finfo(np.float32).tiny)
 class PlaneAdam:
     """Moments of the planes and the step that uses them."""
 
-    def __init__(self, grid: PlaneGrid, *, epsilon: float = 1e-15, betas: tuple[float, float] = (0.9, 0.999)) -> None:
+    def __init__(self, grid: PlaneGrid, *, epsilon: float = 1e-15) -> None:
         """Start with zero moments at step 0. Moments take memory only where cells are touched."""
-        self.grid, self.epsilon, self.betas, self.steps = grid, epsilon, betas, 0
+        self.grid, self.epsilon = grid, epsilon
+        self.steps = torch.zeros((), device=grid.values.device)
+        """() a whole number."""
         self.exp_avg, self.exp_avg_sq = grid.zeros(), grid.zeros()
 
-    def step(self, lr: float) -> None:
-        """Apply one step with learning rate `lr`, then clear the gradients."""
-        self.steps += 1
+    def step(self, lr: float, frozen: Tensor | None = None) -> None:
+        """Apply one step with learning rate `lr`, then clear the gradients; `frozen` is that of `AdamState`."""
         grid = self.grid
+        buffers = (grid.values, grid.grads, self.exp_avg, self.exp_avg_sq)
         if not compiled(grid.values):
-            beta1, beta2 = self.betas
-            rate, root_scale = lr / (1 - beta1**self.steps), 1 / math.sqrt(1 - beta2**self.steps)
-            moments = self.exp_avg, self.exp_avg_sq
-            adam_definition(grid.values, grid.grads, *moments, rate, root_scale, self.epsilon)
+            fused_step(*buffers, self.steps, lr, self.epsilon, frozen)
             grid.grads.zero_()
             grid.marks.fill_(TOUCHED)
             return
-        plane_adam_step(
-            grid.values, grid.grads, self.exp_avg, self.exp_avg_sq, grid.marks, self.steps, lr, self.betas, self.epsilon
-        )
+        self.steps += 1
+        plane_adam_step(*buffers, grid.marks, int(self.steps), lr, epsilon=self.epsilon)
 
     def state_arrays(self) -> dict[str, Tensor]:
         """What a resumed run needs: marks of all cells, moments of the touched ones (in order of cells), step count."""
@@ -57,7 +56,7 @@ class PlaneAdam:
             "plane_adam.marks": self.grid.marks & TOUCHED,
             "plane_adam.exp_avg": self.exp_avg[touched],
             "plane_adam.exp_avg_sq": self.exp_avg_sq[touched],
-            "plane_adam.steps": from_numpy(np.array([self.steps], dtype=np.int64)),
+            "plane_adam.steps": self.steps.to(torch.int64).reshape(1),
         }
 
     def load_state_arrays(self, arrays: dict[str, Tensor]) -> None:
@@ -69,7 +68,7 @@ class PlaneAdam:
         self.exp_avg_sq.zero_()
         self.exp_avg[touched] = arrays["plane_adam.exp_avg"].to(touched.device)
         self.exp_avg_sq[touched] = arrays["plane_adam.exp_avg_sq"].to(touched.device)
-        self.steps = int(arrays["plane_adam.steps"][0])
+        self.steps.copy_(arrays["plane_adam.steps"][0])
 
 
 def plane_adam_step(
@@ -80,7 +79,7 @@ def plane_adam_step(
     marks: Tensor,
     step: int,
     lr: float,
-    betas: tuple[float, float] = (0.9, 0.999),
+    betas: tuple[float, float] = (BETA1, BETA2),
     epsilon: float = 1e-15,
 ) -> None:
     """Update, in place, the rows of `values` that `marks` calls touched, and clear their gradients.
