@@ -14,7 +14,7 @@ import torch
 from test_divergence import poison, state_of
 from test_train import tiny_config
 
-from endoprior import adam_kernels, inspector, temporal
+from endoprior import adam_kernels, inspector, metrics, temporal
 from endoprior.adam import AdamState
 from endoprior.compiled import definitions_only
 from endoprior.data import load_sequence
@@ -209,3 +209,21 @@ def test_points_are_on_tissue_by_the_definition_too(tiny_sequence):
     with definitions_only():
         assert torch.equal(on_tissue(points, frame), want)
     assert want.any() and not want.all()
+
+
+def test_planes_of_half_precision_change_no_picture(tiny_sequence, tmp_path):
+    """Within 0.02 dB of what full precision scores, as the tissue is drawn after training; and they are not saved."""
+    sequence = load_sequence(tiny_sequence)
+    cfg = quiet(tiny_config("hexplane", coarse=20, fine=80))
+    scene = train(sequence, cfg)
+    with definitions_only():
+        halved = scene.to("cpu", half_planes=True)
+        scores = []
+        for each in (scene, halved):
+            pictures = [(each.render(f.time, f.camera).color.numpy(), f.rgb) for f in sequence.frames("video")]
+            scores.append([metrics.psnr_tissue(image, target, target[..., 0] >= 0) for image, target in pictures])
+    assert not np.array_equal(*scores)
+    np.testing.assert_allclose(*scores, rtol=0, atol=0.02)
+    assert halved.field.grid.values.dtype == torch.float16 and not halved.field.grid.grads.numel()
+    with pytest.raises(ValueError, match="half precision"):
+        halved.save(tmp_path / "scene.safetensors")

@@ -1,12 +1,15 @@
-"""Which device to compute on, decided once, from facts, and said in one line."""
+"""Which device to compute on, decided once, from facts, and said in one line; its name, and waiting for it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from .checks import InputError
 from .doctor import Facts, Line, examine, glance, look
+
+if TYPE_CHECKING:
+    import torch
 
 Wanted = Literal["auto", "cpu", "cuda"]
 
@@ -70,3 +73,22 @@ def choose_here(wanted: Wanted) -> Choice:
         if blocking is not None and blocking.name in ("system", "GPU", "driver", "torch"):
             return choose(wanted, facts)
     return choose(wanted, look())  # who asks for CUDA is told what mends it, which takes all facts
+
+
+def name_of(device: torch.device) -> str:
+    """What computes there, in words: the GPU's name, or how many threads of the CPU."""
+    if device.type == "cuda":
+        import torch
+
+        return torch.cuda.get_device_name(device)
+    import numba
+
+    return f"CPU, {numba.get_num_threads()} threads"
+
+
+def wait_for(device: torch.device) -> None:
+    """Return when all that was queued there is done; on the CPU it is."""
+    if device.type == "cuda":
+        import torch
+
+        torch.cuda.synchronize(device)

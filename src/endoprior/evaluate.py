@@ -22,6 +22,7 @@ from .atomic import write_json
 from .checks import InputError
 from .config import DataConfig
 from .data import Sequence
+from .device import name_of, wait_for
 from .memory import BoundedCache, cache_bytes
 from .metrics import ScoreUnavailable
 from .model.playback import Playback
@@ -121,7 +122,7 @@ def evaluate(
             f"{sequence.path}: expected the {len(scene.cameras)} frames the scene was trained on; got {len(sequence)}. "
             "Pass the same sequence."
         )
-    result = Evaluation(_protocol(sequence, split, scene.config.data))
+    result = Evaluation(_protocol(sequence, split, scene))
     progress("drawing")
     drawn, frames = Drawn(scene, sequence, split), sequence.frames(split)
     progress("images and depth")
@@ -151,7 +152,8 @@ def scored_data(trained: DataConfig) -> DataConfig:
     )
 
 
-def _protocol(sequence: Sequence, split: Split, data: DataConfig) -> dict[str, Any]:
+def _protocol(sequence: Sequence, split: Split, scene: Scene) -> dict[str, Any]:
+    data = scene.config.data
     relative = "; relative: the depth's scale is assumed, its mm are not mm" if sequence.depth_is_relative else ""
     return {
         "split": split,
@@ -166,6 +168,8 @@ def _protocol(sequence: Sequence, split: Split, data: DataConfig) -> dict[str, A
         "flow_error": "consecutive frames of the split; *_adjacent: all adjacent frames of the video",
         "depth_instability_mm": "all adjacent frames of the video",
         "data_fingerprint": sequence.fingerprint(),
+        "drawn_by": scene.backend,
+        "fps": f"{FPS_RENDERS} pictures of the sequence's frames, one after the other; {name_of(scene.device)}",
     }
 
 
@@ -307,9 +311,11 @@ def frames_per_second(scene: Scene, *, cached: bool = False) -> float:
 
     for i in range(shown if cached else FPS_WARM_UP):
         draw(i)
+    wait_for(scene.device)
     began = clock.perf_counter()
     for i in range(FPS_RENDERS):
         draw(i)
+    wait_for(scene.device)
     return FPS_RENDERS / (clock.perf_counter() - began)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,6 +14,9 @@ from .memory import BoundedCache, cache_bytes
 from .model.initialize import has_surface
 from .priors import joint_texture_prior
 from .types import Camera, Frame
+
+TENSORS = ("rgb_u8", "tissue_mask", "inverse_depth", "measured")
+"""What of a training frame lies on a device."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +45,12 @@ class TrainingFrame:
         return self.rgb_u8.float() / 255
 
 
+SHARE_OF_DEVICE = 0.25
+"""Of a device's free memory, that frames may take when training begins; those beyond are copied at each use."""
+
+
 class TrainingFrames:
-    """Training frames of a sequence by position; built when first used, kept as memory allows."""
+    """Training frames of a sequence by position; built when first used, kept as memory allows, here and on a device."""
 
     def __init__(self, sequence: Sequence, prior_cfg: PriorConfig, device: torch.device | str = "cpu") -> None:
         """Args: sequence: where frames come from. prior_cfg: of the prior. device: where the tensors are wanted."""
@@ -52,6 +59,9 @@ class TrainingFrames:
         self._prior_cfg = prior_cfg
         self._frames: BoundedCache[TrainingFrame] = BoundedCache(cache_bytes(), _frame_bytes)
         self._priors: BoundedCache[Tensor] = BoundedCache(cache_bytes() // 4, lambda prior: prior.nbytes)
+        room = device_bytes(self.device)
+        self._frames_there: BoundedCache[TrainingFrame] = BoundedCache(room, _frame_bytes)
+        self._priors_there: BoundedCache[Tensor] = BoundedCache(room // 4, lambda prior: prior.nbytes)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -60,10 +70,12 @@ class TrainingFrames:
         """Training frame number `position`, at full or at half width and height."""
 
         def build() -> TrainingFrame:
-            frame = shrunk(self.sequence.frame(self.indices[position]), 2 if half else 1)
-            return _training_frame(frame, self.device)
+            return _training_frame(shrunk(self.sequence.frame(self.indices[position]), 2 if half else 1))
 
-        return self._frames.get((position, half), build)
+        key = (position, half)
+        if self.device.type == "cpu":
+            return self._frames.get(key, build)
+        return self._frames_there.get(key, lambda: _moved(self._frames.get(key, build), self.device))
 
     def before(self, position: int) -> TrainingFrame | None:
         """The frame just before in the sequence if it is itself a training frame (released code), else None."""
@@ -76,27 +88,44 @@ class TrainingFrames:
 
         def build() -> Tensor:
             frame = self.sequence.frame(self.indices[position])
-            prior = joint_texture_prior(frame.rgb, frame.tissue_mask, self._prior_cfg)
-            return torch.from_numpy(prior).to(self.device)
+            return torch.from_numpy(joint_texture_prior(frame.rgb, frame.tissue_mask, self._prior_cfg))
 
-        return self._priors.get(position, build), self.frame(position).tissue_mask
+        if self.device.type == "cpu":
+            prior = self._priors.get(position, build)
+        else:
+            prior = self._priors_there.get(position, lambda: _queued(self._priors.get(position, build), self.device))
+        return prior, self.frame(position).tissue_mask
 
 
-def _training_frame(frame: Frame, device: torch.device) -> TrainingFrame:
+def device_bytes(device: torch.device) -> int:
+    """Memory of a device that frames may take."""
+    return int(SHARE_OF_DEVICE * torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else cache_bytes()
+
+
+def _moved(frame: TrainingFrame, device: torch.device) -> TrainingFrame:
+    return replace(frame, **{name: _queued(getattr(frame, name), device) for name in TENSORS})
+
+
+def _queued(tensor: Tensor, device: torch.device) -> Tensor:
+    """A copy on a device that nobody waits for: from memory that stays in place while it is read."""
+    return (tensor.pin_memory() if device.type == "cuda" else tensor).to(device, non_blocking=True)
+
+
+def _training_frame(frame: Frame) -> TrainingFrame:
     depth, usable = frame.depth, has_surface(frame)
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=usable)
     return TrainingFrame(
         index=frame.index,
         time=frame.time,
         camera=frame.camera,
-        rgb_u8=torch.from_numpy(frame.rgb_u8).to(device),
-        tissue_mask=torch.from_numpy(frame.tissue_mask).to(device),
-        inverse_depth=torch.from_numpy(inverse).to(device),
-        measured=torch.from_numpy(frame.tissue_mask & usable).to(device),
+        rgb_u8=torch.from_numpy(frame.rgb_u8),
+        tissue_mask=torch.from_numpy(frame.tissue_mask),
+        inverse_depth=torch.from_numpy(inverse),
+        measured=torch.from_numpy(frame.tissue_mask & usable),
         num_measured=int(np.count_nonzero(frame.tissue_mask & usable)),
         brightness=float(frame.rgb_u8[frame.tissue_mask].mean()) / 255 if frame.tissue_mask.any() else 0.0,
     )
 
 
 def _frame_bytes(frame: TrainingFrame) -> int:
-    return sum(t.nbytes for t in (frame.rgb_u8, frame.tissue_mask, frame.inverse_depth, frame.measured))
+    return sum(getattr(frame, name).nbytes for name in TENSORS)

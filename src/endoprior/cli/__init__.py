@@ -77,7 +77,13 @@ def main(argv: list[str] | None = None) -> int:
 
 def unforeseen(error: Exception) -> str | None:
     """The line for what no command could foresee, memory and files of the system; None for a failure of ours."""
-    text = " ".join(str(error).split())[-160:]
+    whole = " ".join(str(error).split())
+    if type(error).__name__ == "OutOfMemoryError":  # torch's, of a GPU: its words begin with the numbers
+        return (
+            f"expected enough memory of the GPU; got {whole[:160]!r}. Ask for less, such as smaller frames or "
+            "--init-budget, or add --device cpu; the last checkpoint of a run is whole, go on with --resume."
+        )
+    text = whole[-160:]
     if isinstance(error, MemoryError) or any(words in text for words in NO_MEMORY):
         return (
             f"expected enough memory; got {text or 'none'}. Free some, or ask for less, such as smaller frames; the "

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ..checks import InputError
+from ..device import Wanted
+from .devices import on_device
 from .parsing import parse
 from .progress import say
 
@@ -32,6 +34,8 @@ class Eval:
     """Also score with RAFT and LPIPS where their weights can be had."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
+    device: Wanted = "auto"
+    """Where to draw; auto takes CUDA only where all of it works (`endoprior doctor`)."""
 
 
 def run(argv: list[str]) -> None:
@@ -47,6 +51,7 @@ def run(argv: list[str]) -> None:
         "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
     )
     data = args.data or sequence_of_run(args.run)
+    scene = on_device(scene, args.device)
     evaluate_run(scene, data, args.out or args.run, args.split, args.networks, args.weights_dir, extra={})
 
 

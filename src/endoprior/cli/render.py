@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ..checks import InputError
+from ..device import Wanted
+from .devices import on_device
 from .parsing import parse
 from .progress import say
 
@@ -34,6 +36,8 @@ class Render:
     """JSON list of {"time", "world_to_camera"} to follow in place of a split."""
     data: Path | None = None
     """Sequence folder for the originals; the one the run was trained on if not given."""
+    device: Wanted = "auto"
+    """Where to draw; auto takes CUDA only where all of it works (`endoprior doctor`)."""
 
 
 def run(argv: list[str]) -> None:
@@ -50,6 +54,7 @@ def draw(scene: Scene, args: Render) -> None:
     from .places import demand_folder_place
 
     demand_folder_place("OUT" if args.out else "RUN", args.out or args.run)
+    scene = on_device(scene, args.device, half_planes=True)
     from ..data import load_sequence
     from ..evaluate import scored_data
     from ..show.camera_paths import read_path, sway_path, times_path

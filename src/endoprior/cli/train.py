@@ -7,12 +7,13 @@ import json
 import time as clock
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
 from ..checks import InputError
 from ..config import Config
+from ..device import Wanted
 from ..presets import PresetName, preset
 from .parsing import parse
 from .progress import say, training_progress
@@ -35,7 +36,7 @@ class Train:
     """Where the config starts from."""
     init_budget: int | None = None
     """Short for --init.budget."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: Wanted = "auto"
     """Where to compute; auto takes CUDA only where all of it works (`endoprior doctor`)."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
@@ -125,6 +126,7 @@ def train_and_evaluate(
     del sequence  # and with it the frames it keeps: scoring reads its own
     done = _logged_seconds(out / "log.jsonl")
     speed = {"train_seconds": seconds, "iterations_per_second": done}
+    scene = scene.to("cuda" if cfg.render.backend == "cuda" else "cpu")  # where it was trained
     try:
         evaluate_run(scene, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
     except KeyboardInterrupt:

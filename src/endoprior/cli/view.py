@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from ..checks import InputError
+from ..device import Wanted
+from .devices import on_device
 from .parsing import parse
 from .progress import say
 
@@ -38,6 +40,8 @@ class View:
     """Address to listen on. Anybody who can reach it sees the scene: there is no password."""
     port: int = DEFAULT_PORT
     """Port to listen on; 0 takes any free one."""
+    device: Wanted = "auto"
+    """Where to draw a run; auto takes CUDA only where all of it works (`endoprior doctor`)."""
 
 
 def run(argv: list[str]) -> None:
@@ -46,7 +50,7 @@ def run(argv: list[str]) -> None:
     from ..view.guard import check_address
 
     check_address(args.host, args.port)
-    subject, out = open_subject(args.path, args.data)
+    subject, out = open_subject(args.path, args.data, args.device)
     viewer = import_viewer()(subject, host=args.host, port=args.port, out=out)
     say(f"{subject.title}: {viewer.url}  (Ctrl-C ends)")
     viewer.run()
@@ -87,8 +91,11 @@ def live_view(port: int | None) -> Iterator[Callable[[StepReport, Trainer], None
         view.close()
 
 
-def open_subject(path: Path, data: Path | None) -> tuple[Subject, Path | None]:
+def open_subject(path: Path, data: Path | None, device: Wanted = "cpu") -> tuple[Subject, Path | None]:
     """What is at `path`, and the folder its screenshots go to: none for a sequence, whose folder is not ours.
+
+    Args:
+        data: sequence folder of a run. device: where a run is drawn.
 
     Raises:
         InputError: neither a run nor a sequence.
@@ -106,7 +113,8 @@ def open_subject(path: Path, data: Path | None) -> tuple[Subject, Path | None]:
     from ..view.scene_subject import SceneSubject
 
     scene = load_scene(folder)
-    return SceneSubject(scene, str(folder), _originals(scene, folder, data)), folder / "view"
+    originals = _originals(scene, folder, data)
+    return SceneSubject(on_device(scene, device, half_planes=True), str(folder), originals), folder / "view"
 
 
 def _originals(scene: Scene, folder: Path, data: Path | None) -> Sequence | None:

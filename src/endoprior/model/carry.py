@@ -27,8 +27,8 @@ def carry_points(
     Returns:
         (T, P, 3) world positions, mm.
     """
-    centers = np.stack([scene.at(time).means.numpy() for time in times])
-    opacities = scene.gaussians.opacities.detach().numpy()
+    centers = np.stack([scene.at(time).means.cpu().numpy() for time in times])
+    opacities = scene.gaussians.opacities.detach().cpu().numpy()
     moved = np.empty((len(times), *points.shape), np.float32)
     k = min(NUM_CARRIERS, len(scene))
     for start in np.unique(from_frame):

@@ -15,6 +15,8 @@ from torch import Tensor
 from torch.nn.functional import linear, relu
 from torch.nn.init import xavier_uniform_
 
+from ..compiled import compiled
+
 OUTPUT_WIDTH = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1}
 
 
@@ -65,11 +67,14 @@ class OffsetHeads:
 
     def __call__(self, trunk: Tensor, only: tuple[str, ...] | None = None) -> dict[str, Tensor]:
         """Offsets (N, outputs) by name, from what the trunk makes of the features, (N, W); of `only` some heads."""
-        shared = relu(trunk)
-        return {
-            name: self._linear(f"{name}.output", self._linear(f"{name}.hidden", shared).relu_())
-            for name in only or self.outputs
-        }
+        shared, names = relu(trunk), only or self.outputs
+        if compiled(trunk):
+            hidden = [self._linear(f"{name}.hidden", shared) for name in names]
+        else:  # one product for all: matrices of 32 columns leave a GPU idle, and each launch costs as much as its work
+            weight = torch.cat([self.parameters[f"{name}.hidden.weight"] for name in names])
+            bias = torch.cat([self.parameters[f"{name}.hidden.bias"] for name in names])
+            hidden = linear(shared, weight, bias).chunk(len(names), -1)
+        return {name: self._linear(f"{name}.output", relu(part)) for name, part in zip(names, hidden, strict=True)}
 
     def _linear(self, layer: str, inputs: Tensor) -> Tensor:
         """One linear layer by name."""

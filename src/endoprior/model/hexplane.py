@@ -112,9 +112,18 @@ class PlaneGrid:
 
     def to(self, device: torch.device) -> PlaneGrid:
         """A copy on a device, without gradients."""
-        moved = copy(self)
-        moved.values, moved.marks = self.values.detach().to(device), self.marks.to(device)
+        moved = self._copy(self.values.detach().to(device))
+        moved.marks = self.marks.to(device)
         moved.grads = moved.zeros()
+        return moved
+
+    def halved(self, device: torch.device) -> PlaneGrid:
+        """A copy in half precision on a device, to look up and no more: without gradients, and nothing to train."""
+        return self._copy(self.values.detach().to(device, torch.float16))
+
+    def _copy(self, values: Tensor) -> PlaneGrid:
+        moved = copy(self)
+        moved.values, moved.grads, moved.marks = values, values[:0], self.marks[:0]
         moved.__dict__.pop("layout", None)
         return moved
 

@@ -105,17 +105,26 @@ class Scene:
         return rasterize(splats, camera or self.camera_at(time), background=splats.means.new_zeros(3))
 
     @property
+    def device(self) -> torch.device:
+        """Where it lies and is drawn."""
+        return self.gaussians["means"].device
+
+    @property
     def backend(self) -> render.Backend:
         """What draws it: the backend it was trained with, if its Gaussians lie there; else that of their device."""
         chosen, on_cpu = self.config.render.backend, self.gaussians["means"].device.type == "cpu"
         return chosen if on_cpu == (chosen != "cuda") else "cpu" if on_cpu else "cuda"
 
-    def to(self, device: torch.device | str) -> Scene:
-        """This scene on a device: what it is asked is computed and drawn there; itself if it is there."""
+    def to(self, device: torch.device | str, *, half_planes: bool = False) -> Scene:
+        """This scene on a device: what it is asked is computed and drawn there; itself if it is there.
+
+        Args:
+            half_planes: HexPlane in half precision: half the memory and less to read, for pictures; not to be saved.
+        """
         gaussians = self.gaussians.to(device)
-        if gaussians is self.gaussians:
+        field = self.field and self.field.to(device, half_planes=half_planes)
+        if gaussians is self.gaussians and field is self.field:
             return self
-        field = self.field and self.field.to(device)
         return replace(
             self,
             gaussians=gaussians,
@@ -129,7 +138,13 @@ class Scene:
         return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
 
     def save(self, path: Path) -> None:
-        """Write the scene as one safetensors file, whole or not at all."""
+        """Write the scene as one safetensors file, whole or not at all.
+
+        Raises:
+            ValueError: its planes were halved for drawing.
+        """
+        if self.field is not None and self.field.grid.values.dtype != torch.float32:
+            raise ValueError("save the scene itself, not a copy with planes of half precision")
         intrinsics, poses = _camera_arrays(self.cameras)
         arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
         arrays |= {"prior_score": self.prior_score, "num_valid": self.num_valid}

@@ -35,7 +35,7 @@ def write_views(
     def pictures() -> Iterator[NDArray[np.uint8]]:
         for k, (time, camera) in enumerate(views):
             drawn = scene.render(time, camera)
-            color, depth = to_u8(drawn.color.numpy()), drawn.depth.numpy()
+            color, depth = to_u8(drawn.color.cpu().numpy()), drawn.depth.cpu().numpy()
             name = f"{frames[k].index if frames else k:06d}"
             write_png(out / "rgb" / f"{name}.png", color)
             with whole_file(out / "depth" / f"{name}.npy") as temporary:
@@ -52,7 +52,7 @@ def write_views(
 
 def depth_span(scene: Scene) -> tuple[float, float]:
     """Depths, mm, between which nearly all of the first moment lies: one color scale for all pictures of a scene."""
-    depth = scene.render(0.0).depth.numpy()
+    depth = scene.render(0.0).depth.cpu().numpy()
     drawn = depth[depth > 0]
     low, high = np.percentile(drawn, (2, 98)) if drawn.size else (0.0, 1.0)
     return float(low), float(high)

@@ -73,7 +73,7 @@ def _picture_rows(scene: Scene, sequence: Sequence) -> list[list[tuple[str, NDAr
     rows = []
     for frame in (frames[k] for k in shown):
         drawn = scene.render(frame.time, frame.camera)
-        color, depth = np.clip(drawn.color.numpy(), 0, 1), drawn.depth.numpy()
+        color, depth = np.clip(drawn.color.cpu().numpy(), 0, 1), drawn.depth.cpu().numpy()
         error = np.abs(color - frame.rgb).mean(-1)
         cells = [(f"input, frame {frame.index} (held out)", frame.rgb_u8), ("rendered, tool removed", to_u8(color))]
         tissue = sequence.truth.tissue(frame.index) if sequence.truth else None

@@ -74,14 +74,14 @@ class SceneSubject:
         if kind == "frame":
             return layers.fitted(self.sequence.frame(look.frame).rgb_u8, camera)
         out = self._draw(look, camera, None if kind not in ("motion", "prior") else self._values(look))
-        alpha = out.alpha.numpy()
+        alpha = out.alpha.cpu().numpy()
         if kind == "depth":
-            return layers.depth_picture(expected_depth(out.depth.numpy(), alpha), self.span)
+            return layers.depth_picture(expected_depth(out.depth.cpu().numpy(), alpha), self.span)
         if kind == "alpha":
             return layers.gray_picture(alpha)
         if kind in ("motion", "prior"):
-            return layers.value_picture(out.color[..., 0].numpy(), alpha)
-        color = to_u8(out.color.numpy())
+            return layers.value_picture(out.color[..., 0].cpu().numpy(), alpha)
+        color = to_u8(out.color.cpu().numpy())
         if kind == "difference":
             return layers.difference_picture(color, layers.fitted(self.sequence.frame(look.frame).rgb_u8, camera))
         return color
@@ -89,7 +89,7 @@ class SceneSubject:
     def surface(self, look: Look, camera: Camera) -> NDArray[np.float32]:
         """See `Subject.surface`."""
         out = self._draw(look, camera)
-        return expected_depth(out.depth.numpy(), out.alpha.numpy())
+        return expected_depth(out.depth.cpu().numpy(), out.alpha.cpu().numpy())
 
     @torch.no_grad()
     def _draw(self, look: Look, camera: Camera, values: Tensor | None = None) -> RenderOutput:
@@ -97,7 +97,9 @@ class SceneSubject:
         splats = self._splats(look)
         if values is not None:
             splats = replace(splats, sh=_gray_sh(values))
-        return self._rasterize(_clipped(splats, camera, look.near, look.far), camera, background=torch.zeros(3))
+        return self._rasterize(
+            _clipped(splats, camera, look.near, look.far), camera, background=splats.means.new_zeros(3)
+        )
 
     def _splats(self, look: Look) -> Splats:
         splats = self._playback.splats(look.frame)
@@ -124,7 +126,7 @@ class SceneSubject:
     def largest_motion(self) -> float:
         """Nearly the largest motion since the first frame, mm: the red end of the motion's colors."""
         frames = np.linspace(0, len(self.cameras) - 1, min(MOTION_SAMPLES, len(self.cameras))).astype(int)
-        return max(*(float(np.percentile(self._moved(int(i)).numpy(), 98)) for i in frames), 1e-3)
+        return max(*(float(np.percentile(self._moved(int(i)).cpu().numpy(), 98)) for i in frames), 1e-3)
 
     def sent(self, look: Look) -> bool:
         """See `Subject.sent`: layers that are no color of the Gaussians stay with our renderer."""
@@ -135,14 +137,14 @@ class SceneSubject:
         """See `Subject.cloud`: view-dependent color is left out."""
         splats = _clipped(self._splats(look), self.cameras[look.frame], look.near, look.far)
         if look.layer == "color":
-            colors = to_u8((splats.sh[:, 0] * SH_C0 + 0.5).numpy())
+            colors = to_u8((splats.sh[:, 0] * SH_C0 + 0.5).cpu().numpy())
         else:
             values = _rows(self._values(look), self._splats(look), self.cameras[look.frame], look.near, look.far)
-            colors = layers.colorize(values.numpy()[None], 0, 1)[0]
-        points = splats.means.numpy()
+            colors = layers.colorize(values.cpu().numpy()[None], 0, 1)[0]
+        points = splats.means.cpu().numpy()
         if look.points:
             return Cloud(points, colors, None, None, 3 * self._dot_mm)
-        return Cloud(points, colors, _covariances(splats), splats.opacities.numpy(), 0.0)
+        return Cloud(points, colors, _covariances(splats), splats.opacities.cpu().numpy(), 0.0)
 
     def carry(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
         """See `Subject.carry`: the Gaussians around a point take it along."""
@@ -196,5 +198,5 @@ def _rows(values: Tensor, splats: Splats, camera: Camera, near: float, far: floa
 
 def _covariances(splats: Splats) -> NDArray[np.float32]:
     """(N, 3, 3) second moments, mm^2."""
-    axes = quaternion_to_matrix(splats.quats.numpy()) * splats.scales.numpy()[:, None, :]
+    axes = quaternion_to_matrix(splats.quats.cpu().numpy()) * splats.scales.cpu().numpy()[:, None, :]
     return (axes @ np.swapaxes(axes, 1, 2)).astype(np.float32)

@@ -1,0 +1,25 @@
+"""Moving a scene to where the user wants it drawn."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..device import Wanted, choose_here
+from .progress import say
+
+if TYPE_CHECKING:
+    from ..model.scene import Scene
+
+
+def on_device(scene: Scene, wanted: Wanted, *, half_planes: bool = False) -> Scene:
+    """The scene on the chosen device; which one, and why, is said unless it is the CPU as asked.
+
+    Args:
+        half_planes: on a GPU a HexPlane may be halved (`Scene.to`): for pictures to look at, not for scores.
+    Raises:
+        InputError: CUDA was asked for and cannot be had.
+    """
+    choice = choose_here(wanted)
+    if wanted != "cpu":
+        say(choice.why)
+    return scene.to(choice.device, half_planes=half_planes and choice.device != "cpu")
