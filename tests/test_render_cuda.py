@@ -321,6 +321,11 @@ def gpu_bench(monkeypatch):
     return importlib.import_module("gpu")
 
 
+def gpu_contest(monkeypatch):
+    """The CPU in the GPU's place."""
+    return gpu_bench(monkeypatch).Contest("cpu", torch.device("cpu"))
+
+
 def test_gpu_bench_dry_run_agrees_times_and_writes(tmp_path, monkeypatch, capsys):
     out = tmp_path / "gpu.json"
     options = ["--dry-run", "--scenes", "1", "--gaussians", "50", "--laps", "1", "--out", str(out)]
@@ -329,7 +334,8 @@ def test_gpu_bench_dry_run_agrees_times_and_writes(tmp_path, monkeypatch, capsys
     assert [g["agrees"] for g in found["gaps"]] == [True, True] and found["facts"]["GPU"].startswith("none")
     assert len(found["laps"]) == 4 and all(lap["ms"] > 0 for lap in found["laps"])
     columns = {len(block.splitlines()[0].split("|")) for block in printed.split("\n\n")}
-    assert len(columns) == 3 and all(
+    assert len(found["runs"]) == 1 and found["runs"][0]["scores"]["psnr_tissue"] > 5
+    assert len(columns) == 4 and all(
         len({line.count("|") for line in block.strip().splitlines()}) == 1 for block in printed.split("\n\n")
     )
 
@@ -358,7 +364,7 @@ def test_gpu_bench_says_what_the_device_cannot_do_yet(monkeypatch):
     def broken():
         raise TypeError("can't convert cuda:0 device type tensor to numpy.\nUse Tensor.cpu()")
 
-    lap = gpu_bench(monkeypatch).timed("deformed", 7, broken, torch.device("cpu"), 1)
+    lap = gpu_bench(monkeypatch).timed(gpu_contest(monkeypatch), "deformed", 7, broken, 1)
     assert lap.ms is None and lap.note == "not possible: can't convert cuda:0 device type tensor to numpy."
 
 

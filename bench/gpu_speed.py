@@ -1,0 +1,132 @@
+"""How long a GPU backend takes to draw, measured by the device's own clock."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import common
+import rendering
+import scenes
+import torch
+from gpu_parity import Contest
+
+from endoprior import render
+from endoprior.model.deformation import HexPlaneField
+from endoprior.model.scene import Scene
+from endoprior.presets import preset
+from endoprior.render.projection import FIELDS
+from endoprior.types import Camera, Splats
+
+SIZES = (common.Size(20_000, 640, 512), common.Size(40_000, 640, 512), common.Size(100_000, 640, 512))
+LAPS, WARM_UP = 50, 5
+MOMENT = 0.4
+
+
+@dataclass(frozen=True)
+class Lap:
+    """One timing."""
+
+    backend: str
+    stage: str
+    gaussians: int
+    ms: float | None = None
+    """Median; None if it could not be done."""
+    memory_mb: float | None = None
+    """Peak memory of the device, MB."""
+    note: str = ""
+    pictures: int = 1
+    """Drawn at a time."""
+
+
+def laps_ms(step: Callable[[], Any], device: torch.device, laps: int) -> float:
+    """Median milliseconds of a step, measured on the device where it is a GPU."""
+    for _ in range(min(WARM_UP, laps)):
+        step()
+    if device.type != "cuda":
+        taken = []
+        for _ in range(laps):
+            began = time.perf_counter()
+            step()
+            taken.append(1e3 * (time.perf_counter() - began))
+        return statistics.median(taken)
+    events = [[torch.cuda.Event(enable_timing=True) for _ in range(2)] for _ in range(laps)]
+    torch.cuda.synchronize(device)
+    for start, end in events:
+        start.record()
+        step()
+        end.record()
+    torch.cuda.synchronize(device)
+    return statistics.median(start.elapsed_time(end) for start, end in events)
+
+
+def speed(contest: Contest, sizes: tuple[common.Size, ...], laps: int) -> list[Lap]:
+    """Drawing, drawing and its gradient, and drawing with either deformation before it."""
+    found = []
+    for size in sizes:
+        splats, camera = scenes.splats(size)
+        on_device = Splats(**{name: getattr(splats, name).to(contest.device) for name in FIELDS})
+        rasterize = partial(render.load(contest.backend), camera=camera, background=torch.zeros(3).to(contest.device))
+        steps = {
+            "drawn from kept splats": partial(drawn, rasterize, on_device),
+            "drawn and differentiated": both_ways(rasterize, on_device),
+        }
+        for name in rendering.PRESETS:
+            steps[f"deformed ({name}) and drawn"] = deformed(rasterize, name, splats, camera, contest.device)
+        found += [timed(contest, stage, size.num, step, laps) for stage, step in steps.items()]
+    return found
+
+
+def timed(contest: Contest, stage: str, num: int, step: Callable[[], Any], laps: int) -> Lap:
+    """One row; what the device cannot do yet is said in its note."""
+    device = contest.device
+    on_gpu = device.type == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats(device)
+    try:
+        ms = laps_ms(step, device, laps)
+    except (AttributeError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
+        return Lap(contest.backend, stage, num, note=f"not possible: {str(error).splitlines()[0]:.120}")
+    return Lap(contest.backend, stage, num, ms, torch.cuda.max_memory_allocated(device) / 1e6 if on_gpu else None)
+
+
+@torch.no_grad()
+def drawn(rasterize: Callable[..., Any], splats: Splats) -> None:
+    """Forward only."""
+    rasterize(splats)
+
+
+def both_ways(rasterize: Callable[..., Any], splats: Splats) -> Callable[[], None]:
+    """Forward, and backward to every input and to `means2d`, as training does."""
+    leaves = Splats(**{name: getattr(splats, name).clone().requires_grad_() for name in FIELDS})
+
+    def step() -> None:
+        for name in FIELDS:
+            getattr(leaves, name).grad = None
+        out = rasterize(leaves, depth_grad_to_means=False)
+        out.means2d.retain_grad()
+        (out.color.square().mean() + 1e-4 * out.depth.mean()).backward()
+
+    return step
+
+
+def deformed(
+    rasterize: Callable[..., Any], name: str, splats: Splats, camera: Camera, device: torch.device
+) -> Callable[[], None]:
+    """A preset's deformation at a moment, then forward, on the device; the first lap moves the scene there."""
+    kept: list[Scene] = []
+
+    def step() -> None:
+        if not kept:
+            cfg, field = preset(name).fitted(68), None
+            if cfg.deformation.kind == "hexplane":
+                field = HexPlaneField.from_points(splats.means, cfg.deformation, torch.Generator().manual_seed(0))
+            scene = rendering.make_scene(splats, camera, cfg, field and field.to(device))
+            kept.append(replace(scene, gaussians=scene.gaussians.to(device)))
+        drawn(rasterize, kept[0].at(MOMENT))
+
+    return step

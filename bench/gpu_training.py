@@ -1,0 +1,142 @@
+"""Training a whole scene on a GPU and on the CPU: seconds, scores, and how often the host waits for the device."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+
+from endoprior import render
+from endoprior.config import Config
+from endoprior.data import Sequence, load_sequence
+from endoprior.device import wait_for
+from endoprior.evaluate import evaluate
+from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.presets import preset
+from endoprior.trainer import Trainer
+
+FRAMES, WIDTH, HEIGHT = 63, 640, 512
+WATCHED = 15
+"""Iterations in which waits are counted: fewer than lie between two looks."""
+WATCHED_FROM = 0.6
+"""Of the iterations, so that every term is active."""
+SCORES = (
+    "psnr_tissue", "psnr", "ssim", "depth_rmse_mm", "flow_error_dis_adjacent", "num_gaussians", "fps", "fps_cached",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training."""
+
+    backend: str
+    frames: int
+    start_s: float
+    """From nothing to the first iteration: frames, prior, first points and their tracks, all on the CPU."""
+    loop_s: float
+    """All iterations, the device's work included."""
+    iterations: int
+    waits: float | None = None
+    """Times the host waited for the device, per iteration; None on the CPU."""
+    waited_at: list[str] = field(default_factory=list)
+    """Where."""
+    memory_mb: float | None = None
+    """Peak memory of the device."""
+    scores: dict[str, float] = field(default_factory=dict)
+
+
+@contextmanager
+def sequence_at(data: Path | None, frames: int, width: int, height: int) -> Iterator[Path]:
+    """The folder to train on; without one a phantom of that size, as long as it is needed."""
+    if data is not None:
+        yield data
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        write_phantom(Path(folder) / "phantom", PhantomConfig(frames=frames, width=width, height=height))
+        yield Path(folder) / "phantom"
+
+
+def config(backend: render.Backend, iterations: int | None) -> Config:
+    """`default` on a backend, with another number of iterations if one is given."""
+    cfg = preset("default")
+    cfg = replace(cfg, render=replace(cfg.render, backend=backend))
+    if iterations is None:
+        return cfg
+    half = iterations // 3
+    return replace(
+        cfg, schedule=replace(cfg.schedule, fine_iterations=iterations, half_resolution_iterations=half),
+        optim=replace(cfg.optim, decay_iterations=iterations),
+    )  # fmt: skip
+
+
+def trained(folder: Path, backend: render.Backend, iterations: int | None = None) -> Run:
+    """Train on one backend and score the result where it lies."""
+    cfg = config(backend, iterations)
+    sequence = load_sequence(folder, cfg.data)
+    began = time.perf_counter()
+    trainer = Trainer(sequence, cfg)
+    on_gpu = trainer.device.type == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats(trainer.device)
+    trainer.start()
+    started = time.perf_counter()
+    total, waits, waited_at = cfg.schedule.fine_iterations, None, []
+    while not trainer.finished:
+        if on_gpu and trainer.state.iteration == int(WATCHED_FROM * total) // 100 * 100:
+            waits, waited_at = watched(trainer)
+        else:
+            trainer.step()
+    scene = trainer.scene().to(trainer.device)
+    wait_for(trainer.device)
+    ended = time.perf_counter()
+    return Run(
+        backend=backend, frames=len(sequence), start_s=started - began, loop_s=ended - started, iterations=total,
+        waits=waits, waited_at=waited_at,
+        memory_mb=torch.cuda.max_memory_allocated(trainer.device) / 1e6 if on_gpu else None,
+        scores=scores(scene, sequence),
+    )  # fmt: skip
+
+
+def scores(scene, sequence: Sequence) -> dict[str, float]:
+    """Some scores of the test split, networks left out."""
+    found = evaluate(scene, sequence, networks=False).scores
+    return {name: found[name] for name in SCORES if name in found}
+
+
+def watched(trainer: Trainer) -> tuple[float, list[str]]:
+    """Some iterations, right after a look: how often each waited, as torch reports it, and what said so."""
+    trainer.settle()
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for _ in range(WATCHED):
+                trainer.step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    waited = [w for w in caught if "synchroniz" in str(w.message)]
+    return len(waited) / WATCHED, sorted({f"{Path(w.filename).name}:{w.lineno}" for w in waited})
+
+
+def table(runs: list[Run]) -> list[str]:
+    """Markdown, one row per training."""
+    names = [name for name in SCORES if any(name in run.scores for run in runs)]
+    facts = ("`default` on", "frames", "start, s", "iterations, s", "of them a second", "host waits an iteration")
+    lines = header(*facts, *names)
+    for run in runs:
+        cells = [run.backend, str(run.frames), f"{run.start_s:.1f}", f"{run.loop_s:.1f}"]
+        cells += [f"{run.iterations / run.loop_s:.0f}", "" if run.waits is None else f"{run.waits:.2f}"]
+        cells += [f"{run.scores[name]:.4g}" if name in run.scores else "" for name in names]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def header(*names: str) -> list[str]:
+    """The two first lines of a Markdown table."""
+    return [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
