@@ -19,13 +19,20 @@ class AdamState:
     where it is not 0, parameter, moments and counts stay as they are.
     """
 
-    def __init__(self, param: Tensor, num_counts: int = 1) -> None:
+    def __init__(self, param: Tensor, num_counts: int = 1, reach: int | None = None) -> None:
+        """Start with zero moments.
+
+        Args:
+            num_counts: B for a temporal basis, else 1.
+            reach: of a basis, most functions that one moment reaches; they are neighbors. None: any number.
+        """
+        self.reach = reach
         self.first = torch.zeros_like(param, requires_grad=False)
         self.second = torch.zeros_like(param, requires_grad=False)
         self.steps = torch.zeros(num_counts, device=param.device)
         """(num_counts,) whole numbers."""
 
-    def update(self, param: Tensor, rate: float, epsilon: float, frozen: Tensor | None = None) -> None:
+    def update(self, param: Tensor, rate: float | Tensor, epsilon: float, frozen: Tensor | None = None) -> None:
         """One step of the whole parameter, a leaf with `.grad`; without a gradient nothing happens."""
         if param.grad is None or param.numel() == 0:
             return
@@ -42,7 +49,7 @@ class AdamState:
         self,
         param: Tensor,
         gradients: list[RankOneGradient],
-        rates: NDArray,
+        rates: NDArray | Tensor,
         epsilon: float,
         frozen: Tensor | None = None,
     ) -> None:
@@ -55,14 +62,14 @@ class AdamState:
         """
         if not gradients or param.numel() == 0:
             return
+        if not compiled(param):
+            self._update_band(param, gradients, rates, epsilon, frozen)
+            return
         weights = np.stack([gradient.weights for gradient in gradients]).astype(np.float32)
         active = np.flatnonzero(weights.any(0))
         if len(active) == 0:
             return
         begin, end = int(active[0]), int(active[-1]) + 1
-        if not compiled(param):
-            self._update_band(param, gradients, slice(begin, end), rates, epsilon, frozen)
-            return
         self.steps[begin:end] += 1
         scaled, root_scale = _corrected(rates[None, :], self._counts()[begin:end, None])
         v_offsets = np.stack([gradient.v_offsets.numpy() for gradient in gradients])
@@ -73,19 +80,31 @@ class AdamState:
         self,
         param: Tensor,
         gradients: list[RankOneGradient],
-        band: slice,
-        rates: NDArray,
+        rates: NDArray | Tensor,
         epsilon: float,
         frozen: Tensor | None,
     ) -> None:
-        """`update_bases` by the definition, on any device, of the basis functions in `band`."""
-        grad = sum(_on(param, g.weights[None, band, None]) * g.v_offsets[:, None] for g in gradients)
-        arrays = param.detach()[:, band], self.first[:, band], self.second[:, band]
-        live = None if frozen is None else frozen == 0
-        self.steps[band] += 1 if live is None else live
-        counts = self.steps[band, None].clamp(min=1)  # where the first step is forbidden there is none
+        """`update_bases` by the definition, on any device.
+
+        Which functions are reached is known on the device only, but not more than so many neighbors: they are taken
+        out, stepped, and put back.
+        """
+        weights = torch.stack([_on(param, gradient.weights) for gradient in gradients])
+        reached, num = (weights != 0).any(0), param.shape[1]
+        width = min(self.reach or num, num) if len(gradients) == 1 else num
+        first = reached.to(torch.uint8).argmax().clamp(max=num - width)
+        band = first + torch.arange(width, device=param.device)
+        live = reached[band] if frozen is None else reached[band] & (frozen == 0)
+        grad = sum(w[band, None] * g.v_offsets[:, None] for w, g in zip(weights, gradients, strict=True))
+        wholes = (param.detach(), self.first, self.second)
+        parts = [whole.index_select(1, band) for whole in wholes]
+        steps = self.steps[band] + live
+        counts = steps.clamp(min=1)[:, None]  # where nothing was stepped yet there is no correction
         scaled, root_scale = _on(param, rates) / (1 - BETA1**counts), (1 - BETA2**counts).rsqrt()
-        adam_definition(arrays[0], grad, *arrays[1:], scaled, root_scale, epsilon, live)
+        adam_definition(parts[0], grad, *parts[1:], scaled, root_scale, epsilon, live[:, None])
+        for whole, part in zip(wholes, parts, strict=True):
+            whole.index_copy_(1, band, part)
+        self.steps.index_copy_(0, band, steps)
 
     def _counts(self) -> NDArray[np.int64]:
         """The counts, whole numbers, of a state on the CPU."""
@@ -101,6 +120,6 @@ def _constants(epsilon: float) -> tuple[np.float32, np.float32, np.float32]:
     return np.float32(BETA1), np.float32(BETA2), np.float32(epsilon)
 
 
-def _on(like: Tensor, array: NDArray) -> Tensor:
-    """The numbers as float32 where `like` is; the copy is queued, nobody waits for it."""
-    return torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(like.device, non_blocking=True)
+def _on(like: Tensor, numbers: NDArray | Tensor) -> Tensor:
+    """The numbers as float32 where `like` is; a copy is queued, nobody waits for it."""
+    return torch.as_tensor(numbers).to(like.device, torch.float32, non_blocking=True)

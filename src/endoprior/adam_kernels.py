@@ -35,7 +35,7 @@ def adam_definition(
 
     Args:
         param, grad, first, second: of one shape. rate, root_scale: corrected for young moments, broadcast.
-        live: () bool where `grad` is; where it is False nothing changes, whatever `grad` holds.
+        live: bool, broadcast; where it is False nothing changes, whatever `grad` holds.
     """
     blend1, blend2 = 1 - BETA1, 1 - BETA2
     if live is not None:
@@ -52,7 +52,7 @@ def fused_step(
     first: Tensor,
     second: Tensor,
     steps: Tensor,
-    rate: float,
+    rate: float | Tensor,
     epsilon: float,
     frozen: Tensor | None = None,
 ) -> None:
@@ -60,6 +60,7 @@ def fused_step(
 
     Args:
         param, grad, first, second: of one shape, contiguous. steps: () float32, counted up.
+        rate: a number, or () on the same device.
         frozen: () float32 on the same device; where it is not 0, nothing changes.
     """
     adam(

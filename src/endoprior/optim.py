@@ -14,7 +14,7 @@ from .config import Config, OptimConfig
 from .density import DensityStats, Plan
 from .divergence import ADVICE, Diverged, count_unusable, count_unusable_rows
 from .geometry import quaternion_to_matrix
-from .model.basis import motion_layout
+from .model.basis import bases_reached, motion_layout
 from .model.deformation import HexPlaneField
 from .model.gaussians import Gaussians
 from .model.hexplane_kernels import FRESH
@@ -22,8 +22,14 @@ from .model.plane_adam import PlaneAdam
 from .morton import morton_order
 
 
-def log_linear(start: float, end: float, iteration: int, steps: int) -> float:
-    """Learning rate that falls from `start` to `end` over `steps` iterations, linearly in its logarithm, then holds."""
+def log_linear(start: float, end: float, iteration: int | Tensor, steps: int) -> float | Tensor:
+    """Learning rate that falls from `start` to `end` over `steps` iterations, linearly in its logarithm, then holds.
+
+    Of an iteration that is a () float64 tensor it is one too, () float32 where that lies.
+    """
+    if isinstance(iteration, Tensor):
+        share = (iteration / steps).clamp(0, 1)
+        return (math.log(start) * (1 - share) + math.log(end) * share).exp().float()
     share = min(max(iteration / steps, 0.0), 1.0)
     return math.exp(math.log(start) * (1 - share) + math.log(end) * share)
 
@@ -33,28 +39,31 @@ class Optimizer:
 
     def __init__(self, gaussians: Gaussians, field: HexPlaneField | None, cfg: Config, spatial_scale: float) -> None:
         self.gaussians, self.field, self.cfg, self.spatial_scale = gaussians, field, cfg, spatial_scale
-        self.states = {
-            name: AdamState(value, value.shape[1] if name == "motion" else 1)
-            for name, value in gaussians.tensors.items()
-        }
+        self.states = {name: AdamState(value) for name, value in gaussians.tensors.items() if name != "motion"}
+        if "motion" in gaussians.tensors:
+            motion = gaussians["motion"]
+            self.states["motion"] = AdamState(motion, motion.shape[1], bases_reached(cfg.deformation.basis))
+            rates = torch.from_numpy(motion_rates(cfg, 0, cfg.optim.decay_iterations))
+            self._motion_rates = rates.to(motion.device, torch.float32)
+            """(C,) before they decay, where no kernel takes them."""
         self.plane_adam = None
         if field is not None:
             self.states |= {name: AdamState(value) for name, value in _field_parameters(field).items()}
             self.plane_adam = PlaneAdam(field.grid, epsilon=cfg.optim.epsilon)
 
-    def step(self, iteration: int, frozen: Tensor | None = None) -> None:
+    def step(self, iteration: int | Tensor, frozen: Tensor | None = None) -> None:
         """Apply the gradients and clear them. What got no gradient is left alone, momentum and all.
 
         Args:
-            iteration: 1-based, within the stage.
+            iteration: 1-based, within the stage; on a device a () float64 tensor.
             frozen: () float32 on a device; where it is not 0 the gradients are only cleared.
         """
         optim = self.cfg.optim
         decay = {"iteration": iteration, "steps": optim.decay_iterations}
         for name, param in self.gaussians.tensors.items():
             if name == "motion":
-                gradients = self.gaussians.motion_gradients
-                self.states[name].update_bases(param, gradients, motion_rates(self.cfg, **decay), optim.epsilon, frozen)
+                gradients, rates = self.gaussians.motion_gradients, self._decayed_motion_rates(decay)
+                self.states[name].update_bases(param, gradients, rates, optim.epsilon, frozen)
             else:
                 self.states[name].update(param, self._rate(name, decay), optim.epsilon, frozen)
         if self.field is not None:
@@ -104,7 +113,12 @@ class Optimizer:
         if self.field is not None:
             self.field.grid.clear_grads()
 
-    def _rate(self, name: str, decay: dict) -> float:
+    def _decayed_motion_rates(self, decay: dict) -> NDArray | Tensor:
+        if isinstance(decay["iteration"], Tensor):
+            return self._motion_rates * log_linear(1.0, self.cfg.optim.basis_decay, **decay)
+        return motion_rates(self.cfg, **decay)
+
+    def _rate(self, name: str, decay: dict) -> float | Tensor:
         optim = self.cfg.optim
         if name == "means":
             return self.spatial_scale * log_linear(optim.means_lr, optim.means_lr_final, **decay)

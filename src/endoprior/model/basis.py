@@ -8,6 +8,7 @@ the identity. Bases of this kind were used per Gaussian by Yang et al., "Deform3
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,22 +63,36 @@ def basis_weights(time: float, cfg: BasisConfig) -> NDArray[np.float64]:
     return np.maximum(0.0, (np.exp(-0.5 * (distance / sigma) ** 2) - end) / (1 - end))
 
 
+def weights_definition(time: Tensor, cfg: BasisConfig) -> Tensor:
+    """(B,) float64 `basis_weights` of a moment () float64, where it lies: no number passes through the host."""
+    centers = torch.linspace(0, 1, cfg.num_bases, dtype=torch.float64, device=time.device)
+    end = math.exp(-0.5 * REACH**2)
+    bump = (-0.5 * ((time - centers) * (cfg.num_bases / cfg.relative_width)).square()).exp()
+    return ((bump - end) / (1 - end)).clamp(min=0)
+
+
+def bases_reached(cfg: BasisConfig) -> int:
+    """Most bumps that a moment can lie in; they are neighbors."""
+    return min(cfg.num_bases, int(2 * REACH * cfg.relative_width * (cfg.num_bases - 1) / cfg.num_bases) + 1)
+
+
 @dataclass(frozen=True)
 class RankOneGradient:
     """Gradient of `motion` from one moment, weights (B,) times v_offsets (N, channels): never written out in full."""
 
-    weights: NDArray[np.float32]
+    weights: NDArray[np.float32] | Tensor
+    """A tensor where no kernel takes it."""
     v_offsets: Tensor
 
 
 def basis_offsets(
-    motion: Tensor, time: float, cfg: DeformationConfig, sink: list[RankOneGradient] | None = None
+    motion: Tensor, time: float | Tensor, cfg: DeformationConfig, sink: list[RankOneGradient] | None = None
 ) -> Offsets:
     """What `time` adds to Gaussians with coefficients `motion`.
 
     Args:
         motion: (N, B, channels) coefficients; channels as in `motion_layout`, those of the centers in mm.
-        time: in [0, 1].
+        time: in [0, 1]; off the CPU also as a () float64 tensor.
         sink: takes the gradient of `motion` in place of `motion.grad`. One moment's gradient is an outer product, 30
             times smaller than the coefficients, and the optimizer can use it as it is.
     Returns:
@@ -87,7 +102,11 @@ def basis_offsets(
     """
     layout = motion_layout(cfg)
     check_shape(f"motion:N,{cfg.basis.num_bases},{max(part.stop for part in layout.values())}", motion=motion)
-    total = _WeightedSum.apply(motion, basis_weights(time, cfg.basis), sink)
+    if isinstance(time, Tensor):
+        weights = weights_definition(time, cfg.basis)
+    else:
+        weights = basis_weights(time, cfg.basis)
+    total = _WeightedSum.apply(motion, weights, sink)
     found = {name: total[:, part] for name, part in layout.items()}
     if "opacity_logits" in found:
         found["opacity_logits"] = found["opacity_logits"][:, 0]
@@ -98,14 +117,18 @@ class _WeightedSum(torch.autograd.Function):
     """sum_b weights[b] * motion[:, b] over the band of weights that are not 0."""
 
     @staticmethod
-    def forward(ctx: Any, motion: Tensor, weights: NDArray[np.float64], sink: list[RankOneGradient] | None) -> Tensor:
+    def forward(
+        ctx: Any, motion: Tensor, weights: NDArray[np.float64] | Tensor, sink: list[RankOneGradient] | None
+    ) -> Tensor:
+        ctx.sink = sink
+        if not compiled(motion):
+            weights = torch.as_tensor(weights).to(motion.device, motion.dtype, non_blocking=True)
+            ctx.weights = weights
+            return torch.matmul(weights, motion.detach())
         weights = weights.astype(np.float64 if motion.dtype == torch.float64 else np.float32)
         band = np.flatnonzero(weights)
         ctx.band = (int(band[0]), int(band[-1]) + 1) if len(band) else (0, 0)
-        ctx.weights, ctx.shape, ctx.sink = weights, motion.shape, sink
-        if not compiled(motion):
-            first, stop = ctx.band
-            return torch.einsum("nbc,b->nc", motion.detach()[:, first:stop], _on(motion, weights[first:stop]))
+        ctx.weights, ctx.shape = weights, motion.shape
         coefficients = motion.detach().contiguous().numpy()
         out = np.empty((len(coefficients), coefficients.shape[2]), dtype=coefficients.dtype)
         _weighted_sum(coefficients, weights, *ctx.band, out)
@@ -118,15 +141,10 @@ class _WeightedSum(torch.autograd.Function):
             ctx.sink.append(RankOneGradient(ctx.weights, v_out.contiguous()))
             return None, None, None
         if not compiled(v_out):
-            return v_out[:, None] * _on(v_out, ctx.weights)[:, None], None, None
+            return v_out[:, None] * ctx.weights[:, None], None, None
         v_motion = np.zeros(ctx.shape, dtype=ctx.weights.dtype)
         _weighted_sum_backward(v_out.contiguous().numpy(), ctx.weights, *ctx.band, v_motion)
         return torch.from_numpy(v_motion), None, None
-
-
-def _on(like: Tensor, weights: NDArray) -> Tensor:
-    """The weights where `like` is; the copy is queued, nobody waits for it."""
-    return torch.from_numpy(weights).to(like.device, non_blocking=True)
 
 
 @njit(parallel=True, cache=True)

@@ -105,23 +105,25 @@ class HexPlaneField:
         """Trained numbers in the planes."""
         return self.grid.num_values
 
-    def offsets(self, means: Tensor, time: float) -> Offsets:
+    def offsets(self, means: Tensor, time: float | Tensor) -> Offsets:
         """What `time` adds to Gaussians with canonical centers `means`.
 
         Args:
             means: (N, 3) float32, world axes, mm; any subset of the Gaussians, N may be 0.
-            time: in [0, 1).
+            time: in [0, 1); off the CPU also as a () float64 tensor.
         Returns:
             Offsets with a gradient path to `means`, the box and the network; the planes' gradient goes to `grid.grads`.
         """
         return self._read(*self._trunk(means, (time,)))
 
-    def offsets_and_displacement(self, means: Tensor, time: float, other: float) -> tuple[Offsets, Tensor]:
+    def offsets_and_displacement(
+        self, means: Tensor, time: float | Tensor, other: float | Tensor
+    ) -> tuple[Offsets, Tensor]:
         """`offsets` at `time`, and of the centers alone, (N, 3) mm, at an `other` time: cheaper than two calls."""
         here, there = self._trunk(means, (time, other))
         return self._read(here), self.heads(there, ("means",))["means"]
 
-    def _trunk(self, means: Tensor, times: tuple[float, ...]) -> tuple[Tensor, ...]:
+    def _trunk(self, means: Tensor, times: tuple[float | Tensor, ...]) -> tuple[Tensor, ...]:
         """What the trunk makes of the features, (N, W) per moment."""
         # As in the paper's code the first corner is the maximum, so coordinates run against the axes.
         unit = (means - self.box[0]) / (self.box[1] - self.box[0])

@@ -171,7 +171,9 @@ class PlaneGrid:
             unit = unit.detach().requires_grad_(True)
         return Sample.apply(unit, time, self) if compiled(unit) else features(self, unit, (time,))[0]
 
-    def linear(self, unit: Tensor, times: tuple[float, ...], weight: Tensor, bias: Tensor) -> tuple[Tensor, ...]:
+    def linear(
+        self, unit: Tensor, times: tuple[float | Tensor, ...], weight: Tensor, bias: Tensor
+    ) -> tuple[Tensor, ...]:
         """A linear layer on the features of one or more moments.
 
         Equal to `sample(unit, time) @ weight.T + bias`, but the features, many times wider than what is made of them,
@@ -179,7 +181,7 @@ class PlaneGrid:
 
         Args:
             unit: (N, 3), as in `sample`.
-            times: M moments in [0, 1].
+            times: M moments in [0, 1]; off the CPU also as () float64 tensors.
             weight: (W, S * C). bias: (W,).
         Returns:
             (N, W) float32 per moment. With gradients, backward also adds to `grads`.
@@ -192,7 +194,7 @@ class PlaneGrid:
             return tuple(linear(found, weight, bias) for found in features(self, unit, times))
         return Linear.apply(unit, weight, bias, times, self)
 
-    def _check(self, unit: Tensor, times: tuple[float, ...]) -> None:
+    def _check(self, unit: Tensor, times: tuple[float | Tensor, ...]) -> None:
         check_shape("unit:N,3", unit=unit)
-        if not np.isfinite(times).all():
+        if not all(isinstance(time, Tensor) or np.isfinite(time) for time in times):
             raise ValueError(f"time must be finite; got {times!r}")

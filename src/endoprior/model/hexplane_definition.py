@@ -58,11 +58,11 @@ def layout_of(grid: PlaneGrid) -> Layout:
     return Layout(*(table.to(grid.values.device) for table in tables))
 
 
-def features(grid: PlaneGrid, unit: Tensor, times: tuple[float, ...]) -> tuple[Tensor, ...]:
+def features(grid: PlaneGrid, unit: Tensor, times: tuple[float | Tensor, ...]) -> tuple[Tensor, ...]:
     """`PlaneGrid.sample` at several moments: what does not depend on time is looked up once.
 
     Args:
-        unit: (N, 3) float32. times: in [0, 1].
+        unit: (N, 3) float32. times: in [0, 1], numbers or () float64 tensors on the same device.
     Returns:
         (N, S * C) float32 per moment; backward also adds to `grid.grads` and marks every cell.
     """
@@ -82,16 +82,24 @@ def features(grid: PlaneGrid, unit: Tensor, times: tuple[float, ...]) -> tuple[T
     return tuple(torch.cat(part, -1) for part in parts)
 
 
-def _cut(grid: PlaneGrid, time: float) -> Tensor:
+def _cut(grid: PlaneGrid, time: float | Tensor) -> Tensor:
     """(R, C) the time planes at a moment."""
-    row, share = grid.time_row(time)
     layout = grid.layout
+    if not isinstance(time, Tensor):
+        time = torch.full((), time, dtype=torch.float64, device=layout.first_moment.device)
+    row, share = _time_row(grid, time)
     here = layout.first_moment + row * layout.next_moment
     rows = torch.stack([here, here + layout.next_moment], -1)
-    weights = torch.stack(
-        [torch.full_like(here, 1 - share, dtype=torch.float32), torch.full_like(here, share, dtype=torch.float32)], -1
-    )
+    weights = torch.stack([1 - share, share]).expand(len(rows), 2).contiguous()
     return _sums(weights.requires_grad_(torch.is_grad_enabled()), rows, grid.values, grid)
+
+
+def _time_row(grid: PlaneGrid, time: Tensor) -> tuple[Tensor, Tensor]:
+    """`PlaneGrid.time_row` of a () float64 tensor: () int64 and () float32."""
+    last = grid.time_resolution - 1
+    position = ((time if grid.time_map == "full" else (time + 1) / 2) * last).clamp(0, last)
+    row = position.floor().clamp(max=last - 1)
+    return row.to(torch.int64), (position - row).float()
 
 
 def _bilinear(grid: PlaneGrid, scale: int, low: Tensor, share: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ class PlaneAdam:
         """() a whole number."""
         self.exp_avg, self.exp_avg_sq = grid.zeros(), grid.zeros()
 
-    def step(self, lr: float, frozen: Tensor | None = None) -> None:
+    def step(self, lr: float | Tensor, frozen: Tensor | None = None) -> None:
         """Apply one step with learning rate `lr`, then clear the gradients; `frozen` is that of `AdamState`."""
         grid = self.grid
         buffers = (grid.values, grid.grads, self.exp_avg, self.exp_avg_sq)

@@ -38,9 +38,15 @@ LARGEST_DEVIATION = 5e-3
 
 
 def offsets_at(
-    gaussians: Gaussians, field: HexPlaneField | None, time: float, cfg: Config, chosen: Tensor | None = None
+    gaussians: Gaussians,
+    field: HexPlaneField | None,
+    time: float | Tensor,
+    cfg: Config,
+    chosen: Tensor | None = None,
 ) -> Offsets:
     """Deformation of the Gaussians (of the `chosen` (P,) ones only, if given) at `time` in [0, 1].
+
+    Off the CPU the time may be a () float64 tensor.
 
     Unless some are chosen, the gradient of temporal coefficients goes to `gaussians.motion_gradients`.
     """
