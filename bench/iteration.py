@@ -18,8 +18,8 @@ import common
 import plain
 import torch
 
+from endoprior import iteration as iteration_module
 from endoprior import temporal
-from endoprior import trainer as trainer_module
 from endoprior.config import Config
 from endoprior.data import Sequence, load_sequence
 from endoprior.density import DensityStats
@@ -49,7 +49,7 @@ PARTS = {
     "projection + SH": [(cpu, "project_forward")],
     "binning + sort": [(tiles, "build")],
     "compositing": [(cpu, "composite_forward")],
-    "losses": [(trainer_module, "supervised_terms")],
+    "losses": [(iteration_module, "supervised_terms")],
     "temporal term": [(temporal, n) for n in ("choose", "neighbors", "affinity", "local_motion_loss")],
     "compositing backward": [(cpu, "composite_backward"), (cpu, "gather")],
     "projection backward": [(cpu, "project_backward")],
@@ -130,7 +130,7 @@ def in_torch(trainer: Trainer) -> None:
     if state.field is not None:
         state.field = plain.Field(state.field)
         trained += state.field.parameters()
-    trainer.rasterize = plain.rasterize
+    trainer._work.rasterize = plain.rasterize
     state.optimizer = plain.Adam(trained, trainer.cfg.optim.epsilon)
 
 
@@ -139,7 +139,7 @@ def repeat_in_torch(trainer: Trainer, iteration: int) -> StepReport:
     with ExitStack() as stack:
         for owner, name in (
             (scene_module, "basis_offsets"),
-            (trainer_module, "supervised_losses"),
+            (iteration_module, "supervised_losses"),
             (temporal, "neighbors"),
             (temporal, "affinity"),
             (temporal, "local_motion_loss"),

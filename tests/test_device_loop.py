@@ -20,8 +20,10 @@ from endoprior.compiled import definitions_only
 from endoprior.data import load_sequence
 from endoprior.divergence import Diverged
 from endoprior.inspector import Inspector
+from endoprior.iteration import Work, on_tissue
 from endoprior.model.basis import RankOneGradient
 from endoprior.model.scene import load_scene
+from endoprior.recorded import Recorder
 from endoprior.train import train
 from endoprior.train_state import Stage
 from endoprior.trainer import Trainer
@@ -58,8 +60,9 @@ def off_the_host(trainer, monkeypatch):
     device = torch.device("meta")
     monkeypatch.setattr(adam_kernels, "adam", lambda *args, **kwargs: None)  # has no kernel there
     trainer.device, trainer.frames = device, TrainingFrames(trainer.sequence, trainer.cfg.prior, device)
-    trainer.rasterize, trainer.background = picture_without_values, torch.zeros(3, device=device)
     trainer._inspector = Inspector(device, waits=False)
+    work = Work(trainer.cfg, picture_without_values, torch.zeros(3, device=device), trainer._inspector)
+    trainer._work = Recorder(work, device, None)
     state = trainer.state
     trainer._enter(state.stage, state.gaussians.to(device), state.field and state.field.to(device))
 
@@ -200,8 +203,6 @@ def test_who_takes_no_part_changes_no_term(on_definitions):
 
 
 def test_points_are_on_tissue_by_the_definition_too(tiny_sequence):
-    from endoprior.trainer import on_tissue
-
     trainer = Trainer(load_sequence(tiny_sequence), tiny_config("basis"))
     trainer.start()
     points, frame = trainer.state.gaussians["means"].detach() * 1.1, trainer.frames.frame(0)

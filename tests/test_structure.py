@@ -23,6 +23,8 @@ LAYERS = [
     {"optim", "training_frames", "truth_scores"},
     {"train_state", "evaluate", "show"},
     {"inspector"},
+    {"iteration"},
+    {"recorded"},
     {"trainer", "training_memory", "export", "kernel_cache"},
     {"warm_up"},
     {"run_identity"},

@@ -184,7 +184,7 @@ def test_only_the_configured_ends_of_a_displacement_are_trained(tiny_sequence, k
     cfg = tiny_config(kind, coarse=0)
     trainer = Trainer(load_sequence(tiny_sequence), replace(cfg, temporal=replace(cfg.temporal, gradient=gradient)))
     trainer.start()
-    before = trainer._means_before(0.2, torch.arange(5))
+    before = trainer._work.means_before(trainer.state, 0.2, torch.arange(5))
     assert before.requires_grad is trained and before.shape == (5, 3)
 
 
@@ -195,7 +195,7 @@ def test_both_moments_at_once_have_the_gradients_of_one_after_the_other(tiny_seq
     for apart in (False, True):
         trainer = Trainer(load_sequence(tiny_sequence), cfg)
         trainer.start()
-        field, deform, seen = trainer.state.field, trainer._deform, []
+        field, deform, seen = trainer.state.field, trainer._work._deform, []
         field.grid.values.uniform_(0.2, 1.2, generator=torch.Generator().manual_seed(1))  # so that something moves
 
         # In place of a step, which would amplify noise.
@@ -208,7 +208,8 @@ def test_both_moments_at_once_have_the_gradients_of_one_after_the_other(tiny_seq
 
         monkeypatch.setattr(trainer.state.optimizer, "step", observe)
         if apart:
-            monkeypatch.setattr(trainer, "_deform", lambda frame, _, deform=deform: deform(frame, None))
+            alone = lambda state, task, deform=deform: deform(state, replace(task, before=None))  # noqa: E731
+            monkeypatch.setattr(trainer._work, "_deform", alone)
         terms = [trainer.step().terms for _ in range(7)]
         runs.append((terms, seen))
     (terms, together), (other_terms, apart) = runs

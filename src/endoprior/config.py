@@ -215,8 +215,8 @@ class DeformationConfig:
 class RenderConfig:
     """How splats are drawn."""
 
-    backend: Literal["cpu", "cuda", "reference"] = "cpu"
-    """`cpu`: Numba kernels; `cuda`: gsplat, needs an NVIDIA GPU; `reference`: dense plain torch, for small scenes."""
+    backend: Literal["cpu", "cuda", "triton", "reference"] = "cpu"
+    """`cpu`: Numba kernels; `cuda`, `triton`: an NVIDIA GPU, by gsplat or our own kernels; `reference`: plain torch."""
     depth_grad_to_means: bool = False
     """Let the gradient of rendered depth reach the composited z; EndoGaussian's rasteriser drops it."""
 

@@ -25,15 +25,30 @@ LOOK_EVERY = 20
 """Iterations that a device may be ahead: each look costs one wait, each iteration ahead some wasted work."""
 
 
+class Redo(Exception):
+    """Iterations that a device could not do must be done again; the state is the one before the first of them."""
+
+    def __init__(self, ago: int) -> None:
+        super().__init__()
+        self.ago = ago
+        """Iterations that were begun after that one."""
+
+
 @dataclass(frozen=True)
-class _Pending:
-    """What is known of an iteration that nobody has looked at."""
+class Evidence:
+    """What one iteration leaves to be judged by."""
 
     losses: Losses
-    names: tuple[str, ...]
-    largest: Tensor
-    """(len(names),) largest magnitude of each gradient."""
-    brightness: float
+    names: tuple[str, ...] = ()
+    largest: Tensor | None = None
+    """(len(names),) on a device: largest magnitude of each gradient. None where it was judged at once."""
+    frozen: Tensor | None = None
+    """() on a device: 1 if this iteration, or one before, changed nothing."""
+
+    def copied(self) -> Evidence:
+        """The same numbers in memory of their own."""
+        losses = Losses(self.losses.names, self.losses.values.clone())
+        return Evidence(losses, self.names, self.largest.clone(), self.frozen.clone())
 
 
 class Inspector:
@@ -49,27 +64,43 @@ class Inspector:
         self.frozen: Tensor | None = None if waits else torch.zeros((), device=device)
         """() float32 on the device, 1 once an iteration was unusable; None where each is judged at once."""
         self._watch = Watch()
-        self._pending: list[_Pending] = []
+        self._pending: list[tuple[Evidence, float]] = []
         self._looked_at, self._pace = clock.perf_counter(), 0.0
 
-    def see(self, losses: Losses, optimizer: Optimizer, brightness: float, *, look: bool) -> None:
-        """Judge an iteration by its loss and the gradients that the optimizer is about to use.
+    def judge(
+        self, losses: Losses, optimizer: Optimizer, brightness: float, incomplete: Tensor | None = None
+    ) -> Evidence:
+        """Judge an iteration by its loss and the gradients that the optimizer is about to use; waits for nothing.
 
         Args:
             brightness: see `Watch.see`.
-            look: wait for the device now, whatever the habit: what follows cannot be taken back.
+            incomplete: () bool on a device, whether the picture must be drawn again.
         Raises:
-            Diverged: this iteration is not usable, or, where nobody waits, one of the last `LOOK_EVERY` was not.
+            Diverged: where each is judged at once: this iteration is not usable.
         """
         if self.frozen is None:
             check_step(losses.numbers, optimizer.count_unusable())
             self._watch.see(losses.numbers["color"], brightness)
-            return
+            return Evidence(losses)
         found = optimizer.largest_gradients()
         largest = torch.stack(list(found.values()))
-        unusable = ~(losses.values.isfinite().all() & (largest <= float(LARGEST_GRADIENT)).all())
-        self.frozen.copy_(torch.maximum(self.frozen, unusable.float()))
-        self._pending.append(_Pending(losses, tuple(found), largest, brightness))
+        usable = losses.values.isfinite().all() & (largest <= float(LARGEST_GRADIENT)).all()
+        if incomplete is not None:
+            usable = usable & ~incomplete
+        self.frozen.copy_(torch.maximum(self.frozen, (~usable).float()))
+        return Evidence(losses, tuple(found), largest, self.frozen.clone())
+
+    def note(self, evidence: Evidence, brightness: float, *, look: bool) -> None:
+        """Take in an iteration that was judged, and done unless it was unusable.
+
+        Args:
+            look: wait for the device now, whatever the habit: what follows cannot be taken back.
+        Raises:
+            Diverged, Redo: as `look`.
+        """
+        if evidence.largest is None:
+            return
+        self._pending.append((evidence, brightness))
         if look or len(self._pending) >= LOOK_EVERY:
             self.look()
 
@@ -77,25 +108,27 @@ class Inspector:
         """Wait for the device and judge what has piled up.
 
         Raises:
-            Diverged: with `ago`, how many iterations were seen after the one it is about.
+            Diverged: with `ago`, how many iterations were begun after the one it is about.
+            Redo: some were not done although nothing is wrong with them.
         """
         pending, self._pending = self._pending, []
         if not pending:
             return
-        packed = torch.cat([torch.cat([p.losses.values, p.largest]) for p in pending]).tolist()
+        parts = [torch.cat([e.losses.values, e.largest, e.frozen[None]]) for e, _ in pending]
+        numbers = iter(torch.cat(parts).tolist())
         now = clock.perf_counter()
         self._pace, self._looked_at = (now - self._looked_at) / len(pending), now
-        for ago, seen in zip(reversed(range(len(pending))), pending, strict=True):
-            terms, packed = packed[: len(seen.losses.names)], packed[len(seen.losses.names) :]
-            largest, packed = packed[: len(seen.names)], packed[len(seen.names) :]
+        for ago, (evidence, brightness) in zip(reversed(range(len(pending))), pending, strict=True):
+            terms = {name: next(numbers) for name in evidence.losses.names}
+            largest = {name: next(numbers) for name in evidence.names}
             try:
-                check_largest(
-                    dict(zip(seen.losses.names, terms, strict=True)), dict(zip(seen.names, largest, strict=True))
-                )
-                self._watch.see(terms[seen.losses.names.index("color")], seen.brightness)
-            except Diverged as error:
+                check_largest(terms, largest)
+                if next(numbers):
+                    raise Redo(ago)
+                self._watch.see(terms["color"], brightness)
+            except (Diverged, Redo) as news:
                 self.frozen.zero_()  # who goes on does so from the state before
-                error.ago = ago
+                news.ago = ago
                 raise
 
     def seconds(self, since: float) -> float:

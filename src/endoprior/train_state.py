@@ -39,11 +39,14 @@ class TrainState:
 class Losses:
     """Weighted terms of Eq. (12) that took part in one iteration; asking for `numbers` waits for a device."""
 
-    def __init__(self, terms: Mapping[str, Tensor]) -> None:
-        """Args: terms: () each, by name, on one device."""
-        self.names = tuple(terms)
-        self.values = torch.stack([value.detach() for value in terms.values()])
-        """(len(names),)."""
+    def __init__(self, names: tuple[str, ...], values: Tensor) -> None:
+        """Args: values: (len(names),)."""
+        self.names, self.values = names, values
+
+    @staticmethod
+    def of(terms: Mapping[str, Tensor]) -> Losses:
+        """Of terms () each, by name, on one device."""
+        return Losses(tuple(terms), torch.stack([value.detach() for value in terms.values()]))
 
     @cached_property
     def numbers(self) -> dict[str, float]:

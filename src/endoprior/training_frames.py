@@ -24,7 +24,8 @@ class TrainingFrame:
     """One training frame at one resolution."""
 
     index: int
-    time: float
+    time: float | Tensor
+    """In [0, 1); a () float64 tensor where it lies on a `recorded.Desk`."""
     camera: Camera
     rgb_u8: Tensor
     """(H, W, 3) uint8."""

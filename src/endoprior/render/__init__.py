@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from ..types import Camera, RenderOutput, Splats
 
-Backend = Literal["cpu", "cuda", "reference"]
+Backend = Literal["cpu", "cuda", "triton", "reference"]
 
 
 class Rasterizer(Protocol):
@@ -35,6 +35,11 @@ class Rasterizer(Protocol):
             ValueError: a shape, a floating type or the number of SH coefficients does not fit.
         """
         ...
+
+
+def never_waits(backend: Backend) -> bool:
+    """Whether the host need not wait for the device while a picture is drawn: then drawing can be recorded."""
+    return backend == "triton"
 
 
 def load(backend: Backend) -> Rasterizer:
