@@ -10,7 +10,7 @@ from render_scenes import camera, draw, splats
 
 from endoprior import render
 
-FAST = [name for name in get_args(render.Backend) if name not in ("reference", "cuda")]  # cuda: test_render_cuda.py
+FAST = [name for name in get_args(render.Backend) if name not in ("reference", "cuda", "triton")]  # they have their own
 
 
 def test_a_fast_backend_is_under_test():
