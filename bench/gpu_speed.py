@@ -25,6 +25,8 @@ from endoprior.types import Camera, Splats
 SIZES = (common.Size(20_000, 640, 512), common.Size(40_000, 640, 512), common.Size(100_000, 640, 512))
 LAPS, WARM_UP = 50, 5
 MOMENT = 0.4
+AT_A_TIME = 16
+"""Pictures drawn in one call."""
 
 
 @dataclass(frozen=True)
@@ -70,13 +72,18 @@ def speed(contest: Contest, sizes: tuple[common.Size, ...], laps: int) -> list[L
     for size in sizes:
         splats, camera = scenes.splats(size)
         on_device = Splats(**{name: getattr(splats, name).to(contest.device) for name in FIELDS})
-        rasterize = partial(render.load(contest.backend), camera=camera, background=torch.zeros(3).to(contest.device))
+        background = torch.zeros(3, device=contest.device)
+        rasterize = partial(render.load(contest.backend), camera=camera, background=background)
         steps = {
             "drawn from kept splats": partial(drawn, rasterize, on_device),
             "drawn and differentiated": both_ways(rasterize, on_device),
         }
         for name in rendering.PRESETS:
             steps[f"deformed ({name}) and drawn"] = deformed(rasterize, name, splats, camera, contest.device)
+        several = [on_device] * AT_A_TIME
+        many = partial(render.load_many(contest.backend), cameras=[camera] * AT_A_TIME, background=background)
+        stage = f"drawn from kept splats, {AT_A_TIME} at a time"
+        found.append(replace(timed(contest, stage, size.num, partial(drawn, many, several), laps), pictures=AT_A_TIME))
         found += [timed(contest, stage, size.num, step, laps) for stage, step in steps.items()]
     return found
 
@@ -95,7 +102,7 @@ def timed(contest: Contest, stage: str, num: int, step: Callable[[], Any], laps:
 
 
 @torch.no_grad()
-def drawn(rasterize: Callable[..., Any], splats: Splats) -> None:
+def drawn(rasterize: Callable[..., Any], splats: Splats | list[Splats]) -> None:
     """Forward only."""
     rasterize(splats)
 

@@ -44,6 +44,14 @@ def test_kept_frames_draw_as_the_scene_does(scene):
     assert not pictures_equal(playback.render(0), playback.render(3))
 
 
+def test_several_frames_at_once_are_the_frames(scene):
+    many = Playback(scene).render_many([3, 0, 4])
+    assert all(pictures_equal(a, scene.render(i / NUM_FRAMES)) for a, i in zip(many, (3, 0, 4), strict=True))
+    times, cameras = [0.1, 0.7], list(scene.cameras[:2])
+    for got, time in zip(scene.render_many(times, cameras), times, strict=True):
+        assert pictures_equal(got, scene.render(time))
+
+
 def test_a_frame_is_deformed_once(scene, monkeypatch):
     asked = []
     original = Scene.at

@@ -34,9 +34,20 @@ CAP, EDGE, STOP = 0.999, 1 / 255, 1e-4
 def fully_fused_projection(
     means, covars, quats, scales, viewmats, Ks, width, height, *, eps2d, near_plane, far_plane, opacities
 ):
-    """(1, N, ...) radii int32 x and y, means2d, depths, conics, None; packed and compensations off."""
-    assert covars is None and viewmats.shape == (1, 4, 4) and Ks.shape == (1, 3, 3) and not opacities.requires_grad
-    view, (fx, fy), (cx, cy) = viewmats[0], Ks[0].diagonal()[:2], Ks[0, :2, 2]
+    """(B, 1, N, ...) radii int32 x and y, means2d, depths, conics, None; packed and compensations off."""
+    moments = len(means)
+    assert covars is None and viewmats.shape == (moments, 1, 4, 4) and Ks.shape == (moments, 1, 3, 3)
+    assert not opacities.requires_grad and opacities.shape == means.shape[:2]
+    each = [
+        project_one(*one_of, width, height, eps2d, near_plane, far_plane)
+        for one_of in zip(means, quats, scales, viewmats[:, 0], Ks[:, 0], opacities, strict=True)
+    ]
+    return *(torch.stack(parts)[:, None] for parts in zip(*each, strict=True)), None
+
+
+def project_one(means, quats, scales, view, k, opacities, width, height, eps2d, near_plane, far_plane):
+    """One camera's part of `fully_fused_projection`."""
+    (fx, fy), (cx, cy) = k.diagonal()[:2], k[:2, 2]
     x, y, z = (means @ view[:3, :3].T + view[:3, 3]).unbind(-1)
     ahead = (z >= near_plane)[:, None]
     quats, scales = torch.where(ahead, quats, 1.0), torch.where(ahead, scales, 1.0)
@@ -59,68 +70,80 @@ def fully_fused_projection(
     unwritten = ~seen[:, None]
     conics = torch.stack([conic[:, 0, 0], conic[:, 0, 1], conic[:, 1, 1]], -1)
     means2d, conics = means2d.masked_fill(unwritten, NAN), conics.masked_fill(unwritten, NAN)
-    return radii[None], means2d[None], z.masked_fill(~seen, NAN)[None], conics[None], None
+    return radii, means2d, z.masked_fill(~seen, NAN), conics
 
 
 def spherical_harmonics(degree, dirs, coeffs, masks=None):
-    """(N, 3) sums; directions need not be unit vectors; rows masked out are never written."""
-    assert masks.dtype == torch.bool and coeffs.shape == (len(dirs), (degree + 1) ** 2, 3)
-    dirs, coeffs = torch.where(masks[:, None], dirs, 1.0), torch.where(masks[:, None, None], coeffs, 0.0)
-    values = harmonics.basis(dirs / dirs.norm(dim=-1, keepdim=True), degree)
-    return (values[:, :, None] * coeffs).sum(1).masked_fill(~masks[:, None], NAN)
+    """(B, N, 3) sums; directions need not be unit vectors; rows masked out are never written."""
+    assert masks.dtype == torch.bool and coeffs.shape == (*dirs.shape[:2], (degree + 1) ** 2, 3)
+    dirs, coeffs = torch.where(masks[..., None], dirs, 1.0), torch.where(masks[..., None, None], coeffs, 0.0)
+    values = harmonics.basis((dirs / dirs.norm(dim=-1, keepdim=True)).flatten(0, 1), degree).view(*coeffs.shape[:3])
+    return (values[..., None] * coeffs).sum(2).masked_fill(~masks[..., None], NAN)
 
 
 @torch.no_grad()
 def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
-    """Tiles per Gaussian (1, N), sorted 64-bit ids (tile, then the bits of z), and the Gaussian of each (P,) int32."""
+    """Tiles per Gaussian (B, N), sorted 64-bit ids (picture, tile, bits of z), and the Gaussian of each (P,) int32."""
     ids, owners = [], []
-    bits = depths[0].contiguous().view(torch.int32).tolist()
-    for n in torch.nonzero((radii[0] > 0).all(-1))[:, 0].tolist():
-        low = ((means2d[0, n] - radii[0, n]) / tile_size).floor().long().clamp(min=0).tolist()
-        high = ((means2d[0, n] + radii[0, n]) / tile_size).ceil().long().tolist()
+    bits, (moments, num) = depths.contiguous().view(torch.int32).tolist(), depths.shape
+    for m, n in torch.nonzero((radii > 0).all(-1)).tolist():
+        low = ((means2d[m, n] - radii[m, n]) / tile_size).floor().long().clamp(min=0).tolist()
+        high = ((means2d[m, n] + radii[m, n]) / tile_size).ceil().long().tolist()
         for row in range(low[1], min(high[1], tile_height)):
             for column in range(low[0], min(high[0], tile_width)):
-                ids.append((row * tile_width + column) << 32 | bits[n])
-                owners.append(n)
+                ids.append(((m * tile_height + row) * tile_width + column) << 32 | bits[m][n])
+                owners.append(m * num + n)
     order = np.argsort(np.array(ids, np.int64), kind="stable")
-    counts = torch.bincount(torch.tensor(owners, dtype=torch.int64), minlength=radii.shape[1]).int()[None]
+    counts = torch.bincount(torch.tensor(owners, dtype=torch.int64), minlength=moments * num).int().view(moments, num)
     return counts, torch.tensor(ids, dtype=torch.int64)[order], torch.tensor(owners, dtype=torch.int32)[order]
 
 
 @torch.no_grad()
 def isect_offset_encode(isect_ids, n_images, tile_width, tile_height):
-    """(1, tile_height, tile_width) int32 where each tile's pairs begin."""
-    tiles = torch.arange(tile_width * tile_height)
+    """(B, tile_height, tile_width) int32 where each tile's pairs begin."""
+    tiles = torch.arange(n_images * tile_width * tile_height)
     return torch.searchsorted(isect_ids >> 32, tiles).int().view(n_images, tile_height, tile_width)
 
 
 def rasterize_to_pixels(
-    means2d, conics, colors, opacities, width, height, tile_size, isect_offsets, flatten_ids, backgrounds
+    means2d, conics, colors, opacities, width, height, tile_size, isect_offsets, flatten_ids, backgrounds=None
 ):
-    """(1, H, W, C) color and (1, H, W, 1) alpha, tile by tile."""
-    channels = colors.shape[-1]
-    assert backgrounds.shape == (1, channels) and means2d.shape[1:] == (colors.shape[1], 2)
-    ends = [*isect_offsets.flatten().tolist(), len(flatten_ids)]
+    """(B, H, W, C) color and (B, H, W, 1) alpha, tile by tile."""
+    channels, (moments, num) = colors.shape[-1], opacities.shape
+    assert backgrounds is None and means2d.shape == (moments, num, 2) and conics.shape == (moments, num, 3)
+    flat = [values.flatten(0, 1) for values in (means2d, conics, colors, opacities)]
+    starts = isect_offsets.flatten(1).tolist()
+    ends = [*(row[0] for row in starts[1:]), len(flatten_ids)]
+    drawn = torch.stack(
+        [
+            pixels_of_one(*flat, width, height, tile_size, isect_offsets.shape[1:], [*row, end], flatten_ids)
+            for row, end in zip(starts, ends, strict=True)
+        ]
+    )
+    return drawn[..., :channels], drawn[..., channels:]
+
+
+def pixels_of_one(means2d, conics, colors, opacities, width, height, tile_size, tiles_yx, ends, flatten_ids):
+    """(H, W, C + 1) color and alpha of one picture."""
     rows = []
-    for row in range(isect_offsets.shape[1]):
+    for row in range(tiles_yx[0]):
         tiles = []
-        for column in range(isect_offsets.shape[2]):
-            tile = row * isect_offsets.shape[2] + column
+        for column in range(tiles_yx[1]):
+            tile = row * tiles_yx[1] + column
             ids = flatten_ids[ends[tile] : ends[tile + 1]].long()
             ys = torch.arange(row * tile_size, min((row + 1) * tile_size, height)) + 0.5
             xs = torch.arange(column * tile_size, min((column + 1) * tile_size, width)) + 0.5
             pixels = torch.stack(torch.meshgrid(xs, ys, indexing="xy"), -1)
-            dx, dy = (means2d[0, ids] - pixels[:, :, None]).unbind(-1)
-            a, b, c = conics[0, ids].unbind(-1)
-            alpha = (opacities[0, ids] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp(max=CAP)
+            dx, dy = (means2d[ids] - pixels[:, :, None]).unbind(-1)
+            a, b, c = conics[ids].unbind(-1)
+            alpha = (opacities[ids] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp(max=CAP)
             alpha = torch.where(alpha >= EDGE, alpha, 0)
             alpha = alpha * (torch.cumprod(1 - alpha.detach(), -1) > STOP)
             left = torch.cumprod(torch.cat([torch.ones(*alpha.shape[:2], 1), 1 - alpha], -1), -1)
-            color = (alpha * left[..., :-1]) @ colors[0, ids] + left[..., -1:] * backgrounds[0]
+            color = (alpha * left[..., :-1]) @ colors[ids]
             tiles.append(torch.cat([color, 1 - left[..., -1:]], -1))
         rows.append(torch.cat(tiles, 1))
-    drawn = torch.cat(rows)[None]
-    return drawn[..., :channels], drawn[..., channels:]
+    return torch.cat(rows)
 
 
 @pytest.fixture
@@ -216,7 +239,7 @@ def test_only_what_reaches_a_pixel_center_counts_as_drawn(cuda, monkeypatch):
     view = camera(seed=None)
     scene = replace(one(view, -3.0, 10.5, 40.0), opacities=torch.tensor([0.12]))
     out = render.load("cuda")(scene, view, background=torch.zeros(3))
-    assert (boxes[0] > 0).all() and out.radii.tolist() == [0] and not out.alpha.any()
+    assert (boxes[0] > 0).all() and boxes[0].shape == (1, 1, 1, 2) and out.radii.tolist() == [0] and not out.alpha.any()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -254,7 +277,23 @@ def test_a_camera_far_from_the_origin_still_has_a_behind(cuda):
     view = camera(seed=None)
     view.world_to_camera[:3, 3] = (3e8, -5e8, 9e8)
     lens = cuda.lens_of(view, torch.device("cpu"))
-    assert torch.addmv(lens.z_shift, lens.behind[None], lens.z_row) < 0
+    assert (lens.behind * lens.z_row).sum() + lens.z_shift < 0
+
+
+def test_several_moments_in_one_call_are_the_pictures_of_each(cuda):
+    views = [camera(seed=seed) for seed in range(3)]
+    scenes = [splats(view, degree=1, seed=seed) for seed, view in enumerate(views)]
+    background = torch.tensor([0.1, 0.2, 0.3])
+    for got, scene, view in zip(cuda.rasterize_many(scenes, views, background=background), scenes, views, strict=True):
+        want = cuda.rasterize(scene, view, background=background)
+        for name in ("color", "alpha", "depth", "means2d", "radii"):
+            torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=1e-5, atol=1e-5)
+    empty = [pick(scene, torch.arange(0)) for scene in scenes]
+    assert len(cuda.rasterize_many(empty, views, background=background)) == 3
+    with pytest.raises(ValueError, match="must agree"):
+        cuda.rasterize_many([scenes[0], pick(scenes[1], torch.arange(5))], views[:2], background=background)
+    with pytest.raises(ValueError, match="must agree"):
+        cuda.rasterize_many(scenes[:2], [views[0], replace(views[1], width=9)], background=background)
 
 
 @pytest.mark.parametrize("num", [0, 3])
@@ -332,7 +371,7 @@ def test_gpu_bench_dry_run_agrees_times_and_writes(tmp_path, monkeypatch, capsys
     assert gpu_bench(monkeypatch).main(options) == 0
     found, printed = json.loads(out.read_text()), capsys.readouterr().out
     assert [g["agrees"] for g in found["gaps"]] == [True, True] and found["facts"]["GPU"].startswith("none")
-    assert len(found["laps"]) == 4 and all(lap["ms"] > 0 for lap in found["laps"])
+    assert len(found["laps"]) == 5 and all(lap["ms"] > 0 for lap in found["laps"])
     columns = {len(block.splitlines()[0].split("|")) for block in printed.split("\n\n")}
     assert len(found["runs"]) == 1 and found["runs"][0]["scores"]["psnr_tissue"] > 5
     assert len(columns) == 4 and all(

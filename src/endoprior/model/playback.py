@@ -57,6 +57,12 @@ class Playback:
         """Draw frame `index`, from `camera` or else from where it was taken. See `Scene.render`."""
         return self._rasterize(self.splats(index), camera or self.scene.cameras[index], background=self._background)
 
+    @torch.no_grad()
+    def render_many(self, indices: list[int]) -> list[RenderOutput]:
+        """Draw several frames from where they were taken. See `Scene.render_many`."""
+        splats, cameras = [self.splats(i) for i in indices], [self.scene.cameras[i] for i in indices]
+        return render.load_many(self.scene.backend)(splats, cameras, background=self._background)
+
 
 def _num_bytes(splats: Splats) -> int:
     tensors = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)

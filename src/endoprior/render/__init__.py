@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Literal, Protocol, get_args
 from ..checks import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from torch import Tensor
 
     from ..types import Camera, RenderOutput, Splats
@@ -35,6 +37,24 @@ class Rasterizer(Protocol):
             ValueError: a shape, a floating type or the number of SH coefficients does not fit.
         """
         ...
+
+
+def load_many(backend: Backend) -> Callable[..., list[RenderOutput]]:
+    """How one backend draws several moments: `many(splats, cameras, *, background)`, lists of equal length.
+
+    The moments must agree in their number of Gaussians and the degree of color, the cameras in size.
+
+    Raises:
+        InputError: as `load`.
+    """
+    rasterize = load(backend)
+    if backend == "cuda":
+        return import_module(".cuda", __package__).rasterize_many
+
+    def one_by_one(splats: list[Splats], cameras: list[Camera], *, background: Tensor) -> list[RenderOutput]:
+        return [rasterize(each, camera, background=background) for each, camera in zip(splats, cameras, strict=True)]
+
+    return one_by_one
 
 
 def never_waits(backend: Backend) -> bool:

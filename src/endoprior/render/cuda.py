@@ -2,7 +2,7 @@
 
 gsplat's separate steps are used and not its `rasterization`: color and z are composited in one pass of four channels,
 the gradient of z can be stopped, and `means2d` is the tensor whose gradient is kept. Its tiles are counted on the
-host, once per picture; nothing here waits for the device besides.
+host, once per call; nothing here waits for the device besides.
 
 Where gsplat 1.5.3 differs from `reference`, read from its sources, and what that means for "agrees within 1e-3":
 
@@ -65,24 +65,24 @@ KEPT_CAMERAS = 1024
 
 
 class Lens(NamedTuple):
-    """A camera's numbers on the device, float32."""
+    """The numbers of one camera of each of `B` moments on the device, float32."""
 
     viewmats: Tensor
-    """(1, 4, 4) world to camera."""
+    """(B, 1, 4, 4) world to camera."""
     Ks: Tensor
-    """(1, 3, 3) intrinsics, px."""
+    """(B, 1, 3, 3) intrinsics, px."""
     center: Tensor
-    """(3,) position in the world, mm."""
+    """(B, 1, 3) position in the world, mm."""
     behind: Tensor
-    """(3,) a point behind it: what lies there is culled."""
+    """(B, 1, 3) a point behind it: what lies there is culled."""
     z_row: Tensor
-    """(3,) the z axis in the world, and"""
+    """(B, 1, 3) the z axis in the world, and"""
     z_shift: Tensor
-    """(1,) z of the world's origin, mm: z = means @ z_row + z_shift."""
+    """(B, 1) z of the world's origin, mm: z = means . z_row + z_shift."""
     last_pixel: Tensor
-    """(2,) center of the last pixel, px."""
-    widest: float
-    """Of a Gaussian, standard deviation / z at which its footprint could be LARGEST_SIGMA wide."""
+    """(B, 1, 2) center of the last pixel, px."""
+    widest: Tensor
+    """(B, 1) of a Gaussian, standard deviation / z at which its footprint could be LARGEST_SIGMA wide."""
 
 
 def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_to_means: bool = True) -> RenderOutput:
@@ -92,49 +92,81 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
         ValueError: the input is not float32 on one CUDA device, or its shapes disagree.
         InputError: gsplat could not build its kernels.
     """
-    degree = check(splats, background)
-    _check_device(splats, background)
-    if not len(splats):
-        return _nothing(splats, camera, background)
+    (out,) = rasterize_many([splats], [camera], background=background, depth_grad_to_means=depth_grad_to_means)
+    return out
+
+
+def rasterize_many(
+    splats: list[Splats], cameras: list[Camera], *, background: Tensor, depth_grad_to_means: bool = True
+) -> list[RenderOutput]:
+    """Draw several moments in one call, for which the host waits once. See `render.load_many`.
+
+    For pictures: gsplat 1.5.3 mixes up the gradients of several moments of fewer than 32 Gaussians.
+
+    Raises:
+        ValueError: as `rasterize`, or the moments differ in their number of Gaussians, or cameras in size.
+    """
+    degrees = {check(each, background) for each in splats}
+    alike = degrees, {len(each) for each in splats}, {(camera.width, camera.height) for camera in cameras}
+    if any(len(found) != 1 for found in alike) or len(splats) != len(cameras):
+        raise ValueError("moments drawn in one call must agree in Gaussians, degree of color and size of picture")
+    for each in splats:
+        _check_device(each, background)
+    if not len(splats[0]):
+        return [_nothing(*each, background) for each in zip(splats, cameras, strict=True)]
     _build_kernels()
-    lens = lens_of(camera, splats.means.device)
-    means = torch.where(_usable(splats, lens)[:, None], splats.means, lens.behind)
-    boxes, means2d, depths, conics, _ = gsplat.fully_fused_projection(
+    return _draw(splats, cameras, background, degrees.pop(), depth_grad_to_means)
+
+
+def _draw(
+    splats: list[Splats], cameras: list[Camera], background: Tensor, degree: int, depth_grad_to_means: bool
+) -> list[RenderOutput]:
+    """`B` moments of `N` Gaussians, seen by one camera each."""
+    moments, width, height = len(splats), cameras[0].width, cameras[0].height
+    all_means, quats, scales, opacities, coefficients = (torch.stack([getattr(s, n) for s in splats]) for n in FIELDS)
+    together = Splats(all_means, quats, scales, opacities, coefficients)
+    lens = _together([lens_of(camera, background.device) for camera in cameras])
+    means = torch.where(_usable(together, lens)[..., None], all_means, lens.behind)
+    found = gsplat.fully_fused_projection(
         means,
         None,
-        splats.quats,
-        splats.scales,
+        quats,
+        scales,
         lens.viewmats,
         lens.Ks,
-        camera.width,
-        camera.height,
+        width,
+        height,
         eps2d=BLUR_PX2,
         near_plane=NEAR_PLANE,
         far_plane=OVERFLOW,
-        opacities=splats.opacities.detach(),
+        opacities=opacities.detach(),
     )
-    kept = (boxes[0] > 0).all(-1)  # rows of the others were never written
-    means2d = torch.where(kept[:, None], means2d[0], 0)
-    sh = gsplat.spherical_harmonics(degree, means - lens.center, splats.sh, masks=kept)
+    boxes, centers, depths, conics = (each.squeeze(1) for each in found[:4])  # of the one camera of each moment
+    kept = (boxes > 0).all(-1)  # rows of the others were never written
+    # Of each picture a tensor of its own, whose gradient can be kept.
+    means2d = [torch.where(k[:, None], c, 0) for k, c in zip(kept, centers, strict=True)]
+    centers = torch.stack(means2d)
+    sh = gsplat.spherical_harmonics(degree, means - lens.center, coefficients, masks=kept)
     z = depths if depth_grad_to_means else depths.detach()
-    channels = torch.cat([(sh + 0.5).clamp(min=0)[None], z[..., None]], -1)
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    _, pairs, pair_ids = gsplat.isect_tiles(means2d[None], boxes, depths, TILE, tiles_x, tiles_y)
+    channels = torch.cat([(sh + 0.5).clamp(min=0), z[..., None]], -1)
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    _, pairs, pair_ids = gsplat.isect_tiles(centers, boxes, depths, TILE, tiles_x, tiles_y)
     drawn, alpha = gsplat.rasterize_to_pixels(
-        means2d[None],
+        centers,
         conics,
         channels,
-        splats.opacities[None],
-        camera.width,
-        camera.height,
+        opacities,
+        width,
+        height,
         TILE,
-        gsplat.isect_offset_encode(pairs, 1, tiles_x, tiles_y),
+        gsplat.isect_offset_encode(pairs, moments, tiles_x, tiles_y),
         pair_ids,
-        backgrounds=torch.nn.functional.pad(background, (0, 1))[None],
     )
-    color, depth = drawn[0].split([3, 1], -1)
-    radii = _radii(means2d, conics[0], splats.opacities, kept, lens)
-    return RenderOutput(color, alpha[0, ..., 0], depth[..., 0], means2d, radii)
+    color, depth = drawn.split([3, 1], -1)
+    color = color + (1 - alpha) * background  # given to gsplat, its backward pass reads it at every Gaussian of a pixel
+    radii = _radii(centers, conics, opacities, kept, lens)
+    pictures = zip(color, alpha[..., 0], depth[..., 0], means2d, radii, strict=True)
+    return [RenderOutput(*picture) for picture in pictures]
 
 
 def lens_of(camera: Camera, device: torch.device) -> Lens:
@@ -155,18 +187,24 @@ def _lens(
     steepest = max(fx * np.hypot(1, slope_x), fy * np.hypot(1, slope_y))
     away = 1 + 1e-3 * np.linalg.norm(camera.center)  # mm; more than float32 rounds off
     parts = {
-        "viewmats": view.reshape(1, 4, 4),
-        "Ks": np.array([[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]]),
-        "center": camera.center,
-        "behind": camera.center - away * view[2, :3],
-        "z_row": view[2, :3],
-        "z_shift": view[2, 3:],
-        "last_pixel": np.array([width - 0.5, height - 0.5]),
+        "viewmats": view.reshape(1, 1, 4, 4),
+        "Ks": np.array([[[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]]]),
+        "center": camera.center[None, None],
+        "behind": (camera.center - away * view[2, :3])[None, None],
+        "z_row": view[None, 2:3, :3],
+        "z_shift": view[2:3, 3:],
+        "last_pixel": np.array([[[width - 0.5, height - 0.5]]]),
+        "widest": np.array([[LARGEST_SIGMA / steepest]]),
     }
     packed = torch.from_numpy(np.concatenate([part.ravel() for part in parts.values()]).astype(np.float32)).to(device)
     pieces = packed.split([part.size for part in parts.values()])
     tensors = {name: piece.view(part.shape) for (name, part), piece in zip(parts.items(), pieces, strict=True)}
-    return Lens(**tensors, widest=float(LARGEST_SIGMA / steepest))
+    return Lens(**tensors)
+
+
+def _together(lenses: list[Lens]) -> Lens:
+    """The lenses of several moments as one."""
+    return lenses[0] if len(lenses) == 1 else Lens(*map(torch.cat, zip(*lenses, strict=True)))
 
 
 def _check_device(splats: Splats, background: Tensor) -> None:
@@ -184,7 +222,7 @@ def _build_kernels() -> None:
     """Have gsplat build its kernels, which takes minutes the first time, or say in one line why it cannot."""
     try:
         from gsplat.cuda._backend import _C as kernels
-    except (ImportError, OSError, RuntimeError) as error:
+    except (ImportError, IndexError, OSError, RuntimeError) as error:  # IndexError: no GPU to compile for
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise InputError(f"backend: gsplat could not build its CUDA kernels ({reason}). {NEXT_STEP}") from error
     if kernels is None:
@@ -203,12 +241,12 @@ def _nothing(splats: Splats, camera: Camera, background: Tensor) -> RenderOutput
 
 @torch.no_grad()
 def _usable(splats: Splats, lens: Lens) -> Tensor:
-    """(N,) False where a number is not finite or could become so; written with `<`, which is False for NaN."""
-    numbers = torch.cat([splats.means, splats.quats, splats.scales, splats.opacities[:, None]], -1)
-    z = torch.addmv(lens.z_shift, splats.means, lens.z_row)
+    """(B, N) False where a number is not finite or could become so; written with `<`, which is False for NaN."""
+    numbers = torch.cat([splats.means, splats.quats, splats.scales, splats.opacities[..., None]], -1)
+    z = (splats.means * lens.z_row).sum(-1) + lens.z_shift
     return (
         (numbers.abs() < LARGEST).all(-1)
-        & (splats.sh.abs() < LARGEST_SH).flatten(1).all(-1)
+        & (splats.sh.abs() < LARGEST_SH).flatten(2).all(-1)
         & (splats.quats.norm(dim=-1) >= MIN_QUAT)
         & (splats.scales.amax(-1) < lens.widest * z)
     )
@@ -216,13 +254,13 @@ def _usable(splats: Splats, lens: Lens) -> Tensor:
 
 @torch.no_grad()
 def _radii(means2d: Tensor, conics: Tensor, opacities: Tensor, kept: Tensor, lens: Lens) -> Tensor:
-    """(N,) int32 as in `projection`: ceil(3 sigma_max), and 0 unless the footprint's box holds a pixel center."""
-    a, b, c = torch.where(kept[:, None], conics, 1).unbind(-1)
+    """(B, N) int32 as in `projection`: ceil(3 sigma_max), and 0 unless the footprint's box holds a pixel center."""
+    a, b, c = torch.where(kept[..., None], conics, 1).unbind(-1)
     det = (a * c - b * b).clamp(min=torch.finfo(a.dtype).tiny)
     xx, yy = c / det, a / det
     long_axis = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), b / det)
     reach = (2 * torch.log((opacities / ALPHA_MIN).clamp(min=1))).sqrt()
-    box = reach[:, None] * torch.stack([xx, yy], -1).sqrt()
+    box = reach[..., None] * torch.stack([xx, yy], -1).sqrt()
     touches = ((means2d + box >= 0.5) & (means2d - box <= lens.last_pixel)).all(-1)
     radii = (3 * long_axis.sqrt()).ceil().clamp(max=2**30).to(torch.int32)
     return torch.where(kept & touches & (opacities >= ALPHA_MIN), radii, 0)
