@@ -22,6 +22,8 @@ NEIGHBOR_CHUNK = 4096
 MIN_WEIGHT = 1e-4
 """Motion weights up to this are treated as zero (released code)."""
 
+SAMPLE_STEPS = 2**30
+"""Into which a weight of 1 is divided to add it up off the CPU."""
 RELAX_TRIES, RELAX_THRESHOLD_STEP, RELAX_TEMPERATURE_FACTOR = 8, 0.05, 1.5
 RELAX_THRESHOLD_FLOOR, RELAX_TEMPERATURE_CAP = 0.25, 0.30
 
@@ -139,7 +141,8 @@ def relaxed_definition(score: Tensor, cfg: TemporalConfig) -> Tensor:
 def systematic_definition(weights: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """`systematic_sample` in plain torch, on any device: always `count` < N indices, and which of them are taken."""
     positive = weights > 0
-    cumulative = weights.double().cumsum(0)
+    # Whole numbers: on a GPU sums of others depend on who comes first, and with them who is chosen.
+    cumulative = (weights.double() * SAMPLE_STEPS).round().to(torch.int64).cumsum(0).double()
     marks = (torch.arange(count, device=weights.device) + 0.5) / count * cumulative[-1]
     index = torch.searchsorted(cumulative, marks).clamp(max=len(weights) - 1)
     first = torch.ones_like(index[:1], dtype=torch.bool)

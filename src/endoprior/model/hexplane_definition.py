@@ -143,9 +143,10 @@ class _Sums(torch.autograd.Function):
     def backward(ctx: Any, v_found: Tensor) -> tuple[Tensor, None, Tensor | None, None]:
         weights, rows, source = ctx.saved_tensors
         v_weights = torch.bmm(source[rows], v_found[..., None])[..., 0]
-        v_rows = (weights[..., None] * v_found[:, None]).flatten(0, 1)
+        # Rows are sorted before they are added up, so that on a GPU equal input gives equal bits.
+        adding = {"values": (weights[..., None] * v_found[:, None]).flatten(0, 1), "accumulate": True}
         if ctx.grid is None:
-            return v_weights, None, torch.zeros_like(source).index_add_(0, rows.flatten(), v_rows), None
-        ctx.grid.grads.index_add_(0, rows.flatten(), v_rows)
+            return v_weights, None, torch.zeros_like(source).index_put_((rows.flatten(),), **adding), None
+        ctx.grid.grads.index_put_((rows.flatten(),), **adding)
         ctx.grid.marks.fill_(TOUCHED | FRESH)
         return v_weights, None, None, None
