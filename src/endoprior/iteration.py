@@ -7,6 +7,7 @@ nothing asks for a value.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,8 @@ from .types import RenderOutput
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+KEPT_POSES = 1024
 
 
 @dataclass(frozen=True)
@@ -152,10 +155,16 @@ def on_tissue(points: Tensor, frame: TrainingFrame) -> Tensor:
     """(P,) bool: whether world points (P, 3) mm project in front of the camera, into the image, onto tissue."""
     if not compiled(points):
         camera = frame.camera
-        view = torch.from_numpy(camera.world_to_camera.astype(np.float32)).to(points.device, non_blocking=True)
+        view = _pose_on(camera.world_to_camera.astype(np.float32).tobytes(), points.device)
         x, y, z = (points @ view[:3, :3].T + view[:3, 3]).unbind(-1)
         means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
         return density.valid_projection(means2d, (z > 0).int(), frame.tissue_mask)
     pixels, z = project(points.numpy(), frame.camera)
     means2d, in_front = torch.from_numpy(pixels.astype(np.float32)), torch.from_numpy(z > 0).int()
     return density.valid_projection(means2d, in_front, frame.tissue_mask)
+
+
+@lru_cache(maxsize=KEPT_POSES)
+def _pose_on(pose: bytes, device: torch.device) -> Tensor:
+    """(4, 4) float32 world to camera on a device: copied there once."""
+    return torch.from_numpy(np.frombuffer(pose, np.float32).reshape(4, 4).copy()).to(device)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from pathlib import PurePath
+from pathlib import PurePath, PurePosixPath
 
 from .records import Facts, number
 
@@ -12,6 +12,8 @@ LEAST_CAPABILITY = (7, 0)
 """gsplat uses cooperative groups by label, which older cards lack."""
 LEAST_TORCH = (2, 4)
 LEAST_GSPLAT = (1, 5, 3)
+LEAST_GCC_FOR_13 = 10
+"""With CUDA 13 torch compiles extensions as C++20."""
 NVCC_FOR = {
     (8, 0): (11, 0), (8, 6): (11, 1), (8, 7): (11, 5), (8, 9): (11, 8), (9, 0): (11, 8), (10, 0): (12, 8),
     (10, 3): (12, 9), (12, 0): (12, 8), (12, 1): (12, 9),
@@ -94,10 +96,27 @@ def install_toolkit(facts: Facts) -> str:
         return set_variable(facts, "CUDA_HOME", other)
     if facts.system.name == "Windows":
         return f"winget install Nvidia.CUDA --version {version}"
+    if wanted[:1] == (13,):  # the wheels for 12 lie in a folder each, where torch finds nothing
+        return pip_toolkit(facts, version)
     if facts.system.packages == "apt-get":
         name = f"cuda-toolkit-{version.replace('.', '-')}"
         return f"sudo apt-get install {name} (from NVIDIA's packages: https://developer.nvidia.com/cuda-downloads)"
     return f"install the CUDA toolkit {version} from https://developer.nvidia.com/cuda-toolkit-archive"
+
+
+def pip_toolkit(facts: Facts, version: str) -> str:
+    """How to get a toolkit without root: NVIDIA's wheels beside those that torch brings, all of one minor version.
+
+    Nvcc's wheel named alone would bring a newer one than the headers that are there.
+    """
+    install = f"pip install 'cuda-toolkit[nvcc,cccl]=={version}.*'"
+    return f"{install} && {set_variable(facts, 'CUDA_HOME', facts.toolkit.pip)}" if facts.toolkit.pip else install
+
+
+def link_cudart(facts: Facts) -> str:
+    """How to give the linker the name it looks for, which wheels leave out."""
+    folder = PurePosixPath(facts.toolkit.libraries)
+    return f"ln -sf {shlex.quote(facts.toolkit.cudart_name)} {shlex.quote(str(folder / 'libcudart.so'))}"
 
 
 def fitting_toolkit(facts: Facts) -> str:
@@ -131,17 +150,16 @@ def install_compiler(facts: Facts) -> str:
     return f"sudo {manager} {names[manager]}" if manager in names else "install g++"
 
 
-def older_compiler(facts: Facts, too_new: int) -> str:
-    """How to use a gcc older than `too_new`: one that is here, or one to install."""
-    here = [major for major in facts.builders.other_gcc if major < too_new]
+def other_compiler(facts: Facts, least: int, too_new: int) -> str:
+    """How to use a gcc of at least `least` and below `too_new`: one that is here, or one to install."""
+    here = [major for major in facts.builders.other_gcc if least <= major < too_new]
     major = max(here, default=too_new - 1)
     use = f"export CC=gcc-{major} CXX=g++-{major}"
     if here:
         return use
-    manager = facts.system.packages
-    return (
-        f"sudo {manager} install g++-{major} && {use}" if manager == "apt-get" else f"install g++ {major}, then {use}"
-    )
+    if facts.system.packages == "apt-get":
+        return f"sudo apt-get install g++-{major} && {use}"
+    return f"install g++ {major}, then {use}"
 
 
 def install_python_headers(facts: Facts) -> str:
@@ -152,6 +170,36 @@ def install_python_headers(facts: Facts) -> str:
     if facts.system.packages == "dnf":
         return f"sudo dnf install python{short}-devel"
     return f"install the headers of Python {short}, or use a Python that has them"
+
+
+def install_triton(facts: Facts, again: bool = False) -> str:
+    """How to get the Triton that torch was built with; "" where torch has none, which is on Windows.
+
+    Args:
+        again: it is there, and does not work.
+    """
+    if facts.system.name != "Linux":
+        return ""
+    if not facts.torch.cuda:
+        return install_torch(facts) or install_driver(facts)
+    return f"pip install{' --force-reinstall --no-deps' * again} {shlex.quote(facts.triton.wanted or 'triton')}"
+
+
+def interprets(facts: Facts) -> bool:
+    """Whether Triton was told to interpret kernels on the CPU."""
+    return facts.variables.get("TRITON_INTERPRET", "").lower() in ("1", "true", "yes", "on", "y")
+
+
+def mend_triton(facts: Facts) -> str:
+    """What to do about a Triton that is there and did not compute, by what it said."""
+    error = facts.triton.error
+    if "libcuda" in error:
+        return "sudo ldconfig; if that is not enough, export TRITON_LIBCUDA_PATH=(the folder of libcuda.so.1)"
+    if "fatal error" in error:  # the compiler's words: it lacks the headers of C
+        return install_compiler(facts)
+    if any(words in error for words in ("Permission denied", "Read-only", "No space")):
+        return 'export TRITON_CACHE_DIR="$(mktemp -d)"'
+    return install_triton(facts, again=True) or "endoprior doctor"
 
 
 def set_variable(facts: Facts, name: str, value: str) -> str:

@@ -33,7 +33,7 @@ def machine_lines(facts: Facts) -> list[Line]:
 
 def optional_lines(facts: Facts) -> list[Line]:
     """What else a user may wonder about."""
-    lines = [_triton(facts)]
+    lines = []
     for part, (purpose, packages) in PARTS.items():
         absent = [name for name in packages if not facts.packages.get(name)]
         there = ", ".join(f"{name} {facts.packages[name]}" for name in packages if name not in absent)
@@ -44,15 +44,6 @@ def optional_lines(facts: Facts) -> list[Line]:
     lines.append(Line("also", "browser", "ok", "any serves `endoprior view`; Chromium is for the tests only"))
     lines += _variables(facts)
     return lines
-
-
-def _triton(facts: Facts) -> Line:
-    if facts.torch.triton:
-        return Line("also", "triton", "ok", facts.torch.triton)
-    ships = facts.torch.cuda and facts.system.name == "Linux"
-    return Line(
-        "also", "triton", "missing", "comes with torch for CUDA on Linux", "pip install triton" if ships else ""
-    )
 
 
 def _weights(facts: Facts) -> list[Line]:

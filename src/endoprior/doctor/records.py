@@ -90,7 +90,20 @@ class Torch:
     """Folder in which it keeps compiled extensions."""
     host_compilers: dict[str, list[int]] = field(default_factory=dict)
     """Version of nvcc -> first major version of gcc that is too new for it."""
-    triton: str = ""
+
+
+@dataclass(frozen=True)
+class Triton:
+    """What compiles our own kernels for the GPU."""
+
+    version: str = ""
+    """Empty if it cannot be imported where torch is."""
+    wanted: str = ""
+    """The requirement that torch names: "triton==3.7.1"; empty if it names none."""
+    computes: bool | None = None
+    """Whether it added two numbers on the GPU; None if that was not tried."""
+    error: str = ""
+    """Why it cannot be imported, or does not compute."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +121,8 @@ class Gsplat:
     """Why it cannot."""
     compile_seconds: float | None = None
     """Time of `--compile`; None without it."""
+    compiled_by: str = ""
+    """The nvcc that compiled `cached`; with another one it compiles again at its next use."""
 
 
 @dataclass(frozen=True)
@@ -127,12 +142,20 @@ class Toolkit:
     headers_elsewhere: str = ""
     """Folder below `home` that has it instead."""
     others: tuple[tuple[str, str], ...] = ()
-    """Complete toolkits elsewhere: (folder, version)."""
+    """Toolkits elsewhere that have nvcc and headers: (folder, version)."""
+    libraries: str = ""
+    """Folder to which torch sends the linker."""
+    cudart: bool = False
+    """Whether the linker finds libcudart.so, there or by itself."""
+    cudart_name: str = ""
+    """The library in `libraries` under its full name: "libcudart.so.13"."""
+    pip: str = ""
+    """Folder of NVIDIA's packages for CUDA 13 in this Python, which pip can make a toolkit."""
 
 
 @dataclass(frozen=True)
 class Builders:
-    """What compiles C++."""
+    """What compiles C++ and C."""
 
     compiler: str = ""
     """The command: CXX, c++, or cl."""
@@ -141,6 +164,10 @@ class Builders:
     compiler_error: str = ""
     other_gcc: tuple[int, ...] = ()
     """Major versions N of commands g++-N."""
+    c_compiler: str = ""
+    """The command that Triton takes: CC, gcc or clang."""
+    c_version: str = ""
+    c_error: str = ""
     ninja: str = ""
     ninja_beside_python: str = ""
     """Folder of a ninja that is installed, but not on PATH."""
@@ -154,6 +181,7 @@ class Facts:
     system: System = field(default_factory=System)
     driver: Driver = field(default_factory=Driver)
     torch: Torch = field(default_factory=Torch)
+    triton: Triton = field(default_factory=Triton)
     gsplat: Gsplat = field(default_factory=Gsplat)
     toolkit: Toolkit = field(default_factory=Toolkit)
     builders: Builders = field(default_factory=Builders)
