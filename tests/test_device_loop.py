@@ -128,6 +128,34 @@ def test_the_last_iteration_and_a_checkpoint_are_not_taken_on_trust(tiny_sequenc
     assert trainer.state.iteration == 0
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("saved", [False, True])
+def test_iterations_that_lacked_room_are_done_again(tiny_sequence, kind, saved, on_definitions):
+    """To the same bits as if there had been room: nothing of them is kept, whenever the host looks."""
+    cfg, states = quiet(tiny_config(kind, coarse=0, fine=30)), []
+    for short in (False, True):
+        trainer = Trainer(load_sequence(tiny_sequence), cfg)
+        trainer.start()
+        room = {"lacks": short, "made": 0}
+
+        def make_room(device, room=room):
+            room["made"] += 1
+            room["lacks"] = False
+
+        trainer._make_room = make_room
+        trainer._work.work.incomplete = lambda room=room, t=trainer: torch.tensor(
+            room["lacks"] and t.state.iteration >= 6
+        )
+        done = []
+        while not trainer.finished:
+            done.append(trainer.step().iteration)
+            if saved and done[-1] == 9:
+                trainer.settle()
+        states.append(state_of(trainer))
+        assert room["made"] == short and (done == list(range(1, 31))) is not short
+    assert all(torch.equal(states[0][name], value) for name, value in states[1].items())
+
+
 @pytest.mark.parametrize("frozen", [0.0, 1.0])
 def test_a_frozen_step_changes_nothing(frozen):
     generator = torch.Generator().manual_seed(0)

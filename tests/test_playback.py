@@ -84,3 +84,15 @@ def test_another_camera_and_no_such_frame(scene):
     assert playback.render(2, wide).color.shape == (48, 80, 3)
     with pytest.raises(IndexError, match=r"0\.\.4"):
         playback.render(NUM_FRAMES)
+
+
+@pytest.mark.parametrize(
+    "trained, asked, on_gpu, want",
+    [("cpu", None, False, "cpu"), ("cpu", None, True, "cuda"), ("cpu", "triton", True, "triton"),
+     ("triton", None, True, "triton"), ("triton", None, False, "cpu"), ("reference", None, False, "reference"),
+     ("cuda", "triton", True, "triton"), ("cuda", "triton", False, "cpu")],
+)  # fmt: skip
+def test_what_draws_a_scene_fits_its_device(scene, trained, asked, on_gpu, want):
+    config = replace(scene.config, render=replace(scene.config.render, backend=trained))
+    moved = replace(scene, config=config).to("meta" if on_gpu else "cpu", backend=asked)
+    assert moved.backend == want

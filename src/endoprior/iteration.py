@@ -54,9 +54,20 @@ class Work:
     """Does one iteration after the other on one state."""
 
     def __init__(
-        self, cfg: Config, rasterize: Callable[..., RenderOutput], background: Tensor, inspector: Inspector
+        self,
+        cfg: Config,
+        rasterize: Callable[..., RenderOutput],
+        background: Tensor,
+        inspector: Inspector,
+        incomplete: Callable[[], Tensor] | None = None,
     ) -> None:
+        """Prepare to work.
+
+        Args:
+            incomplete: says on the device whether a picture must be drawn again; None: never.
+        """
         self.cfg, self.rasterize, self.background, self.inspector = cfg, rasterize, background, inspector
+        self.incomplete = incomplete
 
     def __call__(self, state: TrainState, task: Task) -> Evidence:
         """Draw, compare, differentiate and update, as far as the evidence allows.
@@ -78,7 +89,8 @@ class Work:
         if task.before is not None:
             terms |= self._temporal_terms(state, task, splats.means, means_before, out)
         sum(terms.values()).backward()
-        evidence = self.inspector.judge(Losses.of(terms), state.optimizer, frame.brightness)
+        incomplete = self.incomplete() if self.incomplete else None
+        evidence = self.inspector.judge(Losses.of(terms), state.optimizer, frame.brightness, incomplete)
         with torch.no_grad():
             self._observe(state, task, out)
             state.optimizer.step(task.iteration, self.inspector.frozen)

@@ -20,6 +20,7 @@ from filelock import FileLock
 
 from .config import Config
 from .config_io import to_dict
+from .render import ON_GPU
 
 PACKAGE = Path(__file__).parent
 LIMIT_S = 900.0
@@ -35,7 +36,7 @@ def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
     Args:
         say: told once if there is something to wait for.
     """
-    if cfg.render.backend == "cuda":  # which needs no kernels of ours
+    if cfg.render.backend in ON_GPU:  # which needs no kernels of ours
         return
     key = _key(cfg)
     if key in _filled:

@@ -7,6 +7,7 @@ Every random choice is a pure function of (seed, stage, iteration), so a resumed
 from __future__ import annotations
 
 import time as clock
+from functools import partial
 
 import numpy as np
 import torch
@@ -42,12 +43,17 @@ class Trainer:
 
     def __init__(self, sequence: Sequence, cfg: Config) -> None:
         self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
-        self.device = torch.device("cuda" if cfg.render.backend == "cuda" else "cpu")
+        self.device = torch.device("cuda" if cfg.render.backend in render.ON_GPU else "cpu")
         self.frames = TrainingFrames(sequence, cfg.prior, self.device)
         background = torch.zeros(3, device=self.device)
         self._inspector = Inspector(self.device, waits=compiled(background))
-        work = Work(self.cfg, render.load(cfg.render.backend), background, self._inspector)
-        self._work = work if compiled(background) else Recorder(work, self.device, self._recording())
+        queued = None if compiled(background) else render.load_queued(cfg.render.backend)
+        rasterize = queued.rasterize if queued else render.load(cfg.render.backend)
+        incomplete = partial(queued.incomplete, self.device) if queued else None
+        work = Work(self.cfg, rasterize, background, self._inspector, incomplete)
+        self._make_room = queued.make_room if queued else None
+        record = GraphRecorder() if queued and recording_wanted() else None
+        self._work = work if compiled(background) else Recorder(work, self.device, record)
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
         try:
             check_cameras(self.cameras)
@@ -55,10 +61,6 @@ class Trainer:
             raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
         self.spatial_scale = spatial_scale(self.camera_centers, cfg)
         self.state: TrainState | None = None
-
-    def _recording(self) -> GraphRecorder | None:
-        """What records the work on a device: a backend that never waits can be, if it is wanted."""
-        return GraphRecorder() if render.never_waits(self.cfg.render.backend) and recording_wanted() else None
 
     @property
     def camera_centers(self) -> Tensor:
@@ -124,6 +126,7 @@ class Trainer:
             raise
         except Redo as news:
             state.iteration -= news.ago
+            self._prepare_again()
             return self.step()
         if crowd_changes:
             with torch.no_grad():
@@ -161,6 +164,13 @@ class Trainer:
             raise
         except Redo as news:
             self.state.iteration -= news.ago + 1
+            self._prepare_again()
+
+    def _prepare_again(self) -> None:
+        """Before iterations that lacked room are done again."""
+        if self._make_room:
+            self._make_room(self.device)
+        self._work.forget()  # a recording keeps the room that it was made with
 
     def _sh_degree(self, iteration: int) -> int:
         """Degree in use: +1 per `sh_every` iterations of each stage, never falling back (method of 3DGS)."""

@@ -22,4 +22,5 @@ def on_device(scene: Scene, wanted: Wanted, *, half_planes: bool = False) -> Sce
     choice = choose_here(wanted)
     if wanted != "cpu":
         say(choice.why)
-    return scene.to(choice.device, half_planes=half_planes and choice.device != "cpu")
+    on_gpu = choice.device != "cpu"
+    return scene.to(choice.device, backend=choice.backend if on_gpu else None, half_planes=half_planes and on_gpu)

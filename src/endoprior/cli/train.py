@@ -62,7 +62,7 @@ def run(argv: list[str]) -> None:
     choice = choose_here(args.device)
     say(choice.why)
     if choice.device == "cuda":
-        cfg = dataclasses.replace(cfg, render=dataclasses.replace(cfg.render, backend="cuda"))
+        cfg = dataclasses.replace(cfg, render=dataclasses.replace(cfg.render, backend=choice.backend))
     if args.weights_dir and not args.weights_dir.is_dir():
         raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
     if args.init_budget is not None:
@@ -98,6 +98,7 @@ def train_and_evaluate(
     """
     from .. import kernel_cache
     from ..data import load_sequence
+    from ..render import ON_GPU
     from ..run_folder import refuse_unusable_folder
     from ..train import train
     from ..training_memory import refuse_too_large
@@ -126,7 +127,7 @@ def train_and_evaluate(
     del sequence  # and with it the frames it keeps: scoring reads its own
     done = _logged_seconds(out / "log.jsonl")
     speed = {"train_seconds": seconds, "iterations_per_second": done}
-    scene = scene.to("cuda" if cfg.render.backend == "cuda" else "cpu")  # where it was trained
+    scene = scene.to("cuda" if cfg.render.backend in ON_GPU else "cpu")  # where it was trained
     try:
         evaluate_run(scene, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
     except KeyboardInterrupt:

@@ -74,6 +74,8 @@ class Scene:
     """(N,) projections that score was averaged over."""
     lengths_are_relative: bool = False
     """Whether the scale of the sequence's depth was assumed: then what is called mm is not mm."""
+    drawn_by: render.Backend | None = None
+    """What draws it; None: what it was trained with, where it can be used."""
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -127,22 +129,29 @@ class Scene:
 
     @property
     def backend(self) -> render.Backend:
-        """What draws it: the backend it was trained with, if its Gaussians lie there; else that of their device."""
-        chosen, on_cpu = self.config.render.backend, self.gaussians["means"].device.type == "cpu"
-        return chosen if on_cpu == (chosen != "cuda") else "cpu" if on_cpu else "cuda"
+        """What draws it: what was asked for, else what it was trained with, if it draws where the Gaussians lie."""
+        on_gpu = self.device.type != "cpu"
+        for backend in (self.drawn_by, self.config.render.backend):
+            if backend is not None and (backend in render.ON_GPU) == on_gpu:
+                return backend
+        return "cuda" if on_gpu else "cpu"
 
-    def to(self, device: torch.device | str, *, half_planes: bool = False) -> Scene:
+    def to(
+        self, device: torch.device | str, *, backend: render.Backend | None = None, half_planes: bool = False
+    ) -> Scene:
         """This scene on a device: what it is asked is computed and drawn there; itself if it is there.
 
         Args:
+            backend: what draws it there; None: what it was trained with, or gsplat on a GPU.
             half_planes: HexPlane in half precision: half the memory and less to read, for pictures; not to be saved.
         """
         gaussians = self.gaussians.to(device)
         field = self.field and self.field.to(device, half_planes=half_planes)
-        if gaussians is self.gaussians and field is self.field:
+        if gaussians is self.gaussians and field is self.field and backend in (None, self.drawn_by):
             return self
         return replace(
             self,
+            drawn_by=backend,
             gaussians=gaussians,
             field=field,
             prior_score=self.prior_score.to(device),

@@ -7,18 +7,22 @@ float32. `cuda` draws on an NVIDIA GPU, through gsplat, float32; what it does ot
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, get_args
 
 from ..checks import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import torch
     from torch import Tensor
 
     from ..types import Camera, RenderOutput, Splats
 
 Backend = Literal["cpu", "cuda", "triton", "reference"]
+
+ON_GPU = ("cuda", "triton")
+"""Backends that draw on an NVIDIA GPU."""
 
 
 class Rasterizer(Protocol):
@@ -57,9 +61,27 @@ def load_many(backend: Backend) -> Callable[..., list[RenderOutput]]:
     return one_by_one
 
 
-def never_waits(backend: Backend) -> bool:
-    """Whether the host need not wait for the device while a picture is drawn: then drawing can be recorded."""
-    return backend == "triton"
+class Queued(NamedTuple):
+    """Drawing for which the host never waits, so that it can run ahead, and record. Room is chosen beforehand."""
+
+    rasterize: Rasterizer
+    """Draws as `load`'s does, but lacks the farthest Gaussians where there is no room for all."""
+    incomplete: Callable[[torch.device], Tensor]
+    """() bool on the device: whether a picture lacked some since `make_room` was asked."""
+    make_room: Callable[[torch.device], bool]
+    """Wait, see to it that such a picture will be whole when it is drawn again; whether there was one."""
+
+
+def load_queued(backend: Backend) -> Queued | None:
+    """How a backend draws without the host waiting; None if it cannot.
+
+    Raises:
+        InputError: as `load`.
+    """
+    if backend != "triton":
+        return None
+    load(backend)
+    return import_module(".triton", __package__).QUEUED
 
 
 def load(backend: Backend) -> Rasterizer:
