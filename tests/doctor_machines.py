@@ -5,7 +5,7 @@ from dataclasses import replace
 from hypothesis import strategies as st
 
 from endoprior.doctor import Facts
-from endoprior.doctor.records import Builders, Driver, Gpu, Gsplat, System, Toolkit, Torch
+from endoprior.doctor.records import Builders, Driver, Gpu, Gsplat, System, Toolkit, Torch, Triton
 
 H200 = Gpu("NVIDIA H200", (9, 0), 139.0, True)
 NEW_CARD = Gpu("NVIDIA B200", (10, 0), 180.0, True)
@@ -16,11 +16,18 @@ WORKING = Facts(
     torch=Torch(
         "2.13.0+cu130", "13.0", available=True, gpus=(H200,), extensions="cache", host_compilers={"13.0": [16]}
     ),
+    triton=Triton("3.7.1", "triton==3.7.1", True),
     gsplat=Gsplat("1.5.3", cached="cache/gsplat_cuda/gsplat_cuda.so", loads=True),
-    toolkit=Toolkit("/usr/local/cuda", "default", "13.0", "", True),
-    builders=Builders("c++", "12.2.0", True, ninja="1.11.1", python_headers=True),
+    toolkit=Toolkit("/usr/local/cuda", "default", "13.0", "", True, libraries="/usr/local/cuda/lib64", cudart=True),
+    builders=Builders("c++", "12.2.0", True, c_compiler="gcc", c_version="12.2.0", ninja="1.11", python_headers=True),
 )
 """A machine with everything."""
+NO_TRITON = replace(WORKING, triton=Triton("3.7.1", "triton==3.7.1", False, "RuntimeError"), system=System("Windows"))
+"""The same, but Triton does not work there, and nothing mends it soon: the way leads through gsplat."""
+ONLY_TRITON = replace(WORKING, gsplat=Gsplat(), toolkit=Toolkit(pip="/venv/nvidia/cu13"))
+"""As `pip install endoprior` leaves a machine with a driver and torch for CUDA: no gsplat, no toolkit."""
+NO_GPU = replace(WORKING, driver=Driver(0), torch=Torch("2.13.0+cu130", "13.0", available=False, reason="no driver"))
+"""Where an image is built."""
 CHOICES = {
     "system": [System(), System(name="Windows"), System(name="Darwin"), System(container=True, packages="apt-get")],
     "driver": [
@@ -39,24 +46,33 @@ CHOICES = {
         Torch("2.13.0", "13.0", available=True), Torch("2.13.0", "13.0", error="python gave no answer in 90 s"),
         Torch("2.13.0", "13.0", available=True, gpus=(OLD_CARD, H200)),
     ],
+    "triton": [
+        Triton(), WORKING.triton, Triton("3.7.1"), Triton(wanted="triton==3.7.1", error="undefined symbol"),
+        Triton("3.7.1", "triton==3.7.1", False, "libcuda.so cannot found!"), Triton("3.7.1", computes=False),
+        Triton("3.7.1", "triton==3.7.1", False, "cuda_utils.c:5:10: fatal error: stdio.h: No such file"),
+        Triton("3.7.1", "", False, "[Errno 13] Permission denied: '/.triton'"),
+    ],
     "gsplat": [
         Gsplat(), Gsplat("1.5.2"), Gsplat("1.5.3"), WORKING.gsplat, Gsplat("1.5.3", prebuilt="csrc.so", loads=True),
         Gsplat("1.5.3", prebuilt="csrc.so", loads=False, error="undefined symbol"),
         replace(WORKING.gsplat, loads=False, error="undefined symbol"), Gsplat("1.5.3", loads=False, error="nvcc died"),
+        replace(WORKING.gsplat, compiled_by="/cuda/bin/nvcc"), replace(WORKING.gsplat, current=False),
     ],
     "toolkit": [
-        Toolkit(), WORKING.toolkit,
+        Toolkit(), WORKING.toolkit, Toolkit(pip="/venv/nvidia/cu13"),
         Toolkit("/usr/local", "PATH", "13.0", "", False, "", (("/usr/local/cuda-13.0", "13.0"),)),
-        Toolkit("/usr", "PATH", "11.5", "", True),
-        Toolkit("/usr", "PATH", "12.0", "", True, "", (("/opt/cuda-13.0", "13.0"),)),
-        Toolkit("/gone", "CUDA_HOME", "", "no /gone/bin/nvcc"),
+        Toolkit("/usr", "PATH", "11.5", "", True, libraries="/usr/lib64"), Toolkit("/usr", "PATH", "12.8", "", True),
+        Toolkit("/usr", "PATH", "12.0", "", True, "", (("/opt/cuda-13.0", "13.0"),), cudart=True),
+        Toolkit("/gone", "CUDA_HOME", "", "no /gone/bin/nvcc"), Toolkit("/p", "CUDA_HOME", "", "no nvcc", pip="/p"),
         Toolkit("/c", "PATH", "13.1", "", False, "/c/targets/x/include"),
-        Toolkit("/usr", "PATH", "12.8", "", True),
+        Toolkit("/p", "CUDA_HOME", "13.0", "", True, libraries="/p/lib", cudart_name="libcudart.so.13", pip="/p"),
     ],
     "builders": [
         Builders(), WORKING.builders, Builders("g++", "13.1", True),
-        Builders("c++", "16.1.0", True, other_gcc=(13,), ninja="1.11", python_headers=True),
+        Builders("c++", "16.1.0", True, "", (13,), "gcc", "16.1.0", ninja="1.11", python_headers=True),
+        Builders("c++", "9.4.0", True, "", (), "gcc", "9.4.0", ninja="1.11", python_headers=True),
         Builders("c++", "13.1.0", True, ninja_beside_python="/venv/bin", python_headers=True),
+        Builders("g++", "13.1", True, c_compiler="ccache gcc", c_error="no ccache gcc on PATH", python_headers=True),
     ],
 }  # fmt: skip
 

@@ -5,49 +5,66 @@ import json
 from dataclasses import replace
 
 import pytest
-from doctor_machines import CHOICES, H200, OLD_CARD, WORKING, machines
+from doctor_machines import CHOICES, H200, NO_TRITON, OLD_CARD, WORKING, machines
 from hypothesis import given
 
 from endoprior import device
 from endoprior.checks import InputError
 from endoprior.cli import main
 from endoprior.doctor import Facts, examine, mend
-from endoprior.doctor import facts as facts_module
-from endoprior.doctor.records import Driver, Gpu, Gsplat, System, Toolkit, Torch, number
+from endoprior.doctor.records import Driver, Gpu, Gsplat, System, Toolkit, Torch, Triton, number
 
 
 def check_advice(facts: Facts) -> None:
     """What holds for every machine."""
     report = examine(facts)
     chain = [line for line in report.lines if line.part == "cuda"]
-    assert len({line.name for line in report.lines}) == len(report.lines) and len(chain) == 13
-    assert report.works == all(line.state == "ok" for line in chain) == (report.blocking is None)
-    assert report.next_step and "\n" not in report.next_step
+    ways = {part: [line for line in report.lines if line.part == part] for part in ("triton", "gsplat")}
+    assert len({line.name for line in report.lines}) == len(report.lines)
+    assert (len(chain), *map(len, ways.values())) == (6, 3, 7)
+    right = {part: all(line.state == "ok" for line in (*chain, *lines)) for part, lines in ways.items()}
+    assert report.triton == right["triton"]
+    assert report.gsplat == (right["gsplat"] and (facts.builders.python_headers or bool(facts.gsplat.prebuilt)))
+    assert report.works == (report.triton or report.gsplat) == (report.blocking is None)
+    assert report.next_step and "\n" not in report.next_step + report.hinders_compiling
     for line in report.lines:
         assert line.found and line.state in ("ok", "missing", "wrong")
         assert not line.mend or line.state != "ok", "what is right is not mended"
+    check_ways(report.works, ways)
     if report.works:
-        assert report.next_step == "nothing: CUDA works"
+        assert report.next_step.startswith("nothing: CUDA works, by ")
         return
-    first = next(line for line in chain if line.state != "ok")
-    assert report.blocking == first
+    first = report.blocking
+    assert first == next((line for line in chain if line.state != "ok"), first) and first in report.lines
     hopeless = first.name in ("system", "GPU")
     if not first.mend:
-        assert hopeless and not any(line.mend for line in chain), "nothing is recommended that would not help"
+        assert hopeless and not any(line.mend for line in (*chain, *ways["triton"], *ways["gsplat"]))
         return
     assert report.next_step == first.mend
     torch_there = f"/cu{facts.torch.cuda.replace('.', '')}"
     if f"whl{torch_there}" in first.mend and facts.torch.cuda:
         assert facts.torch.error or number(facts.torch.version) < (2, 4), "the same build again would change nothing"
-    if "cuda-toolkit-" in first.mend and facts.toolkit.nvcc:
-        installs = f"cuda-toolkit-{facts.toolkit.nvcc.replace('.', '-')}"
-        assert installs not in first.mend or not facts.toolkit.headers
+    if "cuda-toolkit" in first.mend and facts.toolkit.nvcc:
+        installs = (f"cuda-toolkit-{facts.toolkit.nvcc.replace('.', '-')}", f"=={facts.toolkit.nvcc}.*")
+        assert not any(name in first.mend for name in installs) or not facts.toolkit.headers or not facts.toolkit.cudart
     if "pip install 'endoprior[cuda]'" in first.mend:
         assert not facts.gsplat.version
+    if first.mend.startswith("pip install triton"):
+        assert not facts.triton.version
     if "pip install ninja" in first.mend:
         assert not facts.builders.ninja and not facts.builders.ninja_beside_python
     if first.mend.startswith("export CUDA_HOME="):
         assert first.mend.split("=", 1)[1] in dict(facts.toolkit.others)
+
+
+def check_ways(works: bool, ways: dict[str, list]) -> None:
+    """At most one of the two ways is mended at all its steps, the one with fewer of them; none if one works."""
+    wrong = {part: [line for line in lines if line.state != "ok"] for part, lines in ways.items()}
+    longer = [part for part, lines in wrong.items() if sum(bool(line.mend) for line in lines) <= 1 < len(lines)]
+    both = all(len(lines) > 1 for lines in wrong.values())
+    assert longer or not both
+    if works:
+        assert all(sum(bool(line.mend) for line in lines) <= 1 for lines in wrong.values())
 
 
 @given(machines())
@@ -56,10 +73,14 @@ def test_every_machine_gets_one_next_step_that_is_not_already_there(facts):
     assert device.choose("cpu", facts).device == "cpu"
     choice = device.choose("auto", facts)
     report = examine(facts)
-    assert (choice.device == "cuda") == report.works and "\n" not in choice.why
+    assert choice.device == ("cuda" if report.works else "cpu") and "\n" not in choice.why
+    assert choice.backend == ("cuda" if report.gsplat else "triton" if report.triton else "cpu")
     assert choice.why.startswith("CUDA: " if report.works else "CPU: ")
-    if report.works or report.only_to_compile:
-        assert device.choose("cuda", facts).device == "cuda"
+    if report.works:
+        assert device.choose("cuda", facts) == choice
+    elif report.only_to_compile:
+        forced = device.choose("cuda", facts)
+        assert (forced.device, forced.backend) == ("cuda", "cuda") and "compiles itself first" in forced.why
     else:
         with pytest.raises(InputError) as refused:
             device.choose("cuda", facts)
@@ -74,7 +95,7 @@ def test_every_pair_of_kinds_beside_a_working_rest():
 
 
 def test_a_working_machine_works_and_each_missing_link_is_found():
-    assert examine(WORKING).works
+    assert examine(WORKING).works and examine(NO_TRITON).gsplat and not examine(NO_TRITON).triton
     broken = {
         "system": {"system": System(name="Darwin")},
         "GPU": {"driver": Driver(0), "torch": Torch("2.13.0+cpu")},
@@ -82,17 +103,24 @@ def test_a_working_machine_works_and_each_missing_link_is_found():
         "torch": {"torch": Torch("2.13.0+cpu")},
         "CUDA in torch": {"torch": replace(WORKING.torch, available=False, gpus=())},
         "GPU computes": {"torch": replace(WORKING.torch, gpus=(replace(H200, computes=False, error="sick"),))},
+    }
+    for name, change in broken.items():
+        assert examine(replace(WORKING, **change)).blocking.name == name
+    no_way = {
         "gsplat": {"gsplat": Gsplat()},
         "nvcc": {"toolkit": Toolkit(), "gsplat": Gsplat("1.5.3")},
         "CUDA headers": {"toolkit": replace(WORKING.toolkit, headers=False)},
+        "CUDA library": {"toolkit": replace(WORKING.toolkit, cudart=False), "gsplat": Gsplat("1.5.3")},
         "C++ compiler": {"builders": replace(WORKING.builders, compiler_version="")},
         "Python headers": {"builders": replace(WORKING.builders, python_headers=False)},
         "ninja": {"builders": replace(WORKING.builders, ninja="")},
         "gsplat compiled": {"gsplat": Gsplat("1.5.3")},
     }
-    for name, change in broken.items():
-        assert examine(replace(WORKING, **change)).blocking.name == name
-    only = examine(replace(WORKING, gsplat=Gsplat("1.5.3")))
+    for name, change in no_way.items():
+        machine = replace(WORKING, triton=Triton(), **change)
+        machine = replace(machine, system=System("Windows"))  # torch has no Triton there
+        assert examine(machine).blocking.name == name
+    only = examine(replace(NO_TRITON, triton=Triton(), gsplat=Gsplat("1.5.3")))
     assert only.only_to_compile and only.next_step == "endoprior doctor --compile"
 
 
@@ -120,25 +148,6 @@ def test_torch_is_chosen_by_driver_and_card(serves, card, python, build):
     assert not build or mend.install_torch(with_cpu).startswith("pip uninstall -y torch torchvision && pip install ")
 
 
-def test_toolkits_that_are_here_are_used_before_others_are_installed():
-    beside = Toolkit("/usr/local", "PATH", "13.0", "", False, "", (("/usr/local/cuda-13.0", "13.0"),))
-    assert examine(replace(WORKING, toolkit=beside)).next_step == "export CUDA_HOME=/usr/local/cuda-13.0"
-    older = Toolkit("/usr", "PATH", "12.0", "", True)
-    assert examine(replace(WORKING, toolkit=older)).next_step.endswith("whl/cu126")
-    oldest = replace(WORKING, toolkit=Toolkit("/usr", "PATH", "11.5", "", True), system=System(packages="apt-get"))
-    assert "cuda-toolkit-13-0" in examine(oldest).next_step
-    both = replace(WORKING, toolkit=older, torch=Torch("2.13.0+cpu"))
-    assert examine(both).next_step.endswith("whl/cu126"), "torch is chosen to fit the toolkit"
-    assert "nvcc" not in [line.name for line in examine(both).lines if line.part == "cuda" and line.state != "ok"]
-    gone = replace(WORKING, toolkit=Toolkit("/gone", "CUDA_HOME", "", "no /gone/bin/nvcc"))
-    assert examine(gone).next_step == "unset CUDA_HOME"
-
-
-def test_a_compiler_too_new_for_nvcc_is_replaced_by_one_that_is_here():
-    builders = replace(WORKING.builders, compiler_version="16.0.1", other_gcc=(12, 14, 17))
-    assert examine(replace(WORKING, builders=builders)).next_step == "export CC=gcc-14 CXX=g++-14"
-
-
 def test_masked_cards_and_other_cards():
     masked = replace(WORKING, torch=Torch("2.13.0", "13.0", available=False), variables={"CUDA_VISIBLE_DEVICES": ""})
     assert examine(masked).next_step == "unset CUDA_VISIBLE_DEVICES"
@@ -150,50 +159,34 @@ def test_masked_cards_and_other_cards():
 
 def test_words_of_the_choice():
     assert device.choose("auto", WORKING).why == "CUDA: NVIDIA H200, torch 2.13.0+cu130, gsplat 1.5.3"
+    assert device.choose("cpu", WORKING) == device.Choice("cpu", "cpu", "CPU: as asked")
     no_cuda = device.choose("auto", replace(WORKING, torch=Torch("2.13.0+cpu")))
     assert no_cuda.why == "CPU: torch 2.13.0+cpu, built without CUDA"
     assert device.choose("auto", Facts()).why == "CPU: no NVIDIA GPU is seen"
-    assert "minutes" in device.choose("cuda", replace(WORKING, gsplat=Gsplat("1.5.3"))).why
-    assert "doctor --compile" in device.choose("auto", replace(WORKING, gsplat=Gsplat("1.5.3"))).why
-
-
-def test_the_command_prints_a_table(monkeypatch, capsys):
-    monkeypatch.setattr("endoprior.doctor.look", lambda: replace(WORKING, gsplat=Gsplat()))
-    monkeypatch.setattr(facts_module, "compile_gsplat", lambda facts: pytest.fail("nothing to compile"))
-    assert main(["doctor", "--compile"]) == 0
-    text = capsys.readouterr().out
-    assert "-> pip install 'endoprior[cuda]'" in text and text.count("next: ") == 1
-    assert "not compiled: first mend gsplat" in text
-    assert "--device auto: CPU: gsplat: not installed" in text
-    assert main(["doctor", "--compil"]) == 2
-
-
-def test_the_command_compiles_when_asked(monkeypatch, capsys):
-    monkeypatch.setattr("endoprior.doctor.look", lambda: replace(WORKING, gsplat=Gsplat("1.5.3")))
-    compiled = replace(WORKING, gsplat=replace(WORKING.gsplat, compile_seconds=200.0))
-    monkeypatch.setattr(facts_module, "compile_gsplat", lambda facts: compiled)
-    assert main(["doctor", "--compile"]) == 0
-    text = capsys.readouterr().out
-    assert "ready in 200 s" in text and "next: nothing: CUDA works" in text
+    assert "minutes" in device.choose("cuda", replace(NO_TRITON, gsplat=Gsplat("1.5.3"))).why
+    assert "doctor --compile" in device.choose("auto", replace(NO_TRITON, triton=Triton(), gsplat=Gsplat("1.5.3"))).why
+    no_way = device.choose("auto", replace(WORKING, gsplat=Gsplat(), triton=Triton()))
+    assert no_way.why == "CPU: the GPU is ready, but Triton: not installed; see `endoprior doctor`"
 
 
 def test_json_of_this_machine(capsys):
     assert main(["doctor", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert set(found) == {
-        "version", "device", "why", "cuda_works", "only_to_compile", "blocking", "next_step", "lines", "facts",
+        "version", "device", "backend", "why", "cuda_works", "ways", "only_to_compile", "compiling", "blocking",
+        "next_step", "lines", "facts",
     }  # fmt: skip
     assert all(set(line) == {"part", "name", "state", "found", "mend"} for line in found["lines"])
-    names = [line["name"] for line in found["lines"] if line["part"] == "cuda"]
+    names = [line["name"] for line in found["lines"] if line["part"] in ("cuda", "triton", "gsplat")]
     assert names == [
-        "system", "GPU", "driver", "torch", "CUDA in torch", "GPU computes", "gsplat", "nvcc", "CUDA headers",
-        "C++ compiler", "Python headers", "ninja", "gsplat compiled",
+        "system", "GPU", "driver", "torch", "CUDA in torch", "GPU computes", "C compiler", "Python headers", "Triton",
+        "gsplat", "nvcc", "CUDA headers", "CUDA library", "C++ compiler", "ninja", "gsplat compiled",
     ]  # fmt: skip
     assert set(found["facts"]) == {
-        "system", "driver", "torch", "gsplat", "toolkit", "builders", "packages",
+        "system", "driver", "torch", "triton", "gsplat", "toolkit", "builders", "packages",
         "weights", "weights_error", "variables",
     }  # fmt: skip
-    assert (found["device"] == "cuda") == found["cuda_works"]
+    assert (found["device"] == "cuda") == found["cuda_works"] == any(found["ways"].values())
     assert found["next_step"]
 
 

@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from endoprior import device
 from endoprior.doctor import Facts, examine, glance, look, mend
 from endoprior.doctor import facts as facts_module
+from endoprior.doctor import toolchain
 from endoprior.doctor.ask import MOST_BYTES, ask, clean
 from endoprior.doctor.driver import driver_answers, driver_files, read_banner, read_gpus
-from endoprior.doctor.records import Driver, Gpu, System, Toolkit, Torch, number
-from endoprior.doctor.toolchain import look_for_builders, look_for_toolkit
+from endoprior.doctor.records import Driver, Gpu, System, Torch, number
+from endoprior.doctor.toolchain import look_for_builders
 
 
 def program(folder, name: str, body: str):
@@ -35,8 +36,9 @@ def path(tmp_path, monkeypatch):
     folder = tmp_path / "bin"
     folder.mkdir()
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}/usr/bin{os.pathsep}/bin")
-    for name in facts_module.VARIABLES:
+    for name in (*facts_module.VARIABLES, "LIBRARY_PATH"):
         monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(toolchain, "pip_folder", lambda: "")
     return folder
 
 
@@ -136,60 +138,6 @@ def test_driver_files(tmp_path, path):
     assert examine(unreachable).next_step == "start the container with --gpus all"
 
 
-NVCC = "echo 'Cuda compilation tools, release 13.0, V13.0.88'"
-
-
-def test_toolkit_is_found_where_torch_looks(tmp_path, path, monkeypatch):
-    default = tmp_path / "local/cuda"
-    assert look_for_toolkit(default) == Toolkit()
-    program(tmp_path / "local/cuda-12.6/bin", "nvcc", NVCC.replace("13.0", "12.6"))
-    assert look_for_toolkit(default) == Toolkit(), "without headers it is of no use"
-    (tmp_path / "local/cuda-12.6/include").mkdir()
-    (tmp_path / "local/cuda-12.6/include/cuda_runtime.h").touch()
-    others = ((str(tmp_path / "local/cuda-12.6"), "12.6"),)
-    assert look_for_toolkit(default) == Toolkit(others=others)
-    program(default / "bin", "nvcc", "echo garbage")
-    found = look_for_toolkit(default)
-    assert (found.home, found.home_from, found.nvcc) == (str(default), "default", "") and "no version" in found.error
-    program(path, "nvcc", NVCC)  # a wrapper far from its headers, as package managers leave it
-    found = look_for_toolkit(default)
-    assert found == Toolkit(str(tmp_path), "PATH", "13.0", "", False, "", others)
-    header = tmp_path / "targets/x86_64-linux/include/cuda_runtime.h"
-    header.parent.mkdir(parents=True)
-    header.touch()
-    assert look_for_toolkit(default).headers_elsewhere == str(header.parent)
-    monkeypatch.setenv("CUDA_INC_PATH", str(header.parent))
-    assert look_for_toolkit(default).headers
-    monkeypatch.setenv("CUDA_HOME", str(tmp_path / "gone"))
-    found = look_for_toolkit(default)
-    assert found.home_from == "CUDA_HOME" and "gone" in found.error
-
-
-def test_nvcc_that_hangs(tmp_path, path):
-    program(path, "nvcc", "sleep 30")
-    assert "no answer" in look_for_toolkit(tmp_path / "none", limit_s=0.3).error
-
-
-@pytest.mark.parametrize(
-    ("body", "version", "is_gcc"),
-    [
-        (
-            "echo 'c++ (Debian 12.2.0-14+deb12u1) 12.2.0'; echo 'Copyright (C) Free Software Foundation, Inc.'",
-            "12.2.0",
-            True,
-        ),
-        ("echo 'Apple clang version 17.0.0 (clang-1700)'", "17.0.0", False),
-        ("echo nonsense", "", False),
-        ("sleep 30", "", False),
-    ],
-)
-def test_compilers(path, body, version, is_gcc):
-    program(path, "c++", body)
-    found = look_for_builders(limit_s=0.5)
-    assert (found.compiler_version, found.compiler_is_gcc) == (version, is_gcc)
-    assert bool(found.compiler_error) == (not version)
-
-
 def test_ninja_beside_python_but_not_on_path(tmp_path, monkeypatch, path):
     monkeypatch.setenv("PATH", str(path))
     monkeypatch.setattr(sys, "executable", str(tmp_path / "venv/bin/python"))
@@ -220,7 +168,7 @@ def test_a_torch_that_breaks_hangs_or_dies(tmp_path, monkeypatch, body, says):
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, "torch")
     limit = 2.0 if "sleep" in body else 30.0
-    torch, _, _ = facts_module._ask_torch(limit)
+    torch, *_ = facts_module._ask_torch(limit)
     assert (torch.version, torch.cuda, torch.available) == ("2.13.0+cu130", "13.0", None) and says in torch.error
     assert examine(replace(WORKING, torch=torch)).blocking.name == "torch"
 
@@ -241,7 +189,7 @@ def ones(n, device): raise RuntimeError("no kernel image is available")
     (tmp_path / "torch").mkdir()
     (tmp_path / "torch/__init__.py").write_text(fake)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    torch, _, _ = facts_module._ask_torch(30.0)
+    torch, *_ = facts_module._ask_torch(30.0)
     assert torch.available is True and torch.architectures == ("sm_90",)
     assert torch.gpus[0] == Gpu("NVIDIA H200", (9, 0), 128.0, False, "no kernel image is available")
     assert torch.gpus[1] == Gpu("device 1", None, None, False, "fell off the bus")

@@ -37,8 +37,7 @@ class AdamState:
         if param.grad is None or param.numel() == 0:
             return
         if not compiled(param):
-            tensors = (param.detach(), param.grad.contiguous(), self.first, self.second, self.steps[0])
-            fused_step(*tensors, rate, epsilon, frozen)
+            update_together([self], [param], rate, epsilon, frozen)
             return
         self.steps += 1
         rates, root_scale = _corrected(np.array([rate]), self._counts())
@@ -109,6 +108,25 @@ class AdamState:
     def _counts(self) -> NDArray[np.int64]:
         """The counts, whole numbers, of a state on the CPU."""
         return self.steps.numpy().astype(np.int64)
+
+
+def update_together(
+    states: list[AdamState],
+    params: list[Tensor],
+    rate: float | Tensor,
+    epsilon: float,
+    frozen: Tensor | None = None,
+) -> None:
+    """`AdamState.update` of several parameters with one rate."""
+    due = [(s, p) for s, p in zip(states, params, strict=True) if p.grad is not None and p.numel()]
+    if not due:
+        return
+    if compiled(due[0][1]):
+        for state, param in due:
+            state.update(param, rate, epsilon)
+        return
+    tensors = [(p.detach(), p.grad.contiguous(), s.first, s.second, s.steps[0]) for s, p in due]
+    fused_step(*map(list, zip(*tensors, strict=True)), rate, epsilon, frozen)
 
 
 def _corrected(rates: NDArray, steps: NDArray) -> tuple[NDArray, NDArray]:

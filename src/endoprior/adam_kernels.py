@@ -47,24 +47,24 @@ def adam_definition(
 
 @torch.no_grad()
 def fused_step(
-    param: Tensor,
-    grad: Tensor,
-    first: Tensor,
-    second: Tensor,
-    steps: Tensor,
+    params: list[Tensor],
+    grads: list[Tensor],
+    firsts: list[Tensor],
+    seconds: list[Tensor],
+    steps: list[Tensor],
     rate: float | Tensor,
     epsilon: float,
     frozen: Tensor | None = None,
 ) -> None:
-    """One step of Adam in place, in one pass over memory, by torch's own kernel.
+    """One step of Adam in place, in one pass over memory, by torch's own kernel: of many small tensors at once.
 
     Args:
-        param, grad, first, second: of one shape, contiguous. steps: () float32, counted up.
+        params, grads, firsts, seconds: of equal shapes, contiguous. steps: () float32 each, counted up.
         rate: a number, or () on the same device.
-        frozen: () float32 on the same device; where it is not 0, nothing changes.
+        frozen: () float32 on the same device; where it is 1, nothing changes; else it is 0.
     """
     adam(
-        [param], [grad], [first], [second], [], [steps],
+        params, grads, firsts, seconds, [], steps,
         fused=True, found_inf=frozen, amsgrad=False, beta1=BETA1, beta2=BETA2, lr=rate, weight_decay=0.0, eps=epsilon,
         maximize=False,
     )  # fmt: skip

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .adam import AdamState
+from .adam import AdamState, update_together
 from .config import Config, OptimConfig
 from .density import DensityStats, Plan
 from .divergence import ADVICE, Diverged, count_unusable, count_unusable_rows
@@ -70,8 +70,10 @@ class Optimizer:
             network = self.spatial_scale * log_linear(optim.network_lr, optim.network_lr_final, **decay)
             planes = self.spatial_scale * log_linear(optim.planes_lr, optim.planes_lr_final, **decay)
             parameters = _field_parameters(self.field)
-            for name, param in parameters.items():
-                self.states[name].update(param, planes if name == "box" else network, optim.epsilon, frozen)
+            for rate, names in ((network, parameters.keys() - {"box"}), (planes, parameters.keys() & {"box"})):
+                ordered = sorted(names)
+                states, params = [self.states[name] for name in ordered], [parameters[name] for name in ordered]
+                update_together(states, params, rate, optim.epsilon, frozen)
             if any(param.grad is not None for param in parameters.values()):
                 self.plane_adam.step(planes, frozen)
         self.clear_gradients()

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json as json_text
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from .parsing import parse
 from .progress import say
+
+if TYPE_CHECKING:
+    from ..doctor import Facts
 
 
 @dataclass
@@ -14,38 +18,50 @@ class Doctor:
     """Say whether this machine can use CUDA and what to install, before anything needs it."""
 
     compile: bool = False
-    """Have gsplat compile itself now, which takes minutes, time it, and draw with it."""
+    """Have gsplat compile itself now, which takes minutes, time it, and draw with it. Without a GPU, as where an image
+    is built, it compiles for those that TORCH_CUDA_ARCH_LIST names. Ends with status 1 if that does not work."""
     json: bool = False
     """Print JSON instead of a table."""
 
 
-def run(argv: list[str]) -> None:
-    """Look, judge, print. What is missing is no failure: the exit status is 0."""
+def run(argv: list[str]) -> int:
+    """Look, judge, print. What is missing is no failure: the exit status is 0, unless gsplat was to be compiled."""
     args = parse(Doctor, argv, "doctor")
     from ..device import choose
     from ..doctor import examine, look
-    from ..doctor.facts import compile_gsplat
     from ..doctor.report import as_json, table
 
-    facts = look()
-    report = examine(facts)
-    note = ""
+    facts, compiling = look(), ""
     if args.compile:
-        if report.works or (report.blocking is not None and report.blocking.name == "gsplat compiled"):
-            if not args.json:
-                say("gsplat compiles; this takes minutes")
-            facts = compile_gsplat(facts)
-            report = examine(facts)
-        else:
-            note = f"gsplat was not compiled: first mend {report.blocking.name}"
+        facts, compiling = _compile(facts, quiet=args.json)
+    report = examine(facts)
     choice = choose("auto", facts)
+    status = 1 if args.compile and not facts.gsplat.loads else 0
     if args.json:
-        say(json_text.dumps(as_json(facts, report, choice.device, choice.why), indent=1))
-        return
+        found = as_json(facts, report, choice.device, choice.backend, choice.why, compiling)
+        say(json_text.dumps(found, indent=1))
+        return status
     for row in table(report):
         say(row)
     say("")
-    if note:
-        say(note)
+    if compiling:
+        say(compiling)
     say(f"--device auto: {choice.why}")
     say(f"next: {report.next_step}")
+    return status
+
+
+def _compile(facts: Facts, quiet: bool) -> tuple[Facts, str]:
+    """Have gsplat compile itself, if nothing hinders it; the facts then, and what came of it."""
+    from ..doctor import examine
+    from ..doctor.facts import compile_gsplat
+
+    if hinders := examine(facts).hinders_compiling:
+        return facts, f"gsplat was not compiled: {hinders}"
+    if not quiet:
+        say("gsplat compiles; this takes minutes")
+    facts = compile_gsplat(facts)
+    if not facts.gsplat.loads:
+        return facts, f"gsplat did not compile: {facts.gsplat.error}"
+    where = "" if facts.torch.available else "; here is no GPU to draw on"
+    return facts, f"gsplat is compiled, ready in {facts.gsplat.compile_seconds or 0:.0f} s{where}"

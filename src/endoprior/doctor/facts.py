@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from ..memory import available_bytes
 from .ask import MARK, Answer, ask, clean
 from .driver import driver_answers, driver_files
-from .records import Builders, Driver, Facts, Gpu, Gsplat, System, Toolkit, Torch
+from .records import Builders, Driver, Facts, Gpu, Gsplat, System, Toolkit, Torch, Triton
 from .toolchain import look_for_builders, look_for_toolkit
 
 TORCH_LIMIT_S = 90.0
@@ -30,12 +30,15 @@ PACKAGES = ("OpenEXR", "transformers", "torchvision", "lpips", "ray")
 """What the optional parts import."""
 VARIABLES = (
     "CUDA_HOME", "CUDA_PATH", "CUDA_VISIBLE_DEVICES", "CUDA_INC_PATH", "TORCH_CUDA_ARCH_LIST", "TORCH_EXTENSIONS_DIR",
-    "MAX_JOBS", "CC", "CXX", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS",
+    "MAX_JOBS", "CC", "CXX", "TRITON_INTERPRET", "TRITON_CACHE_DIR", "TRITON_LIBCUDA_PATH", "OMP_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
 )  # fmt: skip
 """Shown when set, besides our own: they change what is found, or how fast it is."""
 PACKAGE_MANAGERS = ("apt-get", "dnf", "zypper", "pacman")
 
 T = TypeVar("T")
+Asked = tuple[Torch, Triton, dict[str, str], str]
+"""Torch, Triton, the weights that were found, and why they could not be looked for."""
 
 
 def glance() -> Facts:
@@ -55,11 +58,12 @@ def look(torch_limit_s: float = TORCH_LIMIT_S) -> Facts:
         toolkit = pool.submit(_or, Toolkit(), look_for_toolkit)
         builders = pool.submit(_or, Builders(), look_for_builders)
         # Torch takes longest, and is asked from this thread: Ctrl-C then ends it at once.
-        silent: tuple[Torch, dict[str, str], str] = (seen.torch, {}, "torch was not asked")
-        torch, weights, weights_error = _or(silent, _ask_torch, torch_limit_s)
+        silent: Asked = (seen.torch, Triton(), {}, "torch was not asked")
+        torch, triton, weights, weights_error = _or(silent, _ask_torch, torch_limit_s)
         return replace(
             seen,
             torch=torch,
+            triton=triton,
             driver=driver.result(),
             toolkit=toolkit.result(),
             builders=builders.result(),
@@ -127,17 +131,17 @@ def _torch_files() -> Torch:
     return Torch(version=value("__version__"), cuda=value("cuda"), hip=value("hip"))
 
 
-def _ask_torch(limit_s: float) -> tuple[Torch, dict[str, str], str]:
-    """Torch, the weights it found, and why it could not look for them."""
+def _ask_torch(limit_s: float) -> Asked:
+    """What a process that imports torch says."""
     seen = _or(Torch(), _torch_files)
     said = _run("torch_probe", [], limit_s)
     found = _after(said)
     if found is None:
         reason = f"{said.problem or 'no answer'} {clean(said.text[-160:])}".strip()
-        return (replace(seen, error=reason) if seen.version else seen), {}, "torch gave no answer"
+        return (replace(seen, error=reason) if seen.version else seen), Triton(), {}, "torch gave no answer"
     if not seen.version and "version" not in found:
-        return seen, {}, "torch is not installed"
-    texts = {name: clean(str(found.get(name, ""))) for name in ("error", "reason", "extensions", "triton")}
+        return seen, Triton(), {}, "torch is not installed"
+    texts = {name: clean(str(found.get(name, ""))) for name in ("error", "reason", "extensions")}
     torch = Torch(
         version=str(found.get("version", seen.version)),
         cuda=str(found.get("cuda", seen.cuda)),
@@ -148,7 +152,28 @@ def _ask_torch(limit_s: float) -> tuple[Torch, dict[str, str], str]:
         host_compilers=found.get("host_compilers", {}),
         **texts,
     )
-    return torch, found.get("weights", {}), clean(str(found.get("weights_error", "")))
+    triton = _or(Triton(), _triton, torch, found.get("triton", {}), said)
+    return torch, triton, found.get("weights", {}), clean(str(found.get("weights_error", "")))
+
+
+def _triton(torch: Torch, found: Mapping[str, Any], said: Answer) -> Triton:
+    """Triton, out of what the process of torch said: if it ended while Triton was tried, that is Triton's answer."""
+    version, computes = clean(str(found.get("version", "")), 40), found.get("computes")
+    error = clean(str(found.get("error", "")))
+    if version and computes is None and torch.gpus and torch.gpus[0].computes:
+        computes, error = False, said.problem or "no answer"
+    elif computes is False:  # Triton tells no more than the status of the C compiler, which has printed its reason
+        printed = [line for line in said.text.splitlines() if "error: " in line and not line.startswith(MARK)]
+        error = clean(printed[0]) if printed else error
+    return Triton(version, _or("", _triton_wanted), computes, error)
+
+
+def _triton_wanted() -> str:
+    """The Triton that torch was built with, as a requirement for pip: torch names it, older ones in brackets."""
+    for requirement in metadata.requires("torch") or ():
+        if found := re.match(r"triton\s*\(?\s*([=<>!~][^;)\s]*)", requirement):
+            return f"triton{found[1]}"
+    return ""
 
 
 def _gpu(entry: Mapping[str, Any]) -> Gpu:
@@ -189,7 +214,24 @@ def _gsplat_files(torch: Torch) -> Gsplat:
         version=_package("gsplat") or "?",
         prebuilt=next((str(file) for file in sorted(package.glob(f"csrc*.{ending}"))), ""),
         cached=str(built) if built and built.is_file() else "",
+        compiled_by=_or("", _compiled_by, built.parent) if built else "",
+        current=_or(None, _current, built.parent) if built else None,
     )
+
+
+def _compiled_by(folder: Path) -> str:
+    """The nvcc that torch wrote down for ninja, "" if it did not."""
+    text = (folder / "build.ninja").read_text(encoding="utf-8", errors="replace")
+    found = re.search(r"^nvcc = (\S+)$", text, re.MULTILINE)
+    return found[1] if found else ""
+
+
+def _current(folder: Path) -> bool | None:
+    """Whether ninja would compile nothing there: another ninja, or sources that changed, have it compile all."""
+    if not (folder / "build.ninja").is_file():
+        return None
+    said = ask(["ninja", "-C", str(folder), "-n"], LOAD_LIMIT_S)  # -n: only says what it would do
+    return None if said.problem else "no work to do" in said.text
 
 
 def _package(name: str) -> str:

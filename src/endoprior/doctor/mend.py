@@ -96,12 +96,17 @@ def install_toolkit(facts: Facts) -> str:
         return set_variable(facts, "CUDA_HOME", other)
     if facts.system.name == "Windows":
         return f"winget install Nvidia.CUDA --version {version}"
-    if wanted[:1] == (13,):  # the wheels for 12 lie in a folder each, where torch finds nothing
+    if pip_has_toolkit(facts):
         return pip_toolkit(facts, version)
     if facts.system.packages == "apt-get":
         name = f"cuda-toolkit-{version.replace('.', '-')}"
         return f"sudo apt-get install {name} (from NVIDIA's packages: https://developer.nvidia.com/cuda-downloads)"
     return f"install the CUDA toolkit {version} from https://developer.nvidia.com/cuda-toolkit-archive"
+
+
+def pip_has_toolkit(facts: Facts) -> bool:
+    """Whether NVIDIA's wheels for torch's CUDA make up a toolkit; those for 12 lie in a folder each."""
+    return facts.system.name == "Linux" and number(planned_cuda(facts))[:1] == (13,)
 
 
 def pip_toolkit(facts: Facts, version: str) -> str:
@@ -110,7 +115,8 @@ def pip_toolkit(facts: Facts, version: str) -> str:
     Nvcc's wheel named alone would bring a newer one than the headers that are there.
     """
     install = f"pip install 'cuda-toolkit[nvcc,cccl]=={version}.*'"
-    return f"{install} && {set_variable(facts, 'CUDA_HOME', facts.toolkit.pip)}" if facts.toolkit.pip else install
+    pip, home = facts.toolkit.pip, facts.toolkit.home
+    return f"{install} && {set_variable(facts, 'CUDA_HOME', pip)}" if pip and pip != home else install
 
 
 def link_cudart(facts: Facts) -> str:

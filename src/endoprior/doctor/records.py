@@ -122,7 +122,9 @@ class Gsplat:
     compile_seconds: float | None = None
     """Time of `--compile`; None without it."""
     compiled_by: str = ""
-    """The nvcc that compiled `cached`; with another one it compiles again at its next use."""
+    """The nvcc that compiled `cached`, as it was spelled then."""
+    current: bool | None = None
+    """Whether ninja finds nothing to do in the folder of `cached`; None if it was not asked or gave no answer."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
-"""What gsplat needs to compile itself: nvcc where torch looks for it, a C++ compiler, ninja, Python's headers."""
+"""What compiles: nvcc where torch looks for it, compilers for C++ and C, ninja, Python's headers."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shutil
@@ -15,6 +16,8 @@ from .records import Builders, Toolkit
 LIMIT_S = 10.0
 WINDOWS = os.name == "nt"
 SUFFIX = ".exe" if WINDOWS else ""
+CUDART = "cudart.lib" if WINDOWS else "libcudart.so"
+"""What gsplat is linked against; wheels have it only under its full name, with a version behind."""
 
 
 def look_for_toolkit(default: Path = Path("/usr/local/cuda"), limit_s: float = LIMIT_S) -> Toolkit:
@@ -22,37 +25,91 @@ def look_for_toolkit(default: Path = Path("/usr/local/cuda"), limit_s: float = L
 
     Args:
         default: folder taken when neither variables nor PATH name one; toolkits called like it with a version after a
-            dash are the others.
+            dash are the others, and one that pip installed.
     """
     home, home_from = _home(default)
+    pip = pip_folder()
+    places = [*sorted(default.parent.glob(f"{default.name}-*")), *[Path(pip)] * bool(pip)]
     others = tuple(
         (str(folder), version)
-        for folder in sorted(default.parent.glob(f"{default.name}-*"))
+        for folder in places
         if str(folder) != home and _has_headers(folder) and (version := _nvcc(folder, limit_s)[0])
     )
     if not home:
-        return Toolkit(others=others)
+        return Toolkit(others=others, pip=pip)
     nvcc, error = _nvcc(Path(home), limit_s)
     elsewhere = next((file.parent for file in sorted(Path(home).glob("targets/*/include/cuda_runtime.h"))), "")
-    return Toolkit(home, home_from, nvcc, error, _has_headers(Path(home), searched=True), str(elsewhere), others)
+    libraries = _libraries(Path(home))
+    return Toolkit(
+        home=home,
+        home_from=home_from,
+        nvcc=nvcc,
+        error=error,
+        headers=_has_headers(Path(home), searched=True),
+        headers_elsewhere=str(elsewhere),
+        others=others,
+        libraries=str(libraries),
+        cudart=(libraries / CUDART).exists() or _linker_finds(CUDART, limit_s),
+        cudart_name=next((file.name for file in sorted(libraries.glob(f"{CUDART}.*"))), ""),
+        pip=pip,
+    )
 
 
 def look_for_builders(limit_s: float = LIMIT_S) -> Builders:
-    """The C++ compiler that torch would take, ninja, and Python's headers."""
-    compiler = os.environ.get("CXX") or ("cl" if WINDOWS else "c++")
-    version, is_gcc, error = _compiler(compiler, limit_s)
+    """The compilers that torch and Triton would take, ninja, and Python's headers."""
+    compiler = _cxx()
+    version, is_gcc, error = _compiler(compiler.split(), limit_s)  # CXX may be "ccache g++"
+    c_compiler = _cc()
+    c_version, _, c_error = _compiler([c_compiler], limit_s) if c_compiler else ("", False, "no gcc, no clang on PATH")
     beside = Path(sys.executable).parent
     ninja = ask(["ninja", "--version"], limit_s)
+    headers = sysconfig.get_path("include", "nt" if WINDOWS else "posix_prefix")  # Debian's own scheme names others
     return Builders(
         compiler=clean(compiler, 80),
         compiler_version=version,
         compiler_is_gcc=is_gcc,
         compiler_error=error,
         other_gcc=tuple(major for major in range(7, 30) if shutil.which(f"g++-{major}")),
+        c_compiler=clean(Path(c_compiler).name, 80),
+        c_version=c_version,
+        c_error=c_error,
         ninja="" if ninja.problem else _version(ninja.text),
         ninja_beside_python=str(beside) if (beside / f"ninja{SUFFIX}").is_file() else "",
-        python_headers=(Path(sysconfig.get_paths()["include"]) / "Python.h").is_file(),
+        python_headers=(Path(headers) / "Python.h").is_file(),
     )
+
+
+def pip_folder() -> str:
+    """Folder in which pip puts NVIDIA's packages for CUDA 13, the libraries of torch among them; "" if it is not there.
+
+    Torch does not look for a toolkit in it.
+    """
+    spec = importlib.util.find_spec("nvidia")
+    folders = [Path(place) / "cu13" for place in (spec.submodule_search_locations if spec else None) or ()]
+    return next((str(folder) for folder in folders if folder.is_dir()), "")
+
+
+def _cxx() -> str:
+    return os.environ.get("CXX") or ("cl" if WINDOWS else "c++")
+
+
+def _cc() -> str:
+    """The C compiler in Triton's order (triton.runtime.build), which takes CC as one word, an empty one too."""
+    named = os.environ.get("CC")
+    return named if named is not None else next(filter(None, map(shutil.which, ("gcc", "clang"))), "")
+
+
+def _libraries(home: Path) -> Path:
+    """Folder to which torch sends the linker (torch.utils.cpp_extension._prepare_ldflags)."""
+    if WINDOWS:
+        return home / "lib" / "x64"
+    return home / "lib" if not (home / "lib64").exists() and (home / "lib").exists() else home / "lib64"
+
+
+def _linker_finds(name: str, limit_s: float) -> bool:
+    """Whether a library is where the linker looks by itself, as Debian's packages put it, or LIBRARY_PATH does."""
+    said = ask([*_cxx().split(), f"-print-file-name={name}"], limit_s)
+    return not said.problem and os.path.isabs(said.text.strip()) and Path(said.text.strip()).exists()
 
 
 def _home(default: Path) -> tuple[str, str]:
@@ -86,11 +143,10 @@ def _has_headers(home: Path, searched: bool = False) -> bool:
     return any((place / "cuda_runtime.h").is_file() for place in places)
 
 
-def _compiler(command: str, limit_s: float) -> tuple[str, bool, str]:
+def _compiler(words: list[str], limit_s: float) -> tuple[str, bool, str]:
     """Version, whether it is gcc, and why there is none."""
-    words = command.split()  # CXX may be "ccache g++"
     if not words or not shutil.which(words[0]):
-        return "", False, f"no {clean(command, 80)} on PATH"
+        return "", False, f"no {clean(' '.join(words), 80) or 'compiler'} on PATH"
     if Path(words[0]).stem.lower() == "cl":  # prints its version and complains; there is nothing else to ask
         said = ask(words, limit_s)
         return _version(said.text) or "?", False, ""

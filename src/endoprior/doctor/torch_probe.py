@@ -1,6 +1,7 @@
 """Runs in a process of its own: imports torch, asks it about CUDA, prints one line of JSON after `MARK`.
 
-A broken torch or driver may crash or hang here, and the CUDA context it makes ends with the process.
+A broken torch or driver may crash or hang here, and the CUDA context it makes ends with the process. Triton is tried
+last, and the line printed again with what came of it: the first one is left if that crashes or hangs.
 """
 
 from __future__ import annotations
@@ -24,15 +25,20 @@ def main() -> None:
     found["version"] = str(torch.__version__)
     found["cuda"] = getattr(torch.version, "cuda", None) or ""
     found["hip"] = getattr(torch.version, "hip", None) or ""
-    for name, look in (("triton", _triton), ("extensions", _extensions), ("host_compilers", _host_compilers)):
+    for name, look in (("extensions", _extensions), ("host_compilers", _host_compilers)):
         try:
             found[name] = look()
         except Exception:
             continue
     found.update(_weights())
+    found["triton"] = _triton()
     if found["cuda"]:
         found.update(_cuda(torch))
     _answer(found)
+    gpus = found.get("gpus")
+    if gpus and gpus[0]["computes"] and found["triton"]["version"]:
+        found["triton"] |= _triton_computes()
+        _answer(found)
 
 
 def _cuda(torch: Any) -> dict[str, Any]:
@@ -62,10 +68,25 @@ def _gpu(torch: Any, index: int) -> dict[str, Any]:
     return gpu
 
 
-def _triton() -> str:
-    import triton
+def _triton() -> dict[str, Any]:
+    """Its version, or why it cannot be imported; that it is not installed needs no words."""
+    try:
+        import triton
 
-    return str(triton.__version__)
+        return {"version": str(triton.__version__), "error": ""}
+    except BaseException as error:
+        absent = isinstance(error, ModuleNotFoundError) and error.name == "triton"
+        return {"version": "", "error": "" if absent else _words(error)}
+
+
+def _triton_computes() -> dict[str, Any]:
+    """Whether it compiles for the first GPU, and computes there."""
+    try:
+        from .triton_probe import adds
+
+        return {"computes": adds("cuda"), "error": ""}
+    except BaseException as error:
+        return {"computes": False, "error": _words(error)}
 
 
 def _extensions() -> str:

@@ -42,7 +42,7 @@ class PlaneAdam:
         grid = self.grid
         buffers = (grid.values, grid.grads, self.exp_avg, self.exp_avg_sq)
         if not compiled(grid.values):
-            fused_step(*buffers, self.steps, lr, self.epsilon, frozen)
+            fused_step(*([buffer] for buffer in (*buffers, self.steps)), lr, self.epsilon, frozen)
             grid.grads.zero_()
             grid.marks.fill_(TOUCHED)
             return
