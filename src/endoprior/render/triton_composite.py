@@ -1,0 +1,247 @@
+"""Front-to-back compositing as Triton kernels, forward and backward.
+
+One program of one warp per tile: nothing has to wait for other warps, and a look at all pixels is five shuffles.
+Pixels are (ROWS, 32) blocks whose first axis lies within a lane, so that a Gaussian's numbers are loaded, and its
+offset from the lane's column is computed, once for ROWS pixels, and ROWS values are added up before the lanes are.
+With (dx, dy) from the Gaussian's center and `u = root dy + root_k dx`, `alpha = 2^(log2(opacity) - m_log2 dx^2 - u^2)`:
+see `triton_bins` for the records, and `triton_project` for the column form.
+
+The backward pass is the same walk again. With weights w_j, colors c_j (z among them), cotangents v and final
+transmittance T_end, Gaussian i at one pixel gets `dL/dalpha_i = T_i (c_i . v) - rest_i / (1 - alpha_i)`, where
+`rest_i = sum_{j > i} w_j (c_j . v) + T_end (background . v - v_alpha)`. `rest` starts as the whole sum, known from the
+forward pass, and loses one term per Gaussian: no list is walked backwards, and both passes decide alike. Every pair
+belongs to one tile, so its program writes that pair's sums, and `gather` adds up each Gaussian's pairs in a fixed
+order: no atomics, and equal input gives equal bits. In this file `v_x` is dL/dx, and dp is dL / d log alpha, 0 where
+ALPHA_MAX binds.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from .constants import ALPHA_MAX, STOP_TRANSMITTANCE
+from .triton_bins import BLUE, HALF_LOG2_E, LOG2_ALPHA_MIN, M_LOG2, RECORD, RED, ROOT, TILE_WIDTH, X
+
+MOMENTS = tl.constexpr(10)
+"""Sums over a pair's pixels of dp times 1, dx, dx^2, u, u^2, u dx, and of the weight times the four cotangents."""
+SIZES = ["width", "height", "tiles_x"]
+"""Arguments that may be any number without another version being compiled."""
+_ALPHA_MAX, _STOP = tl.constexpr(ALPHA_MAX), tl.constexpr(STOP_TRANSMITTANCE)
+_WIDTH = tl.constexpr(TILE_WIDTH)
+_CHECK_EVERY = tl.constexpr(16)  # pairs between two looks at whether the whole tile is full
+
+
+@triton.jit
+def _pixels(tile, tiles_x, width, height, ROWS: tl.constexpr):
+    # Of a tile's pixels: x (1, 32), y of each lane's first (1, 32), row step (ROWS, 1), places, and which are inside.
+    lane, step = tl.arange(0, 32)[None, :], 2 * tl.arange(0, ROWS)[:, None]
+    column = tile % tiles_x * _WIDTH + lane // 2
+    first_row = tile // tiles_x * (2 * ROWS) + lane % 2
+    row = first_row + step
+    inside = (column < width) & (row < height)
+    return column + 0.5, first_row + 0.5, step.to(tl.float32), row * width + column, inside
+
+
+@triton.jit
+def _record(records, ranks, pair, end):
+    # What `_row` returns of one pair; zeros past the end of the list.
+    return _row(records, tl.load(ranks + pair, pair < end, 0), pair < end)
+
+
+@triton.jit
+def _two(row, i: tl.constexpr, known):
+    # Two neighboring numbers of a record in one load of 64 bits: half the loads of the inner loops.
+    both = tl.load((row + i).to(tl.pointer_type(tl.int64)), known, 0)
+    return both.to(tl.int32).to(tl.float32, bitcast=True), (both >> 32).to(tl.int32).to(tl.float32, bitcast=True)
+
+
+@triton.jit
+def _row(records, rank, known):
+    # Center (x, y), root, root_k, m_log2, log2_opacity, red, green, blue and z of the Gaussian of a rank.
+    row = records + rank * RECORD
+    x, y = _two(row, X, known)
+    root, root_k = _two(row, ROOT, known)
+    m_log2, log2_opacity = _two(row, M_LOG2, known)
+    red, green = _two(row, RED, known)
+    blue, z = _two(row, BLUE, known)
+    return x, y, root, root_k, m_log2, log2_opacity, red, green, blue, z
+
+
+@triton.jit
+def _draw(gx, gy, root, root_k, m_log2, log2_opacity, x, y, step, transmittance):
+    # Alpha of a Gaussian, the transmittance behind it, and dx and u, which the gradients need. Fused operations are
+    # named, so that no compiler chooses them and both passes come to the same bits. Times -1 costs nothing; a minus is
+    # a subtraction from 0 in Triton 3.7.
+    dx = x - gx
+    u = tl.fma(step, root, tl.fma(root, y - gy, root_k * dx))
+    exponent = tl.fma(u * -1.0, u, tl.fma(m_log2 * dx * -1.0, dx, log2_opacity))
+    alpha = tl.minimum(tl.exp2(exponent), _ALPHA_MAX)
+    alpha = tl.where(exponent >= LOG2_ALPHA_MIN, alpha, 0.0)
+    return alpha, tl.fma(transmittance * -1.0, alpha, transmittance), dx, u
+
+
+@triton.jit(do_not_specialize=SIZES)
+def composite_forward(
+    records, ranks, tile_starts, background, width, height, tiles_x,
+    color, alpha_out, depth, transmittance_out, tile_ends, ROWS: tl.constexpr,
+):  # fmt: skip
+    """One program per tile. Writes color (H, W, 3), alpha_out, depth, transmittance_out (H, W), and tile_ends (L,):
+    where each tile's list was left."""
+    tile = tl.program_id(0)
+    x, y, step, place, inside = _pixels(tile, tiles_x, width, height, ROWS)
+    pair, end = tl.load(tile_starts + tile), tl.load(tile_starts + tile + 1)
+    t = tl.where(inside, 1.0, -1.0)  # negative: full; its magnitude stays what it was
+    red, green, blue, z = tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t)
+    # Loads run ahead: the record one pair, its rank two, so that few warps suffice to hide how long they take.
+    gx, gy, root, root_k, m, opacity, r, g, b, gz = _record(records, ranks, pair, end)
+    rank = tl.load(ranks + pair + 1, pair + 1 < end, 0)
+    while (pair < end) & (tl.max(tl.max(t, 0), 0) > 0):
+        chunk_end = tl.minimum(pair + _CHECK_EVERY, end)
+        for p in tl.range(pair, chunk_end, loop_unroll_factor=2):
+            n0, n1, n2, n3, n4, n5, n6, n7, n8, n9 = _row(records, rank, True)
+            rank = tl.load(ranks + p + 2, p + 2 < end, 0)
+            alpha, behind, _, _ = _draw(gx, gy, root, root_k, m, opacity, x, y, step, t)
+            weight = tl.where(behind >= _STOP, t * alpha, 0.0)
+            t = tl.where(behind >= _STOP, behind, tl.abs(t) * -1.0)
+            red += weight * r
+            green += weight * g
+            blue += weight * b
+            z += weight * gz
+            gx, gy, root, root_k, m, opacity, r, g, b, gz = n0, n1, n2, n3, n4, n5, n6, n7, n8, n9
+        pair = chunk_end
+    tl.store(tile_ends + tile, pair)
+    t = tl.abs(t)
+    tl.store(color + 3 * place, red + t * tl.load(background), inside)
+    tl.store(color + 3 * place + 1, green + t * tl.load(background + 1), inside)
+    tl.store(color + 3 * place + 2, blue + t * tl.load(background + 2), inside)
+    tl.store(alpha_out + place, 1.0 - t, inside)
+    tl.store(depth + place, z, inside)
+    tl.store(transmittance_out + place, t, inside)
+
+
+@triton.jit
+def _exchange(a, b, lane, BIT: tl.constexpr):
+    # Adds the lanes that differ in BIT: those without it keep the sums of a, those with it the sums of b.
+    upper = (lane & BIT) != 0
+    return tl.where(upper, b, a) + tl.gather(tl.where(upper, a, b), lane ^ BIT, 0)
+
+
+@triton.jit
+def _totals(v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, lane):
+    # Sums of ten values over all lanes, one sum per lane: see `_number` for which. Twelve shuffles instead of fifty.
+    v0, v2, v4 = _exchange(v0, v1, lane, 16), _exchange(v2, v3, lane, 16), _exchange(v4, v5, lane, 16)
+    v6, v8 = _exchange(v6, v7, lane, 16), _exchange(v8, v9, lane, 16)
+    v0, v4, v8 = _exchange(v0, v2, lane, 8), _exchange(v4, v6, lane, 8), _exchange(v8, v8, lane, 8)
+    v0, v8 = _exchange(v0, v4, lane, 4), _exchange(v8, v8, lane, 4)
+    v0 = _exchange(v0, v8, lane, 2)
+    return _exchange(v0, v0, lane, 1)
+
+
+@triton.jit
+def _number(lane):
+    # Which of the ten sums a lane has after `_totals`, and whether it is the one to write it.
+    last = (lane & 2) != 0
+    number = tl.where(last, 8, (lane & 4) + ((lane & 8) >> 2)) + (lane >> 4)
+    return number, ((lane & 1) == 0) & ((~last) | ((lane & 12) == 0))
+
+
+@triton.jit(do_not_specialize=SIZES)
+def composite_backward(
+    records, ranks, slots, tile_starts, tile_ends, width, height, tiles_x,
+    color, depth, transmittance, v_color, v_depth, v_alpha, moments, ROWS: tl.constexpr,
+):  # fmt: skip
+    """One program per tile. Writes moments (P, MOMENTS) by slot; zeros for pairs the forward pass did not need."""
+    tile = tl.program_id(0)
+    x, y, step, place, inside = _pixels(tile, tiles_x, width, height, ROWS)
+    v_red = tl.load(v_color + 3 * place, inside, 0.0)
+    v_green = tl.load(v_color + 3 * place + 1, inside, 0.0)
+    v_blue = tl.load(v_color + 3 * place + 2, inside, 0.0)
+    v_z = tl.load(v_depth + place, inside, 0.0)
+    rest = v_red * tl.load(color + 3 * place, inside, 0.0)
+    rest += v_green * tl.load(color + 3 * place + 1, inside, 0.0)
+    rest += v_blue * tl.load(color + 3 * place + 2, inside, 0.0)
+    rest += v_z * tl.load(depth + place, inside, 0.0)
+    rest -= tl.load(v_alpha + place, inside, 0.0) * tl.load(transmittance + place, inside, 0.0)
+    t = tl.where(inside, 1.0, -1.0)
+    lane = tl.arange(0, 32)
+    number, writes = _number(lane)
+    start, needed, end = tl.load(tile_starts + tile), tl.load(tile_ends + tile), tl.load(tile_starts + tile + 1)
+    gx, gy, root, root_k, m, opacity, r, g, b, gz = _record(records, ranks, start, needed)
+    rank = tl.load(ranks + start + 1, start + 1 < needed, 0)
+    slot = tl.load(slots + start, start < needed, 0)
+    for p in tl.range(start, needed, loop_unroll_factor=2):
+        n0, n1, n2, n3, n4, n5, n6, n7, n8, n9 = _row(records, rank, True)
+        rank = tl.load(ranks + p + 2, p + 2 < needed, 0)
+        next_slot = tl.load(slots + p + 1, p + 1 < needed, 0)
+        alpha, behind, dx, u = _draw(gx, gy, root, root_k, m, opacity, x, y, step, t)
+        weight = tl.where(behind >= _STOP, t * alpha, 0.0)
+        gain = weight * (r * v_red + g * v_green + b * v_blue + gz * v_z)
+        rest -= gain
+        # rest alpha / (1 - alpha), as weight = T alpha and behind = T (1 - alpha). A division is ten instructions, the
+        # square of the inverse root two.
+        inverse_root = tl.rsqrt(tl.abs(behind))
+        pulled = gain - rest * weight * (inverse_root * inverse_root)
+        dp = tl.where((behind >= _STOP) & (alpha < _ALPHA_MAX), pulled, 0.0)
+        t = tl.where(behind >= _STOP, behind, tl.abs(t) * -1.0)
+        # Sums over the lane's pixels first: dx is the same for all of them.
+        dp_u = dp * u
+        dx = tl.sum(dx, 0)
+        s_1, s_u, s_uu = tl.sum(dp, 0), tl.sum(dp_u, 0), tl.sum(dp_u * u, 0)
+        s_red, s_green = tl.sum(weight * v_red, 0), tl.sum(weight * v_green, 0)
+        s_blue, s_z = tl.sum(weight * v_blue, 0), tl.sum(weight * v_z, 0)
+        s_x = s_1 * dx
+        sums = _totals(s_1, s_x, s_x * dx, s_u, s_uu, s_u * dx, s_red, s_green, s_blue, s_z, lane)
+        tl.store(moments + slot * MOMENTS + number, sums, writes)
+        slot = next_slot
+        gx, gy, root, root_k, m, opacity, r, g, b, gz = n0, n1, n2, n3, n4, n5, n6, n7, n8, n9
+    for p in range(needed, end):
+        tl.store(moments + tl.load(slots + p) * MOMENTS + number, tl.zeros_like(number), writes)
+
+
+@triton.jit(do_not_specialize=["num", "capacity"])
+def gather(
+    moments, slot_ends, order, forms, opacities, num, capacity,
+    v_means2d, v_forms, v_opacities, v_colors, v_z, BLOCK: tl.constexpr, SIDE_BY_SIDE: tl.constexpr,
+):  # fmt: skip
+    """One program per BLOCK ranks. Adds up the slots of each, SIDE_BY_SIDE at a time, and writes one row of each v_*.
+
+    log alpha = log opacity - (a U^2 + m dx^2) / 2 with U = dy + k dx = u / root; moving the center moves (dx, dy) the
+    other way.
+    """
+    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    known = rank < num
+    g = tl.load(order + rank, known, 0)
+    start = tl.load(slot_ends + rank - 1, known & (rank > 0), 0)
+    end = tl.minimum(tl.load(slot_ends + rank, known, 0), capacity)
+    s_1 = tl.zeros((BLOCK, SIDE_BY_SIDE), tl.float32)
+    s_x, s_xx, s_u, s_uu, s_ux, s_red, s_green, s_blue, s_z = s_1, s_1, s_1, s_1, s_1, s_1, s_1, s_1, s_1
+    for i in range(0, tl.max(end - start, 0).to(tl.int32), SIDE_BY_SIDE):
+        slot = start[:, None] + i + tl.arange(0, SIDE_BY_SIDE)[None, :]
+        taken = slot < end[:, None]
+        row = moments + slot * MOMENTS
+        s_1 += tl.load(row, taken, 0.0)
+        s_x += tl.load(row + 1, taken, 0.0)
+        s_xx += tl.load(row + 2, taken, 0.0)
+        s_u += tl.load(row + 3, taken, 0.0)
+        s_uu += tl.load(row + 4, taken, 0.0)
+        s_ux += tl.load(row + 5, taken, 0.0)
+        s_red += tl.load(row + 6, taken, 0.0)
+        s_green += tl.load(row + 7, taken, 0.0)
+        s_blue += tl.load(row + 8, taken, 0.0)
+        s_z += tl.load(row + 9, taken, 0.0)
+    some = known & (end > start)
+    a, k = tl.load(forms + 3 * g, some, 1.0), tl.load(forms + 3 * g + 1, some, 0.0)
+    inverse_root = 1.0 / tl.sqrt(a * HALF_LOG2_E)
+    u_1, u_x = tl.sum(s_u, 1) * inverse_root, tl.sum(s_ux, 1) * inverse_root
+    v_y = a * u_1
+    tl.store(v_means2d + 2 * g, k * v_y + tl.load(forms + 3 * g + 2, some, 0.0) * tl.sum(s_x, 1), known)
+    tl.store(v_means2d + 2 * g + 1, v_y, known)
+    tl.store(v_forms + 3 * g, -0.5 * tl.sum(s_uu, 1) * inverse_root * inverse_root, known)
+    tl.store(v_forms + 3 * g + 1, -a * u_x, known)
+    tl.store(v_forms + 3 * g + 2, -0.5 * tl.sum(s_xx, 1), known)
+    tl.store(v_opacities + g, tl.sum(s_1, 1) / tl.load(opacities + g, some, 1.0), known)
+    tl.store(v_colors + 3 * g, tl.sum(s_red, 1), known)
+    tl.store(v_colors + 3 * g + 1, tl.sum(s_green, 1), known)
+    tl.store(v_colors + 3 * g + 2, tl.sum(s_blue, 1), known)
+    tl.store(v_z + g, tl.sum(s_z, 1), known)

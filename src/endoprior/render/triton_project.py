@@ -1,0 +1,289 @@
+"""EWA projection and color of all Gaussians as Triton kernels, forward and backward, one Gaussian per lane.
+
+Meets `projection.project`. What compositing needs of a 2D Gaussian is its *column form* (a, k, m):
+`power = -(a (dy + k dx)^2 + m dx^2) / 2`: every column of pixels is a 1D Gaussian of precision a, centered k dx above,
+and its peak falls off with precision m. With covariance (xx, xy, yy): `a = xx / det`, `k = -xy / xx`, `m = 1 / xx`.
+Unlike the inverse covariance it has no cancellation, and neither has `det` (see `project_kernels`).
+
+Geometry is float64 inside, as on the CPU: a few hundred operations per Gaussian, some microseconds per picture even
+where float64 runs at 1/64 of the speed, for centers and gradients that agree with the definition to float32 rounding.
+Colors are float32. In this file `v_x` is dL/dx; `lens` is what `lens_of` returns.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ..types import Camera
+from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
+from .projection import jacobian_limits
+from .triton_sh import expand, pull_back
+
+BLOCK = 128
+"""Gaussians per program."""
+KEPT_CAMERAS = 1024
+"""Cameras whose numbers stay on the device."""
+CENTER, FX, LIMITS, LENS_SIZE = tl.constexpr(12), tl.constexpr(15), tl.constexpr(19), tl.constexpr(23)
+"""Where the parts of `lens` begin, after the view, and where it ends."""
+_ALPHA_MIN, _BLUR, _NEAR_Z = tl.constexpr(ALPHA_MIN), tl.constexpr(BLUR_PX2), tl.constexpr(NEAR_Z)
+_MIN_QUAT, _OVERFLOW = tl.constexpr(MIN_QUAT), tl.constexpr(OVERFLOW)
+
+
+def lens_of(camera: Camera, device: torch.device) -> Tensor:
+    """(LENS_SIZE,) float64 on that device: view (3, 4), center (3,), fx fy cx cy, left right top bottom.
+
+    Those of cameras seen before are there already: no copy, no waiting.
+    """
+    view = np.asarray(camera.world_to_camera, np.float64)[:3]
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    numbers = np.concatenate([view.ravel(), camera.center, intrinsics, jacobian_limits(camera)])
+    return _on_device(numbers.astype(np.float64).tobytes(), device)
+
+
+@lru_cache(maxsize=KEPT_CAMERAS)
+def _on_device(numbers: bytes, device: torch.device) -> Tensor:
+    # By value: an array that is changed in place, or an address that is used again, finds no stale numbers.
+    return torch.from_numpy(np.frombuffer(numbers).copy()).to(device)
+
+
+@triton.jit
+def _double(value: tl.constexpr):
+    # A constant in float64; some versions of Triton round a plain one to float32 first.
+    return tl.full((), value, tl.float64)
+
+
+@triton.jit
+def _center(row, lens, mask):
+    # Means in the world (wx, wy, wz) and in the camera (x, y, z).
+    wx = tl.load(row, mask, 0.0).to(tl.float64)
+    wy = tl.load(row + 1, mask, 0.0).to(tl.float64)
+    wz = tl.load(row + 2, mask, 0.0).to(tl.float64)
+    x = tl.load(lens) * wx + tl.load(lens + 1) * wy + tl.load(lens + 2) * wz + tl.load(lens + 3)
+    y = tl.load(lens + 4) * wx + tl.load(lens + 5) * wy + tl.load(lens + 6) * wz + tl.load(lens + 7)
+    z = tl.load(lens + 8) * wx + tl.load(lens + 9) * wy + tl.load(lens + 10) * wz + tl.load(lens + 11)
+    return wx, wy, wz, x, y, z
+
+
+@triton.jit
+def _unit_quat(row, mask):
+    # (w, x, y, z) at length 1, and the length it had.
+    w = tl.load(row, mask, 1.0).to(tl.float64)
+    x = tl.load(row + 1, mask, 0.0).to(tl.float64)
+    y = tl.load(row + 2, mask, 0.0).to(tl.float64)
+    z = tl.load(row + 3, mask, 0.0).to(tl.float64)
+    length = tl.sqrt(w * w + x * x + y * y + z * z)
+    return w / length, x / length, y / length, z / length, length
+
+
+@triton.jit
+def _to_camera(lens, i: tl.constexpr, x, y, z):
+    # Row i of the view's rotation times (x, y, z).
+    return tl.load(lens + 4 * i) * x + tl.load(lens + 4 * i + 1) * y + tl.load(lens + 4 * i + 2) * z
+
+
+@triton.jit
+def _to_world(lens, i: tl.constexpr, x, y, z):
+    # Column i of the view's rotation times (x, y, z).
+    return tl.load(lens + i) * x + tl.load(lens + 4 + i) * y + tl.load(lens + 8 + i) * z
+
+
+@triton.jit
+def _spread(lens, j: tl.constexpr, rx, ry, rz, scale, slope_x, slope_y, gx, gy):
+    # Column j of J times the axes, from column j (rx, ry, rz) of the rotation; and that axis' z in the camera frame.
+    axis_z = scale * _to_camera(lens, 2, rx, ry, rz)
+    b = gx * (scale * _to_camera(lens, 0, rx, ry, rz) - slope_x * axis_z)
+    c = gy * (scale * _to_camera(lens, 1, rx, ry, rz) - slope_y * axis_z)
+    return b, c, axis_z
+
+
+@triton.jit
+def _scale(row, j: tl.constexpr, mask):
+    return tl.load(row + j, mask, 1.0).to(tl.float64)
+
+
+@triton.jit
+def _project(means, quats, scales, lens, g, mask):
+    # What both passes need: centers, slopes, J times the axes (rows b, c), covariance and its determinant.
+    wx, wy, wz, x, y, z = _center(means + 3 * g, lens, mask)
+    qw, qx, qy, qz, length = _unit_quat(quats + 4 * g, mask)
+    slope_x = tl.minimum(tl.maximum(x / z, tl.load(lens + LIMITS)), tl.load(lens + LIMITS + 1))
+    slope_y = tl.minimum(tl.maximum(y / z, tl.load(lens + LIMITS + 2)), tl.load(lens + LIMITS + 3))
+    gx, gy = tl.load(lens + FX) / z, tl.load(lens + FX + 1) / z
+    r0, r1, r2 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
+    b0, c0, z0 = _spread(lens, 0, r0, r1, r2, _scale(scales + 3 * g, 0, mask), slope_x, slope_y, gx, gy)
+    r0, r1, r2 = 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
+    b1, c1, z1 = _spread(lens, 1, r0, r1, r2, _scale(scales + 3 * g, 1, mask), slope_x, slope_y, gx, gy)
+    r0, r1, r2 = 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
+    b2, c2, z2 = _spread(lens, 2, r0, r1, r2, _scale(scales + 3 * g, 2, mask), slope_x, slope_y, gx, gy)
+    bb, bc, cc = b0 * b0 + b1 * b1 + b2 * b2, b0 * c0 + b1 * c1 + b2 * c2, c0 * c0 + c1 * c1 + c2 * c2
+    n0, n1, n2 = b1 * c2 - b2 * c1, b2 * c0 - b0 * c2, b0 * c1 - b1 * c0
+    blur = _double(_BLUR)
+    det = n0 * n0 + n1 * n1 + n2 * n2 + blur * (bb + cc) + blur * blur
+    world, center, quat = (wx, wy, wz), (x, y, z), (qw, qx, qy, qz)
+    spread = (b0, b1, b2, c0, c1, c2)
+    cov = (bb + blur, bc, cc + blur, det)
+    return world, center, quat, length, (slope_x, slope_y), (gx, gy), spread, (z0, z1, z2), cov
+
+
+@triton.jit
+def _direction(world, lens):
+    # Unit vector from the camera to the mean, and 1 / distance.
+    wx, wy, wz = world
+    x, y, z = wx - tl.load(lens + CENTER), wy - tl.load(lens + CENTER + 1), wz - tl.load(lens + CENTER + 2)
+    inverse = 1.0 / tl.sqrt(x * x + y * y + z * z)
+    return x * inverse, y * inverse, z * inverse, inverse
+
+
+@triton.jit(do_not_specialize=["num", "width", "height"])
+def project_forward(
+    means, quats, scales, opacities, sh, lens, num, width, height,
+    means2d, forms, z_out, colors, radii, keys,
+    DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """One program per BLOCK Gaussians. Writes one row each of means2d (N, 2), forms (N, 3), z_out (N,), colors (N, 3),
+    radii (N,), and keys (N,): z where the Gaussian is drawn, else infinity. Culled: all zeros."""
+    g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = g < num
+    world, center, _, length, _, _, _, _, cov = _project(means, quats, scales, lens, g, mask)
+    x, y, z = center
+    xx, xy, yy, det = cov
+    px, py = (
+        tl.load(lens + FX) * x / z + tl.load(lens + FX + 2),
+        tl.load(lens + FX + 1) * y / z + tl.load(lens + FX + 3),
+    )
+    ux, uy, uz, _ = _direction(world, lens)
+    num_sh: tl.constexpr = (DEGREE + 1) * (DEGREE + 1)
+    ahead = mask & (z > _double(_NEAR_Z))  # those behind need no coefficients
+    row = sh + g * (3 * num_sh)
+    red, green, blue = expand(row, ux.to(tl.float32), uy.to(tl.float32), uz.to(tl.float32), ahead, DEGREE)
+    opacity = tl.load(opacities + g, mask, 0.0)
+    # One sum notices every NaN and infinity.
+    shades = tl.abs(red).to(tl.float64) + tl.abs(green).to(tl.float64) + tl.abs(blue).to(tl.float64)
+    size = tl.abs(px) + tl.abs(py) + z + xx * yy + shades + tl.abs(opacity).to(tl.float64)
+    usable = ahead & (size < _double(_OVERFLOW)) & (length >= _double(_MIN_QUAT))  # False for NaN
+
+    level = 2.0 * tl.log(tl.maximum(opacity / _ALPHA_MIN, 1.0)).to(tl.float64)  # squared reach, in sigmas
+    reach_x, reach_y = tl.sqrt(level * xx), tl.sqrt(level * yy)
+    touches = (px + reach_x >= 0.5) & (px - reach_x <= width - 0.5) & (py + reach_y >= 0.5)
+    drawn = usable & touches & (py - reach_y <= height - 0.5) & (opacity >= _ALPHA_MIN)
+    half = 0.5 * (xx - yy)
+    long_axis = 0.5 * (xx + yy) + tl.sqrt(half * half + xy * xy)
+    radius = tl.where(drawn, tl.minimum(tl.ceil(3.0 * tl.sqrt(long_axis)), 1073741824.0), 0.0)
+
+    tl.store(means2d + 2 * g, tl.where(usable, px, 0.0).to(tl.float32), mask)
+    tl.store(means2d + 2 * g + 1, tl.where(usable, py, 0.0).to(tl.float32), mask)
+    tl.store(forms + 3 * g, tl.where(usable, xx / det, 0.0).to(tl.float32), mask)
+    tl.store(forms + 3 * g + 1, tl.where(usable, -xy / xx, 0.0).to(tl.float32), mask)
+    tl.store(forms + 3 * g + 2, tl.where(usable, 1.0 / xx, 0.0).to(tl.float32), mask)
+    tl.store(z_out + g, tl.where(usable, z, 0.0).to(tl.float32), mask)
+    tl.store(colors + 3 * g, tl.where(usable, tl.maximum(red, 0.0), 0.0), mask)
+    tl.store(colors + 3 * g + 1, tl.where(usable, tl.maximum(green, 0.0), 0.0), mask)
+    tl.store(colors + 3 * g + 2, tl.where(usable, tl.maximum(blue, 0.0), 0.0), mask)
+    tl.store(radii + g, radius.to(tl.int32), mask)
+    tl.store(keys + g, tl.where(drawn, z.to(tl.float32), float("inf")), mask)
+
+
+@triton.jit
+def _store_axis(row, v_row, lens, j: tl.constexpr, r0, r1, r2, vb, vc, vz, gx, gy, mask, written):
+    # Column j: dL/d(b, c) -> dL/d(axis in the camera frame) -> dL/d(scale), stored, and dL/d(rotation), returned.
+    v0, v1 = gx * vb, gy * vc
+    m0, m1, m2 = _to_world(lens, 0, v0, v1, vz), _to_world(lens, 1, v0, v1, vz), _to_world(lens, 2, v0, v1, vz)
+    v_scale = m0 * r0 + m1 * r1 + m2 * r2
+    tl.store(v_row + j, tl.where(mask, v_scale, 0.0).to(tl.float32), written)
+    scale = _scale(row, j, mask)
+    return m0 * scale, m1 * scale, m2 * scale
+
+
+@triton.jit(do_not_specialize=["num"])
+def project_backward(
+    means, quats, scales, sh, lens, num, radii, v_means2d, v_forms, v_z, v_colors, v_means, v_quats, v_scales, v_sh,
+    DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """One program per BLOCK Gaussians. Writes one row each of v_means, v_quats, v_scales, v_sh; zeros where radii is
+    0."""
+    g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    written = g < num
+    mask = tl.load(radii + g, written, 0) > 0
+    world, center, quat, length, slopes, gains, spread, axes_z, cov = _project(means, quats, scales, lens, g, mask)
+    x, y, z = center
+    qw, qx, qy, qz = quat
+    slope_x, slope_y = slopes
+    gx, gy = gains
+    b0, b1, b2, c0, c1, c2 = spread
+    z0, z1, z2 = axes_z
+    xx, xy, _, det = cov
+
+    # Column form -> covariance -> rows of J times the axes.
+    v_a = tl.load(v_forms + 3 * g, mask, 0.0).to(tl.float64)
+    v_k = tl.load(v_forms + 3 * g + 1, mask, 0.0).to(tl.float64)
+    v_m = tl.load(v_forms + 3 * g + 2, mask, 0.0).to(tl.float64)
+    v_det = -v_a * xx / (det * det)
+    v_yy = v_det * xx
+    v_xy = -2.0 * v_det * xy - v_k / xx
+    v_xx = -v_a * (xy / det) * (xy / det) + (v_k * xy - v_m) / (xx * xx)
+    vb0, vb1, vb2 = 2 * v_xx * b0 + v_xy * c0, 2 * v_xx * b1 + v_xy * c1, 2 * v_xx * b2 + v_xy * c2
+    vc0, vc1, vc2 = 2 * v_yy * c0 + v_xy * b0, 2 * v_yy * c1 + v_xy * b1, 2 * v_yy * c2 + v_xy * b2
+
+    # Rows of J times the axes, and the center in the image -> center in the camera frame.
+    v_x = tl.load(v_means2d + 2 * g, mask, 0.0).to(tl.float64) * gx
+    v_y = tl.load(v_means2d + 2 * g + 1, mask, 0.0).to(tl.float64) * gy
+    v_depth = tl.load(v_z + g, mask, 0.0).to(tl.float64) - (v_x * x + v_y * y) / z
+    v_depth -= (vb0 * b0 + vb1 * b1 + vb2 * b2 + vc0 * c0 + vc1 * c1 + vc2 * c2) / z
+    inside = (x / z >= tl.load(lens + LIMITS)) & (x / z <= tl.load(lens + LIMITS + 1))
+    v_slope = tl.where(inside, -gx * (vb0 * z0 + vb1 * z1 + vb2 * z2), 0.0)
+    v_x += v_slope / z
+    v_depth -= v_slope * x / (z * z)
+    inside = (y / z >= tl.load(lens + LIMITS + 2)) & (y / z <= tl.load(lens + LIMITS + 3))
+    v_slope = tl.where(inside, -gy * (vc0 * z0 + vc1 * z1 + vc2 * z2), 0.0)
+    v_y += v_slope / z
+    v_depth -= v_slope * y / (z * z)
+
+    # Color -> coefficients and direction of view -> mean.
+    ux, uy, uz, inverse = _direction(world, lens)
+    fx, fy, fz = ux.to(tl.float32), uy.to(tl.float32), uz.to(tl.float32)
+    num_sh: tl.constexpr = (DEGREE + 1) * (DEGREE + 1)
+    row, v_row = sh + g * (3 * num_sh), v_sh + g * (3 * num_sh)
+    red, green, blue = expand(row, fx, fy, fz, mask, DEGREE)
+    vr = tl.where(mask & (red >= 0), tl.load(v_colors + 3 * g, mask, 0.0), 0.0)
+    vg = tl.where(mask & (green >= 0), tl.load(v_colors + 3 * g + 1, mask, 0.0), 0.0)
+    vb = tl.where(mask & (blue >= 0), tl.load(v_colors + 3 * g + 2, mask, 0.0), 0.0)
+    fx, fy, fz = tl.where(mask, fx, 0.0), tl.where(mask, fy, 0.0), tl.where(mask, fz, 0.0)  # 0 times NaN is not 0
+    wx, wy, wz = pull_back(row, v_row, fx, fy, fz, vr, vg, vb, mask, written, DEGREE)
+    dx, dy, dz = wx.to(tl.float64), wy.to(tl.float64), wz.to(tl.float64)
+    along = dx * ux + dy * uy + dz * uz
+    dx, dy, dz = inverse * (dx - along * ux), inverse * (dy - along * uy), inverse * (dz - along * uz)
+    dx, dy, dz = (
+        dx + _to_world(lens, 0, v_x, v_y, v_depth),
+        dy + _to_world(lens, 1, v_x, v_y, v_depth),
+        dz + _to_world(lens, 2, v_x, v_y, v_depth),
+    )
+    tl.store(v_means + 3 * g, tl.where(mask, dx, 0.0).to(tl.float32), written)
+    tl.store(v_means + 3 * g + 1, tl.where(mask, dy, 0.0).to(tl.float32), written)
+    tl.store(v_means + 3 * g + 2, tl.where(mask, dz, 0.0).to(tl.float32), written)
+
+    # Axes = view R diag(scales) -> scales and R (m_ij holds dL/dR) -> quaternion, through its normalization.
+    v_axis = -slope_x * gx * vb0 - slope_y * gy * vc0
+    r0, r1, r2 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
+    srow, v_srow = scales + 3 * g, v_scales + 3 * g
+    m00, m10, m20 = _store_axis(srow, v_srow, lens, 0, r0, r1, r2, vb0, vc0, v_axis, gx, gy, mask, written)
+    v_axis = -slope_x * gx * vb1 - slope_y * gy * vc1
+    r0, r1, r2 = 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
+    m01, m11, m21 = _store_axis(srow, v_srow, lens, 1, r0, r1, r2, vb1, vc1, v_axis, gx, gy, mask, written)
+    v_axis = -slope_x * gx * vb2 - slope_y * gy * vc2
+    r0, r1, r2 = 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
+    m02, m12, m22 = _store_axis(srow, v_srow, lens, 2, r0, r1, r2, vb2, vc2, v_axis, gx, gy, mask, written)
+    v_w = 2 * (qx * (m21 - m12) + qy * (m02 - m20) + qz * (m10 - m01))
+    v_i = 2 * (qy * (m01 + m10) + qz * (m02 + m20) + qw * (m21 - m12)) - 4 * qx * (m11 + m22)
+    v_j = 2 * (qx * (m01 + m10) + qz * (m12 + m21) + qw * (m02 - m20)) - 4 * qy * (m00 + m22)
+    v_k = 2 * (qx * (m02 + m20) + qy * (m12 + m21) + qw * (m10 - m01)) - 4 * qz * (m00 + m11)
+    along = v_w * qw + v_i * qx + v_j * qy + v_k * qz
+    tl.store(v_quats + 4 * g, tl.where(mask, (v_w - along * qw) / length, 0.0).to(tl.float32), written)
+    tl.store(v_quats + 4 * g + 1, tl.where(mask, (v_i - along * qx) / length, 0.0).to(tl.float32), written)
+    tl.store(v_quats + 4 * g + 2, tl.where(mask, (v_j - along * qy) / length, 0.0).to(tl.float32), written)
+    tl.store(v_quats + 4 * g + 3, tl.where(mask, (v_k - along * qz) / length, 0.0).to(tl.float32), written)
