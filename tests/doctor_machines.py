@@ -1,10 +1,13 @@
-"""Made-up machines for the tests of the doctor: one with everything, and kinds of every part."""
+"""Made-up machines for the tests of the doctor: one with everything, and kinds of every part; programs that answer."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 from hypothesis import strategies as st
 
-from endoprior.doctor import Facts
+from endoprior.doctor import Facts, toolchain
+from endoprior.doctor import facts as facts_module
 from endoprior.doctor.records import Builders, Driver, Gpu, Gsplat, System, Toolkit, Torch, Triton
 
 H200 = Gpu("NVIDIA H200", (9, 0), 139.0, True)
@@ -22,8 +25,8 @@ WORKING = Facts(
     builders=Builders("c++", "12.2.0", True, c_compiler="gcc", c_version="12.2.0", ninja="1.11", python_headers=True),
 )
 """A machine with everything."""
-NO_TRITON = replace(WORKING, triton=Triton("3.7.1", "triton==3.7.1", False, "RuntimeError"), system=System("Windows"))
-"""The same, but Triton does not work there, and nothing mends it soon: the way leads through gsplat."""
+NO_TRITON = replace(WORKING, triton=Triton("3.7.1", "triton==3.7.1", False, "RuntimeError"))
+"""The same, but Triton does not work there and nothing is known to mend it: the way leads through gsplat."""
 ONLY_TRITON = replace(WORKING, gsplat=Gsplat(), toolkit=Toolkit(pip="/venv/nvidia/cu13"))
 """As `pip install endoprior` leaves a machine with a driver and torch for CUDA: no gsplat, no toolkit."""
 NO_GPU = replace(WORKING, driver=Driver(0), torch=Torch("2.13.0+cu130", "13.0", available=False, reason="no driver"))
@@ -83,3 +86,23 @@ def machines():
     return st.tuples(*(st.sampled_from(CHOICES[name]) for name in names)).map(
         lambda picked: Facts(**dict(zip(names, picked, strict=True)), variables={})
     )
+
+
+def program(folder: Path, name: str, body: str) -> Path:
+    """A script on its own; returns its path."""
+    file = folder / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(f"#!/bin/sh\n{body}\n")
+    file.chmod(0o755)
+    return file
+
+
+def bare_machine(tmp_path: Path, monkeypatch) -> Path:
+    """A folder that is first on PATH, on a machine without variables of CUDA and packages of NVIDIA."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}/usr/bin{os.pathsep}/bin")
+    for name in (*facts_module.VARIABLES, "LIBRARY_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(toolchain, "pip_folder", lambda: "")
+    return folder

@@ -7,39 +7,21 @@ import time
 from dataclasses import replace
 
 import pytest
-from doctor_machines import WORKING
+from doctor_machines import NO_TRITON, WORKING, bare_machine, program
 from hypothesis import given
 from hypothesis import strategies as st
 
 from endoprior import device
 from endoprior.doctor import Facts, examine, glance, look, mend
 from endoprior.doctor import facts as facts_module
-from endoprior.doctor import toolchain
 from endoprior.doctor.ask import MOST_BYTES, ask, clean
 from endoprior.doctor.driver import driver_answers, driver_files, read_banner, read_gpus
 from endoprior.doctor.records import Driver, Gpu, System, Torch, number
-from endoprior.doctor.toolchain import look_for_builders
-
-
-def program(folder, name: str, body: str):
-    """A script on its own; returns its path."""
-    file = folder / name
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(f"#!/bin/sh\n{body}\n")
-    file.chmod(0o755)
-    return file
 
 
 @pytest.fixture
 def path(tmp_path, monkeypatch):
-    """A folder that is first on PATH, and a machine without variables of CUDA."""
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}/usr/bin{os.pathsep}/bin")
-    for name in (*facts_module.VARIABLES, "LIBRARY_PATH"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(toolchain, "pip_folder", lambda: "")
-    return folder
+    return bare_machine(tmp_path, monkeypatch)
 
 
 BANNER = "| NVIDIA-SMI 570.10   Driver Version: 570.124.06   CUDA Version: 12.8 |"
@@ -138,16 +120,6 @@ def test_driver_files(tmp_path, path):
     assert examine(unreachable).next_step == "start the container with --gpus all"
 
 
-def test_ninja_beside_python_but_not_on_path(tmp_path, monkeypatch, path):
-    monkeypatch.setenv("PATH", str(path))
-    monkeypatch.setattr(sys, "executable", str(tmp_path / "venv/bin/python"))
-    program(tmp_path / "venv/bin", "ninja", "echo 1.13")
-    found = look_for_builders()
-    assert found.ninja == "" and found.ninja_beside_python == str(tmp_path / "venv/bin")
-    builders = replace(WORKING.builders, ninja="", ninja_beside_python=found.ninja_beside_python)
-    assert examine(replace(WORKING, builders=builders)).next_step == f'export PATH={tmp_path}/venv/bin:"$PATH"'
-
-
 @pytest.mark.parametrize(
     ("body", "says"),
     [
@@ -217,16 +189,16 @@ def fake_gsplat(folder, backend: str, monkeypatch):
 )
 def test_compiling_that_fails_says_why(tmp_path, monkeypatch, backend, says):
     fake_gsplat(tmp_path, backend, monkeypatch)
-    facts = facts_module.compile_gsplat(WORKING)
+    facts = facts_module.compile_gsplat(NO_TRITON)
     assert facts.gsplat.loads is False and says in facts.gsplat.error
     assert examine(facts).blocking.name == "gsplat compiled" and not examine(facts).only_to_compile
 
 
 def test_compiling_that_works_is_timed(tmp_path, monkeypatch):
     fake_gsplat(tmp_path, "class _C: intersect_tile = None", monkeypatch)
-    facts = facts_module.compile_gsplat(WORKING)
+    facts = facts_module.compile_gsplat(NO_TRITON)
     assert facts.gsplat.loads is True and 0 <= facts.gsplat.compile_seconds < 60
-    assert examine(facts).works
+    assert examine(facts).gsplat
 
 
 def test_compiled_files_are_found_and_tried_without_importing_gsplat(tmp_path, monkeypatch):

@@ -178,17 +178,13 @@ def install_python_headers(facts: Facts) -> str:
     return f"install the headers of Python {short}, or use a Python that has them"
 
 
-def install_triton(facts: Facts, again: bool = False) -> str:
-    """How to get the Triton that torch was built with; "" where torch has none, which is on Windows.
-
-    Args:
-        again: it is there, and does not work.
-    """
+def install_triton(facts: Facts) -> str:
+    """How to get the Triton that torch was built with; "" where torch has none, which is on Windows."""
     if facts.system.name != "Linux":
         return ""
     if not facts.torch.cuda:
         return install_torch(facts) or install_driver(facts)
-    return f"pip install{' --force-reinstall --no-deps' * again} {shlex.quote(facts.triton.wanted or 'triton')}"
+    return f"pip install {shlex.quote(facts.triton.wanted or 'triton')}"
 
 
 def interprets(facts: Facts) -> bool:
@@ -197,15 +193,15 @@ def interprets(facts: Facts) -> bool:
 
 
 def mend_triton(facts: Facts) -> str:
-    """What to do about a Triton that is there and did not compute, by what it said."""
-    error = facts.triton.error
+    """What to do about a Triton that is there and did not compute, by what it said; "" if that tells nothing."""
+    error, wanted = facts.triton.error, facts.triton.wanted
     if "libcuda" in error:
         return "sudo ldconfig; if that is not enough, export TRITON_LIBCUDA_PATH=(the folder of libcuda.so.1)"
     if "fatal error" in error:  # the compiler's words: it lacks the headers of C
         return install_compiler(facts)
     if any(words in error for words in ("Permission denied", "Read-only", "No space")):
         return 'export TRITON_CACHE_DIR="$(mktemp -d)"'
-    return install_triton(facts, again=True) or "endoprior doctor"
+    return install_triton(facts) if wanted and wanted != f"triton=={facts.triton.version}" else ""
 
 
 def set_variable(facts: Facts, name: str, value: str) -> str:

@@ -1,0 +1,192 @@
+"""The doctor and Triton: the shorter of two ways to the GPU, and whether Triton was seen to compute."""
+
+import sys
+from dataclasses import replace
+
+import pytest
+from doctor_machines import H200, NO_GPU, NO_TRITON, ONLY_TRITON, WORKING
+
+from endoprior import device
+from endoprior.checks import InputError
+from endoprior.doctor import examine
+from endoprior.doctor import facts as facts_module
+from endoprior.doctor.ask import Answer, ask
+from endoprior.doctor.records import Gsplat, System, Toolkit, Torch, Triton
+from endoprior.doctor.report import table
+
+INSTALL = ["pip install 'endoprior[cuda]'"]
+
+
+def test_triton_alone_is_enough():
+    report = examine(ONLY_TRITON)
+    assert (report.works, report.triton, report.gsplat) == (True, True, False)
+    assert report.next_step == "nothing: CUDA works, by Triton"
+    text = "\n".join(table(report))
+    assert "then Triton: works" in text and "or gsplat: not needed" in text
+    assert [line.mend for line in report.lines if line.part == "gsplat" and line.mend] == INSTALL, "and no more"
+    choice = device.choose("auto", ONLY_TRITON)
+    assert choice == device.Choice("cuda", "triton", "CUDA: NVIDIA H200, torch 2.13.0+cu130, Triton 3.7.1")
+    assert device.choose("cuda", ONLY_TRITON) == choice
+
+
+def test_gsplat_is_taken_where_both_work_and_never_compiled_where_triton_works():
+    assert device.choose("auto", WORKING).backend == device.choose("cuda", WORKING).backend == "cuda"
+    assert examine(WORKING).next_step == "nothing: CUDA works, by Triton and by gsplat"
+    to_compile = replace(WORKING, gsplat=Gsplat("1.5.3"))
+    for wanted in ("auto", "cuda"):
+        choice = device.choose(wanted, to_compile)
+        assert (choice.device, choice.backend) == ("cuda", "triton")
+        assert choice.why.endswith("Triton 3.7.1; gsplat is not compiled")
+    assert device.choose("auto", NO_TRITON).backend == "cuda"
+    with pytest.raises(InputError, match=r"got Triton: not installed\. Mend it: pip install triton==3\.7\.1"):
+        device.choose("cuda", replace(ONLY_TRITON, triton=Triton(wanted="triton==3.7.1")))
+
+
+@pytest.mark.parametrize(
+    ("changes", "step"),
+    [
+        ({}, "pip install triton==3.7.1"),
+        ({"triton": Triton()}, "pip install triton"),
+        ({"triton": Triton("3.0", "triton==3.7.1", False, "KeyError: 'sm_120'")}, "pip install triton==3.7.1"),
+        # Nothing is known to mend Triton: the way leads through gsplat.
+        ({"triton": Triton("3.7.1", "triton==3.7.1", False, "KeyError: 'sm_120'")}, "endoprior doctor --compile"),
+        ({"system": System("Windows")}, "endoprior doctor --compile"),
+        # One step each: Triton, which compiles in seconds. Two against one: gsplat.
+        ({"builders": replace(WORKING.builders, c_version="")}, "endoprior doctor --compile"),
+        ({"triton": WORKING.triton, "gsplat": Gsplat(), "builders": replace(WORKING.builders, c_version="")}, "g++"),
+        ({"gsplat": Gsplat(), "toolkit": Toolkit()}, "pip install triton==3.7.1"),
+        ({"torch": Torch("2.13.0+cpu")}, "whl/cu130"),
+        ({"builders": replace(WORKING.builders, python_headers=False)}, "install the headers of Python 3.11"),
+    ],
+)
+def test_the_shorter_way_is_named(changes, step):
+    machine = replace(WORKING, triton=Triton(wanted="triton==3.7.1"), gsplat=Gsplat("1.5.3"))
+    report = examine(replace(machine, **changes))
+    assert not report.works and step in report.next_step
+
+
+@pytest.mark.parametrize(
+    ("error", "step"),
+    [
+        ("libcuda.so cannot found!", "sudo ldconfig"),
+        ("cuda_utils.c:5:10: fatal error: stdio.h: No such file or directory", "install g++"),
+        ("[Errno 13] Permission denied: '/.triton'", "export TRITON_CACHE_DIR="),
+        ("[Errno 28] No space left on device", "export TRITON_CACHE_DIR="),
+    ],
+)
+def test_what_triton_says_is_mended(error, step):
+    machine = replace(ONLY_TRITON, triton=Triton("3.7.1", "triton==3.7.1", False, error))
+    report = examine(machine)
+    assert report.next_step.startswith(step) and report.blocking.found == f"3.7.1: {error}"
+    assert device.choose("auto", machine).device == "cpu"
+
+
+def test_interpreted_kernels_are_no_way_to_the_gpu():
+    machine = replace(ONLY_TRITON, variables={"TRITON_INTERPRET": "1"})
+    assert examine(machine).next_step == "unset TRITON_INTERPRET"
+    assert examine(replace(machine, variables={"TRITON_INTERPRET": "0"})).works
+
+
+def test_without_a_gpu_nothing_is_recommended():
+    report = examine(NO_GPU)
+    assert not report.works and report.next_step.startswith("nothing to install: no NVIDIA GPU is seen")
+    rows = table(report)
+    assert not any("nvcc" in row or "C compiler" in row for row in rows)
+    assert any(row.split() == ["ok", "Triton", "3.7.1", "adds", "two", "numbers", "on", "the", "GPU"] for row in rows)
+
+
+FAKE_TORCH = """
+class version: cuda, hip = "13.0", None
+__version__ = "2.13.0+cu130"
+class cuda:
+    def get_arch_list(): return ["sm_90"]
+    def is_available(): return True
+    def device_count(): return 1
+    def get_device_properties(i):
+        return type("P", (), dict(name="NVIDIA H200", major=9, minor=0, total_memory=2**37))
+class ones:
+    def __init__(self, *_, **__): pass
+    def __add__(self, _): return self
+    def sum(self): return self
+    def item(self): return 4.0
+zeros_like = ones
+"""
+FAKE_TRITON = """
+__version__ = "3.7.1"
+class Kernel:
+    def __getitem__(self, grid): return launch
+def launch(*_, **__):
+    import os, sys, time
+    {launch}
+def jit(_): return Kernel()
+"""
+
+
+@pytest.mark.parametrize(
+    ("launch", "computes", "says"),
+    [
+        ("pass", True, ""),
+        ("raise RuntimeError('0 active drivers')", False, "0 active drivers"),
+        ("sys.stderr.write('x.c:1:9: fatal error: Python.h: None\\n'); 1 / 0", False, "x.c:1:9: fatal error: Python.h"),
+        ("os._exit(3)", False, "status 3"),
+        ("os.abort()", False, "signal 6"),
+        ("time.sleep(60)", False, "no answer in 3 s"),
+    ],
+)
+def test_triton_is_tried_and_may_crash_or_hang(tmp_path, monkeypatch, launch, computes, says):
+    for name, text in (("torch", FAKE_TORCH), ("triton", FAKE_TRITON.format(launch=launch))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(text)
+    (tmp_path / "triton/language.py").write_text("constexpr = int")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    torch, triton, *_ = facts_module._ask_torch(3.0 if "sleep" in launch else 30.0)
+    seen = (torch.version, torch.available, torch.gpus[0].computes, torch.error)
+    assert seen == ("2.13.0+cu130", True, True, ""), "torch is judged alone"
+    assert (triton.version, triton.computes) == ("3.7.1", computes) and says in triton.error
+
+
+@pytest.mark.parametrize(
+    ("package", "version", "says"),
+    [("__version__ = '3.7.1'", "3.7.1", ""), ("raise ImportError('libtriton.so')", "", "libtriton.so"), (None, "", "")],
+)
+def test_triton_that_cannot_be_imported(tmp_path, monkeypatch, package, version, says):
+    (tmp_path / "torch").mkdir()
+    (tmp_path / "torch/__init__.py").write_text("class version: cuda, hip = None, None\n__version__ = '2.13.0+cpu'")
+    if package:
+        (tmp_path / "triton.py").write_text(package)
+    else:
+        (tmp_path / "triton.py").write_text("raise ModuleNotFoundError(name='triton')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    _, triton, *_ = facts_module._ask_torch(30.0)
+    assert (triton.version, triton.computes, triton.error) == (version, None, says)
+
+
+@pytest.mark.parametrize(
+    ("requires", "wanted"),
+    [
+        (["filelock", 'triton==3.7.1; platform_system == "Linux"'], "triton==3.7.1"),
+        (['triton (==3.0.0) ; platform_system == "Linux"'], "triton==3.0.0"),
+        (["pytorch-triton-rocm==3.0"], ""),
+        (None, ""),
+    ],
+)
+def test_the_triton_that_torch_names(monkeypatch, requires, wanted):
+    monkeypatch.setattr(facts_module.metadata, "requires", lambda _: requires)
+    assert facts_module._triton_wanted() == wanted
+
+
+def test_a_probe_that_answers_nothing_about_triton():
+    torch = Torch("2.13.0", "13.0", available=True, gpus=(H200,))
+    said = Answer("", "python gave no answer in 90 s")
+    assert facts_module._triton(torch, {"version": "3.7.1"}, said).error == said.problem
+    assert facts_module._triton(torch, {}, said).computes is None, "without Triton there is nothing to try"
+    no_gpu = replace(torch, gpus=())
+    assert facts_module._triton(no_gpu, {"version": "3.7.1"}, said).computes is None
+
+
+def test_the_kernel_adds(monkeypatch):
+    """Interpreted: here is no GPU."""
+    pytest.importorskip("triton")
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    code = "from endoprior.doctor.triton_probe import adds; print(adds('cpu'))"
+    assert ask([sys.executable, "-c", code], 60).text.strip().endswith("True")
