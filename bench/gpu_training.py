@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import tempfile
 import time
 import warnings
@@ -9,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from unittest import mock
 
 import torch
 
@@ -17,8 +20,10 @@ from endoprior.config import Config
 from endoprior.data import Sequence, load_sequence
 from endoprior.device import wait_for
 from endoprior.evaluate import evaluate
+from endoprior.model.scene import Scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.presets import preset
+from endoprior.recorded import SWITCH
 from endoprior.trainer import Trainer
 
 FRAMES, WIDTH, HEIGHT = 63, 640, 512
@@ -35,13 +40,15 @@ SCORES = (
 class Run:
     """One training."""
 
-    backend: str
-    frames: int
-    start_s: float
+    name: str
+    frames: int = 0
+    start_s: float = 0.0
     """From nothing to the first iteration: frames, prior, first points and their tracks, all on the CPU."""
-    loop_s: float
+    loop_s: float = 0.0
     """All iterations, the device's work included."""
-    iterations: int
+    iterations: int = 0
+    bits: str = ""
+    """Digest of the trained Gaussians: equal ones are equal to the last bit."""
     waits: float | None = None
     """Times the host waited for the device, per iteration; None on the CPU."""
     waited_at: list[str] = field(default_factory=list)
@@ -49,6 +56,26 @@ class Run:
     memory_mb: float | None = None
     """Peak memory of the device."""
     scores: dict[str, float] = field(default_factory=dict)
+    note: str = ""
+    """Why there is nothing, if there is nothing."""
+
+
+def runs_of(backends: list[render.Backend], folder: Path, iterations: int | None) -> Iterator[Run]:
+    """One training on each backend; of one that repeats to the bit also a second, and one that is recorded."""
+    for backend in backends:
+        yield attempt(backend, folder, backend, iterations)
+        if backend == "triton":
+            yield attempt("triton again", folder, backend, iterations, scored=False)
+            with mock.patch.dict(os.environ, {SWITCH: "1"}):
+                yield attempt("triton recorded", folder, backend, iterations)
+
+
+def attempt(name: str, folder: Path, backend: render.Backend, iterations: int | None, *, scored: bool = True) -> Run:
+    """A training; what goes wrong becomes its note, so that the others are still done."""
+    try:
+        return trained(name, folder, backend, iterations, scored=scored)
+    except Exception as error:
+        return Run(name, note=f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
 
 
 @contextmanager
@@ -75,7 +102,7 @@ def config(backend: render.Backend, iterations: int | None) -> Config:
     )  # fmt: skip
 
 
-def trained(folder: Path, backend: render.Backend, iterations: int | None = None) -> Run:
+def trained(name: str, folder: Path, backend: render.Backend, iterations: int | None, *, scored: bool) -> Run:
     """Train on one backend and score the result where it lies."""
     cfg = config(backend, iterations)
     sequence = load_sequence(folder, cfg.data)
@@ -96,14 +123,22 @@ def trained(folder: Path, backend: render.Backend, iterations: int | None = None
     wait_for(trainer.device)
     ended = time.perf_counter()
     return Run(
-        backend=backend, frames=len(sequence), start_s=started - began, loop_s=ended - started, iterations=total,
-        waits=waits, waited_at=waited_at,
+        name=name, frames=len(sequence), start_s=started - began, loop_s=ended - started, iterations=total,
+        bits=digest(scene), waits=waits, waited_at=waited_at,
         memory_mb=torch.cuda.max_memory_allocated(trainer.device) / 1e6 if on_gpu else None,
-        scores=scores(scene, sequence),
+        scores=scores(scene, sequence) if scored else {},
     )  # fmt: skip
 
 
-def scores(scene, sequence: Sequence) -> dict[str, float]:
+def digest(scene: Scene) -> str:
+    """Of all trained numbers of the Gaussians."""
+    found = hashlib.sha256()
+    for _, value in sorted(scene.gaussians.tensors.items()):
+        found.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return found.hexdigest()[:12]
+
+
+def scores(scene: Scene, sequence: Sequence) -> dict[str, float]:
     """Some scores of the test split, networks left out."""
     found = evaluate(scene, sequence, networks=False).scores
     return {name: found[name] for name in SCORES if name in found}
@@ -127,11 +162,12 @@ def watched(trainer: Trainer) -> tuple[float, list[str]]:
 def table(runs: list[Run]) -> list[str]:
     """Markdown, one row per training."""
     names = [name for name in SCORES if any(name in run.scores for run in runs)]
-    facts = ("`default` on", "frames", "start, s", "iterations, s", "of them a second", "host waits an iteration")
+    facts = ("`default` on", "frames", "start, s", "iterations, s", "of them a second", "host waits each", "bits")
     lines = header(*facts, *names)
     for run in runs:
-        cells = [run.backend, str(run.frames), f"{run.start_s:.1f}", f"{run.loop_s:.1f}"]
-        cells += [f"{run.iterations / run.loop_s:.0f}", "" if run.waits is None else f"{run.waits:.2f}"]
+        cells = [run.name, str(run.frames), f"{run.start_s:.1f}", f"{run.loop_s:.1f}"]
+        cells += [f"{run.iterations / max(run.loop_s, 1e-9):.0f}", "" if run.waits is None else f"{run.waits:.2f}"]
+        cells.append(run.note or run.bits)
         cells += [f"{run.scores[name]:.4g}" if name in run.scores else "" for name in names]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
