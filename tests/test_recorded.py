@@ -205,3 +205,24 @@ def test_recording_is_asked_for(monkeypatch):
     assert not recorded.recording_wanted()
     monkeypatch.setenv(recorded.SWITCH, "1")
     assert recorded.recording_wanted()
+
+
+def test_a_moving_camera_takes_no_more_room(tiny_sequence, monkeypatch):
+    """The same tensors for all cameras, and not a recording for each of many."""
+    cfg = quiet(tiny_config("basis", coarse=0, fine=60))
+    monkeypatch.setattr(recorded, "MOST_RECORDINGS", 2)
+    with definitions_only():
+        trainer, recorder = started(tiny_sequence, replace(cfg, temporal=replace(cfg.temporal, weight=0.0)), True)
+        original = trainer._task
+
+        def moving(iteration, position):
+            task = original(iteration, position)
+            pose = task.frame.camera.world_to_camera.copy()
+            pose[0, 3] += 0.01 * position
+            return replace(task, frame=replace(task.frame, camera=replace(task.frame.camera, world_to_camera=pose)))
+
+        trainer._task = moving
+        while not trainer.finished:
+            trainer.step()
+    assert recorder.made == 2 and len(trainer._work._known) > 4
+    assert len(trainer._work._desk._rooms) == 1

@@ -24,6 +24,8 @@ from .types import Camera
 
 WARM_UPS = 3
 """Times that a kind of task is done before it is recorded: libraries compile, choose and allocate at first."""
+MOST_RECORDINGS = 16
+"""At a time."""
 SWITCH = "ENDOPRIOR_CUDA_GRAPHS"
 """Environment variable: 1 records, anything else does not."""
 
@@ -43,14 +45,14 @@ def recording_wanted() -> bool:
 def kind_of(task: Task, min_depth_pixels: int) -> Hashable:
     """Equal for tasks that differ in nothing but numbers which lie on the desk."""
     views = [task.frame] if task.before is None else [task.frame, task.before]
-    return (
-        task.fine, task.sh_degree, task.before is None, task.frame.num_measured >= min_depth_pixels,
-        tuple(_shape(t) for t in (task.frame.rgb_u8, task.prior)), tuple(_camera_key(view.camera) for view in views),
-    )  # fmt: skip
+    enough = task.frame.num_measured >= min_depth_pixels
+    return (task.fine, task.sh_degree, enough, _room_key(task), tuple(_camera_key(view.camera) for view in views))
 
 
-def _shape(tensor: Tensor | None) -> tuple[int, ...] | None:
-    return None if tensor is None else tuple(tensor.shape)
+def _room_key(task: Task) -> Hashable:
+    """Equal for tasks that fit into the same tensors."""
+    shapes = (None if tensor is None else tuple(tensor.shape) for tensor in (task.frame.rgb_u8, task.prior))
+    return (task.before is None, *shapes)
 
 
 def _camera_key(camera: Camera) -> Hashable:
@@ -59,48 +61,38 @@ def _camera_key(camera: Camera) -> Hashable:
 
 
 class Desk:
-    """Room for one task of each kind, in tensors that stay where they are."""
+    """Room for one task of each size, in tensors that stay where they are."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
-        self._places: dict[Hashable, Task] = {}
+        self._rooms: dict[Hashable, dict[str, Tensor]] = {}
 
-    def lay(self, task: Task, kind: Hashable) -> Task:
-        """The task with every number that changes in a tensor on the device; one of its kind at a time."""
-        if kind not in self._places:
-            self._places[kind] = self._room(task)
-        place = self._places[kind]
-        place.iteration.fill_(task.iteration)
-        _copy_frame(task.frame, place.frame)
-        if task.before is not None:
-            _copy_frame(task.before, place.before)
-        if task.prior is not None:
-            place.prior.copy_(task.prior, non_blocking=True)
-            place.prior_mask.copy_(task.prior_mask, non_blocking=True)
-        return place
-
-    def _room(self, task: Task) -> Task:
-        return replace(
-            task,
-            iteration=self._number(),
-            frame=self._frame(task.frame),
-            before=task.before and self._frame(task.before),
-            prior=None if task.prior is None else torch.empty_like(task.prior, device=self.device),
-            prior_mask=None if task.prior is None else torch.empty_like(task.prior_mask, device=self.device),
+    def lay(self, task: Task) -> Task:
+        """The task with every number that changes in a tensor on the device; one of its size at a time."""
+        room = self._rooms.setdefault(_room_key(task), {})
+        laid = replace(
+            task, iteration=self._number(room, "iteration", task.iteration), frame=self._frame(room, "now", task.frame)
         )
+        if task.before is not None:
+            laid = replace(laid, before=self._frame(room, "before", task.before))
+        if task.prior is not None:
+            prior, mask = self._tensor(room, "prior", task.prior), self._tensor(room, "prior_mask", task.prior_mask)
+            laid = replace(laid, prior=prior, prior_mask=mask)
+        return laid
 
-    def _frame(self, frame: TrainingFrame) -> TrainingFrame:
-        tensors = {name: torch.empty_like(getattr(frame, name), device=self.device) for name in TENSORS}
-        return replace(frame, time=self._number(), **tensors)
+    def _frame(self, room: dict[str, Tensor], place: str, frame: TrainingFrame) -> TrainingFrame:
+        tensors = {name: self._tensor(room, f"{place} {name}", getattr(frame, name)) for name in TENSORS}
+        return replace(frame, time=self._number(room, f"{place} time", frame.time), **tensors)
 
-    def _number(self) -> Tensor:
-        return torch.zeros((), dtype=torch.float64, device=self.device)
+    def _tensor(self, room: dict[str, Tensor], name: str, tensor: Tensor) -> Tensor:
+        if name not in room:
+            room[name] = torch.empty_like(tensor, device=self.device)
+        return room[name].copy_(tensor, non_blocking=True)
 
-
-def _copy_frame(frame: TrainingFrame, place: TrainingFrame) -> None:
-    place.time.fill_(frame.time)
-    for name in TENSORS:
-        getattr(place, name).copy_(getattr(frame, name), non_blocking=True)
+    def _number(self, room: dict[str, Tensor], name: str, number: float) -> Tensor:
+        if name not in room:
+            room[name] = torch.zeros((), dtype=torch.float64, device=self.device)
+        return room[name].fill_(number)
 
 
 @dataclass
@@ -135,11 +127,16 @@ class Recorder:
         kind = kind_of(task, self.work.cfg.loss.min_depth_pixels)
         known = self._known.setdefault(kind, _Known())
         with self._own_stream():
-            place = self._desk.lay(task, kind)
-            if known.recording is None and self.record is not None and known.done >= WARM_UPS:
+            place = self._desk.lay(task)
+            if self._records(known):
                 known.recording = self.record(lambda: self.work(state, place))
             known.done += 1
             return known.recording().copied() if known.recording else self.work(state, place)
+
+    def _records(self, known: _Known) -> bool:
+        """Whether a kind of task is to be recorded now; of a moving camera there would be one for each frame."""
+        wanted = self.record is not None and known.recording is None and known.done >= WARM_UPS
+        return wanted and sum(each.recording is not None for each in self._known.values()) < MOST_RECORDINGS
 
     def forget(self) -> None:
         """Drop all recordings: they hang on tensors that are no longer the state's."""

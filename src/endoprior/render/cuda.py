@@ -39,7 +39,7 @@ from torch import Tensor
 from ..checks import InputError
 from ..types import Camera, RenderOutput, Splats
 from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
-from .projection import FIELDS, check, jacobian_limits
+from .projection import FIELDS, check, check_device, jacobian_limits
 
 NEXT_STEP = "Install `endoprior[cuda]`; `endoprior doctor` tells what is missing."
 
@@ -111,7 +111,7 @@ def rasterize_many(
     if any(len(found) != 1 for found in alike) or len(splats) != len(cameras):
         raise ValueError("moments drawn in one call must agree in Gaussians, degree of color and size of picture")
     for each in splats:
-        _check_device(each, background)
+        check_device(each, background, DEVICE)
     if not len(splats[0]):
         return [_nothing(*each, background) for each in zip(splats, cameras, strict=True)]
     _build_kernels()
@@ -205,16 +205,6 @@ def _lens(
 def _together(lenses: list[Lens]) -> Lens:
     """The lenses of several moments as one."""
     return lenses[0] if len(lenses) == 1 else Lens(*map(torch.cat, zip(*lenses, strict=True)))
-
-
-def _check_device(splats: Splats, background: Tensor) -> None:
-    """Raise ValueError unless everything is float32 on one device of the right type."""
-    devices = {getattr(splats, name).device for name in FIELDS} | {background.device}
-    found = sorted(map(str, devices))
-    if splats.means.dtype != torch.float32 or len(devices) > 1 or splats.means.device.type != DEVICE:
-        raise ValueError(
-            f"splats and background must be float32 on one {DEVICE} device; got {splats.means.dtype} on {found}"
-        )
 
 
 @cache

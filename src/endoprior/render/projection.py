@@ -54,6 +54,20 @@ def check(splats: Splats, background: Tensor) -> int:
     return sh.degree_of(sizes["K"])
 
 
+def check_device(splats: Splats, background: Tensor, device_type: str) -> None:
+    """Check what a backend of one type of device requires besides.
+
+    Raises:
+        ValueError: something is not float32, or not on one device of that type.
+    """
+    devices = {getattr(splats, name).device for name in FIELDS} | {background.device}
+    if splats.means.dtype != torch.float32 or len(devices) > 1 or splats.means.device.type != device_type:
+        found = sorted(map(str, devices))
+        raise ValueError(
+            f"splats and background must be float32 on one {device_type} device; got {splats.means.dtype} on {found}"
+        )
+
+
 def jacobian_limits(camera: Camera) -> tuple[float, float, float, float]:
     """Smallest and largest x/z, then y/z, at which the Jacobian is evaluated; they follow the true principal point."""
     margin_x = JACOBIAN_MARGIN * 0.5 * camera.width / camera.fx

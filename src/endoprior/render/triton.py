@@ -27,7 +27,7 @@ from torch.autograd.function import once_differentiable
 from ..checks import InputError
 from ..types import Camera, RenderOutput, Splats
 from . import Queued
-from .projection import FIELDS, check
+from .projection import check, check_device
 from .sh import degree_of
 
 NEXT_STEP = "It comes with PyTorch for CUDA on Linux; `endoprior doctor` tells what is missing."
@@ -61,7 +61,7 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
         InputError: Triton could not build its launcher.
     """
     check(splats, background)
-    _check_device(splats, background)
+    check_device(splats, background, DEVICE)
     if DEVICE == "cuda":
         _start_driver()
     with _current(splats.means.device):
@@ -91,16 +91,6 @@ def _rasterize_queued(
 
 
 QUEUED = Queued(_rasterize_queued, incomplete=lacking, make_room=overflowed)
-
-
-def _check_device(splats: Splats, background: Tensor) -> None:
-    """Raise ValueError unless everything is float32 on one device of the right type."""
-    devices = {getattr(splats, name).device for name in FIELDS} | {background.device}
-    if splats.means.dtype != torch.float32 or len(devices) > 1 or splats.means.device.type != DEVICE:
-        found = sorted(map(str, devices))
-        raise ValueError(
-            f"splats and background must be float32 on one {DEVICE} device; got {splats.means.dtype} on {found}"
-        )
 
 
 @cache
