@@ -263,3 +263,11 @@ def test_a_scene_knows_that_its_lengths_are_relative(tiny_sequence, tmp_path):
     assert scene.lengths_are_relative and load_scene(tmp_path / "run").lengths_are_relative
     export(scene, tmp_path / "ply", ExportOptions(format="ply", split="test"))
     assert json.loads((tmp_path / "ply/index.json").read_text())["lengths_are_relative"]
+
+
+@pytest.mark.parametrize("backend", ["cuda", "triton"])
+def test_a_backend_of_a_gpu_without_one_is_refused_in_words(tiny_sequence, backend, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    cfg = tiny_config("basis")
+    with pytest.raises(InputError, match=f"render.backend {backend}: expected a GPU .*`endoprior doctor`"):
+        Trainer(load_sequence(tiny_sequence), replace(cfg, render=replace(cfg.render, backend=backend)))

@@ -43,7 +43,7 @@ class Trainer:
 
     def __init__(self, sequence: Sequence, cfg: Config) -> None:
         self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
-        self.device = torch.device("cuda" if cfg.render.backend in render.ON_GPU else "cpu")
+        self.device = device_for(cfg.render.backend)
         self.frames = TrainingFrames(sequence, cfg.prior, self.device)
         background = torch.zeros(3, device=self.device)
         self._inspector = Inspector(self.device, waits=compiled(background))
@@ -201,6 +201,22 @@ class Trainer:
             num_valid=state.stats.num_valid.cpu().clone(),
             lengths_are_relative=self.sequence.depth_is_relative,
         )
+
+
+def device_for(backend: render.Backend) -> torch.device:
+    """Where to train for a backend to draw there.
+
+    Raises:
+        InputError: on a GPU, and torch sees none.
+    """
+    if backend not in render.ON_GPU:
+        return torch.device("cpu")
+    if not torch.cuda.is_available():
+        raise InputError(
+            f"render.backend {backend}: expected a GPU that torch can use; found none. Leave it out for the CPU; "
+            "`endoprior doctor` tells what is missing."
+        )
+    return torch.device("cuda")
 
 
 def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:

@@ -56,12 +56,16 @@ class Train:
 def run(argv: list[str]) -> None:
     """Train, score, and print where the results are."""
     from ..device import choose_here
+    from ..render import ON_GPU
 
     args = parse(Train, argv, "train", default=_preset_defaults(argv))
     cfg = args.config
-    choice = choose_here(args.device)
+    named = cfg.render.backend if cfg.render.backend in ON_GPU else None
+    if named and args.device == "cpu":
+        raise InputError(f"--render.backend {named}: expected --device cuda or auto; got cpu. Leave one of them out.")
+    choice = choose_here("cuda" if named else args.device)
     say(choice.why)
-    if choice.device == "cuda":
+    if choice.device == "cuda" and not named:
         cfg = dataclasses.replace(cfg, render=dataclasses.replace(cfg.render, backend=choice.backend))
     if args.weights_dir and not args.weights_dir.is_dir():
         raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
