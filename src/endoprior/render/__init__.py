@@ -1,7 +1,8 @@
 """Splats + Camera -> RenderOutput. Knows nothing of time, priors or losses.
 
 `reference` is the definition: dense, slow, plain torch, any floating type. `cpu` is the fast one: Numba kernels,
-float32. `cuda` draws on an NVIDIA GPU, through gsplat, float32; what it does otherwise stands at the top of its file.
+float32. Two draw on an NVIDIA GPU, float32: `triton`, kernels of our own, and `cuda`, through gsplat; what that does
+otherwise stands at the top of its file.
 """
 
 from __future__ import annotations
