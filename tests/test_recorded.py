@@ -117,24 +117,11 @@ def soft_picture(splats, camera, *, background, depth_grad_to_means=True):
     return RenderOutput(color, total / (1 + total), weights @ z / (1 + total), means2d, (3 * spread).int())
 
 
-def numbers_of(trainer):
-    """Every tensor that an iteration may change in place."""
-    state = trainer.state
-    found = list(state.gaussians.tensors.values()) + list(state.stats.tensors().values())
-    for adam in state.optimizer.states.values():
-        found += [adam.first, adam.second, adam.steps]
-    if state.field is not None:
-        planes = state.optimizer.plane_adam
-        found += [state.field.grid.values, state.field.grid.grads, state.field.grid.marks, state.field.box]
-        found += [planes.exp_avg, planes.exp_avg_sq, planes.steps, *state.field.heads.parameters.values()]
-    return [*found, trainer._inspector.frozen]
-
-
 def started(folder, cfg, record):
     trainer = Trainer(load_sequence(folder), cfg)
     trainer._work.work.rasterize = soft_picture
     trainer.start()
-    recorder = TapeRecorder(lambda: numbers_of(trainer))
+    recorder = TapeRecorder(lambda: [*trainer.state.tensors(), trainer._inspector.frozen])
     trainer._work.record = recorder if record else None
     return trainer, recorder
 
@@ -226,3 +213,31 @@ def test_a_moving_camera_takes_no_more_room(tiny_sequence, monkeypatch):
             trainer.step()
     assert recorder.made == 2 and len(trainer._work._known) > 4
     assert len(trainer._work._desk._rooms) == 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", ["differs", "cannot be made"])
+def test_a_bad_recording_is_noticed_and_changes_nothing(tiny_sequence, kind, fault, caplog):
+    cfg, states = quiet(tiny_config(kind, coarse=0, fine=20)), []
+    with definitions_only():
+        for bad in (False, True):
+            trainer, recorder = started(tiny_sequence, cfg, bad)
+
+            def record(call, trainer=trainer, recorder=recorder):
+                recording = recorder(call)
+                if fault == "cannot be made":
+                    raise RuntimeError("operation not permitted\nwhen stream is capturing")
+
+                def wrong():
+                    evidence = recording()
+                    trainer.state.stats.num_seen += 1
+                    return evidence
+
+                return wrong
+
+            trainer._work.record = record if bad else None
+            while not trainer.finished:
+                trainer.step()
+            states.append(state_of(trainer))
+    assert recorder.made == 1 and fault in caplog.text and trainer._work.record is None
+    assert all(torch.equal(states[0][name], value) for name, value in states[1].items())

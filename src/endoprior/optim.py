@@ -160,6 +160,12 @@ class Optimizer:
         grown.clear_gradient()
         return grown
 
+    def tensors(self) -> list[Tensor]:
+        """Moments and counts, as they are held."""
+        found = [tensor for state in self.states.values() for tensor in (state.first, state.second, state.steps)]
+        planes = self.plane_adam
+        return found + ([planes.exp_avg, planes.exp_avg_sq, planes.steps] if planes else [])
+
     def state_arrays(self) -> dict[str, Tensor]:
         """Moments and step counts by name, for a checkpoint."""
         arrays = {}

@@ -7,6 +7,7 @@ with recordings and without.
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
@@ -21,6 +22,8 @@ from .iteration import Task, Work
 from .train_state import TrainState
 from .training_frames import TENSORS, TrainingFrame
 from .types import Camera
+
+log = logging.getLogger(__name__)
 
 WARM_UPS = 3
 """Times that a kind of task is done before it is recorded: libraries compile, choose and allocate at first."""
@@ -104,7 +107,11 @@ class _Known:
 
 
 class Recorder:
-    """`Work` on a device: each kind of task a few times as it is, then, if wanted, as a recording."""
+    """`Work` on a device: each kind of task a few times as it is, then, if wanted, as a recording.
+
+    The first recording of each kind is compared with the work itself, bit for bit, before it is trusted. If it differs,
+    or cannot be made, a warning says so, and the run goes on without.
+    """
 
     def __init__(
         self, work: Work, device: torch.device, record: Callable[[Callable[[], Evidence]], Recording] | None
@@ -112,11 +119,12 @@ class Recorder:
         """Begin without recordings.
 
         Args:
-            record: makes a recording of a call without doing it; None does without.
+            record: makes a recording of a call without doing it; None does without. Raises RuntimeError if it cannot.
         """
         self.work, self.record = work, record
         self._desk, self._stream = Desk(device), torch.cuda.Stream(device) if device.type == "cuda" else None
         self._known: dict[Hashable, _Known] = {}
+        self._trusted: set[Hashable] = set()
         self._of: Tensor | None = None
 
     def __call__(self, state: TrainState, task: Task) -> Evidence:
@@ -128,15 +136,45 @@ class Recorder:
         known = self._known.setdefault(kind, _Known())
         with self._own_stream():
             place = self._desk.lay(task)
-            if self._records(known):
-                known.recording = self.record(lambda: self.work(state, place))
             known.done += 1
+            if self._records(known):
+                known.recording = self._recording(state, place)
+                if known.recording and kind not in self._trusted:
+                    self._trusted.add(kind)
+                    return self._compared(state, place, known.recording)
             return known.recording().copied() if known.recording else self.work(state, place)
 
     def _records(self, known: _Known) -> bool:
         """Whether a kind of task is to be recorded now; of a moving camera there would be one for each frame."""
-        wanted = self.record is not None and known.recording is None and known.done >= WARM_UPS
+        wanted = self.record is not None and known.recording is None and known.done > WARM_UPS
         return wanted and sum(each.recording is not None for each in self._known.values()) < MOST_RECORDINGS
+
+    def _recording(self, state: TrainState, place: Task) -> Recording | None:
+        try:
+            return self.record(lambda: self.work(state, place))
+        except RuntimeError as error:
+            state.optimizer.clear_gradients()  # nothing was computed, but they were put in place
+            self._give_up(f"cannot be made: {' '.join(str(error).split())[:200]}")
+            return None
+
+    def _compared(self, state: TrainState, place: Task, recording: Recording) -> Evidence:
+        """Do the task both ways from the same state; the work itself is what counts."""
+        tensors = [*state.tensors(), self.work.inspector.frozen]
+        before = [tensor.clone() for tensor in tensors]
+        told = recording().copied()
+        recorded = [tensor.clone() for tensor in tensors]
+        for tensor, old in zip(tensors, before, strict=True):
+            tensor.copy_(old)
+        evidence = self.work(state, place)
+        pairs = [*zip(tensors, recorded, strict=True), (evidence.losses.values, told.losses.values)]
+        if not all(torch.equal(ours, theirs) for ours, theirs in pairs):
+            self._give_up("differs from the work that it was made of")
+        return evidence
+
+    def _give_up(self, why: str) -> None:
+        log.warning("a recording %s; training goes on without (%s)", why, SWITCH)
+        self.record = None
+        self.forget()
 
     def forget(self) -> None:
         """Drop all recordings: they hang on tensors that are no longer the state's."""

@@ -35,6 +35,14 @@ class TrainState:
     optimizer: Optimizer
     stats: DensityStats
 
+    def tensors(self) -> list[Tensor]:
+        """Every tensor that an iteration may change in place."""
+        found = [*self.gaussians.tensors.values(), *self.stats.tensors().values(), *self.optimizer.tensors()]
+        if self.field is not None:
+            grid = self.field.grid
+            found += [grid.values, grid.grads, grid.marks, self.field.box, *self.field.heads.parameters.values()]
+        return [tensor.detach() for tensor in found]
+
 
 class Losses:
     """Weighted terms of Eq. (12) that took part in one iteration; asking for `numbers` waits for a device."""
