@@ -67,6 +67,7 @@ def work(job: Job) -> None:
     from ..data import load_sequence
     from ..evaluate import evaluate, scored_data
     from ..train import train
+    from ..trainer import device_for
 
     cfg, folder = from_dict(Config, job.config), Path(job.folder)
     run, key_file = folder / "run", folder / "key"
@@ -80,6 +81,7 @@ def work(job: Job) -> None:
     seconds = clock.perf_counter() - began
     sequence = load_sequence(job.data, scored_data(cfg.data))
     weights_dir = Path(job.weights_dir) if job.weights_dir else None
+    scene = scene.to(device_for(cfg.render.backend))  # drawn where it was trained
     result = evaluate(scene, sequence, networks=job.networks, weights_dir=weights_dir)
     if going_on:
         result.skipped["train_seconds"] = "the run was interrupted"

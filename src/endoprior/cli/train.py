@@ -102,9 +102,9 @@ def train_and_evaluate(
     """
     from .. import kernel_cache
     from ..data import load_sequence
-    from ..render import ON_GPU
     from ..run_folder import refuse_unusable_folder
     from ..train import train
+    from ..trainer import device_for
     from ..training_memory import refuse_too_large
     from .evaluate import evaluate_run
 
@@ -131,7 +131,7 @@ def train_and_evaluate(
     del sequence  # and with it the frames it keeps: scoring reads its own
     done = _logged_seconds(out / "log.jsonl")
     speed = {"train_seconds": seconds, "iterations_per_second": done}
-    scene = scene.to("cuda" if cfg.render.backend in ON_GPU else "cpu")  # where it was trained
+    scene = scene.to(device_for(cfg.render.backend))  # drawn where it was trained
     try:
         evaluate_run(scene, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
     except KeyboardInterrupt:
