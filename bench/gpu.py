@@ -5,13 +5,15 @@
 prints the machine, whether pictures and gradients agree, milliseconds, and a whole training, as a Markdown page for
 docs/gpu.md; exit status 1 if a backend does not agree. It needs torch, NumPy, SciPy, Numba, OpenCV and PyYAML, and
 this checkout; `--wheel` uses gsplat from a wheel that is not installed. `--dry-run` does the same on the CPU, with the
-CPU backend in the GPU's place: it tests this file, not a GPU.
+CPU backend in the GPU's place: it tests this file, not a GPU. `--interpreted` has Triton's kernels interpreted on the
+CPU: whether they agree, in some ten minutes, and no more.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
@@ -39,7 +41,7 @@ def machine(contest: Contest) -> dict[str, str]:
     """What must be known to read the numbers."""
     found = {"commit": str(common.source_commit()), "torch": torch.__version__, "date": time.strftime("%Y-%m-%d")}
     if contest.device.type != "cuda":
-        return found | {"GPU": "none: dry run on the CPU", "gsplat": "none: dry run on the CPU"}
+        return found | {"GPU": "none, on the CPU"}
     major, minor = torch.cuda.get_device_capability(contest.device)
     return found | {
         "GPU": f"{torch.cuda.get_device_name(contest.device)} (compute capability {major}.{minor})",
@@ -100,8 +102,8 @@ def use_wheel(wheel: Path) -> None:
 
 def contests(options: argparse.Namespace) -> list[Contest]:
     """Who takes part: what was named, else every backend of the GPU that can be imported."""
-    if options.dry_run:
-        return [Contest("cpu", torch.device("cpu"))]
+    if options.dry_run or options.interpreted:
+        return [Contest("triton" if options.interpreted else "cpu", torch.device("cpu"))]
     device = torch.device("cuda", 0)
     libraries = {"cuda": "gsplat", "triton": "triton"}
     names = options.backends or [name for name, library in libraries.items() if find_spec(library)]
@@ -116,6 +118,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--wheel", type=Path, metavar="FILE", help="gsplat's wheel, if it is not installed")
     parser.add_argument("--out", type=Path, metavar="FILE", help="also write everything as JSON there")
     parser.add_argument("--dry-run", action="store_true", help="on the CPU, with the CPU backend in the GPU's place")
+    parser.add_argument("--interpreted", action="store_true", help="Triton's kernels on the CPU: agreement only")
     parser.add_argument("--backends", nargs="+", choices=["cuda", "triton"], help="(default: all that are there)")
     parser.add_argument("--scenes", type=int, default=SCENES, help="random scenes (default %(default)s)")
     parser.add_argument("--gaussians", type=int, nargs="+", help="sizes to time (default 20000 40000 100000)")
@@ -129,7 +132,9 @@ def main(words: list[str] | None = None) -> int:
     options = arguments().parse_args(words)
     if options.wheel:
         use_wheel(options.wheel)
-    if not options.dry_run and not torch.cuda.is_available():
+    if options.interpreted:
+        os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is imported
+    if not (options.dry_run or options.interpreted) and not torch.cuda.is_available():
         print("expected a GPU that torch can use; found none. Try `endoprior doctor`, or --dry-run.", file=sys.stderr)
         return 2
     sizes = SIZES if not options.gaussians else tuple(common.Size(num, 640, 512) for num in options.gaussians)
@@ -152,9 +157,10 @@ def main(words: list[str] | None = None) -> int:
         first_ms[contest.backend] = 1e3 * (time.perf_counter() - began)
         gaps += agreement(contest, options.scenes, options.run)
         keep()
-        laps += speed(contest, sizes, options.laps)
-        keep()
-    if not options.no_training:
+        if not options.interpreted:
+            laps += speed(contest, sizes, options.laps)
+            keep()
+    if not (options.no_training or options.interpreted):
         dry = options.dry_run
         with sequence_at(options.data, DRY_FRAMES if dry else FRAMES, *((64, 48) if dry else (WIDTH, HEIGHT))) as data:
             names = list(dict.fromkeys([*(contest.backend for contest in everyone), "cpu"]))

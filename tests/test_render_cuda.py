@@ -379,6 +379,13 @@ def test_gpu_bench_dry_run_agrees_times_and_writes(tmp_path, monkeypatch, capsys
     )
 
 
+def test_gpu_bench_can_have_the_kernels_interpreted(monkeypatch):
+    """That they agree, test_render_triton.py says on smaller scenes."""
+    gpu = gpu_bench(monkeypatch)
+    (contest,) = gpu.contests(gpu.arguments().parse_args(["--interpreted"]))
+    assert (contest.backend, contest.device.type) == ("triton", "cpu")
+
+
 def test_gpu_bench_sees_a_backend_that_draws_something_else(cuda, monkeypatch):
     gpu = gpu_bench(monkeypatch)
     contest, case = gpu.Contest("cuda", torch.device("cpu")), gpu.random_case(1)
