@@ -1,0 +1,44 @@
+"""What planes of half precision change in the pictures of a trained HexPlane scene: tissue PSNR of its test frames, dB.
+
+`python bench/half_planes.py RUN DATA`; on the CPU, by the definitions that a GPU runs.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import common
+import numpy as np
+
+from endoprior import metrics
+from endoprior.compiled import definitions_only
+from endoprior.data import Sequence, load_sequence
+from endoprior.evaluate import scored_data
+from endoprior.model.scene import Scene, load_scene
+
+
+def scores(scene: Scene, sequence: Sequence) -> np.ndarray:
+    """(F,) tissue PSNR of each test frame, of color as it is drawn."""
+    found = []
+    for frame in sequence.frames("test"):
+        color = np.clip(scene.render(frame.time, frame.camera).color.numpy(), 0, 1)
+        found.append(metrics.psnr_tissue(color, frame.rgb, frame.tissue_mask))
+    return np.array(found)
+
+
+def main() -> None:
+    """Score both, print the change."""
+    run, data = map(Path, sys.argv[1:])
+    scene = load_scene(run)
+    sequence = load_sequence(data, scored_data(scene.config.data))
+    with definitions_only():
+        full, half = scores(scene, sequence), scores(scene.to("cpu", half_planes=True), sequence)
+    change = half - full
+    print(
+        f"{common.source_commit()}, {len(full)} frames: {full.mean():.4f} dB, halved {half.mean():.4f}; largest change {abs(change).max():.4f}"
+    )
+
+
+if __name__ == "__main__":
+    main()
