@@ -34,10 +34,8 @@ def main() -> None:
     sequence = load_sequence(data, scored_data(scene.config.data))
     with definitions_only():
         full, half = scores(scene, sequence), scores(scene.to("cpu", half_planes=True), sequence)
-    change = half - full
-    print(
-        f"{common.source_commit()}, {len(full)} frames: {full.mean():.4f} dB, halved {half.mean():.4f}; largest change {abs(change).max():.4f}"
-    )
+    told = f"{len(full)} frames: {full.mean():.4f} dB, halved {half.mean():.4f}"
+    print(f"{common.source_commit()}, {told}; largest change {abs(half - full).max():.4f}")
 
 
 if __name__ == "__main__":
