@@ -271,3 +271,9 @@ def test_a_backend_of_a_gpu_without_one_is_refused_in_words(tiny_sequence, backe
     cfg = tiny_config("basis")
     with pytest.raises(InputError, match=f"render.backend {backend}: expected a GPU .*`endoprior doctor`"):
         Trainer(load_sequence(tiny_sequence), replace(cfg, render=replace(cfg.render, backend=backend)))
+
+
+def test_the_run_says_what_computed_it(tiny_sequence, tmp_path):
+    train(load_sequence(tiny_sequence), tiny_config("basis", coarse=0, fine=2), tmp_path / "run")
+    about = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert about["backend"] == "cpu" and about["device"].startswith("CPU, ") and "triton" not in about["versions"]

@@ -24,6 +24,7 @@ from .checks import InputError
 from .config_io import to_dict
 from .data.files import read_json
 from .data.reading import kind_of
+from .device import name_of
 from .divergence import Diverged
 from .run_identity import refuse_other_run
 
@@ -212,11 +213,14 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
 
 def run_facts(trainer: Trainer, fingerprint: str) -> dict[str, Any]:
     """What must be known to repeat the run: every config field, versions, commit, backend, and the data."""
-    names = ("endoprior", "torch", "numpy", "numba", "scipy", "opencv-python-headless")
+    backend = trainer.cfg.render.backend
+    draws = {"cuda": ("gsplat",), "triton": ("triton",)}.get(backend, ())
+    names = ("endoprior", "torch", "numpy", "numba", "scipy", "opencv-python-headless", *draws)
     return {
         "config": to_dict(trainer.cfg),
         "seed": trainer.cfg.seed,
-        "backend": trainer.cfg.render.backend,
+        "backend": backend,
+        "device": name_of(trainer.device),
         "commit": source_commit(),
         "versions": {name: version(name) for name in names} | {"python": sys.version.split()[0]},
         "data": {
