@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from contextlib import nullcontext
 
 import numba
 import numpy as np
@@ -12,7 +11,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from endoprior.compiled import definitions_only
 from endoprior.config import HexPlaneConfig
 from endoprior.model import hexplane_lookup
 from endoprior.model.hexplane import PLANE_NAMES, PlaneGrid, mapped_zeros
@@ -120,31 +118,6 @@ def test_agrees_with_grid_sample(channels: int, time_map: str) -> None:
         torch.testing.assert_close(grid.grads, values.grad.float(), rtol=1e-4, atol=1e-4)
         received = values.grad.abs().amax(-1) > 0
         assert (grid.marks[received] == TOUCHED | FRESH).all() and (grid.marks == 0).any()
-
-
-@pytest.mark.parametrize("time_map", ["raw", "full"])
-def test_the_definition_agrees_with_the_kernels(time_map: str) -> None:
-    """Two moments at once: values, gradients of positions, planes and layer."""
-    cfg, times = HexPlaneConfig((5, 4, 6), 7, 20, (1, 3), time_map=time_map), (0.2, 0.93)
-    found = []
-    for switch in (nullcontext, definitions_only):
-        with switch():
-            grid = random_grid(cfg)
-            unit = random_unit(150, 3, -0.2, 1.2).requires_grad_(True)
-            weight, bias = random_layer(grid)
-            out = torch.stack(grid.linear(unit, times, weight, bias))
-            (out * torch.randn(out.shape, generator=torch.Generator().manual_seed(1))).sum().backward()
-            sample = grid.sample(unit.detach(), 0.4)
-            sample.square().sum().backward()
-            found.append([out, unit.grad, weight.grad, bias.grad, grid.grads, sample])
-    for ours, theirs in zip(*found, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4 * float(theirs.detach().abs().max()))
-
-
-def test_the_definition_survives_positions_without_a_value() -> None:
-    grid, unit = random_grid(), torch.full((3, 3), float("nan"))
-    with definitions_only(), torch.no_grad():
-        assert grid.sample(unit, 0.3).isnan().all()
 
 
 def random_layer(grid: PlaneGrid, width: int = 5) -> tuple[Tensor, Tensor]:

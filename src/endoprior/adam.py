@@ -16,7 +16,7 @@ class AdamState:
     """Moments of one parameter, and how often it was stepped: a temporal basis counts each of its functions.
 
     On a device nothing here waits for it: counts live there, and so does what may forbid a step, `frozen` () float32:
-    where it is not 0, parameter, moments and counts stay as they are.
+    where it is 1, parameter, moments and counts stay as they are; else it is 0.
     """
 
     def __init__(self, param: Tensor, num_counts: int = 1, reach: int | None = None) -> None:

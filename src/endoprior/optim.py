@@ -56,7 +56,7 @@ class Optimizer:
 
         Args:
             iteration: 1-based, within the stage; on a device a () float64 tensor.
-            frozen: () float32 on a device; where it is not 0 the gradients are only cleared.
+            frozen: () float32 on a device, 0 or 1; where it is 1 the gradients are only cleared.
         """
         optim = self.cfg.optim
         decay = {"iteration": iteration, "steps": optim.decay_iterations}

@@ -89,7 +89,7 @@ def load(backend: Backend) -> Rasterizer:
     """Import one backend. There is no fallback: the caller gets the one it named, or an error.
 
     Raises:
-        InputError: there is no backend of that name, or it is `cuda` and gsplat is not installed.
+        InputError: there is no backend of that name, or the library it draws with, gsplat or Triton, is not installed.
     """
     if backend not in get_args(Backend):
         names = ", ".join(get_args(Backend))
