@@ -9,11 +9,11 @@ import common
 import plain
 import torch
 
-from endoprior.adam import AdamState
+from endoprior.core.presets import preset
 from endoprior.model.basis import RankOneGradient, basis_offsets, identity_motion
 from endoprior.model.deformation import Offsets
-from endoprior.optim import motion_rates
-from endoprior.presets import preset
+from endoprior.training.adam import AdamState
+from endoprior.training.optimizer import motion_rates
 
 MOMENT = 0.4
 

@@ -23,13 +23,13 @@ import scenes
 import torch
 from numpy.typing import NDArray
 
+from endoprior.core.types import Camera, Splats
 from endoprior.render import tiles
 from endoprior.render.composite_backward import MOMENTS, composite_backward, gather
 from endoprior.render.composite_forward import composite_forward
 from endoprior.render.constants import STOP_TRANSMITTANCE
 from endoprior.render.cpu import Project
 from endoprior.render.projection import Projected, project
-from endoprior.types import Camera, Splats
 
 TORCH_MOST = 20_000
 """Gaussians; with more, autograd's memory alone takes torch from seconds to minutes."""

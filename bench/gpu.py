@@ -32,7 +32,7 @@ from gpu_parity import SCENES, Contest, Gap, agreement, draw, gap, random_case  
 from gpu_speed import LAPS, SIZES, Lap, speed, timed  # noqa: F401
 from gpu_training import FRAMES, HEIGHT, WIDTH, Run, header, runs_of, sequence_at, table
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 
 DRY_FRAMES, DRY_ITERATIONS = 9, 6
 

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from endoprior import render
+from endoprior.core.types import Camera, Splats
 from endoprior.model.scene import load_scene
 from endoprior.render.constants import ALPHA_MAX
 from endoprior.render.projection import FIELDS
-from endoprior.types import Camera, Splats
 
 SCENES, FRAMES = 20, 3
 PICTURE_LIMIT, GRADIENT_LIMIT = 1e-3, 0.01

@@ -16,11 +16,11 @@ import torch
 from gpu_parity import Contest
 
 from endoprior import render
+from endoprior.core.presets import preset
+from endoprior.core.types import Camera, Splats
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.scene import Scene
-from endoprior.presets import preset
 from endoprior.render.projection import FIELDS
-from endoprior.types import Camera, Splats
 
 SIZES = (common.Size(20_000, 640, 512), common.Size(40_000, 640, 512), common.Size(100_000, 640, 512))
 LAPS, WARM_UP = 50, 5

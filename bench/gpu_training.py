@@ -16,15 +16,15 @@ from unittest import mock
 import torch
 
 from endoprior import render
-from endoprior.config import Config
-from endoprior.data import Sequence, load_sequence
-from endoprior.device import wait_for
-from endoprior.evaluate import evaluate
+from endoprior.core.config import Config
+from endoprior.core.presets import preset
+from endoprior.data import FrameSequence, load_sequence
+from endoprior.evaluation.scoring import evaluate
 from endoprior.model.scene import Scene
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.presets import preset
-from endoprior.recorded import SWITCH
-from endoprior.trainer import Trainer
+from endoprior.system.devices import wait_for
+from endoprior.training.recorded import SWITCH
+from endoprior.training.trainer import Trainer
 
 FRAMES, WIDTH, HEIGHT = 63, 640, 512
 WATCHED = 15
@@ -138,7 +138,7 @@ def digest(scene: Scene) -> str:
     return found.hexdigest()[:12]
 
 
-def scores(scene: Scene, sequence: Sequence) -> dict[str, float]:
+def scores(scene: Scene, sequence: FrameSequence) -> dict[str, float]:
     """Some scores of the test split, networks left out."""
     found = evaluate(scene, sequence, networks=False).scores
     return {name: found[name] for name in SCORES if name in found}

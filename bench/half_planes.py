@@ -11,14 +11,14 @@ from pathlib import Path
 import common
 import numpy as np
 
-from endoprior import metrics
-from endoprior.compiled import definitions_only
-from endoprior.data import Sequence, load_sequence
-from endoprior.evaluate import scored_data
+from endoprior.compute.compiled import definitions_only
+from endoprior.data import FrameSequence, load_sequence
+from endoprior.evaluation import metrics
+from endoprior.evaluation.scoring import scored_data
 from endoprior.model.scene import Scene, load_scene
 
 
-def scores(scene: Scene, sequence: Sequence) -> np.ndarray:
+def scores(scene: Scene, sequence: FrameSequence) -> np.ndarray:
     """(F,) tissue PSNR of each test frame, of color as it is drawn."""
     found = []
     for frame in sequence.frames("test"):

@@ -9,7 +9,7 @@ import common
 import plain
 import torch
 
-from endoprior.config import DeformationConfig
+from endoprior.core.config import DeformationConfig
 from endoprior.model.deformation import HexPlaneField
 
 

@@ -10,9 +10,9 @@ import plain
 import scenes
 import torch
 
-from endoprior.config import DeformationConfig
+from endoprior.core.config import DeformationConfig
 from endoprior.model.deformation import HexPlaneField
-from endoprior.model.plane_adam import PlaneAdam
+from endoprior.training.plane_adam import PlaneAdam
 
 MOMENT, LEARNING_RATE = 0.4, 1e-3
 EARLIER_MOMENTS = (0.05, 0.2, 0.6, 0.85)

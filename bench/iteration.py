@@ -18,19 +18,19 @@ import common
 import plain
 import torch
 
-from endoprior import iteration as iteration_module
-from endoprior import temporal
-from endoprior.config import Config
-from endoprior.data import Sequence, load_sequence
-from endoprior.density import DensityStats
+from endoprior.core.config import Config
+from endoprior.core.presets import preset
+from endoprior.data import FrameSequence, load_sequence
 from endoprior.model import scene as scene_module
 from endoprior.model.deformation import HexPlaneField
-from endoprior.optim import Optimizer
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.presets import preset
 from endoprior.render import cpu, tiles
-from endoprior.train_state import Stage, StepReport
-from endoprior.trainer import Trainer
+from endoprior.training import step as iteration_module
+from endoprior.training import temporal
+from endoprior.training.density import DensityStats
+from endoprior.training.optimizer import Optimizer
+from endoprior.training.state import Stage, StepReport
+from endoprior.training.trainer import Trainer
 
 PRESETS = ("default", "paper")
 FRAMES = 4
@@ -72,7 +72,7 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     return measured
 
 
-def rows(name: str, sequence: Sequence, size: common.Size) -> list[common.Row]:
+def rows(name: str, sequence: FrameSequence, size: common.Size) -> list[common.Row]:
     """The rows of one preset and size."""
     trainer = started(sequence, config(name, size.num))
     repeated = settle(trainer)
@@ -99,7 +99,7 @@ def config(name: str, num: int) -> Config:
     )
 
 
-def started(sequence: Sequence, cfg: Config) -> Trainer:
+def started(sequence: FrameSequence, cfg: Config) -> Trainer:
     """A trainer before its first iteration, with everything it keeps of the frames already made."""
     trainer = Trainer(sequence, cfg)
     trainer.start()

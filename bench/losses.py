@@ -9,7 +9,7 @@ import common
 import plain
 import torch
 
-from endoprior.loss_kernels import supervised_losses
+from endoprior.training.loss_kernels import supervised_losses
 
 WEIGHTS = (1.0, 1.0, 0.03)
 

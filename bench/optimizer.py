@@ -10,8 +10,8 @@ import plain
 import scenes
 import torch
 
-from endoprior.optim import Optimizer
-from endoprior.presets import preset
+from endoprior.core.presets import preset
+from endoprior.training.optimizer import Optimizer
 
 
 def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:

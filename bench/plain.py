@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample, linear, relu
 
-from endoprior.config import DeformationConfig
-from endoprior.losses import supervised as supervised_losses  # noqa: F401
+from endoprior.core.config import DeformationConfig
+from endoprior.core.types import Camera, RenderOutput, Splats
 from endoprior.model.basis import basis_weights, motion_layout
 from endoprior.model.deformation import HexPlaneField, Offsets
 from endoprior.model.hexplane import PLANE_NAMES, PlaneGrid
 from endoprior.render.constants import ALPHA_MAX, ALPHA_MIN, STOP_TRANSMITTANCE
 from endoprior.render.projection import Projected, project
-from endoprior.temporal import SUM_EPS
-from endoprior.temporal import local_motion_definition as local_motion_loss  # noqa: F401
-from endoprior.types import Camera, RenderOutput, Splats
+from endoprior.training.losses import supervised as supervised_losses  # noqa: F401
+from endoprior.training.temporal import SUM_EPS
+from endoprior.training.temporal import local_motion_definition as local_motion_loss  # noqa: F401
 
 TILE = 16
 """Side of a tile, px."""

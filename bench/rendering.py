@@ -10,14 +10,14 @@ import plain
 import scenes
 import torch
 
-from endoprior.config import Config
+from endoprior.core.config import Config
+from endoprior.core.presets import preset
+from endoprior.core.types import Camera, RenderOutput, Splats
 from endoprior.model import scene as scene_module
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.playback import Playback
 from endoprior.model.scene import Scene
-from endoprior.presets import preset
 from endoprior.render import cpu, tiles
-from endoprior.types import Camera, RenderOutput, Splats
 
 PRESETS = ("default", "paper")
 MOMENT = 0.4

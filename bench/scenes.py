@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endoprior.config import Config
+from endoprior.compute.morton import morton_order
+from endoprior.core.config import Config
+from endoprior.core.types import Camera, Splats
 from endoprior.model.basis import identity_motion
 from endoprior.model.gaussians import Gaussians
-from endoprior.morton import morton_order
-from endoprior.types import Camera, Splats
 
 FOCAL_PER_WIDTH = 0.9
 """Of an endoscope; also the phantom's."""

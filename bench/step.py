@@ -19,11 +19,11 @@ import common
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from endoprior.core.presets import preset
+from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.presets import preset
-from endoprior.trainer import Trainer
-from endoprior.types import RenderOutput
+from endoprior.training.trainer import Trainer
 
 UNCOUNTED, COUNTED, NEVER = 30, 80, 10**6
 NO_WORK = (
@@ -74,7 +74,7 @@ def median_ms(trainer: Trainer) -> float:
 
 def launches(name: str, folder: Path) -> int:
     """Operations of an iteration with every term; the picture is a stand-in of a few."""
-    from endoprior.compiled import definitions_only
+    from endoprior.compute.compiled import definitions_only
 
     def picture(splats, camera, *, background, depth_grad_to_means=True) -> RenderOutput:
         means2d = splats.means[:, :2] * 1.0

@@ -11,8 +11,8 @@ import plain
 import scenes
 import torch
 
-from endoprior import temporal
-from endoprior.presets import preset
+from endoprior.core.presets import preset
+from endoprior.training import temporal
 
 TORCH_MOST = 20_000
 """Points; distances of all pairs grow with their square."""

@@ -22,8 +22,8 @@ import zstandard
 from websockets.sync.client import connect
 
 import endoprior.view.server as server_module
+from endoprior.core.presets import preset
 from endoprior.model.scene import Scene
-from endoprior.presets import preset
 from endoprior.view import stage
 from endoprior.view.scene_subject import SceneSubject
 from endoprior.view.session import REST_SECONDS, Look

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from endoprior.core.presets import preset
+from endoprior.core.types import Camera, Splats
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
-from endoprior.presets import preset
-from endoprior.types import Camera, Splats
 
 NUM_FRAMES = 10
 

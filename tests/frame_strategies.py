@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from endoprior.types import Camera, Frame
+from endoprior.core.types import Camera, Frame
 
 SEEDS = st.integers(0, 2**31 - 1)
 SIDES = st.one_of(st.integers(1, 3), st.integers(4, 40))

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from endoprior.checks import InputError
-from endoprior.config import DataConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from endoprior import render
-from endoprior.types import Camera, RenderOutput, Splats
+from endoprior.core.types import Camera, RenderOutput, Splats
 
 NAMES = tuple(field.name for field in fields(Splats))
 

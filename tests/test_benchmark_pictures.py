@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from endoprior.benchmark.pictures import (
-    center_density,
-    frames_picture,
-    instability_map,
-    prior_picture,
-    zoom_windows,
-)
-from endoprior.types import Camera, Frame
+from endoprior.core.types import Camera, Frame
+from endoprior.experiments.pictures import center_density, frames_picture, instability_map, prior_picture, zoom_windows
 
 WIDTH, HEIGHT = 80, 60
 
@@ -83,7 +77,7 @@ def test_density_counts_centers_in_front_and_inside():
 
 
 def test_pictures_have_a_column_for_each_method():
-    class Sequence:
+    class FrameSequence:
         def frames(self, split):
             return [frame(1)]
 
@@ -92,5 +86,5 @@ def test_pictures_have_a_column_for_each_method():
 
     scenes = {name: Still(np.array([[0.0, 0, 50]])) for name in "ab"}
     width, height = 6 * WIDTH, 6 * HEIGHT  # enlarged to 480 px
-    assert frames_picture(Sequence(), scenes).shape == (4 * height, 3 * width, 3)
-    assert prior_picture(Sequence(), scenes).shape == (height, 4 * width, 3)
+    assert frames_picture(FrameSequence(), scenes).shape == (4 * height, 3 * width, 3)
+    assert prior_picture(FrameSequence(), scenes).shape == (height, 4 * width, 3)

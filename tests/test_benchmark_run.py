@@ -164,10 +164,10 @@ def test_killed_half_way_it_loses_no_finished_cell(tmp_path, how):
 
 
 def test_an_interrupted_cell_goes_on_to_the_same_scene(tmp_path):
-    from endoprior.benchmark.matrix import run_matrix
-    from endoprior.benchmark.spec import load_spec
     from endoprior.data import load_sequence
-    from endoprior.train import train
+    from endoprior.experiments.matrix import run_matrix
+    from endoprior.experiments.spec import load_spec
+    from endoprior.runs.training_run import train
 
     write_tiny_sequence(tmp_path / "tiny")
     sequences = {"tiny": {"path": "tiny"}}
@@ -189,7 +189,7 @@ def test_an_interrupted_cell_goes_on_to_the_same_scene(tmp_path):
     (folder / "key").write_text(job.key)
     with pytest.raises(KeyboardInterrupt):
         train(sequence, cfg, folder / "run", on_step=stop)
-    from endoprior.benchmark.worker import finished, work
+    from endoprior.experiments.worker import finished, work
 
     work(job)
     assert finished(folder, job.key) and not finished(folder, "another")

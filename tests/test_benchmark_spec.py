@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from endoprior.benchmark.spec import Cell, cells, load_spec, sequence_folder
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
+from endoprior.experiments.spec import Cell, cells, load_spec, sequence_folder
 
 SPECS = Path(__file__).parents[1] / "bench" / "specs"
 PLAIN = {

@@ -9,11 +9,11 @@ import math
 import numpy as np
 import pytest
 
-from endoprior.benchmark.report import change
-from endoprior.benchmark.results import Results
-from endoprior.benchmark.spec import Cell, ClaimSpec, MethodSpec, SequenceSpec, Spec
-from endoprior.benchmark.statistics import Difference, difference, gains, summary, verdict
-from endoprior.benchmark.tables import csv_lines, latex, markdown, number, score_table
+from endoprior.experiments.report import change
+from endoprior.experiments.results import Results
+from endoprior.experiments.spec import Cell, ClaimSpec, MethodSpec, SequenceSpec, Spec
+from endoprior.experiments.statistics import Difference, difference, gains, summary, verdict
+from endoprior.experiments.tables import csv_lines, latex, markdown, number, score_table
 
 
 def test_summary_by_hand():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.prepare.calibration import check_pair
 from endoprior.prepare.calibration_files import read_calibration
 

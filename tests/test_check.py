@@ -13,7 +13,7 @@ from sequence_edits import change_poses, describe, write
 
 from endoprior.check import Facts, Finding, find, measure
 from endoprior.cli import main
-from endoprior.config import DataConfig
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.footage.units import guess_unit
 from endoprior.phantom import PhantomConfig, write_phantom

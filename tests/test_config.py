@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from endoprior.checks import InputError
-from endoprior.config import BasisConfig, Config, DensityConfig, HexPlaneConfig
-from endoprior.config_io import from_dict, to_dict
+from endoprior.core.checks import InputError
+from endoprior.core.config import BasisConfig, Config, DensityConfig, HexPlaneConfig
+from endoprior.core.config_io import from_dict, to_dict
+from endoprior.core.presets import preset
 from endoprior.model.basis import identity_motion
-from endoprior.presets import preset
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
 PRESETS = ("default", "paper", "released", "endogaussian")

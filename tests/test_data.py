@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from sequence_edits import change_poses, describe, write
 
-from endoprior.checks import InputError
-from endoprior.config import DataConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
+from endoprior.core.geometry import back_project, project
 from endoprior.data import Truth, clean_depth, load_sequence
-from endoprior.geometry import back_project, project
 
 
 def rotation_about(axis: int, degrees: float) -> np.ndarray:

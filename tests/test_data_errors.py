@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from sequence_edits import change_poses, describe, write
 
-from endoprior.checks import InputError
-from endoprior.config import DataConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 
 # Damage to the folder, file named in the message, words in it.

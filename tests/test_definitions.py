@@ -7,11 +7,11 @@ import pytest
 import torch
 from test_train import tiny_config
 
-from endoprior import compiled as compiled_module
-from endoprior import temporal
-from endoprior.compiled import compiled, definitions_only
+from endoprior.compute import compiled as compiled_module
+from endoprior.compute.compiled import compiled, definitions_only
 from endoprior.data import load_sequence
-from endoprior.trainer import Trainer
+from endoprior.training import temporal
+from endoprior.training.trainer import Trainer
 
 KINDS = ("basis", "hexplane")
 

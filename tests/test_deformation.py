@@ -13,8 +13,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from endoprior.checks import InputError
-from endoprior.config import BasisConfig, DeformationConfig, HexPlaneConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import BasisConfig, DeformationConfig, HexPlaneConfig
 from endoprior.model.basis import basis_offsets, basis_weights, identity_motion, motion_layout
 from endoprior.model.deformation import HexPlaneField, Offsets, box_of_points
 from endoprior.model.heads import OffsetHeads

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from endoprior import density
-from endoprior.config import Config, DensityConfig
-from endoprior.density import DensityStats, Plan
+from endoprior.compute.morton import morton_order
+from endoprior.core.config import Config, DensityConfig
+from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
-from endoprior.morton import morton_order
-from endoprior.optim import Optimizer, split_children
-from endoprior.types import RenderOutput
+from endoprior.training import density
+from endoprior.training.density import DensityStats, Plan
+from endoprior.training.optimizer import Optimizer, split_children
 
 CFG = DensityConfig()
 

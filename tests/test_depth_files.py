@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.data import read_depth_file
 
 UNITS = np.array([[0, 1, 2], [250, 7, 0]], np.float32)

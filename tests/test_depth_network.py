@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from endoprior.checks import InputError
-from endoprior.metrics.torchvision_compat import import_torchvision
+from endoprior.core.checks import InputError
+from endoprior.evaluation.metrics.torchvision_compat import import_torchvision
 from endoprior.prepare import depth_network
 from endoprior.prepare.depth_network import FILES, DepthNetwork
 

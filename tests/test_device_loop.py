@@ -14,21 +14,22 @@ import torch
 from test_divergence import poison, state_of
 from test_train import tiny_config
 
-from endoprior import adam_kernels, inspector, metrics, temporal
-from endoprior.adam import AdamState
-from endoprior.compiled import definitions_only
+from endoprior.compute.compiled import definitions_only
+from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
-from endoprior.divergence import Diverged
-from endoprior.inspector import Inspector
-from endoprior.iteration import Work, on_tissue
+from endoprior.evaluation import metrics
 from endoprior.model.basis import RankOneGradient
 from endoprior.model.scene import load_scene
-from endoprior.recorded import Recorder
-from endoprior.train import train
-from endoprior.train_state import Stage
-from endoprior.trainer import Trainer
-from endoprior.training_frames import TrainingFrames
-from endoprior.types import RenderOutput
+from endoprior.runs.training_run import train
+from endoprior.training import adam_kernels, inspector, temporal
+from endoprior.training.adam import AdamState
+from endoprior.training.divergence import Diverged
+from endoprior.training.frames import TrainingFrames
+from endoprior.training.inspector import Inspector
+from endoprior.training.recorded import Recorder
+from endoprior.training.state import Stage
+from endoprior.training.step import Work, on_tissue
+from endoprior.training.trainer import Trainer
 
 KINDS = ("basis", "hexplane")
 NAN = float("nan")

@@ -9,9 +9,11 @@ import pytest
 import torch
 from test_train import tiny_config
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.divergence import (
+from endoprior.model.scene import load_scene
+from endoprior.runs.training_run import train
+from endoprior.training.divergence import (
     LARGEST_GRADIENT,
     WINDOW,
     Diverged,
@@ -20,9 +22,7 @@ from endoprior.divergence import (
     count_unusable,
     count_unusable_rows,
 )
-from endoprior.model.scene import load_scene
-from endoprior.train import train
-from endoprior.trainer import Trainer
+from endoprior.training.trainer import Trainer
 
 KINDS = ("basis", "hexplane")
 

@@ -8,11 +8,11 @@ import pytest
 from doctor_machines import CHOICES, H200, NO_TRITON, OLD_CARD, WORKING, machines
 from hypothesis import given
 
-from endoprior import device
-from endoprior.checks import InputError
 from endoprior.cli import main
+from endoprior.core.checks import InputError
 from endoprior.doctor import Facts, examine, mend
 from endoprior.doctor.records import Driver, Gpu, Gsplat, System, Toolkit, Torch, Triton, number
+from endoprior.system import devices as device
 
 
 def check_advice(facts: Facts) -> None:

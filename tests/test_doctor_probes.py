@@ -11,12 +11,12 @@ from doctor_machines import NO_TRITON, WORKING, bare_machine, program
 from hypothesis import given
 from hypothesis import strategies as st
 
-from endoprior import device
 from endoprior.doctor import Facts, examine, glance, look, mend
 from endoprior.doctor import facts as facts_module
 from endoprior.doctor.ask import MOST_BYTES, ask, clean
 from endoprior.doctor.driver import driver_answers, driver_files, read_banner, read_gpus
 from endoprior.doctor.records import Driver, Gpu, System, Torch, number
+from endoprior.system import devices as device
 
 
 @pytest.fixture

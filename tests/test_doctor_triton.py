@@ -6,13 +6,13 @@ from dataclasses import replace
 import pytest
 from doctor_machines import H200, NO_GPU, NO_TRITON, ONLY_TRITON, WORKING
 
-from endoprior import device
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.doctor import examine
 from endoprior.doctor import facts as facts_module
 from endoprior.doctor.ask import Answer, ask
 from endoprior.doctor.records import Gsplat, System, Toolkit, Torch, Triton
 from endoprior.doctor.report import table
+from endoprior.system import devices as device
 
 INSTALL = ["pip install 'endoprior[cuda]'"]
 

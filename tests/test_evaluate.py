@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from endoprior.cli import main
+from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.data.truth import Tracks
-from endoprior.evaluate import Evaluation, evaluate
+from endoprior.evaluation.scoring import Evaluation, evaluate
+from endoprior.evaluation.truth import track_end_error_mm, track_scores
 from endoprior.model.carry import carry_points
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.presets import preset
-from endoprior.train import train
-from endoprior.trainer import Trainer
-from endoprior.truth_scores import track_end_error_mm, track_scores
+from endoprior.runs.training_run import train
+from endoprior.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,13 @@ import trimesh
 from export_scenes import moving_scene, plane_camera
 from plyfile import PlyData
 
-from endoprior.checks import InputError
 from endoprior.cli import main
+from endoprior.core.checks import InputError
+from endoprior.core.geometry import project
 from endoprior.export.axes import turned_points
 from endoprior.export.depth import depth_png
 from endoprior.export.surface import Surface, seen_surface
 from endoprior.export.tracks import _seen, grid_picks
-from endoprior.geometry import project
 from endoprior.model.carry import carry_points
 from endoprior.model.scene import load_scene
 from endoprior.render import sh

@@ -12,13 +12,13 @@ import pytest
 import torch
 from export_scenes import moving_scene, plane_camera
 
-from endoprior.config import HexPlaneConfig
+from endoprior.core.config import HexPlaneConfig
+from endoprior.core.presets import preset
 from endoprior.export import FORMATS
 from endoprior.export.axes import ROTATIONS
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
-from endoprior.presets import preset
 
 DOCS = Path(__file__).parents[1] / "docs"
 TIMES = (0.0, 0.13, 0.5, 0.99, 1.0)

@@ -10,12 +10,12 @@ import trimesh
 from export_scenes import moving_scene, plane_camera
 from plyfile import PlyData
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
+from endoprior.core.types import Camera
 from endoprior.export.mesh import depth_grid
 from endoprior.export.mesh_files import encode_mesh
 from endoprior.export.surface import Surface, seen_surface
 from endoprior.export.tsdf import fused_mesh, viewpoints
-from endoprior.types import Camera
 
 CENTER, RADIUS = np.array([1.0, -2.0, 70.0]), 20.0
 

@@ -14,12 +14,12 @@ from plyfile import PlyData
 from pygltflib import GLTF2
 from scipy.spatial.transform import Rotation
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
+from endoprior.core.types import Splats
 from endoprior.export.gltf import encode_glb
 from endoprior.export.ply import encode_ply
 from endoprior.export.splat import encode_splat
 from endoprior.export.spz import encode_spz
-from endoprior.types import Splats
 
 DC = 0.28209479177387814
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from test_train import tiny_config
 
-from endoprior import atomic
-from endoprior.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.run_folder import deferred_interrupt
+from endoprior.runs.folder import deferred_interrupt
+from endoprior.runs.training_run import train
 from endoprior.show.video import _num_frames, write_video
-from endoprior.train import train
-from endoprior.trainer import Trainer
+from endoprior.system import atomic
+from endoprior.system.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder
+from endoprior.training.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
 

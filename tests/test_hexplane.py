@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from endoprior.config import HexPlaneConfig
+from endoprior.core.config import HexPlaneConfig
 from endoprior.model import hexplane_lookup
 from endoprior.model.hexplane import PLANE_NAMES, PlaneGrid, mapped_zeros
 from endoprior.model.hexplane_kernels import FRESH, MAX_CHANNELS, TOUCHED
-from endoprior.model.plane_adam import PlaneAdam, plane_adam_step
+from endoprior.training.plane_adam import PlaneAdam, plane_adam_step
 
 SMALL = HexPlaneConfig(resolution=(5, 4, 6), time_resolution=7, channels=20, multires=(1, 3))
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from test_hexplane import random_grid, random_layer, random_unit
 
-from endoprior.compiled import definitions_only
-from endoprior.config import HexPlaneConfig
+from endoprior.compute.compiled import definitions_only
+from endoprior.core.config import HexPlaneConfig
 
 
 @pytest.mark.parametrize("time_map", ["raw", "full"])

@@ -5,11 +5,11 @@ import pytest
 import torch
 from state_files import StateFile
 
-from endoprior.checkpoint import check_state, checkpoint_schema, load_checkpoint
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.train import train
-from endoprior.trainer import Trainer
+from endoprior.runs.checkpoint import check_state, checkpoint_schema, load_checkpoint
+from endoprior.runs.training_run import train
+from endoprior.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module", params=["basis", "hexplane"])

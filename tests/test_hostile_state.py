@@ -17,16 +17,16 @@ import torch
 from export_scenes import moving_scene
 from state_files import StateFile, packed
 
-from endoprior.arrays_file import LARGEST_HEADER
-from endoprior.checks import InputError
 from endoprior.cli import main
-from endoprior.config import Config
-from endoprior.config_io import from_dict, to_dict
+from endoprior.core.checks import InputError
+from endoprior.core.config import Config
+from endoprior.core.config_io import from_dict, to_dict
+from endoprior.core.presets import preset
 from endoprior.export.html import write_html
 from endoprior.model import hexplane
 from endoprior.model.deformation import HexPlaneField, state_shapes
 from endoprior.model.scene import load_scene
-from endoprior.presets import preset
+from endoprior.system.arrays_file import LARGEST_HEADER
 
 
 @contextmanager

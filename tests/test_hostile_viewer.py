@@ -15,7 +15,7 @@ from export_scenes import moving_scene
 from view_client import Client, at_work
 from websockets.exceptions import ConnectionClosed
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.view import panel as panels
 from endoprior.view.guard import LARGEST_MESSAGE, MOST_BROWSERS, sensible, trusted
 from endoprior.view.jobs import MOST_WAITING, Jobs

@@ -18,14 +18,14 @@ from browser import Page, open_page, pictures_folder, require_chromium
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
+from endoprior.core.presets import preset
+from endoprior.core.types import Camera
 from endoprior.export.html import write_html
 from endoprior.export.html_data import CHANNELS
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
-from endoprior.presets import preset
 from endoprior.render import sh
-from endoprior.types import Camera
 
 WIDTH, HEIGHT, NUM_FRAMES, RATE = 320, 256, 6, 10.0
 FAINT, BROKEN, LOST = 3, 5, 7  # rows: never opaque enough, not finite, 100 m away

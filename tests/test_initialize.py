@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from endoprior.checks import InputError
-from endoprior.config import InitConfig, PriorConfig, SalienceConfig, SpecularConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import InitConfig, PriorConfig, SalienceConfig, SpecularConfig
+from endoprior.core.geometry import project
+from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
-from endoprior.geometry import project
-from endoprior.model.initialize import (
+from endoprior.initialization.cleanup import PointCloud, merge_voxels, remove_outliers
+from endoprior.initialization.sampling import (
     draw_pixels,
     eroded_mask,
     initial_log_scales,
@@ -24,9 +26,7 @@ from endoprior.model.initialize import (
     quotas,
     sampling_distribution,
 )
-from endoprior.model.point_cleanup import PointCloud, merge_voxels, remove_outliers
 from endoprior.priors import joint_texture_prior
-from endoprior.types import Camera, Frame
 
 HEIGHT, WIDTH = 26, 32
 

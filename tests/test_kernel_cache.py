@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import pytest
 
-from endoprior import kernel_cache
-from endoprior.config_io import to_dict
-from endoprior.presets import preset
-from endoprior.trainer import Trainer
-from endoprior.warm_up import shortened, tiny_sequence
+from endoprior.core.config_io import to_dict
+from endoprior.core.presets import preset
+from endoprior.runs import kernel_cache
+from endoprior.runs.warm_up import shortened, tiny_sequence
+from endoprior.training.trainer import Trainer
 
 
 @pytest.fixture

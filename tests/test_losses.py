@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from endoprior import losses
-from endoprior.loss_kernels import supervised_losses
+from endoprior.training import losses
+from endoprior.training.loss_kernels import supervised_losses
 
 
 def scene(seed: int, height: int = 13, width: int = 17):

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.prepare.mask_files import read_user_mask, tool_polarity
 
 SIZE = (64, 48)

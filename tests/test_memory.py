@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from endoprior.data import load_sequence
-from endoprior.memory import LEAST_CACHE, BoundedCache, available_bytes, cache_bytes
-from endoprior.train import train
+from endoprior.runs.training_run import train
+from endoprior.system.memory import LEAST_CACHE, BoundedCache, available_bytes, cache_bytes
 
 
 def test_what_is_free_is_between_nothing_and_all():
@@ -20,7 +20,7 @@ def test_what_is_free_is_between_nothing_and_all():
 
 
 def test_a_limit_of_the_process_counts():
-    code = "from endoprior.memory import available_bytes; print(available_bytes())"
+    code = "from endoprior.system.memory import available_bytes; print(available_bytes())"
     limit = 2 * 2**30
 
     def limited():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.metrics import ScoreUnavailable, dis_flow, flow_error
+from endoprior.evaluation.metrics import ScoreUnavailable, dis_flow, flow_error
 
 
 def texture(height: int, width: int, shift: tuple[int, int] = (0, 0), seed: int = 0) -> np.ndarray:

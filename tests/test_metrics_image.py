@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endoprior.metrics import (
+from endoprior.evaluation.metrics import (
     depth_rmse,
     depth_rmse_endogaussian,
     mean_over_frames,

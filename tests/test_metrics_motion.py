@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from endoprior.metrics import depth_instability, neighbor_breaks, track_error
-from endoprior.types import Camera
+from endoprior.core.types import Camera
+from endoprior.evaluation.metrics import depth_instability, neighbor_breaks, track_error
 
 ALL = np.ones((6, 8), bool)
 
@@ -53,7 +53,8 @@ def test_instability_names_bad_input():
 
 
 def test_metrics_import_without_torch():
-    code = "import sys, endoprior.metrics.stability; print('torch' in sys.modules, 'torchvision' in sys.modules)"
+    module = "endoprior.evaluation.metrics.stability"
+    code = f"import sys, {module}; print('torch' in sys.modules, 'torchvision' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "False"]
 

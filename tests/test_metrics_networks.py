@@ -18,9 +18,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from endoprior.metrics import ScoreUnavailable, WeightsMissing, flow_error, lpips_distance, raft_flow
-from endoprior.metrics.torchvision_compat import import_torchvision
-from endoprior.metrics.weights import ALEXNET, RAFT_LARGE, RAFT_SMALL, SQUEEZENET, find_weights
+from endoprior.evaluation.metrics import ScoreUnavailable, WeightsMissing, flow_error, lpips_distance, raft_flow
+from endoprior.evaluation.metrics.torchvision_compat import import_torchvision
+from endoprior.evaluation.metrics.weights import ALEXNET, RAFT_LARGE, RAFT_SMALL, SQUEEZENET, find_weights
 
 pytestmark = pytest.mark.skipif(
     not all(find_spec(package) for package in ("lpips", "torchvision")),
@@ -212,7 +212,7 @@ def test_a_package_that_is_not_installed_is_a_reason(no_weights, monkeypatch, pa
 def test_torchvision_imports_beside_this_torch_without_a_warning():
     """In a new process, where nothing has declared an operator or imported torchvision before."""
     code = (
-        "from endoprior.metrics import torchvision_compat as compat\n"
+        "from endoprior.evaluation.metrics import torchvision_compat as compat\n"
         "import torch, sys\n"
         "torchvision = compat.import_torchvision()\n"
         "assert compat.import_torchvision() is torchvision is sys.modules['torchvision']\n"
@@ -230,7 +230,7 @@ def test_a_torchvision_that_fails_otherwise_is_a_reason(monkeypatch):
         tried.append(name)
         raise RuntimeError("undefined symbol\nmore")
 
-    monkeypatch.setattr("endoprior.metrics.torchvision_compat.importlib.import_module", fail)
+    monkeypatch.setattr("endoprior.evaluation.metrics.torchvision_compat.importlib.import_module", fail)
     with pytest.raises(ScoreUnavailable, match=r"torchvision does not work beside torch .* \(undefined symbol\)"):
         import_torchvision()
     assert len(tried) == 1  # declaring operators would not help, so nothing is declared and tried again

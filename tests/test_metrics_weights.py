@@ -15,9 +15,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from endoprior.checks import InputError
-from endoprior.metrics import weights
-from endoprior.metrics.weights import (
+from endoprior.core.checks import InputError
+from endoprior.evaluation.metrics import weights
+from endoprior.evaluation.metrics.weights import (
     FoundWeights,
     WeightFiles,
     WeightsMissing,

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from endoprior.morton import morton_order
+from endoprior.compute.morton import morton_order
 
 
 def test_corners_of_a_cube_are_visited_x_first():

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from endoprior import float64_lanes as f8
-from endoprior.neighbor_kernels import MAX_COORDINATE, curve_order
-from endoprior.temporal import neighbors
+from endoprior.compute import float64_lanes as f8
+from endoprior.compute.neighbors import MAX_COORDINATE, curve_order
+from endoprior.training.temporal import neighbors
 
 NUM = 700
 """Points of a cloud: more than 64 blocks of eight, so there are three levels of groups, and the last block is short."""

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from endoprior.adam import AdamState
-from endoprior.config import Config
+from endoprior.core.config import Config
+from endoprior.core.presets import preset
 from endoprior.model.basis import RankOneGradient, motion_layout
-from endoprior.optim import log_linear, motion_rates
-from endoprior.presets import preset
+from endoprior.training.adam import AdamState
+from endoprior.training.optimizer import log_linear, motion_rates
 
 
 def test_update_is_torchs_adam():

@@ -10,8 +10,8 @@ import numba
 import numpy as np
 import pytest
 
-from endoprior.checks import InputError
-from endoprior.geometry import bilinear
+from endoprior.core.checks import InputError
+from endoprior.core.geometry import bilinear
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.phantom.generate import build_scene, visible_points
 from endoprior.phantom.instrument import JAW_MM, draw_tools, pack_tool

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from endoprior.config import Config
+from endoprior.core.config import Config
+from endoprior.core.presets import preset
+from endoprior.core.types import Camera
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.playback import Playback
 from endoprior.model.scene import Scene
-from endoprior.presets import preset
-from endoprior.types import Camera
 
 NUM_FRAMES = 5
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from endoprior.model.initialize import initial_log_scales
-from endoprior.model.point_cleanup import PointCloud, joined, merge_voxels, remove_outliers
+from endoprior.initialization.cleanup import PointCloud, joined, merge_voxels, remove_outliers
+from endoprior.initialization.sampling import initial_log_scales
 
 
 def cloud_of(points: np.ndarray, colors: np.ndarray) -> PointCloud:

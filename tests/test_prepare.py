@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from video_files import write_video
 
-from endoprior.checks import InputError
 from endoprior.cli import main
+from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.prepare import PrepareConfig, prepare, work_folder

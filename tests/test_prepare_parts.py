@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.footage.border import Circle, Strips
 from endoprior.prepare.calibration import Calibration, Eye
 from endoprior.prepare.config import PrepareConfig, parse_rectangle

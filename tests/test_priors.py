@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from endoprior.config import PriorConfig, SalienceConfig, SpecularConfig
+from endoprior.core.config import PriorConfig, SalienceConfig, SpecularConfig
 from endoprior.priors import edge_magnitude, joint_texture_prior, salience, specular_likelihood
 from endoprior.priors.salience import EPSILON
 

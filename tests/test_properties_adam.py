@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior.adam import AdamState
-from endoprior.adam_kernels import BETA1, BETA2
 from endoprior.model.basis import RankOneGradient
+from endoprior.training.adam import AdamState
+from endoprior.training.adam_kernels import BETA1, BETA2
 
 LONGEST_STEP = (1 - BETA1) / np.sqrt(1 - BETA2) / np.sqrt(1 - BETA1**2 / BETA2)
 """In learning rates: 7.3, by Cauchy and Schwarz over all sequences of gradients; test_divergence.py comes close."""

@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior import density
-from endoprior.config import Config, DensityConfig
-from endoprior.density import DensityStats
+from endoprior.core.config import Config, DensityConfig
+from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
-from endoprior.optim import Optimizer
-from endoprior.types import RenderOutput
+from endoprior.training import density
+from endoprior.training.density import DensityStats
+from endoprior.training.optimizer import Optimizer
 
 SEEDS = st.integers(0, 2**31 - 1)
 EMPTY = torch.zeros(0)

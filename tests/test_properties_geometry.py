@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from hypothesis_profiles import examples
 from render_scenes import camera
 
-from endoprior.config import BasisConfig
+from endoprior.compute.morton import morton_order
+from endoprior.core.config import BasisConfig
+from endoprior.core.geometry import back_project, bilinear, expected_depth, pixel_centers, project, quaternion_to_matrix
 from endoprior.data.shrink import shrunk_camera
-from endoprior.geometry import back_project, bilinear, expected_depth, pixel_centers, project, quaternion_to_matrix
 from endoprior.model.basis import basis_weights
-from endoprior.morton import morton_order
-from endoprior.temporal import neighbors
+from endoprior.training.temporal import neighbors
 
 SEEDS = st.integers(0, 2**31 - 1)
 SIDES = st.integers(1, 60)

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior import losses, temporal
-from endoprior.config import TemporalConfig
-from endoprior.loss_kernels import supervised_losses
-from endoprior.temporal_kernels import median
+from endoprior.core.config import TemporalConfig
+from endoprior.training import losses, temporal
+from endoprior.training.loss_kernels import supervised_losses
+from endoprior.training.temporal_kernels import median
 
 
 @st.composite

@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior import metrics
-from endoprior.data.sequence import Sequence
-from endoprior.evaluate import EXACT, Evaluation, evaluate
-from endoprior.presets import preset
-from endoprior.trainer import Trainer
-from endoprior.types import Camera, Frame
+from endoprior.core.presets import preset
+from endoprior.core.types import Camera, Frame
+from endoprior.data.sequence import FrameSequence
+from endoprior.evaluation import metrics
+from endoprior.evaluation.scoring import EXACT, Evaluation, evaluate
+from endoprior.training.trainer import Trainer
 
 IMAGE_SCORES = (metrics.psnr, metrics.psnr_tissue, metrics.ssim, metrics.ssim_tissue)
 
@@ -124,7 +124,7 @@ def _sequence(count, height, width, picture, mask, depth=50.0):
         z = np.full((height, width), depth, np.float32)
         return Frame(index, index / count, camera, picture, mask, z, z > 0)
 
-    return Sequence(Path("made"), [camera] * count, read)
+    return FrameSequence(Path("made"), [camera] * count, read)
 
 
 @pytest.mark.parametrize(

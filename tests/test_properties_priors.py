@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior.config import InitConfig, PriorConfig, SalienceConfig
-from endoprior.model.initialize import eroded_mask, pixel_probability, sampling_distribution
+from endoprior.core.config import InitConfig, PriorConfig, SalienceConfig
+from endoprior.initialization.sampling import eroded_mask, pixel_probability, sampling_distribution
 from endoprior.priors import edge_magnitude, joint_texture_prior, salience, specular_likelihood
 
 

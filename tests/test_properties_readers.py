@@ -14,8 +14,8 @@ from hypothesis_profiles import examples
 from scipy.spatial.transform import Rotation
 from sequence_edits import describe
 
-from endoprior.checks import InputError
-from endoprior.config import DataConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.writer import SequenceMeta, SequenceWriter
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis_profiles import examples
 from render_scenes import NAMES, camera, draw, pick, splats
 
+from endoprior.core.types import Camera, Splats
 from endoprior.render.constants import ALPHA_MIN, MIN_QUAT, NEAR_Z
-from endoprior.types import Camera, Splats
 
 BACKENDS = ("cpu", "reference")
 WEIRD = (math.nan, math.inf, -math.inf)

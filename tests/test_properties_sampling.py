@@ -12,17 +12,17 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior.checks import InputError
-from endoprior.config import BasisConfig, InitConfig, PriorConfig
-from endoprior.data.sequence import Sequence
+from endoprior.core.checks import InputError
+from endoprior.core.config import BasisConfig, InitConfig, PriorConfig
+from endoprior.core.geometry import project
+from endoprior.core.presets import preset
+from endoprior.core.types import Camera, Frame
+from endoprior.data.sequence import FrameSequence
 from endoprior.data.shrink import shrunk
-from endoprior.geometry import project
-from endoprior.model.initialize import draw_pixels, initial_log_scales, initial_points, pixel_probability, quotas
-from endoprior.model.point_cleanup import PointCloud, merge_voxels, remove_outliers
-from endoprior.model.tracks import initial_motion
-from endoprior.presets import preset
-from endoprior.trainer import Trainer
-from endoprior.types import Camera, Frame
+from endoprior.initialization.cleanup import PointCloud, merge_voxels, remove_outliers
+from endoprior.initialization.flow_tracks import initial_motion
+from endoprior.initialization.sampling import draw_pixels, initial_log_scales, initial_points, pixel_probability, quotas
+from endoprior.training.trainer import Trainer
 
 
 @st.composite
@@ -177,7 +177,9 @@ def test_a_start_reads_no_test_frame(count):
         return Frame(index, index / count, camera, picture, np.ones((36, 40), bool), depth, depth > 0)
 
     cfg = preset("default")
-    trainer = Trainer(Sequence(Path("made"), [camera] * count, read), replace(cfg, init=replace(cfg.init, budget=60)))
+    trainer = Trainer(
+        FrameSequence(Path("made"), [camera] * count, read), replace(cfg, init=replace(cfg.init, budget=60))
+    )
     trainer.start()
     for _ in range(3):
         trainer.step()

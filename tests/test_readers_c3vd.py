@@ -10,7 +10,7 @@ import pytest
 from reader_checks import assert_refused, remark_with
 from sequence_edits import write
 
-from endoprior.config import DataConfig
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.c3vd import CF_HQ190L, camera_to_world, read_lens
 from endoprior.data.omnidirectional import Omnidirectional

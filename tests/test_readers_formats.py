@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from reader_checks import assert_refused, edit_json, remark_with
 
-from endoprior.checks import InputError
-from endoprior.config import DataConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.formats import FORMATS
 from endoprior.data.load import find_format

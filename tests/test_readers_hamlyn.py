@@ -10,7 +10,7 @@ import pytest
 from reader_checks import assert_refused, remark_with
 from sequence_edits import change_poses, write
 
-from endoprior.config import DataConfig
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 10

@@ -10,8 +10,8 @@ import pytest
 from reader_checks import assert_refused, remark_with
 from sequence_edits import write
 
-from endoprior.checks import InputError
-from endoprior.config import DataConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 
 WIDTH, HEIGHT, FRAMES = 30, 20, 12

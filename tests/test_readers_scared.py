@@ -11,7 +11,7 @@ import pytest
 from reader_checks import assert_refused, edit_json, remark_with
 from sequence_edits import write
 
-from endoprior.config import DataConfig
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.scared import dataset_number, disparity_to_depth, tissue_from_depth
 

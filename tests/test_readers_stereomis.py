@@ -11,7 +11,7 @@ import pytest
 from reader_checks import assert_refused, edit_json, remark_with
 from sequence_edits import change_poses, write
 
-from endoprior.config import DataConfig
+from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 
 MATRIX = np.array([[61.0, 0, 22.5], [0, 62, 18.25], [0, 0, 1]])

@@ -7,7 +7,7 @@ import pytest
 from reader_checks import assert_refused
 from sequence_edits import write
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.data import load_sequence, write_stir_tracks
 from endoprior.data.stir import nearest_end_errors, stir_tracks, tattoo_centers
 

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 import yaml
 
-from endoprior.benchmark.worker import finished
-from endoprior.checks import InputError
-from endoprior.config import DataConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
 from endoprior.data import numpy_files, reading
 from endoprior.data.files import natural_order
 from endoprior.data.image_header import is_whole, stored_size
 from endoprior.data.numpy_files import read_numpy
 from endoprior.data.reading import kind_of, read_bytes, read_text
 from endoprior.data.yaml_text import MOST_NODES, load_yaml
+from endoprior.experiments.worker import finished
 from endoprior.phantom import PhantomConfig
 from endoprior.prepare import PrepareConfig
 from endoprior.prepare.stereo import StereoConfig

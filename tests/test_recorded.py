@@ -15,13 +15,13 @@ from test_train import tiny_config
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_map
 
-from endoprior import recorded
-from endoprior.compiled import definitions_only
+from endoprior.compute.compiled import definitions_only
+from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
-from endoprior.iteration import Work
-from endoprior.recorded import WARM_UPS
-from endoprior.trainer import Trainer
-from endoprior.types import RenderOutput
+from endoprior.training import recorded
+from endoprior.training.recorded import WARM_UPS
+from endoprior.training.step import Work
+from endoprior.training.trainer import Trainer
 
 KINDS = ("basis", "hexplane")
 

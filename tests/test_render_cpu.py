@@ -12,11 +12,11 @@ from numba import njit
 from render_scenes import NAMES, camera, draw, one, pick, poison, splats
 from scipy.spatial.transform import Rotation
 
-from endoprior import simd
+from endoprior.compute import simd
+from endoprior.core.types import Splats
 from endoprior.render import constants, tiles
 from endoprior.render.cpu import rasterize
 from endoprior.render.pixel_kernels import draw as draw_lanes
-from endoprior.types import Splats
 
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 

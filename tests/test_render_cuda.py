@@ -17,11 +17,11 @@ import torch
 from render_scenes import NAMES, camera, draw, one, pick, poison, splats
 
 from endoprior import render
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
+from endoprior.core.types import Splats
 from endoprior.render import sh as harmonics
 from endoprior.render.constants import NEAR_Z
 from endoprior.render.projection import rotation_matrices
-from endoprior.types import Splats
 
 NAN = float("nan")
 CAP, EDGE, STOP = 0.999, 1 / 255, 1e-4

@@ -9,12 +9,12 @@ from render_scenes import NAMES, camera, draw, one, pick, splats
 from scipy.special import sph_harm_y
 
 from endoprior import render
-from endoprior.checks import InputError
-from endoprior.geometry import project as pinhole
+from endoprior.core.checks import InputError
+from endoprior.core.geometry import project as pinhole
+from endoprior.core.types import Camera, Splats
 from endoprior.render import constants, sh
 from endoprior.render.projection import jacobian_limits, project, rotation_matrices
 from endoprior.render.reference import rasterize
-from endoprior.types import Camera, Splats
 
 BLACK = torch.zeros(3)
 

@@ -19,10 +19,10 @@ from render_scenes import NAMES, camera, draw, one, pick, poison, splats
 from test_render_parity import compare
 
 from endoprior import render
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
+from endoprior.core.types import Splats
 from endoprior.render.constants import ALPHA_MAX, ALPHA_MIN, MIN_QUAT, NEAR_Z
 from endoprior.render.projection import project
-from endoprior.types import Splats
 
 pytest.importorskip("triton")
 if os.environ.get("TRITON_INTERPRET") != "1":

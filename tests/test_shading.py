@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.prepare import shading
 from endoprior.prepare.aligned_depth import MAX_RATIO, NEAR_RATIO, fit_reference, relative_to_mm
 from endoprior.prepare.shading import RELIEF, fit_shading

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from conftest import write_tiny_sequence
 
-from endoprior.checks import InputError
-from endoprior.config import DataConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
+from endoprior.core.geometry import back_project, project
 from endoprior.data import load_sequence, shrunk
-from endoprior.geometry import back_project, project
 
 
 @pytest.mark.parametrize("factor", [2, 3])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from endoprior import simd
+from endoprior.compute import simd
 
 f4 = np.float32
 

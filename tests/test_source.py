@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from video_files import write_video
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.prepare.selection import Selection
 from endoprior.prepare.source import Picture, open_source
 

@@ -3,106 +3,118 @@
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 SRC = Path(__file__).parents[1] / "src" / "endoprior"
 FILES = sorted(SRC.rglob("*.py"))
 
-LAYERS = [
-    {"checks", "types", "lane_types", "morton", "compiled", "density_kernels"},
-    {"simd", "float64_lanes", "memory"},
-    {"config", "atomic", "adam_kernels", "neighbor_kernels", "temporal_kernels"},
-    {"config_io", "presets", "arrays_file", "geometry", "divergence"},
-    {"losses"},
-    {"data", "priors", "render", "loss_kernels", "temporal", "metrics", "footage"},
-    {"phantom", "model", "density", "doctor"},
-    {"device"},
-    {"adam"},
-    {"optim", "training_frames", "truth_scores"},
-    {"train_state", "evaluate", "show"},
-    {"inspector"},
-    {"iteration"},
-    {"recorded"},
-    {"trainer", "training_memory", "export", "kernel_cache"},
-    {"warm_up"},
-    {"run_identity"},
-    {"checkpoint"},
-    {"run_folder"},
-    {"train"},
-    {"benchmark", "check", "prepare", "view"},
+FLOORS = [
+    {"core", "compute"},
+    {"system", "render", "priors", "footage"},
+    {"data", "model"},
+    {"initialization", "evaluation", "show", "phantom"},
+    {"training", "doctor", "prepare", "check", "export", "view"},
+    {"runs"},
+    {"experiments"},
     {"cli"},
-    {"__init__", "__main__"},
 ]
-ORDER = {name: level for level, names in enumerate(LAYERS) for name in names}
-NO_TORCH = ("priors", "data", "metrics/stability.py", "phantom", "geometry.py", "footage", "check")
+"""Packages, lowest first. A package imports from floors below its own, never from its own or from above."""
+FLOOR_OF = {name: level for level, names in enumerate(FLOORS) for name in names}
+ROOT_FILES = {"__init__.py", "__main__.py", "py.typed"}
+NO_TORCH = ("priors", "data", "evaluation/metrics/stability.py", "phantom", "core", "footage", "check")
 
 
-def unit(path: Path) -> str:
-    """First part of the module's path below the package."""
-    return path.relative_to(SRC).parts[0].removesuffix(".py")
+@cache
+def nodes(path: Path) -> list[ast.AST]:
+    """Every node of a file's syntax tree."""
+    return list(ast.walk(ast.parse(path.read_text())))
 
 
-def imported_units(path: Path) -> set[str]:
-    """Own units that a file imports, those for type checking only left out."""
-    tree = ast.parse(path.read_text())
+def imports(path: Path) -> Iterator[tuple[str, ...]]:
+    """Own modules that a file imports, as paths below the package; those for type checking only left out."""
     skipped = {
         id(child)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        for node in nodes(path)
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
         for child in ast.walk(node)
     }
-    depth = len(path.relative_to(SRC).parts)
-    found = set()
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.ImportFrom) or id(node) in skipped or node.level != depth:
+    parts = path.relative_to(SRC).parts
+    for node in nodes(path):
+        if isinstance(node, ast.ImportFrom) and node.level and id(node) not in skipped:
+            base = parts[: len(parts) - node.level]
+            if node.module:
+                yield *base, *node.module.split(".")
+            else:
+                yield from ((*base, alias.name) for alias in node.names)
+
+
+def test_the_root_holds_packages_only():
+    assert {path.name for path in SRC.iterdir() if path.is_file()} <= ROOT_FILES
+    packages = {path.name for path in SRC.iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert packages == FLOOR_OF.keys()
+
+
+def test_imports_point_down():
+    for path in FILES:
+        here = path.relative_to(SRC).parts[0]
+        if here not in FLOOR_OF:
             continue
-        names = [node.module.split(".")[0]] if node.module else [alias.name for alias in node.names]
-        found |= set(names)
-    return found - {unit(path)}
+        for target in imports(path):
+            assert target[0] == here or FLOOR_OF[target[0]] < FLOOR_OF[here], f"{path} must not import {target[0]}"
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SRC)))
-def test_imports_point_one_way(path):
-    here = unit(path)
-    assert here in ORDER, f"{here} has no layer: add it to LAYERS"
-    for name in imported_units(path):
-        assert ORDER[name] < ORDER[here], f"{here} must not import {name}"
+def test_no_module_imports_itself_in_a_circle():
+    names = {path.relative_to(SRC).with_suffix("").parts: path for path in FILES}
+    edges = {name: {target for target in imports(path) if target in names} for name, path in names.items()}
+    done: set[tuple[str, ...]] = set()
+
+    def visit(name: tuple[str, ...], trail: tuple[tuple[str, ...], ...]) -> None:
+        assert name not in trail, " -> ".join(".".join(part) for part in (*trail, name))
+        if name not in done:
+            for target in edges[name]:
+                visit(target, (*trail, name))
+            done.add(name)
+
+    for name in names:
+        visit(name, ())
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SRC)))
-def test_files_are_short_and_say_what_they_are(path):
-    text = path.read_text()
-    assert len(text.splitlines()) <= 400
-    assert not text.strip() or ast.get_docstring(ast.parse(text))
+def test_files_are_short_and_say_what_they_are():
+    for path in FILES:
+        text = path.read_text()
+        assert len(text.splitlines()) <= 400, path
+        assert not text.strip() or ast.get_docstring(ast.parse(text)), path
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SRC)))
-def test_public_functions_and_classes_have_docstrings(path):
-    for node in ast.parse(path.read_text()).body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
-            if any("njit" in ast.unparse(decorator) for decorator in node.decorator_list):
-                continue  # kernels say their contract in a comment on the first line
-            assert ast.get_docstring(node), f"{path.name}: {node.name}"
+def test_public_functions_and_classes_have_docstrings():
+    for path in FILES:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                if any("njit" in ast.unparse(decorator) for decorator in node.decorator_list):
+                    continue  # kernels say their contract in a comment on the first line
+                assert ast.get_docstring(node), f"{path}: {node.name}"
 
 
-@pytest.mark.parametrize("part", NO_TORCH)
-def test_numpy_only_parts_do_not_import_torch(part):
-    folder = SRC / part
-    for path in [folder] if folder.suffix else sorted(folder.rglob("*.py")):
-        modules = {
-            alias.name if isinstance(node, ast.Import) else node.module or ""
-            for node in ast.walk(ast.parse(path.read_text()))
-            if isinstance(node, ast.Import | ast.ImportFrom)
-            for alias in node.names
-        }
-        assert not any(name.split(".")[0] == "torch" for name in modules), path
+def test_numpy_only_parts_do_not_import_torch():
+    for part in NO_TORCH:
+        folder = SRC / part
+        for path in [folder] if folder.suffix else sorted(folder.rglob("*.py")):
+            modules = {
+                alias.name if isinstance(node, ast.Import) else node.module or ""
+                for node in nodes(path)
+                if isinstance(node, ast.Import | ast.ImportFrom)
+                for alias in node.names
+            }
+            if path.name == "types.py":
+                continue  # names tensors in annotations
+            assert not any(name.split(".")[0] == "torch" for name in modules), path
 
 
 def test_no_pickle_and_no_eval_anywhere():
     for path in FILES:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes(path):
             if isinstance(node, ast.Import | ast.ImportFrom):
                 names = {alias.name for alias in node.names}
                 if getattr(node, "module", None) in ("pickle", "dill", "joblib"):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from endoprior import temporal
-from endoprior.config import TemporalConfig
+from endoprior.core.config import TemporalConfig
+from endoprior.training import temporal
 
 CFG = TemporalConfig()
 

@@ -10,16 +10,17 @@ import pytest
 import torch
 from conftest import write_tiny_sequence
 
-from endoprior.checks import InputError
-from endoprior.config import BasisConfig, Config, InitConfig
+from endoprior.core.checks import InputError
+from endoprior.core.config import BasisConfig, Config, InitConfig
+from endoprior.core.geometry import back_project, bilinear, project
+from endoprior.core.presets import preset
+from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
-from endoprior.geometry import back_project, bilinear, project
-from endoprior.model import track_kernels, tracks
+from endoprior.initialization import flow_tracks as tracks
+from endoprior.initialization import track_kernels
+from endoprior.initialization.cleanup import PointCloud
 from endoprior.model.basis import basis_weights
-from endoprior.model.point_cleanup import PointCloud
-from endoprior.presets import preset
-from endoprior.trainer import Trainer
-from endoprior.types import Camera, Frame
+from endoprior.training.trainer import Trainer
 
 WIDTH, HEIGHT, NUM_FRAMES, DEPTH = 160, 128, 7, 50.0
 

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 import torch
 
-from endoprior.checks import InputError
-from endoprior.config import Config
+from endoprior.compute.morton import morton_order
+from endoprior.core.checks import InputError
+from endoprior.core.config import Config
+from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.export import export
 from endoprior.export.options import ExportOptions
 from endoprior.model.scene import load_scene
-from endoprior.morton import morton_order
-from endoprior.optim import log_linear
-from endoprior.presets import preset
-from endoprior.train import train
-from endoprior.train_state import Stage
-from endoprior.trainer import Trainer
+from endoprior.runs.training_run import train
+from endoprior.training.optimizer import log_linear
+from endoprior.training.state import Stage
+from endoprior.training.trainer import Trainer
 
 GOLDEN = Path(__file__).parent / "golden" / "train_losses.json"
 KINDS = ("basis", "hexplane")
@@ -169,7 +169,7 @@ def test_color_degree_rises_and_does_not_fall_back(tiny_sequence):
 
 def test_eligible_frames_of_the_temporal_term(make_tiny_sequence):
     """The frame before must itself be a training frame: 46 of the 55 of a 63-frame sequence, 115 of 136 for 156."""
-    from endoprior.training_frames import TrainingFrames
+    from endoprior.training.frames import TrainingFrames
 
     for frames, train_frames, eligible in ((63, 55, 46), (156, 136, 115)):
         sequence = load_sequence(make_tiny_sequence(str(frames), num_frames=frames, width=16, height=16))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from test_train import tiny_config
 
-from endoprior import training_memory
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
+from endoprior.core.presets import preset
 from endoprior.data import load_sequence
-from endoprior.presets import preset
-from endoprior.train import train
-from endoprior.training_memory import LEAST_BYTES, PICTURE_BYTES, least_bytes
+from endoprior.runs.training_run import train
+from endoprior.training import memory_check as training_memory
+from endoprior.training.memory_check import LEAST_BYTES, PICTURE_BYTES, least_bytes
 
 
 def test_by_hand():

@@ -12,11 +12,11 @@ from browser import open_page, pictures_folder, require_chromium
 from view_client import at_work
 
 from endoprior.cli.view import open_subject
+from endoprior.core.geometry import back_project
+from endoprior.core.presets import preset
 from endoprior.data import load_sequence
-from endoprior.geometry import back_project
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.presets import preset
-from endoprior.train import train
+from endoprior.runs.training_run import train
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT
 from endoprior.view.scene_subject import SceneSubject
 from endoprior.view.server import Viewer

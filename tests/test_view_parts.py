@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endoprior.checks import InputError
-from endoprior.geometry import project
-from endoprior.types import Camera
+from endoprior.core.checks import InputError
+from endoprior.core.geometry import project
+from endoprior.core.types import Camera
 from endoprior.view.dots import draw_dots
 from endoprior.view.guard import check_address, trusted
 from endoprior.view.marks import draw_marks, joined, no_marks, ruler, trails

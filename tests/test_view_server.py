@@ -16,14 +16,14 @@ from websockets.exceptions import ConnectionClosed
 
 from endoprior.cli import main
 from endoprior.cli.view import live_view, open_subject
-from endoprior.config import Config
+from endoprior.core.config import Config
+from endoprior.core.presets import preset
+from endoprior.core.types import Camera
 from endoprior.data import load_sequence
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
-from endoprior.presets import preset
+from endoprior.runs.training_run import train
 from endoprior.show.pictures import to_u8
-from endoprior.train import train
-from endoprior.types import Camera
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT, POINTS
 from endoprior.view.scene_subject import SceneSubject
 from endoprior.view.sequence_subject import SequenceSubject

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.checks import InputError
+from endoprior.core.checks import InputError
 from endoprior.data.writer import SequenceMeta, SequenceWriter
 
 META = SequenceMeta(width=6, height=4, fx=5.0, fy=5.5, cx=3.0, cy=2.0, frames_per_second=25.0, depth_source="test")

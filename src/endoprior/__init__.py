@@ -7,15 +7,15 @@ from importlib import import_module
 from typing import Any
 
 _HOME = {
-    "Config": "config",
-    "InputError": "checks",
+    "Config": "core.config",
+    "InputError": "core.checks",
     "Scene": "model.scene",
-    "evaluate": "evaluate",
+    "evaluate": "evaluation.scoring",
     "joint_texture_prior": "priors",
     "load_scene": "model.scene",
     "load_sequence": "data",
-    "preset": "presets",
-    "train": "train",
+    "preset": "core.presets",
+    "train": "runs.training_run",
 }
 
 __all__ = sorted(_HOME)

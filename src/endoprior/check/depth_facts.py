@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import DataConfig
-from ..data import Sequence
+from ..core.config import DataConfig
+from ..core.types import Frame
+from ..data import FrameSequence
 from ..footage.units import UnitGuess, guess_unit
-from ..types import Frame
 
 BINS = 80
 """Bins of the histogram."""
@@ -48,7 +48,11 @@ class DepthFacts:
 
 
 def measure_depth(
-    sequence: Sequence, few: list[Frame], tissue: list[NDArray[np.bool_]], described: dict[str, Any], cfg: DataConfig
+    sequence: FrameSequence,
+    few: list[Frame],
+    tissue: list[NDArray[np.bool_]],
+    described: dict[str, Any],
+    cfg: DataConfig,
 ) -> DepthFacts:
     """Measure the depth of every frame, and its distribution on some.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..data import Sequence
+from ..data import FrameSequence
 from ..data.files import natural_order
 from ..data.images import read_color
 from ..footage.eyes import EyeOrder, eye_order, vertical_offset_px
@@ -32,7 +32,7 @@ class EyeFacts:
         return f"the eyes explain {explained}; {rows}"
 
 
-def measure_eyes(sequence: Sequence) -> EyeFacts | None:
+def measure_eyes(sequence: FrameSequence) -> EyeFacts | None:
     """Compare both eyes in a few frames; None where the folder has no right eye, or not one picture per frame.
 
     Args:

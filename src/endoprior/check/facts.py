@@ -12,22 +12,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError
-from ..config import DataConfig
-from ..data import Sequence
+from ..core.checks import InputError
+from ..core.config import DataConfig
+from ..core.types import Camera, Frame
+from ..data import FrameSequence
 from ..data.description import read_description
 from ..footage.border import Circle, Strips, find_circle, find_strips
 from ..footage.camera_motion import CameraMotion, camera_motion
 from ..footage.changes import Changes, find_changes
 from ..footage.polarity import Polarity, mask_polarity
 from ..footage.text import find_static_overlays
-from ..model.initialize import initial_points
-from ..types import Camera, Frame
+from ..initialization.sampling import initial_points
 from .depth_facts import DepthFacts, measure_depth
 from .eyes_facts import EyeFacts, measure_eyes
 
 if TYPE_CHECKING:
-    from ..model.point_cleanup import PointCloud
+    from ..initialization.cleanup import PointCloud
 
 LOOKED_AT = 20
 """Frames, evenly spread, that dear measurements look at."""
@@ -120,7 +120,7 @@ class Facts:
         return self.camera_path_mm < 1e-3 and self.camera_turn_deg < 1e-3
 
 
-def measure(sequence: Sequence, cfg: DataConfig | None = None) -> Facts:
+def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
     """Measure a sequence; every frame is decoded and stays in the sequence's cache, as in training.
 
     Args:
@@ -202,7 +202,7 @@ def _mean(values: NDArray) -> float:
     return float(values.mean()) if values.size else 0.0
 
 
-def _first_points(sequence: Sequence) -> PointCloud | None:
+def _first_points(sequence: FrameSequence) -> PointCloud | None:
     train = sequence.frames("train")
     frames = [train[i] for i in spread(len(train), LIFTED)]
     if not any((frame.tissue_mask & frame.depth_valid).any() for frame in frames):

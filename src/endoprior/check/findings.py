@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..checks import runs
+from ..core.checks import runs
 from ..footage.camera_motion import MOVING_FRACTION
 from .facts import Facts
 

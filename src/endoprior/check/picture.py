@@ -16,12 +16,12 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
-from ..atomic import whole_file
-from ..data import Sequence
+from ..core.geometry import project
+from ..core.types import Frame
+from ..data import FrameSequence
 from ..footage.units import FAR_MM, NEAR_MM
-from ..geometry import project
 from ..show.pictures import colorize
-from ..types import Frame
+from ..system.atomic import whole_file
 from .facts import Facts, spread
 from .findings import SEEN_AS_TISSUE, Finding
 from .report import table
@@ -36,7 +36,7 @@ WRAPPED_AT, ROWS = 84, 34
 SEVERITY_COLOR = {"error": "#b00020", "warning": "#b26a00", "note": "#3a5a78"}
 
 
-def draw_check(sequence: Sequence, facts: Facts, findings: list[Finding], path: Path) -> None:
+def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], path: Path) -> None:
     """Write the picture as one PNG.
 
     Rows: frames with tools outlined in red and borders in yellow; their depth; histogram of depth and curves over

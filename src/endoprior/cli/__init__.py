@@ -9,8 +9,8 @@ import os
 import sys
 from importlib import import_module
 
-from ..checks import InputError
-from ..memory import refuse_small_limits
+from ..core.checks import InputError
+from ..system.memory import refuse_small_limits
 
 COMMANDS = {
     "demo": "phantom sequence -> train -> eval -> render, with a summary and pictures",

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from ..checks import InputError
+from ..core.checks import InputError
 from .parsing import parse
 from .progress import say
 
@@ -45,10 +45,10 @@ def run(argv: list[str]) -> int:
     args = parse(Bench, argv, "bench")
     from filelock import FileLock, Timeout
 
-    from ..benchmark.execute import local_executor, ray_executor
-    from ..benchmark.matrix import run_matrix
-    from ..benchmark.report import write_overview, write_report
-    from ..benchmark.spec import load_spec
+    from ..experiments.execute import local_executor, ray_executor
+    from ..experiments.matrix import run_matrix
+    from ..experiments.report import write_overview, write_report
+    from ..experiments.spec import load_spec
     from .places import demand_folder_place
 
     for option, value, least in (("--threads", args.threads, 1), ("--cores", args.cores, 0)):

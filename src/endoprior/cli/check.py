@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from ..checks import InputError
-from ..config import DataConfig
+from ..core.checks import InputError
+from ..core.config import DataConfig
 from .parsing import parse
 from .progress import say
 
@@ -39,10 +39,10 @@ def run(argv: list[str]) -> None:
     for option, file in (("--out", args.out), ("--json", args.json)):
         if file is not None:
             demand_file_place(option, file, args.folder)
-    from ..atomic import write_json
     from ..check import draw_check, find, measure
     from ..check.report import as_json, table
     from ..data import load_sequence
+    from ..system.atomic import write_json
 
     sequence = load_sequence(args.folder, args.data)
     facts = measure(sequence, args.data)

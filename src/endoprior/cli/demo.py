@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from ..presets import PresetName, preset
+from ..core.presets import PresetName, preset
 from .parsing import parse
 from .progress import say
 
@@ -36,7 +36,7 @@ def run(argv: list[str]) -> None:
     from ..data import load_sequence
     from ..model.scene import load_scene
     from ..phantom import PhantomConfig, write_phantom
-    from ..run_folder import prepare_run_folder
+    from ..runs.folder import prepare_run_folder
     from ..show.report import write_report
     from .render import Render, draw
     from .train import train_and_evaluate

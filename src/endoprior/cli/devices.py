@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..device import Wanted, choose_here
+from ..doctor.choice import Wanted, choose_here
 from .progress import say
 
 if TYPE_CHECKING:

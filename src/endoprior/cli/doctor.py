@@ -27,8 +27,8 @@ class Doctor:
 def run(argv: list[str]) -> int:
     """Look, judge, print. What is missing is no failure: the exit status is 0, unless gsplat was to be compiled."""
     args = parse(Doctor, argv, "doctor")
-    from ..device import choose
     from ..doctor import examine, look
+    from ..doctor.choice import choose
     from ..doctor.report import as_json, table
 
     facts, compiling = look(), ""

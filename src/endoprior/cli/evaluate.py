@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..checks import InputError
-from ..device import Wanted
+from ..core.checks import InputError
+from ..doctor.choice import Wanted
 from .devices import on_device
 from .parsing import parse
 from .progress import say
@@ -69,7 +69,7 @@ def evaluate_run(
     Depth is scored against what was measured, whatever the run's preset took for measured in training.
     """
     from ..data import load_sequence
-    from ..evaluate import evaluate, scored_data
+    from ..evaluation.scoring import evaluate, scored_data
 
     sequence = load_sequence(data, scored_data(scene.config.data))
     result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir)

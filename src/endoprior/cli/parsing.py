@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import tyro
 
-from ..checks import InputError
+from ..core.checks import InputError
 
 A = TypeVar("A")
 BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from ..checks import InputError
+from ..core.checks import InputError
 from ..data.reading import kind_of
 
 

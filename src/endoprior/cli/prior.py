@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ..config import PriorConfig
+from ..core.config import PriorConfig
 from .parsing import parse
 from .progress import say
 

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..train_state import StepReport
-    from ..trainer import Trainer
+    from ..training.state import StepReport
+    from ..training.trainer import Trainer
 
 PLAIN_EVERY_SECONDS = 10.0
 
@@ -117,7 +117,7 @@ def _bar() -> Iterator:
 
 def iterations_done(trainer: Trainer) -> tuple[int, int]:
     """Iterations done and in all, over both stages."""
-    from ..train_state import Stage
+    from ..training.state import Stage
 
     coarse, fine = trainer.stage_length(Stage.COARSE), trainer.stage_length(Stage.FINE)
     before = coarse if trainer.state.stage is Stage.FINE else 0

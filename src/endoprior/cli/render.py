@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..checks import InputError
-from ..device import Wanted
+from ..core.checks import InputError
+from ..doctor.choice import Wanted
 from .devices import on_device
 from .parsing import parse
 from .progress import say
@@ -56,7 +56,7 @@ def draw(scene: Scene, args: Render) -> None:
     demand_folder_place("OUT" if args.out else "RUN", args.out or args.run)
     scene = on_device(scene, args.device, half_planes=True)
     from ..data import load_sequence
-    from ..evaluate import scored_data
+    from ..evaluation.scoring import scored_data
     from ..show.camera_paths import read_path, sway_path, times_path
     from ..show.frames import depth_span, write_views
     from .evaluate import sequence_of_run

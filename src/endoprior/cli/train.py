@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
-from ..checks import InputError
-from ..config import Config
-from ..device import Wanted
-from ..presets import PresetName, preset
+from ..core.checks import InputError
+from ..core.config import Config
+from ..core.presets import PresetName, preset
+from ..doctor.choice import Wanted
 from .parsing import parse
 from .progress import say, training_progress
 from .view import live_view
 
 if TYPE_CHECKING:
-    from ..train_state import StepReport
-    from ..trainer import Trainer
+    from ..training.state import StepReport
+    from ..training.trainer import Trainer
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Train:
 
 def run(argv: list[str]) -> None:
     """Train, score, and print where the results are."""
-    from ..device import choose_here
+    from ..doctor.choice import choose_here
     from ..render import ON_GPU
 
     args = parse(Train, argv, "train", default=_preset_defaults(argv))
@@ -100,12 +100,12 @@ def train_and_evaluate(
         view_port: serve a live view of the training there; None does not.
         resume, checkpoint_seconds: as `train.train` has them.
     """
-    from .. import kernel_cache
     from ..data import load_sequence
-    from ..run_folder import refuse_unusable_folder
-    from ..train import train
-    from ..trainer import device_for
-    from ..training_memory import refuse_too_large
+    from ..runs import kernel_cache
+    from ..runs.folder import refuse_unusable_folder
+    from ..runs.training_run import train
+    from ..training.memory_check import refuse_too_large
+    from ..training.trainer import device_for
     from .evaluate import evaluate_run
 
     sequence = load_sequence(data, cfg.data)

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ..checks import InputError
-from ..device import Wanted
+from ..core.checks import InputError
+from ..doctor.choice import Wanted
 from .devices import on_device
 from .parsing import parse
 from .progress import say
 
 if TYPE_CHECKING:
-    from ..data import Sequence
+    from ..data import FrameSequence
     from ..model.scene import Scene
-    from ..train_state import StepReport
-    from ..trainer import Trainer
+    from ..training.state import StepReport
+    from ..training.trainer import Trainer
     from ..view.server import Viewer
     from ..view.subject import Subject
 
@@ -117,14 +117,14 @@ def open_subject(path: Path, data: Path | None, device: Wanted = "cpu") -> tuple
     return SceneSubject(on_device(scene, device, half_planes=True), str(folder), originals), folder / "view"
 
 
-def _originals(scene: Scene, folder: Path, data: Path | None) -> Sequence | None:
+def _originals(scene: Scene, folder: Path, data: Path | None) -> FrameSequence | None:
     """The sequence of a run; None, with a note, if it has gone.
 
     Raises:
         InputError: `data` was given and does not fit.
     """
     from ..data import load_sequence
-    from ..evaluate import scored_data
+    from ..evaluation.scoring import scored_data
     from .evaluate import sequence_of_run
 
     try:

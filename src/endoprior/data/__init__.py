@@ -6,14 +6,14 @@ No torch here: images are NumPy arrays.
 from .depth import clean_depth
 from .depth_files import read_depth_file
 from .load import load_sequence
-from .sequence import FrameList, Sequence, Split
+from .sequence import FrameList, FrameSequence, Split
 from .shrink import shrunk
 from .stir import nearest_end_errors, write_stir_tracks
 from .truth import Truth
 
 __all__ = [
     "FrameList",
-    "Sequence",
+    "FrameSequence",
     "Split",
     "Truth",
     "clean_depth",

@@ -1,4 +1,4 @@
-"""The last step of every reader: which frames are kept, and a `Sequence` out of cameras and a decoder."""
+"""The last step of every reader: which frames are kept, and a `FrameSequence` out of cameras and a decoder."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import DataConfig
-from ..types import Camera, Frame
+from ..core.config import DataConfig
+from ..core.types import Camera, Frame
 from .depth import clean_depth
 from .reading import complaint
-from .sequence import Sequence
+from .sequence import FrameSequence
 from .shrink import shrunk, shrunk_camera
 from .truth import Truth
 
@@ -51,7 +51,7 @@ def assemble(
     mask_folder: str = "masks",
     depth_is_relative: bool = False,
     sources: dict[str, str] | None = None,
-) -> Sequence:
+) -> FrameSequence:
     """A lazy sequence of the kept frames, shrunk as configured.
 
     Args:
@@ -62,7 +62,7 @@ def assemble(
         files: what the sequence is made of, for its fingerprint.
         clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where depth was measured or
             rendered, so that its extremes are real.
-        frames_per_second, truth, remarks, mask_folder, depth_is_relative, sources: see `Sequence`.
+        frames_per_second, truth, remarks, mask_folder, depth_is_relative, sources: see `FrameSequence`.
     Raises:
         InputError: fewer than 2 frames, or no pixel, would be left, or a camera has numbers that no lens has.
     """
@@ -82,7 +82,7 @@ def assemble(
         frame = Frame(index, index / count, cameras[index], rgb_u8, tissue_mask, depth, depth_valid)
         return shrunk(frame, cfg.shrink)
 
-    return Sequence(
+    return FrameSequence(
         path,
         [shrunk_camera(camera, cfg.shrink) for camera in cameras],
         read_frame,

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import DataConfig
-from ..types import Camera
+from ..core.config import DataConfig
+from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import read_values
 from .files import list_files, read_table
@@ -22,7 +22,7 @@ from .images import read_color
 from .omnidirectional import Omnidirectional
 from .poses import demand_rotations, world_to_camera
 from .reading import complaint, read_text
-from .sequence import Sequence
+from .sequence import FrameSequence
 
 CF_HQ190L = Omnidirectional(
     width=1350,
@@ -48,7 +48,7 @@ def is_c3vd(path: Path) -> bool:
     return (path / "pose.txt").exists() and any(path.glob("*_color.png"))
 
 
-def load_c3vd(path: Path, cfg: DataConfig) -> Sequence:
+def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a registered video.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import DataConfig
+from ..core.config import DataConfig
 
 
 def clean_depth(

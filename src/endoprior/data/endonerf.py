@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import DataConfig
-from ..types import Camera
+from ..core.config import DataConfig
+from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .description import check_frames, intrinsics_of, read_description
 from .files import demand_count, list_files, unequal_names
@@ -20,7 +20,7 @@ from .images import read_color, read_depth, read_tool_mask
 from .numpy_files import read_numpy
 from .poses import demand_rotations, world_to_camera
 from .reading import complaint
-from .sequence import Sequence
+from .sequence import FrameSequence
 from .truth import Truth
 
 POSES_HINT = "Write one row of 17 numbers per frame: 3x5 [R | t | (H, W, focal)], near, far."
@@ -40,7 +40,7 @@ def load_endonerf(
     pose_axes: Literal["opencv", "opengl"] = "opencv",
     facts: dict[str, Any] | None = None,
     fact_files: list[Path] | None = None,
-) -> Sequence:
+) -> FrameSequence:
     """Open a folder in the EndoNeRF layout.
 
     Args:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError
+from ..core.checks import InputError
 from .reading import ACCESS_HINT, complaint, read_text
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from ..config import DataConfig
+from ..core.config import DataConfig
 from .c3vd import is_c3vd, load_c3vd
 from .endonerf import is_endonerf, load_endonerf
 from .hamlyn import is_hamlyn, load_hamlyn
 from .plain import is_plain, load_plain
 from .scared import is_scared, load_scared
-from .sequence import Sequence
+from .sequence import FrameSequence
 from .stereomis import is_stereomis, load_stereomis
 from .stir import is_stir, load_stir
 
@@ -24,7 +24,7 @@ class Format(NamedTuple):
     """Its name in `DataConfig.format`."""
     recognizes: Callable[[Path], bool]
     """Whether a folder looks like it, by the names in it alone."""
-    load: Callable[[Path, DataConfig], Sequence]
+    load: Callable[[Path, DataConfig], FrameSequence]
     """Opens the folder, or raises InputError."""
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..config import DataConfig
-from ..types import Camera
+from ..core.config import DataConfig
+from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import read_depth_file
 from .endonerf import read_poses_bounds
@@ -18,7 +18,7 @@ from .files import IMAGE_SUFFIXES, demand_count, list_files, read_table, unequal
 from .images import read_color, read_tool_mask
 from .poses import identity_poses
 from .reading import complaint
-from .sequence import Sequence
+from .sequence import FrameSequence
 
 CROP_LEFT_PX = 40
 """Columns without picture at the left of Forplane's images; its own program cuts them off, too."""
@@ -33,7 +33,7 @@ def is_hamlyn(path: Path) -> bool:
     return forplane or _is_rectified(path)
 
 
-def load_hamlyn(path: Path, cfg: DataConfig) -> Sequence:
+def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a Hamlyn sequence.
 
     Raises:
@@ -46,7 +46,7 @@ def _is_rectified(path: Path) -> bool:
     return (path / "image01").is_dir() and (path / "depth01").is_dir()
 
 
-def _load_forplane(path: Path, cfg: DataConfig) -> Sequence:
+def _load_forplane(path: Path, cfg: DataConfig) -> FrameSequence:
     """`images/`, `gt_masks/` or `masks/`, `gt_depth/` or `depth/`; size and focal length from `poses_bounds.npy`."""
     mask_folder = "gt_masks" if (path / "gt_masks").is_dir() else "masks"
     depth_folder = "gt_depth" if (path / "gt_depth").is_dir() else "depth"
@@ -89,7 +89,7 @@ def _load_forplane(path: Path, cfg: DataConfig) -> Sequence:
     )
 
 
-def _load_rectified(path: Path, cfg: DataConfig) -> Sequence:
+def _load_rectified(path: Path, cfg: DataConfig) -> FrameSequence:
     """`image01/`, `depth01/` in mm, `intrinsics.txt`; no masks."""
     images = list_files(path / "image01", IMAGE_SUFFIXES, "Hamlyn")
     depths = list_files(path / "depth01", (".png",), "Hamlyn")

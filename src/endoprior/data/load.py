@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from ..config import DataConfig
+from ..core.config import DataConfig
 from .endonerf import load_endonerf
 from .files import entries
 from .formats import FORMATS, Format
 from .reading import complaint, kind_of
-from .sequence import Sequence
+from .sequence import FrameSequence
 
 
 def load_sequence(
     path: str | Path, cfg: DataConfig | None = None, *, pose_axes: Literal["opencv", "opengl"] = "opencv"
-) -> Sequence:
+) -> FrameSequence:
     """Open a sequence folder; frames are decoded when they are used.
 
     Args:

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ..config import DataConfig
-from ..types import Camera
+from ..core.config import DataConfig
+from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import DEPTH_SUFFIXES, read_depth_file
 from .description import check_frames, intrinsics_of, read_description
 from .files import IMAGE_SUFFIXES, demand_count, list_files, unequal_names
 from .images import read_color, read_tool_mask
 from .poses import identity_poses
-from .sequence import Sequence
+from .sequence import FrameSequence
 
 ASSUMED_FOCAL = 0.9
 """Focal length in image widths where none is given: a field of view of 58 degrees, between usual endoscopes."""
@@ -26,7 +26,7 @@ def is_plain(path: Path) -> bool:
     return folder.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in folder.iterdir())
 
 
-def load_plain(path: Path, cfg: DataConfig) -> Sequence:
+def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a folder of pictures. What is missing is assumed, and said in a remark.
 
     Raises:

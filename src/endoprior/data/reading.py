@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError
+from ..core.checks import InputError
 
 MOST_BYTES = 1 << 30
 """Of one file, and of what one compressed file may unfold to."""

@@ -15,15 +15,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import DataConfig
-from ..types import Camera
+from ..core.config import DataConfig
+from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import read_values
 from .files import list_files, read_json, read_matrix
 from .images import read_color
 from .poses import demand_rotations
 from .reading import complaint
-from .sequence import Sequence
+from .sequence import FrameSequence
 
 STRIDES = {1: 2, 2: 1, 3: 4, 6: 8, 7: 8}
 """Published frame stride of each dataset number."""
@@ -41,7 +41,7 @@ def is_scared(path: Path) -> bool:
     return any((path / name).exists() for name in names)
 
 
-def load_scared(path: Path, cfg: DataConfig) -> Sequence:
+def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a processed keyframe folder; poses are relative to the first frame.
 
     Raises:

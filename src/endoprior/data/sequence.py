@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
-from collections.abc import Sequence as ReadOnlyList
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, overload
 
-from ..memory import BoundedCache, cache_bytes, workers
-from ..types import Camera, Frame
+from ..core.types import Camera, Frame
+from ..system.memory import BoundedCache, cache_bytes, workers
 from .images import complaint
 from .truth import Truth
 
@@ -26,7 +25,7 @@ TOOL_FRACTION_WARNING = 0.6
 """A larger share of tool pixels than this is more often an inverted mask than a picture of tools."""
 
 
-class Sequence:
+class FrameSequence:
     """Frames of one scene, decoded when they are asked for; as many are kept as memory allows, 1 MB per 110,000 px."""
 
     def __init__(
@@ -158,10 +157,10 @@ def _frame_bytes(frame: Frame) -> int:
     return sum(array.nbytes for array in (frame.rgb_u8, frame.tissue_mask, frame.depth, frame.depth_valid))
 
 
-class FrameList(ReadOnlyList[Frame]):
+class FrameList(Sequence[Frame]):
     """A read-only list of frames that decodes each when it is used."""
 
-    def __init__(self, sequence: Sequence, indices: list[int]) -> None:
+    def __init__(self, sequence: FrameSequence, indices: list[int]) -> None:
         """Args: sequence: where frames come from. indices: which, in order."""
         self.sequence = sequence
         self.indices = indices

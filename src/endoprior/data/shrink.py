@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Camera, Frame
+from ..core.types import Camera, Frame
 
 
 def _steps(camera: Camera, factor: int) -> tuple[int, int]:

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from ..config import DataConfig
+from ..core.config import DataConfig
 from .depth_files import read_values
 from .endonerf import load_endonerf
 from .files import list_files, read_json
 from .images import decode_image
 from .reading import complaint
-from .sequence import Sequence, is_test_frame
+from .sequence import FrameSequence, is_test_frame
 
 RAW_FILE = "StereoCalibration.ini"
 
@@ -26,7 +26,7 @@ def is_stereomis(path: Path) -> bool:
     return (path / RAW_FILE).exists() or ((path / "split.json").exists() and (path / "images").is_dir())
 
 
-def load_stereomis(path: Path, cfg: DataConfig) -> Sequence:
+def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a prepared sequence.
 
     8-bit depth is Omnidata's relative depth, so its scale is unknown; 16-bit depth counts as mm.

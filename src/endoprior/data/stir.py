@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import whole_file
-from ..config import DataConfig
-from ..types import Frame
+from ..core.config import DataConfig
+from ..core.types import Frame
+from ..system.atomic import whole_file
 from .endonerf import load_endonerf
 from .images import decode_image, single_channel
 from .reading import complaint, kind_of
-from .sequence import Sequence
+from .sequence import FrameSequence
 from .truth import Tracks
 
 DEPTH_WINDOW_PX = 2
@@ -34,7 +34,7 @@ def is_stir(path: Path) -> bool:
     return (path / SEGMENTATIONS[0]).exists() or any(path.glob(f"left*/seq*/{SEGMENTATIONS[0]}"))
 
 
-def load_stir(path: Path, cfg: DataConfig) -> Sequence:
+def load_stir(path: Path, cfg: DataConfig) -> FrameSequence:
     """Say how to get a sequence out of a clip.
 
     Raises:

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import refuse_occupied, whole_folder
+from ..system.atomic import refuse_occupied, whole_folder
 from .images import save_png
 
 TOOL_VALUE = 255

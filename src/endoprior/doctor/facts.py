@@ -16,7 +16,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ..memory import available_bytes
+from ..system.memory import available_bytes
 from .ask import MARK, Answer, ask, clean
 from .driver import driver_answers, driver_files
 from .records import Builders, Driver, Facts, Gpu, Gsplat, System, Toolkit, Torch, Triton

@@ -112,7 +112,7 @@ def _weights() -> dict[str, Any]:
     """Where the weights of the scoring networks are; downloads nothing."""
     found: dict[str, str] = {}
     try:
-        from ..metrics import weights
+        from ..evaluation.metrics import weights
 
         for files in (weights.RAFT_LARGE, weights.RAFT_SMALL, weights.ALEXNET, weights.SQUEEZENET):
             try:

@@ -12,8 +12,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..atomic import whole_file, whole_folder, write_json
-from ..checks import InputError
+from ..core.checks import InputError
+from ..system.atomic import whole_file, whole_folder, write_json
 from .options import DEFAULTS, Axes, ExportOptions
 
 if TYPE_CHECKING:

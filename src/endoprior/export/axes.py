@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from ..core.types import Splats
 from ..render import sh as harmonics
-from ..types import Splats
 from .options import Axes
 
 ROTATIONS: dict[str, NDArray[np.float64]] = {

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.types import Splats
 from ..model.gaussians import SH_C0
 from ..model.scene import Scene
-from ..types import Splats
 from .moments import Moment
 from .options import ExportOptions
 

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from ..atomic import whole_file
-from ..checks import InputError
+from ..core.checks import InputError
 from ..model.scene import Scene
+from ..system.atomic import whole_file
 from .html_data import CHANNELS, Quantized, pack, quantize
 
 FORMAT = "endoprior-player-1"

@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..checks import InputError
+from ..core.checks import InputError
+from ..core.types import Camera, Splats
 from ..model.scene import Scene
 from ..render.constants import ALPHA_MIN, NEAR_Z
 from ..render.sh import colors
-from ..types import Camera, Splats
 
 CHANNELS = ("x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz", "opacity", "r", "g", "b")
 LARGEST = 65535

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError
-from ..geometry import back_project, pixel_centers
+from ..core.checks import InputError
+from ..core.geometry import back_project, pixel_centers
 from ..model.scene import Scene
 from .axes import turned_points
 from .mesh_files import encode_mesh

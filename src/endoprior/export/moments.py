@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ..checks import InputError
+from ..core.checks import InputError
+from ..core.types import Camera, Splats
 from ..data.sequence import Split, is_test_frame
 from ..model.scene import Scene
-from ..types import Camera, Splats
 from .axes import turned
 from .options import Axes, ExportOptions
 
@@ -38,7 +38,7 @@ class Moment:
 
 
 def frame_indices(num_frames: int, split: Split) -> list[int]:
-    """Ascending indices of the frames of a split, as `Sequence.indices` without a sequence.
+    """Ascending indices of the frames of a split, as `FrameSequence.indices` without a sequence.
 
     Raises:
         InputError: there are none.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ..checks import check_range
+from ..core.checks import check_range
 
 FormatName = Literal["ply", "splat", "spz", "gltf", "points", "mesh", "depth", "tracks", "video", "scene", "html"]
 Axes = Literal["opencv", "opengl", "ras", "lps"]

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.types import Splats
 from ..model.scene import Scene
-from ..types import Splats
 from .moments import Moment
 from .options import Axes, ExportOptions
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ..checks import InputError
+from ..core.checks import InputError
 from ..model.scene import Scene
 from ..render import sh
 from .axes import turned_points

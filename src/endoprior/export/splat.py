@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..core.types import Splats
 from ..model.gaussians import SH_C0
 from ..model.scene import Scene
-from ..types import Splats
 from .moments import Moment
 from .options import ExportOptions
 

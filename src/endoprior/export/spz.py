@@ -11,10 +11,10 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError
+from ..core.checks import InputError
+from ..core.types import Splats
 from ..model.scene import Scene
 from ..render.sh import degree_of
-from ..types import Splats
 from .moments import Moment
 from .options import ExportOptions
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import expected_depth
+from ..core.geometry import expected_depth
+from ..core.types import Camera
 from ..model.scene import Scene
-from ..types import Camera
 
 
 @dataclass(frozen=True)

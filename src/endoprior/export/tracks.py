@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import whole_folder
-from ..checks import InputError
-from ..geometry import back_project, bilinear, project
+from ..core.checks import InputError
+from ..core.geometry import back_project, bilinear, project
 from ..model.carry import carry_points
 from ..model.scene import Scene
+from ..system.atomic import whole_folder
 from .axes import turned_points
 from .options import ExportOptions
 from .surface import Surface, seen_surface

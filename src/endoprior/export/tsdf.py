@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError
-from ..geometry import back_project, pixel_centers, project
-from ..types import Camera
+from ..core.checks import InputError
+from ..core.geometry import back_project, pixel_centers, project
+from ..core.types import Camera
 from .surface import Surface
 
 TRUNCATION_VOXELS = 3.0

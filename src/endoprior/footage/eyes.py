@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import check_shape
+from ..core.checks import check_shape
 from .matching import disagreement, match_both_ways
 
 LOOK_WIDTH = 320

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import check_shape
+from ..core.checks import check_shape
 
 LIT = 25
 """Darker pixels (largest channel, 0..255) say nothing: they lie outside a round border or in shadow."""

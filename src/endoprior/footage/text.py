@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import check_shape
+from ..core.checks import check_shape
 
 LEAST_PICTURES = 5
 """Fewer samples say too little about what stays put."""

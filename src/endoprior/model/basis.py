@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..checks import check_shape
-from ..compiled import compiled
-from ..config import BasisConfig, DeformationConfig
-from ..simd import LANES, prefetch
+from ..compute.compiled import compiled
+from ..compute.simd import LANES, prefetch
+from ..core.checks import check_shape
+from ..core.config import BasisConfig, DeformationConfig
 from .deformation import Offsets, offset_names
 from .heads import OUTPUT_WIDTH
 

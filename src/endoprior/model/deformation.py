@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..checks import InputError, check_shape
-from ..config import DeformationConfig
+from ..core.checks import InputError, check_shape
+from ..core.config import DeformationConfig
 from .heads import OUTPUT_WIDTH, OffsetHeads
 from .hexplane import PLANE_NAMES, PlaneGrid, plane_shapes
 

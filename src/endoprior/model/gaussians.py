@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..config import Config
-from ..types import Splats
+from ..core.config import Config
+from ..core.types import Splats
 from .basis import RankOneGradient, identity_motion
 from .deformation import Offsets
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import linear, relu
 from torch.nn.init import xavier_uniform_
 
-from ..compiled import compiled
+from ..compute.compiled import compiled
 
 OUTPUT_WIDTH = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1}
 

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from ..checks import check_shape
-from ..compiled import compiled
-from ..config import HexPlaneConfig
+from ..compute.compiled import compiled
+from ..core.checks import check_shape
+from ..core.config import HexPlaneConfig
 from . import hexplane_kernels as kernels
 from .hexplane_definition import Layout, features, layout_of
 from .hexplane_lookup import Linear, Sample

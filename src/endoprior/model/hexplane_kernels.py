@@ -28,7 +28,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from ..simd import LANES, fma, load_some, prefetch, splat, store_some, total
+from ..compute.simd import LANES, fma, load_some, prefetch, splat, store_some, total
 
 MAX_CHANNELS = 256
 TOUCHED = 1

@@ -7,7 +7,7 @@ from collections import OrderedDict
 import torch
 
 from .. import render
-from ..types import Camera, RenderOutput, Splats
+from ..core.types import Camera, RenderOutput, Splats
 from .scene import Scene
 
 DEFAULT_MAX_BYTES = 1 << 30

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
-from ..arrays_file import ArraySpec, load_arrays, part, refusing, save_arrays
-from ..checks import InputError, check_range
-from ..config import Checked, Config, Range
-from ..config_io import from_dict, to_dict
-from ..types import Camera, RenderOutput, Splats
+from ..core.checks import InputError, check_range
+from ..core.config import Checked, Config, Range
+from ..core.config_io import from_dict, to_dict
+from ..core.types import Camera, RenderOutput, Splats
+from ..system.arrays_file import ArraySpec, load_arrays, part, refusing, save_arrays
 from .basis import basis_offsets
 from .deformation import HexPlaneField, Offsets
 from .gaussians import Gaussians

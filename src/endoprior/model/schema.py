@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ..arrays_file import ArraySpec
-from ..checks import InputError
-from ..config import Config
+from ..core.checks import InputError
+from ..core.config import Config
+from ..system.arrays_file import ArraySpec
 from .basis import motion_layout
 from .deformation import state_shapes
 

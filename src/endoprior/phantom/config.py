@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..checks import InputError
+from ..core.checks import InputError
 
 MOST_PIXELS = 3840 * 2160
 GB_PER_PIXEL = 1.3e-6

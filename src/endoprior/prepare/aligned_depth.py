@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError, check_range, check_shape
+from ..core.checks import InputError, check_range, check_shape
 
 Kind = Literal["depth", "disparity"]
 """What the numbers are: near is small, or near is large."""

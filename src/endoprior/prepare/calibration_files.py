@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ..checks import InputError
+from ..core.checks import InputError
 from ..data.numpy_files import read_numpy
 from ..data.reading import complaint, read_text
 from ..data.yaml_text import BoundedLoader, load_yaml

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ..checks import InputError, check_range
+from ..core.checks import InputError, check_range
 from .calibration_files import Unit
 from .layout import Layout
 from .stereo import StereoConfig

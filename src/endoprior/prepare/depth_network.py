@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError, check_shape
+from ..core.checks import InputError, check_shape
 from ..data.reading import complaint
 
 if TYPE_CHECKING:
@@ -104,8 +104,8 @@ def _load(name: str | Path, folder: Path) -> Module:
     """The network in `folder`, in evaluation mode."""
     if find_spec("torchvision") is not None:
         # transformers imports torchvision where it finds it, also one that does not fit the installed torch.
-        from ..metrics.torchvision_compat import import_torchvision
-        from ..metrics.weights import ScoreUnavailable
+        from ..evaluation.metrics.torchvision_compat import import_torchvision
+        from ..evaluation.metrics.weights import ScoreUnavailable
 
         with suppress(ScoreUnavailable):
             import_torchvision()

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError
+from ..core.checks import InputError
 from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_values
 from ..data.reading import complaint
 from ..footage.changes import COLOR_DISTANCE, color_share

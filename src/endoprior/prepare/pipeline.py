@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..checks import runs
+from ..core.checks import runs
 from ..data import write_stir_tracks
 from ..data.images import read_color, read_depth, read_tool_mask, save_png
 from ..data.reading import complaint, kind_of

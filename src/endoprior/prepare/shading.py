@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError, check_range, check_shape
+from ..core.checks import InputError, check_range, check_shape
 from ..priors.specular import specular_likelihood
 
 SMALL_WIDTH = 160

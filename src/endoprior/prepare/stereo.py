@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import check_range, check_shape
+from ..core.checks import check_range, check_shape
 from ..footage.matching import disagreement, match_both_ways
 from ..priors.specular import specular_likelihood
 from .disparity import drop_speckles, fill_small_holes, refine_disparity, smooth_disparity

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-from ..checks import check_shape
+from ..core.checks import check_shape
 
 WORK_PX = 384
 """Longer side of the copy that is looked at, px: a shaft is some 30 px wide there, a jaw 6."""

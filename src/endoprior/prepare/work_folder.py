@@ -12,8 +12,8 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from ..atomic import CannotWrite, flush_folder, refuse_current, refuse_occupied, write_json, writing
-from ..checks import InputError
+from ..core.checks import InputError
+from ..system.atomic import CannotWrite, flush_folder, refuse_current, refuse_occupied, write_json, writing
 
 PLAN = "plan.json"
 """What the folder is being made from; another plan starts from nothing."""

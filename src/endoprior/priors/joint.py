@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import check_shape
-from ..config import PriorConfig
+from ..core.checks import check_shape
+from ..core.config import PriorConfig
 from .salience import salience
 from .specular import specular_likelihood
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import SalienceConfig
+from ..core.config import SalienceConfig
 
 EPSILON = 1e-6
 """Keeps the salience of a featureless image finite, in units of gray (0..1) times the kernel's weight."""

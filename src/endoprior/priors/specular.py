@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import SpecularConfig
+from ..core.config import SpecularConfig
 
 EPSILON = 1e-6
 """Keeps the saturation of a black pixel finite."""

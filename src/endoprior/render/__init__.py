@@ -10,7 +10,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, get_args
 
-from ..checks import InputError
+from ..core.checks import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from ..types import Camera, RenderOutput, Splats
+    from ..core.types import Camera, RenderOutput, Splats
 
 Backend = Literal["cpu", "cuda", "triton", "reference"]
 

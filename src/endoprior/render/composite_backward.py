@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from ..simd import LANES, fma, lane_numbers, load, splat, store, total, where_ge
+from ..compute.simd import LANES, fma, lane_numbers, load, splat, store, total, where_ge
 from . import tiles
 from .pixel_kernels import LARGEST_ALPHA, draw, log2_alpha
 from .tiles import FIRST_ROWS, ID, SLOT, STRIPS, TILE_HEIGHT, TILE_WIDTH

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from ..simd import LANES, fma, lane_numbers, larger, load, splat, store
+from ..compute.simd import LANES, fma, lane_numbers, larger, load, splat, store
 from . import tiles
 from .pixel_kernels import STOP, draw, log2_alpha
 from .tiles import FIRST_ROWS, ID, STRIPS, TILE_HEIGHT, TILE_WIDTH

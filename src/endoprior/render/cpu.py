@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..types import Camera, RenderOutput, Splats
+from ..core.types import Camera, RenderOutput, Splats
 from . import tiles
 from .composite_backward import MOMENTS, composite_backward, gather
 from .composite_forward import composite_forward

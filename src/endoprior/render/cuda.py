@@ -36,8 +36,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError
-from ..types import Camera, RenderOutput, Splats
+from ..core.checks import InputError
+from ..core.types import Camera, RenderOutput, Splats
 from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
 from .projection import FIELDS, check, check_device, jacobian_limits
 

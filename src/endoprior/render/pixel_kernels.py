@@ -12,7 +12,7 @@ from math import log2
 import numpy as np
 from numba import njit
 
-from ..simd import floor, fma, magnitude, scale_by_power_of_two, smaller, splat, where_ge
+from ..compute.simd import floor, fma, magnitude, scale_by_power_of_two, smaller, splat, where_ge
 from .constants import ALPHA_MAX, ALPHA_MIN, STOP_TRANSMITTANCE
 
 f4 = np.float32

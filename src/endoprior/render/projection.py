@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..checks import check_shape
-from ..types import Camera, Splats
+from ..core.checks import check_shape
+from ..core.types import Camera, Splats
 from . import sh
 from .constants import ALPHA_MIN, BLUR_PX2, JACOBIAN_MARGIN, MIN_QUAT, NEAR_Z, OVERFLOW
 

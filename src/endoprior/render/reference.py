@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..geometry import pixel_centers
-from ..types import Camera, RenderOutput, Splats
+from ..core.geometry import pixel_centers
+from ..core.types import Camera, RenderOutput, Splats
 from .constants import ALPHA_MAX, ALPHA_MIN, STOP_TRANSMITTANCE
 from .projection import check, project
 

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ..simd import LANES
+from ..compute.simd import LANES
 from .constants import ALPHA_MIN
 
 STRIPS = 2

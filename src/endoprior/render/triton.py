@@ -24,8 +24,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..checks import InputError
-from ..types import Camera, RenderOutput, Splats
+from ..core.checks import InputError
+from ..core.types import Camera, RenderOutput, Splats
 from . import Queued
 from .projection import check, check_device
 from .sh import degree_of

@@ -20,7 +20,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..types import Camera
+from ..core.types import Camera
 from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
 from .projection import jacobian_limits
 from .triton_sh import expand, pull_back

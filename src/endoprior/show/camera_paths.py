@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import InputError
+from ..core.checks import InputError
+from ..core.types import Camera
 from ..data.reading import read_text
-from ..types import Camera
 
 View = tuple[float, Camera]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import whole_file
+from ..core.types import Frame, RenderOutput
 from ..model.scene import Scene
-from ..types import Frame, RenderOutput
+from ..system.atomic import whole_file
 from .camera_paths import View
 from .pictures import colorize, label, tile, to_u8, write_png
 from .video import write_video

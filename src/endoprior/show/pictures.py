@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import whole_file
 from ..data.images import save_png
+from ..system.atomic import whole_file
 
 
 def write_png(path: Path, rgb_u8: NDArray[np.uint8]) -> None:

@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import refuse_occupied, whole_folder
-from ..config import PriorConfig
-from ..data import Sequence, Split
+from ..core.config import PriorConfig
+from ..data import FrameSequence, Split
 from ..priors import joint_texture_prior, salience, specular_likelihood
+from ..system.atomic import refuse_occupied, whole_folder
 from .pictures import colorize, label, tile, to_u8, write_png
 
 SHEET_FRAMES = 6
 SHEET_WIDTH_PX = 320
 
 
-def write_prior_maps(sequence: Sequence, split: Split, cfg: PriorConfig, out: Path) -> Path:
+def write_prior_maps(sequence: FrameSequence, split: Split, cfg: PriorConfig, out: Path) -> Path:
     """Write `specular/`, `salience/` and `prior/` (gray, 255 = 1) and `contact_sheet.png` into `out`.
 
     Returns:

@@ -11,11 +11,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ..atomic import whole_file
-from ..config import PriorConfig
-from ..data import Sequence
+from ..core.config import PriorConfig
+from ..data import FrameSequence
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
+from ..system.atomic import whole_file
 from .frames import depth_span
 from .pictures import colorize, to_u8
 
@@ -38,7 +38,7 @@ ERROR_FULL_SCALE = 0.15
 """Color error, in [0, 1], that the error map shows as its last color."""
 
 
-def write_report(scene: Scene, sequence: Sequence, run: Path, path: Path) -> None:
+def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path) -> None:
     """Draw the report of a finished run folder as one PNG.
 
     Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; then the
@@ -66,7 +66,7 @@ def write_report(scene: Scene, sequence: Sequence, run: Path, path: Path) -> Non
         figure.savefig(temporary)
 
 
-def _picture_rows(scene: Scene, sequence: Sequence) -> list[list[tuple[str, NDArray[np.uint8]]]]:
+def _picture_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, NDArray[np.uint8]]]]:
     frames = sequence.frames("test")
     shown = sorted({int(k) for k in np.linspace(0, len(frames) - 1, 3)})
     span, unit = depth_span(scene), "relative" if sequence.depth_is_relative else "mm"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import project
-from ..types import Camera
+from ..core.geometry import project
+from ..core.types import Camera
 
 LARGEST_PX = 6
 """Side of the largest square."""

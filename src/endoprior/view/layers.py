@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.types import Camera
 from ..show.pictures import colorize, to_u8
-from ..types import Camera
 
 LARGEST_DIFFERENCE = 0.25
 """Mean absolute difference of the three colors that is drawn red."""

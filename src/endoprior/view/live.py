@@ -13,8 +13,8 @@ from .scene_subject import SceneSubject
 from .server import Viewer
 
 if TYPE_CHECKING:
-    from ..train_state import StepReport
-    from ..trainer import Trainer
+    from ..training.state import StepReport
+    from ..training.trainer import Trainer
 
 REFRESH_SECONDS = 2.0
 """Training goes on at least this long between two states that are shown."""

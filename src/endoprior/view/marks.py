@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import project
-from ..types import Camera
+from ..core.geometry import project
+from ..core.types import Camera
 
 TRAIL_FRAMES = 8
 """Frames back that a track shows."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import back_project
-from ..types import Camera
+from ..core.geometry import back_project
+from ..core.types import Camera
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..types import Camera
+from ..core.types import Camera
 
 LEAST_STEPS = 24
 """Pictures between two kept places whose frames are the same."""

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import whole_file
-from ..checks import InputError
+from ..core.checks import InputError
 from ..show.video import write_video
+from ..system.atomic import whole_file
 
 
 def png_bytes(rgb_u8: NDArray[np.uint8]) -> bytes:

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
-from ..data import Sequence
-from ..geometry import back_project, expected_depth, quaternion_to_matrix
+from ..core.geometry import back_project, expected_depth, quaternion_to_matrix
+from ..core.types import Camera, RenderOutput, Splats
+from ..data import FrameSequence
 from ..model.carry import carry_points
 from ..model.gaussians import SH_C0
 from ..model.playback import Playback
 from ..model.scene import Scene
 from ..show.frames import depth_span
 from ..show.pictures import to_u8
-from ..types import Camera, RenderOutput, Splats
 from . import layers
 from .session import Layer, Look
 from .subject import Cloud
@@ -38,7 +38,7 @@ MOTION_SAMPLES = 8
 class SceneSubject:
     """A scene and, if it is there, the sequence it was trained on."""
 
-    def __init__(self, scene: Scene, title: str, sequence: Sequence | None = None) -> None:
+    def __init__(self, scene: Scene, title: str, sequence: FrameSequence | None = None) -> None:
         """Draw nothing yet.
 
         Args:

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data import Sequence
-from ..geometry import back_project, pixel_centers
+from ..core.geometry import back_project, pixel_centers
+from ..core.types import Camera
+from ..data import FrameSequence
 from ..priors import joint_texture_prior
-from ..types import Camera
 from . import layers
 from .dots import draw_dots
 from .session import Layer, Look
@@ -28,7 +28,7 @@ class SequenceSubject:
     layers: tuple[Layer, ...] = ("frame", "depth", "prior")
     has_tool = True
 
-    def __init__(self, sequence: Sequence) -> None:
+    def __init__(self, sequence: FrameSequence) -> None:
         self.sequence = sequence
         self.title = str(sequence.path)
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))

@@ -24,7 +24,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from ..checks import InputError
+from ..core.checks import InputError
 from . import panel, saving
 from .guard import LARGEST_MESSAGE, MOST_BROWSERS, Pace, check_address, sensible, trusted
 from .jobs import Jobs

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Camera
+from ..core.types import Camera
 from .guard import is_camera
 from .marks import Marks, draw_marks
 from .session import REST_SECONDS, Look, shrink_factor

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Camera
+from ..core.types import Camera
 from .session import Layer, Look
 
 

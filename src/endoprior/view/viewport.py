@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import quaternion_to_matrix
-from ..types import Camera
+from ..core.geometry import quaternion_to_matrix
+from ..core.types import Camera
 
 LEAST_ASPECT, LARGEST_ASPECT = 0.25, 4.0
 """Canvases narrower or wider than this are treated as if they were not."""

@@ -1,0 +1,1 @@
+"""Scores of a scene: image, depth, flow and track metrics, and the protocol they are printed with."""

@@ -1,0 +1,130 @@
+"""LPIPS (Zhang et al. 2018): the distance of two images in the features of a classifier, through the lpips package.
+
+`lpips` means AlexNet, as published; the same distance with SqueezeNet is scored as `lpips_squeeze`. The package brings
+the calibrated heads; the classifier's weights are found by `weights.find_weights`.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.checks import check_shape
+from .torchvision_compat import import_torchvision
+from .weights import ALEXNET, SQUEEZENET, FoundWeights, ScoreUnavailable, find_weights, load_weights, select_weights
+
+if TYPE_CHECKING:
+    from torch.nn import Module
+
+HEADS_VERSION = "0.1"
+"""Version of the calibrated heads: the one every published LPIPS figure uses."""
+MIN_SIZE = 32
+"""Shortest side accepted, px: much below it the deepest features have no pixel left."""
+
+
+@dataclass(frozen=True)
+class LpipsDistance:
+    """The distance, ready to be called on one frame after another."""
+
+    network: Module
+    score_name: str
+    """`lpips` with AlexNet, `lpips_squeeze` with SqueezeNet."""
+    weights: FoundWeights
+    """Where the classifier's weights came from."""
+    device: str
+
+    def __call__(self, image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
+        """LPIPS of the masked images scaled to [-1, 1], averaged over the frame.
+
+        Args:
+            image: (H, W, 3) rendered color in [0, 1].
+            target: (H, W, 3) true color in [0, 1].
+            mask: (H, W) True = tissue; everything else is black in both images.
+        Returns:
+            Distance >= 0; 0 for equal images, NaN for an empty mask.
+        Raises:
+            ValueError: shapes differ, the mask is not bool, or an image is not finite floating point.
+            ScoreUnavailable: a side is shorter than `MIN_SIZE`.
+        """
+        import torch
+
+        size = check_shape("image:H,W,3 target:H,W,3 mask:H,W", image=image, target=target, mask=mask)
+        if mask.dtype != np.bool_:
+            raise ValueError(f"mask must be bool, True = tissue; got {mask.dtype}")
+        for name, values in (("image", image), ("target", target)):
+            if not (np.issubdtype(values.dtype, np.floating) and np.isfinite(values).all()):
+                raise ValueError(f"{name} must be finite floating point in [0, 1]; got {values.dtype} or a NaN in it")
+        if min(size["H"], size["W"]) < MIN_SIZE:
+            raise ScoreUnavailable(f"LPIPS needs images of at least {MIN_SIZE} px a side; got {size['W']}x{size['H']}")
+        if not mask.any():
+            return float("nan")
+        a, b = (
+            torch.from_numpy(np.where(mask[..., None], x, 0).astype(np.float32) * 2 - 1).permute(2, 0, 1)[None]
+            for x in (image, target)
+        )
+        with torch.inference_mode():
+            return float(self.network(a.to(self.device), b.to(self.device)))
+
+
+def lpips_distance(
+    backbone: Literal["alex", "squeeze"] = "alex",
+    weights_dir: Path | None = None,
+    *,
+    device: str = "cpu",
+    download: bool = True,
+) -> LpipsDistance:
+    """Load LPIPS. "alex" is the published score's classifier; "squeeze" is scored under its own name.
+
+    Args:
+        backbone: which classifier.
+        weights_dir: folder to look in first; see `weights.find_weights`.
+        device: torch device to run on.
+        download: False never touches the network.
+    Raises:
+        InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
+        ScoreUnavailable: lpips, torchvision or the weights cannot be had, with the reason.
+    """
+    files, score_name = {"alex": (ALEXNET, "lpips"), "squeeze": (SQUEEZENET, "lpips_squeeze")}[backbone]
+    import_torchvision()
+    found = find_weights(files, weights_dir, download=download)
+    network, heads = _untrained(backbone)
+    state = network.state_dict()
+    trunk = {name: _stored_name(name) for name in state if name.startswith("net.")}
+    weights = select_weights(found, state, trunk) | dict(load_weights(heads))
+    missing, unexpected = network.load_state_dict(weights, strict=False)
+    # All that may stay as constructed are the constants of the input scaling; the heads' file calls each head twice.
+    unset = [name for name in missing if not name.startswith("scaling_layer.") and not name.startswith("lins.")]
+    assert not unset and not unexpected, (unset, unexpected)
+    return LpipsDistance(network.eval().requires_grad_(False).to(device), score_name, found, device)
+
+
+def _stored_name(name: str) -> str:
+    """torchvision's name of a trunk tensor: `features.5.squeeze.weight` for `net.slice3.5.squeeze.weight`."""
+    return "features." + name.split(".", 2)[2]
+
+
+def _untrained(backbone: str) -> tuple[Module, FoundWeights]:
+    """The network with random weights, and the package's file of calibrated heads."""
+    import torch
+
+    try:
+        import lpips
+    except ImportError as error:
+        raise ScoreUnavailable(
+            f"lpips cannot be imported ({error}). Install it with: pip install endoprior[networks]"
+        ) from error
+    # A new network draws random weights; those draws must not shift the caller's random numbers.
+    with torch.random.fork_rng(devices=[]), warnings.catch_warnings():
+        # The package names the classifier's weights in torchvision's old way, even when it wants none.
+        warnings.filterwarnings("ignore", message="The parameter 'pretrained' is deprecated", category=UserWarning)
+        warnings.filterwarnings("ignore", message="Arguments other than a weight enum", category=UserWarning)
+        # pnet_rand and pretrained=False: both of the package's own loads are left out, one needs a download, the other
+        # unpickles.
+        network = lpips.LPIPS(pretrained=False, net=backbone, version=HEADS_VERSION, pnet_rand=True, verbose=False)
+    heads = Path(lpips.__file__).parent / "weights" / f"v{HEADS_VERSION}" / f"{backbone}.pth"
+    return network, FoundWeights(heads, "lpips package")

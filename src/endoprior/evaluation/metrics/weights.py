@@ -1,0 +1,227 @@
+"""Where the weights of a scoring network are, and how to read them without running anything they contain.
+
+Looked for in this order: the folder the caller names, the folder in `ENDOPRIOR_WEIGHTS`, torch's own cache, and at last
+torchvision's published file, downloaded into that cache. Whoever asks for a network gets that network or a reason.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import threading
+import urllib.request
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import TYPE_CHECKING
+
+from ...core.checks import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+ENVIRONMENT_VARIABLE = "ENDOPRIOR_WEIGHTS"
+"""Environment variable that names a folder of weights."""
+NETWORK_TIMEOUT_S = 4.0
+"""Longest wait for an answer of the download server, s: a machine without network must learn so at once."""
+
+
+class ScoreUnavailable(RuntimeError):
+    """A score cannot be had here; the text is the one-line reason to report in its place."""
+
+
+class WeightsMissing(ScoreUnavailable):
+    """The weights of the network behind a score are nowhere to be found, or cannot be read."""
+
+
+@dataclass(frozen=True)
+class WeightFiles:
+    """The files any of which holds the weights of one network."""
+
+    network: str
+    """The network's name in messages."""
+    names: tuple[str, ...]
+    """File names to look for, the first found is taken. Keys are torchvision's."""
+    url: str
+    """Where torchvision publishes them; the file name ends in the start of its SHA-256."""
+
+
+@dataclass(frozen=True)
+class FoundWeights:
+    """A weights file and how it was found."""
+
+    path: Path
+    source: str
+    """"weights folder", "ENDOPRIOR_WEIGHTS", "torch cache" or "download"."""
+
+
+def _published(network: str, folder_name: str, url_name: str) -> WeightFiles:
+    """The file names of one network: ours for a folder of safetensors, and torchvision's."""
+    return WeightFiles(network, (folder_name, url_name), f"https://download.pytorch.org/models/{url_name}")
+
+
+RAFT_LARGE = _published("RAFT-large", "raft_large.safetensors", "raft_large_C_T_SKHT_V2-ff5fadd5.pth")
+RAFT_SMALL = _published("RAFT-small", "raft_small.safetensors", "raft_small_C_T_V2-01064c6d.pth")
+ALEXNET = _published("AlexNet", "alexnet_features.safetensors", "alexnet-owt-7be5be79.pth")
+SQUEEZENET = _published("SqueezeNet 1.1", "squeezenet1_1_features.safetensors", "squeezenet1_1-b8a52dc0.pth")
+
+
+def find_weights(files: WeightFiles, weights_dir: Path | None = None, *, download: bool = True) -> FoundWeights:
+    """Find the weights of a network; see the module for the order of places.
+
+    Args:
+        files: what to look for.
+        weights_dir: a folder to look in first.
+        download: False never touches the network.
+    Returns:
+        The file and where it came from.
+    Raises:
+        InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
+        WeightsMissing: the file is in none of the places and could not be downloaded, with the reason.
+    """
+    cache = _torch_cache()
+    places: list[tuple[str, Path]] = []
+    if weights_dir is not None:
+        places.append(("weights folder", _existing_folder("--weights-dir", Path(weights_dir))))
+    if named := os.environ.get(ENVIRONMENT_VARIABLE):
+        places.append((ENVIRONMENT_VARIABLE, _existing_folder(ENVIRONMENT_VARIABLE, Path(named))))
+    places.append(("torch cache", cache))
+    for source, folder in places:
+        for name in files.names:
+            if (folder / name).is_file():
+                return FoundWeights(folder / name, source)
+    if download:
+        failure = _download(files.url, cache / files.url.rsplit("/", 1)[-1])
+        if failure is None:
+            return FoundWeights(cache / files.url.rsplit("/", 1)[-1], "download")
+        tried = f"the download of {files.url} failed ({failure})"
+    else:
+        tried = "downloads are off"
+    looked = ", ".join(f"{source} {folder}" for source, folder in places)
+    raise WeightsMissing(
+        f"no weights for {files.network}: expected {' or '.join(files.names)} in {looked}; {tried}. "
+        f"Put the file in a folder and name it with --weights-dir or {ENVIRONMENT_VARIABLE}."
+    )
+
+
+def load_weights(found: FoundWeights) -> Mapping[str, Tensor]:
+    """Read named tensors from a `.safetensors` or `.pth` file; a `.pth` that holds anything else than data is refused.
+
+    Raises:
+        WeightsMissing: the file cannot be read or holds no named tensors, with the reason.
+    """
+    import torch
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        if found.path.suffix == ".safetensors":
+            return load_file(found.path)
+        with warnings.catch_warnings():
+            # Torch doubts a pickle of another protocol before it reads it; whether it can be read is all that matters.
+            warnings.filterwarnings("ignore", message="Detected pickle protocol", category=UserWarning)
+            stored = torch.load(found.path, map_location="cpu", weights_only=True)
+    except (OSError, EOFError, RuntimeError, ValueError, UnpicklingError, SafetensorError) as error:
+        raise WeightsMissing(
+            f"{found.path}: expected network weights; got an unreadable file ({_first_line(error)}). Replace it."
+        ) from error
+    if not (isinstance(stored, Mapping) and all(isinstance(value, torch.Tensor) for value in stored.values())):
+        raise WeightsMissing(f"{found.path}: expected network weights; got no named tensors. Replace it.")
+    return stored
+
+
+def select_weights(found: FoundWeights, keys: Mapping[str, Tensor], origin: Mapping[str, str]) -> dict[str, Tensor]:
+    """The tensors a network needs, picked from a weights file by name and checked for shape.
+
+    Args:
+        found: the file.
+        keys: the network's own state: name -> tensor of the right shape.
+        origin: name in the network -> name in the file.
+    Returns:
+        Name in the network -> tensor of the file, for every name in `origin`.
+    Raises:
+        WeightsMissing: the file cannot be read, lacks a name, or holds another shape under it.
+    """
+    stored = load_weights(found)
+    selected = {}
+    for name, stored_name in origin.items():
+        tensor = stored.get(stored_name)
+        if tensor is None or tensor.shape != keys[name].shape:
+            got = "nothing" if tensor is None else f"shape {tuple(tensor.shape)}"
+            raise WeightsMissing(
+                f"{found.path}: expected {stored_name} of shape {tuple(keys[name].shape)}; got {got}. "
+                "Replace the file with torchvision's weights of this network."
+            )
+        selected[name] = tensor
+    return selected
+
+
+def _existing_folder(name: str, folder: Path) -> Path:
+    """The folder itself, or InputError naming the option that gave it."""
+    if not folder.is_dir():
+        raise InputError(
+            f"{name}: expected a folder of network weights; got {folder}, which is not one. Check the path."
+        )
+    return folder
+
+
+def _torch_cache() -> Path:
+    """The folder in which torch keeps downloaded weights."""
+    import torch
+
+    return Path(torch.hub.get_dir()) / "checkpoints"
+
+
+def _download(url: str, target: Path) -> str | None:
+    """Fetch a published file into torch's cache, checked against the hash in its name; None, or why it failed."""
+    import torch
+
+    if failure := _unreachable(url):
+        return failure
+    digest = re.search(r"-([0-9a-f]{8,})\.", target.name)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with _socket_timeout(NETWORK_TIMEOUT_S):
+            torch.hub.download_url_to_file(url, str(target), digest and digest.group(1), progress=False)
+    except (OSError, RuntimeError) as error:
+        return _first_line(error)
+    return None
+
+
+def _unreachable(url: str) -> str | None:
+    """None when the server answers within `NETWORK_TIMEOUT_S`, else why not."""
+    outcome: list[str | None] = []
+
+    def ask() -> None:
+        try:
+            with urllib.request.urlopen(url, timeout=NETWORK_TIMEOUT_S):
+                outcome.append(None)
+        except (OSError, ValueError) as error:
+            outcome.append(_first_line(error))
+
+    # In a thread of its own: looking up a host name obeys no timeout, and may take half a minute without a network.
+    asking = threading.Thread(target=ask, daemon=True)
+    asking.start()
+    asking.join(NETWORK_TIMEOUT_S)
+    return outcome[0] if outcome else f"no answer within {NETWORK_TIMEOUT_S:g} s"
+
+
+@contextmanager
+def _socket_timeout(seconds: float) -> Iterator[None]:
+    """Let new sockets give up after `seconds` of silence: torch's download offers no timeout of its own."""
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(seconds)
+    try:
+        yield
+    finally:
+        socket.setdefaulttimeout(before)
+
+
+def _first_line(error: BaseException) -> str:
+    """What went wrong, in one line."""
+    text = str(error).strip()
+    return text.splitlines()[0] if text else type(error).__name__

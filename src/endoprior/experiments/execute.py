@@ -1,0 +1,125 @@
+"""Runs jobs side by side: on the cores of this machine, or on a Ray cluster. One failing job does not stop the rest."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import time as clock
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from ..core.checks import InputError
+from .worker import Job
+
+SHOWN_LOG_LINES = 3
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended."""
+
+    job: Job
+    seconds: float
+    failure: str = ""
+    """Why it failed, from the end of its log; empty if it is done."""
+
+
+class Executor(Protocol):
+    """Where jobs run."""
+
+    def __call__(self, jobs: list[Job]) -> Iterator[Outcome]:
+        """Yield the outcome of each job as it ends."""
+        ...
+
+
+def run_job(job: Job, started: list[subprocess.Popen] | None = None) -> Outcome:
+    """Run one job in a process of its own and wait for it; its output goes to `log.txt` beside its cell's folder.
+
+    Args:
+        started: takes the process, so that others can signal it.
+    """
+    folder = Path(job.folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    job_file, log = folder.with_suffix(".job.json"), folder.with_suffix(".log.txt")
+    job.write(job_file)
+    environment = os.environ | {"OMP_NUM_THREADS": str(job.threads), "NUMBA_NUM_THREADS": str(job.threads)}
+    environment.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    began = clock.perf_counter()
+    with open(log, "wb") as output:
+        command = [sys.executable, "-m", "endoprior.experiments.worker", str(job_file)]
+        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment)
+        if started is not None:
+            started.append(process)
+        code = process.wait()
+    seconds = clock.perf_counter() - began
+    if code == 0:
+        job_file.unlink()
+        return Outcome(job, seconds)
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    said = " | ".join(lines[-SHOWN_LOG_LINES:]) or "nothing"
+    return Outcome(job, seconds, f"exit status {code}; {log} ends: {said}")
+
+
+@contextmanager
+def local_executor(num_jobs: int) -> Iterator[Executor]:
+    """Processes of this machine, `num_jobs` at a time. On Ctrl-C all are told and save their state first."""
+    started: list[subprocess.Popen] = []
+
+    def execute(jobs: list[Job]) -> Iterator[Outcome]:
+        waiting = list(reversed(jobs))
+        with ThreadPoolExecutor(num_jobs) as pool:
+            running = set()
+            try:
+                while waiting or running:
+                    while waiting and len(running) < num_jobs:
+                        running.add(pool.submit(run_job, waiting.pop(), started))
+                    done, running = wait(running, return_when=FIRST_COMPLETED)
+                    for future in done:
+                        yield future.result()
+            except BaseException:
+                for process in started:
+                    if process.poll() is None:
+                        process.send_signal(signal.SIGINT)
+                raise
+
+    yield execute
+
+
+@contextmanager
+def ray_executor(address: str, threads: int) -> Iterator[Executor]:
+    """A Ray cluster that shares this machine's file system; `local` starts one here.
+
+    Raises:
+        InputError: Ray is not installed, or the cluster cannot be reached.
+    """
+    try:
+        ray: Any = importlib.import_module("ray")
+    except ImportError:
+        raise InputError("--ray: expected Ray to be installed; it is not. Try `pip install endoprior[ray]`.") from None
+    try:
+        ray.init(**({} if address == "local" else {"address": address}), log_to_driver=False, include_dashboard=False)
+    except (ConnectionError, OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"--ray {address}: expected a running cluster; {error}. Start it or correct --ray.") from error
+
+    def execute(jobs: list[Job]) -> Iterator[Outcome]:
+        remote = ray.remote(num_cpus=threads, max_retries=0)(run_job)
+        running = {remote.remote(job): job for job in jobs}
+        while running:
+            (done,), _ = ray.wait(list(running), num_returns=1)
+            job = running.pop(done)
+            try:
+                yield ray.get(done)
+            except ray.exceptions.RayError as error:
+                yield Outcome(job, 0.0, f"Ray: {str(error).splitlines()[0]}")
+
+    try:
+        yield execute
+    finally:
+        ray.shutdown()

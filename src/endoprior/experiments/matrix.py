@@ -1,0 +1,151 @@
+"""The whole matrix: write phantoms, find what is done, run the rest, report what came out.
+
+Below OUT: `sequences/` (phantoms) and `cells/KEY/` (metrics, run folder). A cell's folder is named by all that makes
+its result, so that equal cells of different specs are run once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..core.checks import InputError
+from ..core.config_io import to_dict
+from ..data.files import read_json
+from .execute import Executor
+from .spec import Cell, Spec, cells, sequence_folder
+from .worker import Job, finished
+
+KEY_DIGITS = 16
+SCORES_VERSION = 1
+"""Raise it when a score changes its meaning: finished cells are then run again."""
+
+
+@dataclass
+class Matrix:
+    """Cells of a spec, what became of them, and where."""
+
+    spec: Spec
+    out: Path
+    done: dict[Cell, Path] = field(default_factory=dict)
+    """Folder of each finished cell."""
+    missing: dict[Cell, str] = field(default_factory=dict)
+    """Why a cell has no result."""
+    failed: int = 0
+    """Cells among them that were tried."""
+    data: dict[str, Path] = field(default_factory=dict)
+    """Folder of each sequence that could be read."""
+
+
+def run_matrix(
+    spec: Spec,
+    out: Path,
+    execute: Executor | None,
+    *,
+    threads: int = 1,
+    weights_dir: Path | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Matrix:
+    """Run every cell that is not finished yet.
+
+    Args:
+        out: folder of the benchmark; finished cells in it are kept if nothing that made them has changed.
+        execute: runs the jobs; None runs nothing and only looks at what is there.
+        threads: of each cell.
+        say: takes a line of progress.
+    """
+    matrix = Matrix(spec, out)
+    jobs = _jobs(matrix, threads, weights_dir, write=execute is not None)
+    total = len(cells(spec))
+    say(f"{total} cells: {len(matrix.done)} done before, {len(jobs)} to run, {len(matrix.missing)} without data")
+    for name, reason in {cell.sequence: reason for cell, reason in matrix.missing.items()}.items():
+        say(f"note: {name}: {reason}")
+    if execute is None:
+        matrix.missing |= {cell: "not run yet" for cell in jobs}
+        return matrix
+    alike: dict[str, list[Cell]] = {}  # cells of different methods can come to the same thing
+    for cell, job in jobs.items():
+        alike.setdefault(job.folder, []).append(cell)
+    began, ended = clock.perf_counter(), 0
+    for outcome in execute([jobs[same[0]] for same in alike.values()]):
+        ended += 1
+        for cell in alike[outcome.job.folder]:
+            if outcome.failure:
+                matrix.missing[cell] = outcome.failure
+                matrix.failed += 1
+            else:
+                matrix.done[cell] = Path(outcome.job.folder)
+        left = (clock.perf_counter() - began) / ended * (len(alike) - ended)
+        result = f"failed: {outcome.failure}" if outcome.failure else f"done in {outcome.seconds:.0f} s"
+        say(f"[{ended}/{len(alike)}] {outcome.job.name}: {result}; about {left / 60:.0f} min left")
+    return matrix
+
+
+def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -> dict[Cell, Job]:
+    """A job for each cell that is not finished; fills `done`, `missing` and `data` of the matrix."""
+    spec, found = matrix.spec, {}
+    fingerprints: dict[str, str] = {}
+    for name in spec.sequences:
+        try:
+            matrix.data[name], fingerprints[name] = _sequence(spec, name, matrix.out, write)
+        except InputError as error:
+            matrix.missing |= {cell: str(error) for cell in cells(spec) if cell.sequence == name}
+    for cell in cells(spec):
+        if cell in matrix.missing:
+            continue
+        config = to_dict(spec.config(cell.method, cell.sequence, cell.budget, cell.seed))
+        facts = [config, fingerprints[cell.sequence], spec.networks, SCORES_VERSION]
+        key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+        folder = (matrix.out / "cells" / key[:KEY_DIGITS]).absolute()
+        if finished(folder, key):
+            matrix.done[cell] = folder
+            continue
+        found[cell] = Job(
+            name=cell.name,
+            folder=str(folder),
+            data=str(matrix.data[cell.sequence].absolute()),
+            config=config,
+            key=key,
+            networks=spec.networks,
+            weights_dir=str(weights_dir.absolute()) if weights_dir else None,
+            threads=threads,
+        )
+    return found
+
+
+def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]:
+    """Folder and fingerprint of a sequence; a phantom is written if it is not there.
+
+    Raises:
+        InputError: it is not there or cannot be read.
+    """
+    from ..core.config import DataConfig
+    from ..data import load_sequence
+    from ..phantom import write_phantom
+
+    folder, chosen = sequence_folder(spec, name, out), spec.sequences[name]
+    if unset := re.search(r"\$\{?(\w+)", str(folder)):
+        raise InputError(
+            f"{chosen.path}: expected {unset[1]} to be set; it is not. Set it, or use --data {name}=FOLDER."
+        )
+    if chosen.phantom and write and not folder.is_dir():
+        write_phantom(folder, chosen.phantom)
+    data = DataConfig(**chosen.reading)
+    return folder, load_sequence(folder, data).fingerprint()
+
+
+def commits_of(matrix: Matrix) -> list[str]:
+    """Commits that the finished cells were trained at, sorted; "unknown" for a cell trained outside a checkout."""
+    found = {read_json(folder / "run" / "config.json").get("commit") for folder in matrix.done.values()}
+    return sorted(commit or "unknown" for commit in found)
+
+
+def scores_of(folder: Path) -> dict[str, Any]:
+    """`scores`, `skipped` and `protocol` of a finished cell."""
+    return read_json(folder / "metrics.json")

@@ -1,0 +1,227 @@
+"""What a benchmark leaves: results.md, results.tex, results.csv, results.json and figures."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from ..core.config_io import to_dict
+from ..system.atomic import whole_file, write_json
+from .matrix import Matrix, commits_of, scores_of
+from .pictures import PICTURES, write_pictures
+from .plots import budget_figure, curve_figure
+from .results import Results
+from .spec import ClaimSpec
+from .statistics import ABSOLUTE, IN_DB, MIN_PAIRS, RARE, Difference
+from .tables import LABELS, csv_lines, latex, markdown, score_table
+
+SHOWN_NAMES = 6
+
+
+def write_report(matrix: Matrix, out: Path) -> Path:
+    """Write tables, differences, claims and figures of what is done into `out`; names what is not.
+
+    Returns:
+        Path of `results.md`.
+    """
+    results = Results.of(matrix)
+    _figures(matrix, results, out / "figures")
+    tables = [score_table(results, name) for name in matrix.spec.sequences if name in matrix.data]
+    _write(out / "results.tex", "\n\n".join(latex(table) for table in tables) + "\n")
+    _write(out / "results.csv", csv_lines(results))
+    write_json(out / "results.json", _facts(matrix, results))
+    _write(out / "results.md", "\n\n".join([*_body(matrix, results, out, out, 1), *_protocol([matrix], 2)]) + "\n")
+    return out / "results.md"
+
+
+def write_overview(reports: dict[Path, Matrix], out: Path) -> Path:
+    """Put the reports of several specs into one `results.md` in `out`.
+
+    Args:
+        reports: matrix by the folder that `write_report` wrote, below `out`.
+    """
+    blocks = ["# Results"]
+    for folder, matrix in reports.items():
+        blocks += _body(matrix, Results.of(matrix), folder, out, 2)
+    _write(out / "results.md", "\n\n".join([*blocks, *_protocol(list(reports.values()), 2)]) + "\n")
+    return out / "results.md"
+
+
+def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int) -> list[str]:
+    """All blocks of one spec, its title at heading `level`; pictures in `folder` are linked from `base`."""
+    below = "#" * (level + 1)
+    return [
+        *_head(matrix, "#" * level),
+        *_tables(matrix, results, below),
+        *_claims(results, below),
+        *_pictures(matrix, folder, base, below),
+    ]
+
+
+def _write(path: Path, text: str) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _head(matrix: Matrix, mark: str) -> list[str]:
+    spec = matrix.spec
+    size = f"{len(spec.methods)} methods x {len(spec.sequences)} sequences"
+    size += f" x {len(spec.budgets)} budgets" if spec.budgets else ""
+    seeds = ", ".join(map(str, spec.seeds))
+    lines = [f"{mark} {spec.title}"]
+    if spec.about:
+        lines.append(spec.about.strip())
+    commits = ", ".join(commits_of(matrix)) or "none yet"
+    lines.append(f"{size}, seeds {seeds}; trained at commit {commits}. Mean ± standard deviation over seeds.")
+    if matrix.missing:
+        by_reason: dict[str, list[str]] = {}
+        for cell, reason in matrix.missing.items():
+            by_reason.setdefault(reason, []).append(f"`{cell.name}`")
+        missing = "\n".join(f"- {_some(names)}: {reason}" for reason, names in by_reason.items())
+        lines.append(f"No result for {len(matrix.missing)} cells:\n\n{missing}")
+    return lines
+
+
+def _some(names: list[str]) -> str:
+    """The first few names, and how many more there are."""
+    rest = len(names) - SHOWN_NAMES
+    return ", ".join(names[:SHOWN_NAMES]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _protocol(matrices: list[Matrix], level: int) -> list[str]:
+    """What the scores mean, from the first finished cell."""
+    folders = [folder for matrix in matrices for folder in matrix.done.values()]
+    if not folders:
+        return []
+    hidden = ("frames", "data_fingerprint", "shrink")
+    shown = {name: text for name, text in scores_of(folders[0])["protocol"].items() if name not in hidden}
+    return [f"{'#' * level} Protocol", "\n".join(f"- `{name}`: {text}" for name, text in shown.items())]
+
+
+def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
+    spec, blocks = matrix.spec, []
+    for name in spec.sequences:
+        if name not in matrix.data:
+            continue
+        blocks += [f"{mark} {name}", "Best in bold, second best underlined.", markdown(score_table(results, name))]
+        others = [method for method in spec.methods if method != spec.reference]
+        found = {s: [results.difference(s, method, spec.reference, name) for method in others] for s in spec.scores}
+        known = [score for score in spec.scores if any(f.count for f in found[score])]
+        rows = [[spec.label(m), *(change(s, found[s][i]) for s in known)] for i, m in enumerate(others)]
+        if known:
+            lines = [["method", *(LABELS.get(s, s) for s in known)], ["---"] * (len(known) + 1), *rows]
+            table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+            than = spec.label(spec.reference)
+            about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over seeds]:"
+            blocks += [about, table]
+    return blocks
+
+
+def change(score: str, found: Difference) -> str:
+    """`+3.1 % [+1.0, +5.2]` or `+0.31 dB [+0.10, +0.52]`; a dash where there is nothing to compare."""
+    if not found.count:
+        return "-"
+    if score in IN_DB:
+        factor, digits, unit = 1, 2, " dB"
+    elif score in ABSOLUTE:
+        factor, digits, unit = 1, 0 if score in RARE else 4, ""
+    else:
+        factor, digits, unit = 100, 1, " %"
+    mean, low, high = (f"{factor * value:+.{digits}f}" for value in (found.mean, found.low, found.high))
+    return f"{mean}{unit} [{low}, {high}]" if math.isfinite(found.low) else mean + unit
+
+
+def _amount(score: str, by: float) -> str:
+    return f"{by:g} dB" if score in IN_DB else f"{by:g}" if score in ABSOLUTE else f"{100 * by:g} %"
+
+
+def _claims(results: Results, mark: str) -> list[str]:
+    if not results.spec.claims:
+        return []
+    lines = []
+    for claim in results.spec.claims:
+        found, said = results.judge(claim)
+        parts = []
+        if len(results.spec.sequences) > 1:
+            for name in results.spec.sequences:
+                alone, alone_said = results.judge(claim, name)
+                if alone.count:
+                    parts.append(f"{name}: {alone_said}, {change(claim.score, alone)}")
+        detail = f" ({'; '.join(parts)})" if len(parts) > 1 else ""
+        source = f" [{claim.text}]" if claim.text else ""
+        lines.append(
+            f"- {sentence(results, claim)}{source}: **{said}**, {change(claim.score, found)}, "
+            f"{found.count} pairs{detail}."
+        )
+    note = f"A claim holds, or does not, if the whole interval says so; fewer than {MIN_PAIRS} pairs tell nothing."
+    return [f"{mark} Claims", "\n".join(lines), note]
+
+
+def sentence(results: Results, claim: ClaimSpec) -> str:
+    """The claim in words."""
+    ours, theirs = results.spec.label(claim.method), results.spec.label(claim.than)
+    score, by = LABELS.get(claim.score, claim.score), _amount(claim.score, claim.by)
+    at = f" at {claim.budget:,} initial Gaussians" if claim.budget else ""
+    if claim.expect == "better":
+        return f"{ours} is better than {theirs} in {score}" + (f" by at least {by}" if claim.by else "") + at
+    if claim.expect == "no worse":
+        return f"{ours} is no worse than {theirs} in {score}" + (f" by more than {by}" if claim.by else "") + at
+    return f"{ours} and {theirs} differ in {score} by no more than {by}{at}"
+
+
+def _figures(matrix: Matrix, results: Results, folder: Path) -> None:
+    kinds = set(matrix.spec.figures)
+    if not matrix.done:
+        return
+    if "budgets" in kinds:
+        budget_figure(results, folder / "budgets.png")
+    if "curves" in kinds:
+        curve_figure(results, matrix, folder / "curves.png")
+    write_pictures(matrix, folder, kinds)
+
+
+def _pictures(matrix: Matrix, folder: Path, base: Path, mark: str) -> list[str]:
+    names = ["budgets", "curves", *(f"{kind}-{name}" for name in matrix.data for kind in PICTURES)]
+    drawn = [folder / "figures" / f"{name}.png" for name in names if name.split("-")[0] in matrix.spec.figures]
+    found = [path for path in drawn if path.exists()]
+    return [f"{mark} Figures", *(f"![{f.stem}]({f.relative_to(base).as_posix()})" for f in found)] if found else []
+
+
+def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
+    """All that is in the tables, for programs."""
+    spec = matrix.spec
+    cells = [
+        {"sequence": c.sequence, "method": c.method, "budget": c.budget, "seed": c.seed, "folder": folder.name}
+        | scores_of(folder)
+        for c, folder in matrix.done.items()
+    ]
+    claims = []
+    for claim in spec.claims:
+        found, said = results.judge(claim)
+        claims.append(
+            to_dict(claim) | {"verdict": said, "difference": _json(found), "sentence": sentence(results, claim)}
+        )
+    differences = [
+        {"sequence": name, "method": method, "than": spec.reference, "score": score}
+        | _json(results.difference(score, method, spec.reference, name))
+        for name in spec.sequences
+        for method in spec.methods
+        if method != spec.reference
+        for score in spec.scores
+    ]
+    missing = {cell.name: reason for cell, reason in matrix.missing.items()}
+    return {
+        "spec": to_dict(spec) | {"folder": None},
+        "commits": commits_of(matrix),
+        "cells": cells,
+        "differences": differences,
+        "claims": claims,
+        "missing": missing,
+    }
+
+
+def _json(found: Difference) -> dict[str, Any]:
+    values = json.loads(json.dumps(vars(found)), parse_constant=lambda _: None)
+    return {"mean": values["mean"], "low": values["low"], "high": values["high"], "pairs": values["count"]}

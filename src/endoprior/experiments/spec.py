@@ -1,0 +1,275 @@
+"""What a benchmark compares, as a small YAML or TOML file: read strictly, every mistake named before anything runs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import tomllib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from ..core.checks import InputError
+from ..core.config import Config
+from ..core.config_io import from_dict, to_dict
+from ..core.presets import PresetName, preset
+from ..data.reading import read_text
+from ..data.yaml_text import load_yaml
+from ..phantom import PhantomConfig
+
+Expectation = Literal["better", "no worse", "no effect"]
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
+"""Names of methods and sequences become folders."""
+MOST_EXTENDED = 8
+MOST_CELLS = 100_000
+FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
+"""A value such as `x0.75` multiplies what the preset and the settings before it say."""
+
+
+@dataclass(frozen=True)
+class SequenceSpec:
+    """One sequence: a folder, or a phantom that is written first."""
+
+    path: str = ""
+    """Sequence folder; `~` and `$NAME` are expanded, a relative one starts at the spec's folder."""
+    phantom: PhantomConfig | None = None
+    """Fields of the phantom; in place of `path`."""
+    shrink: int = 1
+    """Fraction of width and height that is read."""
+    first_frames: int = 0
+    """Frames that are read; 0 reads all."""
+    stride: int = 0
+    """Every n-th frame is read; 0 takes what is published for the dataset."""
+    format: str = "auto"
+    """Layout of the folder (docs/datasets.md)."""
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """The fields of `DataConfig` that it decides."""
+        return {"shrink": self.shrink, "first_frames": self.first_frames, "stride": self.stride, "format": self.format}
+
+
+@dataclass(frozen=True)
+class MethodSpec:
+    """One method: a preset and what differs from it."""
+
+    preset: str = "default"
+    set: dict[str, Any] = field(default_factory=dict)
+    """Config fields by dotted name, on top of the benchmark's own `set` and `set_for`."""
+    label: str = ""
+    """Name in tables; the method's own if empty."""
+
+
+@dataclass(frozen=True)
+class ClaimSpec:
+    """A statement that the results are held against."""
+
+    score: str
+    method: str
+    than: str
+    expect: Expectation = "better"
+    by: float = 0.0
+    """Difference that is claimed, or the largest that counts as none for `no effect` and `no worse`.
+
+    In dB for PSNR, as it is for SSIM, relative for all other scores.
+    """
+    text: str = ""
+    """Where the claim comes from."""
+    budget: int | None = None
+    """Only cells of this budget; None takes all."""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """methods x sequences x budgets x seeds, one protocol."""
+
+    title: str
+    sequences: dict[str, SequenceSpec]
+    methods: dict[str, MethodSpec]
+    about: str = ""
+    """Printed above the tables: sizes, what was reduced and why."""
+    budgets: tuple[int, ...] = ()
+    """Initial Gaussians; none leaves each method's own."""
+    seeds: tuple[int, ...] = (0,)
+    set: dict[str, Any] = field(default_factory=dict)
+    """Config fields by dotted name, for all methods."""
+    set_for: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """The same for all methods of a preset; a method's own `set` comes last."""
+    scores: tuple[str, ...] = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis", "num_gaussians")
+    """Columns of the tables."""
+    claims: tuple[ClaimSpec, ...] = ()
+    figures: tuple[Literal["budgets", "curves", "frames", "instability", "prior"], ...] = ("curves", "frames")
+    compare_with: str = ""
+    """Method that paired differences are taken from; the first if empty."""
+    networks: bool = False
+    """Also score with RAFT and LPIPS where their weights can be had."""
+    folder: str = "."
+    """Where relative paths start: the folder of the spec file."""
+
+    @property
+    def reference(self) -> str:
+        """Method that paired differences are taken from."""
+        return self.compare_with or next(iter(self.methods))
+
+    def label(self, method: str) -> str:
+        """Name of a method in tables."""
+        return self.methods[method].label or method
+
+    def config(self, method: str, sequence: str, budget: int | None, seed: int) -> Config:
+        """The full config of one cell.
+
+        Raises:
+            InputError: an override names no field, or has a value of the wrong kind.
+        """
+        chosen, data = self.methods[method], self.sequences[sequence]
+        values = to_dict(preset(chosen.preset))
+        for where, overrides in (
+            ("set", self.set),
+            (f"set_for.{chosen.preset}", self.set_for.get(chosen.preset, {})),
+            (f"methods.{method}.set", chosen.set),
+        ):
+            for name, value in overrides.items():
+                _override(values, name, value, where)
+        values["data"] |= data.reading
+        if budget is not None:
+            values["init"]["budget"] = budget
+        values["seed"] = seed
+        return from_dict(Config, values, f"methods.{method}")
+
+
+def _override(values: dict[str, Any], name: str, value: Any, where: str) -> None:
+    *path, last = name.split(".")
+    for part in path:
+        values = values.get(part)
+        if not isinstance(values, dict):
+            break
+    if not isinstance(values, dict) or last not in values or isinstance(values[last], dict):
+        raise InputError(f"{where}: expected the dotted name of a config field; got {name}. See `endoprior train -h`.")
+    if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(values[last]) in (int, float):
+        value = type(values[last])(values[last] * float(factor[1]))
+    values[last] = value
+
+
+def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
+    """Read and check a spec.
+
+    Args:
+        path: `.yaml`, `.yml` or `.toml`.
+        data: folders of sequences by name, in place of those of the file.
+    Raises:
+        InputError: naming the file and the field, what was expected and what was found.
+    """
+    values = _read(path)
+    try:
+        for name in ("title", "sequences", "methods"):
+            if not values.get(name):
+                raise InputError(f"{name}: expected an entry; found none. Add it.")
+        spec = replace(from_dict(Spec, values, "spec"), folder=str(path.parent))
+        for name, folder in (data or {}).items():
+            if name not in spec.sequences:
+                raise InputError(f"--data {name}: no such sequence; expected one of {', '.join(spec.sequences)}.")
+            known = replace(spec.sequences[name], path=str(folder.absolute()), phantom=None)
+            spec = replace(spec, sequences=spec.sequences | {name: known})
+        _check(spec)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return spec
+
+
+def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Entries of a file over those of the files it `extends`: later ones win, `set` and `set_for` are merged.
+
+    Raises:
+        InputError: a file cannot be read, or extends itself.
+    """
+    readers = {".yaml": load_yaml, ".yml": load_yaml, ".toml": tomllib.loads}
+    if path.suffix not in readers:
+        raise InputError(f"{path}: expected a .yaml or .toml file; got {path.suffix or 'no suffix'}. Rename it.")
+    text = read_text(path, "a readable file", "Correct the path.")
+    if path.resolve() in chain:
+        raise InputError(f"{path}: expected to end somewhere; it extends itself. Remove one `extends`.")
+    if len(chain) >= MOST_EXTENDED:
+        raise InputError(f"{path}: expected at most {MOST_EXTENDED} files that extend each other. Merge some.")
+    try:
+        values = readers[path.suffix](text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a number of 5000 digits is a plain ValueError
+        raise InputError(f"{path}: expected valid {path.suffix[1:]}; {error}. Correct it.") from None
+    extends = values.pop("extends", []) if isinstance(values, dict) else None
+    if not isinstance(extends, list) or not all(isinstance(name, str) for name in extends):
+        raise InputError(f"{path}: expected named entries, `extends` a list of files; got something else. Correct it.")
+    merged: dict[str, Any] = {}
+    for part in [*(_read(path.parent / name, (*chain, path.resolve())) for name in extends), values]:
+        both = {k for k in ("set", "set_for") if isinstance(merged.get(k), dict) and isinstance(part.get(k), dict)}
+        merged |= {key: merged[key] | value if key in both else value for key, value in part.items()}
+    return merged
+
+
+def _check(spec: Spec) -> None:
+    for kind, names in (("sequences", spec.sequences), ("methods", spec.methods)):
+        for name in names:
+            if not NAME.fullmatch(name):
+                raise InputError(f"{kind}: expected a name of letters, digits and . _ + -; got {name!r}. Rename it.")
+    for name, sequence in spec.sequences.items():
+        if bool(sequence.path) == (sequence.phantom is not None):
+            raise InputError(f"sequences.{name}: expected either path or phantom; got both or none. Keep one.")
+        if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
+            raise InputError(f"sequences.{name}: a phantom is written at its size; remove shrink and first_frames.")
+    for name in spec.set_for:
+        if name not in PresetName.__args__:
+            raise InputError(f"set_for: expected one of {', '.join(PresetName.__args__)}; got {name!r}. Choose one.")
+    for name, method in spec.methods.items():
+        if method.preset not in PresetName.__args__:
+            choice = ", ".join(PresetName.__args__)
+            raise InputError(f"methods.{name}.preset: expected one of {choice}; got {method.preset!r}. Choose one.")
+    named = [spec.reference, *(name for claim in spec.claims for name in (claim.method, claim.than))]
+    for name in named:
+        if name not in spec.methods:
+            raise InputError(f"claims, compare_with: expected one of {', '.join(spec.methods)}; got {name!r}.")
+    if not spec.seeds or len(set(spec.seeds)) < len(spec.seeds):
+        raise InputError(f"seeds: expected different numbers; got {list(spec.seeds)}. Correct them.")
+    count = len(spec.seeds) * len(spec.sequences) * max(len(spec.budgets), 1) * len(spec.methods)
+    if count > MOST_CELLS:
+        raise InputError(f"methods x sequences x budgets x seeds: expected at most {MOST_CELLS}; got {count}. Split.")
+    for cell in cells(spec):
+        spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of the matrix."""
+
+    sequence: str
+    method: str
+    budget: int | None
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Unique in the matrix."""
+        budget = "" if self.budget is None else f"@{self.budget}"
+        return f"{self.sequence}/{self.method}{budget}/seed{self.seed}"
+
+
+def cells(spec: Spec) -> list[Cell]:
+    """All cells; seeds vary slowest, so that an unfinished matrix has whole seeds."""
+    return [
+        Cell(sequence, method, budget, seed)
+        for seed in spec.seeds
+        for sequence in spec.sequences
+        for budget in (spec.budgets or (None,))
+        for method in spec.methods
+    ]
+
+
+def sequence_folder(spec: Spec, name: str, out: Path) -> Path:
+    """Where the sequence lies: the user's folder, or the phantom's below `out`."""
+    sequence = spec.sequences[name]
+    if sequence.phantom:
+        fields = json.dumps(to_dict(sequence.phantom), sort_keys=True)
+        return out / "sequences" / f"{name}-{hashlib.sha256(fields.encode()).hexdigest()[:8]}"
+    path = Path(os.path.expandvars(sequence.path)).expanduser()
+    return path if path.is_absolute() else Path(spec.folder) / path

@@ -1,0 +1,185 @@
+"""Where surface points travel: optical flow from frame to frame, lifted by measured depth, as temporal coefficients.
+
+Coefficients that start at zero have to learn every motion from color, whose gradient reaches a few pixels only; tissue
+that moves farther than that between frames is then explained by Gaussians that fade in and out. Following each point by
+dense inverse search (Kroeger et al. 2016, OpenCV) first gives training the motion, and leaves it to refine it.
+
+Shared letters: `T` training frames, `N` points, `B` basis functions.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.config import BasisConfig
+from ..core.geometry import back_project, bilinear, project
+from ..core.types import Camera, Frame
+from ..model.basis import basis_weights
+from ..system.memory import BoundedCache, cache_bytes, workers
+from . import track_kernels as kernels
+from .cleanup import PointCloud
+from .sampling import has_surface
+
+MIN_SIZE_PX = 32
+"""Smallest image side that dense inverse search can work on."""
+HALVED_FROM_PX = 256
+"""Frames whose shorter side is at least this long are followed at half their size: four times faster, hardly worse."""
+RETURN_PX, RETURN_SHARE = 1.0, 0.05
+"""A point is lost where forward and backward flow disagree by more than this, plus this share of the step."""
+STILL_MARGIN = 1.1
+"""A point stands still if its color explains the frames there, up to this factor as well as along its track."""
+BLUR_PX = 1.5
+"""Standard deviation of the blur under which colors are compared."""
+FLOW_BYTES = 40
+"""Per pixel of a frame, while the flow of a pair is computed."""
+FLOW_CHUNK = 16
+"""Pairs of frames whose flow is computed, kept and forgotten together."""
+RIDGE = 1e-2
+"""Of the least squares that turn tracks into coefficients; frames count 1 each."""
+
+log = logging.getLogger(__name__)
+
+
+def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig) -> NDArray[np.float32]:
+    """Temporal coefficients that carry every point of the cloud along its track.
+
+    Args:
+        frames: T training frames (never test frames), in order.
+        cloud: points with the frames they were lifted from.
+    Returns:
+        (N, B, 3) coefficients of the centers, mm; 0 for frames too small for optical flow.
+    """
+    height, width = frames[0].tissue_mask.shape
+    if min(height, width) < MIN_SIZE_PX:
+        log.warning("initial motion: frames of %d x %d px are too small for optical flow", width, height)
+        return np.zeros((len(cloud), cfg.num_bases, 3), np.float32)
+    points = cloud.points.astype(np.float64)
+    pixels = follow(frames, points, cloud.origins)
+    moving = ~stands_still(frames, points, cloud.origins, pixels)
+    log.info("initial motion: %d of %d points move", moving.sum(), len(cloud))
+    offsets = lift(frames, pixels[:, moving]) - points[moving]
+    kernels.fill_gaps(offsets)
+    motion = np.zeros((len(cloud), cfg.num_bases, 3), np.float32)
+    motion[moving] = fit_basis(offsets, [frame.time for frame in frames], cfg)
+    return motion
+
+
+def follow(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Pixels of each point in every frame, by chaining flow away from its own frame in both directions.
+
+    A point is lost, from there on, where it leaves image or tissue or where the flow back does not return to it.
+
+    Args:
+        points: (N, 3) world, mm. origins: (N,) position in `frames` that each was lifted from.
+    Returns:
+        (T, N, 2) px; NaN where a point is lost.
+    """
+    pixels = np.full((len(frames), len(points), 2), np.nan)
+    for position in np.unique(origins):
+        own = origins == position
+        pixels[position, own] = project(points[own], frames[position].camera)[0]
+    flow, limits = _flows(frames), (RETURN_PX, RETURN_SHARE)
+    for k in range(len(frames) - 1):
+        kernels.advance(pixels[k], origins <= k, *flow(k), frames[k + 1].tissue_mask, *limits, pixels[k + 1])
+    for k in range(len(frames) - 1, 0, -1):
+        forward, backward = flow(k - 1)
+        kernels.advance(pixels[k], origins >= k, backward, forward, frames[k - 1].tissue_mask, *limits, pixels[k - 1])
+    return pixels
+
+
+FlowPair = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Flow (h, w, 2) from a frame to the next and back, in px of the image it was computed on."""
+
+
+def _flows(frames: Sequence[Frame]) -> Callable[[int], FlowPair]:
+    """A function that gives the flows between frames k and k + 1; as many are kept as memory allows."""
+    height, width = frames[0].tissue_mask.shape
+    shrink = 2 if min(height, width) >= HALVED_FROM_PX else 1
+    size = (width // shrink, height // shrink)
+
+    def gray(k: int) -> NDArray[np.uint8]:
+        full = cv2.cvtColor(frames[k].rgb_u8, cv2.COLOR_RGB2GRAY)
+        return cv2.resize(full, size, interpolation=cv2.INTER_AREA)
+
+    def chunk(number: int) -> list[FlowPair]:
+        first = number * FLOW_CHUNK
+        grays = [gray(k) for k in range(first, min(first + FLOW_CHUNK + 1, len(frames)))]
+
+        def both_ways(k: int) -> FlowPair:
+            # A new estimator for each pair: it keeps buffers, and a pair must not depend on the one before.
+            estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+            forward = estimator.calc(grays[k], grays[k + 1], None)
+            return forward, estimator.calc(grays[k + 1], grays[k], None)
+
+        with ThreadPoolExecutor(workers(FLOW_BYTES * width * height)) as pool:  # OpenCV releases the interpreter lock
+            return list(pool.map(both_ways, range(len(grays) - 1)))
+
+    kept: BoundedCache[list[FlowPair]] = BoundedCache(
+        cache_bytes(), lambda pairs: sum(flow.nbytes for pair in pairs for flow in pair)
+    )
+    return lambda k: kept.get(k // FLOW_CHUNK, lambda: chunk(k // FLOW_CHUNK))[k % FLOW_CHUNK]
+
+
+def stands_still(
+    frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer], pixels: NDArray
+) -> NDArray[np.bool_]:
+    """(N,) whether a point left at rest matches the frames as well as its track does.
+
+    Chained flow drifts, and depth jitters: where nothing moves, rest is the better guess.
+
+    Args:
+        points: (N, 3) world, mm. origins: (N,) positions in `frames`. pixels: (T, N, 2) from `follow`.
+    """
+
+    def blurred(position: int) -> NDArray[np.uint8]:
+        return cv2.GaussianBlur(cv2.cvtColor(frames[position].rgb_u8, cv2.COLOR_RGB2GRAY), (0, 0), BLUR_PX)
+
+    own_gray, along_track, at_rest = np.zeros((3, len(points)))
+    for position in np.unique(origins):
+        own = origins == position
+        own_gray[own] = bilinear(blurred(position), pixels[position, own])
+    for position in range(len(frames)):
+        image = blurred(position)
+        resting = _project_in_front(points, frames[position].camera)
+        kernels.add_mismatch(image, pixels[position], origins != position, resting, own_gray, along_track, at_rest)
+    return at_rest <= STILL_MARGIN * along_track
+
+
+def _project_in_front(points: NDArray, camera: Camera) -> NDArray[np.float64]:
+    """Pixels (M, 2) of world points; far outside the image for those behind the camera."""
+    pixels, z = project(points, camera)
+    return np.where((z > 0)[:, None], pixels, -1e6)
+
+
+def lift(frames: Sequence[Frame], pixels: NDArray) -> NDArray[np.float64]:
+    """World points (T, N, 3) mm of pixels (T, N, 2); NaN where the pixel is unknown or has no measured depth."""
+    found = np.full((*pixels.shape[:2], 3), np.nan)
+    for position, frame in enumerate(frames):
+        known = np.flatnonzero(np.isfinite(pixels[position, :, 0]))
+        height, width = frame.tissue_mask.shape
+        x, y = _nearest(pixels[position, known], width, height)
+        measured = has_surface(frame)[y, x]
+        depth = frame.depth[y, x].astype(np.float64)[measured]
+        found[position, known[measured]] = back_project(pixels[position, known[measured]], depth, frame.camera)
+    return found
+
+
+def _nearest(pixels: NDArray, width: int, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Column and row of the pixel that each position falls into, held inside the image."""
+    x, y = np.floor(pixels).astype(np.intp).T
+    return np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
+
+
+def fit_basis(offsets: NDArray[np.float64], times: list[float], cfg: BasisConfig) -> NDArray[np.float32]:
+    """Least-squares coefficients (N, B, 3) of offsets (T, N, 3) mm at T `times` in [0, 1]."""
+    weights = np.stack([basis_weights(time, cfg) for time in times])
+    normal = weights.T @ weights + RIDGE * np.eye(cfg.num_bases)
+    solve = np.linalg.solve(normal, weights.T)
+    fitted = solve @ offsets.reshape(len(times), -1)
+    return np.ascontiguousarray(fitted.reshape(cfg.num_bases, -1, 3).transpose(1, 0, 2), np.float32)

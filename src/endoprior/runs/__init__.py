@@ -1,0 +1,1 @@
+"""A training run on disk: config, log, checkpoints, identity of the data, compiled kernels."""

@@ -1,0 +1,1 @@
+"""The training loop, the optimizer, the losses, density control and the divergence check."""

@@ -1,0 +1,132 @@
+"""What the loop needs of each training frame, as tensors made once: targets, masks, the prior, the frame before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core.config import PriorConfig
+from ..core.types import Camera, Frame
+from ..data import FrameSequence, shrunk
+from ..initialization.sampling import has_surface
+from ..priors import joint_texture_prior
+from ..system.memory import BoundedCache, cache_bytes
+
+TENSORS = ("rgb_u8", "tissue_mask", "inverse_depth", "measured")
+"""What of a training frame lies on a device."""
+
+
+@dataclass(frozen=True)
+class TrainingFrame:
+    """One training frame at one resolution."""
+
+    index: int
+    time: float | Tensor
+    """In [0, 1); a () float64 tensor where it lies on a `recorded.Desk`."""
+    camera: Camera
+    rgb_u8: Tensor
+    """(H, W, 3) uint8."""
+    tissue_mask: Tensor
+    """(H, W) bool, True on tissue."""
+    inverse_depth: Tensor
+    """(H, W) 1 / mm; 0 where there is no depth."""
+    measured: Tensor
+    """(H, W) bool, True where tissue has a depth."""
+    num_measured: int
+    """Pixels of `measured`."""
+    brightness: float
+    """Mean color over tissue, in [0, 1]; 0 without tissue."""
+
+    @property
+    def rgb(self) -> Tensor:
+        """(H, W, 3) color in [0, 1]."""
+        return self.rgb_u8.float() / 255
+
+
+SHARE_OF_DEVICE = 0.25
+"""Of a device's free memory, that frames may take when training begins; those beyond are copied at each use."""
+
+
+class TrainingFrames:
+    """Training frames of a sequence by position; built when first used, kept as memory allows, here and on a device."""
+
+    def __init__(self, sequence: FrameSequence, prior_cfg: PriorConfig, device: torch.device | str = "cpu") -> None:
+        """Args: sequence: where frames come from. prior_cfg: of the prior. device: where the tensors are wanted."""
+        self.sequence, self.device = sequence, torch.device(device)
+        self.indices = sequence.indices("train")
+        self._prior_cfg = prior_cfg
+        self._frames: BoundedCache[TrainingFrame] = BoundedCache(cache_bytes(), _frame_bytes)
+        self._priors: BoundedCache[Tensor] = BoundedCache(cache_bytes() // 4, lambda prior: prior.nbytes)
+        room = device_bytes(self.device)
+        self._frames_there: BoundedCache[TrainingFrame] = BoundedCache(room, _frame_bytes)
+        self._priors_there: BoundedCache[Tensor] = BoundedCache(room // 4, lambda prior: prior.nbytes)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def frame(self, position: int, *, half: bool = False) -> TrainingFrame:
+        """Training frame number `position`, at full or at half width and height."""
+
+        def build() -> TrainingFrame:
+            return _training_frame(shrunk(self.sequence.frame(self.indices[position]), 2 if half else 1))
+
+        key = (position, half)
+        if self.device.type == "cpu":
+            return self._frames.get(key, build)
+        return self._frames_there.get(key, lambda: _moved(self._frames.get(key, build), self.device))
+
+    def before(self, position: int) -> TrainingFrame | None:
+        """The frame just before in the sequence if it is itself a training frame (released code), else None."""
+        if position > 0 and self.indices[position - 1] == self.indices[position] - 1:
+            return self.frame(position - 1)
+        return None
+
+    def prior(self, position: int) -> tuple[Tensor, Tensor]:
+        """rho (H, W) in [0, 1] and the tissue mask (H, W) bool, at full resolution."""
+
+        def build() -> Tensor:
+            frame = self.sequence.frame(self.indices[position])
+            return torch.from_numpy(joint_texture_prior(frame.rgb, frame.tissue_mask, self._prior_cfg))
+
+        if self.device.type == "cpu":
+            prior = self._priors.get(position, build)
+        else:
+            prior = self._priors_there.get(position, lambda: _queued(self._priors.get(position, build), self.device))
+        return prior, self.frame(position).tissue_mask
+
+
+def device_bytes(device: torch.device) -> int:
+    """Memory of a device that frames may take."""
+    return int(SHARE_OF_DEVICE * torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else cache_bytes()
+
+
+def _moved(frame: TrainingFrame, device: torch.device) -> TrainingFrame:
+    return replace(frame, **{name: _queued(getattr(frame, name), device) for name in TENSORS})
+
+
+def _queued(tensor: Tensor, device: torch.device) -> Tensor:
+    """A copy on a device that nobody waits for: from memory that stays in place while it is read."""
+    return (tensor.pin_memory() if device.type == "cuda" else tensor).to(device, non_blocking=True)
+
+
+def _training_frame(frame: Frame) -> TrainingFrame:
+    depth, usable = frame.depth, has_surface(frame)
+    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=usable)
+    return TrainingFrame(
+        index=frame.index,
+        time=frame.time,
+        camera=frame.camera,
+        rgb_u8=torch.from_numpy(frame.rgb_u8),
+        tissue_mask=torch.from_numpy(frame.tissue_mask),
+        inverse_depth=torch.from_numpy(inverse),
+        measured=torch.from_numpy(frame.tissue_mask & usable),
+        num_measured=int(np.count_nonzero(frame.tissue_mask & usable)),
+        brightness=float(frame.rgb_u8[frame.tissue_mask].mean()) / 255 if frame.tissue_mask.any() else 0.0,
+    )
+
+
+def _frame_bytes(frame: TrainingFrame) -> int:
+    return sum(getattr(frame, name).nbytes for name in TENSORS)
