@@ -16,7 +16,7 @@ from test_train import tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.runs.folder import deferred_interrupt
+from endoprior.runs.interrupt import deferred_interrupt
 from endoprior.runs.training_run import train
 from endoprior.show.video import _num_frames, write_video
 from endoprior.system import atomic
