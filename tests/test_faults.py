@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_train import tiny_config
+from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence

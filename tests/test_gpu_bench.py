@@ -9,7 +9,7 @@ import zipfile
 from pathlib import Path
 
 import torch
-from test_render_cuda import NAN, loaded, rasterize_to_pixels
+from gsplat_stand_in import NAN, loaded, rasterize_to_pixels
 
 GPU_BENCH = Path(__file__).parents[1] / "bench" / "gpu.py"
 
