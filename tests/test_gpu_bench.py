@@ -8,6 +8,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import pytest
 import torch
 from gsplat_stand_in import NAN, loaded, rasterize_to_pixels
 
@@ -24,6 +25,7 @@ def gpu_contest(monkeypatch):
     return gpu_bench(monkeypatch).Contest("cpu", torch.device("cpu"))
 
 
+@pytest.mark.slow
 def test_gpu_bench_dry_run_agrees_times_and_writes(tmp_path, monkeypatch, capsys):
     out = tmp_path / "gpu.json"
     options = ["--dry-run", "--scenes", "1", "--gaussians", "50", "--laps", "1", "--out", str(out)]

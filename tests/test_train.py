@@ -211,6 +211,7 @@ def test_gaussians_stay_in_the_order_of_space(tiny_sequence, kind):
     assert all(np.array_equal(a, b) for a, b in zip(found, ordered, strict=True))
 
 
+@pytest.mark.slow
 def test_ctrl_c_on_the_command_line_saves_and_says_how_to_go_on(tiny_sequence, tmp_path):
     out = tmp_path / "run"
     command = [sys.executable, "-m", "endoprior", "train", str(tiny_sequence), str(out)]
