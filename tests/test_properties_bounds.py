@@ -1,7 +1,7 @@
 """No kernel reads or writes outside its arrays: the generated inputs again, under Numba's bounds checks.
 
-Kernels run without these checks otherwise. They are all compiled anew here, which takes minutes. Vector loads and stores
-(`simd`) are not checked.
+Kernels run without these checks otherwise. They are all compiled anew here, which takes minutes. Vector loads and
+stores (`simd`) are not checked.
 """
 
 from __future__ import annotations
