@@ -35,9 +35,15 @@ NO_TORCH = ("priors", "data", "evaluation/metrics/stability.py", "phantom", "cor
 
 
 @cache
+def tree(path: Path) -> ast.Module:
+    """A file's syntax tree."""
+    return ast.parse(path.read_text())
+
+
+@cache
 def nodes(path: Path) -> list[ast.AST]:
     """Every node of a file's syntax tree."""
-    return list(ast.walk(ast.parse(path.read_text())))
+    return list(ast.walk(tree(path)))
 
 
 def imports(path: Path) -> Iterator[tuple[str, ...]]:
@@ -93,12 +99,12 @@ def test_files_are_short_and_say_what_they_are():
     for path in FILES:
         text = path.read_text()
         assert len(text.splitlines()) <= 400, path
-        assert not text.strip() or ast.get_docstring(ast.parse(text)), path
+        assert not text.strip() or ast.get_docstring(tree(path)), path
 
 
 def test_public_functions_and_classes_have_docstrings():
     for path in FILES:
-        for node in ast.parse(path.read_text()).body:
+        for node in tree(path).body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                 if any("njit" in ast.unparse(decorator) for decorator in node.decorator_list):
                     continue  # kernels say their contract in a comment on the first line
