@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_train import tiny_config
+from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import HexPlaneConfig

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from export_readers import read_glb, read_spz
 from export_scenes import moving_scene, plane_camera
 from plyfile import PlyData
 
@@ -94,8 +95,6 @@ def test_scenes_where_nothing_but_the_centers_moves(tmp_path, name):
 
 
 def test_axes_default_to_what_the_format_demands(run, tmp_path):
-    from test_export_splats import read_glb, read_spz
-
     scene, times = load_scene(run), ("--times", "0.5")
     upright = scene.at(0.5).means.numpy() * [1, -1, -1]
     assert export(run, tmp_path / "a.spz", "spz", *times) == export(run, tmp_path / "a.glb", "gltf", *times) == 0

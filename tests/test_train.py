@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tiny_training import KINDS, losses_of, tiny_config
 
 from endoprior.compute.morton import morton_order
 from endoprior.core.checks import InputError
@@ -26,35 +27,6 @@ from endoprior.training.state import Stage
 from endoprior.training.trainer import Trainer
 
 GOLDEN = Path(__file__).parent / "golden" / "train_losses.json"
-KINDS = ("basis", "hexplane")
-
-
-def tiny_config(kind: str, coarse: int = 6, fine: int = 14) -> Config:
-    """A config in which everything happens within a few iterations: growth, pruning, the temporal term."""
-    cfg = preset("released")
-    deformation = replace(cfg.deformation, kind=kind)
-    if kind == "hexplane":
-        planes = replace(deformation.hexplane, resolution=(8, 8, 8), time_resolution=6, channels=4, multires=(1, 2))
-        deformation = replace(deformation, hexplane=planes)
-    return replace(
-        cfg,
-        init=replace(cfg.init, budget=300, cleanup=False),
-        deformation=deformation,
-        density=replace(cfg.density, start_iteration=2, every=4, grow_threshold=2e-3, score_mode="every"),
-        temporal=replace(cfg.temporal, start_iteration=3, min_points=20, weight=1e-3),
-        schedule=replace(cfg.schedule, coarse_iterations=coarse, fine_iterations=fine, sh_every=4),
-    )
-
-
-def losses_of(folder, cfg):
-    """Objective after each iteration, and the number of Gaussians."""
-    trainer = Trainer(load_sequence(folder, cfg.data), cfg)
-    trainer.start()
-    rows = []
-    while not trainer.finished:
-        report = trainer.step()
-        rows.append([sum(report.terms.values()), report.num_gaussians])
-    return rows
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -239,6 +211,7 @@ def test_gaussians_stay_in_the_order_of_space(tiny_sequence, kind):
     assert all(np.array_equal(a, b) for a, b in zip(found, ordered, strict=True))
 
 
+@pytest.mark.slow
 def test_ctrl_c_on_the_command_line_saves_and_says_how_to_go_on(tiny_sequence, tmp_path):
     out = tmp_path / "run"
     command = [sys.executable, "-m", "endoprior", "train", str(tiny_sequence), str(out)]
