@@ -14,7 +14,6 @@ from torch.nn.functional import grid_sample
 
 from endoprior.core.config import HexPlaneConfig
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, TOUCHED, PlaneGrid, mapped_zeros
-from endoprior.model.hexplane_kernels import MAX_CHANNELS
 from endoprior.model.hexplane_numba import CHUNK, hexplane_linear
 from endoprior.training.plane_adam import PlaneAdam
 from endoprior.training.plane_adam_numba import adam_planes_step, step_cells
@@ -351,7 +350,7 @@ def test_adam_state_resumes_bit_for_bit() -> None:
     "change",
     [
         {"channels": 0},
-        {"channels": MAX_CHANNELS + 1},
+        {"channels": 257},
         {"multires": ()},
         {"time_resolution": 1},
         {"resolution": (1, 4, 4)},

@@ -6,10 +6,13 @@ import torch
 
 from endoprior.core.config import Config
 from endoprior.core.presets import preset
-from endoprior.model.basis import RankOneGradient, motion_layout
+from endoprior.model.attributes import motion_layout
+from endoprior.model.basis import RankOneGradient
+from endoprior.model.gaussians import create_gaussians
 from endoprior.training import adam_numba
 from endoprior.training.adam import AdamState
-from endoprior.training.optimizer import log_linear, motion_rates
+from endoprior.training.ops import NUMBA
+from endoprior.training.optimizer import Optimizer, log_linear, motion_rates
 
 
 def test_update_is_torchs_adam():
@@ -52,13 +55,17 @@ def test_basis_functions_without_weight_stay_unchanged():
 
 
 def test_without_a_gradient_nothing_moves():
-    param = torch.ones(3).requires_grad_()
-    state = AdamState(param)
-    param.grad = torch.ones(3)
-    adam_numba.adam_step([state], [param], 0.1, 1e-15)
-    moved, param.grad = param.detach().clone(), None
-    adam_numba.adam_step([state], [param], 0.1, 1e-15)
-    assert torch.equal(param.detach(), moved)
+    cfg = preset("paper")
+    rng = np.random.default_rng(0)
+    model = create_gaussians(rng.random((5, 3)), rng.random((5, 3)), np.zeros(5), cfg)
+    optimizer = Optimizer(model, None, cfg, 1.0, NUMBA)
+    model["means"].grad = torch.ones(5, 3)
+    optimizer.step(1)
+    moved, first = model["means"].detach().clone(), optimizer.states["means"].first.clone()
+    assert model["means"].grad is None
+    optimizer.step(2)
+    assert torch.equal(model["means"].detach(), moved) and torch.equal(optimizer.states["means"].first, first)
+    assert optimizer.states["means"].steps == 1 and optimizer.states["quats"].steps == 0
 
 
 def test_log_linear_ends_and_middle():

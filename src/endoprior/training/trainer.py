@@ -184,6 +184,6 @@ def device_for(backend: render.Backend) -> torch.device:
 
 
 def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:
-    """Factor of the learning rates that are lengths: 1.1 x radius of the camera path, or a constant where it stands still."""
+    """Factor of the learning rates that are lengths: 1.1 x radius of the camera path; constant for a static one."""
     radius = 1.1 * float((camera_centers - camera_centers.mean(0)).norm(dim=-1).max())
     return radius if radius > 1e-3 else cfg.optim.still_camera_scale
