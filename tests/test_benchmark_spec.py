@@ -114,6 +114,8 @@ def test_toml_says_the_same(tmp_path):
         ({"set_for": {"best": {}}}, "set_for: expected one of default"),
         ({"extends": "spec.yaml"}, "`extends` a list of files"),
         ({"set": {"density.min_densify_weight": 3.0}}, "min_densify_weight must be in"),
+        ({"scores": ["psnr", "speed"]}, "names of scores; got 'speed'"),
+        ({"claims": [{"score": "speed", "method": "ours", "than": "base"}]}, "names of scores; got 'speed'"),
         ({"compare_with": "them"}, "compare_with: expected one of base, ours"),
         ({"claims": [{"score": "psnr", "method": "ours", "than": "nobody"}]}, "expected one of base, ours"),
         ({"claims": [{"score": "psnr", "method": "ours", "than": "base", "expect": "magic"}]}, "expect: expected one"),

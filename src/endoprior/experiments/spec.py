@@ -19,6 +19,7 @@ from ..core.config_io import from_dict, to_dict
 from ..core.presets import PresetName, preset
 from ..data.reading import read_text
 from ..data.yaml_text import load_yaml
+from ..evaluation.registry import all_scores
 from ..phantom import PhantomConfig
 
 Expectation = Literal["better", "no worse", "no effect"]
@@ -229,6 +230,9 @@ def _check(spec: Spec) -> None:
     for name in named:
         if name not in spec.methods:
             raise InputError(f"claims, compare_with: expected one of {', '.join(spec.methods)}; got {name!r}.")
+    for name in (*spec.scores, *(claim.score for claim in spec.claims)):
+        if name not in all_scores():
+            raise InputError(f"scores, claims: expected names of scores; got {name!r}. Fix: see docs/scores.md.")
     if not spec.seeds or len(set(spec.seeds)) < len(spec.seeds):
         raise InputError(f"seeds: expected different numbers; got {list(spec.seeds)}. Correct them.")
     count = len(spec.seeds) * len(spec.sequences) * max(len(spec.budgets), 1) * len(spec.methods)
