@@ -107,6 +107,7 @@ def test_toml_says_the_same(tmp_path):
         ({"sequences": {"a": {}}}, "sequences.a: expected either path or phantom"),
         ({"sequences": {"a": {"phantom": {"frames": 1}}}}, "frames"),
         ({"sequences": {"a": {"phantom": {}, "shrink": 2}}}, "a phantom is written at its size"),
+        ({"sequences": {"a": {"path": "x", "format": "endo"}}}, "sequences.a.format: expected auto, scared"),
         ({"methods": {"m": {"preset": "best"}}}, "methods.m.preset: expected one of default"),
         ({"methods": {"m": {"set": {"init": 3}}}}, "methods.m.set: expected the dotted name"),
         ({"methods": {"m": {"set": {"init.bugdet": 3}}}}, "methods.m.set: expected the dotted name"),

@@ -17,6 +17,7 @@ from ..core.checks import InputError
 from ..core.config import Config
 from ..core.config_io import from_dict, to_dict
 from ..core.presets import PresetName, preset
+from ..data.formats import FORMATS
 from ..data.reading import read_text
 from ..data.yaml_text import load_yaml
 from ..evaluation.registry import all_scores
@@ -219,6 +220,8 @@ def _check(spec: Spec) -> None:
             raise InputError(f"sequences.{name}: expected either path or phantom; got both or none. Keep one.")
         if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
             raise InputError(f"sequences.{name}: a phantom is written at its size; remove shrink and first_frames.")
+        if sequence.format not in ("auto", *FORMATS):
+            raise InputError(f"sequences.{name}.format: expected auto, {', '.join(FORMATS)}; got {sequence.format!r}.")
     for name in spec.set_for:
         if name not in PresetName.__args__:
             raise InputError(f"set_for: expected one of {', '.join(PresetName.__args__)}; got {name!r}. Choose one.")
