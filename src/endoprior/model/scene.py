@@ -17,6 +17,7 @@ from .. import render
 from ..core.checks import InputError, check_range
 from ..core.config import Checked, Config, Range
 from ..core.config_io import from_dict, to_dict
+from ..core.geometry import FARTHEST_MM
 from ..core.types import Camera, RenderOutput, Splats
 from ..system.arrays_file import ArraySpec, load_arrays, part, refusing, save_arrays
 from .basis import basis_offsets
@@ -31,8 +32,6 @@ LARGEST_SIDE = 2**16
 LARGEST_PICTURE = 2**26
 """Pixels that are drawn at most: 8192 x 8192."""
 MOST_GAUSSIANS, MOST_FRAMES = 10_000_000, 1_000_000
-FARTHEST_MM = 1e9
-"""Lengths beyond it come from no endoscope, in whatever unit, and their squares leave float32."""
 LARGEST_DEVIATION = 5e-3
 """Largest entry of R R^T - I that still passes for a rotation; readers accept 1e-3 of R^T R."""
 
