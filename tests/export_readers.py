@@ -1,9 +1,10 @@
-"""Readers of splat formats for tests, written from the specifications; they share nothing with the exporters."""
+"""Readers of splat containers that share nothing with the package's writers."""
 
 from __future__ import annotations
 
 import gzip
 import struct
+from pathlib import Path
 
 import numpy as np
 from pygltflib import GLTF2
@@ -43,9 +44,9 @@ def read_spz(data: bytes) -> dict[str, np.ndarray]:
     }
 
 
-def read_glb(data: bytes, tmp_path) -> tuple[GLTF2, dict[str, np.ndarray]]:
+def read_glb(data: bytes, folder: Path) -> tuple[GLTF2, dict[str, np.ndarray]]:
     """The document and the arrays of its only primitive."""
-    file = tmp_path / "a.glb"
+    file = folder / "a.glb"
     file.write_bytes(data)
     gltf = GLTF2().load(str(file))
     blob = gltf.binary_blob()

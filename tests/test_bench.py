@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 
 import common
 import iteration
-import losses
+import ops
 import plain
 import run
 import scenes
@@ -86,9 +86,9 @@ def test_the_committed_baseline_can_be_read():
 
 
 def test_a_cheap_stage_is_measured_beside_torch():
-    (found,) = losses.measure((TINY,))
-    assert found.stage == "losses, both ways" and found.size == "48x40"
-    assert 0 < found.ours_ms < 1e4 and 0 < found.torch_ms < 1e4
+    steps = (ops.losses(TINY.width, TINY.height, each) for each in (ops.NUMBA, ops.TORCH))
+    ((ours_ms, torch_ms),) = common.race(*steps).values()
+    assert 0 < ours_ms < 1e4 and 0 < torch_ms < 1e4
 
 
 def test_parts_inside_parts_are_counted_once():
@@ -141,9 +141,8 @@ def test_plain_torch_trains_on_the_same_terms(make_tiny_sequence, name):
         temporal=replace(cfg.temporal, min_valid=0, min_points=20, weight=1.0),
     )
     sequence = load_sequence(make_tiny_sequence(num_frames=iteration.FRAMES))
-    trainer, other = iteration.started(sequence, cfg), iteration.started(sequence, cfg)
-    iteration.in_torch(other)
-    want, got = iteration.repeat(trainer, REPEATED), iteration.repeat_in_torch(other, REPEATED)
+    trainer, other = iteration.started(sequence, cfg), iteration.started(sequence, cfg, ops.TORCH)
+    want, got = iteration.repeat(trainer, REPEATED), iteration.repeat(other, REPEATED)
     assert "distance" in want.terms, "the iteration had no frame before: repeat another one"
     assert got.terms == pytest.approx(want.terms, rel=1e-3, abs=1e-7)
     gradients = [t.state.stats.grad2d_ndc_sum for t in (trainer, other)]

@@ -73,6 +73,7 @@ def test_a_whole_sequence_gives_no_findings(facts):
     assert len(facts.cloud) > 10_000 and facts.eyes.order.as_given > 0.8
 
 
+@pytest.mark.slow
 def test_the_real_clip_gives_no_findings(real_clip):
     cfg = DataConfig(stride=6)
     assert find(measure(load_sequence(real_clip, cfg), cfg)) == []
@@ -277,6 +278,7 @@ def test_command_prints_draws_and_writes(data, capsys):
     assert sorted(path.name for path in data.parent.iterdir()) == ["check.json", "data", "new"]
 
 
+@pytest.mark.slow
 def test_exit_statuses(data, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["check", str(data), "--strict"]) == 0

@@ -209,6 +209,7 @@ def test_a_package_that_is_not_installed_is_a_reason(no_weights, monkeypatch, pa
         lpips_distance("alex", no_weights, download=False)
 
 
+@pytest.mark.slow
 def test_torchvision_imports_beside_this_torch_without_a_warning():
     """In a new process, where nothing has declared an operator or imported torchvision before."""
     code = (

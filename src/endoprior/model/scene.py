@@ -23,6 +23,7 @@ from ..system.arrays_file import ArraySpec, load_arrays, part, refusing, save_ar
 from .basis import basis_offsets
 from .deformation import HexPlaneField, Offsets
 from .gaussians import Gaussians
+from .ops import ModelOps, ops_for
 from .schema import model_schema
 
 FORMAT = "endoprior-scene-1"
@@ -39,21 +40,20 @@ LARGEST_DEVIATION = 5e-3
 def offsets_at(
     gaussians: Gaussians,
     field: HexPlaneField | None,
-    time: float | Tensor,
+    time: float,
     cfg: Config,
+    ops: ModelOps,
     chosen: Tensor | None = None,
 ) -> Offsets:
     """Deformation of the Gaussians (of the `chosen` (P,) ones only, if given) at `time` in [0, 1].
-
-    Off the CPU the time may be a () float64 tensor.
 
     Unless some are chosen, the gradient of temporal coefficients goes to `gaussians.motion_gradients`.
     """
     rows = slice(None) if chosen is None else chosen
     if field is not None:
-        return field.offsets(gaussians["means"][rows], time)
+        return field.offsets(gaussians["means"][rows], time, ops)
     sink = gaussians.motion_gradients if chosen is None else None
-    return basis_offsets(gaussians["motion"][rows], time, cfg.deformation, sink)
+    return basis_offsets(gaussians["motion"][rows], time, cfg.deformation, ops, sink)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Scene:
         """
         if not 0 <= time <= 1:
             raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
-        return self._splats(offsets_at(self.gaussians, self.field, time, self.config))
+        return self._splats(offsets_at(self.gaussians, self.field, time, self.config, ops_for(self.device)))
 
     @torch.no_grad()
     def canonical(self) -> Splats:
@@ -136,16 +136,16 @@ class Scene:
         return "cuda" if on_gpu else "cpu"
 
     def to(
-        self, device: torch.device | str, *, backend: render.Backend | None = None, half_planes: bool = False
+        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
     ) -> Scene:
         """This scene on a device: what it is asked is computed and drawn there; itself if it is there.
 
         Args:
             backend: what draws it there; None: what it was trained with, or gsplat on a GPU.
-            half_planes: HexPlane in half precision: half the memory and less to read, for pictures; not to be saved.
+            fp16_planes: HexPlane in half precision, half the memory and faster: for rendering, cannot be saved.
         """
         gaussians = self.gaussians.to(device)
-        field = self.field and self.field.to(device, half_planes=half_planes)
+        field = self.field and self.field.to(device, fp16_planes=fp16_planes)
         if gaussians is self.gaussians and field is self.field and backend in (None, self.drawn_by):
             return self
         return replace(
@@ -165,10 +165,10 @@ class Scene:
         """Write the scene as one safetensors file, whole or not at all.
 
         Raises:
-            ValueError: its planes were halved for drawing.
+            ValueError: its planes are in half precision.
         """
         if self.field is not None and self.field.grid.values.dtype != torch.float32:
-            raise ValueError("save the scene itself, not a copy with planes of half precision")
+            raise ValueError("save the scene itself, not a copy with fp16 planes")
         intrinsics, poses = _camera_arrays(self.cameras)
         arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
         arrays |= {"prior_score": self.prior_score, "num_valid": self.num_valid}

@@ -1,8 +1,8 @@
-"""The supervised terms of Eq. (12) in one pass: values and gradients together, for the training loop on a CPU.
+"""The supervised terms of Eq. (12) in Numba: values and gradients in one pass over the image. CPU, float32.
 
-`losses.py` defines the terms; this must agree with it. A dozen small torch operations and their backward each walk the
-whole image, which costs as much as drawing it; here each row of pixels is read once. Sums are taken per row, then over
-rows in order, so they repeat bit for bit whatever the number of threads.
+Computes what `losses_torch.py` computes. A dozen small torch operations and their backward passes each read the whole
+image, which costs as much as rendering it; here each row of pixels is read once. Sums run over rows, then over the rows
+in order, so they are bit-identical whatever the number of threads.
 """
 
 from __future__ import annotations
@@ -14,9 +14,6 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-
-from ..compute.compiled import compiled
-from . import losses
 
 FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
 
@@ -30,18 +27,7 @@ def supervised_losses(
     measured: Tensor,
     weights: tuple[float, float, float],
 ) -> Tensor:
-    """Weighted color, depth and total-variation terms; the gradient flows to `color` and `depth`.
-
-    Args:
-        color: (H, W, 3) float32. depth: (H, W) float32 mm, 0 where nothing is drawn.
-        target_u8: (H, W, 3) uint8. target_inverse: (H, W) 1 / mm.
-        tissue_mask, measured: (H, W) bool, True where color, respectively depth, is compared.
-        weights: factors of the three terms; the depth term is 0 where its factor is.
-    Returns:
-        (3,) the weighted terms.
-    """
-    if not compiled(color):
-        return losses.supervised(color, depth, target_u8, target_inverse, tissue_mask, measured, weights)
+    """See `losses_torch.supervised_losses`. The terms must be summed, not scaled: their gradients are added already."""
     return _SupervisedLosses.apply(color, depth, target_u8, target_inverse, tissue_mask, measured, weights)
 
 

@@ -1,73 +1,46 @@
-"""HexPlane features in torch: what the kernels of `hexplane_kernels.py` compute, and what runs on any other device.
+"""HexPlane features in PyTorch, on any device; `hexplane_numba.py` computes the same.
 
-The time planes are cut at each moment first; a feature is then a product of three bilinear and three linear look-ups.
-Each look-up is a weighted sum of a few rows of one matrix, whose gradient is added to the rows of `PlaneGrid.grads`:
-autograd would make a gradient of all planes, hundreds of megabytes, for each of the twenty-four.
+The time planes are interpolated at each time first; a feature is then a product of three bilinear and three linear
+look-ups. Each look-up is a weighted sum of a few rows of one matrix, whose gradient is added to the rows of
+`PlaneGrid.grads`: autograd would allocate a gradient of all planes, hundreds of megabytes, for each of the twenty-four.
 
-Letters: `N` positions, `S` scales, `C` channels, `R` rows of the cut time planes, `M` sums of `k` rows each.
+Letters: `N` positions, `S` scales, `C` channels, `R` rows of the interpolated time planes.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import embedding_bag
+from torch.nn.functional import embedding_bag, linear
 
-from .hexplane_kernels import FRESH, TOUCHED
-
-if TYPE_CHECKING:
-    from .hexplane import PlaneGrid
+from ..core.checks import check_shape
+from .hexplane import FRESH, TOUCHED, PlaneGrid
 
 
-class Layout(NamedTuple):
-    """Where the planes lie in `PlaneGrid.values`, as tensors on its device: made once, so that no call copies them."""
-
-    resolution: Tensor
-    """(S, 3) float32 cells along x, y, z."""
-    space_start: Tensor
-    """(S, 3) first row of the planes xy, xz, yz, and"""
-    space_width: Tensor
-    """(S, 3) how many rows further the next cell along the second letter is."""
-    table_start: Tensor
-    """(S, 3) first row of the cut planes xt, yt, zt."""
-    first_moment: Tensor
-    """(R,) row of `values` that holds each cell of the cut planes at the first moment, and"""
-    next_moment: Tensor
-    """(R,) how many rows further the next moment is."""
-
-
-def layout_of(grid: PlaneGrid) -> Layout:
-    """The layout of a grid on the device of its values."""
-    size = torch.from_numpy(grid.resolution)
-    first, step = [], []
-    for starts, cells in zip(grid.time_start.tolist(), grid.resolution.tolist(), strict=True):
-        for start, count in zip(starts, cells, strict=True):
-            first.append(start + torch.arange(count))
-            step.append(torch.full((count,), count))
-    tables = (
-        size.float(),
-        torch.from_numpy(grid.space_start),
-        torch.stack([size[:, 0], size[:, 0], size[:, 1]], 1),
-        torch.from_numpy(grid.table_start),
-        torch.cat(first),
-        torch.cat(step),
-    )
-    return Layout(*(table.to(grid.values.device) for table in tables))
-
-
-def features(grid: PlaneGrid, unit: Tensor, times: tuple[float | Tensor, ...]) -> tuple[Tensor, ...]:
-    """`PlaneGrid.sample` at several moments: what does not depend on time is looked up once.
+def hexplane_linear(
+    grid: PlaneGrid, unit: Tensor, times: tuple[float, ...], weight: Tensor, bias: Tensor
+) -> tuple[Tensor, ...]:
+    """A linear layer on the features at one or more times.
 
     Args:
-        unit: (N, 3) float32. times: in [0, 1], numbers or () float64 tensors on the same device.
+        unit: (N, 3) float32 positions, 0..1 from the first to the second corner of the box; clamped outside.
+        times: M of them in [0, 1]. weight: (W, S * C). bias: (W,).
     Returns:
-        (N, S * C) float32 per moment; backward also adds to `grid.grads` and marks every cell.
+        (N, W) float32 per time. With gradients enabled, backward also adds to `grid.grads`.
+    Raises:
+        ValueError: a wrong shape.
     """
+    check_shape(f"unit:N,3 weight:W,{grid.num_features} bias:W", unit=unit, weight=weight, bias=bias)
+    return tuple(linear(found, weight, bias) for found in features(grid, unit, times))
+
+
+def features(grid: PlaneGrid, unit: Tensor, times: tuple[float, ...]) -> tuple[Tensor, ...]:
+    """Features (N, S * C) float32 per time; arguments as `hexplane_linear`. The space planes are read once for all."""
     layout = grid.layout
-    tables = [_cut(grid, time) for time in times]
+    tables = [_at_time(grid, time) for time in times]
     parts: list[list[Tensor]] = [[] for _ in times]
     for scale in range(grid.num_scales):
         position = unit.clamp(0, 1) * (layout.resolution[scale] - 1)
@@ -82,24 +55,14 @@ def features(grid: PlaneGrid, unit: Tensor, times: tuple[float | Tensor, ...]) -
     return tuple(torch.cat(part, -1) for part in parts)
 
 
-def _cut(grid: PlaneGrid, time: float | Tensor) -> Tensor:
-    """(R, C) the time planes at a moment."""
+def _at_time(grid: PlaneGrid, time: float) -> Tensor:
+    """(R, C) the time planes, interpolated at `time`."""
     layout = grid.layout
-    if not isinstance(time, Tensor):
-        time = torch.full((), time, dtype=torch.float64, device=layout.first_moment.device)
-    row, share = _time_row(grid, time)
-    here = layout.first_moment + row * layout.next_moment
-    rows = torch.stack([here, here + layout.next_moment], -1)
-    weights = torch.stack([1 - share, share]).expand(len(rows), 2).contiguous()
+    row, fraction = grid.time_row(time)
+    below = layout.time_first + row * layout.time_step
+    rows = torch.stack([below, below + layout.time_step], -1)
+    weights = rows.new_tensor([1 - fraction, fraction], dtype=torch.float32).expand(len(rows), 2).contiguous()
     return _sums(weights.requires_grad_(torch.is_grad_enabled()), rows, grid.values, grid)
-
-
-def _time_row(grid: PlaneGrid, time: Tensor) -> tuple[Tensor, Tensor]:
-    """`PlaneGrid.time_row` of a () float64 tensor: () int64 and () float32."""
-    last = grid.time_resolution - 1
-    position = ((time if grid.time_map == "full" else (time + 1) / 2) * last).clamp(0, last)
-    row = position.floor().clamp(max=last - 1)
-    return row.to(torch.int64), (position - row).float()
 
 
 def _bilinear(grid: PlaneGrid, scale: int, low: Tensor, share: Tensor) -> Tensor:

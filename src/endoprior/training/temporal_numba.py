@@ -1,10 +1,10 @@
-"""The temporal term in few passes: pair weights, and Eq. (11) with its gradient, for the training loop on a CPU.
+"""The temporal term, Eqs. (10) and (11), in Numba: few passes, value and gradient together. CPU.
 
-`temporal.py` defines the term; this must agree with it. Shared letters: `P` points, `K` neighbors, `T` tasks.
+Computes what `temporal_torch.py` computes. Shared letters: `P` points, `K` neighbors.
 
-A pair (i, j) pulls on both of its points. Each point therefore walks its own neighbors and then those it is a neighbor
-of, in order of their index, so no task writes another's row. Sums are taken per run of points, then over runs in order:
-they repeat bit for bit whatever the number of threads.
+A pair (i, j) pulls on both of its points. Each point therefore visits its own neighbors and then those whose neighbor
+it is, in order of their index, so no task writes another's row. Sums are taken per run of points, then over runs in
+order: they are bit-identical whatever the number of threads.
 """
 
 from __future__ import annotations
@@ -18,18 +18,73 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-SQRT_EPS = 1e-8
-"""Under the root of the displacement norm, mm**2: a finite gradient at zero."""
-SUM_EPS = 1e-8
-"""Least pair weight, and least sum of them; a larger one would silence the term: typical weights are near 0.002."""
+from ..compute.neighbors import MAX_COORDINATE, nearest
+from ..core.checks import check_shape
+from ..core.config import TemporalConfig
+from .temporal_torch import SQRT_EPS, SUM_EPS
 
 FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
 _POINTS_PER_TASK = 256
 _SAMPLE_ROWS, _SAMPLE_MARGIN = 512, 0.08
 
 
+def local_consistency(now: Tensor, before: Tensor, weights: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
+    """See `temporal_torch.local_consistency`."""
+    indices, distances = neighbors(before.detach().numpy(), cfg.num_neighbors)
+    return local_motion(now, before, indices, affinity(distances, indices, weights.numpy()), cfg)
+
+
+def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
+    """The `k` nearest other points of each point; of equally near ones those with the smallest indices.
+
+    Args:
+        points: (P, 3) mm, finite, 0 < k < P.
+    Returns:
+        (P, k) indices, nearest first, and (P, k) distances, mm.
+    Raises:
+        ValueError: too few points, or a coordinate that is not finite or too large to be squared.
+    """
+    check_shape("points:P,3", points=points)
+    if not 0 < k < len(points):
+        raise ValueError(f"k must be in [1, {len(points) - 1}], the number of other points; got {k}")
+    if not float(np.abs(points).max()) <= MAX_COORDINATE:
+        raise ValueError(f"points must be finite, of magnitude up to {MAX_COORDINATE:g} mm")
+    return nearest(np.ascontiguousarray(points), k)
+
+
+def affinity(distances: NDArray[np.float64], indices: NDArray[np.intp], weights: NDArray) -> NDArray[np.float64]:
+    """(P, K) pair weights: see `temporal_torch.affinity`."""
+    sigma = max(median(distances), 1e-8)
+    out = np.empty(distances.shape)
+    _weigh_pairs(distances, indices, weights, 1 / (2 * sigma**2), out)
+    return out
+
+
+def local_motion(
+    now: Tensor, before: Tensor, indices: NDArray[np.intp], pair_weights: NDArray, cfg: TemporalConfig
+) -> tuple[Tensor, Tensor]:
+    """See `temporal_torch.local_motion`; the gradient flows to `now` and `before`.
+
+    Raises:
+        ValueError: shapes or types disagree, or an index is out of range.
+    """
+    check_shape(
+        "now:P,3 before:P,3 indices:P,K pair_weights:P,K",
+        now=now,
+        before=before,
+        indices=indices,
+        pair_weights=pair_weights,
+    )
+    if now.dtype != before.dtype:
+        raise ValueError(f"before must have the type of now, {now.dtype}; got {before.dtype}")
+    if not 0 <= indices.min() <= indices.max() < len(now):
+        raise ValueError(f"indices must be in [0, {len(now) - 1}]; got {indices.min()} to {indices.max()}")
+    factor = 1 / cfg.huber_delta if cfg.huber_scale == "released" else 1.0
+    return _LocalMotion.apply(now, before, indices, pair_weights, cfg.huber_delta, factor)
+
+
 def median(values: NDArray[np.float64]) -> float:
-    """`np.median` of all (P, K) values, with the same bits: most are ruled out by the median of some rows."""
+    """`np.median` of all (P, K) values, bit-identical: a sample of the rows rules most of them out first."""
     num = values.size
     sample = np.sort(values[:: max(len(values) // _SAMPLE_ROWS, 1)], axis=None)
     low, high = (sample[int((0.5 + sign * _SAMPLE_MARGIN) * (len(sample) - 1))] for sign in (-1, 1))
@@ -40,27 +95,6 @@ def median(values: NDArray[np.float64]) -> float:
         return float(np.median(values))
     middle = np.partition(inside, (first, last))
     return float((middle[first] + middle[last]) / 2)
-
-
-def weigh_pairs(
-    distances: NDArray[np.float64], indices: NDArray[np.intp], weights: NDArray, sigma: float
-) -> NDArray[np.float64]:
-    """(P, K) weights of Eq. (10), floored at `SUM_EPS`, for trusted (P, K) distances, (P, K) indices, (P,) weights."""
-    out = np.empty(distances.shape)
-    _weigh_pairs(distances, indices, weights, 1 / (2 * sigma**2), out)
-    return out
-
-
-def local_motion(
-    now: Tensor, before: Tensor, indices: NDArray[np.intp], weights: NDArray, delta: float, factor: float
-) -> tuple[Tensor, Tensor]:
-    """The two weighted means of Eq. (11), displacement and distance; the gradient flows to `now` and `before`.
-
-    Args:
-        now, before: (P, 3) mm, of one floating type. indices: (P, K) trusted. weights: (P, K) pair weights.
-        delta: of Huber's penalty, mm. factor: of the whole penalty.
-    """
-    return _LocalMotion.apply(now, before, indices, weights, delta, factor)
 
 
 class _LocalMotion(torch.autograd.Function):
@@ -122,7 +156,7 @@ def _list_incoming(indices, weights, starts, sources, incoming):
 
 @njit(cache=True, forceinline=True, fastmath=FLAGS)
 def _pair(now, before, i, j, w, constants):
-    # Of pair (i, j), times w: displacement and penalty of Eq. (11), then what they owe to point i: the displacement to
+    # Of pair (i, j), times w: displacement and penalty of Eq. (11), then its gradients for point i: the displacement to
     # now_i (to before_i the opposite), the penalty to now_i, and the penalty to before_i.
     half, delta, factor, eps = constants[0], constants[1], constants[2], constants[3]
     ax, ay, az = now[i, 0] - now[j, 0], now[i, 1] - now[j, 1], now[i, 2] - now[j, 2]
