@@ -16,7 +16,7 @@ from ..model.gaussians import Gaussians
 from ..model.hexplane import plane_shapes
 from ..model.hexplane_kernels import TOUCHED
 from ..model.schema import model_schema
-from ..system.arrays_file import ArraySpec, load_arrays, part, refusing, save_arrays
+from ..system.arrays_file import ArraySpec, load_arrays, part, rejecting, save_arrays
 from ..training.density import DensityStats
 from ..training.optimizer import Optimizer
 from ..training.state import Stage, TrainState
@@ -66,7 +66,7 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
         return checkpoint_schema(cfg)
 
     arrays, about = load_arrays(path, FORMAT, schema, next_step)
-    with refusing(path, "a training state", next_step):
+    with rejecting(path, "a training state", next_step):
         stage, iteration = Stage(about["stage"]), about["iteration"]
         if type(iteration) is not int or not 0 <= iteration <= trainer.stage_length(stage):
             expected = f"0 to {trainer.stage_length(stage)}"

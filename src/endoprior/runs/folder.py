@@ -22,7 +22,7 @@ from ..core.checks import InputError
 from ..core.config_io import to_dict
 from ..data.files import read_json
 from ..data.reading import kind_of
-from ..system.atomic import refuse_occupied, remove_leftovers, whole_file, write_json, writing
+from ..system.atomic import reject_occupied, remove_leftovers, whole_file, write_json, writing
 from ..system.devices import name_of
 from ..training.divergence import Diverged
 from .checkpoint import load_checkpoint, save_checkpoint
@@ -65,7 +65,7 @@ def refuse_unusable_folder(out: Path, *, resume: bool) -> None:
     if there:
         remove_leftovers(out)
     if not (resume and there):
-        refuse_occupied(out, ", or add --resume to continue a run", spare=LOCK)
+        reject_occupied(out, ", or add --resume to continue a run", spare=LOCK)
 
 
 def prepare_run_folder(out: Path, *, resume: bool) -> bool:

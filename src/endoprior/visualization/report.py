@@ -16,8 +16,8 @@ from ..data import FrameSequence
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
 from ..system.atomic import whole_file
-from .frames import depth_span
-from .pictures import colorize, to_u8
+from .image_tools import colorize, to_u8
+from .rendered_views import depth_span
 
 SHOWN_SCORES = {
     "psnr_tissue": "PSNR on tissue, dB",
