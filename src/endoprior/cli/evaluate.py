@@ -42,14 +42,14 @@ def run(argv: list[str]) -> None:
     """Score and print."""
     args = parse(Eval, argv, "eval")
     from ..model.scene import load_scene
-    from .places import demand_folder_place
+    from .output_paths import require_writable_folder
 
     if args.weights_dir and not args.weights_dir.is_dir():
         raise InputError(
             f"{args.weights_dir}: expected a folder of network weights; got none. Fix: correct --weights-dir."
         )
     scene = load_scene(args.run)
-    demand_folder_place(
+    require_writable_folder(
         "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
     )
     data = args.data or sequence_of_run(args.run)

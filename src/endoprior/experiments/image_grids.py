@@ -19,7 +19,7 @@ from ..core.types import Frame
 from ..data import FrameSequence, load_sequence
 from ..model.scene import Scene, load_scene
 from ..priors import joint_texture_prior, specular_likelihood
-from ..show.pictures import colorize, label, tile, to_u8, write_png
+from ..visualization.image_tools import colorize, label, tile, to_u8, write_png
 from .matrix import Matrix
 from .spec import Cell
 

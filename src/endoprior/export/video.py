@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.scene import Scene
-from ..show.pictures import to_u8
-from ..show.video import write_video
+from ..visualization.image_tools import to_u8
+from ..visualization.video import write_video
 from .formats import Format, Progress
 from .options import ExportOptions
 from .time_steps import frame_indices

@@ -19,7 +19,7 @@ from ..core.config import Checked, Config, Range
 from ..core.config_io import from_dict, to_dict
 from ..core.geometry import FARTHEST_MM
 from ..core.types import Camera, RenderOutput, Splats
-from ..system.arrays_file import ArraySpec, load_arrays, part, refusing, save_arrays
+from ..system.arrays_file import ArraySpec, load_arrays, part, rejecting, save_arrays
 from .basis import basis_offsets
 from .deformation import HexPlaneField, Offsets
 from .gaussians import Gaussians
@@ -194,7 +194,7 @@ def load_scene(path: str | Path) -> Scene:
         raise InputError(f"{file}: expected a trained scene; found none. Train one with `endoprior train DATA {path}`.")
     next_step = "Train the scene again."
     arrays, about = load_arrays(file, FORMAT, scene_schema, next_step)
-    with refusing(file, "a scene", next_step):
+    with rejecting(file, "a scene", next_step):
         facts = from_dict(SceneFacts, {name: value for name, value in about.items() if name != "format"}, "about")
         check_values(arrays)
         return _from_arrays(arrays, facts)

@@ -10,7 +10,7 @@ from filelock import FileLock, Timeout
 
 from ..core.checks import InputError
 from ..data.reading import kind_of
-from ..system.atomic import refuse_occupied, remove_leftovers
+from ..system.atomic import reject_occupied, remove_leftovers
 
 LOCK = ".lock"
 """File that a process holds while it trains in a folder."""
@@ -26,7 +26,7 @@ def refuse_unusable_folder(out: Path, *, resume: bool) -> None:
     if exists:
         remove_leftovers(out)
     if not (resume and exists):
-        refuse_occupied(out, ", or add --resume to continue a run", spare=LOCK)
+        reject_occupied(out, ", or add --resume to continue a run", spare=LOCK)
 
 
 def prepare_run_folder(out: Path, *, resume: bool) -> bool:

@@ -16,9 +16,9 @@ from ..data import FrameSequence
 from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
-from ..show.frames import depth_span
-from ..show.pictures import colorize, to_u8
 from ..system.atomic import whole_file
+from ..visualization.image_tools import colorize, to_u8
+from ..visualization.rendered_views import depth_span
 
 SHOWN_SCORES = (
     "psnr_tissue",
