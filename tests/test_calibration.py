@@ -94,32 +94,32 @@ def test_every_spelling_gives_the_same_numbers(tmp_path, form):
 def test_one_eye(tmp_path):
     found = read_calibration(opencv_yaml(tmp_path / "c.yaml", camera_matrix=K1, distortion_coefficients=D1))
     assert found.right is None and np.allclose(found.left.distortion, D1) and found.size is None
-    with pytest.raises(InputError, match=r"expected both eyes, R and T; got one eye.*--layout mono"):
+    with pytest.raises(InputError, match=r"expected both cameras, R and T, got one camera.*--layout mono"):
         check_pair(found, "c.yaml")
 
 
 def test_other_pictures_of_the_same_proportions_scale_it(tmp_path):
     found = read_calibration(FORMS["json"](tmp_path)).for_size(1280, 1024, "c")
     assert found.left.matrix[0, 0] == 1160 and found.left.matrix[0, 2] == pytest.approx(2 * 318.7)
-    with pytest.raises(InputError, match="expected pictures of 640x512 px, or the same proportions; got 720x480"):
+    with pytest.raises(InputError, match="expected images of 640x512 px, or the same aspect ratio, got 720x480"):
         read_calibration(FORMS["json"](tmp_path)).for_size(720, 480, "c")
 
 
 def test_a_unit_can_be_given(tmp_path):
     path = as_json(tmp_path / "c.json", K1=K1, K2=K2, R=R, T=T / 10)
     assert np.allclose(read_calibration(path, "cm").translation_mm, T)
-    with pytest.raises(InputError, match=r"baseline of 1 to 30 mm; got 0\.42.*--calibration-unit"):
+    with pytest.raises(InputError, match=r"baseline of 1 to 30 mm, got 0\.42.*--calibration-unit"):
         check_pair(read_calibration(path), "c.json")
 
 
 BROKEN = {
     "no suffix": ("c", "x", "a .yaml, .json, .npz or .ini file"),
     "not json": ("c.json", "{", "a readable calibration"),
-    "a list": ("c.json", "[1]", "named quantities"),
+    "a list": ("c.json", "[1]", "named values"),
     "pickle in npz": ("c.npz", "x", "a readable calibration"),
     "python in yaml": ("c.yaml", "K_left: !!python/object/apply:os.system ['true']", "a readable calibration"),
     "no matrix": ("c.json", '{"R": 1}', "the left camera matrix"),
-    "no R": ("c.json", json.dumps({"K1": K1.tolist(), "K2": K2.tolist()}), "how the eyes stand to each other"),
+    "no R": ("c.json", json.dumps({"K1": K1.tolist(), "K2": K2.tolist()}), "the relative pose of the cameras"),
     "short T": (
         "c.json",
         json.dumps({"K1": K1.tolist(), "K2": K2.tolist(), "R": R.tolist(), "T": [1]}),

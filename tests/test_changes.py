@@ -17,14 +17,14 @@ def texture(seed: int) -> np.ndarray:
 
 
 def clip(noise: float = 1.5, step: float = 1.0) -> list[np.ndarray]:
-    """COUNT noisy pictures of tissue that slides by `step` px each."""
+    """COUNT noisy images of tissue that slides by `step` px each."""
     rng, wide = np.random.default_rng(1), texture(0)
-    pictures = []
+    images = []
     for i in range(COUNT):
         shift = np.array([[1, 0, -step * i], [0, 1, 0]], np.float32)
         moved = cv2.warpAffine(wide, shift, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
-        pictures.append(np.clip(moved + rng.normal(0, noise, moved.shape), 0, 255).astype(np.uint8))
-    return pictures
+        images.append(np.clip(moved + rng.normal(0, noise, moved.shape), 0, 255).astype(np.uint8))
+    return images
 
 
 def odd(changes) -> dict[str, tuple[int, ...]]:
@@ -41,18 +41,18 @@ def test_nothing_is_found_in_a_clean_clip(options):
 
 
 def test_copies_are_found():
-    pictures = clip()
-    pictures[7] = pictures[6]
-    pictures[15] = pictures[14]
-    assert odd(find_changes(pictures)) == {"duplicates": (7, 15)}
+    images = clip()
+    images[7] = images[6]
+    images[15] = images[14]
+    assert odd(find_changes(images)) == {"duplicates": (7, 15)}
     assert find_changes([p for p in clip() for _ in range(2)]).duplicates == tuple(range(1, 2 * COUNT, 2))
 
 
 def test_copies_survive_video_coding_but_a_scene_at_rest_is_no_copy():
-    pictures = clip(noise=0.5)
+    images = clip(noise=0.5)
     residue = np.random.default_rng(2).random((HEIGHT, WIDTH, 1)) < 0.06  # what is left after coding, one level
-    pictures[9] = pictures[8] + residue.astype(np.uint8)
-    assert find_changes(pictures).duplicates == (9,)
+    images[9] = images[8] + residue.astype(np.uint8)
+    assert find_changes(images).duplicates == (9,)
     moving_then_resting = np.array([2.0] * 12 + [0.15] * 12)
     assert find_duplicates(moving_then_resting) == ()
     assert find_duplicates(np.array([2.0, 2.0, 0.1, 2.0, 2.0])) == (3,)
@@ -61,31 +61,31 @@ def test_copies_survive_video_coding_but_a_scene_at_rest_is_no_copy():
 
 @pytest.mark.parametrize("gain", [0.75, 1.3])
 def test_an_exposure_jump_is_found_where_it_happens(gain):
-    pictures = [np.clip(p * (gain if i >= 10 else 1.0), 0, 255).astype(np.uint8) for i, p in enumerate(clip())]
-    assert odd(find_changes(pictures)) == {"exposure_jumps": (10,)}
+    images = [np.clip(p * (gain if i >= 10 else 1.0), 0, 255).astype(np.uint8) for i, p in enumerate(clip())]
+    assert odd(find_changes(images)) == {"exposure_jumps": (10,)}
 
 
 def test_a_slow_drift_and_a_dark_tool_are_no_exposure_jumps():
     drifting = [(p * (1 - 0.015 * i)).astype(np.uint8) for i, p in enumerate(clip())]
     assert odd(find_changes(drifting)) == {}
     with_tool = clip()
-    for picture in with_tool[10:]:
-        picture[:, :90] = 40
+    for image in with_tool[10:]:
+        image[:, :90] = 40
     assert find_changes(with_tool).exposure_jumps == ()
 
 
 def test_a_cut_is_a_cut_and_not_an_exposure_jump():
     other = (0.5 * texture(5)[:HEIGHT, :WIDTH]).astype(np.uint8)
-    pictures = clip()[:12] + [np.roll(other, i, 1) for i in range(12)]
-    found = find_changes(pictures)
+    images = clip()[:12] + [np.roll(other, i, 1) for i in range(12)]
+    found = find_changes(images)
     assert found.cuts == (12,) and found.exposure_jumps == ()
 
 
 def test_blur_and_other_colors_are_found():
-    pictures = clip()
-    pictures[6] = cv2.GaussianBlur(pictures[6], (0, 0), 4)
-    pictures[18] = np.ascontiguousarray(pictures[18][..., [1, 0, 2]])
-    found = find_changes(pictures)
+    images = clip()
+    images[6] = cv2.GaussianBlur(images[6], (0, 0), 4)
+    images[18] = np.ascontiguousarray(images[18][..., [1, 0, 2]])
+    found = find_changes(images)
     assert found.blurred == (6,) and found.off_color == (18,)
 
 
@@ -96,5 +96,5 @@ def test_one_picture_has_no_changes():
 
 @pytest.mark.slow
 def test_nothing_is_found_in_the_real_clip(real_clip):
-    pictures = [cv2.imread(str(file))[..., ::-1] for file in sorted((real_clip / "images").iterdir())]
-    assert odd(find_changes(pictures)) == {}
+    images = [cv2.imread(str(file))[..., ::-1] for file in sorted((real_clip / "images").iterdir())]
+    assert odd(find_changes(images)) == {}

@@ -23,7 +23,7 @@ FRAMES, WIDTH, HEIGHT = 16, 256, 192
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
-    """A phantom of both eyes, left as it is."""
+    """A phantom of both cameras, left as it is."""
     folder = tmp_path_factory.mktemp("check") / "phantom"
     write_phantom(folder, PhantomConfig(frames=FRAMES, width=WIDTH, height=HEIGHT, stereo=True))
     shutil.rmtree(folder / "truth")
@@ -44,7 +44,7 @@ def stereo(whole: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def data(whole: Path, tmp_path: Path) -> Path:
-    """A copy of the phantom's left eye to break."""
+    """A copy of the phantom's left camera to break."""
     return Path(shutil.copytree(whole, tmp_path / "data", ignore=shutil.ignore_patterns("right")))
 
 
@@ -70,7 +70,7 @@ def only(folder: Path, code: str) -> Finding:
 
 def test_a_whole_sequence_gives_no_findings(facts):
     assert find(facts) == []
-    assert len(facts.cloud) > 10_000 and facts.eyes.order.as_given > 0.8
+    assert len(facts.cloud) > 10_000 and facts.stereo.order.as_given > 0.8
 
 
 @pytest.mark.slow
@@ -122,10 +122,10 @@ def test_depth_of_8_bits(data):
 
 
 def test_console_strip(data):
-    def paint(picture: np.ndarray, position: int) -> np.ndarray:
-        picture[-20:] = 45
-        cv2.putText(picture, "OR 2", (150, HEIGHT - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (220, 220, 220), 1)
-        return picture
+    def paint(image: np.ndarray, position: int) -> np.ndarray:
+        image[-20:] = 45
+        cv2.putText(image, "OR 2", (150, HEIGHT - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (220, 220, 220), 1)
+        return image
 
     edit(data / "images", paint)
     finding = only(data, "console-strip")
@@ -138,20 +138,20 @@ def test_console_strip(data):
 def test_round_border(data):
     inside = np.zeros((HEIGHT, WIDTH, 1), np.uint8)
     cv2.circle(inside, (WIDTH // 2, HEIGHT // 2), 120, 1, -1)
-    edit(data / "images", lambda picture, _: picture * inside)
+    edit(data / "images", lambda image, _: image * inside)
     assert (
-        only(data, "round-border").what == "the picture is round (radius 120 px) and what is outside counts as tissue"
+        only(data, "round-border").what == "the image is round (radius 120 px) and its outside counts as tissue"
     )
 
 
 def test_burned_in_writing(data):
-    def paint(picture: np.ndarray, position: int) -> np.ndarray:
-        picture[5:27, 150:240] = 0
-        cv2.putText(picture, "SMITH J", (154, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 2)
-        return picture
+    def paint(image: np.ndarray, position: int) -> np.ndarray:
+        image[5:27, 150:240] = 0
+        cv2.putText(image, "SMITH J", (154, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 2)
+        return image
 
     edit(data / "images", paint)
-    assert only(data, "burned-in-text").what.startswith("burned-in writing counts as tissue: ")
+    assert only(data, "burned-in-text").what.startswith("burned-in text counts as tissue: ")
 
 
 def test_swapped_eyes(stereo):
@@ -164,8 +164,8 @@ def test_swapped_eyes(stereo):
 
 
 def test_eyes_on_unequal_heights(stereo):
-    edit(stereo / "right", lambda picture, _: np.roll(picture, 4, 0))
-    assert only(stereo, "vertical-offset").what == "the rows of the two eyes are 4.0 px apart"
+    edit(stereo / "right", lambda image, _: np.roll(image, 4, 0))
+    assert only(stereo, "vertical-offset").what == "the rows of left and right images are 4.0 px apart"
 
 
 def test_duplicated_frames(data):
@@ -189,15 +189,15 @@ def test_exposure_jump(data):
     edit(data / "images", lambda p, i: np.clip(p * (1.4 if i >= 11 else 1.0), 0, 255).astype(np.uint8))
     finding = only(data, "exposure-jump")
     assert str(finding) == (
-        "warning: exposure-jump: the brightness of the whole picture jumps at frame 11; "
+        "warning: exposure-jump: the brightness of the whole image jumps at frame 11; "
         f"fix: endoprior train {data} RUN --data.first-frames 11"
     )
 
 
 def test_moving_camera_with_resting_poses(data):
-    def pan(picture: np.ndarray, position: int) -> np.ndarray:
+    def pan(image: np.ndarray, position: int) -> np.ndarray:
         shift = np.array([[1.15, 0, -16 - 3 * position], [0, 1.15, -14]], np.float32)
-        return cv2.warpAffine(picture, shift, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
+        return cv2.warpAffine(image, shift, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
 
     edit(data / "images", pan)
     finding = findings(data)["camera-moves"]
@@ -249,14 +249,14 @@ def test_blurred_frames_and_few_frames(data):
 
 def test_intrinsics_of_another_size(facts):
     (finding,) = find(replace(facts, camera=replace(facts.camera, fx=2880.0, fy=2880.0)))
-    assert finding.code == "intrinsics" and finding.what.startswith("fx 2880, fy 2880, cx 128, cy 96 px see 5 degrees")
+    assert finding.code == "intrinsics" and finding.what.startswith("fx 2880, fy 2880, cx 128, cy 96 px give 5 degrees")
     assert finding.fix == f'set "fx", "fy", "cx", "cy" in {facts.path}/sequence.json, px'
 
 
 def test_what_only_facts_say(facts):
     relative = find(replace(facts, depth=replace(facts.depth, relative=True)))
     assert [(f.code, f.severity) for f in relative] == [("relative-depth", "note")]
-    assert [f.code for f in find(replace(facts, remarks=("odd",), cloud=None))] == ["no-points", "reader"]
+    assert [f.code for f in find(replace(facts, notes=("odd",), cloud=None))] == ["no-points", "reader"]
     much = find(replace(facts, masks=replace(facts.masks, tool_fraction=np.full(FRAMES, 0.7))))
     assert [f.what for f in much] == ["70% of all pixels are tool"]
     cut = find(replace(facts, changes=replace(facts.changes, cuts=(3,))))
@@ -282,12 +282,13 @@ def test_command_prints_draws_and_writes(data, capsys):
 def test_exit_statuses(data, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["check", str(data), "--strict"]) == 0
-    assert capsys.readouterr().out.splitlines()[-2:] == ["nothing suspicious", "check.png"]
+    assert capsys.readouterr().out.splitlines()[-2:] == ["no problems found", "check.png"]
     assert (tmp_path / "check.png").exists()
     assert main(["check", str(data), "--data.depth-unit-mm", "0.00001", "--strict"]) == 2
     assert "error: depth-metres" in capsys.readouterr().out
     assert main(["check", str(data), "--out", str(tmp_path / "check.txt")]) == 2
-    assert capsys.readouterr().err == f"endoprior: --out: expected a .png file; got {tmp_path}/check.txt. Rename it.\n"
+    fix = f"Fix: `--out {tmp_path}/check.png`."
+    assert capsys.readouterr().err == f"endoprior: --out: expected a .png file, got {tmp_path}/check.txt. {fix}\n"
     (data / "images" / "000003.png").write_bytes(b"nothing")
     assert main(["check", str(data)]) == 2
     said = capsys.readouterr()

@@ -60,16 +60,16 @@ def test_a_folder_is_loaded_and_looks_at_a_picture_of_any_size(folder, monkeypat
     monkeypatch.setattr(depth_network, "SHORT_SIDE_PX", 56)
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
     network = DepthNetwork(folder)
-    picture = np.random.default_rng(0).integers(0, 256, (45, 71, 3), np.uint8)
-    inverse = network.inverse_depth(picture)
+    image = np.random.default_rng(0).integers(0, 256, (45, 71, 3), np.uint8)
+    inverse = network.inverse_depth(image)
     assert inverse.shape == (45, 71) and inverse.dtype == np.float32
     assert np.isfinite(inverse).all() and inverse.min() >= 0 and inverse.std() > 0
-    assert (network.inverse_depth(picture) == inverse).all()
-    assert not np.array_equal(network.inverse_depth(picture[..., ::-1].copy()), inverse)
+    assert (network.inverse_depth(image) == inverse).all()
+    assert not np.array_equal(network.inverse_depth(image[..., ::-1].copy()), inverse)
     with pytest.raises(ValueError, match="rgb_u8"):
-        network.inverse_depth(picture[..., 0])
+        network.inverse_depth(image[..., 0])
     with pytest.raises(ValueError, match="8-bit"):
-        network.inverse_depth(picture / 255)
+        network.inverse_depth(image / 255)
 
 
 @needs_transformers
@@ -131,7 +131,7 @@ def test_a_hub_name_is_looked_for_in_the_cache_first(folder, monkeypatch):
 
 def test_without_the_package_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(depth_network, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install endoprior\[mono\]"):
+    with pytest.raises(InputError, match=r'pip install "endoprior\[mono\]"'):
         DepthNetwork()
 
 

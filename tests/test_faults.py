@@ -18,10 +18,10 @@ from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.runs.interrupt import deferred_interrupt
 from endoprior.runs.training_run import train
-from endoprior.show.video import _num_frames, write_video
 from endoprior.system import atomic
 from endoprior.system.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder
 from endoprior.training.trainer import Trainer
+from endoprior.visualization.video import _num_frames, write_video
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
 
@@ -227,7 +227,7 @@ def test_a_film_that_was_cut_short_is_noticed(tmp_path):
 
 
 def test_an_encoder_that_dies_leaves_no_film(tmp_path, monkeypatch):
-    monkeypatch.setattr("endoprior.show.video._num_frames", lambda path: 3)
+    monkeypatch.setattr("endoprior.visualization.video._num_frames", lambda path: 3)
     with pytest.raises(CannotWrite, match="an encoder that stopped"):
         write_video(tmp_path / "film.mp4", [np.zeros((32, 32, 3), np.uint8)] * 7, 10.0)
     assert list(tmp_path.iterdir()) == []

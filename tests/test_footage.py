@@ -1,4 +1,4 @@
-"""What surrounds a picture, and whether the camera moves: closed forms, and no false alarms on the phantom."""
+"""What surrounds an image, and whether the camera moves: closed forms, and no false alarms on the phantom."""
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ from endoprior.footage.camera_motion import camera_motion
 
 
 def tissue(count=6, height=120, width=160, seed=0):
-    """Pictures of a smooth, reddish texture that slides a little."""
+    """Images of a smooth, reddish texture that slides a little."""
     rng = np.random.default_rng(seed)
     large = cv2.GaussianBlur(rng.random((height + 60, width + 60, 3), np.float32), (0, 0), 3)
     large = (large - large.min()) / np.ptp(large) * [200, 110, 100] + [40, 25, 25]
@@ -24,21 +24,21 @@ def test_no_border_is_found_on_plain_tissue():
 @pytest.mark.parametrize("side", ["top", "bottom", "left", "right"])
 @pytest.mark.parametrize("level", [0, 70])
 def test_strips_are_measured_to_the_pixel(side, level):
-    pictures = tissue()
-    for picture in pictures:
+    images = tissue()
+    for image in images:
         where = {"top": np.s_[:12], "bottom": np.s_[-12:], "left": np.s_[:, :12], "right": np.s_[:, -12:]}[side]
-        picture[where] = level
-    assert find_strips(pictures) == Strips(**{name: 12 * (name == side) for name in ("top", "bottom", "left", "right")})
+        image[where] = level
+    assert find_strips(images) == Strips(**{name: 12 * (name == side) for name in ("top", "bottom", "left", "right")})
 
 
 def test_a_strip_with_still_text_counts_and_a_still_red_one_does_not():
-    pictures = tissue()
-    for picture in pictures:
-        picture[-12:], picture[-9:-4, 20:60] = 60, 220
-    assert find_strips(pictures).bottom == 12
-    for picture in pictures:
-        picture[-12:] = (150, 40, 40)  # a still piece of tissue is still tissue
-    assert not find_strips(pictures)
+    images = tissue()
+    for image in images:
+        image[-12:], image[-9:-4, 20:60] = 60, 220
+    assert find_strips(images).bottom == 12
+    for image in images:
+        image[-12:] = (150, 40, 40)  # a still piece of tissue is still tissue
+    assert not find_strips(images)
 
 
 @pytest.mark.parametrize("circle", [(80, 60, 55), (80, 66, 75), (70, 50, 80), (84, 63, 58.5)])
@@ -46,21 +46,21 @@ def test_a_round_border_is_measured(circle):
     inside = Circle(*circle).mask(160, 120)
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 12, (120, 160, 3), np.uint8)
-    found = find_circle([np.where(inside[..., None], picture, noise) for picture in tissue()])
+    found = find_circle([np.where(inside[..., None], image, noise) for image in tissue()])
     assert np.allclose((found.center_x, found.center_y, found.radius), circle, atol=0.6)
 
 
 def test_dark_corners_are_no_round_border():
     y, x = np.mgrid[:120, :160]
     fall = np.clip(1.25 - np.hypot(x - 80, y - 60) / 100, 0.02, 1)[..., None]  # light falls off smoothly
-    assert find_circle([(picture * fall).astype(np.uint8) for picture in tissue()]) is None
+    assert find_circle([(image * fall).astype(np.uint8) for image in tissue()]) is None
 
 
-def moved(picture, shift=0.0, degrees=0.0, zoom=1.0):
-    height, width = picture.shape[:2]
+def moved(image, shift=0.0, degrees=0.0, zoom=1.0):
+    height, width = image.shape[:2]
     matrix = cv2.getRotationMatrix2D((width / 2, height / 2), degrees, zoom)
     matrix[0, 2] += shift
-    return cv2.warpAffine(picture, matrix, (width, height), borderMode=cv2.BORDER_REFLECT)
+    return cv2.warpAffine(image, matrix, (width, height), borderMode=cv2.BORDER_REFLECT)
 
 
 def test_shift_is_measured_in_pixels_of_the_pictures():
@@ -91,11 +91,11 @@ def test_what_nothing_explains_is_nan():
 
 def test_masked_tools_do_not_count():
     base = tissue(1, 240, 320)[0]
-    pictures = [base.copy() for _ in range(8)]
+    images = [base.copy() for _ in range(8)]
     patch = tissue(1, 200, 200, seed=5)[0]
-    for i, picture in enumerate(pictures):
-        picture[20:220, 5 * i : 5 * i + 200] = patch
-    tissue_masks = [np.ones((240, 320), bool) for _ in pictures]
+    for i, image in enumerate(images):
+        image[20:220, 5 * i : 5 * i + 200] = patch
+    tissue_masks = [np.ones((240, 320), bool) for _ in images]
     for mask in tissue_masks:
         mask[:, :240] = False
-    assert camera_motion(pictures).moving and not camera_motion(pictures, tissue_masks).moving
+    assert camera_motion(images).moving and not camera_motion(images, tissue_masks).moving

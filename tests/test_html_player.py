@@ -145,19 +145,21 @@ def test_the_page_refers_to_nothing_outside(player):
 
 
 def test_what_cannot_be_written_is_refused_in_one_line(scene, tmp_path):
-    with pytest.raises(InputError, match=r"scene\.html: expected at most 0\.0 MB; got 0\.\d MB for 6 moments of 2997"):
+    with pytest.raises(
+        InputError, match=r"scene\.html: expected at most 0\.0 MB; got 0\.\d MB for 6 time steps of 2997"
+    ):
         write_html(scene, tmp_path / "scene.html", max_bytes=1000)
     with pytest.raises(InputError, match=r"expected a file to write; got a folder"):
         write_html(scene, tmp_path)
     for times in ([], [0.5, 0.5], [0.5, 0.2]):
-        with pytest.raises(InputError, match="increasing moments"):
+        with pytest.raises(InputError, match="increasing times"):
             write_html(scene, tmp_path / "scene.html", times=times)
     with pytest.raises(ValueError, match=r"time must be in \[0, 1\]"):
         write_html(scene, tmp_path / "scene.html", times=[1.5])
     hidden = random_scene(20, 2)
     with torch.no_grad():
         hidden.gaussians["opacity_logits"].fill_(-20)
-    with pytest.raises(InputError, match="found none that can be drawn"):
+    with pytest.raises(InputError, match="got none that is visible"):
         write_html(hidden, tmp_path / "scene.html")
     assert not list(tmp_path.iterdir())
 

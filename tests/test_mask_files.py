@@ -103,7 +103,7 @@ def unusable(folder):
         "cannot be decoded": folder / "broken.png",
         "a NumPy file": folder / "broken.npy",
         "pickled objects": folder / "objects.npy",
-        "one array; got 2": folder / "two.npz",
+        "one array, got 2": folder / "two.npz",
         "many colors": save(folder / "photo.png", photo),
         "No such file": folder / "absent.png",
         "numbers of shape": save(folder / "flat.npy", np.zeros(5)),
@@ -120,11 +120,11 @@ def test_complaints_name_the_file_on_one_line(tmp_path):
 
 
 def test_polarity_as_told_detected_or_by_convention():
-    picture = np.where(TRUE[..., None], (120, 120, 120), (190, 90, 85)).astype(np.uint8)
-    assert tool_polarity("low", [TRUE], [picture]).tool_is_high is False
-    assert "as told" in tool_polarity("high", [~TRUE], [picture]).reason
-    assert tool_polarity("auto", [TRUE], [picture]).tool_is_high
-    found = tool_polarity("auto", [~TRUE], [picture])
+    image = np.where(TRUE[..., None], (120, 120, 120), (190, 90, 85)).astype(np.uint8)
+    assert tool_polarity("low", [TRUE], [image]).tool_is_high is False
+    assert "--mask-tool-value" in tool_polarity("high", [~TRUE], [image]).reason
+    assert tool_polarity("auto", [TRUE], [image]).tool_is_high
+    found = tool_polarity("auto", [~TRUE], [image])
     assert not found.tool_is_high and found.reason.startswith("low values mark tools")
-    unclear = tool_polarity("auto", [np.ones_like(TRUE)], [picture])
+    unclear = tool_polarity("auto", [np.ones_like(TRUE)], [image])
     assert unclear.tool_is_high and "convention" in unclear.reason

@@ -1,4 +1,4 @@
-"""Burned-in writing: found where it stands still before a moving picture, and nowhere else."""
+"""Burned-in writing: found where it stands still before a moving image, and nowhere else."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from endoprior.data.images import read_color
-from endoprior.footage.text import find_static_overlays
+from endoprior.footage.overlays import find_static_overlays
 
 HEIGHT, WIDTH, COUNT = 160, 240, 10
 
 
 def moving(seed=0):
-    """Pictures of high-contrast blobs that slide by several px from one to the next."""
+    """Images of high-contrast blobs that slide by several px from one to the next."""
     rng = np.random.default_rng(seed)
     blobs = cv2.GaussianBlur(rng.normal(0, 1, (HEIGHT + 200, WIDTH + 200)), (0, 0), 3)
     levels = np.clip(120 + 50 * blobs / blobs.std(), 0, 255)
@@ -81,12 +81,12 @@ def test_borders_and_round_borders_are_no_writing():
 def test_too_few_pictures_say_nothing():
     marked = written(moving())
     assert find_static_overlays(marked[:4]) == [] and find_static_overlays([]) == []
-    with pytest.raises(ValueError, match="picture must have shape"):
+    with pytest.raises(ValueError, match="image must have shape"):
         find_static_overlays([*marked[:5], marked[5][:-1]])
 
 
 def test_real_clip(real_clip):
-    pictures = [read_color(real_clip / "images" / f"{i:06d}.png") for i in range(0, 90, 6)]
-    (found,) = find_static_overlays(pictures)  # the word "Left" in a label of 110x42 px at the corner
+    images = [read_color(real_clip / "images" / f"{i:06d}.png") for i in range(0, 90, 6)]
+    (found,) = find_static_overlays(images)  # the word "Left" in a label of 110x42 px at the corner
     x, y, width, height = found
     assert x < 20 and y < 10 and 50 < width < 120 and 25 < height < 60

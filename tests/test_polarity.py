@@ -12,19 +12,19 @@ HEIGHT, WIDTH = 60, 80
 
 
 def scene(tool_color=(120, 120, 125), tissue_color=(190, 90, 85), columns=20, seed=0):
-    """A tool of some columns that enters from below in front of tissue, noisy: (mask, picture)."""
+    """A tool of some columns that enters from below in front of tissue, noisy: (mask, image)."""
     tool = np.zeros((HEIGHT, WIDTH), bool)
     tool[20:, 30 : 30 + columns] = True
-    picture = np.where(tool[..., None], tool_color, tissue_color) + np.random.default_rng(seed).normal(
+    image = np.where(tool[..., None], tool_color, tissue_color) + np.random.default_rng(seed).normal(
         0, 6, (60, 80, 3)
     )
-    return tool, np.clip(picture, 0, 255).astype(np.uint8)
+    return tool, np.clip(image, 0, 255).astype(np.uint8)
 
 
 @pytest.mark.parametrize("inverted", [False, True])
 def test_gray_side_is_the_tool(inverted):
-    tool, picture = scene()
-    found = mask_polarity([tool ^ inverted] * 3, [picture] * 3)
+    tool, image = scene()
+    found = mask_polarity([tool ^ inverted] * 3, [image] * 3)
     assert found.tool_is_high != inverted
     assert found.certainty > 0.95
     assert "\n" not in found.reason and f"{1 - tool.mean() if inverted else tool.mean():.0%}"[0] in found.reason
@@ -34,48 +34,48 @@ def test_gray_side_is_the_tool(inverted):
 def test_color_outweighs_area(inverted):
     tool = np.zeros((HEIGHT, WIDTH), bool)
     tool[:, : int(0.65 * WIDTH)] = True  # a tool close to the lens
-    picture = np.where(tool[..., None], (110, 110, 112), (190, 90, 85)).astype(np.uint8)
-    found = mask_polarity([tool ^ inverted], [picture])
+    image = np.where(tool[..., None], (110, 110, 112), (190, 90, 85)).astype(np.uint8)
+    found = mask_polarity([tool ^ inverted], [image])
     assert found.tool_is_high != inverted and found.certainty > 0.8
 
 
 @pytest.mark.parametrize("inverted", [False, True])
 def test_area_decides_where_color_says_nothing(inverted):
-    tool, picture = scene(tool_color=(150, 100, 100), tissue_color=(150, 100, 100))
-    found = mask_polarity([tool ^ inverted], [picture])
+    tool, image = scene(tool_color=(150, 100, 100), tissue_color=(150, 100, 100))
+    found = mask_polarity([tool ^ inverted], [image])
     assert found.tool_is_high != inverted
     assert 0.3 < found.certainty < 0.95
 
 
 def test_unsure_where_nothing_speaks():
-    _, picture = scene(columns=0)
+    _, image = scene(columns=0)
     left = np.zeros((HEIGHT, WIDTH), bool)
     left[:, : WIDTH // 2] = True
     random = np.random.default_rng(1).random((HEIGHT, WIDTH)) > 0.5
     for high in (left, ~left, random):
-        assert mask_polarity([high], [picture]).certainty < 0.3
+        assert mask_polarity([high], [image]).certainty < 0.3
     for high in (np.zeros_like(left), np.ones_like(left)):
-        found = mask_polarity([high], [picture])
+        found = mask_polarity([high], [image])
         assert found.certainty == 0 and "nothing" in found.reason
         assert found.tool_is_high != high.all()  # no tools rather than nothing but tools
 
 
 def test_what_lies_outside_a_round_border_does_not_count():
-    tool, picture = scene()
+    tool, image = scene()
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     outside = (x - 40) ** 2 + (y - 30) ** 2 > 22**2  # two thirds of all pixels, black and so as gray as the tool
-    picture[outside] = 0
+    image[outside] = 0
     for high in (tool, tool | outside):
-        found = mask_polarity([high], [picture])
+        found = mask_polarity([high], [image])
         assert found.tool_is_high and found.certainty > 0.9
 
 
 def test_errors():
-    tool, picture = scene()
+    tool, image = scene()
     with pytest.raises(ValueError, match="at least one mask"):
         mask_polarity([], [])
-    with pytest.raises(ValueError, match="picture must have shape"):
-        mask_polarity([tool], [picture[:-1]])
+    with pytest.raises(ValueError, match="image must have shape"):
+        mask_polarity([tool], [image[:-1]])
 
 
 @pytest.mark.parametrize("inverted", [False, True])

@@ -1,4 +1,4 @@
-"""From video files to sequence folders: a stereo phantom in every layout, one eye, bad input, interruption."""
+"""From video files to sequence folders: a stereo phantom in every layout, one camera, bad input, interruption."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ def phantom(tmp_path_factory):
     return folder
 
 
-def eyes(phantom):
+def cameras(phantom):
     def read(name):
         return [cv2.imread(str(file))[..., ::-1] for file in sorted((phantom / name).glob("*.png"))]
 
@@ -66,7 +66,7 @@ SLOW = pytest.mark.slow
     "layout", ["side-by-side", *(pytest.param(name, marks=SLOW) for name in ("top-bottom", "interlaced"))]
 )
 def test_a_stereo_video_becomes_a_sequence(tmp_path, phantom, layout):
-    frames = [LAYOUTS[layout](*pair) for pair in zip(*eyes(phantom), strict=True)]
+    frames = [LAYOUTS[layout](*pair) for pair in zip(*cameras(phantom), strict=True)]
     video = write_video(tmp_path / "v.mp4", frames, rate=15)
     done = prepare(video, tmp_path / "out", options(phantom, keep_right=True))
     sequence = load_sequence(done.out)
@@ -94,19 +94,19 @@ def test_two_folders_of_pictures_and_a_part_of_them(tmp_path, phantom):
 
 
 def test_a_distorted_pair_is_rectified(tmp_path, phantom):
-    """Both eyes seen through lenses with distortion, the right one turned: depth is the same as before."""
+    """Both cameras seen through lenses with distortion, the right one turned: depth is the same as before."""
     focal, center = 0.9 * WIDTH, (120.0 - 0.5, HEIGHT / 2 - 0.5)
     matrix = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]])
     bent, turn = np.array([-0.12, 0.03, 0, 0, 0]), cv2.Rodrigues(np.array([0.0, 0.01, 0.02]))[0]
     shift = turn @ np.array([-4.2, 0, 0])
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
 
-    def through(picture, rotation):  # where each pixel of the lens's picture lies in the pinhole's
+    def through(image, rotation):  # where each pixel of the lens's image lies in the pinhole's
         straight = cv2.undistortPoints(np.stack([x, y], -1).reshape(-1, 1, 2), matrix, bent, R=rotation.T, P=matrix)
         at = straight.reshape(HEIGHT, WIDTH, 2).astype(np.float32)
-        return cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_CUBIC)
+        return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC)
 
-    pairs = zip(*eyes(phantom), strict=True)
+    pairs = zip(*cameras(phantom), strict=True)
     frames = [np.hstack([through(left, np.eye(3)), through(right, turn)]) for left, right in pairs]
     storage = cv2.FileStorage(str(tmp_path / "c.yaml"), cv2.FILE_STORAGE_WRITE)
     for name, value in {"M1": matrix, "D1": bent, "M2": matrix, "D2": bent, "R": turn, "T": shift}.items():
@@ -136,13 +136,13 @@ def test_a_distorted_pair_is_rectified(tmp_path, phantom):
 
 
 def test_one_eye_and_nothing_else(tmp_path, phantom):
-    done = prepare(write_video(tmp_path / "v.mp4", eyes(phantom)[0]), tmp_path / "out")
+    done = prepare(write_video(tmp_path / "v.mp4", cameras(phantom)[0]), tmp_path / "out")
     sequence = load_sequence(done.out)
     assert sequence.depth_is_relative and sequence.frame(0).depth_valid.mean() > 0.9
     tissue = [frame.depth[frame.tissue_mask] for frame in sequence.frames("video")]
     assert np.median(np.concatenate(tissue)) == pytest.approx(70, rel=0.1)
-    text = " ".join(done.remarks)
-    assert "no calibration" in text and "relative (shading)" in text and "stands still" in text
+    text = " ".join(done.notes)
+    assert "no calibration" in text and "relative (shading)" in text and "static" in text
     assert sequence.validate() is not None
 
 
@@ -179,7 +179,7 @@ def test_depth_in_another_unit_than_declared(tmp_path, phantom):
         cv2.imwrite(str(tmp_path / f"depth/{index}.png"), frame.depth.astype(np.uint8))
         (tmp_path / f"depth/{index}.npy").unlink()
     done = prepare(phantom / "images", tmp_path / "out", before)
-    assert any("8-bit files are too coarse" in remark for remark in done.remarks)
+    assert any("8-bit files are too coarse" in remark for remark in done.notes)
 
 
 def test_relative_disparity_of_a_network(tmp_path, phantom):
@@ -213,14 +213,14 @@ def test_inverted_masks_are_turned(tmp_path, phantom):
         cv2.imwrite(str(tmp_path / "masks" / file.name), 255 - cv2.imread(str(file), 0))
     cfg = options(phantom, masks=str(tmp_path / "masks"), layout="mono")
     done = prepare(phantom / "images", tmp_path / "out", cfg)
-    assert any("low values mark tools" in remark for remark in done.remarks)
+    assert any("low values mark tools" in remark for remark in done.notes)
     for mine, true in zip(load_sequence(done.out).frames("video"), load_sequence(phantom).frames("video"), strict=True):
         assert np.array_equal(mine.tissue_mask, true.tissue_mask)
 
 
 def test_names_are_painted_over_and_nothing_of_the_file_is_copied(tmp_path, phantom):
     cfg = options(phantom, layout="mono", blank=("10,20,50,15",))
-    done = prepare(write_video(tmp_path / "SMITH_John.mkv", eyes(phantom)[0]), tmp_path / "out", cfg)
+    done = prepare(write_video(tmp_path / "SMITH_John.mkv", cameras(phantom)[0]), tmp_path / "out", cfg)
     frame = load_sequence(done.out).frame(1)
     assert not frame.rgb_u8[20:35, 10:60].any() and not frame.tissue_mask[20:35, 10:60].any()
     for file in done.out.rglob("*"):
@@ -229,12 +229,12 @@ def test_names_are_painted_over_and_nothing_of_the_file_is_copied(tmp_path, phan
 
 @pytest.mark.slow
 def test_frames_out_of_the_body_can_be_dropped(tmp_path, phantom):
-    pictures = eyes(phantom)[0]
-    pictures.insert(2, np.full_like(pictures[0], (90, 140, 160)))
-    video = write_video(tmp_path / "v.mkv", pictures)
+    images = cameras(phantom)[0]
+    images.insert(2, np.full_like(images[0], (90, 140, 160)))
+    video = write_video(tmp_path / "v.mkv", images)
     kept = prepare(video, tmp_path / "kept", PrepareConfig(layout="mono"))
     assert json.loads((kept.out / "sequence.json").read_text())["unexplained_frames"] == [2]
-    assert any("not explained" in remark and "frames 2;" in remark for remark in kept.remarks)
+    assert any("not explained" in remark and "frames 2;" in remark for remark in kept.notes)
     dropped = prepare(video, tmp_path / "dropped", PrepareConfig(layout="mono", drop_out_of_body=True))
     assert dropped.num_frames == FRAMES
 
@@ -259,7 +259,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, phantom):
 
 
 def cut_short(folder, phantom):
-    video = write_video(folder / "v.mp4", [np.hstack(pair) for pair in zip(*eyes(phantom), strict=True)] * 8)
+    video = write_video(folder / "v.mp4", [np.hstack(pair) for pair in zip(*cameras(phantom), strict=True)] * 8)
     video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
     return video
 
@@ -282,18 +282,18 @@ BAD = {
     "zero-length video": lambda d, p: ((d / "v.mp4").touch(), d / "v.mp4", {}, "an empty file")[1:],
     "truncated video": lambda d, p: (cut_short(d, p), {"layout": "side-by-side"}, "--end"),
     "no such video": lambda d, p: (d / "no.mp4", {}, "no such file"),
-    "swapped eyes": lambda d, p: (p / "right", {"right": p / "images"}, "--swap-eyes"),
+    "swapped cameras": lambda d, p: (p / "right", {"right": p / "images"}, "--swap-eyes"),
     "missing calibration key": lambda d, p: (
         p / "images",
         {"right": p / "right", "calibration": without(d, p, "R")},
         "no R",
     ),
-    "second eye missing": lambda d, p: (p / "images", {"layout": "two-files"}, "--right"),
-    "sgbm with one eye": lambda d, p: (p / "images", {"layout": "mono", "depth": "sgbm"}, "expected two eyes"),
+    "second camera missing": lambda d, p: (p / "images", {"layout": "two-files"}, "--right"),
+    "sgbm with one camera": lambda d, p: (p / "images", {"layout": "mono", "depth": "sgbm"}, "expected two cameras"),
     "mask of another size": lambda d, p: (
         p / "images",
         {"layout": "mono", "masks": str(smaller_masks(d, p))},
-        "px like the pictures",
+        "px like the images",
     ),
     "no mask folder": lambda d, p: (p / "images", {"layout": "mono", "masks": "nowhere"}, "a folder of masks"),
     "no depth folder": lambda d, p: (p / "images", {"layout": "mono", "depth": "nowhere"}, "a folder of depth"),
@@ -306,7 +306,7 @@ BAD = {
     ),
     "no poses": lambda d, p: (p / "images", {"layout": "mono", "poses": "nowhere.npy"}, "camera poses"),
     "crop outside": lambda d, p: (p / "images", {"layout": "mono", "crop": "0,0,999,9"}, "--crop"),
-    "calibration of another camera": lambda d, p: (p / "images", {"layout": "side-by-side"}, "the same proportions"),
+    "calibration of another camera": lambda d, p: (p / "images", {"layout": "side-by-side"}, "the same aspect ratio"),
 }
 
 
@@ -321,7 +321,7 @@ def test_bad_input_gives_one_line_and_leaves_nothing(tmp_path, phantom, kind):
 
 
 def test_the_command(tmp_path, phantom, capsys):
-    frames = [np.vstack(pair) for pair in zip(*eyes(phantom), strict=True)]
+    frames = [np.vstack(pair) for pair in zip(*cameras(phantom), strict=True)]
     video = write_video(tmp_path / "v.mp4", frames, rate=15)
     calibration = str(phantom / "calibration.json")
     assert main(["prepare", str(video), str(tmp_path / "out"), "--calibration", calibration]) == 0
@@ -349,11 +349,11 @@ def test_a_moving_camera_with_one_eye(tmp_path):
     rng = np.random.default_rng(0)
     noise = cv2.GaussianBlur(rng.random((500, 700, 3), np.float32), (0, 0), 2)
     wall = (60 + 150 * (noise - noise.min()) / np.ptp(noise) * np.array([1, 0.5, 0.45])).astype(np.uint8)
-    pictures = [np.ascontiguousarray(wall[100 + 2 * i : 292 + 2 * i, 50 + 6 * i : 306 + 6 * i]) for i in range(16)]
-    done = prepare(write_video(tmp_path / "v.mkv", pictures), tmp_path / "out", PrepareConfig(masks="none"))
+    images = [np.ascontiguousarray(wall[100 + 2 * i : 292 + 2 * i, 50 + 6 * i : 306 + 6 * i]) for i in range(16)]
+    done = prepare(write_video(tmp_path / "v.mkv", images), tmp_path / "out", PrepareConfig(masks="none"))
     sequence = load_sequence(done.out)
     centers = np.array([sequence.camera(i).center for i in range(16)])
-    assert any("the camera moves" in remark for remark in done.remarks)
+    assert any("the camera moves" in remark for remark in done.notes)
     # 6 px a frame at a working distance of 70 mm.
     step = 70 / sequence.camera(0).fx * np.array([6, 2])
     assert np.allclose(np.diff(centers[:, :2], axis=0).mean(0), step, rtol=0.25)

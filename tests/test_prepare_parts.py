@@ -1,4 +1,4 @@
-"""The steps of `prepare`, each alone: eyes apart, geometry, matching files, the camera's path, interrupted folders."""
+"""The steps of `prepare`, one by one: stereo layout, geometry, file matching, camera poses, work folder."""
 
 import cv2
 import numpy as np
@@ -6,13 +6,13 @@ import pytest
 
 from endoprior.core.checks import InputError
 from endoprior.footage.border import Circle, Strips
-from endoprior.prepare.calibration import Calibration, Eye
+from endoprior.prepare.calibration import Calibration, Intrinsics
 from endoprior.prepare.config import PrepareConfig, parse_rectangle
 from endoprior.prepare.frame_files import match_files
-from endoprior.prepare.frames import REACH, Developed, with_neighbors
-from endoprior.prepare.layout import find_layout, split_eyes
-from endoprior.prepare.poses import Seen, estimate_poses, read_poses
-from endoprior.prepare.view import make_view
+from endoprior.prepare.frame_geometry import make_geometry
+from endoprior.prepare.frames import REACH, MeasuredFrame, with_neighbors
+from endoprior.prepare.poses import PoseInput, estimate_poses, read_poses
+from endoprior.prepare.stereo_layout import find_layout, split_cameras
 from endoprior.prepare.work_folder import frames_done, work_folder
 
 
@@ -30,20 +30,20 @@ def pair(shift=6):
 def test_eyes_come_apart_as_they_were_put_together():
     left, right = pair()
     for layout, frame in (("side-by-side", np.hstack([left, right])), ("top-bottom", np.vstack([left, right]))):
-        assert all(np.array_equal(a, b) for a, b in zip(split_eyes(frame, layout), (left, right), strict=True))
-    assert split_eyes(left, "mono")[1] is None
+        assert all(np.array_equal(a, b) for a, b in zip(split_cameras(frame, layout), (left, right), strict=True))
+    assert split_cameras(left, "mono")[1] is None
 
 
 def test_interlaced_rows_keep_their_heights():
     ramp = np.repeat(np.arange(0, 240, 4, dtype=np.uint8)[:, None, None], 8, 1).repeat(3, 2)
-    first, second = split_eyes(ramp, "interlaced")
+    first, second = split_cameras(ramp, "interlaced")
     # A ramp is linear, so rows in between are exact; only the last (first) row has one neighbor of its own.
     assert np.array_equal(first[:-1], ramp[:-1]) and np.array_equal(second[1:], ramp[1:])
 
 
 def stereo(size=None, layout=None):
-    eye = Eye(np.array([[90.0, 0, 48], [0, 90, 32], [0, 0, 1]]), np.zeros(5))
-    return Calibration(eye, eye, np.eye(3), np.array([-4.0, 0, 0]), size, layout)
+    camera = Intrinsics(np.array([[90.0, 0, 48], [0, 90, 32], [0, 0, 1]]), np.zeros(5))
+    return Calibration(camera, camera, np.eye(3), np.array([-4.0, 0, 0]), size, layout)
 
 
 def test_the_layout_is_found():
@@ -55,65 +55,65 @@ def test_the_layout_is_found():
         assert find_layout(frame, stereo(), False, "v") == layout  # by what it shows
     for layout in ("side-by-side", "top-bottom"):
         assert find_layout(np.zeros_like(frames[layout]), stereo((96, 64)), False, "v") == layout  # by its size
-    assert find_layout(left, stereo(layout="left eye top-bottom"), False, "v") == "top-bottom"  # by what is said
+    assert find_layout(left, stereo(layout="left camera top-bottom"), False, "v") == "top-bottom"  # by what is said
     assert find_layout(left, None, False, "v") == "mono" and find_layout(left, None, True, "v") == "two-files"
 
 
 def test_a_layout_that_cannot_be_told_is_asked_for():
     left, right = pair()
-    with pytest.raises(InputError, match=r"v: expected two eyes in each frame; got 96x64 px.*--layout"):
+    with pytest.raises(InputError, match=r"v: expected two cameras in each frame, got 96x64 px.*--layout"):
         find_layout(smooth(64, 96), stereo((50, 60)), False, "v")
     with pytest.raises(
-        InputError, match=r"expected a calibration for a stereo video; got none, and a side-by-side frame"
+        InputError, match=r"expected a calibration for a stereo video, got none, and a side-by-side frame"
     ):
         find_layout(np.hstack([left, right]), None, False, "v")
 
 
-def view_of(size, calibration=None, **options):
+def geometry_of(size, calibration=None, **options):
     base = {"stereo": False, "name": "c", "field_of_view_degrees": 90.0, "max_width": 0}
-    return make_view(size, calibration, **(base | options))
+    return make_geometry(size, calibration, **(base | options))
 
 
 def test_a_plain_view_changes_nothing():
-    view, picture = view_of((96, 64)), smooth(64, 96)
-    assert np.array_equal(view.picture(picture), picture) and view.inside.all()
-    assert np.allclose(view.matrix, [[48, 0, 48], [0, 48, 32], [0, 0, 1]])  # 90 degrees across 96 px
+    geometry, image = geometry_of((96, 64)), smooth(64, 96)
+    assert np.array_equal(geometry.image(image), image) and geometry.inside.all()
+    assert np.allclose(geometry.matrix, [[48, 0, 48], [0, 48, 32], [0, 0, 1]])  # 90 degrees across 96 px
 
 
 def test_odd_sizes_stay(tmp_path):
-    view = view_of((97, 63))
-    assert view.size == (97, 63) and np.array_equal(view.picture(smooth(63, 97)), smooth(63, 97))
+    geometry = geometry_of((97, 63))
+    assert geometry.size == (97, 63) and np.array_equal(geometry.image(smooth(63, 97)), smooth(63, 97))
 
 
 def test_cutting_and_shrinking_move_the_principal_point():
-    view = view_of((200, 100), crop=(20, 10, 120, 80), max_width=60)
-    assert view.size == (60, 40)
-    assert np.allclose(view.matrix, [[50, 0, (100 - 20) / 2], [0, 50, (50 - 10) / 2], [0, 0, 1]])
-    picture = smooth(100, 200)
-    want = cv2.resize(picture[10:90, 20:140], (60, 40), interpolation=cv2.INTER_AREA)
-    assert np.array_equal(view.picture(picture), want)
+    geometry = geometry_of((200, 100), crop=(20, 10, 120, 80), max_width=60)
+    assert geometry.size == (60, 40)
+    assert np.allclose(geometry.matrix, [[50, 0, (100 - 20) / 2], [0, 50, (50 - 10) / 2], [0, 0, 1]])
+    image = smooth(100, 200)
+    want = cv2.resize(image[10:90, 20:140], (60, 40), interpolation=cv2.INTER_AREA)
+    assert np.array_equal(geometry.image(image), want)
 
 
 def test_strips_circle_and_blank_rectangles_are_left_out():
     circle = Circle(50, 40, 35)
-    view = view_of((100, 80), strips=Strips(0, 10, 0, 0), circle=circle, blank=[(40, 30, 10, 5)])
+    geometry = geometry_of((100, 80), strips=Strips(0, 10, 0, 0), circle=circle, blank=[(40, 30, 10, 5)])
     kept = circle.mask(100, 80, 0.025 * 35)
     kept[70:] = False
     rows, columns = np.flatnonzero(kept.any(1)), np.flatnonzero(kept.any(0))
-    box = np.s_[rows[0] : rows[0] + view.size[1], columns[0] : columns[0] + view.size[0]]
+    box = np.s_[rows[0] : rows[0] + geometry.size[1], columns[0] : columns[0] + geometry.size[0]]
     painted = np.zeros((80, 100), bool)
     painted[30:35, 40:50] = True
-    assert np.array_equal(view.inside, (kept & ~painted)[box])
-    assert np.allclose(view.matrix[:2, 2], (50 - columns[0], 40 - rows[0]))
-    assert not view.picture(np.full((80, 100, 3), 9, np.uint8))[painted[box]].any()
+    assert np.array_equal(geometry.inside, (kept & ~painted)[box])
+    assert np.allclose(geometry.matrix[:2, 2], (50 - columns[0], 40 - rows[0]))
+    assert not geometry.image(np.full((80, 100, 3), 9, np.uint8))[painted[box]].any()
 
 
 def test_values_are_never_mixed_and_may_have_either_size():
-    view = view_of((200, 100), max_width=50)
+    geometry = geometry_of((200, 100), max_width=50)
     mask = np.random.default_rng(0).random((100, 200)) > 0.5
-    assert view.size == (50, 25) and view.values(mask).shape == (25, 50) and view.values(mask).dtype == bool
-    small = np.zeros(view.size[::-1], np.float32)
-    assert view.values(small) is small
+    assert geometry.size == (50, 25) and geometry.values(mask).shape == (25, 50) and geometry.values(mask).dtype == bool
+    small = np.zeros(geometry.size[::-1], np.float32)
+    assert geometry.values(small) is small
 
 
 def project(points, matrix, distortion, rotation, translation):
@@ -122,42 +122,42 @@ def project(points, matrix, distortion, rotation, translation):
 
 
 def test_rectified_eyes_see_a_point_in_one_row_at_the_disparity_of_its_depth():
-    left = Eye(np.array([[300.0, 0, 160.5], [0, 301, 120.5], [0, 0, 1]]), np.array([-0.2, 0.05, 0.001, 0, 0]))
-    right = Eye(np.array([[295.0, 0, 165.5], [0, 296, 118.5], [0, 0, 1]]), np.array([-0.15, 0.02, 0, 0.001, 0]))
+    left = Intrinsics(np.array([[300.0, 0, 160.5], [0, 301, 120.5], [0, 0, 1]]), np.array([-0.2, 0.05, 0.001, 0, 0]))
+    right = Intrinsics(np.array([[295.0, 0, 165.5], [0, 296, 118.5], [0, 0, 1]]), np.array([-0.15, 0.02, 0, 0.001, 0]))
     rotation = cv2.Rodrigues(np.array([0.01, -0.02, 0.015]))[0]
     translation = np.array([-4.5, 0.1, 0.05])
-    view = view_of((320, 240), Calibration(left, right, rotation, translation), stereo=True)
-    assert view.baseline_mm == pytest.approx(np.linalg.norm(translation))
+    geometry = geometry_of((320, 240), Calibration(left, right, rotation, translation), stereo=True)
+    assert geometry.baseline_mm == pytest.approx(np.linalg.norm(translation))
     rng = np.random.default_rng(0)
     points = np.stack([rng.uniform(-15, 15, 40), rng.uniform(-10, 10, 40), rng.uniform(50, 90, 40)], 1)
-    pictures = []
-    for eye, turn, shift in ((left, np.eye(3), np.zeros(3)), (right, rotation, translation)):
-        opencv = eye.matrix - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-        picture = np.zeros((240, 320, 3), np.uint8)
-        pictures.append((picture, project(points, opencv, eye.distortion, turn, shift)))
+    images = []
+    for camera, turn, shift in ((left, np.eye(3), np.zeros(3)), (right, rotation, translation)):
+        opencv = camera.matrix - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        image = np.zeros((240, 320, 3), np.uint8)
+        images.append((image, project(points, opencv, camera.distortion, turn, shift)))
     rectified = []
-    for (picture, pixels), is_right in zip(pictures, (False, True), strict=True):
+    for (image, pixels), is_right in zip(images, (False, True), strict=True):
         found = []
         for pixel in pixels:  # a blob per point, found again by its center of mass
-            spot = picture.copy()
+            spot = image.copy()
             y, x = np.mgrid[:240, :320]
             spot[...] = (250 * np.exp(-((x - pixel[0]) ** 2 + (y - pixel[1]) ** 2) / 8))[..., None]
-            seen = view.picture(spot, is_right)[..., 0].astype(float)
+            seen = geometry.image(spot, is_right)[..., 0].astype(float)
             yy, xx = np.mgrid[: seen.shape[0], : seen.shape[1]]
             found.append(((xx * seen).sum() / seen.sum() + 0.5, (yy * seen).sum() / seen.sum() + 0.5))
         rectified.append(np.array(found))
-    inside = [(v > 8).all(1) & (v[:, 0] < view.size[0] - 8) & (v[:, 1] < view.size[1] - 8) for v in rectified]
+    inside = [(v > 8).all(1) & (v[:, 0] < geometry.size[0] - 8) & (v[:, 1] < geometry.size[1] - 8) for v in rectified]
     both = inside[0] & inside[1]
     disparity = (rectified[0] - rectified[1])[both]
     assert both.sum() > 20 and np.abs(disparity[:, 1]).max() < 0.15
-    depth = view.matrix[0, 0] * view.baseline_mm / (disparity[:, 0] - view.center_shift_px)
+    depth = geometry.matrix[0, 0] * geometry.baseline_mm / (disparity[:, 0] - geometry.center_shift_px)
     assert np.abs(depth / points[both, 2] - 1).max() < 0.03  # the rectified camera is turned by half a degree
 
 
 def test_a_rectangle_must_lie_in_the_picture():
-    with pytest.raises(InputError, match="--crop: expected a rectangle within 100x80 px; got 50,50,60,10"):
-        view_of((100, 80), crop=(50, 50, 60, 10))
-    with pytest.raises(InputError, match="--blank: expected x,y,width,height in px; got '1,2,3'"):
+    with pytest.raises(InputError, match="--crop: expected a rectangle within 100x80 px, got 50,50,60,10"):
+        geometry_of((100, 80), crop=(50, 50, 60, 10))
+    with pytest.raises(InputError, match="--blank: expected x,y,width,height in px, got '1,2,3'"):
         parse_rectangle("1,2,3", "--blank")
 
 
@@ -208,7 +208,7 @@ def plane_frames(count=12):
         hit = pose[:3, 3] + rays * z[..., None]
         at = (hit[..., :2] * 4 + 450).astype(np.float32) - 0.5
         seen.append(
-            Seen(
+            PoseInput(
                 cv2.remap(texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR),
                 np.ones((120, 160), bool),
                 z.astype(np.float32),
@@ -233,14 +233,14 @@ def test_the_path_of_a_camera_is_found():
 
 def test_relative_depth_is_scaled_to_the_points_that_are_followed():
     seen, _, matrix = plane_frames()
-    wrong = [Seen(s.rgb_u8, s.tissue_mask, s.depth * np.float32(1 + 0.02 * i)) for i, s in enumerate(seen)]
+    wrong = [PoseInput(s.rgb_u8, s.tissue_mask, s.depth * np.float32(1 + 0.02 * i)) for i, s in enumerate(seen)]
     found = estimate_poses(wrong.__getitem__, len(wrong), matrix, relative_depth=True)
     assert np.allclose(found.depth_scale, 1 / (1 + 0.02 * np.arange(len(seen))), atol=0.01)
 
 
 def test_a_frame_of_something_else_is_not_explained():
     seen, _, matrix = plane_frames(6)
-    seen[3] = Seen(smooth(120, 160, seed=9), seen[3].tissue_mask, seen[3].depth)
+    seen[3] = PoseInput(smooth(120, 160, seed=9), seen[3].tissue_mask, seen[3].depth)
     found = estimate_poses(seen.__getitem__, 6, matrix, relative_depth=False)
     assert not found.explained[3] and found.explained[:3].all()
     assert np.array_equal(found.camera_to_world[3], found.camera_to_world[2])
@@ -250,7 +250,7 @@ def test_poses_of_the_user(tmp_path):
     _, poses, _ = plane_frames(3)
     np.save(tmp_path / "p.npy", poses)
     assert np.allclose(read_poses(tmp_path / "p.npy", 3).camera_to_world, poses)
-    with pytest.raises(InputError, match=r"expected shape \(4, 4, 4\), one pose per frame; got \(3, 4, 4\)"):
+    with pytest.raises(InputError, match=r"expected shape \(4, 4, 4\), one pose per frame, got \(3, 4, 4\)"):
         read_poses(tmp_path / "p.npy", 4)
     poses[1, 0, 0] = np.nan
     np.save(tmp_path / "p.npy", poses)
@@ -280,7 +280,7 @@ def test_a_work_folder_survives_what_is_not_its_users_fault(tmp_path):
 
 def test_two_processes_do_not_write_one_folder(tmp_path):
     with work_folder(tmp_path / "out", {}) as folder:
-        with pytest.raises(InputError, match="expected no other process"), work_folder(tmp_path / "out", {}):
+        with pytest.raises(InputError, match="no other process is writing"), work_folder(tmp_path / "out", {}):
             pass
         assert folder.exists()
 
@@ -303,7 +303,7 @@ def test_impossible_options_are_refused(options):
 
 @pytest.mark.parametrize("count", range(9))
 def test_frames_stand_in_the_middle_of_their_neighbors(count):
-    frames = [Developed(i, i, np.zeros((1, 1, 3), np.uint8), None, None) for i in range(count)]
+    frames = [MeasuredFrame(i, i, np.zeros((1, 1, 3), np.uint8), None, None) for i in range(count)]
     windows = [[frame.position for frame in window] for window in with_neighbors(frames)]
     reach = [min(REACH, i, count - 1 - i) for i in range(count)]
     assert windows == [list(range(i - r, i + r + 1)) for i, r in enumerate(reach)]

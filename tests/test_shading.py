@@ -6,7 +6,7 @@ import pytest
 
 from endoprior.core.checks import InputError
 from endoprior.prepare import shading
-from endoprior.prepare.aligned_depth import MAX_RATIO, NEAR_RATIO, fit_reference, relative_to_mm
+from endoprior.prepare.relative_depth import MAX_RATIO, NEAR_RATIO, fit_reference, relative_to_mm
 from endoprior.prepare.shading import RELIEF, fit_shading
 
 WIDTH, HEIGHT = 201, 151
@@ -16,7 +16,7 @@ EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
 
 
 def lit(depth: np.ndarray, exposure: float = 1.0, corners: float = 0.0) -> np.ndarray:
-    """(H, W, 3) picture of a surface of one color that faces the light, with darker corners."""
+    """(H, W, 3) image of a surface of one color that faces the light, with darker corners."""
     falloff = np.exp(-corners * (COLUMN**2 * WIDTH**2 + ROW**2 * HEIGHT**2) / (WIDTH**2 + HEIGHT**2))
     linear = 0.25 * exposure * falloff * (70 / depth) ** 2
     gray = np.clip(linear, 0, 1) ** (1 / 2.2) * 255
@@ -39,7 +39,7 @@ def test_exposure_moves_nothing():
     model = fit_shading([lit(BUMP, e) for e in (0.8, 1.0, 1.3)], [EVERYWHERE] * 3)
     usual = model.depth(lit(BUMP), EVERYWHERE)
     for exposure in (0.6, 1.6):
-        # Levels are whole numbers: the dark pictures have steps of 1 %, a quarter of an eighth of that in depth.
+        # Levels are whole numbers: the dark images have steps of 1 %, a quarter of an eighth of that in depth.
         np.testing.assert_allclose(model.depth(lit(BUMP, exposure), EVERYWHERE), usual, rtol=5e-3)
 
 
@@ -65,17 +65,17 @@ def test_brighter_corners_are_not_taken_for_a_lens():
 
 
 def test_tools_highlights_and_the_outside_are_filled_from_around():
-    picture = lit(BUMP)
-    model = fit_shading([picture], [EVERYWHERE])
-    clean = model.depth(picture, EVERYWHERE)
-    spoiled, usable = picture.copy(), EVERYWHERE.copy()
+    image = lit(BUMP)
+    model = fit_shading([image], [EVERYWHERE])
+    clean = model.depth(image, EVERYWHERE)
+    spoiled, usable = image.copy(), EVERYWHERE.copy()
     spoiled[20:60, 20:50] = 5  # a dark tool, masked
     usable[18:62, 18:52] = False
     spoiled[100:106, 120:126] = 255  # a highlight, not masked
     depth = model.depth(spoiled, usable)
     np.testing.assert_allclose(depth, clean, rtol=0.02)
     round_border = COLUMN**2 + ROW**2 < 0.7
-    assert np.isfinite(model.depth(np.where(round_border[..., None], picture, 0).astype(np.uint8), round_border)).all()
+    assert np.isfinite(model.depth(np.where(round_border[..., None], image, 0).astype(np.uint8), round_border)).all()
 
 
 def test_depth_is_finite_and_bounded_whatever_comes(monkeypatch):

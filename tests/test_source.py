@@ -1,4 +1,4 @@
-"""Pictures from files: every one, in order, at its moment; damaged files named in one line."""
+"""Images from files: every one, in order, at its moment; damaged files named in one line."""
 
 import cv2
 import numpy as np
@@ -6,8 +6,8 @@ import pytest
 from video_files import write_video
 
 from endoprior.core.checks import InputError
-from endoprior.prepare.selection import Selection
-from endoprior.prepare.source import Picture, open_source
+from endoprior.prepare.frame_selection import FrameSelection
+from endoprior.prepare.source import SourceFrame, open_source
 
 
 def pictures_of(count, height=24, width=32):
@@ -32,8 +32,8 @@ def test_odd_sizes_are_kept(tmp_path):
 
 
 def test_folder_in_numeric_order(tmp_path):
-    for number, picture in zip((1, 2, 10), pictures_of(3), strict=True):
-        cv2.imwrite(str(tmp_path / f"f{number}.png"), picture[..., ::-1])
+    for number, image in zip((1, 2, 10), pictures_of(3), strict=True):
+        cv2.imwrite(str(tmp_path / f"f{number}.png"), image[..., ::-1])
     source = open_source(tmp_path, 5.0)
     found = list(source)
     assert [p.seconds for p in found] == [0, 0.2, 0.4]
@@ -50,7 +50,7 @@ BROKEN = {
     "missing": (lambda d: d / "no.mp4", "no such file"),
     "empty": (lambda d: (d / "e.mp4").touch() or d / "e.mp4", "an empty file"),
     "text": (lambda d: (d / "t.mp4").write_text("not a video") and d / "t.mp4", "Invalid data"),
-    "no pictures": (lambda d: d, "none"),
+    "no images": (lambda d: d, "none"),
     "header only": (lambda d: cut(write_video(d / "h.mp4", pictures_of(20)), 0.05), ""),
 }
 
@@ -67,23 +67,23 @@ def test_broken_sources_are_refused_in_one_line(tmp_path, kind):
 def test_a_truncated_video_says_how_to_use_what_is_there(tmp_path):
     path = cut(write_video(tmp_path / "cut.mp4", pictures_of(40)), 0.6)
     seen = []
-    with pytest.raises(InputError, match=r"cut\.mp4: expected 40 pictures; got .*--end"):
-        for picture in open_source(path):
-            seen.append(picture)
+    with pytest.raises(InputError, match=r"cut\.mp4: expected 40 images, got .*--end"):
+        for image in open_source(path):
+            seen.append(image)
     assert 0 < len(seen) < 40
 
 
 def test_a_picture_of_another_size_is_named(tmp_path):
     for number, size in enumerate((32, 32, 30)):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((24, size, 3), np.uint8))
-    with pytest.raises(InputError, match=r"2\.png: expected 32x24 px like the first picture; got 30x24"):
+    with pytest.raises(InputError, match=r"2\.png: expected 32x24 px like the first image, got 30x24"):
         list(open_source(tmp_path))
 
 
 def taken(times, **options):
-    selection = Selection(**options)
-    shots = list(selection.pick(Picture(i, t, np.zeros((1, 1, 3), np.uint8)) for i, t in enumerate(times)))
-    return [shot.index for shot in shots], selection
+    selection = FrameSelection(**options)
+    stereo_frames = list(selection.pick(SourceFrame(i, t, np.zeros((1, 1, 3), np.uint8)) for i, t in enumerate(times)))
+    return [stereo_frame.index for stereo_frame in stereo_frames], selection
 
 
 def test_an_even_clip_is_taken_whole():
@@ -104,7 +104,7 @@ def test_a_rate_that_does_not_divide_takes_the_nearest():
 
 
 def test_variable_rate_is_counted_and_no_picture_is_taken_twice():
-    times = np.r_[np.arange(10) / 25, 0.4 + 0.2 + np.arange(10) / 25]  # five pictures dropped in the middle
+    times = np.r_[np.arange(10) / 25, 0.4 + 0.2 + np.arange(10) / 25]  # five images dropped in the middle
     found, selection = taken(times, frames_per_second=25, source_rate=25)
     assert found == list(range(20))
     assert selection.gaps == 5 and selection.uneven_steps == 1

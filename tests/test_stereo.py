@@ -1,4 +1,4 @@
-"""Depth from two eyes: closed-form disparities, what must stay missing, and smoothing over time."""
+"""Depth from two cameras: closed-form disparities, what must stay missing, and smoothing over time."""
 
 import cv2
 import numpy as np
@@ -20,10 +20,10 @@ def tissue(seed: int = 0, sigma: float = 1.2) -> np.ndarray:
     return np.array([170, 90, 90], np.float32) + 25 * noise / noise.std()
 
 
-def eyes(disparity: np.ndarray, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right pictures with left(x) = right(x - disparity(x)); `picture` is the right one."""
-    left = cv2.remap(picture, COLUMN - disparity, ROW, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    return tuple(np.clip(np.rint(eye), 0, 255).astype(np.uint8) for eye in (left, picture))
+def cameras(disparity: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right images with left(x) = right(x - disparity(x)); `image` is the right one."""
+    left = cv2.remap(image, COLUMN - disparity, ROW, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return tuple(np.clip(np.rint(camera), 0, 255).astype(np.uint8) for camera in (left, image))
 
 
 def flat(disparity: float) -> np.ndarray:
@@ -36,7 +36,7 @@ def measure(pair: tuple[np.ndarray, np.ndarray], shift: float = 0.0, **options: 
 
 @pytest.mark.parametrize("disparity", [6.0, 9.3, 12.5])
 def test_a_wall_is_found_at_its_depth(disparity):
-    found = measure(eyes(flat(disparity), tissue()))
+    found = measure(cameras(flat(disparity), tissue()))
     inside = np.s_[8:-8, 16:-8]
     assert (found.depth[inside] > 0).mean() > 0.99
     # 0.05 px is half the noise that rounding to 8 bit leaves in this texture, times ten; the matcher alone has 1/16 px.
@@ -48,7 +48,7 @@ def test_a_wall_is_found_at_its_depth(disparity):
 
 def test_a_slanted_plane_is_smooth_in_disparity():
     plane = 6 + 0.04 * COLUMN + 0.02 * ROW
-    depth = measure(eyes(plane, tissue())).depth[8:-8, 20:-8]
+    depth = measure(cameras(plane, tissue())).depth[8:-8, 20:-8]
     error = np.abs(PRODUCT / depth[depth > 0] - plane[8:-8, 20:-8][depth > 0])
     assert (depth > 0).mean() > 0.98
     assert np.median(error) < 0.05 and np.quantile(error, 0.95) < 0.3
@@ -56,13 +56,13 @@ def test_a_slanted_plane_is_smooth_in_disparity():
 
 def test_the_refinement_finds_the_shift_that_is_left():
     truth = 6 + 0.04 * COLUMN
-    left, right = (cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in eyes(truth, tissue()))
+    left, right = (cv2.cvtColor(camera, cv2.COLOR_RGB2GRAY) for camera in cameras(truth, tissue()))
     inside = np.s_[8:-8, 20:-8]
     for offset in (-0.3, 0.0, 0.3):
         refined, texture = refine_disparity(left, right, truth + np.float32(offset))
         assert np.abs(refined - truth)[inside].mean() < 0.02
         assert (texture > 0.5)[inside].all()
-    brighter = np.clip(right * 0.9 + 35, 0, 255).astype(np.uint8)  # as eyes with different exposure see it
+    brighter = np.clip(right * 0.9 + 35, 0, 255).astype(np.uint8)  # as cameras with different exposure see it
     refined, _ = refine_disparity(left, brighter, truth + np.float32(0.3))
     assert np.abs(refined - truth)[inside].mean() < 0.03
     far_off, _ = refine_disparity(left, right, truth + np.float32(3))
@@ -81,15 +81,15 @@ def test_smoothing_takes_out_steps_and_keeps_jumps():
 
 
 def test_what_lies_outside_the_other_picture_is_missing():
-    depth = measure(eyes(flat(12.0), tissue())).depth
+    depth = measure(cameras(flat(12.0), tissue())).depth
     assert not depth[:, :10].any()
     assert (depth[8:-8, 14:20] > 0).all()
 
 
 def test_half_occluded_pixels_are_missing_and_the_jump_is_kept():
     near = (COLUMN > 80) & (COLUMN < 130)
-    left, right = eyes(np.where(near, 14.0, 5.0).astype(np.float32), tissue())
-    hidden = np.s_[:, 72:81]  # 14 - 5 px of the wall behind, which the right eye cannot see
+    left, right = cameras(np.where(near, 14.0, 5.0).astype(np.float32), tissue())
+    hidden = np.s_[:, 72:81]  # 14 - 5 px of the wall behind, which the right camera cannot see
     left[hidden] = tissue(seed=5)[hidden].astype(np.uint8)
     depth = measure((left, right)).depth
     rows = np.s_[10:-10]
@@ -107,34 +107,34 @@ def test_a_pale_wall_without_texture_is_not_trusted():
 
 
 def test_highlights_halve_the_confidence():
-    picture = tissue()
-    plain = measure(eyes(flat(9.0), picture)).confidence
-    picture[50:70, 70:100] = 252 + 3 * np.sign(picture[50:70, 70:100, :1] - 170)
-    shiny = measure(eyes(flat(9.0), picture), min_confidence=0).confidence
+    image = tissue()
+    plain = measure(cameras(flat(9.0), image)).confidence
+    image[50:70, 70:100] = 252 + 3 * np.sign(image[50:70, 70:100, :1] - 170)
+    shiny = measure(cameras(flat(9.0), image), min_confidence=0).confidence
     assert shiny[58:62, 90:98].max() <= 0.5 < plain[58:62, 90:98].min()
 
 
 def test_the_shift_of_the_principal_points_is_subtracted():
-    depth = measure(eyes(flat(9.0 - 4.0), tissue()), shift=-4.0).depth
+    depth = measure(cameras(flat(9.0 - 4.0), tissue()), shift=-4.0).depth
     assert abs(np.median(depth[8:-8, 20:-8]) - PRODUCT / 9) < 0.5
     # Rectified to converge: near tissue has negative disparity.
-    depth = measure(eyes(flat(9.0 - 14.0), tissue()), shift=-14.0).depth
+    depth = measure(cameras(flat(9.0 - 14.0), tissue()), shift=-14.0).depth
     assert abs(np.median(depth[8:-8, 8:-20]) - PRODUCT / 9) < 0.5
     assert (depth[8:-8, -10:-7] > 0).all() and not depth[:, -4:].any()
 
 
 def test_depth_stays_in_range():
-    depth = measure(eyes(flat(12.0), tissue()), near_mm=60, far_mm=200).depth  # the wall stands at 50 mm
+    depth = measure(cameras(flat(12.0), tissue()), near_mm=60, far_mm=200).depth  # the wall stands at 50 mm
     assert ((depth == 0) | ((depth >= 60) & (depth <= 200))).all()
 
 
 def test_exchanged_eyes_give_little():
-    left, right = eyes(flat(9.0), tissue())
+    left, right = cameras(flat(9.0), tissue())
     assert (measure((right, left)).depth > 0).mean() < 0.4
 
 
 def test_no_confidence_asked_for_still_asks_both_eyes():
-    left, right = eyes(flat(9.0), tissue())
+    left, right = cameras(flat(9.0), tissue())
     right[30:90, 60:110] = tissue(seed=7)[30:90, 60:110].astype(np.uint8)
     depth = measure((left, right), min_confidence=0, fill_px=0, speckle_px=0).depth
     assert (depth[40:80, 75:105] > 0).mean() < 0.5
@@ -144,14 +144,14 @@ def test_no_confidence_asked_for_still_asks_both_eyes():
 
 def test_wide_pictures_are_matched_small_and_refined_at_full_size(monkeypatch):
     monkeypatch.setattr("endoprior.prepare.stereo.MATCHING_WIDTH", 60)
-    depth = measure(eyes(flat(9.3), tissue(sigma=4.0))).depth
+    depth = measure(cameras(flat(9.3), tissue(sigma=4.0))).depth
     inside = depth[12:-12, 24:-12]
     assert (inside > 0).mean() > 0.9
     assert abs(np.median(PRODUCT / inside[inside > 0]) - 9.3) < 0.1
 
 
 def test_the_same_pictures_give_the_same_bits():
-    pair = eyes(6 + 0.04 * COLUMN, tissue())
+    pair = cameras(6 + 0.04 * COLUMN, tissue())
     assert (measure(pair).depth == measure(pair).depth).all()
 
 
@@ -172,14 +172,14 @@ def test_small_holes_are_filled_on_planes_only():
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda eye: eye[..., :1], "left_u8"),
-        (lambda eye: eye[..., 0], "left_u8"),
-        (lambda eye: eye[:, :-1], "left_u8|right_u8"),
-        (lambda eye: eye.astype(np.float32), "8-bit"),
+        (lambda camera: camera[..., :1], "left_u8"),
+        (lambda camera: camera[..., 0], "left_u8"),
+        (lambda camera: camera[:, :-1], "left_u8|right_u8"),
+        (lambda camera: camera.astype(np.float32), "8-bit"),
     ],
 )
 def test_other_pictures_are_refused(change, message):
-    left, right = eyes(flat(9.0), tissue())
+    left, right = cameras(flat(9.0), tissue())
     with pytest.raises(ValueError, match=message):
         measure((change(left), right))
 
@@ -193,7 +193,7 @@ def test_config_is_checked(options):
 
 
 def test_impossible_geometry_is_refused():
-    pair = eyes(flat(9.0), tissue())
+    pair = cameras(flat(9.0), tissue())
     with pytest.raises(ValueError, match="far_mm"):
         stereo_depth(*pair, 1e5, BASELINE)
     for focal, baseline, shift in ((np.nan, 4, 0), (150, np.nan, 0), (150, 0, 0), (150, 4, np.nan)):

@@ -16,7 +16,7 @@ FLOORS = [
     {"core", "compute"},
     {"system", "render", "priors", "footage"},
     {"data", "model"},
-    {"initialization", "evaluation", "show", "phantom"},
+    {"initialization", "evaluation", "visualization", "phantom"},
     {"training", "doctor", "prepare", "check", "export", "view"},
     {"runs"},
     {"experiments"},

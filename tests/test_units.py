@@ -9,7 +9,7 @@ HEIGHT, WIDTH = 60, 80
 
 
 def view(kind: str = "depth", factor: float = 1.0, tool: bool = True, shading: float = 1.0, seed: int = 0):
-    """Values, validity, picture and tissue mask of a wall 60-100 mm away, lit from the camera, with a tool at 40 mm."""
+    """Values, validity, image and tissue mask of a wall 60-100 mm away, lit from the camera, with a tool at 40 mm."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     depth = 60 + 40 * (x / WIDTH) + rng.normal(0, 0.5, (HEIGHT, WIDTH))
@@ -18,10 +18,10 @@ def view(kind: str = "depth", factor: float = 1.0, tool: bool = True, shading: f
         tissue[20:35, 10:60] = False
         depth[~tissue] = 40
     light = 160 * (60 / depth) ** (2 * shading) + rng.normal(0, 3, depth.shape)
-    picture = np.repeat(light.clip(0, 255).astype(np.uint8)[..., None], 3, -1)
+    image = np.repeat(light.clip(0, 255).astype(np.uint8)[..., None], 3, -1)
     values = factor * (depth if kind == "depth" else 5000 / depth)
     valid = (y > 2) | (x > 2)
-    return np.where(valid, values, 0), valid, picture, tissue
+    return np.where(valid, values, 0), valid, image, tissue
 
 
 @pytest.mark.parametrize(
@@ -40,8 +40,8 @@ def test_usual_units(factor, unit, mm):
 )
 def test_where_one_unit_ends_and_the_next_begins(median, unit):
     flat = np.full((HEIGHT, WIDTH), median), np.ones((HEIGHT, WIDTH), bool)
-    picture = np.full((HEIGHT, WIDTH, 3), 100, np.uint8)
-    assert guess_unit([(*flat, picture, flat[1])]).unit == unit
+    image = np.full((HEIGHT, WIDTH, 3), 100, np.uint8)
+    assert guess_unit([(*flat, image, flat[1])]).unit == unit
 
 
 @pytest.mark.parametrize("tool", [True, False])
@@ -63,15 +63,15 @@ def test_tissue_that_is_brighter_far_away_stays_depth_beside_a_near_tool():
 
 
 def test_no_depth_and_constant_depth():
-    values, _, picture, tissue = view()
-    none = guess_unit([(values, np.zeros_like(tissue), picture, tissue)])
+    values, _, image, tissue = view()
+    none = guess_unit([(values, np.zeros_like(tissue), image, tissue)])
     assert (none.unit, none.mm_per_unit, none.reason) == ("none", None, "no pixel has depth")
-    assert guess_unit([(np.full_like(values, 70), tissue | True, picture, tissue)]).shading == 0
+    assert guess_unit([(np.full_like(values, 70), tissue | True, image, tissue)]).shading == 0
 
 
 def test_frames_without_tissue_use_what_there_is():
-    values, valid, picture, tissue = view()
-    assert guess_unit([(values, valid, picture, np.zeros_like(tissue))]).unit == "mm"
+    values, valid, image, tissue = view()
+    assert guess_unit([(values, valid, image, np.zeros_like(tissue))]).unit == "mm"
 
 
 def test_the_real_clip_is_in_mm_and_its_inverse_is_disparity(real_clip):

@@ -23,12 +23,12 @@ from endoprior.data import load_sequence
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
 from endoprior.runs.training_run import train
-from endoprior.show.pictures import to_u8
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT, POINTS
 from endoprior.view.scene_subject import SceneSubject
 from endoprior.view.sequence_subject import SequenceSubject
 from endoprior.view.server import Viewer
 from endoprior.view.session import Look
+from endoprior.visualization.image_tools import to_u8
 
 NUM_FRAMES = 6
 CAMERA = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))

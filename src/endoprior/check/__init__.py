@@ -1,10 +1,10 @@
-"""Look at a sequence before training: what it is (facts), what is wrong with it (findings), and one picture of it.
+"""Check a sequence before training: measure it (facts), list its problems (findings), draw a figure.
 
-Nothing here needs torch: pictures, masks, depth and points are NumPy arrays.
+NumPy only, no torch.
 """
 
 from .facts import Facts, measure
+from .figure import draw_check
 from .findings import Finding, find
-from .picture import draw_check
 
 __all__ = ["Facts", "Finding", "draw_check", "find", "measure"]

@@ -1,4 +1,4 @@
-"""Depth of a sequence, measured: coverage, medians, distribution, resolution of what is stored, unit."""
+"""Measure the depth of a sequence: coverage, medians, distribution, stored resolution, unit."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ..data import FrameSequence
 from ..footage.units import UnitGuess, guess_unit
 
 BINS = 80
-"""Bins of the histogram."""
+"""Number of histogram bins."""
 EVERY = 7
-"""Every 7th pixel enters the distribution."""
+"""The distribution uses every 7th pixel."""
 
 
 @dataclass(frozen=True)
 class DepthFacts:
-    """Depth as it is read, in mm if the folder is right about its unit."""
+    """Depth as read; in mm if the folder states the right unit."""
 
     coverage: NDArray[np.float64]
     """(T,) share of tissue pixels with depth; 0 in a frame without tissue."""
@@ -33,35 +33,35 @@ class DepthFacts:
     high: float
     """99th percentile on tissue; 0 without depth."""
     edges: NDArray[np.float64]
-    """(81,) borders of the histogram's bins."""
+    """(81,) edges of the histogram bins."""
     counts: NDArray[np.int64]
-    """(80,) tissue pixels in each bin, of those looked at."""
+    """(80,) sampled tissue pixels in each bin."""
     step: float
-    """Usual distance between neighboring values that occur in a frame; 0 without depth."""
+    """Median difference between neighboring values of a frame; 0 without depth."""
     bits: int | None
-    """Bits a value is stored with; None where the files do not say."""
+    """Bits per stored value; None if unknown."""
     scale: float
-    """mm per stored unit: what was asked for, else what the folder says, else 1."""
+    """mm per stored unit: the option, else the value in `sequence.json`, else 1."""
     unit: UnitGuess
     relative: bool
-    """Whether the folder says that its scale is unknown."""
+    """Whether the folder states that its scale is unknown."""
 
 
 def measure_depth(
     sequence: FrameSequence,
-    few: list[Frame],
+    samples: list[Frame],
     tissue: list[NDArray[np.bool_]],
     described: dict[str, Any],
     cfg: DataConfig,
 ) -> DepthFacts:
-    """Measure the depth of every frame, and its distribution on some.
+    """Measure coverage and median of every frame, and the distribution over sample frames.
 
     Args:
         sequence: the whole sequence.
-        few: frames whose distribution and unit are looked at.
-        tissue: (H, W) each, True on their tissue, masks read inverted put right.
-        described: what `sequence.json` says.
-        cfg: what the sequence was opened with.
+        samples: frames for the distribution and the unit.
+        tissue: (H, W) each, True on their tissue; inverted masks are corrected.
+        described: content of `sequence.json`.
+        cfg: options with which the sequence was opened.
     """
     coverage, median = [], []
     for index in range(len(sequence)):
@@ -70,11 +70,11 @@ def measure_depth(
         coverage.append(float(on_tissue.sum() / max(frame.tissue_mask.sum(), 1)))
         values = frame.depth[on_tissue][::EVERY]
         median.append(float(np.median(values)) if len(values) else float("nan"))
-    values = np.concatenate([f.depth[f.depth_valid & mask][::EVERY] for f, mask in zip(few, tissue, strict=True)])
+    values = np.concatenate([f.depth[f.depth_valid & mask][::EVERY] for f, mask in zip(samples, tissue, strict=True)])
     low, high = (float(v) for v in np.percentile(values, (1, 99))) if len(values) else (0.0, 0.0)
-    room = 0.1 * (high - low) or 0.1 * high or 1.0
-    counts, edges = np.histogram(values, BINS, (max(low - room, 0), high + room))
-    looked_at = zip(few, tissue, strict=True)
+    margin = 0.1 * (high - low) or 0.1 * high or 1.0
+    counts, edges = np.histogram(values, BINS, (max(low - margin, 0), high + margin))
+    pairs = zip(samples, tissue, strict=True)
     return DepthFacts(
         np.array(coverage),
         np.array(median),
@@ -82,16 +82,16 @@ def measure_depth(
         high,
         edges,
         counts,
-        _step(few),
+        _step(samples),
         stored_bits(sequence.path / "depth"),
         float(cfg.depth_unit_mm or described.get("depth_scale") or 1.0),
-        guess_unit((frame.depth, frame.depth_valid, frame.rgb_u8, mask) for frame, mask in looked_at),
+        guess_unit((frame.depth, frame.depth_valid, frame.rgb_u8, mask) for frame, mask in pairs),
         sequence.depth_is_relative,
     )
 
 
 def stored_bits(folder: Path) -> int | None:
-    """Bits per value of the first PNG in a folder, from its header; None where there is none."""
+    """Bits per value of the first PNG in a folder, from its header; None if there is none."""
     for file in sorted(folder.glob("*.png")) if folder.is_dir() else ():
         header = file.read_bytes()[:26]
         return header[24] if len(header) == 26 else None

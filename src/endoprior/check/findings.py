@@ -1,4 +1,4 @@
-"""What is suspicious about a sequence, each with the fix to type. Pure: facts in, findings out.
+"""Problems of a sequence, each with its fix. Pure functions: facts in, findings out.
 
 The codes are stable; docs/check.md explains each.
 """
@@ -11,42 +11,42 @@ from typing import Literal
 
 import numpy as np
 
-from ..core.checks import runs
+from ..core.checks import number_ranges
 from ..footage.camera_motion import MOVING_FRACTION
 from .facts import Facts
 
 Severity = Literal["error", "warning", "note"]
 
 TOOL_MOST = 0.6
-"""More tool than this leaves too little tissue to learn from."""
+"""With a larger share of tool pixels there is too little tissue for training."""
 COVERED = 0.5
-"""Less depth than this, as a share of the tissue, is sparse."""
+"""Depth on a smaller share of the tissue is sparse."""
 FEW_FRAMES = 10
-"""Fewer frames say little about motion, and leave one test frame."""
+"""Fewer frames contain little motion and leave one test frame."""
 SEEN_AS_TISSUE = 0.5
-"""A border is a finding where the masks call more than this share of it tissue."""
+"""A border is reported if the masks mark a larger share of it as tissue."""
 VERTICAL_PX = 1.5
-"""Largest vertical offset of rectified eyes, px."""
+"""Largest vertical offset of rectified cameras, px."""
 ODD_VIEW_DEG = (20.0, 120.0)
-"""An endoscope's horizontal field of view lies between these."""
+"""Range of the horizontal field of view of endoscopes."""
 DEPTH_JUMP = 0.2
-"""Change of the logarithm of the median depth that tissue does not do between two frames."""
+"""Change of the log median depth between two frames that is too large for tissue motion."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to look at."""
+    """One problem of a sequence."""
 
     code: str
     """Stable name."""
     severity: Severity
     """`error`: training would fail or learn something wrong; `warning`: it costs quality; `note`: good to know."""
     what: str
-    """What was found, on one line."""
+    """The problem, on one line."""
     fix: str
-    """What to type or do."""
+    """The command to type, or what to do."""
     frames: tuple[int, ...] = ()
-    """Frames it concerns; empty if all."""
+    """Affected frames; empty for all."""
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.code}: {self.what}; fix: {self.fix}"
@@ -54,7 +54,7 @@ class Finding:
 
 def find(facts: Facts) -> list[Finding]:
     """All findings, errors first."""
-    found = [finding for look in LOOKS for finding in look(facts)]
+    found = [finding for check in CHECKS for finding in check(facts)]
     order = {"error": 0, "warning": 1, "note": 2}
     return sorted(found, key=lambda finding: order[finding.severity])
 
@@ -68,8 +68,8 @@ def _size(facts: Facts) -> Iterator[Finding]:
     off_center = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
     if not ODD_VIEW_DEG[0] <= view <= ODD_VIEW_DEG[1] or off_center > 0.2 or not 0.8 < camera.fx / camera.fy < 1.25:
         what = (
-            f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px see {view:.0f} degrees across "
-            f"{camera.width}x{camera.height} px; they may belong to pictures of another size"
+            f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px give {view:.0f} degrees across "
+            f"{camera.width}x{camera.height} px; they may belong to images of another size"
         )
         yield Finding("intrinsics", "warning", what, f'set "fx", "fy", "cx", "cy" in {facts.path}/sequence.json, px')
 
@@ -83,19 +83,19 @@ def _masks(facts: Facts) -> Iterator[Finding]:
         yield Finding("mask-polarity", "error", what, fix)
     elif mean > TOOL_MOST:
         what = f"{mean:.0%} of all pixels are tool"
-        yield Finding("tool-fraction", "warning", what, "look at the masks; 5 % to 40 % are usual")
+        yield Finding("tool-fraction", "warning", what, "check the masks; 5 % to 40 % are usual")
     elif not masks.tool_fraction.any():
         what = "no mask marks a tool"
-        yield Finding("tool-fraction", "note", what, "nothing if no instrument is in view, else give masks")
+        yield Finding("tool-fraction", "note", what, "nothing if no instrument is in view, else add masks")
 
 
 def _depth(facts: Facts) -> Iterator[Finding]:
     depth, path, unit = facts.depth, facts.path, facts.depth.unit
-    # A mask that is read inverted hides what these two are about.
+    # With inverted masks, depth on tissue cannot be checked.
     empty = tuple(int(i) for i in np.flatnonzero(depth.coverage == 0))
     if len(empty) == facts.frames and unit.unit == "none":
         yield Finding(
-            "no-depth-frames", "error", "no frame has depth", f"endoprior prepare CLIP NEW, or give {path}/depth in mm"
+            "no-depth-frames", "error", "no frame has depth", f"endoprior prepare CLIP NEW, or add {path}/depth in mm"
         )
         return
     if empty and not facts.masks.inverted:
@@ -115,7 +115,7 @@ def _depth(facts: Facts) -> Iterator[Finding]:
         )
         yield Finding("depth-8-bit", "warning", what, fix)
     if depth.relative:
-        fix = "nothing for pictures; for lengths in mm measure depth with both eyes"
+        fix = "nothing for rendering; for lengths in mm use stereo depth"
         yield Finding("relative-depth", "note", "the scale of the depth is unknown or assumed", fix)
     yield from _unit(facts)
     steps = np.abs(np.diff(np.log(np.where(depth.median > 0, depth.median, np.nan))))
@@ -143,7 +143,7 @@ def _unit(facts: Facts) -> Iterator[Finding]:
 
 
 def _set_scale(facts: Facts, factor: float | None) -> str:
-    """What to type to multiply depth by `factor`; None if it is not known."""
+    """The command that multiplies depth by `factor`; None if the factor is unknown."""
     scale = "MM_PER_UNIT" if factor is None else f"{facts.depth.scale * factor:.6g}"
     return (
         f'set "depth_scale": {scale} in {facts.path}/sequence.json, '
@@ -162,11 +162,11 @@ def _border(facts: Facts) -> Iterator[Finding]:
         fix = f"endoprior prepare CLIP NEW --crop {strips.left},{strips.top},{width},{height}, or mark it in the masks"
         yield Finding("console-strip", "warning", what, fix)
     if border.circle and border.outside_as_tissue > SEEN_AS_TISSUE:
-        what = f"the picture is round (radius {border.circle.radius:.0f} px) and what is outside counts as tissue"
+        what = f"the image is round (radius {border.circle.radius:.0f} px) and its outside counts as tissue"
         yield Finding("round-border", "warning", what, "mark the outside in the masks; endoprior prepare does")
     if border.overlays:
-        places = ", ".join(f"{width}x{height} px at {x}, {y}" for x, y, width, height in border.overlays[:3])
-        what = f"burned-in writing counts as tissue: {places}{' and more' if len(border.overlays) > 3 else ''}"
+        boxes = ", ".join(f"{width}x{height} px at {x}, {y}" for x, y, width, height in border.overlays[:3])
+        what = f"burned-in text counts as tissue: {boxes}{' and more' if len(border.overlays) > 3 else ''}"
         yield Finding("burned-in-text", "warning", what, "mark it in the masks; endoprior prepare does")
 
 
@@ -175,7 +175,7 @@ def _motion(facts: Facts) -> Iterator[Finding]:
         return
     beyond = np.flatnonzero(facts.motion.path_px > MOVING_FRACTION * facts.camera.width)
     first = int(beyond[0]) * facts.motion_step if len(beyond) else 0
-    what = f"the camera moves, and the stored poses say that it rests ({facts.motion.reason})"
+    what = f"the camera moves, but it is static in the stored poses ({facts.motion.reason})"
     enough = first >= max(FEW_FRAMES, facts.frames / 2)
     fix = "endoprior prepare CLIP NEW --poses estimate"
     yield Finding("camera-moves", "warning", what, f"{fix}, or {_until(facts, first)}" if enough else fix)
@@ -191,65 +191,63 @@ def _changes(facts: Facts) -> Iterator[Finding]:
         fix = f"endoprior train {path} RUN --data.stride {stride}" if regular else f"remove them from {path}"
         yield Finding("duplicate-frames", "warning", what, fix, copies)
     for code, frames, what in (
-        ("exposure-jump", changes.exposure_jumps, "the brightness of the whole picture jumps at"),
-        ("scene-cut", changes.cuts, "the view changes at once at"),
+        ("exposure-jump", changes.exposure_jumps, "the brightness of the whole image jumps at"),
+        ("scene-cut", changes.cuts, "the view changes abruptly at"),
     ):
         if frames:
             severity: Severity = "error" if code == "scene-cut" else "warning"
             yield Finding(code, severity, f"{what} {_frames(frames)}", _until(facts, frames[0]), frames)
     odd = tuple(sorted({*changes.blurred, *changes.off_color}))
     if odd:
-        what = f"unlike the rest (blurred, covered or out of the body): {_frames(odd)}"
+        what = f"blurred, covered or outside the body: {_frames(odd)}"
         yield Finding("unexplained-frames", "warning", what, f"remove them from {path}", odd)
 
 
-def _eyes(facts: Facts) -> Iterator[Finding]:
-    eyes, path = facts.eyes, facts.path
-    if eyes is None:
+def _stereo(facts: Facts) -> Iterator[Finding]:
+    stereo, path = facts.stereo, facts.path
+    if stereo is None:
         return
-    if eyes.order.swapped:
+    if stereo.order.swapped:
         fix = f"swap the folders {path}/images and {path}/right, and measure depth again"
-        yield Finding("swapped-eyes", "error", f"left and right eye are swapped ({eyes.reason})", fix)
-    if eyes.vertical_px > VERTICAL_PX:
-        what = f"the rows of the two eyes are {eyes.vertical_px:.1f} px apart"
-        yield Finding(
-            "vertical-offset", "warning", what, "rectify the eyes: endoprior prepare CLIP NEW --calibration FILE"
-        )
+        yield Finding("swapped-eyes", "error", f"left and right images are swapped ({stereo.reason})", fix)
+    if stereo.vertical_px > VERTICAL_PX:
+        what = f"the rows of left and right images are {stereo.vertical_px:.1f} px apart"
+        yield Finding("vertical-offset", "warning", what, "rectify: endoprior prepare CLIP NEW --calibration FILE")
 
 
 def _points(facts: Facts) -> Iterator[Finding]:
     explained = facts.depth.unit.unit in ("none", "m", "0.01 mm") or facts.masks.inverted
     if facts.cloud is None and not explained:
-        what = "training finds no pixel that is tissue and has depth to start from"
-        yield Finding("no-points", "error", what, "look at masks and depth in the picture")
+        what = "no pixel is tissue and has depth, so training has no initial points"
+        yield Finding("no-points", "error", what, "check masks and depth in the figure")
 
 
-def _remarks(facts: Facts) -> Iterator[Finding]:
-    for remark in facts.remarks:
-        yield Finding("reader", "note", remark, "look at the files")
+def _reader_notes(facts: Facts) -> Iterator[Finding]:
+    for note in facts.notes:
+        yield Finding("reader", "note", note, "check the files")
 
 
-LOOKS: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
+CHECKS: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
     _masks,
     _depth,
     _border,
-    _eyes,
+    _stereo,
     _motion,
     _changes,
     _size,
     _points,
-    _remarks,
+    _reader_notes,
 )
-"""In the order in which they are reported."""
+"""In the order of the report."""
 
 
 def _frames(frames: tuple[int, ...]) -> str:
-    """Frame numbers in words, at most six, runs shortened: `frames 3-7 and 9`."""
-    return f"frame{'s' if len(frames) > 1 else ''} {runs(frames, 6)}"
+    """Frame numbers as text, at most six ranges: `frames 3-7, 9`."""
+    return f"frame{'s' if len(frames) > 1 else ''} {number_ranges(frames, 6)}"
 
 
 def _until(facts: Facts, first: int) -> str:
-    """What to type to leave out a frame and what follows, or what comes before it, whichever is less."""
+    """The command that leaves out the frames from `first` on, or those before it, whichever are fewer."""
     if first >= facts.frames / 2:
         return f"endoprior train {facts.path} RUN --data.first-frames {first}"
     return f"remove frames 0-{first - 1} from {facts.path}"

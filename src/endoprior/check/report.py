@@ -1,4 +1,4 @@
-"""Facts as a table for people and as JSON for programs."""
+"""Print the facts as a table, and convert facts and findings to JSON."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .findings import Finding
 
 
 def table(facts: Facts) -> list[tuple[str, str]]:
-    """Rows of (what, value), in the order in which they are read."""
+    """Rows of (name, value), in the order of the report."""
     camera, depth, border, changes = facts.camera, facts.depth, facts.border, facts.changes
     rate = facts.frames_per_second
     seconds = f", {facts.frames / rate:.1f} s at {rate:g} frames/s" if rate else ", rate unknown"
@@ -22,13 +22,13 @@ def table(facts: Facts) -> list[tuple[str, str]]:
     value = "high" if facts.described.get("mask_tool_value", 255) == 255 else "low"
     rows = [
         ("frames", f"{facts.frames}: {facts.train_frames} to train, {facts.test_frames} to test{seconds}"),
-        ("pictures", f"{camera.width} x {camera.height} px{', both eyes' if facts.eyes else ''}"),
+        ("images", f"{camera.width} x {camera.height} px{', stereo' if facts.stereo else ''}"),
         (
             "intrinsics",
             f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px; {view:.0f} degrees",
         ),
         ("camera", _camera_words(facts)),
-        ("picture motion", facts.motion.reason),
+        ("image motion", facts.motion.reason),
         ("tools", f"{tool.mean():.1%} of pixels ({tool.min():.1%} to {tool.max():.1%})"),
         ("mask polarity", f"read as tool = {value}; {facts.masks.reason}"),
         ("border", _border_words(facts)),
@@ -50,23 +50,23 @@ def table(facts: Facts) -> list[tuple[str, str]]:
             "changes",
             f"{len(changes.duplicates)} copies, {len(changes.exposure_jumps)} exposure jumps, {len(changes.cuts)} cuts",
         ),
-        ("first points", f"{len(facts.cloud):,}" if facts.cloud else "none"),
+        ("initial points", f"{len(facts.cloud):,}" if facts.cloud else "none"),
     ]
-    if facts.eyes:
-        rows.insert(4, ("eyes", facts.eyes.reason))
+    if facts.stereo:
+        rows.insert(4, ("stereo", facts.stereo.reason))
     rows += [(f"source of {name}", text) for name, text in facts.sources.items()]
     return rows
 
 
 def as_json(facts: Facts, findings: list[Finding]) -> dict[str, Any]:
-    """Facts and findings as JSON values; the first points only by their number. NaN becomes None."""
+    """Facts and findings as JSON values. Of the initial points only the number is written; NaN becomes None."""
     return {"facts": _plain(facts), "findings": _plain(findings)}
 
 
 def _camera_words(facts: Facts) -> str:
     if facts.camera_is_fixed:
-        return "stands still, by the stored poses"
-    return f"moves by up to {facts.camera_path_mm:.3g} mm and {facts.camera_turn_deg:.3g} degrees, by the stored poses"
+        return "static in the stored poses"
+    return f"moves up to {facts.camera_path_mm:.3g} mm and {facts.camera_turn_deg:.3g} degrees in the stored poses"
 
 
 def _border_words(facts: Facts) -> str:
@@ -77,7 +77,7 @@ def _border_words(facts: Facts) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """JSON values of a record, list, array or number."""
+    """JSON values of a dataclass, list, array or number."""
     if type(value).__name__ == "PointCloud":
         return {"points": len(value)}
     if is_dataclass(value):

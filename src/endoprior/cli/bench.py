@@ -49,7 +49,7 @@ def run(argv: list[str]) -> int:
     from ..experiments.matrix import run_matrix
     from ..experiments.report import write_overview, write_report
     from ..experiments.spec import load_spec
-    from .places import demand_folder_place
+    from .output_paths import require_writable_folder
 
     for option, value, least in (("--threads", args.threads, 1), ("--cores", args.cores, 0)):
         if not least <= value <= MOST_CORES:
@@ -58,7 +58,7 @@ def run(argv: list[str]) -> int:
         raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
     specs = _specs(args.spec)
     loaded = {path: load_spec(path, _folders(args.data)) for path in specs}
-    demand_folder_place("OUT", args.out)
+    require_writable_folder("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

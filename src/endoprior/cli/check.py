@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
 from .parsing import parse
 from .progress import say
@@ -16,16 +16,16 @@ from .progress import say
 
 @dataclass
 class Check:
-    """Read a sequence as training would, say what it is and what is suspicious, and draw it."""
+    """Check a sequence before training: print its properties and problems, and draw a figure."""
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
     """Sequence folder."""
     out: Path = Path("check.png")
-    """PNG to draw."""
+    """PNG file of the figure."""
     json: Path | None = None
     """Also write facts and findings to this file."""
     strict: bool = False
-    """Exit with status 2 if there is an error, as for a sequence that cannot be read."""
+    """Exit with status 2 if there is a problem of severity `error`."""
     data: DataConfig = field(default_factory=DataConfig)
 
 
@@ -33,12 +33,12 @@ def run(argv: list[str]) -> None:
     """Measure, print, draw."""
     args = parse(Check, argv, "check")
     if args.out.suffix.lower() != ".png":
-        raise InputError(f"--out: expected a .png file; got {args.out}. Rename it.")
-    from .places import demand_file_place
+        raise input_error("--out", "a .png file", str(args.out), f"`--out {args.out.with_suffix('.png')}`.")
+    from .output_paths import require_writable_file
 
     for option, file in (("--out", args.out), ("--json", args.json)):
         if file is not None:
-            demand_file_place(option, file, args.folder)
+            require_writable_file(option, file, args.folder)
     from ..check import draw_check, find, measure
     from ..check.report import as_json, table
     from ..data import load_sequence
@@ -53,11 +53,11 @@ def run(argv: list[str]) -> None:
     for finding in findings:
         say(str(finding))
     if not findings:
-        say("nothing suspicious")
+        say("no problems found")
     if args.json:
         write_json(args.json, as_json(facts, findings))
     draw_check(sequence, facts, findings, args.out)
     say(f"{args.out}")
     errors = [finding for finding in findings if finding.severity == "error"]
     if args.strict and errors:
-        raise InputError(f"{args.folder}: expected no errors with --strict; got {len(errors)}: {errors[0]}")
+        raise InputError(f"{args.folder}: expected no errors with --strict, got {len(errors)}: {errors[0]}")

@@ -37,8 +37,8 @@ def run(argv: list[str]) -> None:
     from ..model.scene import load_scene
     from ..phantom import PhantomConfig, write_phantom
     from ..runs.folder import prepare_run_folder
-    from ..show.report import write_report
-    from .render import Render, draw
+    from ..runs.report import write_report
+    from .render import Render, render
     from .train import train_and_evaluate
 
     phantom, cfg = PhantomConfig(frames=args.frames, seed=args.seed), replace(preset(args.preset), seed=args.seed)
@@ -52,7 +52,7 @@ def run(argv: list[str]) -> None:
     train_and_evaluate(data, cfg, folder, resume=False, networks=False, weights_dir=None)
     say("\n3/4  drawing")
     scene = load_scene(folder)
-    draw(scene, Render(run=folder))
+    render(scene, Render(run=folder))
     say("4/4  report")
     report = args.out / "report.png"
     write_report(scene, load_sequence(data), folder, report)

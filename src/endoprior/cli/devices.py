@@ -1,4 +1,4 @@
-"""Moving a scene to where the user wants it drawn."""
+"""Move a scene to the device that renders it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 
 def on_device(scene: Scene, wanted: Wanted, *, half_planes: bool = False) -> Scene:
-    """The scene on the chosen device; which one, and why, is said unless it is the CPU as asked.
+    """The scene on the chosen device. Prints the device and the reason, unless the user asked for the CPU.
 
     Args:
-        half_planes: on a GPU a HexPlane may be halved (`Scene.to`): for pictures to look at, not for scores.
+        half_planes: on a GPU, store a HexPlane as fp16 (`Scene.to`): for viewing, not for scores.
     Raises:
-        InputError: CUDA was asked for and cannot be had.
+        InputError: CUDA was requested and is not usable.
     """
     choice = choose_here(wanted)
     if wanted != "cpu":

@@ -1,4 +1,4 @@
-"""Arguments from dataclasses, by tyro; a mistake becomes one line instead of a page."""
+"""Parse command-line arguments into dataclasses with tyro; usage errors become one line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import tyro
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 
 A = TypeVar("A")
 BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
@@ -22,23 +22,25 @@ def parse(cls: type[A], argv: list[str], command: str, default: A | None = None)
         InputError: an unknown option, a missing argument, or a value of the wrong kind or range.
     """
     if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in argv):
-        said = "expected a name or a value in each place; got an empty one. Is a variable of the shell not set?"
-        raise InputError(f"endoprior {command}: {said}")
-    said = io.StringIO()
+        fix = "Set the shell variable, or remove the empty argument."
+        raise input_error(f"endoprior {command}", "no empty argument", "one", fix)
+    errors = io.StringIO()
     extra = {} if default is None else {"default": default}
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(errors):
             return tyro.cli(cls, args=argv, prog=f"endoprior {command}", description=cls.__doc__, **extra)
     except SystemExit as exit_:
         if exit_.code == 0:
             raise
-        raise InputError(f"{_one_line(said.getvalue())}. Try `endoprior {command} --help`.") from None
+        raise InputError(f"{_one_line(errors.getvalue())}. Fix: `endoprior {command} --help`.") from None
+    except InputError:
+        raise
     except ValueError as error:  # a range check of the config
-        raise InputError(f"{str(error).removesuffix('.')}. Try `endoprior {command} --help`.") from None
+        raise InputError(f"{str(error).removesuffix('.')}. Fix: `endoprior {command} --help`.") from None
 
 
 def _one_line(page: str) -> str:
-    """What went wrong, out of tyro's framed page: without the frame, its title, and the closing advice."""
+    """The error in tyro's framed page, without the frame, its title and the closing advice."""
     body = [BOX_DRAWING.sub(" ", line).strip() for line in page.splitlines() if not line.startswith("\u256d")]
     text = " ".join(" ".join(body).split("For full helptext")[0].split())
     return text.rstrip(". ")

@@ -15,14 +15,14 @@ from .progress import Counting, say
 
 @dataclass
 class Prepare:
-    """Write a sequence folder from an endoscope video: eyes split and rectified, borders cut, depth, tool masks, poses.
+    """Write a sequence folder from an endoscope video: rectified frames, depth, tool masks and camera poses.
 
-    Give the same command again to go on after an interruption. Nothing is sent anywhere, and no metadata is
-    copied; `--depth depth-anything` downloads its network.
+    To resume after an interruption, run the same command again. Your video never leaves this computer, and no metadata
+    is copied. `--depth depth-anything` downloads its network.
     """
 
     video: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIDEO")]]
-    """Video file, or folder of pictures."""
+    """Video file, or folder of images."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Sequence folder to write; must be new or empty."""
     config: Annotated[PrepareConfig, tyro.conf.arg(name="")] = field(default_factory=PrepareConfig)
@@ -35,7 +35,7 @@ def run(argv: list[str]) -> None:
 
     with Counting() as progress:
         done = prepare(args.video, args.out, args.config, progress)
-    for remark in done.remarks:
-        say(f"note: {remark}")
+    for note in done.notes:
+        say(f"note: {note}")
     say(f"{done.out}: {done.num_frames} frames of {done.size[0]}x{done.size[1]}")
     say(f"next: endoprior check {done.out}; endoprior train {done.out} RUN")

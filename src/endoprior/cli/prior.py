@@ -15,22 +15,22 @@ from .progress import say
 
 @dataclass
 class Prior:
-    """Draw the cue maps and the joint texture prior of each frame: a PNG per map and a contact sheet."""
+    """Write the cue maps and the joint texture prior of each frame: one PNG per map, and a contact sheet."""
 
     data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
     """Sequence folder."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for specular/, salience/, prior/ and contact_sheet.png."""
     split: Literal["train", "test", "video"] = "video"
-    """Frames to draw."""
+    """Frames to write."""
     config: Annotated[PriorConfig, tyro.conf.arg(name="")] = field(default_factory=PriorConfig)
 
 
 def run(argv: list[str]) -> None:
-    """Draw the maps."""
+    """Write the maps."""
     args = parse(Prior, argv, "prior")
     from ..data import load_sequence
-    from ..show.prior_maps import write_prior_maps
+    from ..visualization.prior_maps import write_prior_maps
 
     sequence = load_sequence(args.data)
     sheet = write_prior_maps(sequence, args.split, args.config, args.out)

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar with rate and time left on a terminal, plain lines elsewhere."""
+"""Progress of long operations: a bar with rate and remaining time on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PLAIN_EVERY_SECONDS = 10.0
 
 
 def say(text: str) -> None:
-    """One line on stdout, at once; what the terminal's encoding lacks, such as bytes of a name, is written as \\xNN."""
+    """Print one line and flush it. Characters that the terminal's encoding lacks are written as \\xNN."""
     encoding = sys.stdout.encoding or "utf-8"
     print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
@@ -32,7 +32,7 @@ def training_progress() -> Iterator:
 
 
 class Counting:
-    """Work that counts: a line every few seconds, or one line that is written over on a terminal."""
+    """Progress of countable steps: a line every few seconds, or one updated line on a terminal."""
 
     def __enter__(self) -> Counting:
         self._terminal, self._what, self._first = sys.stderr.isatty(), "", 0
@@ -44,7 +44,7 @@ class Counting:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Say how far `what` has come; a `total` of 0 is not known."""
+        """Report progress of the step `what`; a `total` of 0 is unknown."""
         now = clock.monotonic()
         if what != self._what:
             self._what, self._began, self._first = what, now, done
@@ -62,7 +62,7 @@ class Counting:
 
 
 class _PlainLines:
-    """A line every few seconds, for log files."""
+    """Prints a line every few seconds, for log files."""
 
     def __init__(self) -> None:
         self.began = clock.monotonic()

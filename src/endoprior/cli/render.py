@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..doctor.choice import Wanted
 from .devices import on_device
 from .parsing import parse
@@ -20,50 +20,50 @@ if TYPE_CHECKING:
 
 @dataclass
 class Render:
-    """Draw a trained scene: rgb/*.png, depth/*.npy (mm), side_by_side/*.png and an mp4."""
+    """Render a trained scene: rgb/*.png, depth/*.npy (mm), side_by_side/*.png and an mp4."""
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder."""
     out: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="OUT")]] = None
-    """Folder for the frames; RUN/renders if not given, and then the film is RUN/video.mp4."""
+    """Output folder. Default: RUN/renders for the frames and RUN/video.mp4 for the video."""
     split: Literal["video", "test", "train"] = "video"
-    """Frames of the sequence to draw."""
+    """Frames of the sequence to render."""
     times: tuple[float, ...] = ()
-    """Moments in [0, 1] to draw in place of a split."""
+    """Times in [0, 1] to render instead of a split."""
     camera: Literal["sequence", "sway"] = "sequence"
     """The sequence's own camera, or one that sways around it."""
     camera_path: Path | None = None
-    """JSON list of {"time", "world_to_camera"} to follow in place of a split."""
+    """JSON list of {"time", "world_to_camera"} to render instead of a split."""
     data: Path | None = None
-    """Sequence folder for the originals; the one the run was trained on if not given."""
+    """Sequence folder with the input frames. Default: the one the run was trained on."""
     device: Wanted = "auto"
-    """Where to draw; auto takes CUDA only where all of it works (`endoprior doctor`)."""
+    """Device; auto uses CUDA only if all of it works (`endoprior doctor`)."""
 
 
 def run(argv: list[str]) -> None:
-    """Draw."""
+    """Load the scene and render it."""
     args = parse(Render, argv, "render")
     from ..model.scene import load_scene
 
     scene = load_scene(args.run)
-    draw(scene, args)
+    render(scene, args)
 
 
-def draw(scene: Scene, args: Render) -> None:
-    """Draw what `args` asks for and say where it is."""
-    from .places import demand_folder_place
+def render(scene: Scene, args: Render) -> None:
+    """Render the views selected by `args` and print the output paths."""
+    from .output_paths import require_writable_folder
 
-    demand_folder_place("OUT" if args.out else "RUN", args.out or args.run)
+    require_writable_folder("OUT" if args.out else "RUN", args.out or args.run)
     scene = on_device(scene, args.device, half_planes=True)
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
-    from ..show.camera_paths import read_path, sway_path, times_path
-    from ..show.frames import depth_span, write_views
+    from ..visualization.camera_paths import read_path, sway_path, times_path
+    from ..visualization.rendered_views import depth_span, write_views
     from .evaluate import sequence_of_run
 
     frames, total = None, len(scene.cameras)
     if bad := [t for t in args.times if not 0 <= t <= 1]:
-        raise InputError(f"--times: expected moments in [0, 1]; got {bad[0]}. Frame i of T is at i / T.")
+        raise input_error("--times", "times in [0, 1]", str(bad[0]), "Frame i of T is at time i / T.")
     if args.camera_path:
         views = read_path(args.camera_path, scene.cameras)
     else:
@@ -71,9 +71,8 @@ def draw(scene: Scene, args: Render) -> None:
         if not times:
             sequence = load_sequence(args.data or sequence_of_run(args.run), scored_data(scene.config.data))
             if len(sequence) != total:
-                raise InputError(
-                    f"{sequence.path}: expected {total} frames; got {len(sequence)}. Pass the run's sequence."
-                )
+                fix = "`--data FOLDER` with the sequence of the run."
+                raise input_error(sequence.path, f"{total} frames", str(len(sequence)), fix)
             frames = sequence.frames(args.split)
             times = [index / total for index in sequence.indices(args.split)]
         if args.camera == "sway":
@@ -83,7 +82,7 @@ def draw(scene: Scene, args: Render) -> None:
             views = times_path(times, scene.cameras)
     out = args.out or args.run / "renders"
     video = args.out / "video.mp4" if args.out else args.run / "video.mp4"
-    if not args.out and out.is_symlink():  # a run from a stranger could point it anywhere
-        raise InputError(f"{out}: expected a folder; got a link to one. Remove it, or name OUT.")
+    if not args.out and out.is_symlink():  # in an untrusted run the link could point anywhere
+        raise input_error(out, "a folder", "a link to one", "Remove the link, or pass OUT.")
     write_views(scene, views, out, video, frames)
     say(f"{len(views)} views: {out}\n{video}")

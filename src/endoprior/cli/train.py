@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.presets import PresetName, preset
 from ..doctor.choice import Wanted
@@ -26,35 +26,35 @@ if TYPE_CHECKING:
 
 @dataclass
 class Train:
-    """Train one scene and score it. Every option below --view-port is a field of the config; the preset sets it."""
+    """Train one scene and score it. The options below --view-port are fields of the config; the preset sets them."""
 
     data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
     """Sequence folder: images/, masks/, depth/, poses_bounds.npy."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Run folder to write."""
     preset: PresetName = "default"
-    """Where the config starts from."""
+    """Preset of the config."""
     init_budget: int | None = None
     """Short for --init.budget."""
     device: Wanted = "auto"
-    """Where to compute; auto takes CUDA only where all of it works (`endoprior doctor`)."""
+    """Device; auto uses CUDA only if all of it works (`endoprior doctor`)."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     networks: bool = True
-    """Also score with RAFT and LPIPS where their weights can be had."""
+    """Also score with RAFT and LPIPS if their weights are available."""
     resume: bool = False
-    """Continue the run in OUT, after Ctrl-C or a crash, to the same bits."""
+    """Resume the run in OUT after Ctrl-C or a crash. The result is bit-identical to an uninterrupted run."""
     checkpoint_seconds: float = 60.0
-    """Time between two checkpoints: the longest that a crash can cost."""
+    """Time between two checkpoints, and the most time that a crash can cost."""
     view: bool = False
-    """Show the scene in a web browser while it trains, at 127.0.0.1 and --view-port. Takes time from the training."""
+    """Show the scene in a web browser during training, at 127.0.0.1 and --view-port. This slows down training."""
     view_port: int = 8080
-    """Port of --view; 0 takes any free one."""
+    """Port of --view; 0 uses any free port."""
     config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
 
 
 def run(argv: list[str]) -> None:
-    """Train, score, and print where the results are."""
+    """Train, score, and print the results."""
     from ..doctor.choice import choose_here
     from ..render import ON_GPU
 
@@ -62,23 +62,22 @@ def run(argv: list[str]) -> None:
     cfg = args.config
     named = cfg.render.backend if cfg.render.backend in ON_GPU else None
     if named and args.device == "cpu":
-        raise InputError(f"--render.backend {named}: expected --device cuda or auto; got cpu. Leave one of them out.")
+        fix = f"Remove --device cpu or --render.backend {named}."
+        raise input_error(f"--render.backend {named}", "--device cuda or auto", "cpu", fix)
     choice = choose_here("cuda" if named else args.device)
     say(choice.why)
     if choice.device == "cuda" and not named:
         cfg = dataclasses.replace(cfg, render=dataclasses.replace(cfg.render, backend=choice.backend))
     if args.weights_dir and not args.weights_dir.is_dir():
-        raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
+        raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
     if args.init_budget is not None:
         try:
             cfg = dataclasses.replace(cfg, init=dataclasses.replace(cfg.init, budget=args.init_budget))
         except ValueError as error:
-            raise InputError(f"--init-budget: {error}. Correct it.") from None
+            raise InputError(f"--init-budget: {error}. Fix: correct the value.") from None
     port = args.view_port if args.view else None
     if not args.checkpoint_seconds >= 0:
-        raise InputError(
-            f"--checkpoint-seconds: expected at least 0; got {args.checkpoint_seconds}. Leave it out for 60."
-        )
+        raise input_error("--checkpoint-seconds", "at least 0", str(args.checkpoint_seconds), "Remove it for 60.")
     kept = {"resume": args.resume, "checkpoint_seconds": args.checkpoint_seconds}
     train_and_evaluate(args.data, cfg, args.out, args.networks, args.weights_dir, port, **kept)
 
@@ -94,11 +93,11 @@ def train_and_evaluate(
     resume: bool = False,
     checkpoint_seconds: float = 60.0,
 ) -> None:
-    """Train on the folder `data` into the run folder `out`, score the test split there, print the scores.
+    """Train on the folder `data`, write the run folder `out`, score the test split, print the scores.
 
     Args:
-        view_port: serve a live view of the training there; None does not.
-        resume, checkpoint_seconds: as `train.train` has them.
+        view_port: port of a live view of the training; None for no view.
+        resume, checkpoint_seconds: as in `runs.training_run.train`.
     """
     from ..data import load_sequence
     from ..runs.training_run import TrainingRun
@@ -116,13 +115,13 @@ def train_and_evaluate(
 
             scene = training.complete(on_step, checkpoint_seconds=checkpoint_seconds)
     except KeyboardInterrupt:
-        say(f"Stopped; the state is saved. Go on with the same command and --resume ({out}).")
+        say(f"Stopped; the state is saved in {out}. To resume, run the same command with --resume.")
         raise
     seconds = clock.perf_counter() - began
-    del training  # and with it the frames it caches: scoring reads its own
+    del training  # frees its cached frames; scoring loads its own
     done = _logged_seconds(out / "log.jsonl")
     speed = {"train_seconds": seconds, "iterations_per_second": done}
-    scene = scene.to(device_for(cfg.render.backend))  # drawn where it was trained
+    scene = scene.to(device_for(cfg.render.backend))  # score on the training device
     try:
         evaluate_run(scene, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
     except KeyboardInterrupt:
@@ -131,13 +130,13 @@ def train_and_evaluate(
 
 
 def _logged_seconds(log: Path) -> float:
-    """Iterations per second by the log: the reciprocal of the mean time of the iterations it shows."""
+    """Iterations per second: the reciprocal of the mean time of the logged iterations."""
     seconds = [json.loads(line)["seconds"] for line in log.read_text().splitlines()]
     return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0
 
 
 def _preset_defaults(argv: list[str]) -> Train:
-    """Defaults with the config of the preset named in `argv`, so that --help and options build on it."""
+    """Defaults from the preset named in `argv`, so that --help shows its values and options override them."""
     name = "default"
     for i, word in enumerate(argv):
         if word == "--preset" and i + 1 < len(argv):
@@ -145,7 +144,5 @@ def _preset_defaults(argv: list[str]) -> Train:
         elif word.startswith("--preset="):
             name = word.removeprefix("--preset=")
     if name not in get_args(PresetName):
-        raise InputError(
-            f"--preset: expected one of {', '.join(get_args(PresetName))}; got {name!r}. Choose one of them."
-        )
+        raise input_error("--preset", f"one of {', '.join(get_args(PresetName))}", repr(name), "`--preset default`.")
     return Train(data=tyro.MISSING, out=tyro.MISSING, preset=name, config=preset(name))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..doctor.choice import Wanted
 from .devices import on_device
 from .parsing import parse
@@ -30,18 +30,18 @@ DEFAULT_PORT = 8080
 
 @dataclass
 class View:
-    """Look at a trained scene, or at a sequence before training, in a web browser."""
+    """Show a trained scene, or a sequence before training, in a web browser."""
 
     path: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN|DATA")]]
     """Run folder, or sequence folder."""
     data: Path | None = None
-    """Sequence folder of the originals of a run; the one it was trained on if not given."""
+    """Sequence folder with the input frames of a run. Default: the one it was trained on."""
     host: str = "127.0.0.1"
-    """Address to listen on. Anybody who can reach it sees the scene: there is no password."""
+    """Address to listen on. Everyone who can reach it sees the scene: there is no password."""
     port: int = DEFAULT_PORT
-    """Port to listen on; 0 takes any free one."""
+    """Port to listen on; 0 uses any free port."""
     device: Wanted = "auto"
-    """Where to draw a run; auto takes CUDA only where all of it works (`endoprior doctor`)."""
+    """Device that renders a run; auto uses CUDA only if all of it works (`endoprior doctor`)."""
 
 
 def run(argv: list[str]) -> None:
@@ -52,12 +52,12 @@ def run(argv: list[str]) -> None:
     check_address(args.host, args.port)
     subject, out = open_subject(args.path, args.data, args.device)
     viewer = import_viewer()(subject, host=args.host, port=args.port, out=out)
-    say(f"{subject.title}: {viewer.url}  (Ctrl-C ends)")
+    say(f"{subject.title}: {viewer.url}  (Ctrl-C stops)")
     viewer.run()
 
 
 def import_viewer() -> type[Viewer]:
-    """The class that serves.
+    """Import the viewer class.
 
     Raises:
         InputError: viser is not installed.
@@ -65,16 +65,16 @@ def import_viewer() -> type[Viewer]:
     try:
         from ..view.server import Viewer
     except ModuleNotFoundError as error:
-        raise InputError(f"the viewer: expected the package {error.name}; found none. `pip install viser`.") from None
+        raise input_error("the viewer", f"the package {error.name}", "none", "`pip install viser`.") from None
     return Viewer
 
 
 @contextmanager
 def live_view(port: int | None) -> Iterator[Callable[[StepReport, Trainer], None]]:
-    """Yield an `on_step` of `train.train` that shows the scene at 127.0.0.1; one that does nothing if `port` is None.
+    """Yield an `on_step` callback that shows the scene at 127.0.0.1. It does nothing if `port` is None.
 
     Raises:
-        InputError: viser is not installed, or the port is taken.
+        InputError: viser is not installed, or the port is in use.
     """
     if port is None:
         yield lambda report, trainer: None
@@ -92,11 +92,11 @@ def live_view(port: int | None) -> Iterator[Callable[[StepReport, Trainer], None
 
 
 def open_subject(path: Path, data: Path | None, device: Wanted = "cpu") -> tuple[Subject, Path | None]:
-    """What is at `path`, and the folder its screenshots go to: none for a sequence, whose folder is not ours.
+    """Open the run or sequence at `path`. Also returns the folder for its screenshots: None for a sequence.
 
     Args:
-        data: sequence folder of a run. device: where a run is drawn.
-
+        data: sequence folder of a run.
+        device: device that renders a run.
     Raises:
         InputError: neither a run nor a sequence.
     """
@@ -104,10 +104,10 @@ def open_subject(path: Path, data: Path | None, device: Wanted = "cpu") -> tuple
     from ..view.sequence_subject import SequenceSubject
 
     folder = path.parent if path.name == "scene.safetensors" else path
-    if not os.path.isfile(folder / "scene.safetensors"):  # of a name too long for the system pathlib would raise
+    if not os.path.isfile(folder / "scene.safetensors"):  # pathlib raises for a name that is too long
         if (folder / "config.json").is_file() and (folder / "log.jsonl").is_file():
-            hint = "It appears when training is done; `endoprior train --view` shows a scene while it trains."
-            raise InputError(f"{folder / 'scene.safetensors'}: expected a trained scene; found none yet. {hint}")
+            fix = "Wait until training is done; `endoprior train --view` shows a scene during training."
+            raise input_error(folder / "scene.safetensors", "a trained scene", "none yet", fix)
         return SequenceSubject(load_sequence(path)), None
     from ..model.scene import load_scene
     from ..view.scene_subject import SceneSubject
@@ -118,10 +118,10 @@ def open_subject(path: Path, data: Path | None, device: Wanted = "cpu") -> tuple
 
 
 def _originals(scene: Scene, folder: Path, data: Path | None) -> FrameSequence | None:
-    """The sequence of a run; None, with a note, if it has gone.
+    """The sequence of a run; None, with a note, if it does not exist any more.
 
     Raises:
-        InputError: `data` was given and does not fit.
+        InputError: `data` does not fit the run.
     """
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
@@ -132,10 +132,9 @@ def _originals(scene: Scene, folder: Path, data: Path | None) -> FrameSequence |
     except InputError as error:
         if data:
             raise
-        say(f"note: no originals, differences or tools: {error}")
+        say(f"note: no input frames, differences or tools: {error}")
         return None
     if len(sequence) != len(scene.cameras):
-        raise InputError(
-            f"{sequence.path}: expected {len(scene.cameras)} frames; got {len(sequence)}. Pass the run's own --data."
-        )
+        fix = "`--data FOLDER` with the sequence of the run."
+        raise input_error(sequence.path, f"{len(scene.cameras)} frames", str(len(sequence)), fix)
     return sequence

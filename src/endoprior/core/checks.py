@@ -1,32 +1,43 @@
-"""One grammar for every complaint: what was expected, what was found, what to do next."""
+"""Input checks and their error messages: `FILE: expected X, got Y. Fix: COMMAND.`"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 
 class InputError(ValueError):
-    """The caller's data or options cannot be used. The command line prints it as one line and exits with status 2."""
+    """The user's data or options cannot be used. The command line prints it as one line and exits with status 2."""
 
 
-def runs(numbers: Iterable[int], most: int = 8) -> str:
-    """Ascending numbers in words: `3-5, 9` of 3, 4, 5, 9, and how many runs there are beyond `most`."""
-    found: list[list[int]] = []
+def input_error(subject: Path | str, expected: str, got: str, fix: str) -> InputError:
+    """The error for a file, folder or option that cannot be used: `SUBJECT: expected X, got Y. Fix: Z`.
+
+    Args:
+        subject: name of the file, folder or option.
+        fix: the command to run, in backticks, or one sentence; with its final period.
+    """
+    return InputError(f"{subject}: expected {expected}, got {got}. Fix: {fix}")
+
+
+def number_ranges(numbers: Iterable[int], most: int = 8) -> str:
+    """Ascending numbers as text: 3, 4, 5, 9 give `3-5, 9`. Beyond `most` ranges, the rest is only counted."""
+    ranges: list[list[int]] = []
     for number in numbers:
-        if found and number == found[-1][1] + 1:
-            found[-1][1] = number
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1][1] = number
         else:
-            found.append([number, number])
-    words = ", ".join(f"{first}" if first == last else f"{first}-{last}" for first, last in found[:most])
-    return words + (f" and {len(found) - most} more places" if len(found) > most else "")
+            ranges.append([number, number])
+    text = ", ".join(f"{first}" if first == last else f"{first}-{last}" for first, last in ranges[:most])
+    return text + (f" and {len(ranges) - most} more" if len(ranges) > most else "")
 
 
 def check_shape(spec: str, **arrays: Any) -> dict[str, int]:
-    """Match array shapes against a spec such as ``"means:N,3 quats:N,4"`` and return the sizes it bound.
+    """Compare array shapes with a spec such as ``"means:N,3 quats:N,4"`` and return the size of each letter.
 
     Raises:
-        ValueError: a shape differs from its spec, or one letter would stand for two sizes.
+        ValueError: a shape differs from its spec, or one letter has two sizes.
     """
     sizes: dict[str, int] = {}
     for item in spec.split():
@@ -36,11 +47,11 @@ def check_shape(spec: str, **arrays: Any) -> dict[str, int]:
             (int(w) if w.isdigit() else sizes.setdefault(w, g)) == g for w, g in zip(want, got, strict=True)
         )
         if not matches:
-            raise ValueError(f"{name} must have shape ({dims}); got {got} where {sizes or 'nothing is bound yet'}")
+            raise ValueError(f"{name} must have shape ({dims}), got {got}{f' with {sizes}' if sizes else ''}")
     return sizes
 
 
 def check_range(name: str, value: float, low: float, high: float) -> None:
     """Raise ValueError unless low <= value <= high (NaN fails)."""
     if not low <= value <= high:
-        raise ValueError(f"{name} must be in [{low:g}, {high:g}]; got {value!r}")
+        raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value!r}")

@@ -32,8 +32,8 @@ class DataConfig(Checked):
     """Read frames at this fraction of their width and height: 2 averages blocks of 2 x 2 pixels."""
     first_frames: Count = 0
     """Read only so many frames from the start of the sequence; 0 reads all."""
-    format: Literal["auto", "scared", "c3vd", "stir", "stereomis", "hamlyn", "endonerf", "plain"] = "auto"
-    """Layout of the folder (docs/datasets.md); `auto` recognizes it."""
+    format: str = "auto"
+    """Layout of the folder: a name in docs/datasets.md, such as `endonerf`; `auto` recognizes it."""
     stride: Annotated[int, Range(0, 10_000)] = 0
     """Keep every n-th frame of the folder; 0 takes what is published for the dataset."""
     depth_unit_mm: Weight = 0.0

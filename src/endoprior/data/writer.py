@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.atomic import refuse_occupied, whole_folder
+from ..system.atomic import reject_occupied, whole_folder
 from .images import save_png
 
 TOOL_VALUE = 255
@@ -187,7 +187,7 @@ class SequenceWriter(FrameFiles):
             InputError: `out` is a file or a folder that is not empty, or cannot be created.
         """
         self.out = Path(out)
-        refuse_occupied(self.out)
+        reject_occupied(self.out)
         self._whole = whole_folder(self.out)
         super().__init__(self._whole.__enter__(), meta)
 

@@ -1,1 +1,1 @@
-"""What pictures of a clip show, measured by pure functions: borders, labels, motion, changes, units."""
+"""What images of a clip show, measured by pure functions: borders, labels, motion, changes, units."""

@@ -1,6 +1,6 @@
-"""What surrounds the endoscope's picture: black bars, console strips, the round border of a lens.
+"""What surrounds the endoscope's image: black bars, console strips, the round border of a lens.
 
-Shared letters: `K` sample pictures of one clip, (H, W, 3) uint8 each. A picture is never black in the same place for
+Shared letters: `K` sample images of one clip, (H, W, 3) uint8 each. An image is never black in the same place for
 long, and never still: what is, does not belong to it.
 """
 
@@ -18,9 +18,9 @@ BLACK_LEVEL = 28
 MIN_STRIP_PX = 3
 """Thinner strips are left to the coding noise of border rows."""
 MAX_STRIP_FRACTION = 0.25
-"""A strip never takes more of the picture than this."""
+"""A strip never takes more of the image than this."""
 STILL_RATIO = 0.3
-"""A strip changes less than this share of what the middle of the picture changes ..."""
+"""A strip changes less than this share of what the middle of the image changes ..."""
 STRIP_CHROMA = 40
 """... and is gray: half of its pixels have channels closer together than this."""
 EDGE_SHARE = 0.55
@@ -33,7 +33,7 @@ CIRCLE_RESIDUAL = 0.012
 
 @dataclass(frozen=True)
 class Strips:
-    """Rows and columns at each side that do not belong to the picture, px."""
+    """Rows and columns at each side that do not belong to the image, px."""
 
     top: int
     bottom: int
@@ -46,7 +46,7 @@ class Strips:
 
 @dataclass(frozen=True)
 class Circle:
-    """The round border of the endoscope's picture, px; the center of the top-left pixel is (0.5, 0.5)."""
+    """The round border of the endoscope's image, px; the center of the top-left pixel is (0.5, 0.5)."""
 
     center_x: float
     center_y: float
@@ -59,17 +59,17 @@ class Circle:
         return x * x + y * y < (self.radius - margin_px) ** 2
 
 
-def find_strips(pictures: Sequence[NDArray[np.uint8]]) -> Strips:
+def find_strips(images: Sequence[NDArray[np.uint8]]) -> Strips:
     """Black bars and still, gray console strips at the sides.
 
     Args:
-        pictures: K of one size, some time apart; one picture alone shows black bars only.
+        images: K of one size, some time apart; one image alone shows black bars only.
     """
-    grays = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in pictures]
+    grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in images]
     mean = sum(grays) / len(grays)
     change = np.sqrt(sum((gray - mean) ** 2 for gray in grays) / len(grays))
-    low = np.maximum.reduce([picture.max(-1) for picture in pictures])
-    chroma = sum(picture.max(-1) - picture.min(-1).astype(np.float32) for picture in pictures) / len(pictures)
+    low = np.maximum.reduce([image.max(-1) for image in images])
+    chroma = sum(image.max(-1) - image.min(-1).astype(np.float32) for image in images) / len(images)
     middle = tuple(slice(n // 4, n - n // 4) for n in low.shape)
     lively = float(np.median(change[middle]))
     found = []
@@ -83,24 +83,24 @@ def _strip_on_top(low: NDArray[np.uint8], chroma: NDArray, change: NDArray, mean
     """Number of rows of a strip at the top of these (H, W) maps, 0 for none."""
     limit = int(MAX_STRIP_FRACTION * len(low))
     black = np.quantile(low[: limit + 1], 0.98, axis=1) < BLACK_LEVEL
-    still = np.quantile(change[: limit + 1], 0.8, axis=1) < STILL_RATIO * lively  # never, if there is one picture
+    still = np.quantile(change[: limit + 1], 0.8, axis=1) < STILL_RATIO * lively  # never, if there is one image
     gray = np.median(chroma[: limit + 1], axis=1) < STRIP_CHROMA
     belongs = black | (still & gray)
     rows = limit + 1 if belongs.all() else int(np.argmin(belongs))
     if rows < MIN_STRIP_PX or rows > limit:
         return 0
-    # A row of coding noise may lie between strip and picture.
+    # A row of coding noise may lie between strip and image.
     jumps = [np.abs(mean[rows + d] - mean[rows - 1]) > EDGE_STEP for d in (0, 1) if rows + d < len(mean)]
     return rows if max(jump.mean() for jump in jumps) > EDGE_SHARE else 0
 
 
-def find_circle(pictures: Sequence[NDArray[np.uint8]]) -> Circle | None:
+def find_circle(images: Sequence[NDArray[np.uint8]]) -> Circle | None:
     """The round border, if the corners stay black and what is lit ends in a circle.
 
     Args:
-        pictures: K of one size, some time apart.
+        images: K of one size, some time apart.
     """
-    low = np.stack(pictures).max(-1).max(0)
+    low = np.stack(images).max(-1).max(0)
     height, width = low.shape
     lit = cv2.medianBlur(low, 5) >= BLACK_LEVEL
     side = max(min(height, width) // 40, 2)

@@ -10,25 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 WORK_WIDTH = 320
-"""Pictures are brought to this width, px: enough for hundreds of corners, quick to follow."""
+"""Images are brought to this width, px: enough for hundreds of corners, quick to follow."""
 MAX_CORNERS = 400
 MIN_TRACKS = 24
-"""Fewer followed corners say nothing about a pair of pictures."""
+"""Fewer followed corners say nothing about a pair of images."""
 MIN_INLIERS = 0.4
 """Share of corners that must agree on one motion; below, the pair is not explained by the camera."""
 MOVING_FRACTION = 0.06
-"""The camera moves if the picture as a whole ends up or passes farther away than this share of its width.
+"""The camera moves if the image as a whole ends up or passes farther away than this share of its width.
 Breathing shifts it by 3 % and back."""
 
 
 @dataclass(frozen=True)
 class CameraMotion:
-    """Motion of the picture as a whole."""
+    """Motion of the image as a whole."""
 
     pixels_per_frame: NDArray[np.float64]
-    """(K - 1,) mean shift of the picture from each to the next, px of the given pictures; NaN where nothing agrees."""
+    """(K - 1,) mean shift of the image from each to the next, px of the given images; NaN where nothing agrees."""
     path_px: NDArray[np.float64]
-    """(K,) how far the picture as a whole has come from the first one, px, unexplained steps counted as none."""
+    """(K,) how far the image as a whole has come from the first one, px, unexplained steps counted as none."""
     moving: bool
     """Whether a camera that stands still is implausible."""
     reason: str
@@ -36,20 +36,20 @@ class CameraMotion:
 
 
 def camera_motion(
-    pictures: Iterable[NDArray[np.uint8]], tissue_masks: Iterable[NDArray[np.bool_]] | None = None
+    images: Iterable[NDArray[np.uint8]], tissue_masks: Iterable[NDArray[np.bool_]] | None = None
 ) -> CameraMotion:
-    """Follow corners from picture to picture and chain the similarity transforms that most of them agree on.
+    """Follow corners from image to image and chain the similarity transforms that most of them agree on.
 
     Args:
-        pictures: K of (H, W, 3), in order; only two are held at a time.
+        images: K of (H, W, 3), in order; only two are held at a time.
         tissue_masks: (H, W) each, True where corners may lie; None allows all.
     """
     shifts, path = [], [0.0]
     chain, before, size, factor = np.eye(3), None, (1, 1), 1.0
     masks = iter(tissue_masks) if tissue_masks is not None else None
-    for picture in pictures:
-        factor = min(1.0, WORK_WIDTH / picture.shape[1])
-        gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    for image in images:
+        factor = min(1.0, WORK_WIDTH / image.shape[1])
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         fy = max(factor, 1 / gray.shape[0])  # a strip keeps its one row
         gray = cv2.resize(gray, None, fx=factor, fy=fy, interpolation=cv2.INTER_AREA)
         allowed = None
@@ -72,14 +72,14 @@ def camera_motion(
     moving = bool(farthest > MOVING_FRACTION * size[0] / factor)
     explained = float(np.isfinite(steps).mean()) if len(steps) else 1.0
     reason = (
-        f"the picture as a whole comes up to {farthest:.0f} px away from the first frame "
+        f"the image as a whole comes up to {farthest:.0f} px away from the first frame "
         f"({np.nanmedian(steps) if np.isfinite(steps).any() else 0:.1f} px a step; {explained:.0%} of steps explained)"
     )
     return CameraMotion(steps, distances, moving, reason)
 
 
 def _step(before: NDArray[np.uint8], allowed: NDArray[np.uint8] | None, now: NDArray[np.uint8]) -> NDArray | None:
-    """(3, 3) similarity from one small gray picture to the next, None if corners do not agree on one."""
+    """(3, 3) similarity from one small gray image to the next, None if corners do not agree on one."""
     corners = cv2.goodFeaturesToTrack(before, MAX_CORNERS, 0.01, 5, mask=allowed)
     if corners is None or len(corners) < MIN_TRACKS:
         return None
@@ -96,7 +96,7 @@ def _step(before: NDArray[np.uint8], allowed: NDArray[np.uint8] | None, now: NDA
 
 
 def _grid(width: int, height: int) -> NDArray[np.float64]:
-    """(9, 2) points all over the picture: a zoom about the center moves most of them."""
+    """(9, 2) points all over the image: a zoom about the center moves most of them."""
     x, y = np.meshgrid(np.array([1, 3, 5]) * width / 6, np.array([1, 3, 5]) * height / 6)
     return np.stack([x.ravel(), y.ravel()], 1)
 

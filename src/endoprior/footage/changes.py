@@ -1,6 +1,6 @@
-"""What changes from picture to picture that tissue does not do: copies, exposure jumps, cuts, blur, another place.
+"""What changes from image to image that tissue does not do: copies, exposure jumps, cuts, blur, another place.
 
-Shared letters: `T` successive pictures of one clip. Everything is measured on thumbnails, so noise hardly counts.
+Shared letters: `T` successive images of one clip. Everything is measured on thumbnails, so noise hardly counts.
 """
 
 from __future__ import annotations
@@ -14,31 +14,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 THUMB_WIDTH = 160
-"""Pictures are compared at this width, px."""
+"""Images are compared at this width, px."""
 SAME_LEVELS = 0.03
-"""Pictures that differ by less than this on average, levels of 255, are the same picture."""
+"""Images that differ by less than this on average, levels of 255, are the same image."""
 COPY_LEVELS, COPY_SHARE = 0.12, 0.08
 """So are those that differ by less than this after video coding, if it is less than this share of what is usual
 around them: a scene that has come to rest changes by 0.15 levels and more."""
 JUMP = 0.13
-"""Smallest exposure jump: change of the logarithm of brightness (14 %) between two pictures."""
+"""Smallest exposure jump: change of the logarithm of brightness (14 %) between two images."""
 JUMP_RATIO = 6.0
 """An exposure jump is this many times the usual change of brightness ..."""
 JUMP_AGREEMENT = 0.85
-"""... and this share of the picture changes in the same direction: a tool that comes in darkens only a part."""
+"""... and this share of the image changes in the same direction: a tool that comes in darkens only a part."""
 CUT_CORRELATION = 0.4
-"""Successive pictures of one scene are correlated better than this."""
+"""Successive images of one scene are correlated better than this."""
 BLUR_RATIO = 0.45
-"""A picture with less than this share of its neighbors' sharpness is blurred."""
+"""An image with less than this share of its neighbors' sharpness is blurred."""
 NEIGHBORS = 5
-"""What is usual is judged by this many pictures to each side."""
+"""What is usual is judged by this many images to each side."""
 COLOR_DISTANCE = 0.07
-"""A picture whose mean red or green share is this far from the clip's median shows another place."""
+"""An image whose mean red or green share is this far from the clip's median shows another place."""
 
 
 @dataclass(frozen=True)
 class Changes:
-    """Curves over the clip, and the pictures that stand out; positions count from 0."""
+    """Curves over the clip, and the images that stand out; positions count from 0."""
 
     brightness: NDArray[np.float64]
     """(T,) mean gray level in [0, 1]."""
@@ -47,30 +47,30 @@ class Changes:
     sharpness: NDArray[np.float64]
     """(T,) RMS of the Laplacian divided by brightness, > 0; comparable within one clip only."""
     duplicates: tuple[int, ...]
-    """Pictures that repeat the one before."""
+    """Images that repeat the one before."""
     exposure_jumps: tuple[int, ...]
-    """Pictures that are suddenly brighter or darker as a whole than the one before."""
+    """Images that are suddenly brighter or darker as a whole than the one before."""
     cuts: tuple[int, ...]
-    """Pictures that show another view than the one before."""
+    """Images that show another view than the one before."""
     blurred: tuple[int, ...]
-    """Pictures much less sharp than their neighbors."""
+    """Images much less sharp than their neighbors."""
     off_color: tuple[int, ...]
-    """Pictures of another color than the clip: out of the body, or covered by smoke or blood."""
+    """Images of another color than the clip: out of the body, or covered by smoke or blood."""
 
 
-def find_changes(pictures: Iterable[NDArray[np.uint8]]) -> Changes:
+def find_changes(images: Iterable[NDArray[np.uint8]]) -> Changes:
     """Measure the curves and pick what stands out.
 
     Args:
-        pictures: T of (H, W, 3) and of one size, in order, T >= 1; each is used once.
+        images: T of (H, W, 3) and of one size, in order, T >= 1; each is used once.
     """
     thumbs, sharpness, shares = [], [], []
-    for picture in pictures:
-        size = THUMB_WIDTH, max(1, round(THUMB_WIDTH * picture.shape[0] / picture.shape[1]))
-        color = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    for image in images:
+        size = THUMB_WIDTH, max(1, round(THUMB_WIDTH * image.shape[0] / image.shape[1]))
+        color = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         thumbs.append(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
         shares.append(color_share(color))
-        sharpness.append(_sharpness(picture))
+        sharpness.append(_sharpness(image))
     brightness = np.array([thumb.mean() for thumb in thumbs], np.float64) / 255
     pairs = list(pairwise(thumbs))
     difference = np.array([np.abs(now - before).mean() for before, now in pairs], np.float64)
@@ -89,10 +89,10 @@ def find_changes(pictures: Iterable[NDArray[np.uint8]]) -> Changes:
 
 
 def find_duplicates(difference: NDArray[np.floating]) -> tuple[int, ...]:
-    """Positions of the pictures that repeat the one before.
+    """Positions of the images that repeat the one before.
 
     Args:
-        difference: (T - 1,) mean absolute difference of successive pictures, levels of 255.
+        difference: (T - 1,) mean absolute difference of successive images, levels of 255.
     """
     # The upper end, not the median: a clip brought to twice its rate consists of copies by half.
     windows = (difference[max(0, i - NEIGHBORS) : i + NEIGHBORS + 1] for i in range(len(difference)))
@@ -118,9 +118,9 @@ def _exposure_jumps(pairs: list[tuple[NDArray, NDArray]]) -> list[int]:
     return [i + 1 for i, c in enumerate(changes) if abs(c) > limit and agreements[i] > JUMP_AGREEMENT]
 
 
-def _sharpness(picture: NDArray[np.uint8]) -> float:
+def _sharpness(image: NDArray[np.uint8]) -> float:
     """RMS of the Laplacian at half size, divided by brightness: exposure does not change it."""
-    gray = _reduced(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 0.5)
+    gray = _reduced(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), 0.5)
     return float(cv2.Laplacian(gray, cv2.CV_32F).std() / max(float(gray.mean()), 1.0)) + 1e-6
 
 
@@ -137,9 +137,9 @@ def _blurred(sharpness: NDArray[np.float64]) -> tuple[int, ...]:
     return tuple(int(i) for i in np.flatnonzero(sharpness < BLUR_RATIO * usual))
 
 
-def color_share(picture: NDArray) -> NDArray[np.float64]:
-    """(2,) share of red and of green in the mean color of a picture (H, W, 3) of 0..255."""
-    mean = picture.mean((0, 1), dtype=np.float64)
+def color_share(image: NDArray) -> NDArray[np.float64]:
+    """(2,) share of red and of green in the mean color of an image (H, W, 3) of 0..255."""
+    mean = image.mean((0, 1), dtype=np.float64)
     return mean[:2] / max(mean.sum(), 1.0)
 
 
@@ -149,7 +149,7 @@ def _off_color(shares: NDArray[np.float64]) -> tuple[int, ...]:
 
 
 def _correlation(a: NDArray, b: NDArray) -> float:
-    """Correlation of two thumbnails after smoothing; 1 for pictures without content."""
+    """Correlation of two thumbnails after smoothing; 1 for images without content."""
     a, b = (cv2.GaussianBlur(x, (0, 0), 2.0) for x in (a, b))
     a, b = a - a.mean(), b - b.mean()
     energy = float(np.sqrt((a * a).mean() * (b * b).mean()))

@@ -32,12 +32,12 @@ class Polarity:
     """The evidence in one line."""
 
 
-def mask_polarity(highs: Sequence[NDArray[np.bool_]], pictures: Sequence[NDArray[np.uint8]]) -> Polarity:
+def mask_polarity(highs: Sequence[NDArray[np.bool_]], images: Sequence[NDArray[np.uint8]]) -> Polarity:
     """Decide which side of the masks is the tools.
 
     Args:
         highs: (H, W) each, True where the mask's value is above half.
-        pictures: (H, W, 3) each, 0..255, the frames of these masks; a dozen are enough.
+        images: (H, W, 3) each, 0..255, the frames of these masks; a dozen are enough.
     Returns:
         With one side empty: tools are the smaller side, at certainty 0.
     Raises:
@@ -46,15 +46,15 @@ def mask_polarity(highs: Sequence[NDArray[np.bool_]], pictures: Sequence[NDArray
     if not highs:
         raise ValueError("highs must hold at least one mask; got none")
     sides, reds, rims = [], [], []
-    for high, picture in zip(highs, pictures, strict=True):
-        check_shape("high:H,W picture:H,W,3", high=high, picture=picture)
+    for high, image in zip(highs, images, strict=True):
+        check_shape("high:H,W image:H,W,3", high=high, image=image)
         rim = np.zeros(high.shape, bool)
         rim[[0, -1]] = rim[:, [0, -1]] = True
         step = max(1, min(high.shape) // 160)  # a sample is enough, but every pixel of the border counts
         few = rim.copy()
         few[::step, ::step] = True
-        few &= picture.max(-1) > LIT
-        color = picture[few].astype(np.float64) + 10  # the offset calms the ratio of dark, noisy pixels
+        few &= image.max(-1) > LIT
+        color = image[few].astype(np.float64) + 10  # the offset calms the ratio of dark, noisy pixels
         reds.append(np.log(color[:, 0] / color[:, 1]))
         sides.append(high[few])
         rims.append(rim[few])
@@ -75,7 +75,7 @@ def mask_polarity(highs: Sequence[NDArray[np.bool_]], pictures: Sequence[NDArray
         + COLOR_WEIGHT * float(np.clip(grayer, -COLOR_LIMIT, COLOR_LIMIT))
     )
     reason = (
-        f"high values cover {area:.0%} of the picture and {border:.0%} of its border, "
+        f"high values cover {area:.0%} of the image and {border:.0%} of its border, "
         f"redness {high_red:.2f} against {low_red:.2f} elsewhere"
     )
     return Polarity(log_odds >= 0, float(np.tanh(abs(log_odds) / 2)), reason)

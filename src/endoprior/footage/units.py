@@ -31,7 +31,7 @@ SHADING_LIMIT = 0.3
 TOOL_LIMIT = 1.1
 """Value on a tool, divided by that of the tissue around it, above which larger means nearer."""
 SAMPLES = 4000
-"""Pixels of a picture that enter its correlation."""
+"""Pixels of an image that enter its correlation."""
 MIN_PIXELS = 50
 """Fewer pixels give no figure."""
 
@@ -60,16 +60,16 @@ def guess_unit(
     """Guess the unit of a clip's depth from a few frames of it.
 
     Args:
-        frames: of each frame the values (H, W), where they were measured (H, W), the picture (H, W, 3) and the
+        frames: of each frame the values (H, W), where they were measured (H, W), the image (H, W, 3) and the
             tissue mask (H, W), True on tissue.
     """
     medians, shadings, ratios = [], [], []
-    for values, valid, picture, tissue in frames:
+    for values, valid, image, tissue in frames:
         on_tissue = valid & tissue if (valid & tissue).any() else valid
         if not on_tissue.any():
             continue
         medians.append(float(np.median(values[on_tissue])))
-        shadings += _shading(values, picture, on_tissue)
+        shadings += _shading(values, image, on_tissue)
         ratios += _tool_ratio(values, valid, tissue)
     if not medians:
         return UnitGuess("none", None, 0.0, 0.0, float("nan"), "no pixel has depth")
@@ -105,9 +105,9 @@ def _reason(median: float, shading: float, tool: float) -> str:
     return f"the median is {median:.4g}, which in {unit} is {median * factor:.0f} mm away"
 
 
-def _shading(values: NDArray, picture: NDArray[np.uint8], where: NDArray[np.bool_]) -> list[float]:
+def _shading(values: NDArray, image: NDArray[np.uint8], where: NDArray[np.bool_]) -> list[float]:
     """Rank correlation of smoothed brightness and value; none where there are few pixels or only one value."""
-    brightness = cv2.GaussianBlur(picture.max(-1).astype(np.float32), (0, 0), max(picture.shape[1] / 80, 1.0))
+    brightness = cv2.GaussianBlur(image.max(-1).astype(np.float32), (0, 0), max(image.shape[1] / 80, 1.0))
     picked = np.flatnonzero(where)
     picked = picked[:: max(1, len(picked) // SAMPLES)]
     a, b = brightness.reshape(-1)[picked], values.reshape(-1)[picked]

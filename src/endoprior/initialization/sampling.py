@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from ..core.checks import InputError, check_shape
 from ..core.config import InitConfig, PriorConfig
-from ..core.geometry import back_project
+from ..core.geometry import FARTHEST_MM, back_project
 from ..core.types import Frame
 from ..priors import joint_texture_prior
 from ..render.constants import NEAR_Z
@@ -34,8 +34,6 @@ PRIOR_BYTES = 200
 """Per pixel, while the points of a frame are drawn."""
 MIN_POINTS = 4
 """A scale needs three neighbors."""
-FARTHEST_MM = 1e9
-"""A depth from here on is no measurement; the squares of such lengths would soon leave float32."""
 
 log = logging.getLogger(__name__)
 

@@ -17,9 +17,10 @@ from .. import render
 from ..core.checks import InputError, check_range
 from ..core.config import Config
 from ..core.config_io import from_dict, to_dict
+from ..core.geometry import FARTHEST_MM
 from ..core.ranges import Checked, Range
 from ..core.types import Camera, RenderOutput, Splats
-from ..system.arrays_file import ArraySpec, load_arrays, part, refusing, save_arrays
+from ..system.arrays_file import ArraySpec, load_arrays, part, rejecting, save_arrays
 from .basis import basis_offsets
 from .deformation import HexPlaneField, Offsets
 from .gaussians import Gaussians
@@ -33,8 +34,6 @@ LARGEST_SIDE = 2**16
 LARGEST_IMAGE = 2**26
 """Largest number of pixels of an image: 8192 x 8192."""
 MOST_GAUSSIANS, MOST_FRAMES = 10_000_000, 1_000_000
-FARTHEST_MM = 1e9
-"""Lengths beyond it come from no endoscope, in whatever unit, and their squares leave float32."""
 LARGEST_DEVIATION = 5e-3
 """Largest entry of R R^T - I that still passes for a rotation; readers accept 1e-3 of R^T R."""
 
@@ -196,7 +195,7 @@ def load_scene(path: str | Path) -> Scene:
         raise InputError(f"{file}: expected a trained scene; found none. Train one with `endoprior train DATA {path}`.")
     next_step = "Train the scene again."
     arrays, about = load_arrays(file, FORMAT, scene_schema, next_step)
-    with refusing(file, "a scene", next_step):
+    with rejecting(file, "a scene", next_step):
         facts = from_dict(SceneFacts, {name: value for name, value in about.items() if name != "format"}, "about")
         check_values(arrays)
         return _from_arrays(arrays, facts)

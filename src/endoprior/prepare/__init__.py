@@ -1,4 +1,4 @@
-"""From a video to a sequence folder: what is cut out, masked, measured and written."""
+"""Write a sequence folder from a video: select frames, rectify, crop, mask tools, measure depth, estimate poses."""
 
 from .config import PrepareConfig
 from .pipeline import Prepared, prepare

@@ -1,7 +1,7 @@
-"""Calibration files to `Calibration`: OpenCV's YAML, plain YAML or JSON, NPZ, and the da Vinci's ini.
+"""Read calibration files: OpenCV YAML, plain YAML or JSON, NPZ, and da Vinci ini.
 
-A file becomes a flat table of names and numbers; names are compared without case and punctuation, and every usual
-spelling of a quantity is known. Nothing in a file is ever executed.
+A file becomes a flat table of names and values. Names are compared without case and punctuation, and every usual name
+of a quantity is accepted. Nothing in a file is ever executed.
 """
 
 from __future__ import annotations
@@ -16,50 +16,50 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..data.numpy_files import read_numpy
-from ..data.reading import complaint, read_text
+from ..data.reading import read_text
 from ..data.yaml_text import BoundedLoader, load_yaml
-from .calibration import Calibration, Eye
+from .calibration import Calibration, Intrinsics
 
 Unit = Literal["auto", "mm", "cm", "m"]
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 MOST_PX = 1e6
-"""Of a size, a focal length or a principal point."""
+"""Largest plausible image size, focal length or principal point, px."""
 METERS_BELOW = 0.05
-"""A T shorter than this is in meters: no stereo endoscope has its eyes 0.05 mm apart."""
+"""A T shorter than this is in meters: no stereo endoscope has a baseline of 0.05 mm."""
 
 MATRIX = ("k", "m", "cameramatrix", "mtx", "intrinsics", "intrinsic", "intrinsicmatrix", "cammatrix")
 DISTORTION = ("d", "dist", "distortion", "distcoeffs", "distcoeff", "distortioncoefficients", "distortioncoeffs")
 SIDES = (("left", "right"), ("l", "r"), ("1", "2"), ("0", "1"))
 ROTATION = ("r", "rotation", "rot", "rotationmatrix", "rstereo")
 TRANSLATION = ("t", "translation", "trans", "translationvector", "tvec", "tstereo")
-HINT = "Names: K_left, distortion_left, K_right, distortion_right, R, T_mm, width, height (docs/prepare.md has more)."
+HINT = "Use the names K_left, distortion_left, K_right, distortion_right, R, T_mm, width, height (docs/prepare.md)."
 
 Table = dict[str, Any]
-"""Numbers, arrays and texts by name in lower case without punctuation."""
+"""Numbers, arrays and texts, by name in lower case without punctuation."""
 
 
 def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
-    """Read the calibration of one or two eyes.
+    """Read the calibration of one or two cameras.
 
     Args:
         path: .yaml, .yml, .json, .npz or .ini.
-        unit: of T; "auto" believes the file (`T_mm`), else takes mm, and m where T is shorter than 0.05.
+        unit: of T; "auto" uses the name in the file (`T_mm`), else mm, or m if T is shorter than 0.05.
     Raises:
-        InputError: unreadable, a quantity is missing or malformed; one line.
+        InputError: the file is unreadable, or a quantity is missing or malformed.
     """
     table = _read_table(path)
     table = {_plain(name): value for name, value in table.items()}
     size = _size(table, path)
-    # Files of this project count pixel centers from 0.5; OpenCV and all others count them from 0.
+    # Files of this package count pixel centers from 0.5; OpenCV and all others count them from 0.
     offset = 0.5 - _number(table, "pixelcenter", path, 0.0)
     if "fcxleft" in table:
-        left, right = _da_vinci_eye(table, "left", offset, path), _da_vinci_eye(table, "right", offset, path)
+        left, right = _da_vinci_camera(table, "left", offset, path), _da_vinci_camera(table, "right", offset, path)
     else:
-        left, right = _eyes(table, offset, path)
+        left, right = _cameras(table, offset, path)
     if left is None:
-        raise complaint(path, "the left camera matrix", f"only {_some(table)}", HINT)
+        raise input_error(path, "the left camera matrix", f"only {_some(table)}", HINT)
     if right is None and table.get("baselinemm") is not None:
         shift = np.array([-_number(table, "baselinemm", path), 0.0, 0.0])
         return Calibration(left, left, np.eye(3), shift, size, _text(table, "layout"))
@@ -70,9 +70,9 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     translation = _find(table, (*(name + "mm" for name in TRANSLATION), *TRANSLATION), path, (3,))
     if rotation is None or translation is None:
         missing = "R" if rotation is None else "T"
-        raise complaint(path, "how the eyes stand to each other (R, T)", f"no {missing}", HINT)
+        raise input_error(path, "the relative pose of the cameras (R, T)", f"no {missing}", HINT)
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
-        raise complaint(path, "R to be a rotation", "another matrix", "Write R as 3x3, row by row.")
+        raise input_error(path, "R to be a rotation", "another matrix", "Write R as 3x3, row by row.")
     if unit == "auto":
         unit = "m" if not in_mm and 0 < np.linalg.norm(translation) < METERS_BELOW else "mm"
     scale = 1.0 if in_mm else MM_PER_UNIT[unit]
@@ -83,7 +83,7 @@ def _read_table(path: Path) -> Table:
     """The file as a flat table; nested names are joined, matrices with rows, cols and data become arrays."""
     readers = {".yaml": _read_yaml, ".yml": _read_yaml, ".json": _read_yaml, ".npz": _read_npz, ".ini": _read_ini}
     if path.suffix.lower() not in readers:
-        raise complaint(path, "a .yaml, .json, .npz or .ini file", path.suffix or "no suffix", "Convert it.")
+        raise input_error(path, "a .yaml, .json, .npz or .ini file", path.suffix or "no suffix", "Convert it.")
     try:
         content = readers[path.suffix.lower()](path)
         if isinstance(content, dict) and content:
@@ -91,8 +91,8 @@ def _read_table(path: Path) -> Table:
     except InputError:
         raise
     except (ValueError, TypeError, OverflowError, RecursionError, yaml.YAMLError, configparser.Error) as error:
-        raise complaint(path, "a readable calibration", " ".join(str(error).split())[:120], "Correct it.") from None
-    raise complaint(path, "named quantities", type(content).__name__, HINT)
+        raise input_error(path, "a readable calibration", " ".join(str(error).split())[:120], "Correct it.") from None
+    raise input_error(path, "named values", type(content).__name__, HINT)
 
 
 class _Loader(BoundedLoader):
@@ -157,7 +157,7 @@ def _some(table: Table) -> str:
 
 
 def _find(table: Table, names: tuple[str, ...], path: Path, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """The first of the named quantities as an array of that shape (-1: any length), None if there is none."""
+    """The first of the named values as an array of this shape (-1: any length); None if there is none."""
     for name in names:
         if name not in table:
             continue
@@ -166,22 +166,22 @@ def _find(table: Table, names: tuple[str, ...], path: Path, shape: tuple[int, ..
             value = value.reshape(shape)
         except (TypeError, ValueError, OverflowError):
             want = "x".join(map(str, shape)).replace("-1", "k")
-            raise complaint(path, f"{name} to have {want} numbers", repr(table[name])[:60], HINT) from None
+            raise input_error(path, f"{name} to have {want} numbers", repr(table[name])[:60], HINT) from None
         if not np.isfinite(value).all():
-            raise complaint(path, f"{name} to be finite", "NaN or infinity", "Calibrate again.")
+            raise input_error(path, f"{name} to be finite", "NaN or infinity", "Calibrate again.")
         return value
     return None
 
 
-def _eyes(table: Table, offset: float, path: Path) -> tuple[Eye | None, Eye | None]:
-    """Both eyes under the first pair of names that has a left one; a single eye under names without a side."""
+def _cameras(table: Table, offset: float, path: Path) -> tuple[Intrinsics | None, Intrinsics | None]:
+    """Left and right camera, under the first pair of side names in the table; or one camera without side names."""
     for left_name, right_name in SIDES:
-        if left := _eye(table, left_name, offset, path):
-            return left, _eye(table, right_name, offset, path)
-    return _eye(table, "", offset, path) or _plain_pinhole(table, offset, path), None
+        if left := _camera(table, left_name, offset, path):
+            return left, _camera(table, right_name, offset, path)
+    return _camera(table, "", offset, path) or _plain_pinhole(table, offset, path), None
 
 
-def _eye(table: Table, side: str, offset: float, path: Path) -> Eye | None:
+def _camera(table: Table, side: str, offset: float, path: Path) -> Intrinsics | None:
     def spelled(names: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(spelling for name in names for spelling in (name + side, side + name))
 
@@ -192,21 +192,21 @@ def _eye(table: Table, side: str, offset: float, path: Path) -> Eye | None:
     return _checked(matrix, np.zeros(0) if distortion is None else distortion, offset, path)
 
 
-def _checked(matrix: NDArray, distortion: NDArray, offset: float, path: Path) -> Eye:
-    sane = np.isfinite(matrix).all() and np.isfinite(distortion).all() and np.abs(matrix).max() < MOST_PX
-    if not (sane and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], (0, 0, 1))):
-        raise complaint(path, "a camera matrix (fx 0 cx; 0 fy cy; 0 0 1)", str(matrix.tolist()), "Correct it.")
+def _checked(matrix: NDArray, distortion: NDArray, offset: float, path: Path) -> Intrinsics:
+    plausible = np.isfinite(matrix).all() and np.isfinite(distortion).all() and np.abs(matrix).max() < MOST_PX
+    if not (plausible and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], (0, 0, 1))):
+        raise input_error(path, "a camera matrix (fx 0 cx; 0 fy cy; 0 0 1)", str(matrix.tolist()), "Correct it.")
     if len(distortion) not in (0, 1, 2, 3, 4, 5, 8, 12, 14):
-        raise complaint(path, "4, 5, 8, 12 or 14 distortion coefficients", str(len(distortion)), "Correct them.")
+        raise input_error(path, "4, 5, 8, 12 or 14 distortion coefficients", str(len(distortion)), "Correct them.")
     if len(distortion) < 4:
         distortion = np.pad(distortion, (0, 4 - len(distortion)))
     moved = matrix.copy()
     moved[:2, 2] += offset
-    return Eye(moved, distortion)
+    return Intrinsics(moved, distortion)
 
 
-def _plain_pinhole(table: Table, offset: float, path: Path) -> Eye | None:
-    """fx, fy, cx, cy as `sequence.json` has them."""
+def _plain_pinhole(table: Table, offset: float, path: Path) -> Intrinsics | None:
+    """A camera from fx, fy, cx, cy, as in `sequence.json`."""
     if not {"fx", "cx", "cy"} <= table.keys():
         return None
     fx, cx, cy = (_number(table, name, path) for name in ("fx", "cx", "cy"))
@@ -214,29 +214,29 @@ def _plain_pinhole(table: Table, offset: float, path: Path) -> Eye | None:
     return _checked(matrix, np.zeros(4), offset, path)
 
 
-def _da_vinci_eye(table: Table, side: str, offset: float, path: Path) -> Eye:
+def _da_vinci_camera(table: Table, side: str, offset: float, path: Path) -> Intrinsics:
     names = [name + side for name in ("fcx", "fcy", "ccx", "ccy")]
     if missing := [name for name in names if name not in table]:
-        raise complaint(path, "fc_x, fc_y, cc_x, cc_y of both eyes", f"no {missing[0]}", "Complete it.")
+        raise input_error(path, "fc_x, fc_y, cc_x, cc_y of both cameras", f"no {missing[0]}", "Complete it.")
     fx, fy, cx, cy = (_number(table, name, path) for name in names)
-    bent = [_number(table, f"kc{i}{side}", path, 0.0) for i in range(8)]
+    distortion = [_number(table, f"kc{i}{side}", path, 0.0) for i in range(8)]
     if side == "right":
         for name, count in (("r", 9), ("t", 3)):
             values = [table.get(f"{name}{i}right") for i in range(count)]
             if None not in values:
                 table[name] = values
-    return _checked(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(bent), offset, path)
+    return _checked(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(distortion), offset, path)
 
 
 def _number(table: Table, name: str, path: Path, otherwise: float | None = None) -> float:
-    """A finite number of the table."""
+    """A finite number from the table."""
     value = table.get(name, otherwise)
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise complaint(path, f"{name} to be a number", repr(value)[:60], "Correct it.")
+        raise input_error(path, f"{name} to be a number", repr(value)[:60], "Correct it.")
     return number
 
 
@@ -249,7 +249,7 @@ def _size(table: Table, path: Path) -> tuple[int, int] | None:
     try:
         width, height = (int(v) for v in found[0])
     except (TypeError, ValueError, OverflowError):
-        raise complaint(path, "width and height in px", repr(found[0])[:60], "Correct them.") from None
+        raise input_error(path, "width and height in px", repr(found[0])[:60], "Correct them.") from None
     if not (1 <= width < MOST_PX and 1 <= height < MOST_PX):
-        raise complaint(path, "width and height in px", f"{width}x{height}", "Correct them.")
+        raise input_error(path, "width and height in px", f"{width}x{height}", "Correct them.")
     return width, height

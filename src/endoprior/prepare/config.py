@@ -1,4 +1,4 @@
-"""What `endoprior prepare` can be told. The fields are its options."""
+"""The options of `endoprior prepare`: one field each."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ..core.checks import InputError, check_range
+from ..core.checks import check_range, input_error
 from .calibration_files import Unit
-from .layout import Layout
 from .stereo import StereoConfig
+from .stereo_layout import Layout
 
 Rectangle = tuple[int, int, int, int]
-"""x, y, width, height, px of one eye's picture in the source."""
+"""x, y, width, height in px, in one camera's image of the source video."""
 
 
 def parse_rectangle(text: str, option: str) -> Rectangle:
     """`x,y,width,height` in px.
 
     Raises:
-        InputError: something else.
+        InputError: the text has another form.
     """
     try:
         x, y, width, height = (int(part) for part in text.split(","))
     except ValueError:
-        raise InputError(f"{option}: expected x,y,width,height in px; got {text!r}. Try 0,0,640,500.") from None
+        raise input_error(option, "x,y,width,height in px", repr(text), f"`{option} 0,0,640,500`.") from None
     if min(x, y) < 0 or min(width, height) < 1:
-        raise InputError(f"{option}: expected x, y >= 0 and width, height >= 1; got {text!r}. Try 0,0,640,500.")
+        raise input_error(option, "x, y >= 0 and width, height >= 1", repr(text), f"`{option} 0,0,640,500`.")
     return x, y, width, height
 
 
@@ -36,71 +36,71 @@ class PrepareConfig:
     """How a video becomes a sequence folder."""
 
     right: Path | None = None
-    """Video or folder of the second eye, where each eye has its own."""
+    """Video or image folder of the second camera, if each camera has its own file."""
     calibration: Path | None = None
-    """OpenCV calibration (.yaml, .json, .npz) or da Vinci .ini, of one or two eyes."""
+    """Calibration of one or two cameras: OpenCV (.yaml, .json, .npz) or da Vinci (.ini)."""
     calibration_unit: Unit = "auto"
-    """Unit of the calibration's T."""
+    """Unit of the translation T in the calibration."""
     layout: Layout = "auto"
-    """How the eyes share a frame."""
+    """How the images of two cameras are stored in a video frame."""
     swap_eyes: bool = False
-    """The first eye of the video is the right one."""
+    """The first camera of the video is the right one: swap them."""
     field_of_view_degrees: float = 70.0
-    """Without a calibration: assumed angle across the picture's width, or across the round border."""
+    """Assumed angle across the image width, or across the round border. Used only without a calibration."""
 
     start: float = 0.0
-    """First moment, seconds."""
+    """First time to use, seconds."""
     end: float = math.inf
-    """Last moment, seconds; not included."""
+    """End time, seconds; not included."""
     frames_per_second: float = 0.0
-    """Rate of the frames to write; 0 takes every picture of the source."""
+    """Frame rate of the output; 0 uses every frame of the source."""
     folder_rate: float = 25.0
-    """Rate of a folder of pictures, 1/s."""
+    """Frame rate of a folder of images, 1/s."""
     max_frames: int = 500
-    """Refuse to write more: a longer clip needs a part chosen, or a lower rate."""
+    """Stop with an error above this number of frames; choose a part of the video or a lower rate."""
     drop_out_of_body: bool = False
     """Leave out frames that do not look like the inside of a body."""
 
     crop: str | None = None
-    """x,y,width,height in px of one eye's picture: nothing outside is written."""
+    """x,y,width,height in px of one camera's image: keep only this part."""
     blank: tuple[str, ...] = ()
-    """x,y,width,height rectangles to paint black and mask, for burned-in names."""
+    """x,y,width,height rectangles to paint black and mask, such as burned-in patient names."""
     border: Literal["auto", "keep"] = "auto"
-    """`auto`: cut console strips and black bars, mask what lies outside a round border, blank burned-in labels."""
+    """`auto`: crop console strips and black bars, mask the outside of a round border, blank burned-in labels."""
     max_width: int = 640
-    """Shrink wider pictures to this width, px; 0 keeps the size."""
+    """Resize wider images to this width, px; 0 keeps the size."""
 
     depth: str = "auto"
-    """`sgbm` (stereo), `shading` (one eye, relative), `depth-anything[:FOLDER]` (network, relative), a folder of depth
-    files, or `none`; `auto` is sgbm for two eyes and shading for one."""
+    """`sgbm` (stereo), `shading` (monocular, relative), `depth-anything[:FOLDER]` (network, relative), a folder of
+    depth files, or `none`. `auto` is `sgbm` for two cameras and `shading` for one."""
     depth_unit_mm: float = 0.0
-    """mm per unit of the files of a depth folder; must be given with one, unless it is relative."""
+    """mm per unit of the files in a depth folder; required with such a folder unless its depth is relative."""
     depth_relative: Literal["no", "depth", "disparity"] = "no"
-    """The depth folder holds a network's relative depth, or relative disparity (near is large)."""
+    """The depth folder holds relative depth, or relative disparity (near is large), of a network."""
     working_distance_mm: float = 70.0
-    """Median distance that relative depth is scaled to."""
+    """Relative depth is scaled to this median, mm."""
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
     masks: str = "auto"
-    """`auto` (found by color and depth), `none`, or a folder of masks."""
+    """`auto` (tools detected by color and depth), `none`, or a folder of masks."""
     mask_tool_value: Literal["auto", "high", "low"] = "auto"
     """Which value marks tools in the mask folder."""
 
     poses: str = "auto"
-    """`still`, `estimate` (from depth and what stands still), or a file: .npy (T, 4, 4) camera-to-world in mm, or
-    poses_bounds.npy. `auto` estimates if the camera moves."""
+    """`still` (static camera), `estimate` (from depth and static tissue), or a file: .npy (T, 4, 4) camera-to-world in
+    mm, or poses_bounds.npy. `auto` estimates poses if the camera moves."""
     stir: Path | None = None
     """Folder of the STIR clip (`left/seqNN`) that VIDEO belongs to: its tattooed points become `truth/tracks.npz`."""
     keep_right: bool = False
-    """Also write the second eye's pictures to `right/`."""
+    """Also write the images of the right camera to `right/`."""
 
     def __post_init__(self) -> None:
         if self.stir is not None and self.depth == "none":
-            raise ValueError("stir needs depth, which --depth none leaves out")
+            raise ValueError("stir needs depth, got --depth none")
         check_range("field_of_view_degrees", self.field_of_view_degrees, 10, 170)
         check_range("start", self.start, 0, 1e9)
         if not self.end > self.start:
-            raise ValueError(f"end must come after start; got {self.end:g} and {self.start:g}")
+            raise ValueError(f"end must be after start, got {self.end:g} and {self.start:g}")
         check_range("frames_per_second", self.frames_per_second, 0, 1000)
         check_range("folder_rate", self.folder_rate, 0.01, 1000)
         check_range("max_frames", self.max_frames, 2, 1_000_000)

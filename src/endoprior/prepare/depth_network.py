@@ -1,7 +1,7 @@
-"""Relative inverse depth of one picture by a Depth Anything network (L. Yang et al., NeurIPS 2024). `H, W` image size.
+"""Relative inverse depth of one image by a Depth Anything network (L. Yang et al., NeurIPS 2024). `H, W` image size.
 
-The network runs on this machine through the transformers library. Only a name of the Hugging Face hub, given by the
-user, makes this module use the net: for the two files it needs, unless they lie in the library's cache.
+The network runs on this machine through the transformers library. This module uses the internet only if the user names
+a model of the Hugging Face hub that is not in the library's cache: it then downloads two files.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError, check_shape
-from ..data.reading import complaint
+from ..core.checks import check_shape, input_error
 
 if TYPE_CHECKING:
     from torch.nn import Module
@@ -24,31 +23,30 @@ if TYPE_CHECKING:
 DEFAULT_MODEL = "depth-anything/Depth-Anything-V2-Small-hf"
 """Name on the hub; about 100 MB, Apache-2.0."""
 FILES = ("config.json", "model.safetensors")
-"""What a model consists of. Pickled weights are not read."""
+"""Files of a model. Pickled weights are not read."""
 SHORT_SIDE_PX = 518
-"""The picture is enlarged or shrunk so that its shorter side has this length, as the network was trained."""
+"""The image is resized so that its shorter side has this length, as in the training of the network."""
 MEAN, STD = np.array([0.485, 0.456, 0.406], np.float32), np.array([0.229, 0.224, 0.225], np.float32)
-"""Of ImageNet's colors in [0, 1], which the network's input is normalized by."""
+"""ImageNet statistics that normalize the input, colors in [0, 1]."""
 
 
 class DepthNetwork:
-    """A network in memory, ready to look at pictures."""
+    """A Depth Anything network in memory."""
 
     def __init__(self, name_or_folder: str | Path = DEFAULT_MODEL) -> None:
         """Load it from a folder, from the library's cache, or from the hub.
 
         Raises:
-            InputError: transformers is not installed, the files are nowhere to be had, or they are not such a network.
+            InputError: transformers is not installed, the files cannot be had, or they hold another network.
         """
         if find_spec("transformers") is None:
-            raise InputError(
-                "the depth network: expected the transformers package; got none. Run: pip install endoprior[mono]"
-            )
+            fix = '`pip install "endoprior[mono]"`.'
+            raise input_error("--depth depth-anything", "the transformers package", "none", fix)
         self._network = _load(name_or_folder, _find(str(name_or_folder)))
         self._patch = int(self._network.config.patch_size)
 
     def inverse_depth(self, rgb_u8: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Relative inverse depth: near is large; scale and shift are unknown (`aligned_depth` chooses them).
+        """Relative inverse depth: near is large, scale and shift are unknown (`relative_depth` sets them).
 
         Args:
             rgb_u8: (H, W, 3) 0..255.
@@ -61,31 +59,35 @@ class DepthNetwork:
 
         check_shape("rgb_u8:H,W,3", rgb_u8=rgb_u8)
         if rgb_u8.dtype != np.uint8:
-            raise ValueError(f"rgb_u8 must be 8-bit; got {rgb_u8.dtype}")
+            raise ValueError(f"rgb_u8 must be 8-bit, got {rgb_u8.dtype}")
         height, width = rgb_u8.shape[:2]
         scale = SHORT_SIDE_PX / min(height, width)
         size = [max(round(side * scale / self._patch), 1) * self._patch for side in (width, height)]
-        picture = cv2.resize(rgb_u8.astype(np.float32) / np.float32(255), size, interpolation=cv2.INTER_CUBIC)
-        pixels = np.ascontiguousarray(((picture - MEAN) / STD).transpose(2, 0, 1)[None])
+        image = cv2.resize(rgb_u8.astype(np.float32) / np.float32(255), size, interpolation=cv2.INTER_CUBIC)
+        pixels = np.ascontiguousarray(((image - MEAN) / STD).transpose(2, 0, 1)[None])
         with torch.inference_mode():
             inverse = self._network(pixel_values=torch.from_numpy(pixels)).predicted_depth[0].numpy()
         return cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _find(name: str) -> Path:
-    """The folder with the model's files; downloads them if `name` is one of the hub's and they are not cached."""
+    """The folder with the model's files; downloads them if `name` is a hub model that is not cached."""
     folder = Path(name).expanduser()
     if folder.is_dir():
         missing = [file for file in FILES if not (folder / file).is_file()]
         if missing:
-            raise complaint(folder, "a model's " + " and ".join(FILES), f"no {missing[0]}", "Download the model again.")
+            raise input_error(
+                folder, "a model's " + " and ".join(FILES), f"no {missing[0]}", "Download the model again."
+            )
         return folder
-    hint = f"Download {' and '.join(FILES)} of {DEFAULT_MODEL} on another machine and name their folder."
+    hint = (
+        f"Download {' and '.join(FILES)} of {DEFAULT_MODEL} on another machine, then `--depth depth-anything:FOLDER`."
+    )
     if name.count("/") != 1 or name.startswith((".", "/", "~")):
-        raise complaint(name, "a model folder or a name of the Hugging Face hub", "neither", hint)
+        raise input_error(name, "a model folder or a name of the Hugging Face hub", "neither", hint)
     from huggingface_hub import snapshot_download
 
-    # Only the files that are needed, and no more questions to the hub than that; transformers' own loader asks others.
+    # Request only the files that are needed; the loader of transformers requests more.
     with suppress(Exception):
         cached = Path(snapshot_download(name, allow_patterns=list(FILES), local_files_only=True))
         if all((cached / file).is_file() for file in FILES):
@@ -94,16 +96,16 @@ def _find(name: str) -> Path:
         fetched = Path(snapshot_download(name, allow_patterns=list(FILES)))
     except Exception as error:  # the hub client's, its transport's and the system's errors share no other base
         reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise complaint(name, "a model in the cache or a download", reason[0].removeprefix("Got: "), hint) from None
+        raise input_error(name, "a model in the cache or a download", reason[0].removeprefix("Got: "), hint) from None
     if not all((fetched / file).is_file() for file in FILES):
-        raise complaint(name, "a model's " + " and ".join(FILES), "other files", "Choose a model in this format.")
+        raise input_error(name, "a model's " + " and ".join(FILES), "other files", "Choose a model in this format.")
     return fetched
 
 
 def _load(name: str | Path, folder: Path) -> Module:
     """The network in `folder`, in evaluation mode."""
     if find_spec("torchvision") is not None:
-        # transformers imports torchvision where it finds it, also one that does not fit the installed torch.
+        # transformers imports torchvision if it is installed, even one that does not fit the installed torch.
         from ..evaluation.metrics.torchvision_compat import import_torchvision
         from ..evaluation.metrics.weights import ScoreUnavailable
 
@@ -115,10 +117,10 @@ def _load(name: str | Path, folder: Path) -> Module:
         network, report = DepthAnythingForDepthEstimation.from_pretrained(
             folder, local_files_only=True, use_safetensors=True, output_loading_info=True
         )
-    except Exception as error:  # whatever a wrong file makes the library raise
+    except Exception as error:  # the library raises many types for a wrong file
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise complaint(name, "a Depth Anything model", reason, "Choose another model.") from None
+        raise input_error(name, "a Depth Anything model", reason, "Choose another model.") from None
     if report["missing_keys"]:
         got = f"no weights for {sorted(report['missing_keys'])[0]} and {len(report['missing_keys']) - 1} more"
-        raise complaint(name, "a Depth Anything model", got, "Choose another model.")
+        raise input_error(name, "a Depth Anything model", got, "Choose another model.")
     return network.eval()

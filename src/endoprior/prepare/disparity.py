@@ -1,4 +1,4 @@
-"""Disparity maps made better: finer than the matcher's steps, no speckles, small holes closed. `H, W` image size."""
+"""Refinement of disparity maps: sub-pixel precision, speckle removal, filling of small holes. `H, W` image size."""
 
 from __future__ import annotations
 
@@ -9,39 +9,38 @@ from numpy.typing import NDArray
 ROUNDS = 3
 """Gauss-Newton steps of the refinement."""
 WINDOW_SIGMA_PX = 5.0
-"""Standard deviation of the Gaussian window in which one shift is sought."""
+"""Standard deviation of the Gaussian window over which one shift is estimated."""
 NOISE_VARIANCE = 4.0
-"""Sensor noise of the gray pictures, levels^2: slopes weaker than that move nothing."""
+"""Sensor noise of the gray images, levels^2: weaker gradients do not change the disparity."""
 OUTLIER_LEVELS = 6.0
-"""Brightness difference between the eyes at which a pixel counts half."""
+"""Brightness difference between the cameras at which a pixel has half weight."""
 MAX_CHANGE_PX = 0.5
-"""The refinement stays this close to the matcher's disparity, so that windows across a depth jump do no harm."""
+"""Largest change by the refinement; limits the damage of windows across a depth edge."""
 SMOOTHING_PX, SMOOTHING_SIGMA_PX = 15, 5.0
 """Size and standard deviation of the smoothing window ..."""
 SMOOTHING_STEP_PX = 0.5
 """... and the difference of disparity at which a neighbor begins to belong to another surface, px."""
 SPECKLE_STEP_PX = 1.0
-"""Neighbors whose disparities differ by more belong to different patches."""
+"""Neighbors whose disparities differ by more belong to different regions."""
 PLANE_RESIDUAL_PX = 0.35
-"""A hole is closed if its rim lies on a plane to within this (largest of nine tenths of the rim), px of disparity."""
+"""A hole is filled if 90 % of its rim lies on a plane to within this, px of disparity."""
 
 
 def refine_disparity(
     left: NDArray[np.uint8], right: NDArray[np.uint8], disparity: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Move each disparity to where the two pictures agree best within a Gaussian window.
+    """Refine each disparity by matching a Gaussian window of both images.
 
-    Semi-global matching prefers whole and half pixels ("pixel locking"). Here the right picture is warped onto the left
-    one, and the shift that is left is found from slopes by least squares (B. Lucas and T. Kanade, IJCAI 1981, along
-    rows only). A difference of brightness that is smooth over the window is taken out first; pixels that differ much
-    weigh little.
+    Semi-global matching prefers whole and half pixels ("pixel locking"). This function warps the right image onto the
+    left one and estimates the remaining shift by least squares on gradients (B. Lucas and T. Kanade, IJCAI 1981, along
+    rows only). It first removes smooth brightness differences; outliers get a low weight.
 
     Args:
         left, right: (H, W) gray.
-        disparity: (H, W) px; NaN where not known.
+        disparity: (H, W) px; NaN where unknown.
     Returns:
-        (H, W) disparity, px, NaN where it was; (H, W) texture in [0, 1): near 1 where slopes along rows stand far above
-        the noise.
+        (H, W) disparity, px, NaN at the same pixels; (H, W) texture in [0, 1): near 1 where gradients along rows are
+        far above the noise.
     """
     known = np.isfinite(disparity)
     trust = known.astype(np.float32)
@@ -65,7 +64,7 @@ def refine_disparity(
 
 
 def smooth_disparity(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) `disparity` averaged over neighbors on the same surface (bilateral filter); NaN stays where it was."""
+    """(H, W) `disparity` after a bilateral filter, which keeps depth edges; NaN at the same pixels."""
     known = np.isfinite(disparity)
     if not known.any():
         return disparity
@@ -75,7 +74,7 @@ def smooth_disparity(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def drop_speckles(disparity: NDArray[np.float32], smallest_px: int) -> NDArray[np.float32]:
-    """(H, W) `disparity` without patches of fewer than `smallest_px` pixels that stand apart."""
+    """(H, W) `disparity` without isolated regions of fewer than `smallest_px` pixels."""
     unknown = -(2**15)
     sixteenths = np.where(np.isfinite(disparity), np.rint(disparity * 16), unknown).astype(np.int16)
     cv2.filterSpeckles(sixteenths, unknown, smallest_px, 16 * SPECKLE_STEP_PX)
@@ -83,13 +82,12 @@ def drop_speckles(disparity: NDArray[np.float32], smallest_px: int) -> NDArray[n
 
 
 def fill_small_holes(disparity: NDArray[np.float32], largest_px: int) -> NDArray[np.float32]:
-    """Close holes of at most `largest_px` pixels whose rim lies on a plane; leave all others.
+    """Fill holes of at most `largest_px` pixels whose rim lies on a plane; leave all others.
 
-    A hole at a depth jump has a rim on two surfaces, and one at the border of the picture a rim on some sides only:
-    both stay. A plane in space is a plane in disparity.
+    Holes at depth edges and at the image border stay. A plane in space is also a plane in disparity.
 
     Args:
-        disparity: (H, W) px; NaN where not known.
+        disparity: (H, W) px; NaN where unknown.
     Returns:
         (H, W) disparity, px.
     """
@@ -112,7 +110,7 @@ def fill_small_holes(disparity: NDArray[np.float32], largest_px: int) -> NDArray
 
 
 def _plane(rim: NDArray[np.bool_], values: NDArray[np.float32]) -> NDArray[np.float64] | None:
-    """(3,) the plane through `values` at the pixels of `rim`; None if they do not lie on one."""
+    """(3,) the plane through `values` at the pixels of `rim`; None if the residual is too large."""
     if values.size < 8:
         return None
     at = _coordinates(rim)

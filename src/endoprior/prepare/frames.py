@@ -1,4 +1,4 @@
-"""The walk that writes frames: develop each shot, find depth and tools, compare with its neighbors, write."""
+"""Second pass over a clip: rectify each frame, measure depth and tool mask, filter depth in time, write the files."""
 
 from __future__ import annotations
 
@@ -10,68 +10,70 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.writer import FrameFiles
-from .clip import Shot
+from .frame_geometry import FrameGeometry
 from .stereo import temporal_median
-from .view import View
+from .video_clip import StereoFrame
 
 REACH = 2
-"""Frames to each side that depth is compared with."""
+"""Number of frames on each side in the temporal depth filter."""
 Mask = NDArray[np.bool_]
 Depth = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Developed:
-    """A shot as a frame, with what was measured on it."""
+class MeasuredFrame:
+    """A rectified frame and its depth."""
 
     position: int
-    """Of the frame in the sequence, from 0."""
+    """Position in the sequence, from 0."""
     index: int
-    """Of the picture in the source."""
+    """Position in the source."""
     rgb_u8: NDArray[np.uint8]
     """(H, W, 3)."""
     right_u8: NDArray[np.uint8] | None
-    """(H, W, 3) of the second eye, rectified to the first one's rows."""
+    """(H, W, 3) image of the right camera, rectified; None if monocular."""
     depth: Depth | None
-    """(H, W) mm, 0 where missing; None before it is known."""
+    """(H, W) mm, 0 where missing; None before it is measured."""
 
 
 @dataclass(frozen=True)
-class Makers:
-    """How depth and masks of a clip are made, each bound to what was learned from the samples."""
+class FrameMethods:
+    """Functions that make depth and masks of one clip."""
 
-    measured: Callable[[Developed], Depth] | None
+    measure: Callable[[MeasuredFrame], Depth] | None
     """Depth that needs no mask: stereo, files, a network."""
-    shaded: Callable[[NDArray[np.uint8], Mask], Depth] | None
-    """Depth from shading, of a picture and where it may be used."""
-    tools: Callable[[Developed], Mask]
-    """(H, W) True on tools of a frame; what lies outside the picture does not count."""
-    steady: bool
-    """Whether depth is compared with the neighbors in time."""
+    shade: Callable[[NDArray[np.uint8], Mask], Depth] | None
+    """Depth from the shading of an image inside a mask."""
+    tools: Callable[[MeasuredFrame], Mask]
+    """(H, W) True on the tools of a frame."""
+    filter_in_time: bool
+    """Whether to filter depth over neighboring frames."""
     wanted: Callable[[NDArray[np.uint8]], bool]
-    """Whether a picture (H, W, 3) belongs into the sequence."""
+    """Whether an image (H, W, 3) belongs in the sequence."""
 
 
-def develop(shots: Iterable[Shot], view: View, makers: Makers, first: int) -> Iterator[Developed]:
-    """The wanted shots as frames, counted from 0; those before `first` are not measured and not returned."""
+def measure_frames(
+    stereo_frames: Iterable[StereoFrame], geometry: FrameGeometry, methods: FrameMethods, first: int
+) -> Iterator[MeasuredFrame]:
+    """Rectify the wanted frames and measure their depth, from position `first` on."""
     position = 0
-    for shot in shots:
-        rgb_u8 = view.picture(shot.left)
-        if not makers.wanted(rgb_u8):
+    for stereo_frame in stereo_frames:
+        rgb_u8 = geometry.image(stereo_frame.left)
+        if not methods.wanted(rgb_u8):
             continue
         if position >= first:
-            right = None if shot.right is None else view.picture(shot.right, right=True)
-            frame = Developed(position, shot.index, rgb_u8, right, None)
-            yield replace(frame, depth=makers.measured(frame)) if makers.measured else frame
+            right = None if stereo_frame.right is None else geometry.image(stereo_frame.right, right=True)
+            frame = MeasuredFrame(position, stereo_frame.index, rgb_u8, right, None)
+            yield replace(frame, depth=methods.measure(frame)) if methods.measure else frame
         position += 1
 
 
-def with_neighbors(frames: Iterable[Developed]) -> Iterator[list[Developed]]:
-    """Each frame in the middle of those before and after it, `REACH` to each side or what the ends leave."""
-    window: deque[Developed] = deque(maxlen=2 * REACH + 1)
-    at = -1  # of the frame that is due, in the window
+def with_neighbors(frames: Iterable[MeasuredFrame]) -> Iterator[list[MeasuredFrame]]:
+    """For each frame, the window centered on it: `REACH` frames on each side, fewer at both ends."""
+    window: deque[MeasuredFrame] = deque(maxlen=2 * REACH + 1)
+    at = -1  # position of the center frame in the window
 
-    def around() -> list[Developed]:
+    def around() -> list[MeasuredFrame]:
         reach = min(at, len(window) - 1 - at)
         return list(window)[at - reach : at + reach + 1]
 
@@ -87,33 +89,33 @@ def with_neighbors(frames: Iterable[Developed]) -> Iterator[list[Developed]]:
 
 
 def write_frames(
-    shots: Iterable[Shot],
-    view: View,
-    makers: Makers,
+    stereo_frames: Iterable[StereoFrame],
+    geometry: FrameGeometry,
+    methods: FrameMethods,
     files: FrameFiles,
     *,
     keep_right: bool,
     on_frame: Callable[[int], None] = lambda count: None,
 ) -> None:
-    """Write every wanted shot that `files` does not have yet.
+    """Write every wanted frame that `files` does not have yet.
 
     Args:
-        on_frame: called with the number of frames written after each.
+        on_frame: called after each frame with the number of frames written.
     """
     done = files.count
-    # Frames before the first one due are measured again, because their depth is compared with.
-    for window in with_neighbors(develop(shots, view, makers, max(done - REACH, 0))):
+    # After a resume, measure a few finished frames again: the temporal filter needs their depth.
+    for window in with_neighbors(measure_frames(stereo_frames, geometry, methods, max(done - REACH, 0))):
         frame = window[len(window) // 2]
         if frame.position < done:
             continue
         depth = frame.depth
-        if makers.steady:
+        if methods.filter_in_time:
             depth = temporal_median([other.depth for other in window])
-        tools = makers.tools(frame) | ~view.inside
-        if makers.shaded:
-            depth = makers.shaded(frame.rgb_u8, ~tools)
+        tools = methods.tools(frame) | ~geometry.inside
+        if methods.shade:
+            depth = methods.shade(frame.rgb_u8, ~tools)
         if depth is not None:
-            depth = np.where(view.inside, depth, np.float32(0))
-        rgb_u8 = np.where(view.inside[..., None], frame.rgb_u8, np.uint8(0))
+            depth = np.where(geometry.inside, depth, np.float32(0))
+        rgb_u8 = np.where(geometry.inside[..., None], frame.rgb_u8, np.uint8(0))
         files.add(rgb_u8, tools, depth, frame.right_u8 if keep_right else None)
         on_frame(files.count)

@@ -1,4 +1,4 @@
-"""From a video to a sequence folder: the one place of this package that acts."""
+"""`prepare`: run all steps that turn a video into a sequence folder."""
 
 from __future__ import annotations
 
@@ -9,52 +9,52 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..core.checks import runs
+from ..core.checks import input_error, number_ranges
 from ..data import write_stir_tracks
 from ..data.images import read_color, read_depth, read_tool_mask, save_png
-from ..data.reading import complaint, kind_of
+from ..data.reading import kind_of
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
 from ..footage.camera_motion import camera_motion
 from ..footage.changes import find_changes
 from .calibration_files import read_calibration
-from .clip import Clip
 from .config import PrepareConfig
+from .depth_and_masks import ChosenMethods, choose_methods
+from .first_pass import run_first_pass, source_facts
+from .frame_geometry import FrameGeometry
 from .frames import write_frames
-from .makers import Chosen, choose_makers
-from .poses import PosePath, Seen, estimate_poses, read_poses
-from .survey import look_through, source_facts
-from .view import View
-from .work_folder import forget_plan, frames_done, work_folder
+from .poses import PoseInput, PosePath, estimate_poses, read_poses
+from .video_clip import Clip
+from .work_folder import delete_plan, frames_done, work_folder
 
 DEPTH_SCALE = 0.01
 """mm per unit of the 16-bit depth files: up to 655 mm."""
 Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and how much there is (0: not known)."""
+"""Called with the name of the step, the number of items done, and their total (0: unknown)."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """What became of a video."""
+    """Result of `prepare`."""
 
     out: Path
     num_frames: int
     size: tuple[int, int]
     """(width, height), px."""
-    remarks: list[str]
-    """What the user should know, one line each."""
+    notes: list[str]
+    """Notes for the user, one line each."""
 
 
 def prepare(
     video: Path, out: Path, cfg: PrepareConfig | None = None, progress: Progress = lambda what, done, total: None
 ) -> Prepared:
-    """Write a sequence folder from a video; the same call goes on where an interrupted one stopped.
+    """Write a sequence folder from a video. The same call resumes after an interruption.
 
     Args:
-        video: a file, or a folder of pictures.
+        video: a file, or a folder of images.
         out: a new or empty folder; it appears when the sequence is complete.
     Raises:
-        InputError: the video, or anything that the options name, cannot be used; nothing is left behind.
+        InputError: the video, or a file named by an option, cannot be used; nothing is left behind.
     """
     cfg = cfg or PrepareConfig()
     named = [video, cfg.right, cfg.calibration, cfg.stir, Path(cfg.masks), Path(cfg.depth), Path(cfg.poses)]
@@ -66,47 +66,47 @@ def prepare(
         calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
         clip = Clip(video, cfg, calibration)
         progress("looking through", 0, clip.source.num_frames)
-        survey = look_through(clip, cfg, calibration, str(cfg.calibration))
-        chosen = choose_makers(cfg, clip, survey)
-        meta = _meta(clip, survey.view, chosen)
+        first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
+        chosen = choose_methods(cfg, clip, first_pass)
+        meta = _meta(clip, first_pass.geometry, chosen)
         parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
         files = FrameFiles(folder, meta, frames_done(folder, parts))
         write_frames(
-            clip.shots(clip.selection()),
-            survey.view,
-            chosen.makers,
+            clip.stereo_frames(clip.selection()),
+            first_pass.geometry,
+            chosen.methods,
             files,
             keep_right=cfg.keep_right,
-            on_frame=lambda done: progress("writing frames", done, len(survey.indices)),
+            on_frame=lambda done: progress("writing frames", done, len(first_pass.indices)),
         )
         if files.count < 2:
-            hint = "Check --start, --end and --drop-out-of-body."
-            raise complaint(video, "at least 2 frames that show the inside of a body", str(files.count), hint)
+            fix = "Change --start, --end or --drop-out-of-body."
+            raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
         progress("following the camera", 0, files.count)
-        path, said = _camera_path(cfg, files, meta)
+        path, motion_notes = _camera_path(cfg, files, meta)
         unexplained = _unexplained(path, files)
         if path is not None and meta.depth_relative:
             _scale_depth(files, path)
         files.finish(None if path is None else path.camera_to_world, unexplained)
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
-        remarks = [*survey.remarks, *chosen.remarks, *said]
-        if len(unexplained):
-            which = f"not explained by the camera or by what the rest shows: frames {runs(unexplained)}"
-            remarks.append(f"{which}; --start and --end leave them out, if they stand together")
-    return Prepared(out, files.count, survey.view.size, remarks)
+        notes = [*first_pass.notes, *chosen.notes, *motion_notes]
+        if unexplained:
+            frames = number_ranges(unexplained)
+            notes.append(f"no camera pose, or another scene, in frames {frames}; --start and --end can leave them out")
+    return Prepared(out, files.count, first_pass.geometry.size, notes)
 
 
-def _meta(clip: Clip, view: View, chosen: Chosen) -> SequenceMeta:
+def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods) -> SequenceMeta:
     return SequenceMeta(
-        width=view.size[0],
-        height=view.size[1],
-        fx=float(view.matrix[0, 0]),
-        fy=float(view.matrix[1, 1]),
-        cx=float(view.matrix[0, 2]),
-        cy=float(view.matrix[1, 2]),
+        width=geometry.size[0],
+        height=geometry.size[1],
+        fx=float(geometry.matrix[0, 0]),
+        fy=float(geometry.matrix[1, 1]),
+        cx=float(geometry.matrix[0, 2]),
+        cy=float(geometry.matrix[1, 2]),
         frames_per_second=clip.frames_per_second,
-        baseline_mm=view.baseline_mm,
+        baseline_mm=geometry.baseline_mm,
         depth_scale=DEPTH_SCALE,
         depth_source=chosen.sources["depth"],
         depth_relative=chosen.relative,
@@ -115,7 +115,7 @@ def _meta(clip: Clip, view: View, chosen: Chosen) -> SequenceMeta:
 
 
 def _camera_path(cfg: PrepareConfig, files: FrameFiles, meta: SequenceMeta) -> tuple[PosePath | None, list[str]]:
-    """Poses of the written frames, None for a camera that stands still, and what to say about them."""
+    """Poses of the written frames, None for a static camera; and notes for the user."""
     if cfg.poses not in ("auto", "still", "estimate"):
         return read_poses(Path(cfg.poses), files.count), []
     if cfg.poses == "still":
@@ -125,27 +125,27 @@ def _camera_path(cfg: PrepareConfig, files: FrameFiles, meta: SequenceMeta) -> t
         (~read_tool_mask(files.file("masks", i)) for i in range(files.count)),
     )
     if cfg.poses == "auto" and not motion.moving:
-        return None, [f"the camera stands still: {motion.reason}"]
+        return None, [f"the camera is static: {motion.reason}"]
     if cfg.depth == "none":
         return None, [f"the camera moves: {motion.reason}; without depth its path cannot be estimated"]
 
-    def seen(index: int) -> Seen:
-        return Seen(
+    def load(index: int) -> PoseInput:
+        return PoseInput(
             read_color(files.file("images", index)),
             ~read_tool_mask(files.file("masks", index)),
             read_depth(files.file("depth", index), meta.depth_scale),
         )
 
     matrix = np.array([[meta.fx, 0, meta.cx], [0, meta.fy, meta.cy], [0, 0, 1]])
-    path = estimate_poses(seen, files.count, matrix, relative_depth=meta.depth_relative)
-    way = np.linalg.norm(path.camera_to_world[:, :3, 3], axis=1).max()
+    path = estimate_poses(load, files.count, matrix, relative_depth=meta.depth_relative)
+    reach = np.linalg.norm(path.camera_to_world[:, :3, 3], axis=1).max()
     unit = "mm (relative)" if meta.depth_relative else "mm"
-    return path, [f"the camera moves: {motion.reason}; estimated path reaches {way:.0f} {unit} from its start"]
+    return path, [f"the camera moves: {motion.reason}; the estimated path reaches {reach:.0f} {unit} from its start"]
 
 
 def _scale_depth(files: FrameFiles, path: PosePath) -> None:
-    """Bring each frame's relative depth to the scale of the points that the camera's path was found by."""
-    forget_plan(files.folder)
+    """Rescale the relative depth of each frame to agree with the tracked points of the pose estimation."""
+    delete_plan(files.folder)
     for index, scale in enumerate(path.depth_scale):
         file = files.file("depth", index)
         stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.float64) * scale
@@ -153,7 +153,7 @@ def _scale_depth(files: FrameFiles, path: PosePath) -> None:
 
 
 def _unexplained(path: PosePath | None, files: FrameFiles) -> list[int]:
-    """Frames without a pose of their own, and frames that show another place than the rest."""
+    """Frames without an estimated pose, and frames whose color differs from the rest."""
     lost = set() if path is None else set(np.flatnonzero(~path.explained).tolist())
     changes = find_changes(read_color(files.file("images", i)) for i in range(files.count))
     return sorted(lost | set(changes.off_color))

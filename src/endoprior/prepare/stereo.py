@@ -1,7 +1,7 @@
-"""Depth from a rectified pair of pictures. `H, W` image size.
+"""Depth from a rectified stereo pair. `H, W` image size.
 
 Disparity and depth: x_left - x_right = focal * baseline / z + center_shift, with center_shift = cx_left - cx_right, the
-difference of the rectified eyes' principal points (0 where rectification gave both the same).
+difference of the principal points of the rectified cameras (often 0).
 """
 
 from __future__ import annotations
@@ -14,41 +14,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_range, check_shape
-from ..footage.matching import disagreement, match_both_ways
+from ..footage.stereo_matching import disagreement, match_both_ways
 from ..priors.specular import specular_likelihood
 from .disparity import drop_speckles, fill_small_holes, refine_disparity, smooth_disparity
 
 MATCHING_WIDTH = 960
-"""Wider pictures are matched at a whole fraction of their size (the refinement sees all of it), px."""
+"""Wider images are matched at a whole fraction of their size, px. The refinement uses the full size."""
 
 
 @dataclass(frozen=True)
 class StereoConfig:
-    """Depth from two eyes."""
+    """Options of stereo matching."""
 
     near_mm: float = 25.0
-    """Nearest depth to look for, mm, 1..10000; nearer costs time."""
+    """Smallest depth of the search, mm, 1..10000; a smaller value takes more time."""
     far_mm: float = 300.0
-    """Farthest depth to look for, mm, at most 100000."""
+    """Largest depth of the search, mm, at most 100000."""
     block_px: int = 7
-    """Side of the blocks that are compared, px, odd, 3..15: larger is smoother."""
+    """Side of the matching blocks, px, odd, 3..15: larger is smoother."""
     left_right_px: float = 1.0
-    """The eyes' disparities of a point may differ by this much, px, 0.1..10."""
+    """Tolerance of the left-right consistency check, px, 0.1..10."""
     speckle_px: int = 150
-    """Patches of fewer pixels that stand apart from their surroundings are dropped, 0..1000000."""
+    """Isolated regions of fewer pixels are removed, 0..1000000."""
     fill_px: int = 400
-    """Holes of at most so many pixels are closed where the surface around them is smooth, 0..1000000."""
+    """Holes of at most this many pixels in a smooth surface are filled, 0..1000000."""
     min_confidence: float = 0.1
-    """Depth that is trusted less is left out, 0..1."""
+    """Depth of lower confidence is removed, 0..1."""
 
     def __post_init__(self) -> None:
         check_range("near_mm", self.near_mm, 1, 1e4)
         check_range("far_mm", self.far_mm, 1, 1e5)
         if not self.near_mm < self.far_mm:
-            raise ValueError(f"far_mm must be more than near_mm; got {self.far_mm:g} and {self.near_mm:g}")
+            raise ValueError(f"far_mm must be more than near_mm, got {self.far_mm:g} and {self.near_mm:g}")
         check_range("block_px", self.block_px, 3, 15)
         if self.block_px % 2 == 0:
-            raise ValueError(f"block_px must be odd; got {self.block_px}")
+            raise ValueError(f"block_px must be odd, got {self.block_px}")
         check_range("left_right_px", self.left_right_px, 0.1, 10)
         check_range("speckle_px", self.speckle_px, 0, 1_000_000)
         check_range("fill_px", self.fill_px, 0, 1_000_000)
@@ -57,7 +57,7 @@ class StereoConfig:
 
 @dataclass(frozen=True)
 class StereoDepth:
-    """What two eyes say of the left one's pixels."""
+    """Depth and confidence of the left image."""
 
     depth: NDArray[np.float32]
     """(H, W) z, mm; 0 where not measured."""
@@ -73,27 +73,27 @@ def stereo_depth(
     cfg: StereoConfig | None = None,
     center_shift_px: float = 0.0,
 ) -> StereoDepth:
-    """Depth of every pixel of the left picture that both eyes agree on.
+    """Depth of every pixel of the left image that passes the left-right consistency check.
 
-    What only one eye sees is left out. Highlights slide over the tissue with the eye that looks at them, so their
-    confidence is halved; so is that of small holes, which are closed in smooth surface.
+    Occluded pixels get no depth. Highlights move with the camera rather than with the tissue, so their confidence is
+    halved, as is that of filled holes.
 
     Args:
-        left_u8, right_u8: (H, W, 3) rectified pictures, 0..255.
-        focal_px: of the rectified pictures, > 0.
-        baseline_mm: distance of the eyes, > 0.
+        left_u8, right_u8: (H, W, 3) rectified images, 0..255.
+        focal_px: focal length of the rectified images, > 0.
+        baseline_mm: distance between the cameras, > 0.
         cfg: range and thresholds.
         center_shift_px: cx_left - cx_right, px.
     Returns:
-        depth within [near_mm, far_mm], and confidence: the product of agreement between the eyes, texture and
-        absence of highlights.
+        depth within [near_mm, far_mm], and confidence: the product of left-right consistency, texture and absence of
+        highlights.
     Raises:
-        ValueError: other shapes or types, or a range of depths that no pixel of such pictures can have.
+        ValueError: wrong shapes or types, or a depth range that is impossible for this image size.
     """
     cfg = cfg or StereoConfig()
     check_shape("left_u8:H,W,3 right_u8:H,W,3", left_u8=left_u8, right_u8=right_u8)
     if left_u8.dtype != np.uint8 or right_u8.dtype != np.uint8:
-        raise ValueError(f"pictures must be 8-bit; got {left_u8.dtype} and {right_u8.dtype}")
+        raise ValueError(f"images must be 8-bit, got {left_u8.dtype} and {right_u8.dtype}")
     check_range("focal_px", focal_px, 1, 1e6)
     check_range("baseline_mm", baseline_mm, 1e-3, 1e4)
     width = left_u8.shape[1]
@@ -104,11 +104,11 @@ def stereo_depth(
     if lowest > highest:
         raise ValueError(
             f"far_mm must be more than {product / max(width - 1 - center_shift_px, 1e-6):.4g} for "
-            f"focal_px {focal_px:g}, baseline_mm {baseline_mm:g} and pictures {width} px wide; got {cfg.far_mm:g}"
+            f"focal_px {focal_px:g}, baseline_mm {baseline_mm:g} and images {width} px wide, got {cfg.far_mm:g}"
         )
-    left, right = (cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in (left_u8, right_u8))
+    left, right = (cv2.cvtColor(camera, cv2.COLOR_RGB2GRAY) for camera in (left_u8, right_u8))
     disparity, apart = _match_consistently(left, right, lowest, highest, cfg)
-    # Smoothed first, because the refinement moves whole windows and leaves the matcher's steps within them.
+    # Smooth first: the refinement shifts whole windows and would keep the matcher's steps inside them.
     disparity, texture = refine_disparity(left, right, smooth_disparity(disparity))
     glint = specular_likelihood(left_u8 * np.float32(1 / 255))
     confidence = texture * np.exp(-((apart / np.float32(cfg.left_right_px)) ** 2)) * (1 - glint / 2)
@@ -120,33 +120,33 @@ def stereo_depth(
     if filled.any():
         support = np.isfinite(disparity) & ~filled
         confidence[filled] = _mean_around(confidence, support)[filled] / 2
-    # Written so that NaN and disparities of the wrong sign fail too.
-    seen = (disparity >= lowest) & (disparity <= product / cfg.near_mm + center_shift_px)
-    depth = np.divide(product, disparity - center_shift_px, out=np.zeros_like(disparity), where=seen)
-    return StereoDepth(depth, np.where(seen, confidence, np.float32(0)))
+    # This comparison also excludes NaN and disparities of the wrong sign.
+    valid = (disparity >= lowest) & (disparity <= product / cfg.near_mm + center_shift_px)
+    depth = np.divide(product, disparity - center_shift_px, out=np.zeros_like(disparity), where=valid)
+    return StereoDepth(depth, np.where(valid, confidence, np.float32(0)))
 
 
 def temporal_median(
     window: Sequence[NDArray[np.float32]], tolerance: float = 0.02, surroundings_px: int = 15
 ) -> NDArray[np.float32]:
-    """The middle depth map of a window in time, with its noise reduced where the surface hardly moves.
+    """Temporal median filter of depth for the middle frame of a window.
 
-    Frames count in pairs, one before and one after at equal distance, and only at pixels where both agree with the
-    middle frame: a surface that moves steadily then keeps its place, one that jumps keeps its own value. A hole is
-    closed by the nearest pair if its two frames agree with each other and with the depth around the hole.
+    Frames enter in pairs, one before and one after at equal distance, and only at pixels where both agree with the
+    middle frame. Steady motion therefore adds no bias, and a sudden change keeps the value of the middle frame. A hole
+    is filled by the nearest pair if its two frames agree with each other and with the depth around the hole.
 
     Args:
-        window: an odd number of (H, W) depth maps, mm, 0 where missing; the middle one is wanted.
+        window: an odd number of (H, W) depth maps, mm, 0 where missing; the middle one is filtered.
         tolerance: largest relative difference that counts as agreement; 0.02 is about half a pixel of disparity at the
             usual distance of a stereo endoscope.
-        surroundings_px: side of the square around a hole that its filling must agree with.
+        surroundings_px: side of the square around a hole whose mean the filling must agree with.
     Returns:
         (H, W) depth, mm; 0 where missing.
     Raises:
         ValueError: an even number of maps, or maps of different sizes.
     """
     if len(window) % 2 == 0:
-        raise ValueError(f"window must have an odd number of depth maps; got {len(window)}")
+        raise ValueError(f"window must have an odd number of depth maps, got {len(window)}")
     for depth in window:
         check_shape("depth:H,W middle:H,W", depth=depth, middle=window[len(window) // 2])
     half = len(window) // 2
@@ -156,17 +156,17 @@ def temporal_median(
     for away in range(1, half + 1):
         before, after = window[half - away], window[half + away]
         agree = np.maximum(np.abs(before - middle), np.abs(after - middle)) <= np.float32(tolerance) * middle
-        # A pair of opposite infinities leaves the median to the others.
+        # A pair of opposite infinities does not change the median.
         votes += [np.where(agree, before, -np.inf), np.where(agree, after, np.inf)]
-    calm = np.partition(np.stack(votes), half, axis=0)[half] if half else middle
-    result = np.where(measured, calm, 0).astype(np.float32)
+    median = np.partition(np.stack(votes), half, axis=0)[half] if half else middle
+    result = np.where(measured, median, 0).astype(np.float32)
     if half and not measured.all():
         before, after = window[half - 1], window[half + 1]
         between = (before + after) / 2
         around = _mean_around(middle, measured, surroundings_px)
-        steady = np.abs(before - after) <= np.float32(tolerance) * between
+        static = np.abs(before - after) <= np.float32(tolerance) * between
         fits = np.abs(between - around) <= np.float32(2 * tolerance) * around
-        fill = ~measured & (before > 0) & (after > 0) & steady & fits
+        fill = ~measured & (before > 0) & (after > 0) & static & fits
         result[fill] = between[fill]
     return result
 
@@ -174,13 +174,13 @@ def temporal_median(
 def _match_consistently(
     left: NDArray[np.uint8], right: NDArray[np.uint8], lowest: float, highest: float, cfg: StereoConfig
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(H, W) disparity of the left picture, NaN where the eyes disagree, and (H, W) by how much they do, px."""
+    """(H, W) disparity of the left image, NaN where the consistency check fails; (H, W) left-right difference, px."""
     height, width = left.shape
     times = -(-width // MATCHING_WIDTH)
     size = (-(-width // times), -(-height // times))
     scale = width / size[0]
     if times > 1:
-        left, right = (cv2.resize(eye, size, interpolation=cv2.INTER_AREA) for eye in (left, right))
+        left, right = (cv2.resize(camera, size, interpolation=cv2.INTER_AREA) for camera in (left, right))
     bounds = int(np.floor(lowest / scale)), int(np.ceil(highest / scale))
     from_left, from_right = match_both_ways(left, right, *bounds, cfg.block_px)
     apart = disagreement(from_left, from_right)
@@ -194,7 +194,7 @@ def _match_consistently(
 
 
 def _mean_around(values: NDArray[np.float32], measured: NDArray[np.bool_], side_px: int = 15) -> NDArray[np.float32]:
-    """(H, W) mean of the measured values in a square around each pixel; 0 where it holds none."""
+    """(H, W) mean of the measured values in a square around each pixel; 0 if there are none."""
     weight = measured.astype(np.float32)
     total = cv2.blur(values * weight, (side_px, side_px))
     share = cv2.blur(weight, (side_px, side_px))

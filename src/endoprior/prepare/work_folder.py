@@ -1,4 +1,4 @@
-"""A folder that is written over hours and may be interrupted: hidden beside its target until it is complete."""
+"""A resumable output folder: hidden next to its target until it is complete."""
 
 from __future__ import annotations
 
@@ -12,37 +12,38 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from ..core.checks import InputError
-from ..system.atomic import CannotWrite, flush_folder, refuse_current, refuse_occupied, write_json, writing
+from ..core.checks import InputError, input_error
+from ..system.atomic import CannotWrite, flush_folder, reject_current_folder, reject_occupied, write_json, writing
 
 PLAN = "plan.json"
-"""What the folder is being made from; another plan starts from nothing."""
+"""Inputs and options of the folder. If they changed, the work starts from the beginning."""
 
 
 @contextmanager
 def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
-    """Yield the hidden folder for `out`, with what an interrupted run of the same plan left in it.
+    """Yield the hidden folder of `out`, with the files of an interrupted run of the same plan.
 
-    When the block ends normally the folder takes the name `out`. On `InputError` it is removed; on anything else,
+    When the block ends normally, the folder is renamed to `out`. On `InputError` it is removed. On any other failure,
     such as Ctrl-C or a full disk, it stays for the next run.
 
     Args:
-        plan: JSON values that decide every byte that will be written.
+        plan: JSON values that determine every byte of the output.
     Raises:
-        InputError: `out` is in use, or another process is writing it, or no folder can be made there.
+        InputError: `out` is not empty, another process is writing it, or the folder cannot be created.
     """
-    refuse_occupied(out)
-    refuse_current(out)
+    reject_occupied(out)
+    reject_current_folder(out)
     folder = out.absolute().with_name(f".{out.name}.preparing")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder.with_name(folder.name + ".lock"))
         lock.acquire(timeout=0)
     except Timeout:
-        raise InputError(f"{out}: expected no other process to write it; one does. Wait, or choose another.") from None
+        fix = "Wait for it, or choose another folder."
+        raise input_error(out, "a folder that no other process is writing", "one that is being written", fix) from None
     except OSError as error:
         got = error.strerror or str(error)
-        raise InputError(f"{out}: expected a place where a folder can be made; got {got}. Choose another.") from None
+        raise input_error(out, "a path where a folder can be created", got, "Choose another path.") from None
     try:
         if _plan_of(folder) != json.loads(json.dumps(plan)):
             shutil.rmtree(folder, ignore_errors=True)
@@ -50,8 +51,8 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
             write_json(folder / PLAN, plan)
         with writing(out):
             yield folder
-            forget_plan(folder)
-            refuse_occupied(out)
+            delete_plan(folder)
+            reject_occupied(out)
             flush_folder(folder)
             os.replace(folder, out)
     except CannotWrite:
@@ -64,8 +65,8 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
         Path(lock.lock_file).unlink(missing_ok=True)
 
 
-def forget_plan(folder: Path) -> None:
-    """From now on an interrupted run starts from nothing: what follows cannot be done twice."""
+def delete_plan(folder: Path) -> None:
+    """Make an interrupted run start from the beginning, because the next step cannot be repeated."""
     (folder / PLAN).unlink(missing_ok=True)
 
 
@@ -77,6 +78,6 @@ def _plan_of(folder: Path) -> Any:
 
 
 def frames_done(folder: Path, parts: list[str]) -> int:
-    """Frames that an interrupted run left complete: all but the last one of those that every part has."""
+    """Number of complete frames of an interrupted run; the last frame may be incomplete and does not count."""
     counts = [len(list((folder / part).glob("*.png"))) for part in parts]
     return max(min(counts) - 1, 0)

@@ -13,12 +13,12 @@ from ..core.config import Config
 from ..core.config_io import to_dict
 from ..model.hexplane import TOUCHED, plane_shapes
 from ..model.schema import model_schema
-from ..system.arrays_file import ArraySpec, load_arrays, refusing, save_arrays
+from ..system.arrays_file import ArraySpec, load_arrays, rejecting, save_arrays
 from ..training.density import DensityStats
 from ..training.state import Stage
 from ..training.step import stage_length
 from ..training.trainer import Trainer
-from .identity import refuse_other_run
+from .identity import reject_other_run
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,11 +52,11 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
     cfg, next_step = trainer.cfg, "Train again without --resume."
 
     def schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
-        refuse_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, trainer.sequence.path)
+        reject_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, trainer.sequence.path)
         return checkpoint_schema(cfg)
 
     arrays, about = load_arrays(path, FORMAT, schema, next_step)
-    with refusing(path, "a training state", next_step):
+    with rejecting(path, "a training state", next_step):
         stage, iteration = Stage(about["stage"]), about["iteration"]
         length = stage_length(cfg, stage)
         if type(iteration) is not int or not 0 <= iteration <= length:

@@ -10,13 +10,13 @@ from filelock import FileLock, Timeout
 
 from ..core.checks import InputError
 from ..data.reading import kind_of
-from ..system.atomic import refuse_occupied, remove_leftovers
+from ..system.atomic import reject_occupied, remove_leftovers
 
 LOCK = ".lock"
 """File that a process holds while it trains in a folder."""
 
 
-def refuse_unusable_folder(out: Path, *, resume: bool) -> None:
+def reject_unusable_folder(out: Path, *, resume: bool) -> None:
     """Reject a folder that cannot take a run; nothing is created yet.
 
     Raises:
@@ -26,7 +26,7 @@ def refuse_unusable_folder(out: Path, *, resume: bool) -> None:
     if exists:
         remove_leftovers(out)
     if not (resume and exists):
-        refuse_occupied(out, ", or add --resume to continue a run", spare=LOCK)
+        reject_occupied(out, ", or add --resume to continue a run", spare=LOCK)
 
 
 def prepare_run_folder(out: Path, *, resume: bool) -> bool:
@@ -35,9 +35,9 @@ def prepare_run_folder(out: Path, *, resume: bool) -> bool:
     Returns:
         Whether the folder is new.
     Raises:
-        InputError: as `refuse_unusable_folder`, or it cannot be made.
+        InputError: as `reject_unusable_folder`, or it cannot be made.
     """
-    refuse_unusable_folder(out, resume=resume)
+    reject_unusable_folder(out, resume=resume)
     existed = out.is_dir()
     try:
         out.mkdir(parents=True, exist_ok=True)

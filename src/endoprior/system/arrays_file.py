@@ -82,7 +82,7 @@ def load_arrays(path: Path, file_format: str, schema: Schema, next_step: str) ->
     """
     from safetensors import SafetensorError, safe_open
 
-    with refusing(path, f"a file of format {file_format}", next_step, SafetensorError):
+    with rejecting(path, f"a file of format {file_format}", next_step, SafetensorError):
         _check_size(path)
         with safe_open(path, "pt") as opened:
             about = _strict_json((opened.metadata() or {})[KEY])
@@ -99,7 +99,7 @@ def load_arrays(path: Path, file_format: str, schema: Schema, next_step: str) ->
 
 
 @contextmanager
-def refusing(path: Path, expected: str, next_step: str, *others: type[Exception]) -> Iterator[None]:
+def rejecting(path: Path, expected: str, next_step: str, *others: type[Exception]) -> Iterator[None]:
     """Turn whatever a wrong file provokes in here, `others` besides the usual errors, into one line about it.
 
     Raises:

@@ -91,8 +91,8 @@ def whole_folder(path: Path) -> Iterator[Path]:
         InputError: `path` is in use, or no folder can be made there.
         CannotWrite: the disk does not take what is written.
     """
-    refuse_current(path)
-    refuse_occupied(path)
+    reject_current_folder(path)
+    reject_occupied(path)
     temporary = path.absolute().with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -104,7 +104,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     try:
         with writing(path):
             yield temporary
-            refuse_occupied(path)
+            reject_occupied(path)
             flush_folder(temporary)
             os.replace(temporary, path)
             _to_disk(path.absolute().parent)
@@ -156,13 +156,13 @@ def _alive(process: int) -> bool:
     return True
 
 
-def refuse_current(path: Path) -> None:
+def reject_current_folder(path: Path) -> None:
     """Raise InputError if `path` is the current folder or one above: it cannot be replaced by another one."""
     if path.resolve() in (Path.cwd(), *Path.cwd().parents):
         raise InputError(f"{path}: expected the name of a new folder; got one that is in use. Choose a name in it.")
 
 
-def refuse_occupied(path: Path, otherwise: str = "", *, spare: str | None = None) -> None:
+def reject_occupied(path: Path, otherwise: str = "", *, spare: str | None = None) -> None:
     """Raise InputError unless `path` does not exist yet or is an empty folder.
 
     Args:

@@ -38,7 +38,7 @@ def cache_bytes() -> int:
         return max(int(CACHE_SHARE * (available_bytes() or 0)), LEAST_CACHE)
 
 
-def refuse_small_limits() -> None:
+def reject_small_limits() -> None:
     """Refuse limits of the process under which not even the libraries load: some of them wait for memory for ever.
 
     Raises:

@@ -13,6 +13,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from ..core.checks import InputError
+from ..core.geometry import FARTHEST_MM
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 LARGEST_MESSAGE = 2**16
@@ -21,8 +22,6 @@ MOST_BROWSERS = 32
 """Connections at a time."""
 MOST_PER_SECOND = 500
 """Messages of one connection; dragging sends as many as the screen draws pictures."""
-FARTHEST_MM = 1e7
-"""From the origin that a camera may be."""
 LARGEST_CANVAS = 100_000
 """Pixels along a side."""
 

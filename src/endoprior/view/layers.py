@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Camera
-from ..show.pictures import colorize, to_u8
+from ..visualization.image_tools import colorize, to_u8
 
 LARGEST_DIFFERENCE = 0.25
 """Mean absolute difference of the three colors that is drawn red."""

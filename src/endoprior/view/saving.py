@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError
-from ..show.video import write_video
 from ..system.atomic import whole_file
+from ..visualization.video import write_video
 
 
 def png_bytes(rgb_u8: NDArray[np.uint8]) -> bytes:

@@ -18,8 +18,8 @@ from ..model.carry import carry_points
 from ..model.gaussians import SH_C0
 from ..model.playback import Playback
 from ..model.scene import Scene
-from ..show.frames import depth_span
-from ..show.pictures import to_u8
+from ..visualization.image_tools import to_u8
+from ..visualization.rendered_views import depth_span
 from . import layers
 from .session import Layer, Look
 from .subject import Cloud

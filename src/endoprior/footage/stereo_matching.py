@@ -1,4 +1,4 @@
-"""Dense matching of a rectified pair, from the left eye and from the right one. `H, W` image size.
+"""Dense matching of a rectified pair, from the left camera and from the right one. `H, W` image size.
 
 The matcher is OpenCV's semi-global one (H. Hirschmüller, "Stereo processing by semiglobal matching and mutual
 information", PAMI 2008, with Birchfield and Tomasi's cost over blocks), along all eight directions.
@@ -15,33 +15,33 @@ SMALL_STEP, LARGE_STEP = 16, 64
 UNIQUENESS_PERCENT = 10
 """The best match must be better by this much than any that is not beside it."""
 CONTRAST_LIMIT = 31
-"""Slopes of the picture are clipped here, levels, before they are compared."""
+"""Slopes of the image are clipped here, levels, before they are compared."""
 
 
 def match_both_ways(
     left: NDArray[np.uint8], right: NDArray[np.uint8], lowest: int, highest: int, block: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Disparity x_left - x_right as each eye finds it.
+    """Disparity x_left - x_right as each camera finds it.
 
-    A pixel whose partner lies outside the other picture still gets a value, which its neighbors suggest.
+    A pixel whose partner lies outside the other image still gets a value, which its neighbors suggest.
 
     Args:
         left, right: (H, W) gray.
         lowest, highest: disparities to search, px, negative ones too.
         block: side of the blocks that are compared, px, odd.
     Returns:
-        (H, W) disparity at the left picture's pixels and (H, W) at the right one's, px in steps of 1/16; NaN where no
+        (H, W) disparity at the left image's pixels and (H, W) at the right one's, px in steps of 1/16; NaN where no
         match stands out.
     """
-    # Mirrored and exchanged, the right picture is matched like a left one.
+    # Mirrored and exchanged, the right image is matched like a left one.
     mirrored = _match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]), lowest, highest, block)
     return _match(left, right, lowest, highest, block), np.ascontiguousarray(mirrored[:, ::-1])
 
 
 def disagreement(from_left: NDArray[np.float32], from_right: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) how far the right eye's disparity differs from the left one's at the point it names, px.
+    """(H, W) how far the right camera's disparity differs from the left one's at the point it names, px.
 
-    Infinite where either found nothing, and where the partner lies outside the right picture.
+    Infinite where either found nothing, and where the partner lies outside the right image.
     """
     height, width = from_left.shape
     known = np.isfinite(from_left)
@@ -65,9 +65,9 @@ def _match(near: NDArray[np.uint8], other: NDArray[np.uint8], lowest: int, highe
         uniquenessRatio=UNIQUENESS_PERCENT,
         mode=cv2.STEREO_SGBM_MODE_HH,
     )
-    # OpenCV gives no value in columns whose partner could fall off the picture: move those into a margin.
+    # OpenCV gives no value in columns whose partner could fall off the image: move those into a margin.
     before, after = max(lowest + count, 0), max(-lowest, 0)
-    wide = [cv2.copyMakeBorder(eye, 0, 0, before, after, cv2.BORDER_REPLICATE) for eye in (near, other)]
+    wide = [cv2.copyMakeBorder(camera, 0, 0, before, after, cv2.BORDER_REPLICATE) for camera in (near, other)]
     sixteenths = matcher.compute(*wide)[:, before : before + near.shape[1]]
     found = sixteenths >= 16 * lowest
     return np.where(found, sixteenths * np.float32(1 / 16), np.float32(np.nan))

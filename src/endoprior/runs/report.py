@@ -1,4 +1,4 @@
-"""One picture that tells how a run went: frames beside what was seen, curves, and the scores."""
+"""One image that summarizes a run: test frames beside their renders, curves, and the scores."""
 
 from __future__ import annotations
 
@@ -13,33 +13,34 @@ from numpy.typing import NDArray
 
 from ..core.config import PriorConfig
 from ..data import FrameSequence
+from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
 from ..system.atomic import whole_file
-from .frames import depth_span
-from .pictures import colorize, to_u8
+from ..visualization.image_tools import colorize, to_u8
+from ..visualization.rendered_views import depth_span
 
-SHOWN_SCORES = {
-    "psnr_tissue": "PSNR on tissue, dB",
-    "psnr": "PSNR as published, dB",
-    "ssim": "SSIM",
-    "depth_rmse_mm": "depth error, mm",
-    "flow_error_dis": "flow error (DIS), px",
-    "depth_instability_mm": "depth instability, mm",
-    "psnr_behind_tool": "PSNR behind tool, dB",
-    "depth_rmse_behind_tool_mm": "depth error behind tool, mm",
-    "track_error_mm": "track error, mm",
-    "num_gaussians": "Gaussians",
-    "fps": "frames/s drawn",
-    "fps_cached": "frames/s from the cache",
-    "train_seconds": "training, s",
-}
+SHOWN_SCORES = (
+    "psnr_tissue",
+    "psnr",
+    "ssim",
+    "depth_rmse_mm",
+    "flow_error_dis",
+    "depth_instability_mm",
+    "psnr_behind_tool",
+    "depth_rmse_behind_tool_mm",
+    "track_error_mm",
+    "num_gaussians",
+    "fps",
+    "fps_cached",
+    "train_seconds",
+)
 ERROR_FULL_SCALE = 0.15
-"""Color error, in [0, 1], that the error map shows as its last color."""
+"""Color error, in [0, 1], at the end of the error map's color scale."""
 
 
 def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path) -> None:
-    """Draw the report of a finished run folder as one PNG.
+    """Write the report of a finished run folder as one PNG.
 
     Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; then the
     training curve, the PSNR of each test frame, and the scores of `metrics.json`.
@@ -47,35 +48,35 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path) -
     metrics = json.loads((run / "metrics.json").read_text())
     per_frame = json.loads((run / "per_frame.json").read_text())
     log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-    rows = _picture_rows(scene, sequence)
-    # A canvas of its own: choosing a backend for the whole process would be the caller's affair.
+    rows = _image_rows(scene, sequence)
+    # An own canvas: `pyplot` would choose a backend for the whole process.
     figure = Figure(figsize=(2.6 * len(rows[0]), 2.1 * len(rows) + 3.4), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
     top, bottom = figure.subfigures(2, 1, height_ratios=[2.1 * len(rows), 3.4])
     axes = np.atleast_2d(top.subplots(len(rows), len(rows[0])))
     for row, cells in zip(axes, rows, strict=True):
-        for axis, (title, picture) in zip(row, cells, strict=True):
-            axis.imshow(picture)
+        for axis, (title, image) in zip(row, cells, strict=True):
+            axis.imshow(image)
             axis.set_title(title, fontsize=8)
             axis.set_axis_off()
     loss_axis, psnr_axis, table_axis = bottom.subplots(1, 3, width_ratios=[1, 1, 1.1])
-    _draw_loss(loss_axis, log)
-    _draw_psnr(psnr_axis, per_frame)
-    _draw_scores(table_axis, metrics)
+    _plot_loss(loss_axis, log)
+    _plot_psnr(psnr_axis, per_frame)
+    _write_scores(table_axis, metrics)
     with whole_file(path) as temporary:
         figure.savefig(temporary)
 
 
-def _picture_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, NDArray[np.uint8]]]]:
+def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, NDArray[np.uint8]]]]:
     frames = sequence.frames("test")
     shown = sorted({int(k) for k in np.linspace(0, len(frames) - 1, 3)})
     span, unit = depth_span(scene), "relative" if sequence.depth_is_relative else "mm"
     rows = []
     for frame in (frames[k] for k in shown):
-        drawn = scene.render(frame.time, frame.camera)
-        color, depth = np.clip(drawn.color.cpu().numpy(), 0, 1), drawn.depth.cpu().numpy()
+        out = scene.render(frame.time, frame.camera)
+        color, depth = np.clip(out.color.cpu().numpy(), 0, 1), out.depth.cpu().numpy()
         error = np.abs(color - frame.rgb).mean(-1)
-        cells = [(f"input, frame {frame.index} (held out)", frame.rgb_u8), ("rendered, tool removed", to_u8(color))]
+        cells = [(f"input, frame {frame.index} (test)", frame.rgb_u8), ("rendered, tool removed", to_u8(color))]
         tissue = sequence.truth.tissue(frame.index) if sequence.truth else None
         if tissue is not None:
             cells.append(("true tissue", tissue))
@@ -89,7 +90,7 @@ def _picture_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str,
     return rows
 
 
-def _draw_loss(axis: Axes, log: list[dict]) -> None:
+def _plot_loss(axis: Axes, log: list[dict]) -> None:
     axis.semilogy([sum(line["terms"].values()) for line in log], linewidth=0.6, color="tab:red")
     starts = [k for k in range(1, len(log)) if log[k]["stage"] != log[k - 1]["stage"]]
     for k in starts:
@@ -100,21 +101,17 @@ def _draw_loss(axis: Axes, log: list[dict]) -> None:
         axis.legend(fontsize=7)
 
 
-def _draw_psnr(axis: Axes, per_frame: list[dict]) -> None:
+def _plot_psnr(axis: Axes, per_frame: list[dict]) -> None:
     points = [(row["index"], row["psnr_tissue"]) for row in per_frame if "psnr_tissue" in row]
     if points:
         axis.plot(*zip(*points, strict=True), "o-", color="tab:blue", markersize=4)
-    axis.set_title("PSNR on tissue, held-out frames, dB", fontsize=9)
+    axis.set_title(f"{all_scores()['psnr_tissue'].heading}, test frames", fontsize=9)
     axis.set_xlabel("frame", fontsize=8)
     axis.grid(alpha=0.3)
 
 
-def _draw_scores(axis: Axes, metrics: dict) -> None:
-    scores = metrics["scores"]
-    lines = [f"{text:<30}{_number(scores[name]):>10}" for name, text in SHOWN_SCORES.items() if name in scores]
+def _write_scores(axis: Axes, metrics: dict) -> None:
+    scores, known = metrics["scores"], all_scores()
+    lines = [f"{known[name].label:<20}{known[name].text(scores[name]):>16}" for name in SHOWN_SCORES if name in scores]
     axis.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=axis.transAxes)
     axis.set_axis_off()
-
-
-def _number(value: float) -> str:
-    return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"

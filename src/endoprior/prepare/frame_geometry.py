@@ -1,6 +1,6 @@
-"""From an eye's picture to a frame: rectify, cut to what belongs to the picture, shrink. One camera for all frames.
+"""From a source image to a frame: rectify or undistort, crop, resize. All frames share one camera matrix.
 
-Rectangles and borders are given in px of one eye's picture as it comes from the source.
+Rectangles and borders are in px of one camera's source image.
 """
 
 from __future__ import annotations
@@ -13,42 +13,42 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.reading import complaint
+from ..core.checks import input_error
 from ..footage.border import Circle, Strips
 from .calibration import Calibration, check_pair
 from .config import Rectangle
 
 CIRCLE_MARGIN = 0.025
-"""Share of the radius left out: the rim of a round border is dark and blurred, and moves a little with the optics."""
+"""Share of the radius to leave out: the rim of a round border is dark, blurred and moves slightly with the optics."""
 MIN_SIDE_PX = 32
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
-class View:
-    """How every picture of a source becomes a frame."""
+class FrameGeometry:
+    """How every source image becomes a frame."""
 
     source_size: tuple[int, int]
-    """(width, height) of one eye's picture, px."""
+    """(width, height) of one camera's source image, px."""
     maps: tuple[Maps | None, Maps | None]
-    """Left and right: where each rectified pixel lies in the picture; None if the picture is rectified."""
+    """Rectification maps of the left and right camera; None if the images are rectified already."""
     cut: Rectangle
-    """Part of the rectified picture that is kept."""
+    """Part of the rectified image to keep."""
     size: tuple[int, int]
     """(width, height) of a frame, px."""
     matrix: NDArray[np.float64]
-    """(3, 3) K of the frames, px; the left-most pixel is centered at 0.5."""
+    """(3, 3) camera matrix K of the frames, px; the left-most pixel is centered at 0.5."""
     baseline_mm: float | None
-    """None for one eye."""
+    """None if monocular."""
     center_shift_px: float
-    """Principal point x of the left eye minus that of the right one, px: the disparity of a point at infinity."""
+    """cx_left - cx_right, px: the disparity of a point at infinity."""
     blank: NDArray[np.bool_]
-    """(h, w) of the source: True where pictures are painted black."""
+    """(h, w) of the source: True where images are painted black."""
     inside: NDArray[np.bool_]
-    """(H, W) of a frame: True where it shows what the lens sees."""
+    """(H, W) of a frame: True inside the endoscope's field of view."""
 
-    def picture(self, rgb_u8: NDArray[np.uint8], right: bool = False) -> NDArray[np.uint8]:
-        """The frame's picture (H, W, 3) of an eye's picture (h, w, 3)."""
+    def image(self, rgb_u8: NDArray[np.uint8], right: bool = False) -> NDArray[np.uint8]:
+        """The frame (H, W, 3) of a source image (h, w, 3)."""
         if self.blank.any():
             rgb_u8 = np.where(self.blank[..., None], np.uint8(0), rgb_u8)
         maps = self.maps[int(right)]
@@ -57,9 +57,9 @@ class View:
         return _shrink(_cut(rgb_u8, self.cut), self.size)
 
     def values(self, image: NDArray) -> NDArray:
-        """A mask or depth map that belongs to the left picture (h, w), or to the frame already, as the frame (H, W).
+        """A mask or depth map of the left source image (h, w), resampled to the frame (H, W) by nearest neighbor.
 
-        Nearest neighbor: values are never mixed.
+        An array of the frame's size is returned as it is.
         """
         if image.shape[:2] == self.size[::-1]:
             return image
@@ -80,7 +80,7 @@ def _shrink(image: NDArray, size: tuple[int, int]) -> NDArray:
     return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def make_view(
+def make_geometry(
     size: tuple[int, int],
     calibration: Calibration | None,
     *,
@@ -92,24 +92,24 @@ def make_view(
     blank: Sequence[Rectangle] = (),
     strips: Strips | None = None,
     circle: Circle | None = None,
-) -> View:
-    """Decide geometry once for all frames.
+) -> FrameGeometry:
+    """Compute the geometry of all frames.
 
     Args:
-        size: (width, height) of one eye's picture.
-        calibration: of the eyes; None assumes a pinhole of `field_of_view_degrees` with its center in the middle.
-        name: of the calibration, for complaints.
-        crop, blank, strips, circle: what to keep and what to paint over.
+        size: (width, height) of one camera's source image.
+        calibration: None assumes a pinhole camera of `field_of_view_degrees` with a centered principal point.
+        name: of the calibration, for error messages.
+        crop, blank, strips, circle: parts to keep and parts to paint over.
     Raises:
-        InputError: nothing is left, or the calibration does not fit.
+        InputError: the crop leaves too little, or the calibration does not fit.
     """
     width, height = size
     keep = np.ones((height, width), bool)
     if crop is not None:
         x, y, w, h = crop
         if x + w > width or y + h > height:
-            hint = "Choose a part of one eye's picture."
-            raise complaint("--crop", f"a rectangle within {width}x{height} px", ",".join(map(str, crop)), hint)
+            hint = "Choose a rectangle inside one camera's image."
+            raise input_error("--crop", f"a rectangle within {width}x{height} px", ",".join(map(str, crop)), hint)
         keep[:] = False
         keep[y : y + h, x : x + w] = True
     if strips:
@@ -142,11 +142,11 @@ def make_view(
     shift_px = 0.0
     if maps[0] is None and calibration is not None and calibration.right is not None and stereo:
         shift_px = float(calibration.left.matrix[0, 2] - calibration.right.matrix[0, 2]) * scale[0, 0]
-    return View(size, maps, cut, frame, scale @ shift @ matrix, baseline, shift_px, painted, inside)
+    return FrameGeometry(size, maps, cut, frame, scale @ shift @ matrix, baseline, shift_px, painted, inside)
 
 
 def _assumed(width: int, height: int, circle: Circle | None, degrees: float) -> NDArray[np.float64]:
-    """K of a lens whose angle is known roughly at best."""
+    """K of a camera with an assumed field of view."""
     half = math.tan(math.radians(degrees / 2))
     extent, x, y = (width / 2, width / 2, height / 2)
     if circle is not None:
@@ -155,14 +155,14 @@ def _assumed(width: int, height: int, circle: Circle | None, degrees: float) -> 
 
 
 def _moved(matrix: NDArray, by: float) -> NDArray[np.float64]:
-    """K with its principal point moved: OpenCV counts pixel centers from 0, we from 0.5."""
+    """K with its principal point moved: OpenCV counts pixel centers from 0, this package from 0.5."""
     moved = matrix.copy()
     moved[:2, 2] += by
     return moved
 
 
 def _rectify_pair(calibration: Calibration, size: tuple[int, int]) -> tuple[NDArray, tuple[Maps | None, Maps | None]]:
-    """K of both rectified eyes and the maps, None where the pictures are rectified already."""
+    """K of both rectified cameras, and the rectification maps; None if the images are rectified already."""
     left, right = calibration.left, calibration.right
     assert right is not None and calibration.rotation is not None and calibration.translation_mm is not None
     if calibration.rectified:
@@ -180,19 +180,22 @@ def _rectify_pair(calibration: Calibration, size: tuple[int, int]) -> tuple[NDAr
 
 
 def _undistort(calibration: Calibration, size: tuple[int, int]) -> tuple[NDArray, tuple[Maps | None, None]]:
-    eye = calibration.left
-    if not np.any(eye.distortion):
-        return eye.matrix, (None, None)
-    k = _moved(eye.matrix, -0.5)
-    better, _ = cv2.getOptimalNewCameraMatrix(k, eye.distortion, size, 0)
-    return _moved(better, 0.5), (cv2.initUndistortRectifyMap(k, eye.distortion, None, better, size, cv2.CV_32FC1), None)
+    camera = calibration.left
+    if not np.any(camera.distortion):
+        return camera.matrix, (None, None)
+    k = _moved(camera.matrix, -0.5)
+    better, _ = cv2.getOptimalNewCameraMatrix(k, camera.distortion, size, 0)
+    return _moved(better, 0.5), (
+        cv2.initUndistortRectifyMap(k, camera.distortion, None, better, size, cv2.CV_32FC1),
+        None,
+    )
 
 
 def _bounding_box(keep: NDArray[np.bool_]) -> Rectangle:
     rows, columns = np.flatnonzero(keep.any(1)), np.flatnonzero(keep.any(0))
     if len(rows) < MIN_SIDE_PX or len(columns) < MIN_SIDE_PX:
-        hint = "Give a larger --crop, or --border keep."
-        raise complaint("--crop", f"at least {MIN_SIDE_PX} px to be left", f"{len(columns)}x{len(rows)}", hint)
+        hint = "Use a larger --crop, or `--border keep`."
+        raise input_error("--crop", f"at least {MIN_SIDE_PX} px a side", f"{len(columns)}x{len(rows)}", hint)
     return int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from endoprior.core.types import Camera, Frame
-from endoprior.experiments.pictures import center_density, frames_picture, instability_map, prior_picture, zoom_windows
+from endoprior.experiments.image_grids import center_density, frames_grid, instability_map, prior_grid, zoom_windows
 
 WIDTH, HEIGHT = 80, 60
 
@@ -58,15 +58,15 @@ def test_windows_hold_what_they_are_named_for():
         assert 0 <= rows.start and rows.stop <= HEIGHT and 0 <= cols.start and cols.stop <= WIDTH
 
 
-def test_instability_is_the_mean_change_where_both_show_drawn_tissue():
+def test_instability_is_the_mean_change_where_both_show_rendered_tissue():
     frames = [frame(i) for i in range(4)]
     frames[2].tissue_mask[:5] = False
     found = instability_map(Still(np.zeros((1, 3)), 0.25), frames)
-    drawn = np.ones((HEIGHT, WIDTH), bool)
-    drawn[:, -5:] = False
-    drawn[45:, :10] = False
-    assert np.isnan(found[~drawn]).all()
-    assert found[drawn] == pytest.approx(0.25, abs=1e-5)  # float32 depths near 50
+    rendered = np.ones((HEIGHT, WIDTH), bool)
+    rendered[:, -5:] = False
+    rendered[45:, :10] = False
+    assert np.isnan(found[~rendered]).all()
+    assert found[rendered] == pytest.approx(0.25, abs=1e-5)  # float32 depths near 50
 
 
 def test_density_counts_centers_in_front_and_inside():
@@ -76,7 +76,7 @@ def test_density_counts_centers_in_front_and_inside():
     assert np.unravel_index(found.argmax(), found.shape) == (HEIGHT // 2, WIDTH // 2)
 
 
-def test_pictures_have_a_column_for_each_method():
+def test_grids_have_a_column_for_each_method():
     class FrameSequence:
         def frames(self, split):
             return [frame(1)]
@@ -86,5 +86,5 @@ def test_pictures_have_a_column_for_each_method():
 
     scenes = {name: Still(np.array([[0.0, 0, 50]])) for name in "ab"}
     width, height = 6 * WIDTH, 6 * HEIGHT  # enlarged to 480 px
-    assert frames_picture(FrameSequence(), scenes).shape == (4 * height, 3 * width, 3)
-    assert prior_picture(FrameSequence(), scenes).shape == (height, 4 * width, 3)
+    assert frames_grid(FrameSequence(), scenes).shape == (4 * height, 3 * width, 3)
+    assert prior_grid(FrameSequence(), scenes).shape == (height, 4 * width, 3)

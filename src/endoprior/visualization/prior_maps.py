@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ..core.config import PriorConfig
 from ..data import FrameSequence, Split
 from ..priors import joint_texture_prior, salience, specular_likelihood
-from ..system.atomic import refuse_occupied, whole_folder
-from .pictures import colorize, label, tile, to_u8, write_png
+from ..system.atomic import reject_occupied, whole_folder
+from .image_tools import colorize, label, tile, to_u8, write_png
 
 SHEET_FRAMES = 6
 SHEET_WIDTH_PX = 320
@@ -26,7 +26,7 @@ def write_prior_maps(sequence: FrameSequence, split: Split, cfg: PriorConfig, ou
     Raises:
         InputError: `out` exists and is not empty.
     """
-    refuse_occupied(out)
+    reject_occupied(out)
     frames = sequence.frames(split)
     shown = set(np.linspace(0, len(frames) - 1, min(SHEET_FRAMES, len(frames))).astype(int).tolist())
     rows: list[NDArray[np.uint8]] = []

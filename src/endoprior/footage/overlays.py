@@ -1,4 +1,4 @@
-"""Burned-in labels and console text: high contrast that stays put while the picture changes around it.
+"""Burned-in labels and console text: high contrast that stays put while the image changes around it.
 
 Says where such writing lies, not what it says. Faint or changing writing (a running clock) is not found.
 """
@@ -22,41 +22,41 @@ STILL = 0.035
 STILL_SCENE = 0.3
 """If more than this share of all edges is still, the scene itself stands still and nothing can be said."""
 GAP = 0.025
-"""Letters closer together than this share of the picture's height belong to one label."""
+"""Letters closer together than this share of the image's height belong to one label."""
 LEAST_PX, MOST_HEIGHT = 7, 0.2
-"""Sides of a label: no readable letter is smaller; a share of the picture's height, for a block of several lines.
+"""Sides of a label: no readable letter is smaller; a share of the image's height, for a block of several lines.
 The straight edge of a bar or a console is thinner or longer."""
 LINE_ASPECT, BLOCK_SHARE = 1.5, 0.003
-"""A line of two letters is this much wider than high; a block covers this share of the picture. Resting highlights of a
+"""A line of two letters is this much wider than high; a block covers this share of the image. Resting highlights of a
 static camera are neither."""
 LEAST_FILL = 0.25
 """Share of a label's rectangle that lies along strokes; on a round border or a resting tool it is far less."""
 
 
-def find_static_overlays(pictures: Sequence[NDArray[np.uint8]]) -> list[tuple[int, int, int, int]]:
-    """Rectangles around writing that is burned into every picture of a clip; words far apart get one each.
+def find_static_overlays(images: Sequence[NDArray[np.uint8]]) -> list[tuple[int, int, int, int]]:
+    """Rectangles around writing that is burned into every image of a clip; words far apart get one each.
 
     Args:
-        pictures: (H, W, 3) each, 0..255, spread over the clip (about 20); fewer than 5 give no rectangles.
+        images: (H, W, 3) each, 0..255, spread over the clip (about 20); fewer than 5 give no rectangles.
     Returns:
         (x, y, width, height) each, px, with a margin of about half a letter, from top to bottom. Empty where
         the scene itself stands still.
     Raises:
-        ValueError: pictures of unequal shapes.
+        ValueError: images of unequal shapes.
     """
-    if len(pictures) < LEAST_PICTURES:
+    if len(images) < LEAST_PICTURES:
         return []
-    height, width = pictures[0].shape[:2]
+    height, width = images[0].shape[:2]
     total, squares = np.zeros((2, height, width))
     any_edge = np.zeros((height, width), bool)
-    for picture in pictures:
-        check_shape("first:H,W,3 picture:H,W,3", first=pictures[0], picture=picture)
-        gray = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY).astype(np.float64)
+    for image in images:
+        check_shape("first:H,W,3 image:H,W,3", first=images[0], image=image)
+        gray = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY).astype(np.float64)
         total += gray
         squares += gray * gray
         any_edge |= _contrast(gray) > LEAST_CONTRAST
-    mean = total / len(pictures)
-    deviation = np.sqrt(np.maximum(squares / len(pictures) - mean * mean, 0))
+    mean = total / len(images)
+    deviation = np.sqrt(np.maximum(squares / len(images) - mean * mean, 0))
     contrast = _contrast(mean)
     still = (contrast > LEAST_CONTRAST) & (deviation < STILL * contrast)
     if still.sum() > STILL_SCENE * any_edge.sum():

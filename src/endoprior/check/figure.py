@@ -1,4 +1,4 @@
-"""One picture of a sequence: frames with what was found in them, depth, curves over time, and the first points."""
+"""The figure of `endoprior check`: frames with tools and borders, depth, curves over time, initial points."""
 
 from __future__ import annotations
 
@@ -20,43 +20,43 @@ from ..core.geometry import project
 from ..core.types import Frame
 from ..data import FrameSequence
 from ..footage.units import FAR_MM, NEAR_MM
-from ..show.pictures import colorize
 from ..system.atomic import whole_file
+from ..visualization.image_tools import colorize
 from .facts import Facts, spread
 from .findings import SEEN_AS_TISSUE, Finding
 from .report import table
 
 SHOWN = 4
-"""Frames shown."""
+"""Number of frames shown."""
 RULER_MM = 10.0
-"""Length of the ruler in the pictures, at their median depth."""
+"""Length of the ruler, at the median depth of the frame."""
 TOOL_COLOR, BORDER_COLOR, FLAG_COLOR = "#ff3b30", "#ffd60a", "#d62728"
 WRAPPED_AT, ROWS = 84, 34
-"""Characters of a line and lines of the panel of findings."""
+"""Characters per line and number of lines of the findings panel."""
 SEVERITY_COLOR = {"error": "#b00020", "warning": "#b26a00", "note": "#3a5a78"}
 
 
 def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], path: Path) -> None:
-    """Write the picture as one PNG.
+    """Write the figure as a PNG file.
 
-    Rows: frames with tools outlined in red and borders in yellow; their depth; histogram of depth and curves over
-    time, frames of findings marked; the first points from the camera and from the side, and the findings.
+    Rows: frames with tools outlined in red and borders in yellow; their depth; depth histogram and curves over time,
+    with the frames of findings marked; initial points from the camera and from the side, and the findings.
 
     Args:
-        sequence: what was measured.
-        facts, findings: what came of it.
-        path: the file, whole or not at all.
+        sequence: the measured sequence.
+        facts, findings: its facts and findings.
+        path: the file; written completely or not at all.
     """
-    # A canvas of its own: choosing a backend for the whole process would be the caller's affair.
+    # Use a canvas directly: selecting a Matplotlib backend would change the whole process.
     figure = Figure(figsize=(15, 14), layout="constrained", dpi=100)
     FigureCanvasAgg(figure)
     camera = facts.camera
-    # A name may hold bytes that are no text, and signs that Matplotlib would take for formulas.
+    # A file name may hold bytes that are not text, and characters that Matplotlib would parse as formulas.
     name = os.fsencode(facts.path.name).decode("utf-8", "backslashreplace")
     title = f"{name}   {facts.frames} frames of {camera.width} x {camera.height} px"
     figure.suptitle(title, fontsize=13, parse_math=False)
-    pictures, curves, space = figure.subfigures(3, 1, height_ratios=[5.6, 3.4, 4.8])
-    _draw_frames(pictures, [sequence.frame(i) for i in spread(len(sequence), SHOWN)], facts)
+    images, curves, space = figure.subfigures(3, 1, height_ratios=[5.6, 3.4, 4.8])
+    _draw_frames(images, [sequence.frame(i) for i in spread(len(sequence), SHOWN)], facts)
     left, right = curves.subfigures(1, 2, width_ratios=[1, 2.4])
     _draw_histogram(left.subplots(), facts)
     _draw_curves(right, facts, findings)
@@ -79,7 +79,7 @@ def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
         if not facts.depth.relative:
             _draw_ruler(top, frame)
         bottom.imshow(colorize(frame.depth, low, high, frame.depth_valid))
-        bottom.set_title("depth, black where there is none", fontsize=9)
+        bottom.set_title("depth, black where missing", fontsize=9)
         for axis in (top, bottom):
             axis.set_xlim(0, frame.camera.width)
             axis.set_ylim(frame.camera.height, 0)
@@ -99,18 +99,18 @@ def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
 
 
 def _outlined(frame: Frame) -> NDArray[np.uint8]:
-    """The picture with tools tinted and outlined in red."""
-    picture = frame.rgb_u8.copy()
+    """The frame with tools tinted and outlined in red."""
+    image = frame.rgb_u8.copy()
     tool = ~frame.tissue_mask
     red = np.array([int(TOOL_COLOR[i : i + 2], 16) for i in (1, 3, 5)], np.float32)
-    picture[tool] = (0.72 * picture[tool] + 0.28 * red).astype(np.uint8)
+    image[tool] = (0.72 * image[tool] + 0.28 * red).astype(np.uint8)
     outlines, _ = cv2.findContours(tool.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(picture, outlines, -1, red.tolist(), max(1, picture.shape[1] // 300))
-    return picture
+    cv2.drawContours(image, outlines, -1, red.tolist(), max(1, image.shape[1] // 300))
+    return image
 
 
 def _draw_border(axis: Axes, facts: Facts) -> None:
-    """Strips, round border and labels, in yellow; dashed where the masks already leave them out."""
+    """Strips, round border and labels, in yellow; dotted where the masks already exclude them."""
     border, (width, height) = facts.border, (facts.camera.width, facts.camera.height)
     strips = border.strips
     for size, at, extent in (
@@ -133,7 +133,7 @@ def _line(solid: bool) -> dict[str, object]:
 
 
 def _draw_ruler(axis: Axes, frame: Frame) -> None:
-    """A line as long as 10 mm at the frame's median depth: absurd where the unit is wrong."""
+    """A line of 10 mm at the median depth of the frame. With a wrong depth unit its length is implausible."""
     if not frame.depth_valid.any():
         return
     length = RULER_MM * frame.camera.fx / float(np.median(frame.depth[frame.depth_valid]))
@@ -165,7 +165,7 @@ def _draw_curves(part: SubFigure, facts: Facts, findings: list[Finding]) -> None
         ("brightness", every, facts.changes.brightness, {"exposure-jump", "unexplained-frames", "scene-cut"}),
         ("tool, share of pixels", every, facts.masks.tool_fraction, set()),
         (f"median depth, {_unit(facts)}", every, facts.depth.median, {"depth-jumps", "no-depth-frames"}),
-        ("motion of the picture, px a frame", moved, facts.motion.pixels_per_frame, {"duplicate-frames"}),
+        ("image motion, px per frame", moved, facts.motion.pixels_per_frame, {"duplicate-frames"}),
     )
     for axis, (title, x, y, codes) in zip(part.subplots(2, 2, sharex=True).flat, curves, strict=True):
         axis.plot(x, y, color="#30506b", linewidth=1.2)
@@ -180,8 +180,8 @@ def _draw_curves(part: SubFigure, facts: Facts, findings: list[Finding]) -> None
 
 
 def _draw_cloud(front: Axes, side: Axes, facts: Facts) -> None:
-    """The first points as the first camera sees them, and from its right, the camera at the left edge."""
-    for axis, title in ((front, "first points, from the camera"), (side, "from the side")):
+    """The initial points, from the first camera and from the side with the camera at the left edge."""
+    for axis, title in ((front, "initial points, from the camera"), (side, "from the side")):
         axis.set_facecolor("#101418")
         axis.set_title(title, fontsize=9)
         axis.tick_params(labelsize=8)
@@ -209,7 +209,7 @@ def _draw_cloud(front: Axes, side: Axes, facts: Facts) -> None:
 
 
 def _draw_findings(axis: Axes, facts: Facts, findings: list[Finding]) -> None:
-    """The findings and, as far as there is room, the table of facts."""
+    """The findings, and below them as much of the table of facts as fits."""
     axis.set_axis_off()
     lines: list[tuple[str, str, str]] = []
     for finding in findings:
@@ -218,7 +218,7 @@ def _draw_findings(axis: Axes, facts: Facts, findings: list[Finding]) -> None:
         fix = textwrap.wrap(f"fix: {finding.fix}", WRAPPED_AT, subsequent_indent="     ")
         lines += [(line, "#444444", "normal") for line in fix] + [("", "black", "normal")]
     if not findings:
-        lines += [("nothing suspicious", "#2e8b57", "bold"), ("", "black", "normal")]
+        lines += [("no problems", "#2e8b57", "bold"), ("", "black", "normal")]
     for name, value in table(facts):
         rows = textwrap.wrap(value, WRAPPED_AT - 17) or [""]
         lines += [(f"{name if i == 0 else '':<17}{row}", "#3a5a78", "normal") for i, row in enumerate(rows)]
@@ -228,5 +228,5 @@ def _draw_findings(axis: Axes, facts: Facts, findings: list[Finding]) -> None:
 
 
 def _unit(facts: Facts) -> str:
-    """Unit of the depth as it is read."""
+    """Unit of the depth as read."""
     return "relative" if facts.depth.relative else "mm"

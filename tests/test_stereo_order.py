@@ -1,10 +1,10 @@
-"""Which eye is which, and whether the rows of a pair fit."""
+"""Which camera is which, and whether the rows of a pair fit."""
 
 import cv2
 import numpy as np
 import pytest
 
-from endoprior.footage.eyes import eye_order, vertical_offset_px
+from endoprior.footage.stereo_order import stereo_order, vertical_offset_px
 
 WIDTH, HEIGHT = 241, 179
 
@@ -23,25 +23,25 @@ def pair() -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_order_of_the_eyes_is_recognized(pair):
     left, right = pair
-    given, exchanged = eye_order(left, right), eye_order(right, left)
+    given, exchanged = stereo_order(left, right), stereo_order(right, left)
     assert given.as_given > 0.8 and given.exchanged < 0.5 and not given.swapped
     assert exchanged.swapped
-    # Not to the last bit: the matcher starts from one eye.
+    # Not to the last bit: the matcher starts from one camera.
     assert abs(given.as_given - exchanged.exchanged) < 0.05
 
 
 def test_converging_eyes_need_their_shift(pair):
     left, right = pair
     moved = np.roll(right, 20, 1)  # disparity is 20 px less now, all of it negative
-    assert eye_order(left, moved).swapped
-    assert not eye_order(left, moved, center_shift_px=-20.0).swapped
-    assert eye_order(moved, left, center_shift_px=20.0).swapped
+    assert stereo_order(left, moved).swapped
+    assert not stereo_order(left, moved, center_shift_px=-20.0).swapped
+    assert stereo_order(moved, left, center_shift_px=20.0).swapped
 
 
 def test_one_picture_twice_says_nothing(pair):
-    assert not eye_order(pair[0], pair[0]).swapped
+    assert not stereo_order(pair[0], pair[0]).swapped
     blank = np.zeros_like(pair[0])
-    assert not eye_order(blank, blank).swapped
+    assert not stereo_order(blank, blank).swapped
 
 
 @pytest.mark.parametrize("rows", [0, 1, 5])
@@ -61,7 +61,7 @@ def test_too_few_features_give_no_number(pair):
 
 
 def test_shapes_are_checked(pair):
-    for function in (eye_order, vertical_offset_px):
+    for function in (stereo_order, vertical_offset_px):
         with pytest.raises(ValueError, match="right_u8"):
             function(pair[0], pair[1][:, :-2])
         with pytest.raises(ValueError, match="left_u8"):

@@ -12,7 +12,7 @@ from ..core.types import Frame, RenderOutput
 from ..model.scene import Scene
 from ..system.atomic import whole_file
 from .camera_paths import View
-from .pictures import colorize, label, tile, to_u8, write_png
+from .image_tools import colorize, label, tile, to_u8, write_png
 from .video import write_video
 
 AT_A_TIME = 8

@@ -1,4 +1,4 @@
-"""How two eyes share a frame, and how to tell them apart."""
+"""How the images of two cameras are stored in one video frame: detect the layout, split the frame."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.reading import complaint
+from ..core.checks import input_error
 from .calibration import Calibration
 
 Layout = Literal["auto", "mono", "side-by-side", "top-bottom", "interlaced", "two-files"]
 LOOK_ALIKE = 0.8
-"""Correlation of two halves of a frame above which they are two eyes that see the same."""
+"""Correlation above which the halves of a frame are two views of the same scene."""
 
 
-def split_eyes(frame: NDArray[np.uint8], layout: Layout) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """First and second eye of a frame; the second is None for `mono` and `two-files`.
+def split_cameras(frame: NDArray[np.uint8], layout: Layout) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """Images of the first and second camera; the second is None for `mono` and `two-files`.
 
     Args:
         frame: (H, W, 3).
-        layout: not `auto`. The eyes of an interlaced frame are its even and odd rows; each comes back with H rows,
-            those in between interpolated, so that both keep their rows' true heights.
+        layout: not `auto`. An interlaced frame holds the cameras in its even and odd rows. Both images come back with H
+            rows, missing rows interpolated, so that rows keep their true heights.
     """
     height, width = frame.shape[:2]
     if layout == "side-by-side":
@@ -35,7 +35,7 @@ def split_eyes(frame: NDArray[np.uint8], layout: Layout) -> tuple[NDArray[np.uin
 
 
 def _fill_rows(frame: NDArray[np.uint8], parity: int) -> NDArray[np.uint8]:
-    """(H, W, 3) with rows of the other parity replaced by the mean of their neighbors."""
+    """(H, W, 3) with the rows of the other parity replaced by the mean of their neighbors."""
     filled = frame.copy()
     own = frame[parity::2].astype(np.uint16)
     between = ((own[:-1] + own[1:] + 1) // 2).astype(np.uint8)
@@ -47,8 +47,8 @@ def _fill_rows(frame: NDArray[np.uint8], parity: int) -> NDArray[np.uint8]:
     return filled
 
 
-def eye_size(width: int, height: int, layout: Layout) -> tuple[int, int]:
-    """(width, height) of one eye, px."""
+def camera_size(width: int, height: int, layout: Layout) -> tuple[int, int]:
+    """(width, height) of one camera's image, px."""
     if layout == "side-by-side":
         return width // 2, height
     return (width, height // 2) if layout == "top-bottom" else (width, height)
@@ -57,13 +57,13 @@ def eye_size(width: int, height: int, layout: Layout) -> tuple[int, int]:
 def find_layout(
     frame: NDArray[np.uint8], calibration: Calibration | None, has_second_source: bool, name: str
 ) -> Layout:
-    """How the eyes share this frame, by the calibration's size and by what the frame shows.
+    """Detect the layout from the image size of the calibration and from the content of one frame.
 
     Args:
-        frame: (H, W, 3), one picture of the source.
-        name: of the source, for the complaint.
+        frame: (H, W, 3), one frame of the source.
+        name: of the source, for the error message.
     Raises:
-        InputError: it cannot be told.
+        InputError: the layout cannot be detected.
     """
     if has_second_source:
         return "two-files"
@@ -72,12 +72,12 @@ def find_layout(
     alike: list[Layout] = [kind for kind in ("side-by-side", "top-bottom", "interlaced") if _alike(frame, kind)]
     if not stereo:
         if alike and alike[0] != "interlaced":
-            hint = f"Give --calibration with --layout {alike[0]}, or --layout mono if it is one eye."
-            raise complaint(name, "a calibration for a stereo video", f"none, and a {alike[0]} frame", hint)
+            hint = f"`--calibration FILE --layout {alike[0]}`, or `--layout mono` if there is one camera."
+            raise input_error(name, "a calibration for a stereo video", f"none, and a {alike[0]} frame", hint)
         return "mono"
-    said = calibration.layout or ""
+    stated = calibration.layout or ""
     for kind in ("side-by-side", "top-bottom", "interlaced"):
-        if kind in said.lower():
+        if kind in stated.lower():
             return kind
     if calibration.size:
         across, down = width / calibration.size[0], height / calibration.size[1]
@@ -89,21 +89,21 @@ def find_layout(
             return "interlaced"
     if alike:
         return alike[0]
-    hint = "Give --layout side-by-side, top-bottom or interlaced, or the second eye's video with --right."
-    raise complaint(name, "two eyes in each frame", f"{width}x{height} px that do not show them", hint)
+    hint = "`--layout side-by-side`, `top-bottom` or `interlaced`, or `--right VIDEO` for a second video."
+    raise input_error(name, "two cameras in each frame", f"{width}x{height} px without a known layout", hint)
 
 
 def _alike(frame: NDArray[np.uint8], layout: Layout) -> bool:
-    """Whether the halves show nearly the same: smoothed, and moved along x as two eyes see it."""
+    """Whether both halves show nearly the same image, up to a shift along x."""
     gray = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
     if layout == "interlaced":
         rows = gray[: len(gray) // 2 * 2].astype(np.float32)
-        # Rows of one eye continue each other better than they continue those of the other eye.
+        # Rows of one camera are more similar to each other than to the rows of the other camera.
         own, other = np.abs(rows[2:] - rows[:-2]).mean(), np.abs(rows[1:] - rows[:-1]).mean()
         return bool(other > 1.2 * own)
-    first, second = split_eyes(gray[..., None], layout)
+    first, second = split_cameras(gray[..., None], layout)
     first, second = (
-        cv2.resize(np.ascontiguousarray(eye), (96, 64), interpolation=cv2.INTER_AREA) for eye in (first, second)
+        cv2.resize(np.ascontiguousarray(camera), (96, 64), interpolation=cv2.INTER_AREA) for camera in (first, second)
     )
     middle = first[:, 16:-16].astype(np.float32)
     scores = cv2.matchTemplate(second.astype(np.float32), middle, cv2.TM_CCOEFF_NORMED)

@@ -1,6 +1,6 @@
-"""Figures of pictures: frames beside each other with zooms, maps of depth instability, the prior under the Gaussians.
+"""Figures of images side by side: frames with zooms, maps of depth instability, the prior and the Gaussians' density.
 
-`H, W` image size. All show the first seed and the last budget.
+`H, W` image size. All show the first seed at the last budget.
 """
 
 from __future__ import annotations
@@ -19,46 +19,46 @@ from ..core.types import Frame
 from ..data import FrameSequence, load_sequence
 from ..model.scene import Scene, load_scene
 from ..priors import joint_texture_prior, specular_likelihood
-from ..show.pictures import colorize, label, tile, to_u8, write_png
+from ..visualization.image_tools import colorize, label, tile, to_u8, write_png
 from .matrix import Matrix
 from .spec import Cell
 
 ZOOM = 4
-"""Windows show this fraction of the frame's width and height."""
+"""A zoom window is this fraction of the frame's width and height."""
 DENSITY_SIGMA = 64
-"""The density of centers is blurred by this fraction of the width."""
+"""The density of centers is blurred by this fraction of the frame's width."""
 TILE_WIDTH_PX = 480
-"""Pictures smaller than this are enlarged, so that their labels can be read."""
+"""Narrower images are enlarged, so that their labels can be read."""
 INSTABILITY_FULL_SCALE_MM = 1.0
 DIFFERENCE_FULL_SCALE_MM = 0.5
 
 
 def scenes_of(matrix: Matrix, sequence: str) -> dict[str, Scene]:
-    """The trained scene of every method that is done, by label."""
+    """The trained scene of every method whose cell is finished, by label."""
     spec = matrix.spec
     budget = spec.budgets[-1] if spec.budgets else None
     folders = {m: matrix.done.get(Cell(sequence, m, budget, spec.seeds[0])) for m in spec.methods}
     return {spec.label(m): load_scene(folder / "run") for m, folder in folders.items() if folder}
 
 
-def frames_picture(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
-    """The middle held-out frame and its zooms into highlight, dark and boundary; columns: input and each method."""
+def frames_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+    """The middle test frame, zoomed to a highlight, a dark part and a mask border; columns: input and each method."""
     test = sequence.frames("test")
     frame = test[len(test) // 2]
     windows = zoom_windows(frame)
     columns = {"input": frame.rgb_u8}
     columns |= {name: to_u8(scene.render(frame.time, frame.camera).color.numpy()) for name, scene in scenes.items()}
     height, width = frame.tissue_mask.shape
-    pictures = [_labeled(_outlined(picture, windows), name) for name, picture in columns.items()]
+    tiles = [_labeled(_outlined(image, windows), name) for name, image in columns.items()]
     for what, (rows, cols) in windows.items():
-        for picture in columns.values():
-            zoomed = cv2.resize(picture[rows, cols], (width, height), interpolation=cv2.INTER_NEAREST)
-            pictures.append(_labeled(zoomed, what))
-    return tile(pictures, len(columns))
+        for image in columns.values():
+            zoomed = cv2.resize(image[rows, cols], (width, height), interpolation=cv2.INTER_NEAREST)
+            tiles.append(_labeled(zoomed, what))
+    return tile(tiles, len(columns))
 
 
 def zoom_windows(frame: Frame) -> dict[str, tuple[slice, slice]]:
-    """Windows of a quarter of the frame: most highlights, darkest tissue, most border of the tissue mask."""
+    """The windows with the most highlights, the darkest tissue and the most border of the tissue mask."""
     height, width = frame.tissue_mask.shape
     size = (max(width // ZOOM, 1), max(height // ZOOM, 1))
     tissue = frame.tissue_mask.astype(np.float32)
@@ -70,7 +70,7 @@ def zoom_windows(frame: Frame) -> dict[str, tuple[slice, slice]]:
     }
     windows = {}
     for name, values in wanted.items():
-        # Means over all windows; anchor: the window's upper left corner.
+        # The mean of every window, stored at the window's upper left corner.
         means = cv2.boxFilter(values, cv2.CV_32F, size, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
         inside = means[: height - size[1] + 1, : width - size[0] + 1]
         top, left = np.unravel_index(int(inside.argmax()), inside.shape)
@@ -78,14 +78,14 @@ def zoom_windows(frame: Frame) -> dict[str, tuple[slice, slice]]:
     return windows
 
 
-def _outlined(picture: NDArray[np.uint8], windows: dict[str, tuple[slice, slice]]) -> NDArray[np.uint8]:
-    drawn = np.ascontiguousarray(picture).copy()
+def _outlined(image: NDArray[np.uint8], windows: dict[str, tuple[slice, slice]]) -> NDArray[np.uint8]:
+    outlined = np.ascontiguousarray(image).copy()
     for rows, cols in windows.values():
-        cv2.rectangle(drawn, (cols.start, rows.start), (cols.stop - 1, rows.stop - 1), (255, 255, 255), 1)
-    return drawn
+        cv2.rectangle(outlined, (cols.start, rows.start), (cols.stop - 1, rows.stop - 1), (255, 255, 255), 1)
+    return outlined
 
 
-def instability_picture(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+def instability_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
     """Mean absolute change of rendered depth between adjacent frames, and each method's minus the first's."""
     frames = list(sequence.frames("video"))
     maps = {name: instability_map(scene, frames) for name, scene in scenes.items()}
@@ -103,7 +103,7 @@ def instability_picture(sequence: FrameSequence, scenes: dict[str, Scene]) -> ND
 
 
 def instability_map(scene: Scene, frames: list[Frame]) -> NDArray[np.float64]:
-    """(H, W) mean |change of depth|, mm, over adjacent pairs where both show drawn tissue; NaN where none does."""
+    """(H, W) mean |change of depth|, mm, over adjacent pairs that both show rendered tissue; NaN where none does."""
     total = np.zeros(frames[0].tissue_mask.shape)
     count = np.zeros_like(total)
     depths = (scene.render(frame.time, frame.camera).depth.numpy() for frame in frames)
@@ -114,15 +114,15 @@ def instability_map(scene: Scene, frames: list[Frame]) -> NDArray[np.float64]:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def prior_picture(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+def prior_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
     """The joint texture prior of the first frame, and the density of each method's projected centers there."""
     frame = sequence.frame(0)
     rho = joint_texture_prior(frame.rgb, frame.tissue_mask, PriorConfig())
     densities = {name: center_density(scene, frame) for name, scene in scenes.items()}
     top = max(float(np.percentile(density, 99.5)) for density in densities.values())
-    pictures = [_labeled(frame.rgb_u8, "input"), _labeled(colorize(rho, 0, 1), "prior")]
-    pictures += [_labeled(colorize(d, 0, top), f"centers, {name}") for name, d in densities.items()]
-    return tile(pictures, len(pictures))
+    tiles = [_labeled(frame.rgb_u8, "input"), _labeled(colorize(rho, 0, 1), "prior")]
+    tiles += [_labeled(colorize(d, 0, top), f"centers, {name}") for name, d in densities.items()]
+    return tile(tiles, len(tiles))
 
 
 def center_density(scene: Scene, frame: Frame) -> NDArray[np.float32]:
@@ -136,27 +136,27 @@ def center_density(scene: Scene, frame: Frame) -> NDArray[np.float32]:
     return cv2.GaussianBlur(counts, (0, 0), max(width / DENSITY_SIGMA, 1))
 
 
-def _labeled(picture: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
-    factor = -(-TILE_WIDTH_PX // picture.shape[1])
-    return label(cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST), text)
+def _labeled(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    factor = -(-TILE_WIDTH_PX // image.shape[1])
+    return label(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST), text)
 
 
-PICTURES: dict[str, Callable[[FrameSequence, dict[str, Scene]], NDArray[np.uint8]]] = {
-    "frames": frames_picture,
-    "instability": instability_picture,
-    "prior": prior_picture,
+GRIDS: dict[str, Callable[[FrameSequence, dict[str, Scene]], NDArray[np.uint8]]] = {
+    "frames": frames_grid,
+    "instability": instability_grid,
+    "prior": prior_grid,
 }
-"""Maker of each kind of picture."""
+"""What makes each kind of figure."""
 
 
-def write_pictures(matrix: Matrix, folder: Path, kinds: set[str]) -> None:
-    """Draw the asked-for `kinds` (frames, instability, prior) of every sequence into `folder`."""
+def write_image_grids(matrix: Matrix, folder: Path, kinds: set[str]) -> None:
+    """Write those of `kinds` that are in `GRIDS` for every sequence into `folder`."""
     for name, data in matrix.data.items():
         scenes = scenes_of(matrix, name)
         if not scenes:
             continue
         spec = matrix.spec.sequences[name]
         sequence = load_sequence(data, DataConfig(**spec.reading))
-        for kind, make in PICTURES.items():
+        for kind, make in GRIDS.items():
             if kind in kinds:
                 write_png(folder / f"{kind}-{name}.png", make(sequence, scenes))

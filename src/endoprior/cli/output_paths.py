@@ -1,0 +1,47 @@
+"""Check that output paths are writable, before the work begins."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from ..core.checks import input_error
+from ..data.reading import kind_of
+
+
+def require_writable_file(option: str, path: Path, keep: Path) -> None:
+    """Reject a path that cannot be written, and files of the input folder.
+
+    Args:
+        option: the option that names the path.
+        path: the file to write; an existing file is replaced.
+        keep: the input folder, whose files must not change.
+    Raises:
+        InputError: names option and path.
+    """
+    kind = kind_of(path)
+    if kind not in ("a file", "nothing"):
+        raise input_error(f"{option} {path}", "the path of a file", kind, "Choose another name.")
+    if kind == "a file" and keep.resolve() in path.resolve().parents:
+        raise input_error(f"{option} {path}", f"a path outside of {keep}", "a file in it", "Choose another name.")
+    _require_writable(option, path, path.absolute().parent)
+
+
+def require_writable_folder(option: str, path: Path) -> None:
+    """Reject a path where no folder can be created or written; see `require_writable_file`."""
+    kind = kind_of(path)
+    if kind not in ("a folder", "nothing"):
+        raise input_error(f"{option} {path}", "the path of a folder", kind, "Choose another name.")
+    _require_writable(option, path, path.absolute())
+
+
+def _require_writable(option: str, path: Path, folder: Path) -> None:
+    """Try to write an anonymous file in the nearest existing parent folder."""
+    while kind_of(folder) == "nothing" and folder != folder.parent:
+        folder = folder.parent
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        got = f"{error.strerror} at {folder}"
+        raise input_error(f"{option} {path}", "a writable path", got, "Choose another path.") from None

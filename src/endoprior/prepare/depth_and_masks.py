@@ -1,0 +1,216 @@
+"""Choose how depth and tool masks of a clip are made, from the options and the available inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import InputError, input_error
+from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_values
+from ..footage.changes import COLOR_DISTANCE, color_share
+from ..footage.stereo_order import stereo_order, vertical_offset_px
+from ..footage.units import guess_unit
+from .config import PrepareConfig
+from .first_pass import FirstPass
+from .frame_files import match_files
+from .frame_geometry import FrameGeometry
+from .frames import Depth, FrameMethods, Mask, MeasuredFrame
+from .mask_files import SUFFIXES, read_user_mask, tool_polarity
+from .relative_depth import Kind, fit_reference, relative_to_mm
+from .shading import fit_shading
+from .stereo import stereo_depth
+from .tool_mask import fit_tools
+from .video_clip import Clip
+
+FITTED_SAMPLES = 16
+"""Number of frames to which the tool and shading models are fitted."""
+MAX_ROW_OFFSET_PX = 1.5
+"""If the rows of the two cameras are further apart, stereo matching is poor."""
+NETWORK = "depth-anything"
+FEWEST_STEPS = 256
+"""Depth with at most this many different values was stored in 8 bits."""
+DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
+Measure = Callable[[MeasuredFrame], Depth]
+Shade = Callable[[NDArray[np.uint8], Mask], Depth]
+
+
+@dataclass
+class ChosenMethods:
+    """How depth and masks of a clip are made."""
+
+    methods: FrameMethods
+    sources: dict[str, str]
+    """Where images, depth and masks come from."""
+    relative: bool
+    """Whether the scale of the depth is assumed."""
+    notes: list[str]
+    """Notes for the user, one line each."""
+
+
+def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> ChosenMethods:
+    """Choose the methods and fit their models to samples of the clip.
+
+    Raises:
+        InputError: a folder named by an option cannot be used, or an option needs a second camera.
+    """
+    geometry, step = first_pass.geometry, max(len(first_pass.samples) // FITTED_SAMPLES, 1)
+    samples = []
+    for stereo_frame in first_pass.samples[::step]:
+        right = None if stereo_frame.right is None else geometry.image(stereo_frame.right, right=True)
+        samples.append(MeasuredFrame(0, stereo_frame.index, geometry.image(stereo_frame.left), right, None))
+    notes = _check_stereo(samples, geometry, clip) if clip.stereo else []
+    kind = _depth_kind(cfg, clip)
+    relative = kind in ("shading", "network") or cfg.depth_relative != "no"
+    measure, source = (None, kind) if kind in ("none", "shading") else _measured_depth(kind, cfg, clip, first_pass)
+    near = [measure(frame) for frame in samples] if measure and not relative and cfg.masks == "auto" else None
+    tools, mask_source, mask_note = _tools(cfg, first_pass, samples, near)
+    notes += mask_note
+    shade: Shade | None = None
+    if relative:
+        images, usable = [frame.rgb_u8 for frame in samples], [geometry.inside & ~tools(frame) for frame in samples]
+        if measure is None:
+            shade = fit_shading(images, usable, cfg.working_distance_mm).depth
+        else:
+            measure = _scaled(measure, samples, usable, cfg)
+        notes.append(
+            f"depth is relative ({source}) and scaled to a median of {cfg.working_distance_mm:g} mm: "
+            "lengths and scores in mm are relative too"
+        )
+    elif kind == "folder":
+        notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.depth)
+    wanted = _inside_body([frame.rgb_u8 for frame in samples]) if cfg.drop_out_of_body else lambda rgb_u8: True
+    methods = FrameMethods(measure, shade, tools, kind == "sgbm", wanted)
+    sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
+    return ChosenMethods(methods, sources, relative, notes)
+
+
+def _check_stereo(samples: list[MeasuredFrame], geometry: FrameGeometry, clip: Clip) -> list[str]:
+    """Reject swapped cameras; return a note if the rows do not match."""
+    middle = [frame for frame in samples if frame.right_u8 is not None][:: max(len(samples) // 3, 1)]
+    orders = [stereo_order(frame.rgb_u8, frame.right_u8, geometry.center_shift_px) for frame in middle]
+    if sum(order.swapped for order in orders) > len(orders) / 2:
+        fix = "Remove --swap-eyes." if clip.swap else "Add --swap-eyes."
+        shares = f"{orders[0].exchanged:.0%} of the image matches swapped, {orders[0].as_given:.0%} as given"
+        raise input_error(clip.source.path, "the left camera first", f"the right one ({shares})", fix)
+    offset = float(np.nanmedian([vertical_offset_px(frame.rgb_u8, frame.right_u8) for frame in middle]))
+    if offset > MAX_ROW_OFFSET_PX:
+        return [f"rows of the cameras are {offset:.1f} px apart, depth will be poor: check the calibration file"]
+    return []
+
+
+def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
+    """The depth method that --depth selects.
+
+    Raises:
+        InputError: --depth-relative without a depth folder.
+    """
+    if cfg.depth == "auto":
+        kind: DepthKind = "sgbm" if clip.stereo else "shading"
+    elif cfg.depth in ("none", "sgbm", "shading"):
+        kind = cfg.depth
+    else:
+        kind = "network" if cfg.depth.partition(":")[0] == NETWORK else "folder"
+    if cfg.depth_relative != "no" and kind != "folder":
+        raise input_error("--depth-relative", "a folder with --depth", cfg.depth, "Remove --depth-relative.")
+    return kind
+
+
+def _measured_depth(kind: DepthKind, cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> tuple[Measure, str]:
+    """A function that measures depth without a mask (mm, or relative values of a network), and its name."""
+    geometry = first_pass.geometry
+    if kind == "sgbm":
+        if not clip.stereo or geometry.baseline_mm is None:
+            fix = "`--calibration FILE` with both cameras, or `--depth shading`."
+            raise input_error("--depth sgbm", "two cameras and their calibration", "one camera", fix)
+        focal, baseline = float(geometry.matrix[0, 0]), geometry.baseline_mm
+
+        def match(frame: MeasuredFrame) -> Depth:
+            assert frame.right_u8 is not None
+            pair = frame.rgb_u8, frame.right_u8
+            return stereo_depth(*pair, focal, baseline, cfg.stereo, geometry.center_shift_px).depth
+
+        return match, "stereo: semi-global matching"
+    if kind == "network":
+        from .depth_network import DEFAULT_MODEL, DepthNetwork
+
+        network = DepthNetwork(cfg.depth.partition(":")[2] or DEFAULT_MODEL)
+        return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2"
+    files = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices)
+    if cfg.depth_relative == "no" and not cfg.depth_unit_mm:
+        fix = "`--depth-unit-mm 1` for mm, `0.01` for 0.01 mm, `1000` for m; or `--depth-relative depth`."
+        raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.depth}", "none", fix)
+
+    def read(path: Path, size: tuple[int, int]) -> NDArray:
+        if cfg.depth_relative != "no":
+            return read_values(path, size)
+        return read_depth_file(path, cfg.depth_unit_mm, size)
+
+    return lambda frame: geometry.values(_of_either_size(read, files[frame.index], geometry)), "user's files"
+
+
+def _scaled(measure: Measure, samples: list[MeasuredFrame], usable: list[Mask], cfg: PrepareConfig) -> Measure:
+    """Relative values scaled to the working distance by constants of the clip."""
+    kind: Kind = "depth" if cfg.depth_relative == "depth" else "disparity"
+    reference = fit_reference([measure(frame) for frame in samples], usable, kind, cfg.working_distance_mm)
+    return lambda frame: relative_to_mm(measure(frame), kind, reference)
+
+
+def _check_unit(samples: list[MeasuredFrame], depths: list[Depth], geometry: FrameGeometry, folder: str) -> list[str]:
+    """Reject depth outside the range of an endoscope; return notes on implausible depth."""
+    guess = guess_unit((d, d > 0, f.rgb_u8, geometry.inside) for f, d in zip(samples, depths, strict=True))
+    if guess.unit in ("m", "0.01 mm"):
+        fix = f"The values look like {guess.unit}: multiply --depth-unit-mm by {guess.mm_per_unit:g}."
+        raise input_error("--depth-unit-mm", "tissue 20 to 250 mm away", f"{guess.median:g} mm in {folder}", fix)
+    notes = [] if guess.unit == "mm" else [f"check the depth unit: {guess.reason}"]
+    if max(len(np.unique(depth)) for depth in depths) <= FEWEST_STEPS:
+        notes.append("the depth has at most 256 steps: 8-bit files are too coarse for motion in mm")
+    return notes
+
+
+def _of_either_size(read: Callable[[Path, tuple[int, int]], NDArray], path: Path, geometry: FrameGeometry) -> NDArray:
+    """Read a file that has the size of the source images or of the frames."""
+    try:
+        return read(path, geometry.source_size)
+    except InputError:
+        if geometry.size == geometry.source_size:
+            raise
+        try:
+            return read(path, geometry.size)
+        except InputError:
+            pass
+        raise
+
+
+def _tools(
+    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame], depths: Sequence[Depth] | None
+) -> tuple[Callable[[MeasuredFrame], Mask], str, list[str]]:
+    """A function that returns the tool mask of a frame, the name of its source, and a note."""
+    geometry = first_pass.geometry
+    if cfg.masks == "none":
+        return lambda frame: np.zeros_like(geometry.inside), "none", []
+    if cfg.masks == "auto":
+        model = fit_tools([frame.rgb_u8 for frame in samples], [geometry.inside] * len(samples), depths)
+        source = f"tools found by color{' and depth' if depths else ''} in {model.detected_share:.0%} of the samples"
+        if not model.detected_share:
+            source = "no tools found by color"
+        note = f"{source}; check masks/ and correct them in any paint program (255 = tool)"
+        return lambda frame: model.mask(frame.rgb_u8, geometry.inside, frame.depth if depths else None), source, [note]
+    files = match_files(Path(cfg.masks), SUFFIXES, "masks", first_pass.indices)
+
+    def high(frame: MeasuredFrame) -> Mask:
+        return geometry.values(_of_either_size(read_user_mask, files[frame.index], geometry))
+
+    polarity = tool_polarity(cfg.mask_tool_value, [high(f) for f in samples], [f.rgb_u8 for f in samples])
+    tool_is_high = polarity.tool_is_high
+    return lambda frame: high(frame) == tool_is_high, "user's files", [f"masks: {polarity.reason}"]
+
+
+def _inside_body(images: list[NDArray[np.uint8]]) -> Callable[[NDArray[np.uint8]], bool]:
+    """A function that tells whether an image has the usual color of the samples."""
+    usual = np.median([color_share(image) for image in images], 0)
+    return lambda rgb_u8: bool(np.abs(color_share(rgb_u8) - usual).max() < COLOR_DISTANCE)

@@ -1,0 +1,122 @@
+"""First pass over a clip: count its frames, detect borders and labels, and fix the geometry of all frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import input_error
+from ..footage.border import Circle, Strips, find_circle, find_strips
+from ..footage.overlays import find_static_overlays
+from .calibration import Calibration
+from .config import PrepareConfig, Rectangle, parse_rectangle
+from .frame_geometry import FrameGeometry, make_geometry
+from .video_clip import Clip, EvenSample, StereoFrame
+
+SAMPLES = 24
+"""Number of frames used to detect borders, labels, tools and lighting."""
+
+
+@dataclass
+class FirstPass:
+    """Result of the first pass."""
+
+    indices: list[int]
+    """Positions of the selected frames in the source."""
+    samples: list[StereoFrame]
+    """At most `SAMPLES` of them, evenly spaced."""
+    geometry: FrameGeometry
+    notes: list[str] = field(default_factory=list)
+    """Notes for the user, one line each."""
+
+
+def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | None, name: str) -> FirstPass:
+    """Decode the selected frames once.
+
+    Args:
+        name: of the calibration file, for error messages.
+    Raises:
+        InputError: too few or too many frames, or a file is damaged.
+    """
+    selection, sample = clip.selection(), EvenSample(SAMPLES)
+    indices: list[int] = []
+    path = str(clip.source.path)
+    for stereo_frame in clip.stereo_frames(selection):
+        sample.add(stereo_frame)
+        indices.append(stereo_frame.index)
+        if len(indices) > cfg.max_frames:
+            got = f"{clip.source.num_frames or 'more'} in the file"
+            hint = "Choose a part with --start and --end, lower --frames-per-second, or raise --max-frames."
+            raise input_error(path, f"at most {cfg.max_frames} frames", got, hint)
+    if len(indices) < 2:
+        hint = "Check --start, --end and --frames-per-second."
+        raise input_error(path, "at least 2 frames in the selection", str(len(indices)), hint)
+    lefts = [stereo_frame.left for stereo_frame in sample.kept]
+    notes = _timing_notes(selection.gaps, selection.uneven_steps, len(indices))
+    strips = circle = None
+    labels: list[Rectangle] = []
+    if cfg.border == "auto":
+        circle = find_circle(lefts)
+        strips = find_strips(lefts) or None
+        labels = [tuple(box) for box in find_static_overlays([_without(p, strips) for p in lefts])]
+        notes += _border_notes(strips, circle, labels)
+    geometry = make_geometry(
+        clip.camera_size,
+        calibration,
+        stereo=clip.stereo,
+        name=name,
+        field_of_view_degrees=cfg.field_of_view_degrees,
+        max_width=cfg.max_width,
+        crop=parse_rectangle(cfg.crop, "--crop") if cfg.crop else None,
+        blank=[*labels, *(parse_rectangle(text, "--blank") for text in cfg.blank)],
+        strips=strips,
+        circle=circle,
+    )
+    if calibration is None:
+        notes.append(
+            f"no calibration: assuming a field of view of {cfg.field_of_view_degrees:g} degrees "
+            f"(f = {geometry.matrix[0, 0]:.0f} px); set --calibration or --field-of-view-degrees to change it"
+        )
+    return FirstPass(indices, sample.kept, geometry, notes)
+
+
+def _without(image: NDArray[np.uint8], strips: Strips | None) -> NDArray[np.uint8]:
+    """The image with its strips painted black, so that their text is not detected again."""
+    if not strips:
+        return image
+    height, width = image.shape[:2]
+    clean = np.zeros_like(image)
+    part = slice(strips.top, height - strips.bottom), slice(strips.left, width - strips.right)
+    clean[part] = image[part]
+    return clean
+
+
+def _timing_notes(gaps: int, uneven: int, count: int) -> list[str]:
+    notes = []
+    if uneven > max(2, 0.02 * count):
+        notes.append(f"variable frame rate: {uneven} uneven time steps; frames were selected on an even time grid")
+    if gaps:
+        notes.append(f"{gaps} steps of the time grid have no frame and are left out")
+    return notes
+
+
+def _border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle]) -> list[str]:
+    notes = []
+    if strips:
+        sides = ", ".join(f"{n} px {side}" for side, n in vars(strips).items() if n)
+        notes.append(f"black bars or console strips cropped: {sides} (--border keep leaves them)")
+    if circle:
+        center = f"({circle.center_x:.0f}, {circle.center_y:.0f})"
+        notes.append(f"round border: center {center}, radius {circle.radius:.0f} px; masked outside")
+    notes += [f"burned-in label painted over: {x},{y},{w},{h}" for x, y, w, h in labels]
+    return notes
+
+
+def source_facts(path: Path) -> dict[str, object]:
+    """Identity of a file or folder: its name, and the name, size and modification time of its files."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.exists()]
+    return {"name": path.name, "files": [list(entry) for entry in stats]}
