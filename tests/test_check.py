@@ -285,7 +285,9 @@ def test_exit_statuses(data, tmp_path, capsys, monkeypatch):
     assert main(["check", str(data), "--data.depth-unit-mm", "0.00001", "--strict"]) == 2
     assert "error: depth-metres" in capsys.readouterr().out
     assert main(["check", str(data), "--out", str(tmp_path / "check.txt")]) == 2
-    assert capsys.readouterr().err == f"endoprior: --out: expected a .png file, got {tmp_path}/check.txt. Fix: `--out {tmp_path}/check.png`.\n"
+    text = tmp_path / "check.txt"
+    expected = f"endoprior: --out: expected a .png file, got {text}. Fix: `--out {text.with_suffix('.png')}`.\n"
+    assert capsys.readouterr().err == expected
     (data / "images" / "000003.png").write_bytes(b"nothing")
     assert main(["check", str(data)]) == 2
     said = capsys.readouterr()

@@ -21,7 +21,13 @@ from endoprior.data.sequence import FrameSequence
 from endoprior.data.shrink import shrunk
 from endoprior.initialization.cleanup import PointCloud, merge_voxels, remove_outliers
 from endoprior.initialization.flow_tracks import initial_motion
-from endoprior.initialization.sampling import draw_pixels, initial_log_scales, initial_points, pixel_probability, quotas
+from endoprior.initialization.sampling import (
+    initial_log_scales,
+    initial_points,
+    pixel_probability,
+    quotas,
+    sample_pixels,
+)
 from endoprior.training.trainer import Trainer
 
 
@@ -106,7 +112,7 @@ def test_quotas_are_equal_shares_of_the_whole_budget(budget, num_frames):
 def test_drawn_pixels_are_distinct_and_have_weight(seed, height, width, count, exponent):
     rng = np.random.default_rng(seed)
     weights = np.where(rng.random((height, width)) < 0.6, rng.random((height, width)) * 10.0**exponent, 0)
-    drawn = draw_pixels(weights, count, rng)
+    drawn = sample_pixels(weights, count, rng)
     assert len(drawn) == min(count, np.count_nonzero(weights))
     assert (np.diff(drawn) > 0).all() and (weights.reshape(-1)[drawn] > 0).all()
 

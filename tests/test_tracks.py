@@ -55,7 +55,7 @@ def cloud_at(pixels: list[tuple[float, float]], origin: int, camera: Camera) -> 
 
 def followed(frames: list[Frame], cloud: PointCloud) -> np.ndarray:
     """(T, N, 2) tracks of the cloud."""
-    return tracks.follow(frames, cloud.points.astype(np.float64), cloud.origins)
+    return tracks.track_points(frames, cloud.points.astype(np.float64), cloud.origins)
 
 
 @pytest.mark.parametrize("origin", [0, 3, 6])

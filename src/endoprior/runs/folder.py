@@ -65,7 +65,7 @@ def refuse_unusable_folder(out: Path, *, resume: bool) -> None:
     if there:
         remove_leftovers(out)
     if not (resume and there):
-        reject_occupied(out, ", or add --resume to continue a run", spare=LOCK)
+        reject_occupied(out, ", or add --resume to continue a run", ignore=LOCK)
 
 
 def prepare_run_folder(out: Path, *, resume: bool) -> bool:
