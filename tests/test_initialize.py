@@ -274,7 +274,7 @@ def test_frame_that_is_too_small_gives_what_it_has_and_says_so(mask, caplog):
         cloud = initial_points(frames, InitConfig(budget=90))
     assert len(cloud) == 30 + 5
     assert [record.getMessage() for record in caplog.records] == [
-        "initialization: 55 of 90 points could not be drawn, too few tissue pixels"
+        "initialization: 55 of 90 points are missing, too few tissue pixels"
     ]
 
 

@@ -204,5 +204,5 @@ def test_training_starts_along_the_tracks(tmp_path):
 
 
 def test_only_the_basis_can_start_along_tracks():
-    with pytest.raises(InputError, match=r"init\.motion: expected rest with deformation\.kind hexplane, got flow"):
+    with pytest.raises(InputError, match=r"init\.motion: expected rest with deformation\.kind hexplane[;,] got flow"):
         Config(init=InitConfig(motion="flow"))
