@@ -109,8 +109,8 @@ def choose_tracks(scene: Scene) -> NDArray[np.int64]:
     weight = pull**2
     weight[even] = 0
     extra = min(cfg.tracks - spread, int((weight > 0).sum()))
-    drawn = rng.choice(len(rows), extra, replace=False, p=weight / weight.sum())
-    chosen = np.sort(np.concatenate([even, drawn]))
+    near_pulls = rng.choice(len(rows), extra, replace=False, p=weight / weight.sum())
+    chosen = np.sort(np.concatenate([even, near_pulls]))
     return np.stack([rows[chosen], columns[chosen]], -1)
 
 

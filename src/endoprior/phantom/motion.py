@@ -55,7 +55,7 @@ class Pull:
 
 @dataclass(frozen=True)
 class ToolPose:
-    """Where an instrument is at one moment, in camera axes, mm."""
+    """Pose of an instrument at one time, in camera axes, mm."""
 
     pivot: NDArray[np.float64]
     """(3,) point the shaft always passes through (the port in the abdominal wall)."""
