@@ -1,4 +1,5 @@
 # Two commands on a fresh machine: `make demo` and `make test`. Both create .venv and install the pinned requirements.
+# `make test-all` runs `make test`, then the tests that take long. docs/development.md says what is where.
 # `make bench` times every stage beside plain torch and fails if one fell behind bench/baseline.json; options go in
 # BENCH, for example `make bench BENCH=--quick`.
 PYTHON ?= python3
@@ -6,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-faults lint browser bench figures clean
+.PHONY: demo test test-all test-faults lint browser bench figures clean
 
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
@@ -14,7 +15,10 @@ demo: $(VENV)/.installed
 test: $(VENV)/.test-installed lint browser
 	$(BIN)/python -m pytest
 
-# Kills, full disks, little memory, hostile input, long and large sequences: docs/reliability.md.
+test-all: test
+	$(BIN)/python -m pytest -m slow
+
+# Kills, full disks, little memory, property tests with many examples, long and large sequences: docs/reliability.md.
 test-faults: $(VENV)/.test-installed
 	$(BIN)/python faults/run.py $(FAULTS)
 

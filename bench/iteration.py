@@ -9,10 +9,8 @@ degrees of color, with the temporal term, without growth.
 from __future__ import annotations
 
 import tempfile
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from unittest import mock
 
 import common
 import plain
@@ -26,8 +24,8 @@ from endoprior.model.deformation import HexPlaneField
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.render import cpu, tiles
 from endoprior.training import step as iteration_module
-from endoprior.training import temporal
-from endoprior.training.density import DensityStats
+from endoprior.training import temporal, temporal_numba
+from endoprior.training.ops import NUMBA, TORCH, TrainingOps
 from endoprior.training.optimizer import Optimizer
 from endoprior.training.state import Stage, StepReport
 from endoprior.training.trainer import Trainer
@@ -50,11 +48,11 @@ PARTS = {
     "binning + sort": [(tiles, "build")],
     "compositing": [(cpu, "composite_forward")],
     "losses": [(iteration_module, "supervised_terms")],
-    "temporal term": [(temporal, n) for n in ("choose", "neighbors", "affinity", "local_motion_loss")],
+    "temporal term": [(temporal, "choose"), *((temporal_numba, n) for n in ("neighbors", "affinity", "local_motion"))],
     "compositing backward": [(cpu, "composite_backward"), (cpu, "gather")],
     "projection backward": [(cpu, "project_backward")],
     "other backward": [(torch.Tensor, "backward")],
-    "density statistics": [(DensityStats, "add_gradient"), (DensityStats, "add_score")],
+    "density statistics": [(iteration_module.TrainingStep, "_observe")],
     "optimizer": [(Optimizer, "step")],
 }
 
@@ -79,9 +77,8 @@ def rows(name: str, sequence: FrameSequence, size: common.Size) -> list[common.R
     ours = {"": lambda _: repeat(trainer, repeated)}
     theirs = None
     if size.num <= TORCH_MOST.num and size.width <= TORCH_MOST.width:
-        other = started(sequence, trainer.cfg)
-        in_torch(other)
-        theirs = {"": lambda _: repeat_in_torch(other, repeated)}
+        other = started(sequence, trainer.cfg, TORCH)
+        theirs = {"": lambda _: repeat(other, repeated)}
     picture, num = (size.width, size.height), len(trainer.state.gaussians)
     measured = common.rows(f"iteration {name}", common.race(ours, theirs), num, picture)
     return measured + common.part_rows(f"iteration {name}", ours, PARTS, common.Size(num, *picture))
@@ -99,13 +96,16 @@ def config(name: str, num: int) -> Config:
     )
 
 
-def started(sequence: FrameSequence, cfg: Config) -> Trainer:
-    """A trainer before its first iteration, with everything it keeps of the frames already made."""
-    trainer = Trainer(sequence, cfg)
+def started(sequence: FrameSequence, cfg: Config, ops: TrainingOps = NUMBA) -> Trainer:
+    """A trainer before its first iteration, with its cache of frames filled; with `TORCH`, plain torch throughout."""
+    trainer = Trainer(sequence, cfg, ops)
+    if ops is TORCH:
+        trainer.step_once.rasterize = plain.rasterize
     trainer.start()
-    for position in range(len(trainer.frames)):
-        trainer.frames.frame(position)
-        trainer.frames.prior(position)
+    frames = trainer.step_once.frames
+    for position in range(len(frames)):
+        frames.frame(position)
+        frames.prior(position)
     return trainer
 
 
@@ -121,31 +121,6 @@ def repeat(trainer: Trainer, iteration: int) -> StepReport:
     """Do a fine iteration again: the same frame, the same terms."""
     trainer.state.stage, trainer.state.iteration = Stage.FINE, iteration - 1
     return trainer.step()
-
-
-def in_torch(trainer: Trainer) -> None:
-    """Put plain torch in the place of the parts that a trainer holds."""
-    state = trainer.state
-    trained = list(state.gaussians.tensors.values())
-    if state.field is not None:
-        state.field = plain.Field(state.field)
-        trained += state.field.parameters()
-    trainer._work.rasterize = plain.rasterize
-    state.optimizer = plain.Adam(trained, trainer.cfg.optim.epsilon)
-
-
-def repeat_in_torch(trainer: Trainer, iteration: int) -> StepReport:
-    """`repeat`, with plain torch also in the place of the functions that a trainer calls."""
-    with ExitStack() as stack:
-        for owner, name in (
-            (scene_module, "basis_offsets"),
-            (iteration_module, "supervised_losses"),
-            (temporal, "neighbors"),
-            (temporal, "affinity"),
-            (temporal, "local_motion_loss"),
-        ):
-            stack.enter_context(mock.patch.object(owner, name, getattr(plain, name)))
-        return repeat(trainer, iteration)
 
 
 if __name__ == "__main__":

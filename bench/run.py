@@ -15,19 +15,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-import basis
 import binning
 import common
 import compositing
-import heads
-import hexplane
 import iteration
-import losses
-import optimizer
+import ops
 import projection
 import rendering
 import stereo
-import temporal
 import viewer
 from common import Row
 
@@ -35,12 +30,7 @@ STAGES: dict[str, common.Measure] = {
     "projection": projection.measure,
     "binning": binning.measure,
     "compositing": compositing.measure,
-    "hexplane": hexplane.measure,
-    "basis": basis.measure,
-    "heads": heads.measure,
-    "temporal": temporal.measure,
-    "losses": losses.measure,
-    "optimizer": optimizer.measure,
+    "ops": ops.measure,
     "rendering": rendering.measure,
     "stereo": stereo.measure,
     "viewer": viewer.measure,

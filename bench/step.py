@@ -3,7 +3,7 @@
     PYTHONPATH=CHECKOUT/src python bench/step.py [--preset default] [--launches]
 
 prints the median of 80 iterations at full size with the temporal term, on a phantom of 12 frames of 640x512, after 30
-uncounted ones; with `--launches` how many operations one of them takes by the definitions, without the rasterizer.
+uncounted ones; with `--launches` how many PyTorch operations one of them takes on a device, without the rasterizer.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from endoprior.core.presets import preset
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.training.ops import NUMBA, TORCH, TrainingOps
 from endoprior.training.trainer import Trainer
 
 UNCOUNTED, COUNTED, NEVER = 30, 80, 10**6
@@ -47,8 +48,8 @@ class Launches(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def trainer_of(name: str, folder: Path, **changes: int) -> Trainer:
-    """A started trainer of a preset in which every term is active at once, and nothing changes the crowd."""
+def trainer_of(name: str, folder: Path, ops: TrainingOps = NUMBA, **changes: int) -> Trainer:
+    """A started trainer of a preset in which every term is active at once, without density events."""
     cfg = preset(name)
     cfg = replace(
         cfg,
@@ -57,7 +58,7 @@ def trainer_of(name: str, folder: Path, **changes: int) -> Trainer:
         temporal=replace(cfg.temporal, start_iteration=1, min_valid=0),
         density=replace(cfg.density, start_iteration=NEVER),
     )
-    trainer = Trainer(load_sequence(folder), cfg)
+    trainer = Trainer(load_sequence(folder), cfg, ops)
     trainer.start()
     return trainer
 
@@ -74,7 +75,6 @@ def median_ms(trainer: Trainer) -> float:
 
 def launches(name: str, folder: Path) -> int:
     """Operations of an iteration with every term; the picture is a stand-in of a few."""
-    from endoprior.compute.compiled import definitions_only
 
     def picture(splats, camera, *, background, depth_grad_to_means=True) -> RenderOutput:
         means2d = splats.means[:, :2] * 1.0
@@ -83,14 +83,13 @@ def launches(name: str, folder: Path) -> int:
         radii = torch.ones(len(splats), dtype=torch.int32)
         return RenderOutput(background.expand(*flat.shape, 3) + tied, flat.clone(), flat.clone(), means2d, radii)
 
-    with definitions_only():
-        trainer = trainer_of(name, folder, budget=2000)
-        trainer._work.work.rasterize = picture
-        while True:
-            with Launches() as counted:
-                report = trainer.step()
-            if "distance" in report.losses.names and report.iteration > 3:
-                return counted.count
+    trainer = trainer_of(name, folder, TORCH, budget=2000)
+    trainer.step_once.rasterize = picture
+    while True:
+        with Launches() as counted:
+            report = trainer.step()
+        if "distance" in report.losses and report.iteration > 3:
+            return counted.count
 
 
 def main() -> None:
@@ -99,8 +98,8 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     parser.add_argument("--launches", action="store_true")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as room:
-        folder = Path(room) / "phantom"
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "phantom"
         write_phantom(folder, PhantomConfig(frames=12, width=640, height=512))
         if options.launches:
             print(f"{options.preset}: {launches(options.preset, folder)} operations")

@@ -65,8 +65,27 @@ class Samples:
         return target
 
 
+Step = Callable[[Path], object]
+"""Makes or damages something below a folder."""
 Build = Callable[[Path, Samples], list[str]]
 """Makes the input in a folder, which is the command's working folder, and returns the command's arguments."""
+
+
+def given(command: str | list[str], *steps: Step, needs: str = "") -> Build:
+    """A command after some steps in its working folder; a string is split at spaces.
+
+    Args:
+        needs: names of samples that are copied first: `sequence` to `data`, `run` to `run`, `video` to `clip.mkv`.
+    """
+
+    def build(folder: Path, samples: Samples) -> list[str]:
+        for name in needs.split():
+            samples.copy(name, folder / {"sequence": "data", "run": "run", "video": "clip.mkv"}[name])
+        for step in steps:
+            step(folder)
+        return command.split() if isinstance(command, str) else command
+
+    return build
 
 
 @dataclass(frozen=True)
@@ -81,8 +100,6 @@ class Case:
     """What the command may add to its working folder: the beginnings of relative paths."""
     check: Callable[[Path], bool] = field(default=lambda folder: True)
     """Whether what it left is right, for cases that work."""
-    heavy: bool = False
-    """Takes seconds: left out of the quick tests."""
     noise: str = ""
     """What a library in C writes to stderr before it can be stopped."""
     needs_user: bool = False

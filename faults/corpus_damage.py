@@ -14,34 +14,37 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from corpus_case import Build, Samples
+from corpus_case import Build, Step, given
 
-CHECK = ["check", "data"]
-Damage = Callable[[Path], object]
-
-
-def damaged(damage: Damage, command: list[str] = CHECK) -> Build:
-    """A sound sequence in `data`, damaged."""
-
-    def build(folder: Path, samples: Samples) -> list[str]:
-        damage(samples.copy("sequence", folder / "data"))
-        return command
-
-    return build
+CHECK = "check data"
 
 
-def made(write: Damage, command: list[str] = CHECK) -> Build:
-    """A folder `data` that `write` fills from nothing."""
-
-    def build(folder: Path, samples: Samples) -> list[str]:
-        (folder / "data").mkdir()
-        write(folder / "data")
-        return command
-
-    return build
+def damaged(*steps: Step, command: str = CHECK) -> Build:
+    """A sound sequence in `data`, damaged by steps in that folder."""
+    return given(command, *(inside("data", step) for step in steps), needs="sequence")
 
 
-def put(name: str, content: bytes | str) -> Damage:
+def made(*steps: Step, command: str = CHECK) -> Build:
+    """A folder `data` that steps fill from nothing."""
+    return given(command, empty_folder("data"), *(inside("data", step) for step in steps))
+
+
+def inside(name: str, step: Step) -> Step:
+    """A step in a folder below."""
+    return lambda folder: step(folder / name)
+
+
+def empty_folder(name: str) -> Step:
+    """A new folder."""
+    return lambda folder: (folder / name).mkdir()
+
+
+def without(name: str) -> Step:
+    """Removes a file or a folder."""
+    return lambda folder: shutil.rmtree(folder / name) if (folder / name).is_dir() else (folder / name).unlink()
+
+
+def put(name: str, content: bytes | str) -> Step:
     """Replaces a file by these bytes."""
     data = content.encode() if isinstance(content, str) else content
 
@@ -54,17 +57,17 @@ def put(name: str, content: bytes | str) -> Damage:
     return damage
 
 
-def picture(name: str, pixels: np.ndarray, suffix: str = "") -> Damage:
+def picture(name: str, pixels: np.ndarray, suffix: str = "") -> Step:
     """Replaces a file by an encoded picture, of another kind than its name says if `suffix` is given."""
     return put(name, cv2.imencode(suffix or Path(name).suffix, pixels)[1].tobytes())
 
 
-def everywhere(part: str, pixels: np.ndarray) -> Damage:
+def everywhere(part: str, pixels: np.ndarray) -> Step:
     """Replaces all pictures of one folder."""
     return lambda data: [picture(f"{part}/{file.name}", pixels)(data) for file in (data / part).iterdir()]
 
 
-def described(**changes: object) -> Damage:
+def described(**changes: object) -> Step:
     """Changes keys of sequence.json, None removes one; NaN is written as such."""
 
     def damage(data: Path) -> None:
@@ -75,7 +78,7 @@ def described(**changes: object) -> Damage:
     return damage
 
 
-def poses(change: Callable[[np.ndarray], object]) -> Damage:
+def poses(change: Callable[[np.ndarray], object]) -> Step:
     """Changes `poses_bounds.npy`, in place or to what is returned."""
 
     def damage(data: Path) -> None:
@@ -86,22 +89,22 @@ def poses(change: Callable[[np.ndarray], object]) -> Damage:
     return damage
 
 
-def entry(row: int, column: int, value: float) -> Damage:
+def entry(row: int, column: int, value: float) -> Step:
     """One number of the poses."""
     return poses(lambda p: p.__setitem__((row, column), value))
 
 
-def link(name: str, target: str) -> Damage:
+def link(name: str, target: str) -> Step:
     """A link in place of a file."""
     return lambda data: ((data / name).unlink(missing_ok=True), (data / name).symlink_to(target))
 
 
-def pipe(name: str) -> Damage:
+def pipe(name: str) -> Step:
     """A named pipe in place of a file: opening it waits for ever."""
     return lambda data: ((data / name).unlink(missing_ok=True), os.mkfifo(data / name))
 
 
-def instead(name: str) -> Damage:
+def instead(name: str) -> Step:
     """A folder in place of a file, or a file in place of a folder."""
 
     def damage(data: Path) -> None:
@@ -116,12 +119,12 @@ def instead(name: str) -> Damage:
     return damage
 
 
-def closed(name: str) -> Damage:
+def closed(name: str) -> Step:
     """Takes all rights away."""
     return lambda data: (data / name).chmod(0)
 
 
-def first_frames(count: int) -> Damage:
+def first_frames(count: int) -> Step:
     """Leaves so many frames."""
 
     def damage(data: Path) -> None:
@@ -133,7 +136,7 @@ def first_frames(count: int) -> Damage:
     return damage
 
 
-def sized(width: int, height: int, plain: bool = False) -> Damage:
+def sized(width: int, height: int, plain: bool = False) -> Step:
     """A whole sequence of another size, from nothing; as a plain folder, depth is in .npy files."""
 
     def write(data: Path) -> None:

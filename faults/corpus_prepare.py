@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
-import os
-from pathlib import Path
 
 import cv2
 import numpy as np
-from corpus_case import Build, Case, Samples
+from corpus_case import Build, Case, Step, given
 from corpus_damage import (
     NESTED,
     NOISE,
+    empty_folder,
     executing_pickle,
     lying_npy,
     npz_bomb,
     pickled_npy,
+    pipe,
     png_bomb,
     put,
     whole_npy,
@@ -25,13 +25,7 @@ from corpus_videos import EYES, PLAIN, pictures_folder
 
 def calibrated(name: str, content: bytes | str) -> Build:
     """A sound video with this calibration."""
-
-    def build(folder: Path, samples: Samples) -> list[str]:
-        samples.copy("video", folder / "clip.mkv")
-        put(name, content)(folder)
-        return ["prepare", "clip.mkv", "out", "--calibration", name, *PLAIN]
-
-    return build
+    return given(f"prepare clip.mkv out --calibration {name} {PLAIN}", put(name, content), needs="video")
 
 
 def eyes(**changes: object) -> Build:
@@ -39,32 +33,26 @@ def eyes(**changes: object) -> Build:
     return calibrated("c.json", json.dumps(EYES | changes))
 
 
-def beside(option: str, name: str, *damages: object, more: tuple[str, ...] = ()) -> Build:
+def beside(option: str, name: str, *steps: Step, more: str = "") -> Build:
     """A sound video of ten pictures with what an option names."""
-
-    def build(folder: Path, samples: Samples) -> list[str]:
-        samples.copy("video", folder / "clip.mkv")
-        for damage in damages:
-            damage(folder)
-        kept = [
-            word
-            for pair in zip(PLAIN[::2], PLAIN[1::2], strict=True)
-            if pair[0] not in (option, *more)
-            for word in pair
-        ]
-        return ["prepare", "clip.mkv", "out", option, name, *more, *kept]
-
-    return build
+    words, given_already = PLAIN.split(), (option, *more.split())
+    kept = [word for pair in zip(words[::2], words[1::2], strict=True) if pair[0] not in given_already for word in pair]
+    return given(["prepare", "clip.mkv", "out", option, name, *more.split(), *kept], *steps, needs="video")
 
 
-def ten(folder: str, content: bytes, suffix: str) -> object:
-    """Ten equal files."""
-    return lambda place: [put(f"{folder}/{i}{suffix}", content)(place) for i in range(10)]
+def ten(folder: str, content: bytes, suffix: str, last: bytes = b"") -> Step:
+    """Ten equal files, but for the last if it is given."""
+    return lambda place: [put(f"{folder}/{i}{suffix}", last if last and i == 9 else content)(place) for i in range(10)]
 
 
-def nine_and(folder: str, good: bytes, bad: bytes, suffix: str) -> object:
-    """Nine sound files and a last one."""
-    return lambda place: [put(f"{folder}/{i}{suffix}", good if i < 9 else bad)(place) for i in range(10)]
+def moving(poses: np.ndarray) -> Build:
+    """A sound video with these poses."""
+    return beside("--poses", "p.npy", lambda f: np.save(f / "p.npy", poses))
+
+
+def preparing(out: str, *steps: Step) -> Build:
+    """A sound video, to be written to `out`."""
+    return given(["prepare", "clip.mkv", out, *PLAIN.split()], *steps, needs="video")
 
 
 MASK = cv2.imencode(".png", np.zeros((80, 96), np.uint8))[1].tobytes()
@@ -113,21 +101,20 @@ CALIBRATIONS = [
     Case("an archive of pickles", calibrated("c.npz", executing_pickle()), ("c.npz", "pickle")),
     Case(
         "a calibration that unfolds to 2 GB",
-        lambda f, s: calibrated("c.npz", npz_bomb(("K",)))(f, s),
+        beside("--calibration", "c.npz", lambda f: (f / "c.npz").write_bytes(npz_bomb(("K",)))),  # made late
         ("c.npz", "1024 MB"),
-        heavy=True,
     ),
     Case("an ini of words", calibrated("c.ini", "[StereoLeft]\nfc_x=wide\n"), ("c.ini",)),
     Case("an ini without sections", calibrated("c.ini", "fc_x=1"), ("c.ini",)),
     Case("an ini of one eye", calibrated("c.ini", "[StereoLeft]\nfc_x=1\nfc_y=1\ncc_x=1\ncc_y=1\n"), ("c.ini",)),
     Case(
         "a folder for a calibration",
-        beside("--calibration", "c.yaml", lambda f: (f / "c.yaml").mkdir()),
+        beside("--calibration", "c.yaml", empty_folder("c.yaml")),
         ("c.yaml", "a folder"),
     ),
     Case(
         "a pipe for a calibration",
-        beside("--calibration", "c.yaml", lambda f: os.mkfifo(f / "c.yaml")),
+        beside("--calibration", "c.yaml", pipe("c.yaml")),
         ("c.yaml", "pipe"),
     ),
 ]
@@ -149,7 +136,7 @@ PARTS = [
     ),
     Case(
         "a mask that is a bomb in the middle",
-        beside("--masks", "masks", nine_and("masks", MASK, png_bomb(), ".png")),
+        beside("--masks", "masks", ten("masks", MASK, ".png", png_bomb())),
         ("masks/9.png", "60000x60000"),
     ),
     Case(
@@ -167,13 +154,13 @@ PARTS = [
             "--depth",
             "d",
             ten("d", cv2.imencode(".png", np.zeros((80, 96), np.uint16))[1].tobytes(), ".png"),
-            more=("--depth-unit-mm", "1"),
+            more="--depth-unit-mm 1",
         ),
         leaves=("out",),
     ),
     Case(
         "depth that is text",
-        beside("--depth", "d", ten("d", b"hello", ".tiff"), more=("--depth-unit-mm", "1")),
+        beside("--depth", "d", ten("d", b"hello", ".tiff"), more="--depth-unit-mm 1"),
         ("d/0.tiff",),
     ),
     Case(
@@ -182,40 +169,40 @@ PARTS = [
             "--depth",
             "d",
             ten("d", whole_npy(np.full((80, 96), 0.06, np.float32)), ".npy"),
-            more=("--depth-unit-mm", "1"),
+            more="--depth-unit-mm 1",
         ),
         ("--depth-unit-mm", "mm in d"),
     ),
     Case(
         "half an EXR",
-        beside("--depth", "d", ten("d", b"v/1\x01\x02\0\0\0channels\0", ".exr"), more=("--depth-unit-mm", "1")),
+        beside("--depth", "d", ten("d", b"v/1\x01\x02\0\0\0channels\0", ".exr"), more="--depth-unit-mm 1"),
         ("d/0.exr",),
     ),
     Case("no file of poses", beside("--poses", "p.npy"), ("p.npy", "o such file")),
     Case(
         "poses of another clip",
-        beside("--poses", "p.npy", lambda f: np.save(f / "p.npy", np.tile(np.eye(4), (5, 1, 1)))),
+        moving(np.tile(np.eye(4), (5, 1, 1))),
         ("p.npy", "(10, 4, 4)", "(5, 4, 4)"),
     ),
     Case(
         "poses that scale",
-        beside("--poses", "p.npy", lambda f: np.save(f / "p.npy", np.tile(2 * np.eye(4), (10, 1, 1)))),
+        moving(np.tile(2 * np.eye(4), (10, 1, 1))),
         ("p.npy", "rotation"),
     ),
     Case(
         "poses of NaN",
-        beside("--poses", "p.npy", lambda f: np.save(f / "p.npy", np.full((10, 4, 4), np.nan))),
+        moving(np.full((10, 4, 4), np.nan)),
         ("p.npy",),
     ),
     Case(
         "poses in words",
-        beside("--poses", "p.npy", lambda f: np.save(f / "p.npy", np.full((10, 4, 4), "x"))),
+        moving(np.full((10, 4, 4), "x")),
         ("p.npy",),
     ),
     Case("poses as a pickle", beside("--poses", "p.npy", put("p.npy", pickled_npy())), ("p.npy", "pickle")),
     Case(
         "a STIR clip without spots",
-        beside("--stir", "seq", lambda f: (f / "seq").mkdir(), more=("--depth", "shading")),
+        beside("--stir", "seq", empty_folder("seq"), more="--depth shading"),
         ("seq", "STIR"),
     ),
     Case("a network that is nowhere", beside("--depth", "depth-anything:./nowhere"), ("nowhere",)),
@@ -223,35 +210,12 @@ PARTS = [
         "a network of garbage",
         beside("--depth", "depth-anything:net", put("net/config.json", "{"), put("net/model.safetensors", "x")),
         ("net",),
-        heavy=True,
     ),
-    Case(
-        "the video is the output",
-        lambda f, s: ["prepare", s.copy("video", f / "clip.mkv").name, "clip.mkv"],
-        ("clip.mkv", "a file"),
-    ),
-    Case(
-        "an output that is in use",
-        lambda f, s: [s.copy("video", f / "clip.mkv"), put("out/x", "x")(f), ["prepare", "clip.mkv", "out", *PLAIN]][2],
-        ("out", "files in it"),
-    ),
-    Case(
-        "an output below a file",
-        lambda f, s: ["prepare", s.copy("video", f / "clip.mkv").name, "clip.mkv/out", *PLAIN],
-        ("clip.mkv/out", "a place"),
-    ),
-    Case(
-        "an output where nothing can be",
-        lambda f, s: ["prepare", s.copy("video", f / "clip.mkv").name, "/proc/x/out", *PLAIN],
-        ("/proc/x/out", "a place"),
-    ),
-    Case(
-        "an output of no name", lambda f, s: ["prepare", s.copy("video", f / "clip.mkv").name, "", *PLAIN], ("empty",)
-    ),
-    Case(
-        "an output inside the pictures",
-        lambda f, s: [pictures_folder()(f, s), ["prepare", "clip", "clip/out", *PLAIN]][1],
-        leaves=("clip/out", "clip"),
-    ),
+    Case("the video is the output", preparing("clip.mkv"), ("clip.mkv", "a file")),
+    Case("an output that is in use", preparing("out", put("out/x", "x")), ("out", "files in it")),
+    Case("an output below a file", preparing("clip.mkv/out"), ("clip.mkv/out", "a place")),
+    Case("an output where nothing can be", preparing("/proc/x/out"), ("/proc/x/out", "a place")),
+    Case("an output of no name", preparing(""), ("empty",)),
+    Case("an output inside the pictures", pictures_folder(out="clip/out"), leaves=("clip/out", "clip")),
 ]
 CASES = [*CALIBRATIONS, *PARTS]

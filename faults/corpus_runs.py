@@ -3,49 +3,30 @@
 from __future__ import annotations
 
 import json
-import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from corpus_case import Build, Case, Samples
-from corpus_damage import NESTED, put
+from corpus_case import Build, Case, Step, given
+from corpus_damage import NESTED, empty_folder, instead, pipe, put, without
 from corpus_prepare import BOMB
 
-EVAL = ["eval", "run", "--no-networks"]
-RENDER = ["render", "run", "out", "--times", "0"]
+EVAL = "eval run --no-networks"
+RENDER = "render run out --times 0"
 TRAINED = "--init-budget 200 --schedule.coarse-iterations 1 --schedule.fine-iterations 3 --no-networks"
 """Options of the sound run."""
-RESUME = ["train", "data", "run", "--resume", *TRAINED.split()]
-SCENE, CHECKPOINT = "run/scene.safetensors", "run/checkpoint.safetensors"
+RESUME = f"train data run --resume {TRAINED}"
+SCENE, CHECKPOINT, CONFIG = "run/scene.safetensors", "run/checkpoint.safetensors", "run/config.json"
 
 
-def damaged(damage: Callable[[Path], object], command: list[str]) -> Build:
+def damaged(command: str, *steps: Step) -> Build:
     """A sound run in `run` and its sequence in `data`, damaged."""
-
-    def build(folder: Path, samples: Samples) -> list[str]:
-        samples.copy("sequence", folder / "data")
-        samples.copy("run", folder / "run")
-        damage(folder)
-        return command
-
-    return build
+    return given(command, *steps, needs="sequence run")
 
 
-def cut(name: str, by: int) -> Callable[[Path], object]:
+def cut(name: str, by: int) -> Step:
     """Takes bytes off the end of a file."""
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:-by])
-
-
-def config(change: Callable[[dict], object]) -> Callable[[Path], object]:
-    """Changes the run's config.json."""
-
-    def damage(folder: Path) -> None:
-        facts = json.loads((folder / "run/config.json").read_text())
-        change(facts)
-        (folder / "run/config.json").write_text(json.dumps(facts))
-
-    return damage
 
 
 def header(text: bytes | str, length: int | None = None) -> bytes:
@@ -61,100 +42,85 @@ def about(text: str) -> bytes:
 
 def path_of(text: str) -> Build:
     """A camera path."""
-    return damaged(put("path.json", text), ["render", "run", "out", "--camera-path", "path.json"])
+    return damaged("render run out --camera-path path.json", put("path.json", text))
+
+
+def scene(name: str, *steps: Step, says: tuple[str, ...] = ()) -> Case:
+    """A damaged scene."""
+    return Case(name, damaged(RENDER, *steps), (SCENE, *says))
+
+
+def config(name: str, content: bytes | str | Callable[[dict], object], *says: str) -> Case:
+    """A run's config.json of these bytes, or changed."""
+
+    def damage(folder: Path) -> None:
+        facts = json.loads((folder / CONFIG).read_text())
+        content(facts)
+        (folder / CONFIG).write_text(json.dumps(facts))
+
+    return Case(name, damaged(EVAL, damage if callable(content) else put(CONFIG, content)), says or ("config.json",))
+
+
+def resumed(name: str, *steps: Step, says: tuple[str, ...] = (), options: str = "") -> Case:
+    """A training that cannot be resumed."""
+    return Case(name, damaged(f"{RESUME} {options}", *steps), (CHECKPOINT, *says), ("run",))
 
 
 TERABYTES = '{"a":{"dtype":"F32","shape":[1000000000,1000000],"data_offsets":[0,4000000000000000]}}'
+BYTES = bytes(range(256))
+EMPTY = '{"format": "endoprior-scene-1", "config": {}}'
+POSE = [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 RUNS = [
-    Case("no run", lambda f, s: EVAL, ("run",)),
-    Case("an empty run", lambda f, s: [(f / "run").mkdir(), EVAL][1], ("scene.safetensors",)),
-    Case("a scene of nothing", damaged(put(SCENE, b""), RENDER), (SCENE,)),
-    Case("a scene of noise", damaged(put(SCENE, bytes(range(256)) * 20), RENDER), (SCENE,)),
-    Case("a scene cut short", damaged(cut(SCENE, 100), RENDER), (SCENE,)),
-    Case("a scene with an endless header", damaged(put(SCENE, header("{}", 1 << 63)), RENDER), (SCENE,)),
-    Case("a scene that promises terabytes", damaged(put(SCENE, header(TERABYTES)), RENDER), (SCENE,)),
-    Case("a scene without a description", damaged(put(SCENE, header("{}")), RENDER), (SCENE,)),
-    Case("a scene of another format", damaged(put(SCENE, about('{"format": "other"}')), RENDER), (SCENE, "other")),
-    Case("a scene nested without end", damaged(put(SCENE, about(NESTED)), RENDER), (SCENE,)),
-    Case(
-        "a scene without arrays",
-        damaged(put(SCENE, about('{"format": "endoprior-scene-1", "config": {}}')), RENDER),
-        (SCENE,),
-    ),
-    Case("a folder for a scene", damaged(lambda f: [(f / SCENE).unlink(), (f / SCENE).mkdir()], RENDER), (SCENE,)),
-    Case("a pipe for a scene", damaged(lambda f: [(f / SCENE).unlink(), os.mkfifo(f / SCENE)], RENDER), (SCENE,)),
-    Case("a config that is not JSON", damaged(put("run/config.json", "{"), EVAL), ("config.json",)),
-    Case("a config nested without end", damaged(put("run/config.json", NESTED), EVAL), ("config.json",)),
-    Case("a config of bytes", damaged(put("run/config.json", bytes(range(256))), EVAL), ("config.json",)),
-    Case("a config that is a list", damaged(put("run/config.json", "[]"), EVAL), ("config.json",)),
-    Case("a config without data", damaged(config(lambda c: c.pop("data")), EVAL), ("config.json", "--data")),
-    Case(
-        "a config with a number for data", damaged(config(lambda c: c["data"].update(path=5)), EVAL), ("config.json",)
-    ),
-    Case(
-        "a config with gone data", damaged(config(lambda c: c["data"].update(path="/gone")), EVAL), ("/gone", "--data")
-    ),
-    Case(
-        "a config with an impossible path",
-        damaged(config(lambda c: c["data"].update(path="\0" + "x" * 5000)), EVAL),
-        ("xxx",),
-    ),
-    Case(
-        "a pipe for a config",
-        damaged(lambda f: [(f / "run/config.json").unlink(), os.mkfifo(f / "run/config.json")], EVAL),
-        ("config.json",),
-    ),
-    Case(
-        "other data",
-        lambda f, s: [s.copy("run", f / "run"), put("other/images/a.png", "x")(f), [*EVAL, "--data", "other"]][2],
-        ("other",),
-    ),
-    Case(
-        "nothing to resume",
-        damaged(lambda f: [(f / CHECKPOINT).unlink(), (f / "run/config.json").unlink()], RESUME),
-        (CHECKPOINT,),
-        ("run",),
-    ),
-    Case("a checkpoint cut short", damaged(cut(CHECKPOINT, 100), RESUME), (CHECKPOINT,), ("run",)),
-    Case("a checkpoint of noise", damaged(put(CHECKPOINT, bytes(range(256)) * 20), RESUME), (CHECKPOINT,), ("run",)),
-    Case(
-        "a checkpoint that promises terabytes",
-        damaged(put(CHECKPOINT, header(TERABYTES)), RESUME),
-        (CHECKPOINT,),
-        ("run",),
-    ),
-    Case("a checkpoint nested without end", damaged(put(CHECKPOINT, about(NESTED)), RESUME), (CHECKPOINT,), ("run",)),
-    Case(
+    Case("no run", given(EVAL), ("run",)),
+    Case("an empty run", given(EVAL, empty_folder("run")), ("scene.safetensors",)),
+    scene("a scene of nothing", put(SCENE, b"")),
+    scene("a scene of noise", put(SCENE, BYTES * 20)),
+    scene("a scene cut short", cut(SCENE, 100)),
+    scene("a scene with an endless header", put(SCENE, header("{}", 1 << 63))),
+    scene("a scene that promises terabytes", put(SCENE, header(TERABYTES))),
+    scene("a scene without a description", put(SCENE, header("{}"))),
+    scene("a scene of another format", put(SCENE, about('{"format": "other"}')), says=("other",)),
+    scene("a scene nested without end", put(SCENE, about(NESTED))),
+    scene("a scene without arrays", put(SCENE, about(EMPTY))),
+    scene("a folder for a scene", instead(SCENE)),
+    scene("a pipe for a scene", pipe(SCENE)),
+    config("a config that is not JSON", "{"),
+    config("a config nested without end", NESTED),
+    config("a config of bytes", BYTES),
+    config("a config that is a list", "[]"),
+    config("a config without data", lambda c: c.pop("data"), "config.json", "--data"),
+    config("a config with a number for data", lambda c: c["data"].update(path=5)),
+    config("a config with gone data", lambda c: c["data"].update(path="/gone"), "/gone", "--data"),
+    config("a config with an impossible path", lambda c: c["data"].update(path="\0" + "x" * 5000), "xxx"),
+    Case("a pipe for a config", damaged(EVAL, pipe(CONFIG)), ("config.json",)),
+    Case("other data", given(f"{EVAL} --data other", put("other/images/a.png", "x"), needs="run"), ("other",)),
+    resumed("nothing to resume", without(CHECKPOINT), without(CONFIG)),
+    resumed("a checkpoint cut short", cut(CHECKPOINT, 100)),
+    resumed("a checkpoint of noise", put(CHECKPOINT, BYTES * 20)),
+    resumed("a checkpoint that promises terabytes", put(CHECKPOINT, header(TERABYTES))),
+    resumed("a checkpoint nested without end", put(CHECKPOINT, about(NESTED))),
+    resumed(
         "a checkpoint that is a scene",
-        damaged(lambda f: (f / CHECKPOINT).write_bytes((f / SCENE).read_bytes()), RESUME),
-        (CHECKPOINT, "endoprior-scene-1"),
-        ("run",),
+        lambda f: (f / CHECKPOINT).write_bytes((f / SCENE).read_bytes()),
+        says=("endoprior-scene-1",),
     ),
-    Case("another config", damaged(lambda f: None, [*RESUME, "--seed", "7"]), (CHECKPOINT, "seed"), ("run",)),
-    Case(
-        "other data to resume",
-        damaged(lambda f: (f / "data/sequence.json").unlink(), RESUME),
-        (CHECKPOINT, "other data"),
-        ("run",),
-    ),
+    resumed("another config", options="--seed 7", says=("seed",)),
+    resumed("other data to resume", without("data/sequence.json"), says=("other data",)),
     Case(
         "a camera path that is nowhere",
-        damaged(lambda f: None, [*RENDER[:3], "--camera-path", "path.json"]),
+        given("render run out --camera-path path.json", needs="run"),
         ("path.json",),
     ),
-    Case("a camera path of words", path_of("hello"), ("path.json",)),
-    Case("a camera path of nothing", path_of("[]"), ("path.json",)),
-    Case("a camera path nested without end", path_of(NESTED), ("path.json",)),
-    Case("a camera path at NaN", path_of('[{"time": NaN}]'), ("path.json",)),
-    Case(
-        "a camera path of NaN",
-        path_of(json.dumps([{"time": 0, "world_to_camera": [[float("nan")] * 4] * 4}])),
-        ("path.json",),
-    ),
-    Case(
-        "a camera path that scales",
-        path_of('[{"time": 0, "world_to_camera": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]'),
-        ("path.json",),
+    *(
+        Case(f"a camera path {what}", path_of(text), ("path.json",))
+        for what, text in {
+            "of words": "hello",
+            "of nothing": "[]",
+            "nested without end": NESTED,
+            "at NaN": '[{"time": NaN}]',
+            "of NaN": json.dumps([{"time": 0, "world_to_camera": [[float("nan")] * 4] * 4}]),
+            "that scales": json.dumps([{"time": 0, "world_to_camera": POSE}]),
+        }.items()
     ),
 ]
 SOUND = """
@@ -165,14 +131,9 @@ seeds: [0]
 """
 
 
-def spec(text: bytes | str, name: str = "spec.yaml", command: tuple[str, ...] = ()) -> Build:
+def spec(text: bytes | str, name: str = "spec.yaml") -> Build:
     """A spec, reported on only, so that nothing is trained."""
-
-    def build(folder: Path, samples: Samples) -> list[str]:
-        put(name, text)(folder)
-        return ["bench", name, "out", "--report-only", *command]
-
-    return build
+    return given(f"bench {name} out --report-only", put(name, text))
 
 
 def changed(old: str, new: str) -> Build:
@@ -182,11 +143,9 @@ def changed(old: str, new: str) -> Build:
 
 
 SPECS = [
-    Case("no spec", lambda f, s: ["bench", "spec.yaml", "out"], ("spec.yaml", "o such file")),
+    Case("no spec", given("bench spec.yaml out"), ("spec.yaml", "o such file")),
     Case("a spec of another kind", spec("x", "spec.txt"), ("spec.txt", ".yaml")),
-    Case(
-        "a folder without specs", lambda f, s: [(f / "specs").mkdir(), ["bench", "specs", "out"]][1], ("specs", "none")
-    ),
+    Case("a folder without specs", given("bench specs out", empty_folder("specs")), ("specs", "none")),
     Case("an empty spec", spec(""), ("spec.yaml",)),
     Case("a spec of bytes", spec(bytes(range(256))), ("spec.yaml",)),
     Case("a spec that is a list", spec("[1]"), ("spec.yaml",)),
@@ -231,7 +190,7 @@ SPECS = [
     Case("a field nobody knows", spec(SOUND + "colour: red"), ("spec.yaml", "colour")),
     Case(
         "a pipe for a spec",
-        lambda f, s: [os.mkfifo(f / "spec.yaml"), ["bench", "spec.yaml", "out"]][1],
+        given("bench spec.yaml out", pipe("spec.yaml")),
         ("spec.yaml", "pipe"),
     ),
     Case("a variable that is not set", changed("path: data", "path: $NO_SUCH_VARIABLE/data"), leaves=("out",)),

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import struct
 from pathlib import Path
 
 import cv2
 import numpy as np
-from corpus_case import Case
+from corpus_case import Case, given
 from corpus_damage import (
     CHECK,
     DRAWS,
@@ -20,9 +19,10 @@ from corpus_damage import (
     NESTED,
     NOISE,
     SOUND,
-    Damage,
+    Step,
     closed,
     damaged,
+    empty_folder,
     everywhere,
     first_frames,
     instead,
@@ -35,6 +35,7 @@ from corpus_damage import (
     put,
     sized,
     whole_npy,
+    without,
 )
 
 
@@ -77,35 +78,55 @@ def stereomis(data: Path) -> None:
     np.save(data / "intrinsics.npy", np.array([[50.0, 0, 24], [0, 50, 20], [0, 0, 1]]))
 
 
-def then(*damages: Damage) -> Damage:
-    """One after the other."""
-    return lambda data: [damage(data) for damage in damages]
-
-
-def everywhere_npy(value: float) -> Damage:
+def everywhere_npy(value: float) -> Step:
     """Depth of one value in all files of a plain folder."""
     content = whole_npy(np.full((40, 48), value, np.float32))
     return lambda data: [put(f"depth/{i}.npy", content)(data) for i in range(3)]
 
 
-TRAIN = (
-    "train data out --init-budget 100 --schedule.coarse-iterations 2 --schedule.fine-iterations 3 --no-networks".split()
-)
+def changed(name: str, old: str, new: str) -> Step:
+    """Replaces text in a file."""
+    return lambda data: (data / name).write_text((data / name).read_text().replace(old, new))
+
+
+def narrow(data: Path) -> None:
+    """Names of Forplane, and pictures that are too narrow for it."""
+    (data / "masks").rename(data / "gt_masks")
+    (data / "depth").rename(data / "gt_depth")
+    everywhere("images", NOISE[:, :30])(data)
+
+
+TRAIN = "train data out"
+SHORT = f"{TRAIN} --init-budget 100 --schedule.coarse-iterations 2 --schedule.fine-iterations 3 --no-networks"
+MASKED = everywhere("masks", np.full((40, 48), 255, np.uint8))
+PLAIN = sized(48, 40, True)
+BAD_POSE = {"camera-calibration": {"KL": np.eye(3).tolist()}, "camera-pose": np.full((4, 4), np.nan).tolist()}
+LAST_FACTS, LAST_Q = "data/frame_data/frame_data000001.json", "data/reprojection_data/frame_data000001.json"
+NARROW_TIFF, WIDE_TIFF = struct.pack("<HHII", 256, 3, 1, 48), struct.pack("<HHII", 256, 4, 1, 1 << 24)
+LYING_TIFF = cv2.imencode(".tiff", NOISE)[1].tobytes().replace(NARROW_TIFF, WIDE_TIFF)
+ALPHABETS, NO_TEXT = "dé tà\n☃ 'x'", os.fsdecode(b"\xff\xfe")
+
+
+def moved(name: str) -> Step:
+    """Gives the sequence another name."""
+    return lambda folder: (folder / "data").rename(folder / name)
+
+
 FOLDERS = [
-    Case("no folder", lambda folder, samples: CHECK, ("data", "no such folder")),
-    Case("an empty folder", made(lambda data: None), ("data", "an empty folder")),
-    Case("a file for a sequence", lambda f, s: [(f / "data").write_text("x"), CHECK][1], ("data", "a file")),
-    Case("a pipe for a sequence", lambda f, s: [os.mkfifo(f / "data"), CHECK][1], ("data", "pipe")),
-    Case("a link to itself", lambda f, s: [(f / "data").symlink_to("data"), CHECK][1], ("data", "no such folder")),
-    Case("a name of 5000 letters", lambda f, s: ["check", "x" * 5000], ("xxx", "too long")),
+    Case("no folder", given(CHECK), ("data", "no such folder")),
+    Case("an empty folder", made(), ("data", "an empty folder")),
+    Case("a file for a sequence", given(CHECK, put("data", "x")), ("data", "a file")),
+    Case("a pipe for a sequence", given(CHECK, pipe("data")), ("data", "pipe")),
+    Case("a link to itself", given(CHECK, link("data", "data")), ("data", "no such folder")),
+    Case("a name of 5000 letters", given("check " + "x" * 5000), ("xxx", "too long")),
     Case("a closed folder", damaged(closed("images")), ("images", "ermission"), needs_user=True),
-    Case("no pictures", damaged(lambda d: [f.unlink() for f in (d / "images").iterdir()]), ("images", "none")),
+    Case("no pictures", damaged(without("images"), empty_folder("images")), ("images", "none")),
     Case("pictures of another kind", damaged(instead("images")), ("images",)),
-    Case("no masks", damaged(lambda d: shutil.rmtree(d / "masks")), ("masks", "no such folder")),
+    Case("no masks", damaged(without("masks")), ("masks", "no such folder")),
     Case("a file for the depth folder", damaged(instead("depth")), ("depth",)),
     Case("one frame", damaged(first_frames(1)), ("images", "at least 2 frames")),
     Case("two frames", damaged(first_frames(2)), leaves=DRAWS),
-    Case("a mask too few", damaged(lambda d: (d / "masks/000003.png").unlink()), ("masks", "17 files", "16")),
+    Case("a mask too few", damaged(without("masks/000003.png")), ("masks", "17 files", "16")),
     Case("a link to nowhere", damaged(link(IMAGE, "/nowhere.png")), (IMAGE, "o such file")),
     Case("a picture that links to itself", damaged(link(IMAGE, "000003.png")), (IMAGE, "o such file")),
     Case("a pipe for a picture", damaged(pipe(IMAGE)), (IMAGE, "pipe")),
@@ -116,23 +137,9 @@ FOLDERS = [
     Case("a folder for a picture", damaged(instead(IMAGE)), (IMAGE, "a folder")),
     Case("a folder for the poses", damaged(instead("poses_bounds.npy")), ("poses_bounds.npy", "a folder")),
     Case("a closed picture", damaged(closed(IMAGE)), (IMAGE, "ermission"), needs_user=True),
-    Case(
-        "names of many alphabets",
-        lambda f, s: ["check", str(s.copy("sequence", f / "dé tà\n☃ 'x'"))],
-        leaves=DRAWS,
-        heavy=True,
-    ),
-    Case(
-        "a name that is no text",
-        lambda f, s: ["check", str(s.copy("sequence", f / os.fsdecode(b"\xff\xfe")))],
-        leaves=DRAWS,
-    ),
-    Case(
-        "digits that are none",
-        damaged(lambda d: (d / IMAGE).rename(d / "images/000003²٣.png")),
-        leaves=DRAWS,
-        heavy=True,
-    ),
+    Case("names of many alphabets", given(["check", ALPHABETS], moved(ALPHABETS), needs="sequence"), leaves=DRAWS),
+    Case("a name that is no text", given(["check", NO_TEXT], moved(NO_TEXT), needs="sequence"), leaves=DRAWS),
+    Case("digits that are none", damaged(lambda d: (d / IMAGE).rename(d / "images/000003²٣.png")), leaves=DRAWS),
     Case("a sequence of 1x1 px", made(sized(1, 1)), leaves=DRAWS),
 ]
 PICTURES = [
@@ -154,160 +161,78 @@ PICTURES = [
         (IMAGE, "cannot be decoded"),
         noise="libpng",
     ),
-    Case(
-        "a TIFF that promises too much",
-        damaged(
-            put(
-                IMAGE,
-                cv2.imencode(".tiff", NOISE)[1]
-                .tobytes()
-                .replace(struct.pack("<HHII", 256, 3, 1, 48), struct.pack("<HHII", 256, 4, 1, 1 << 24)),
-            )
-        ),
-        (IMAGE, "16777216x40"),
-    ),
+    Case("a TIFF that promises too much", damaged(put(IMAGE, LYING_TIFF)), (IMAGE, "16777216x40")),
     Case("another size", damaged(picture(IMAGE, NOISE[:30])), (IMAGE, "48x40", "48x30")),
     Case("16-bit color", damaged(picture(IMAGE, NOISE.astype(np.uint16))), (IMAGE, "16-bit")),
     Case("a gray picture", damaged(picture(IMAGE, NOISE[..., 0])), (IMAGE, "1 channel")),
     Case("a smooth mask", damaged(picture("masks/000003.png", NOISE[..., 0])), ("masks/000003.png", "0 and 255")),
     Case("a mask of 0 and 1", damaged(picture("masks/000003.png", NOISE[..., 0] // 128)), ("masks/000003.png", "255")),
     Case("a colored mask", damaged(picture("masks/000003.png", NOISE)), ("masks/000003.png", "one channel")),
-    Case(
-        "tools everywhere, checked",
-        damaged(everywhere("masks", np.full((40, 48), 255, np.uint8)), [*CHECK, "--strict"]),
-        ("data", "no errors"),
-        DRAWS,
-    ),
-    Case(
-        "tools everywhere, trained",
-        damaged(everywhere("masks", np.full((40, 48), 255, np.uint8)), ["train", "data", "out"]),
-        ("masks", "tissue"),
-    ),
+    Case("tools everywhere, checked", damaged(MASKED, command=f"{CHECK} --strict"), ("data", "no errors"), DRAWS),
+    Case("tools everywhere, trained", damaged(MASKED, command=TRAIN), ("masks", "tissue")),
     Case(
         "no depth at all",
-        damaged(everywhere("depth", np.zeros((40, 48), np.uint16)), ["train", "data", "out"]),
+        damaged(everywhere("depth", np.zeros((40, 48), np.uint16)), command=TRAIN),
         ("depth", "depth > 0"),
     ),
-    Case(
-        "depth of NaN",
-        made(then(sized(48, 40, True), everywhere_npy(np.nan)), ["train", "data", "out"]),
-        ("depth", "depth > 0"),
-    ),
+    Case("depth of NaN", made(PLAIN, everywhere_npy(np.nan), command=TRAIN), ("depth", "depth > 0")),
     Case("depth as a color map", damaged(picture("depth/000003.png", NOISE)), ("depth/000003.png", "one channel")),
-    Case(
-        "depth of infinity",
-        made(then(sized(48, 40, True), everywhere_npy(np.inf)), ["train", "data", "out"]),
-        ("depth", "depth > 0"),
-    ),
-    Case("pictures of 1x1 px, trained", made(sized(1, 1), [*TRAIN]), ("initialization", "4 tissue pixels"), heavy=True),
-    Case("pictures of 2x2 px, trained", made(sized(2, 2), [*TRAIN]), leaves=("out",), heavy=True),
-    Case("pictures of 5x4 px, checked", made(sized(5, 4)), leaves=DRAWS, heavy=True),
-    Case("three frames, trained", made(sized(48, 40), [*TRAIN]), leaves=("out",), heavy=True),
+    Case("depth of infinity", made(PLAIN, everywhere_npy(np.inf), command=TRAIN), ("depth", "depth > 0")),
+    Case("pictures of 1x1 px, trained", made(sized(1, 1), command=SHORT), ("initialization", "4 tissue pixels")),
+    Case("pictures of 2x2 px, trained", made(sized(2, 2), command=SHORT), leaves=("out",)),
+    Case("pictures of 5x4 px, checked", made(sized(5, 4)), leaves=DRAWS),
+    Case("three frames, trained", made(sized(48, 40), command=SHORT), leaves=("out",)),
 ]
 LAYOUTS = [
     Case("a raw SCARED keyframe", made(put("data/frame_data.tar.gz", b"x")), ("frame_data", "SCARED")),
-    Case("SCARED without disparity", made(then(scared, lambda d: shutil.rmtree(d / "data/disparity"))), ("disparity",)),
+    Case("SCARED without disparity", made(scared, without("data/disparity")), ("disparity",)),
     Case(
         "SCARED with a pose of NaN",
-        made(
-            then(
-                scared,
-                put(
-                    "data/frame_data/frame_data000001.json",
-                    json.dumps(
-                        {
-                            "camera-calibration": {"KL": np.eye(3).tolist()},
-                            "camera-pose": np.full((4, 4), np.nan).tolist(),
-                        }
-                    ),
-                ),
-            )
-        ),
+        made(scared, put(LAST_FACTS, json.dumps(BAD_POSE))),
         ("frame_data000001.json", "camera-pose", "NaN"),
     ),
-    Case(
-        "SCARED nested without end",
-        made(then(scared, put("data/frame_data/frame_data000001.json", NESTED))),
-        ("frame_data000001.json",),
-    ),
+    Case("SCARED nested without end", made(scared, put(LAST_FACTS, NESTED)), ("frame_data000001.json",)),
     Case(
         "SCARED with a huge number",
-        made(
-            then(
-                scared,
-                put("data/reprojection_data/frame_data000001.json", '{"reprojection-matrix": [[1' + "0" * 400 + "]]}"),
-            )
-        ),
+        made(scared, put(LAST_Q, '{"reprojection-matrix": [[1' + "0" * 400 + "]]}")),
         ("frame_data000001.json", "reprojection-matrix"),
     ),
-    Case("C3VD without a depth", made(then(c3vd, lambda d: (d / "0001_depth.tiff").unlink())), ("0001_depth.tiff",)),
-    Case("C3VD with words for poses", made(then(c3vd, put("pose.txt", "a,b,c"))), ("pose.txt", "rows of numbers")),
+    Case("C3VD without a depth", made(c3vd, without("0001_depth.tiff")), ("0001_depth.tiff",)),
+    Case("C3VD with words for poses", made(c3vd, put("pose.txt", "a,b,c")), ("pose.txt", "rows of numbers")),
     Case(
         "C3VD with poses of NaN",
-        made(then(c3vd, put("pose.txt", "\n".join([",".join(["nan"] * 16)] * 2)))),
+        made(c3vd, put("pose.txt", "\n".join([",".join(["nan"] * 16)] * 2))),
         ("pose.txt", "NaN"),
     ),
     Case(
-        "C3VD with a lens that is none",
-        made(
-            then(
-                c3vd, lambda d: put("config.ini", (d / "config.ini").read_text().replace("a2 = -0.02", "a2 = 1e300"))(d)
-            )
-        ),
-        ("data", "fx"),
+        "C3VD with a lens that is none", made(c3vd, changed("config.ini", "a2 = -0.02", "a2 = 1e300")), ("data", "fx")
     ),
-    Case("C3VD of another size", made(then(c3vd, lambda d: (d / "config.ini").unlink())), ("0_color.png", "1350x1080")),
-    Case("Hamlyn without a camera", made(then(hamlyn, lambda d: (d / "intrinsics.txt").unlink())), ("intrinsics.txt",)),
+    Case("C3VD of another size", made(c3vd, without("config.ini")), ("0_color.png", "1350x1080")),
+    Case("Hamlyn without a camera", made(hamlyn, without("intrinsics.txt")), ("intrinsics.txt",)),
     Case(
         "Hamlyn with a camera of NaN",
-        made(then(hamlyn, put("intrinsics.txt", "nan 0 1\n0 nan 1\n0 0 1"))),
+        made(hamlyn, put("intrinsics.txt", "nan 0 1\n0 nan 1\n0 0 1")),
         ("intrinsics.txt", "camera matrix"),
     ),
-    Case(
-        "Forplane, too narrow",
-        damaged(
-            lambda d: [
-                (d / "masks").rename(d / "gt_masks"),
-                (d / "depth").rename(d / "gt_depth"),
-                *[picture(f"images/{f.name}", NOISE[:, :30])(d) for f in (d / "images").iterdir()],
-            ]
-        ),
-        ("images/000000.png", "40 columns"),
-    ),
+    Case("Forplane, too narrow", damaged(narrow), ("images/000000.png", "40 columns")),
     Case("a raw StereoMIS sequence", made(put("StereoCalibration.ini", "x")), ("StereoCalibration.ini", "prepare")),
     Case(
         "StereoMIS with a split of its own",
-        damaged(then(stereomis, put("split.json", '{"test_indices": [0]}'))),
+        damaged(stereomis, put("split.json", '{"test_indices": [0]}')),
         ("split.json", "test_indices"),
     ),
-    Case(
-        "StereoMIS with a lying camera",
-        damaged(then(stereomis, put("intrinsics.npy", lying_npy()))),
-        ("intrinsics.npy",),
-    ),
+    Case("StereoMIS with a lying camera", damaged(stereomis, put("intrinsics.npy", lying_npy())), ("intrinsics.npy",)),
     Case("a STIR clip without depth", made(put("segmentation/icgstartseg.png", b"x")), ("data", "prepare")),
     Case(
         "plain with depth as a bomb",
-        made(then(sized(48, 40, True), put("depth/2.npy", lying_npy("(40, 48000000000)", "'<f4'")))),
+        made(PLAIN, put("depth/2.npy", lying_npy("(40, 48000000000)", "'<f4'"))),
         ("depth/2.npy", "64 bytes"),
     ),
     Case(
         "plain with half an EXR",
-        made(
-            then(
-                sized(48, 40, True),
-                lambda d: (d / "depth/2.npy").unlink(),
-                put("depth/2.exr", b"v/1\x01\x02\0\0\0channels\0"),
-            )
-        ),
+        made(PLAIN, without("depth/2.npy"), put("depth/2.exr", b"v/1\x01\x02\0\0\0channels\0")),
         ("depth/2.exr",),
     ),
-    Case(
-        "plain, sound",
-        made(sized(48, 40, True)),
-        leaves=DRAWS,
-        heavy=True,
-        check=lambda f: (f / "check.png").stat().st_size > 1000,
-    ),
+    Case("plain, sound", made(PLAIN), leaves=DRAWS, check=lambda f: (f / "check.png").stat().st_size > 1000),
 ]
 CASES = [*FOLDERS, *PICTURES, *LAYOUTS]

@@ -27,43 +27,21 @@ BEGIN, END = "<!-- figures: make test-faults -->", "<!-- end of figures -->"
 
 
 def properties(work: Path) -> list[Row]:
-    """The property-based tests with random seeds and many examples, and those of divergence and hostile files."""
+    """The property-based tests with random seeds and ten times as many examples as in the test suite."""
     files = sorted((ROOT / "tests").glob("test_properties_*.py"))
-    files += [
-        ROOT / "tests" / f"test_{name}.py"
-        for name in ("divergence", "hostile_state", "hostile_checkpoint", "hostile_viewer")
-    ]
     words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *map(str, files)]
-    return [
-        _subprocess_row("properties", "property-based tests, thorough, and hostile files", words, _last_pytest_line)
-    ]
-
-
-def corpus(work: Path) -> list[Row]:
-    """The bad-input corpus, every case a process of its own under limits."""
-    words = [sys.executable, str(ROOT / "faults" / "corpus.py")]
-    return [_subprocess_row("bad input", "corpus", words, lambda out: out.strip().splitlines()[-1])]
-
-
-def _subprocess_row(part: str, what: str, words: list[str], told: Callable[[str], str]) -> Row:
     environment = ENVIRONMENT | {"ENDOPRIOR_HYPOTHESIS": "thorough"}
     done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         print(done.stdout[-6000:], done.stderr[-3000:], sep="\n", file=sys.stderr)
-    return Row(part, what, told(done.stdout or "no output\n"), done.returncode == 0)
-
-
-def _last_pytest_line(out: str) -> str:
-    """`n passed ...` without the time."""
-    lines = [line for line in out.splitlines() if " passed" in line or " failed" in line or " error" in line]
-    return lines[-1].strip("= ").split(" in ")[0] if lines else out.strip().splitlines()[-1]
+    last = (done.stdout.strip() or "no output").splitlines()[-1]  # `n passed in ...`
+    return [Row("properties", "property-based tests, thorough", last.split(" in ")[0], done.returncode == 0)]
 
 
 PARTS: dict[str, Callable[[Path], list[Row]]] = {
     "kills": kills.main,
     "disk": disk.main,
     "memory": memory.main,
-    "bad input": corpus,
     "properties": properties,
     "soak": soak.main,
     "limits": limits.main,

@@ -36,8 +36,8 @@ def train_again_and_again(data: Path, out: Path) -> None:
     cfg = replace(cfg, schedule=schedule, init=replace(cfg.init, budget=4000))
     for i in range(TRAININGS):
         sequence = endoprior.load_sequence(data)
-        scene = endoprior.runs.training_run(sequence, cfg, out=out / str(i))
-        endoprior.evaluation.scoring(scene, sequence, networks=False)
+        scene = endoprior.train(sequence, cfg, out=out / str(i))
+        endoprior.evaluate(scene, sequence, networks=False)
         del scene, sequence
         gc.collect()
         ctypes.CDLL(None).malloc_trim(0)  # freed pages that the allocator merely keeps are no leak

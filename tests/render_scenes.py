@@ -102,3 +102,25 @@ def draw(
     pulled.backward()
     grads = {name: getattr(scene, name).grad for name in NAMES}
     return out, grads | {"means2d": out.means2d.grad, "background": behind.grad}
+
+
+def agree(got, want, relative, name):
+    """Largest difference, in units of the largest value."""
+    scale = want.abs().max().clamp(min=1e-12)
+    gap = ((got.double() - want) / scale).abs().max()
+    assert gap <= relative, f"{name} differs by {gap:.1e} of its largest value"
+
+
+def compare(backend, scene, view, picture=2e-6, gradient=1e-5, **options):
+    """Picture, alpha and depth within a few float32 roundings per layer; gradients sum more of them."""
+    want, want_grads = draw("reference", scene, view, **options)
+    got, grads = draw(backend, scene, view, **options)
+    for name in ("color", "alpha", "depth"):
+        agree(getattr(got, name), getattr(want, name), picture, name)
+    drawn = want.radii > 0
+    agree(got.means2d[drawn], want.means2d[drawn], 1e-6, "means2d")
+    assert torch.equal(got.radii > 0, drawn)
+    assert (got.radii - want.radii).abs().max() <= 1  # ceil may fall on either side
+    for name, value in want_grads.items():
+        agree(grads[name], value, gradient, f"gradient of {name}")
+    return want, want_grads

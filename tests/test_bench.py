@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 
 import common
 import iteration
-import losses
+import ops
 import plain
 import run
 import scenes
@@ -24,6 +24,10 @@ from endoprior.render import cpu
 
 BENCH = Path(common.__file__).parent
 TINY = Size(40, 48, 40)
+WITHOUT_COMMON = (
+    "plain.py", "gpu_parity.py", "gpu_training.py",  # imported by other scripts only
+    "publish.py", "figures.py", "prepared.py", "golden.py",  # do not import torch
+)  # fmt: skip
 REPEATED = 7
 """An iteration whose frame has a training frame before it."""
 
@@ -86,9 +90,9 @@ def test_the_committed_baseline_can_be_read():
 
 
 def test_a_cheap_stage_is_measured_beside_torch():
-    (found,) = losses.measure((TINY,))
-    assert found.stage == "losses, both ways" and found.size == "48x40"
-    assert 0 < found.ours_ms < 1e4 and 0 < found.torch_ms < 1e4
+    steps = (ops.losses(TINY.width, TINY.height, each) for each in (ops.NUMBA, ops.TORCH))
+    ((ours_ms, torch_ms),) = common.race(*steps).values()
+    assert 0 < ours_ms < 1e4 and 0 < torch_ms < 1e4
 
 
 def test_parts_inside_parts_are_counted_once():
@@ -111,7 +115,15 @@ def test_idle_threads_are_told_to_sleep_before_torch_is_imported(path):
     if path.name == "common.py":
         assert any("OMP_WAIT_POLICY" in line for line in lines[: imported[1]])
     # The first is imported by stages only, the others do without torch.
-    elif path.name not in ("plain.py", "publish.py", "figures.py", "prepared.py", "gpu_parity.py", "gpu_training.py"):
+    elif path.name not in (
+        "plain.py",
+        "publish.py",
+        "figures.py",
+        "prepared.py",
+        "golden.py",
+        "gpu_parity.py",
+        "gpu_training.py",
+    ):
         assert path.stem == "run" or next(lines[i] for i in imported if is_foreign(lines[i])) == "import common"
 
 
@@ -141,9 +153,8 @@ def test_plain_torch_trains_on_the_same_terms(make_tiny_sequence, name):
         temporal=replace(cfg.temporal, min_valid=0, min_points=20, weight=1.0),
     )
     sequence = load_sequence(make_tiny_sequence(num_frames=iteration.FRAMES))
-    trainer, other = iteration.started(sequence, cfg), iteration.started(sequence, cfg)
-    iteration.in_torch(other)
-    want, got = iteration.repeat(trainer, REPEATED), iteration.repeat_in_torch(other, REPEATED)
+    trainer, other = iteration.started(sequence, cfg), iteration.started(sequence, cfg, ops.TORCH)
+    want, got = iteration.repeat(trainer, REPEATED), iteration.repeat(other, REPEATED)
     assert "distance" in want.terms, "the iteration had no frame before: repeat another one"
     assert got.terms == pytest.approx(want.terms, rel=1e-3, abs=1e-7)
     gradients = [t.state.stats.grad2d_ndc_sum for t in (trainer, other)]

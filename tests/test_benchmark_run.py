@@ -62,6 +62,7 @@ def done_times(out: Path) -> dict[str, int]:
     return {str(path.relative_to(out)): path.stat().st_mtime_ns for path in out.glob("cells/**/cell.json")}
 
 
+@pytest.mark.slow
 def test_report_has_tables_claims_and_pictures(finished):
     _, out = finished
     text = (out / "results.md").read_text()
@@ -81,6 +82,7 @@ def test_report_has_tables_claims_and_pictures(finished):
     assert len(set(found)) == 3  # seeds differ
 
 
+@pytest.mark.slow
 def test_equal_cells_have_equal_scores_and_finished_ones_are_kept(finished, capsys):
     spec, out = finished
     before = done_times(out)
@@ -90,6 +92,7 @@ def test_equal_cells_have_equal_scores_and_finished_ones_are_kept(finished, caps
     assert "12 cells: 6 done before, 0 to run, 6 without data" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_changed_method_runs_again_and_the_others_do_not(finished):
     spec, out = finished
     before = done_times(out)
@@ -109,6 +112,7 @@ def test_report_only_trains_nothing(tmp_path, monkeypatch):
     assert "not run yet" in text and not list((tmp_path / "out").glob("cells/**/cell.json"))
 
 
+@pytest.mark.slow
 def test_a_failing_cell_is_reported_and_does_not_stop_the_rest(tmp_path, capsys):
     write_tiny_sequence(tmp_path / "tiny")
     for file in (tmp_path / "tiny" / "depth").iterdir():  # readable, but nothing to start from
@@ -126,6 +130,7 @@ def test_a_failing_cell_is_reported_and_does_not_stop_the_rest(tmp_path, capsys)
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_killed_half_way_it_loses_no_finished_cell(tmp_path, how):
     write_tiny_sequence(tmp_path / "tiny")
@@ -222,6 +227,7 @@ def test_bad_options_are_named(tmp_path, capsys, options, said):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed")
 def test_ray_runs_the_same_cells(finished, tmp_path):
     write_tiny_sequence(tmp_path / "tiny")
@@ -234,6 +240,7 @@ def test_ray_runs_the_same_cells(finished, tmp_path):
     assert cell.read_bytes() == same.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_folder_of_specs_shares_equal_cells(tmp_path, capsys):
     write_tiny_sequence(tmp_path / "tiny")
     specs = tmp_path / "specs"
@@ -252,6 +259,7 @@ def test_a_folder_of_specs_shares_equal_cells(tmp_path, capsys):
     assert "got none. Pass a folder of specs" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_overview_can_be_published(finished, tmp_path):
     spec = importlib.util.spec_from_file_location("publish", Path(__file__).parents[1] / "bench" / "publish.py")
     publish = importlib.util.module_from_spec(spec)

@@ -137,7 +137,7 @@ def test_csv_has_every_value():
     assert rows[0] == {"sequence": "s", "method": "a_1", "budget": "", "seed": "0", "score": "psnr", "value": "30"}
 
 
-def test_a_claim_is_judged_on_pairs():
-    found, said = results().judge(results().spec.claims[0])
+def test_a_claim_is_checked_on_pairs():
+    found, said = results().check(results().spec.claims[0])
     assert said == "holds" and found.count == 3
     assert found.mean == pytest.approx(1.0)

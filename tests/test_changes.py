@@ -94,6 +94,7 @@ def test_one_picture_has_no_changes():
     assert odd(changes) == {} and changes.difference.shape == (0,)
 
 
+@pytest.mark.slow
 def test_nothing_is_found_in_the_real_clip(real_clip):
     images = [cv2.imread(str(file))[..., ::-1] for file in sorted((real_clip / "images").iterdir())]
     assert odd(find_changes(images)) == {}

@@ -57,7 +57,7 @@ def test_every_command_explains_itself(command, capsys):
         (["train", "nowhere", "out", "--preset", "best"], "--preset"),
         (["train", "nowhere", "out", "--seed", "one"], "one"),
         (["train", "nowhere", "out", "--density.min-densify-weight", "2"], "min_densify_weight"),
-        (["train", "nowhere", "out", "--device", "cuda"], "--device"),
+        pytest.param(["train", "nowhere", "out", "--device", "cuda"], "--device", marks=pytest.mark.slow),
         (["train", "nowhere", "out", "--render.backend", "triton"], "--device cuda"),
         (["train", "nowhere", "out", "--render.backend", "cuda", "--device", "cpu"], "--render.backend cuda"),
         (["eval", "nowhere", "--device", "gpu"], "gpu"),

@@ -1,4 +1,4 @@
-"""Offsets of one moment: the HexPlane field with its box and heads, and the temporal basis."""
+"""Offsets at one time: the HexPlane field with its box and heads, and the temporal basis."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from torch.nn.functional import grid_sample
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import BasisConfig, DeformationConfig, HexPlaneConfig
-from endoprior.model.basis import basis_offsets, basis_weights, identity_motion, motion_layout
+from endoprior.model.attributes import motion_layout
+from endoprior.model.basis import basis_offsets, basis_weights, identity_motion
 from endoprior.model.deformation import HexPlaneField, Offsets, box_of_points
 from endoprior.model.heads import OffsetHeads
 from endoprior.model.hexplane import PLANE_NAMES
+from endoprior.model.ops import NUMBA
 
 SMALL = DeformationConfig(hexplane=HexPlaneConfig((6, 5, 4), 8, 12, (1, 2)))
 BASIS = DeformationConfig(kind="basis", basis=BasisConfig(num_bases=9, relative_width=0.7))
@@ -72,7 +74,7 @@ def test_field_agrees_with_the_literal_formulas() -> None:
     model.grid.values.uniform_(0.3, 1.1, generator=torch.Generator().manual_seed(2))
     means = (points(80, 1) * 1.05).requires_grad_(True)
     cotangent = torch.randn(80, 3, generator=torch.Generator().manual_seed(3))
-    got = model.offsets(means, 0.6).means
+    got = model.offsets(means, 0.6, NUMBA).means
     (got * cotangent).sum().backward()
     double_means = means.detach().double().requires_grad_(True)
     double_box = model.box.detach().double().requires_grad_(True)
@@ -92,25 +94,30 @@ def test_displacement_at_another_time_is_that_of_a_second_call() -> None:
         model.grid.values.uniform_(0.3, 1.1, generator=torch.Generator().manual_seed(2))
         means = (points(80, 1) * 1.05).requires_grad_(True)
         if together:
-            offsets, displacement = model.offsets_and_displacement(means, 0.6, 0.2)
+            offsets, displacement = model.offsets_and_displacement(means, 0.6, 0.2, NUMBA)
         else:
-            offsets, displacement = model.offsets(means, 0.6), model.offsets(means, 0.2).means
+            offsets, displacement = model.offsets(means, 0.6, NUMBA), model.offsets(means, 0.2, NUMBA).means
         made = [displacement, *vars(offsets).values()]
         found = [value for value in made if value is not None]
         sum((k + 1) * value.square().sum() for k, value in enumerate(found)).backward()
-        network = [tensor.grad for tensor in model.parameters_by_group()["network"]]
+        network = [tensor.grad for tensor in model.heads.parameters.values()]
         results.append([*found, means.grad, model.box.grad, model.grid.grads, *network])
     assert len(results[0]) == 5 + 3 + 18
     for together, apart in zip(*results, strict=True):
         torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-4)  # float32 sums over 80 Gaussians
 
 
+def test_a_time_that_is_not_finite_is_rejected() -> None:
+    with pytest.raises(ValueError, match="time must be finite"):
+        field().offsets(points(), math.nan, NUMBA)
+
+
 def test_network_gradients_by_central_differences() -> None:
     model, means = field(), points(40, 1)
-    loss = lambda: model.offsets(means, 0.3).means.double().square().sum()  # noqa: E731
+    loss = lambda: model.offsets(means, 0.3, NUMBA).means.double().square().sum()  # noqa: E731
     loss().backward()
     with torch.no_grad():
-        for tensor in model.parameters_by_group()["network"]:
+        for tensor in model.heads.parameters.values():
             if tensor.grad is None:  # heads that this loss does not read
                 continue
             index = int(tensor.grad.abs().argmax())
@@ -126,10 +133,10 @@ def test_network_gradients_by_central_differences() -> None:
 
 def test_plane_gradients_reach_the_buffer_through_the_field() -> None:
     model = field()
-    model.offsets(points(), 0.3).means.square().sum().backward()
+    model.offsets(points(), 0.3, NUMBA).means.square().sum().backward()
     assert model.grid.grads.abs().sum() > 0
     fixed = field(replace(SMALL, hexplane=replace(SMALL.hexplane, learn_box=False)))
-    fixed.offsets(points(), 0.3).means.square().sum().backward()
+    fixed.offsets(points(), 0.3, NUMBA).means.square().sum().backward()
     assert fixed.box.grad is None and fixed.grid.grads.abs().sum() > 0
     assert model.box.grad.abs().sum() > 0
 
@@ -148,7 +155,7 @@ def test_plane_gradients_reach_the_buffer_through_the_field() -> None:
 def test_fields_of_the_offsets(cfg: DeformationConfig, fields: dict[str, tuple[int, ...]]) -> None:
     """EndoNeRF, SCARED, and the released code with its opacity head; nothing starts at zero offset."""
     model = field(cfg)
-    found = {name: value for name, value in vars(model.offsets(points(7), 0.2)).items() if value is not None}
+    found = {name: value for name, value in vars(model.offsets(points(7), 0.2, NUMBA)).items() if value is not None}
     assert {name: tuple(value.shape) for name, value in found.items()} == fields
     assert all((value != 0).any() for value in found.values())
     expected = {"trunk"} | {f"{name}.{layer}" for name in fields for layer in ("hidden", "output")}
@@ -157,18 +164,18 @@ def test_fields_of_the_offsets(cfg: DeformationConfig, fields: dict[str, tuple[i
 
 def test_offsets_of_no_gaussians_and_of_a_subset() -> None:
     model, cloud = field(), points()
-    model.offsets(cloud[:0], 0.1).means.sum().backward()
-    assert model.offsets(cloud[:0], 0.1).quats.shape == (0, 4)
+    model.offsets(cloud[:0], 0.1, NUMBA).means.sum().backward()
+    assert model.offsets(cloud[:0], 0.1, NUMBA).quats.shape == (0, 4)
     with torch.no_grad():
-        everyone, few = model.offsets(cloud, 0.1), model.offsets(cloud[10:20], 0.1)
+        everyone, few = model.offsets(cloud, 0.1, NUMBA), model.offsets(cloud[10:20], 0.1, NUMBA)
     # Matrix products of another height may block their sums in another way.
     torch.testing.assert_close(few.means, everyone.means[10:20], rtol=1e-5, atol=1e-6)
 
 
 def test_heads_start_as_stated() -> None:
     width, features = 32, 256
-    default = OffsetHeads(features, width, ("means", "quats"), "default", torch.Generator().manual_seed(1))
-    zero = OffsetHeads(features, width, ("means", "quats"), "zero", torch.Generator().manual_seed(1))
+    default = OffsetHeads(features, width, {"means": 3, "quats": 4}, "default", torch.Generator().manual_seed(1))
+    zero = OffsetHeads(features, width, {"means": 3, "quats": 4}, "zero", torch.Generator().manual_seed(1))
     for name, value in default.parameters.items():
         fan_in = features if name.startswith("trunk") else width
         if name.endswith("weight"):
@@ -177,7 +184,7 @@ def test_heads_start_as_stated() -> None:
         else:
             assert 0 < value.abs().max() <= 1 / math.sqrt(fan_in)
             assert not zero.parameters[name].any()
-    again = OffsetHeads(features, width, ("means", "quats"), "default", torch.Generator().manual_seed(1))
+    again = OffsetHeads(features, width, {"means": 3, "quats": 4}, "default", torch.Generator().manual_seed(1))
     assert all(torch.equal(a, b) for a, b in zip(default.parameters.values(), again.parameters.values(), strict=True))
 
 
@@ -196,11 +203,11 @@ def test_state_survives_a_file(tmp_path: Path) -> None:
     names = set(source.state_arrays())
     assert {"hexplane.box", "hexplane.0.xy", "hexplane.1.zt", "heads.trunk.weight"} <= names
     save_file(source.state_arrays(), tmp_path / "scene.safetensors")
-    box, network = target.box, target.parameters_by_group()["network"]
+    box, network = target.box, list(target.heads.parameters.values())
     target.load_state_arrays(load_file(tmp_path / "scene.safetensors"))
-    assert torch.equal(target.offsets(points(), 0.7).means, source.offsets(points(), 0.7).means)
+    assert torch.equal(target.offsets(points(), 0.7, NUMBA).means, source.offsets(points(), 0.7, NUMBA).means)
     # Optimizers hold these very tensors.
-    assert target.box is box and target.parameters_by_group()["network"][0] is network[0] and box.requires_grad
+    assert target.box is box and next(iter(target.heads.parameters.values())) is network[0] and box.requires_grad
 
 
 def test_a_wrong_state_is_refused() -> None:
@@ -215,9 +222,11 @@ def test_a_wrong_state_is_refused() -> None:
 
 def test_time_moves_the_field_once_its_time_planes_differ() -> None:
     model, cloud = field(), points()
-    assert torch.equal(model.offsets(cloud, 0.1).means, model.offsets(cloud, 0.9).means)  # time planes start at 1
+    assert torch.equal(
+        model.offsets(cloud, 0.1, NUMBA).means, model.offsets(cloud, 0.9, NUMBA).means
+    )  # time planes start at 1
     model.grid.plane(0, "xt")[-1] = 2
-    assert not torch.equal(model.offsets(cloud, 0.1).means, model.offsets(cloud, 0.99).means)
+    assert not torch.equal(model.offsets(cloud, 0.1, NUMBA).means, model.offsets(cloud, 0.99, NUMBA).means)
 
 
 def test_motion_layout_follows_the_configuration() -> None:
@@ -251,12 +260,12 @@ def test_basis_by_its_definition(time: float) -> None:
     np.testing.assert_allclose(basis_weights(time, cfg.basis), weights, rtol=1e-12)
     assert 0 in weights  # the cut is being tested
     total = sum(w * motion[:, b].double() for b, w in enumerate(weights)).float()
-    got = basis_offsets(motion, time, cfg)
+    got = basis_offsets(motion, time, cfg, NUMBA)
     parts = [got.means, got.quats, got.log_scales, got.opacity_logits[:, None], got.sh_dc]
     torch.testing.assert_close(torch.cat(parts, -1), total, rtol=1e-5, atol=1e-6)  # nine float32 terms
 
 
-def test_a_bump_ends_at_three_standard_deviations_without_a_jump() -> None:
+def test_a_basis_function_ends_at_three_standard_deviations_without_a_jump() -> None:
     cfg = BasisConfig(num_bases=101, relative_width=1.01)  # sigma = 0.01 = distance of the centers
     assert np.flatnonzero(basis_weights(0.5 + 1e-9, cfg)).tolist() == list(range(48, 54))
     assert basis_weights(0.5, cfg)[50] == 1
@@ -269,7 +278,7 @@ def test_basis_gradient() -> None:
     motion = torch.randn(3, 9, 13, dtype=torch.float64, requires_grad=True)
 
     def offsets(motion: Tensor) -> tuple[Tensor, ...]:
-        found = basis_offsets(motion, 0.4, BASIS)
+        found = basis_offsets(motion, 0.4, BASIS, NUMBA)
         return found.means, found.quats, found.log_scales, found.sh_dc
 
     assert torch.autograd.gradcheck(offsets, (motion,))
@@ -277,7 +286,7 @@ def test_basis_gradient() -> None:
 
 def test_basis_starts_as_the_identity() -> None:
     motion = identity_motion(4, BASIS).requires_grad_(True)
-    found = basis_offsets(motion, 0.25, BASIS)
+    found = basis_offsets(motion, 0.25, BASIS, NUMBA)
     assert isinstance(found, Offsets) and found.opacity_logits is None
     assert not any(value.any() for value in (found.means, found.quats, found.log_scales, found.sh_dc))
     found.means.sum().backward()
@@ -286,9 +295,9 @@ def test_basis_starts_as_the_identity() -> None:
 
 def test_basis_of_no_gaussians_far_times_and_wrong_shapes() -> None:
     motion = identity_motion(0, BASIS).requires_grad_(True)
-    basis_offsets(motion, 0.5, BASIS).means.sum().backward()
+    basis_offsets(motion, 0.5, BASIS, NUMBA).means.sum().backward()
     assert motion.grad.shape == motion.shape
     ones = identity_motion(2, BASIS) + 1
-    assert not basis_offsets(ones, 5.0, BASIS).means.any()
+    assert not basis_offsets(ones, 5.0, BASIS, NUMBA).means.any()
     with pytest.raises(ValueError, match="motion"):
-        basis_offsets(ones[..., :-1], 0.5, BASIS)
+        basis_offsets(ones[..., :-1], 0.5, BASIS, NUMBA)

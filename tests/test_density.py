@@ -10,9 +10,11 @@ from endoprior.compute.morton import morton_order
 from endoprior.core.config import Config, DensityConfig
 from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
-from endoprior.training import density
+from endoprior.training import density, density_numba
+from endoprior.training.densify import apply_plan, split_children
 from endoprior.training.density import DensityStats, Plan
-from endoprior.training.optimizer import Optimizer, split_children
+from endoprior.training.ops import NUMBA
+from endoprior.training.optimizer import Optimizer
 
 CFG = DensityConfig()
 
@@ -45,7 +47,7 @@ def test_a_constant_prior_gives_that_score_to_every_observed_gaussian(c):
     stats = DensityStats.zeros(3)
     prior, mask = torch.full((20, 30), c), torch.ones(20, 30, dtype=torch.bool)
     for _ in range(5):
-        stats.add_score(output([[3, 4], [29.9, 0.1], [15, 10]]), prior, mask, torch.full((3,), 0.4))
+        density_numba.add_score(stats, output([[3, 4], [29.9, 0.1], [15, 10]]), prior, mask, torch.full((3,), 0.4))
     # epsilon 1e-6 in the denominator of Eq. (7)
     assert stats.score(0.0).tolist() == pytest.approx([c] * 3, abs=1e-6)
     assert stats.mean_opacity(torch.zeros(3)).tolist() == pytest.approx([0.4] * 3)
@@ -54,8 +56,12 @@ def test_a_constant_prior_gives_that_score_to_every_observed_gaussian(c):
 def test_score_samples_a_ramp_at_the_projected_centre():
     ramp = (torch.arange(30) + 0.5).expand(20, 30) / 30  # value x / 30 at x px
     stats = DensityStats.zeros(2)
-    stats.add_score(
-        output([[7.25, 3.0], [20.5, 12.0]]), ramp.contiguous(), torch.ones(20, 30, dtype=torch.bool), torch.ones(2)
+    density_numba.add_score(
+        stats,
+        output([[7.25, 3.0], [20.5, 12.0]]),
+        ramp.contiguous(),
+        torch.ones(20, 30, dtype=torch.bool),
+        torch.ones(2),
     )
     assert stats.score(0.0).tolist() == pytest.approx([7.25 / 30, 20.5 / 30], abs=1e-5)
 
@@ -65,7 +71,7 @@ def test_projections_off_the_image_off_tissue_or_undrawn_do_not_count():
     mask[:, :10] = False
     stats = DensityStats.zeros(5)
     where = [[-1, 5], [15, 25], [4, 4], [20, 10], [20, 10]]
-    stats.add_score(output(where, [1, 1, 1, 0, 1]), torch.ones(20, 30), mask, torch.ones(5))
+    density_numba.add_score(stats, output(where, [1, 1, 1, 0, 1]), torch.ones(20, 30), mask, torch.ones(5))
     assert stats.num_valid.tolist() == [0, 0, 0, 0, 1]
 
 
@@ -80,7 +86,7 @@ def test_score_agrees_with_grid_sample(scale):
     prior, mask = torch.rand(20, 30, generator=generator), torch.rand(20, 30, generator=generator) > 0.3
     opacities = torch.rand(num, generator=generator)
     stats = DensityStats.zeros(num)
-    stats.add_score(output(means2d.tolist(), radii.tolist()), prior, mask, opacities, scale)
+    density_numba.add_score(stats, output(means2d.tolist(), radii.tolist()), prior, mask, opacities, scale)
 
     grid = (2 * scale * means2d / torch.tensor([30.0, 20.0]) - 1)[None, None]
     maps = torch.stack([prior, mask.float()])[None]
@@ -92,7 +98,7 @@ def test_score_agrees_with_grid_sample(scale):
     assert torch.equal(stats.num_valid[clear], valid.float()[clear])
     torch.testing.assert_close(stats.score_sum[clear], torch.where(valid, value, 0)[clear], rtol=1e-5, atol=1e-5)
     assert torch.equal(stats.opacity_sum[clear], torch.where(valid, opacities, 0)[clear])
-    found = density.valid_projection(scale * means2d, radii, mask)
+    found = density_numba.valid_projection(scale * means2d, radii, mask)
     assert torch.equal(found, stats.num_valid > 0)
 
 
@@ -111,7 +117,7 @@ def test_gradient_is_counted_in_ndc_and_only_where_drawn():
     out = output([[1, 1], [2, 2]], [1, 0])
     out.means2d.grad = torch.tensor([[3.0, 4.0], [1.0, 1.0]])
     stats = DensityStats.zeros(2)
-    stats.add_gradient(out, width=200, height=100)
+    density_numba.add_gradient(stats, out, width=200, height=100)
     assert stats.grad2d_ndc_sum.tolist() == pytest.approx([np.hypot(300, 200), 0])
     assert stats.num_seen.tolist() == [1, 0]
 
@@ -188,7 +194,7 @@ def test_every_row_stays_together_through_a_plan(kind):
     cfg = Config()
     cfg = replace(cfg, deformation=replace(cfg.deformation, kind=kind))
     model = gaussians(6, cfg)
-    optimizer = Optimizer(model, None, cfg, 10.0)
+    optimizer = Optimizer(model, None, cfg, 10.0, NUMBA)
     for i, (name, value) in enumerate(model.tensors.items()):  # mark every row of every tensor by its Gaussian
         marks = torch.arange(6.0).reshape(-1, *[1] * (value.ndim - 1)) + 10 * i
         value.data += 0 if name in ("means", "quats", "log_scales") else marks
@@ -197,7 +203,7 @@ def test_every_row_stays_together_through_a_plan(kind):
     stats = DensityStats(*(torch.arange(6.0) + k for k in range(5)))
     flags = torch.eye(6, dtype=torch.bool)
     planned = Plan(clone=flags[1], split=flags[2], remove=flags[4])
-    grown = optimizer.apply_plan(planned, stats, np.random.default_rng(0))
+    grown = apply_plan(optimizer, planned, stats, np.random.default_rng(0))
     # The marks say which Gaussian each row was: the kept ones, the clone, two children, in an order of their own.
     parents = (model["opacity_logits"].detach()[:, None] - before["opacity_logits"]).abs().argmin(1)
     assert sorted(parents.tolist()) == [0, 1, 1, 2, 2, 3, 5]

@@ -7,63 +7,64 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_train import tiny_config
+from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
+from endoprior.core.config import HexPlaneConfig
 from endoprior.data import load_sequence
+from endoprior.model.hexplane import FRESH, TOUCHED, PlaneGrid
 from endoprior.model.scene import load_scene
 from endoprior.runs.training_run import train
 from endoprior.training.divergence import (
+    CHECK_EVERY,
     LARGEST_GRADIENT,
     WINDOW,
     Diverged,
+    DivergenceCheck,
     Watch,
-    check_step,
-    count_unusable,
-    count_unusable_rows,
+    unusable_numbers,
 )
+from endoprior.training.ops import NUMBA, TORCH
+from endoprior.training.optimizer import Optimizer
 from endoprior.training.trainer import Trainer
 
 KINDS = ("basis", "hexplane")
 
 
-@pytest.mark.parametrize("shape", [(0,), (1,), (7,), (100, 3), (5, 16, 3)])
-def test_unusable_entries_are_counted(shape):
-    generator = torch.Generator().manual_seed(0)
-    values = torch.randn(shape, generator=generator)
-    assert count_unusable(values) == 0
-    flat = values.reshape(-1)
-    bad = [float("nan"), float("inf"), -float("inf"), 2 * float(LARGEST_GRADIENT), -1e30]
-    for i in range(min(len(bad), len(flat))):
-        flat[i] = bad[i]
-    assert count_unusable(values) == min(len(bad), len(flat))
+BAD = [float("nan"), float("inf"), -float("inf"), 2 * LARGEST_GRADIENT, -1e30]
 
 
-def test_rows_without_the_mark_do_not_count():
-    values = torch.full((4, 3), float("nan"))
-    values[3] = 1
-    marks = torch.tensor([0, 1, 3, 2], dtype=torch.uint8)
-    assert count_unusable_rows(values, marks, 2) == 3
+@pytest.mark.parametrize("ops", [NUMBA, TORCH], ids=lambda ops: ops.model.name)
+def test_unusable_entries_are_counted(ops):
+    for shape in [(0,), (1,), (7,), (100, 3), (5, 16, 3)]:
+        values = torch.randn(shape, generator=torch.Generator().manual_seed(0))
+        assert ops.count_unusable(values, LARGEST_GRADIENT) == 0
+        flat = values.reshape(-1)
+        count = min(len(BAD), len(flat))
+        flat[:count] = torch.tensor(BAD[:count])
+        assert ops.count_unusable(values, LARGEST_GRADIENT) == count
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_a_loss_without_a_value_is_refused_by_name(value):
-    check_step({"color": 0.1}, {"means": 0})
-    with pytest.raises(Diverged, match="color"):
-        check_step({"color": value}, {"means": 0})
-    with pytest.raises(Diverged, match="3 unusable entries in the gradient of means"):
-        check_step({"color": 0.1}, {"means": 3, "quats": 0})
+def test_cells_without_a_new_gradient_do_not_count():
+    grid = PlaneGrid(HexPlaneConfig((2, 2, 2), 2, 3, (1,)))
+    grid.grads[:3], grid.marks[:4] = float("nan"), torch.tensor([0, TOUCHED, TOUCHED | FRESH, FRESH])
+    assert NUMBA.count_unusable_in_planes(grid, LARGEST_GRADIENT) == 3
 
 
-def test_pictures_no_better_than_black_are_noticed_and_dark_ones_are_not_judged():
+def test_unusable_numbers_are_named():
+    assert unusable_numbers({"color": 0.1}, {"means": 0}) is None
+    for value in BAD[:3]:
+        assert "got color" in unusable_numbers({"color": value}, {"means": 0})
+    assert "3 unusable entries in the gradient of means" in unusable_numbers({"color": 0.1}, {"means": 3, "quats": 0})
+
+
+def test_images_no_better_than_black_are_noticed_and_dark_ones_are_not():
     good, dark, lost = Watch(), Watch(), Watch()
     for _ in range(3 * WINDOW):
-        good.see(0.3, 0.4)
-        dark.see(0.01, 0.01)
+        assert good.see(0.3, 0.4) is None and dark.see(0.01, 0.01) is None
     for _ in range(WINDOW - 1):
-        lost.see(0.4, 0.4)
-    with pytest.raises(Diverged, match="black"):
-        lost.see(0.4, 0.4)
+        assert lost.see(0.4, 0.4) is None
+    assert "black" in lost.see(0.4, 0.4)
 
 
 def state_of(trainer):
@@ -161,3 +162,62 @@ def test_steps_of_adam_are_bounded_as_the_guard_assumes():
         corrected = moments / (1 - np.array([0.9, 0.999]) ** t)
         largest = max(largest, corrected[0] / (np.sqrt(corrected[1]) + 1e-15))
     assert 7.2 < largest < 7.3
+
+
+def as_on_a_device(trainer):
+    """Have a started trainer check its iterations as it does on a device: now and then."""
+    trainer.step_once.ops = TORCH
+    trainer.step_once.check = DivergenceCheck(torch.device("cpu"), blocking=False)
+    state = trainer.state
+    state.optimizer = Optimizer(state.gaussians, state.field, trainer.cfg, trainer.spatial_scale, TORCH)
+    return trainer
+
+
+def without_density_events(cfg):
+    """At which a device is checked at once."""
+    return replace(cfg, density=replace(cfg.density, start_iteration=10**6))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["means", "opacity_logits"])
+def test_a_late_check_finds_the_state_before_a_bad_gradient(tiny_sequence, kind, name):
+    trainer = Trainer(load_sequence(tiny_sequence), without_density_events(tiny_config(kind, coarse=0, fine=200)))
+    trainer.start()
+    as_on_a_device(trainer)
+    for _ in range(8):
+        trainer.step()
+    trainer.synchronize()
+    before = state_of(trainer)
+    poison(trainer, name, float("nan"))
+    with pytest.raises(Diverged, match=f"gradient of {name}"):
+        for _ in range(CHECK_EVERY):
+            trainer.step()
+    after = state_of(trainer)
+    assert trainer.state.iteration == 8
+    assert all(torch.equal(before[key], after[key]) for key in before)
+
+
+def test_the_last_iteration_and_a_checkpoint_wait_for_the_check(tiny_sequence):
+    for ending in (Trainer.step, Trainer.synchronize):
+        trainer = Trainer(load_sequence(tiny_sequence), without_density_events(tiny_config("basis", coarse=0, fine=2)))
+        trainer.start()
+        as_on_a_device(trainer)
+        poison(trainer, "means", float("nan"))
+        assert trainer.step().divergence is None
+        with pytest.raises(Diverged):
+            ending(trainer)
+        assert trainer.state.iteration == 0
+
+
+def test_a_run_folder_keeps_the_scene_before_a_late_check(tiny_sequence, tmp_path):
+    def spoil(report, trainer):
+        if report.iteration == 1:
+            as_on_a_device(trainer)
+        if report.iteration == 9:
+            poison(trainer, "quats", float("nan"))
+
+    cfg = without_density_events(tiny_config("basis", coarse=0, fine=60))
+    with pytest.raises(Diverged, match=r"fine iteration 10: .*last_good"):
+        train(load_sequence(tiny_sequence), cfg, tmp_path / "run", on_step=spoil)
+    scene = load_scene(tmp_path / "run" / "last_good.safetensors")
+    assert all(bool(value.isfinite().all()) for value in scene.gaussians.tensors.values())

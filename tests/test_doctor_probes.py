@@ -201,6 +201,7 @@ def test_compiling_that_works_is_timed(tmp_path, monkeypatch):
     assert examine(facts).gsplat
 
 
+@pytest.mark.slow
 def test_compiled_files_are_found_and_tried_without_importing_gsplat(tmp_path, monkeypatch):
     fake_gsplat(tmp_path, "raise SystemExit('compiles')", monkeypatch)
     (tmp_path / "gsplat/__init__.py").write_text("raise SystemExit('imported')")

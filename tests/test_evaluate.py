@@ -11,8 +11,9 @@ from endoprior.cli import main
 from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.data.truth import Tracks
-from endoprior.evaluation.scoring import Evaluation, evaluate
-from endoprior.evaluation.truth import track_end_error_mm, track_scores
+from endoprior.evaluation.context import Evaluation
+from endoprior.evaluation.scorers.tracks import track_end_error_mm, track_scores
+from endoprior.evaluation.scoring import evaluate
 from endoprior.model.carry import carry_points
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.runs.training_run import train
@@ -119,5 +120,5 @@ def test_frames_far_below_the_median_are_named():
     rows = [
         {"index": i, "psnr_tissue": value} for i, value in ((1, 34.0), (9, 33.0), (17, 29.9), (25, None), (33, 35.0))
     ]
-    assert Evaluation({}, per_frame=rows).badly_explained() == [17]
-    assert Evaluation({}).badly_explained() == []
+    assert Evaluation({}, per_frame=rows).outlier_frames() == [17]
+    assert Evaluation({}).outlier_frames() == []

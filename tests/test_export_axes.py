@@ -11,16 +11,16 @@ from export_scenes import covariances, moving_scene, random_splats
 from scipy.spatial.transform import Rotation
 
 from endoprior import render
-from endoprior.export.axes import ROTATIONS, multiplied, rotated, turned, turned_points
+from endoprior.export.axes import ROTATIONS, points_in_axes, quaternion_product, rotated, splats_in_axes
 from endoprior.render import sh
 
 
 def test_axes_are_what_the_documentation_says():
     right, down, forward = np.eye(3)
-    assert np.array_equal(turned_points(np.stack([right, down, forward]), "opengl"), np.diag([1.0, -1, -1]))
-    lps = turned_points(np.stack([right, down, forward]), "lps")
+    assert np.array_equal(points_in_axes(np.stack([right, down, forward]), "opengl"), np.diag([1.0, -1, -1]))
+    lps = points_in_axes(np.stack([right, down, forward]), "lps")
     assert np.array_equal(lps, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # left, inferior, posterior
-    ras = turned_points(np.stack([right, down, forward]), "ras")
+    ras = points_in_axes(np.stack([right, down, forward]), "ras")
     assert np.array_equal(ras, lps * [-1, -1, 1])
 
 
@@ -32,7 +32,7 @@ def test_axes_are_proper_rotations(name):
 
 def test_opencv_leaves_every_bit():
     splats = random_splats()
-    assert turned(splats, "opencv") is splats
+    assert splats_in_axes(splats, "opencv") is splats
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -57,7 +57,7 @@ def test_turned_gaussians_look_the_same_from_the_turned_side(degree, seed):
 def test_quaternion_product_is_one_turn_after_the_other():
     first, second = Rotation.random(2, random_state=4)
     left, right = (torch.from_numpy(np.roll(r.as_quat(), 1)) for r in (second, first))
-    both = np.roll(multiplied(left, right).numpy(), -1)
+    both = np.roll(quaternion_product(left, right).numpy(), -1)
     assert Rotation.from_quat(both).as_matrix() == pytest.approx((second * first).as_matrix(), abs=1e-12)
 
 
@@ -70,6 +70,6 @@ def test_a_turned_scene_draws_the_same_picture(name):
     moved = replace(camera, world_to_camera=camera.world_to_camera @ matrix.T)
     rasterize = render.load("cpu")
     want = rasterize(splats, camera, background=torch.zeros(3))
-    got = rasterize(turned(splats, name), moved, background=torch.zeros(3))
+    got = rasterize(splats_in_axes(splats, name), moved, background=torch.zeros(3))
     torch.testing.assert_close(got.color, want.color, rtol=0, atol=1e-4)  # a tie in depth may be drawn in another order
     torch.testing.assert_close(got.depth, want.depth, rtol=0, atol=1e-2)

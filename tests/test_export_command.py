@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from export_readers import read_glb, read_spz
 from export_scenes import moving_scene, plane_camera
 from plyfile import PlyData
 
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.core.geometry import project
-from endoprior.export.axes import turned_points
+from endoprior.export.axes import points_in_axes
 from endoprior.export.depth import depth_png
-from endoprior.export.surface import Surface, seen_surface
-from endoprior.export.tracks import _seen, grid_picks
+from endoprior.export.surface import Surface, render_surface
+from endoprior.export.tracks import grid_query_points, project_visible
 from endoprior.model.carry import carry_points
 from endoprior.model.scene import load_scene
 from endoprior.render import sh
@@ -52,9 +53,9 @@ def test_ply_of_all_frames_and_their_index(run, tmp_path):
     assert names == [f"{i:06d}.ply" for i in range(10)] + ["index.json"]
     index = json.loads((tmp_path / "out" / "index.json").read_text())
     assert (index["axes"], index["unit"], index["frames_per_second"]) == ("lps", "mm", 25.0)
-    assert index["moments"][7] == {"files": ["000007.ply"], "time": 0.7, "frame": 7}
+    assert index["time_steps"][7] == {"files": ["000007.ply"], "time": 0.7, "frame": 7}
     for i in (0, 7):
-        want = turned_points(scene.at(i / 10).means.numpy(), "lps")
+        want = points_in_axes(scene.at(i / 10).means.numpy(), "lps")
         assert positions(tmp_path / "out" / f"{i:06d}.ply") == pytest.approx(want, abs=1e-5)
 
 
@@ -66,7 +67,7 @@ def test_ply_of_all_frames_and_their_index(run, tmp_path):
         (("--canonical",), ["canonical"]),
     ],
 )
-def test_chosen_moments(run, tmp_path, options, names):
+def test_selected_time_steps(run, tmp_path, options, names):
     assert export(run, tmp_path / "out", "splat", *options) == 0
     assert sorted(p.stem for p in (tmp_path / "out").glob("*.splat")) == names
 
@@ -94,8 +95,6 @@ def test_scenes_where_nothing_but_the_centers_moves(tmp_path, name):
 
 
 def test_axes_default_to_what_the_format_demands(run, tmp_path):
-    from test_export_splats import read_glb, read_spz
-
     scene, times = load_scene(run), ("--times", "0.5")
     upright = scene.at(0.5).means.numpy() * [1, -1, -1]
     assert export(run, tmp_path / "a.spz", "spz", *times) == export(run, tmp_path / "a.glb", "gltf", *times) == 0
@@ -127,10 +126,10 @@ def test_depth_in_both_files(run, tmp_path):
     png = cv2.imread(str(tmp_path / "out" / "000000.png"), cv2.IMREAD_UNCHANGED)
     depth = np.load(tmp_path / "out" / "000000.npy")
     assert png.dtype == np.uint16 and depth.dtype == np.float32 and png.shape == depth.shape == (48, 64)
-    drawn = load_scene(run).render(0.2)
-    shown = drawn.alpha.numpy() >= 0.5
+    out = load_scene(run).render(0.2)
+    shown = out.alpha.numpy() >= 0.5
     assert np.array_equal(depth > 0, shown) and np.array_equal(png > 0, shown)
-    assert depth[shown] == pytest.approx((drawn.depth / drawn.alpha).numpy()[shown], rel=1e-6)
+    assert depth[shown] == pytest.approx((out.depth / out.alpha).numpy()[shown], rel=1e-6)
     assert png * 0.01 == pytest.approx(depth, abs=0.005 + 1e-5)
 
 
@@ -146,19 +145,19 @@ def read_tracks(file) -> list[dict[str, str]]:
         return list(csv.DictReader(text))
 
 
-def test_tracks_of_picked_points(run, tmp_path):
+def test_tracks_of_query_points(run, tmp_path):
     scene = load_scene(run)
-    picks = tmp_path / "picks.csv"
-    picks.write_text("x,y,frame,name\n30.5,20.5,0,a\n40.25,30,4,b\n")
-    assert export(run, tmp_path / "out", "tracks", "--points", str(picks), "--frame", "opengl") == 0
+    queries = tmp_path / "points.csv"
+    queries.write_text("x,y,frame,name\n30.5,20.5,0,a\n40.25,30,4,b\n")
+    assert export(run, tmp_path / "out", "tracks", "--points", str(queries), "--frame", "opengl") == 0
     found = np.load(tmp_path / "out" / "tracks.npz")
     assert found["points"].shape == (10, 2, 3) and found["visible"].shape == (10, 2)
     world = found["points"] * [1, -1, -1]
     for point, (frame, pixel) in enumerate([(0, (30.5, 20.5)), (4, (40.25, 30.0))]):
-        # in its own frame each point lies where it was picked, on the surface that is drawn there
+        # in its own frame each point lies at its pixel, on the rendered surface
         assert found["pixels"][frame, point] == pytest.approx(pixel, abs=1e-2)
-        drawn = scene.render(frame / 10)
-        depth = (drawn.depth / drawn.alpha).numpy()
+        out = scene.render(frame / 10)
+        depth = (out.depth / out.alpha).numpy()
         between = depth[29:31, 39:41].mean(0) @ [0.25, 0.75]  # of the pixels centered at 39.5 and 40.5, 29.5 and 30.5
         assert world[frame, point, 2] == pytest.approx(between if point else depth[20, 30], abs=1e-3)
     moved = carry_points(scene, world[[0, 4], [0, 1]].astype(np.float64), np.array([0, 4]), [i / 10 for i in range(10)])
@@ -176,13 +175,13 @@ def test_tracks_of_picked_points(run, tmp_path):
     assert found["visible"].mean() > 0.7
 
 
-def test_tracks_behind_tissue_or_outside_the_picture_are_not_visible(run):
+def test_tracks_behind_tissue_or_outside_the_image_are_not_visible(run):
     scene = load_scene(run)
-    seen = seen_surface(scene, 0.0, scene.cameras[0], 0.5)
-    z = float(seen.depth[24, 32])
+    surface = render_surface(scene, 0.0, scene.cameras[0], 0.5)
+    z = float(surface.depth[24, 32])
     middle = np.array([(32.5 - 30) / 80, (24.5 - 26) / 80, 1.0])
     points = np.stack([middle * z, middle * (z + 10), middle * (z - 10), middle * z + [200, 0, 0], -middle * z])
-    assert _seen(points, seen)[1].tolist() == [True, False, True, False, False]
+    assert project_visible(points, surface)[1].tolist() == [True, False, True, False, False]
 
 
 def test_tracks_of_a_grid_start_on_tissue(run, tmp_path):
@@ -196,10 +195,10 @@ def test_tracks_of_a_grid_start_on_tissue(run, tmp_path):
 def test_grid_lies_on_pixel_centers_that_show_tissue():
     depth = np.zeros((48, 64), np.float32)
     depth[10:20, 30:] = 50
-    seen = Surface(depth, np.zeros((48, 64, 3), np.float32), plane_camera())
-    assert grid_picks(seen, 8).pixels.tolist() == [[x, 12.5] for x in (36.5, 44.5, 52.5, 60.5)]
+    surface = Surface(depth, np.zeros((48, 64, 3), np.float32), plane_camera())
+    assert grid_query_points(surface, 8).pixels.tolist() == [[x, 12.5] for x in (36.5, 44.5, 52.5, 60.5)]
     with pytest.raises(InputError, match="--grid-px"):
-        grid_picks(seen, 64)
+        grid_query_points(surface, 64)
 
 
 def test_mesh_of_a_scene_is_its_wall(run, tmp_path):
@@ -216,10 +215,10 @@ def test_mesh_of_a_scene_is_its_wall(run, tmp_path):
 
 def test_video_has_the_frames_of_the_split(run, tmp_path):
     assert export(run, tmp_path / "v.mp4", "video", "--split", "train") == 0
-    film, frames = cv2.VideoCapture(str(tmp_path / "v.mp4")), []
-    while (read := film.read())[0]:
+    video, frames = cv2.VideoCapture(str(tmp_path / "v.mp4")), []
+    while (read := video.read())[0]:
         frames.append(read[1][..., ::-1])
-    film.release()
+    video.release()
     assert len(frames) == 8 and frames[0].shape == (48, 64, 3)
     scene = load_scene(run)
     own, first = (scene.render(0.8, scene.cameras[i]).color.clamp(0, 1).numpy() * 255 for i in (8, 0))
@@ -269,11 +268,11 @@ def test_a_mistake_is_one_line_and_leaves_nothing(run, tmp_path, capsys, out, op
         ("x,y,frame\n", "no rows"),
         ("x,y,frame\n1,1,99\n", "99"),
         ("x,y,frame\n1,nan,0\n", "nan"),
-        ("x,y,frame\n1,1,0\n", "nothing is drawn"),
+        ("x,y,frame\n1,1,0\n", "no surface is rendered"),
     ],
 )
-def test_picks_that_cannot_be_followed(run, tmp_path, capsys, text, said):
-    file = tmp_path / "picks.csv"
+def test_query_points_that_cannot_be_tracked(run, tmp_path, capsys, text, said):
+    file = tmp_path / "points.csv"
     file.write_text(text)
     assert export(run, tmp_path / "out", "tracks", "--points", str(file)) == 2
     error = capsys.readouterr().err

@@ -14,8 +14,8 @@ from export_scenes import moving_scene, plane_camera
 
 from endoprior.core.config import HexPlaneConfig
 from endoprior.core.presets import preset
-from endoprior.export import FORMATS
 from endoprior.export.axes import ROTATIONS
+from endoprior.export.formats import FORMATS
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene

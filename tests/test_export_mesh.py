@@ -14,7 +14,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.types import Camera
 from endoprior.export.mesh import depth_grid
 from endoprior.export.mesh_files import encode_mesh
-from endoprior.export.surface import Surface, seen_surface
+from endoprior.export.surface import Surface, render_surface
 from endoprior.export.tsdf import fused_mesh, viewpoints
 
 CENTER, RADIUS = np.array([1.0, -2.0, 70.0]), 20.0
@@ -111,7 +111,7 @@ def test_fusion_wants_a_camera_that_moves():
 def test_surface_is_freed_from_the_background():
     scene = moving_scene()
     drawn = scene.render(0.2)
-    seen = seen_surface(scene, 0.2, scene.cameras[2], 0.5)
+    seen = render_surface(scene, 0.2, scene.cameras[2], 0.5)
     shown = drawn.alpha.numpy() >= 0.5
     assert shown.any() and not shown.all()
     assert (seen.depth[~shown] == 0).all() and (seen.color[~shown] == 0).all()

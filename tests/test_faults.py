@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_train import tiny_config
+from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.runs.folder import deferred_interrupt
+from endoprior.runs.interrupt import deferred_interrupt
 from endoprior.runs.training_run import train
 from endoprior.system import atomic
 from endoprior.system.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder
@@ -96,6 +96,7 @@ def test_leftovers_of_the_dead_go_and_those_of_the_living_stay(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == [f".a.{os.getpid()}.partial.png", f".b.{os.getpid()}.partial"]
 
 
+@pytest.mark.slow
 def test_training_goes_on_after_kills_to_the_same_bytes(tiny_sequence, tmp_path):
     words, parts = ["train", tiny_sequence, tmp_path / "parts", *SHORT], tmp_path / "parts"
     assert run("train", tiny_sequence, tmp_path / "whole", *SHORT).status == 0
@@ -205,6 +206,7 @@ def test_signals_are_left_alone_outside_the_main_thread():
     assert seen == [False]
 
 
+@pytest.mark.slow
 def test_a_limit_for_files_stops_training_in_one_line_and_keeps_the_checkpoint(tiny_sequence, tmp_path):
     out = tmp_path / "run"
     words = ["train", tiny_sequence, out, *SHORT]

@@ -8,8 +8,9 @@ import sys
 import zipfile
 from pathlib import Path
 
+import pytest
 import torch
-from test_render_cuda import NAN, loaded, rasterize_to_pixels
+from gsplat_stand_in import NAN, loaded, rasterize_to_pixels
 
 GPU_BENCH = Path(__file__).parents[1] / "bench" / "gpu.py"
 
@@ -24,6 +25,7 @@ def gpu_contest(monkeypatch):
     return gpu_bench(monkeypatch).Contest("cpu", torch.device("cpu"))
 
 
+@pytest.mark.slow
 def test_gpu_bench_dry_run_agrees_times_and_writes(tmp_path, monkeypatch, capsys):
     out = tmp_path / "gpu.json"
     options = ["--dry-run", "--scenes", "1", "--gaussians", "50", "--laps", "1", "--out", str(out)]

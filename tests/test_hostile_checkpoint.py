@@ -16,7 +16,7 @@ from endoprior.training.trainer import Trainer
 def run(request, tmp_path_factory):
     """A short training: what made it, and its checkpoint taken apart."""
     from conftest import write_tiny_sequence
-    from test_train import tiny_config
+    from tiny_training import tiny_config
 
     folder = tmp_path_factory.mktemp("checkpoint")
     sequence = load_sequence(write_tiny_sequence(folder / "data"))

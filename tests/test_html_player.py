@@ -129,6 +129,7 @@ def test_what_is_stored_is_the_scene_within_the_stated_bounds(scene, player):
         assert np.allclose(about["cameras"][t], [300, 310, 150, 137, *camera.world_to_camera.ravel()])
 
 
+@pytest.mark.slow
 def test_sixty_frames_of_twenty_thousand_fit_in_a_mail(tmp_path):
     page = write_html(random_scene(20_000, 60), tmp_path / "new" / "scene.html")  # refuses more than 20 MB itself
     size = page.stat().st_size
@@ -144,19 +145,21 @@ def test_the_page_refers_to_nothing_outside(player):
 
 
 def test_what_cannot_be_written_is_refused_in_one_line(scene, tmp_path):
-    with pytest.raises(InputError, match=r"scene\.html: expected at most 0\.0 MB; got 0\.\d MB for 6 moments of 2997"):
+    with pytest.raises(
+        InputError, match=r"scene\.html: expected at most 0\.0 MB; got 0\.\d MB for 6 time steps of 2997"
+    ):
         write_html(scene, tmp_path / "scene.html", max_bytes=1000)
     with pytest.raises(InputError, match=r"expected a file to write; got a folder"):
         write_html(scene, tmp_path)
     for times in ([], [0.5, 0.5], [0.5, 0.2]):
-        with pytest.raises(InputError, match="increasing moments"):
+        with pytest.raises(InputError, match="increasing times"):
             write_html(scene, tmp_path / "scene.html", times=times)
     with pytest.raises(ValueError, match=r"time must be in \[0, 1\]"):
         write_html(scene, tmp_path / "scene.html", times=[1.5])
     hidden = random_scene(20, 2)
     with torch.no_grad():
         hidden.gaussians["opacity_logits"].fill_(-20)
-    with pytest.raises(InputError, match="found none that can be drawn"):
+    with pytest.raises(InputError, match="got none that is visible"):
         write_html(hidden, tmp_path / "scene.html")
     assert not list(tmp_path.iterdir())
 
@@ -236,6 +239,7 @@ def test_draws_what_the_renderer_draws(scene, page, kept):
     assert all(address.startswith(("file://", "blob:")) for address in page.requests)
 
 
+@pytest.mark.slow
 def test_the_slider_and_the_keys_choose_the_frame(scene, page, kept):
     before = picture(page, kept / "first.png")
     left, top, width, height = page.box("#slider")
@@ -254,6 +258,7 @@ def test_the_slider_and_the_keys_choose_the_frame(scene, page, kept):
     assert not page.problems
 
 
+@pytest.mark.slow
 def test_play_goes_on_and_pauses(page):
     page.click("#play")
     assert page.evaluate("play.getAttribute('aria-label')") == "Pause"
@@ -271,6 +276,7 @@ def test_play_goes_on_and_pauses(page):
     assert not page.problems
 
 
+@pytest.mark.slow
 def test_the_free_view_turns_zooms_and_comes_back(page, kept):
     recorded = picture(page, kept / "recorded.png")
     page.press("f")
@@ -298,6 +304,7 @@ def test_the_free_view_turns_zooms_and_comes_back(page, kept):
     assert not page.problems
 
 
+@pytest.mark.slow
 def test_depth_is_shown_near_bright_far_dark(scene, page, kept):
     page.click("#depth")
     settle(page)
@@ -312,6 +319,7 @@ def test_depth_is_shown_near_bright_far_dark(scene, page, kept):
     assert not page.problems
 
 
+@pytest.mark.slow
 def test_one_frame_is_a_still(scene, browser, kept):
     open_player(browser, write_html(scene, kept / "still.html", times=[0.5]))
     assert np.abs(picture(browser, kept / "still.png") - rendered(scene, 0.5)).mean() < 0.65
@@ -331,6 +339,7 @@ BEFORE = "Page.addScriptToEvaluateOnNewDocument"
 DYING = "terminate() {} postMessage() { setTimeout(() => this.onerror(new Event('error'))); }"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "code",
     [
@@ -352,6 +361,7 @@ def test_without_workers_the_page_sorts_by_itself(scene, browser, player, kept, 
         browser.send("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
 
 
+@pytest.mark.slow
 def test_a_lost_graphics_card_comes_back(page, kept):
     before = picture(page, kept / "before.png")
     page.evaluate(
@@ -366,6 +376,7 @@ def test_a_lost_graphics_card_comes_back(page, kept):
     assert all("context" in problem.lower() for problem in page.problems)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "says"),
     [

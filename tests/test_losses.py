@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from endoprior.training import losses
-from endoprior.training.loss_kernels import supervised_losses
+from endoprior.training import losses_torch
+from endoprior.training.losses_numba import supervised_losses
 
 
 def scene(seed: int, height: int = 13, width: int = 17):
@@ -20,43 +20,26 @@ def scene(seed: int, height: int = 13, width: int = 17):
     return color, depth, target_u8, target_inverse, tissue, measured
 
 
-def definition(color, depth, target_u8, target_inverse, tissue, measured, weights):
-    inverse = losses.inverse_depth(depth)
-    return torch.stack(
-        [
-            weights[0] * losses.color_l1(color, target_u8.to(color) / 255, tissue),
-            weights[1] * losses.inverse_depth_l1(inverse, target_inverse, measured, 0),
-            weights[2] * (losses.total_variation(color) + losses.total_variation(inverse)),
-        ]
-    )
-
-
 def test_color_l1_of_a_constant_offset_is_the_offset():
     target, mask = torch.rand(5, 6, 3), torch.ones(5, 6, dtype=torch.bool)
     mask[0] = False
     color = target + 0.25
     color[0] = 9  # not tissue: must not count
-    assert losses.color_l1(color, target, mask).item() == pytest.approx(0.25, abs=1e-6)
+    assert losses_torch.color_l1(color, target, mask).item() == pytest.approx(0.25, abs=1e-6)
 
 
 def test_inverse_depth_keeps_zero_where_nothing_is_drawn():
     depth = torch.tensor([[0.0, 2.0]], requires_grad=True)
-    inverse = losses.inverse_depth(depth)
+    inverse = losses_torch.inverse_depth(depth)
     assert inverse.tolist() == [[0.0, 0.5]]
     inverse.sum().backward()
     assert depth.grad.tolist() == [[0.0, -0.25]]
 
 
-def test_depth_term_is_zero_with_too_few_pixels():
-    ones, measured = torch.ones(3, 3), torch.ones(3, 3, dtype=torch.bool)
-    assert losses.inverse_depth_l1(ones, 2 * ones, measured, min_pixels=10).item() == 0
-    assert losses.inverse_depth_l1(ones, 2 * ones, measured, min_pixels=9).item() == 1
-
-
 def test_total_variation_of_a_step():
     image = torch.zeros(4, 4)
     image[:, 2:] = 1  # one jump in each of 4 rows, 16 values
-    assert losses.total_variation(image).item() == pytest.approx(4 / 16)
+    assert losses_torch.total_variation(image).item() == pytest.approx(4 / 16)
 
 
 def test_total_variation_is_the_double_loop():
@@ -67,15 +50,15 @@ def test_total_variation_is_the_double_loop():
             for c in range(3):
                 total += abs(image[y + 1, x, c] - image[y, x, c]).item() if y < 4 else 0
                 total += abs(image[y, x + 1, c] - image[y, x, c]).item() if x < 6 else 0
-    assert losses.total_variation(image).item() == pytest.approx(total / image.numel(), rel=1e-5)
+    assert losses_torch.total_variation(image).item() == pytest.approx(total / image.numel(), rel=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_fused_terms_and_gradients_agree_with_the_definition(seed):
+def test_fused_terms_and_gradients_agree_with_the_torch_implementation(seed):
     color, depth, *rest = scene(seed)
     weights = (1.0, 0.7, 0.03)
     grads, values = [], []
-    for function in (definition, supervised_losses):
+    for function in (losses_torch.supervised_losses, supervised_losses):
         c, d = color.clone().requires_grad_(), depth.clone().requires_grad_()
         terms = function(c, d, *rest, weights)
         terms.sum().backward()
@@ -105,4 +88,4 @@ def test_fused_terms_of_a_frame_without_tissue_are_finite():
 def test_fused_terms_of_degenerate_images(shape):
     color, depth, *rest = scene(2, *shape)
     args = (color, depth, *rest, (1.0, 1.0, 1.0))
-    torch.testing.assert_close(supervised_losses(*args), definition(*args), rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(supervised_losses(*args), losses_torch.supervised_losses(*args), rtol=1e-5, atol=1e-7)

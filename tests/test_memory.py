@@ -68,7 +68,7 @@ def test_the_least_recently_used_goes_first():
 
 
 def test_a_small_cache_changes_speed_and_nothing_else(tiny_sequence, tmp_path, monkeypatch):
-    from test_train import tiny_config
+    from tiny_training import tiny_config
 
     files = []
     for size in ("1", "0"):

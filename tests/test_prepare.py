@@ -59,7 +59,12 @@ LAYOUTS = {
 }
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "layout", ["side-by-side", *(pytest.param(name, marks=SLOW) for name in ("top-bottom", "interlaced"))]
+)
 def test_a_stereo_video_becomes_a_sequence(tmp_path, phantom, layout):
     frames = [LAYOUTS[layout](*pair) for pair in zip(*cameras(phantom), strict=True)]
     video = write_video(tmp_path / "v.mp4", frames, rate=15)
@@ -220,6 +225,7 @@ def test_names_are_painted_over_and_nothing_of_the_file_is_copied(tmp_path, phan
         assert "SMITH" not in file.name and (file.is_dir() or b"SMITH" not in file.read_bytes())
 
 
+@pytest.mark.slow
 def test_frames_out_of_the_body_can_be_dropped(tmp_path, phantom):
     images = cameras(phantom)[0]
     images.insert(2, np.full_like(images[0], (90, 140, 160)))
@@ -336,6 +342,7 @@ def test_the_hidden_folder_is_the_only_thing_an_interruption_leaves(tmp_path, ph
     shutil.rmtree(tmp_path / ".out.preparing")
 
 
+@pytest.mark.slow
 def test_a_moving_camera_with_one_eye(tmp_path):
     rng = np.random.default_rng(0)
     noise = cv2.GaussianBlur(rng.random((500, 700, 3), np.float32), (0, 0), 2)

@@ -15,8 +15,10 @@ from hypothesis_profiles import examples
 from endoprior.core.config import Config, DensityConfig
 from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
-from endoprior.training import density
+from endoprior.training import density, density_numba
+from endoprior.training.densify import apply_plan
 from endoprior.training.density import DensityStats
+from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import Optimizer
 
 SEEDS = st.integers(0, 2**31 - 1)
@@ -91,9 +93,9 @@ def test_an_applied_plan_gives_the_planned_number_of_finite_gaussians(made, degr
     config = replace(config, schedule=replace(config.schedule, sh_degree=degree))
     rng = np.random.default_rng(num)
     gaussians = create_gaussians(rng.normal(size=(num, 3)), rng.random((num, 3)), scales.amax(-1).log().numpy(), config)
-    optimizer = Optimizer(gaussians, None, config, 1.0)
+    optimizer = Optimizer(gaussians, None, config, 1.0, NUMBA)
     planned = density.plan(stats, gaussians.scales, gaussians.opacities, extent, cfg)
-    new = optimizer.apply_plan(planned, stats, rng)
+    new = apply_plan(optimizer, planned, stats, rng)
     after = num + int(planned.clone.sum()) + int(planned.split.sum()) - int(planned.remove.sum())
     assert len(gaussians) == after
     assert all(len(value) == after and torch.isfinite(value).all() for value in gaussians.tensors.values())
@@ -113,14 +115,14 @@ def test_scores_stay_within_the_prior(seed, height, width, num, level, scale):
     out = RenderOutput(EMPTY, EMPTY, EMPTY, torch.tensor(means2d, dtype=torch.float32), radii)
     mask, prior = torch.tensor(rng.random((height, width)) < 0.6), torch.full((height, width), level)
     stats = DensityStats.zeros(num)
-    stats.add_score(out, prior, mask, torch.full((num,), 0.5), scale)
+    density_numba.add_score(stats, out, prior, mask, torch.full((num,), 0.5), scale)
     valid = stats.num_valid > 0
     assert not valid[radii == 0].any() and (mask.any() or not valid.any())
     inside = torch.tensor(((means2d * scale >= 0) & (means2d * scale <= [width, height])).all(-1))
     assert not valid[~inside].any()
     assert stats.score(0.0)[valid].numpy() == pytest.approx(level, abs=2e-6)
     if scale == 1.0:
-        assert torch.equal(density.valid_projection(out.means2d, radii, mask), valid)
+        assert torch.equal(density_numba.valid_projection(out.means2d, radii, mask), valid)
 
 
 @given(SEEDS, st.integers(0, 20))
@@ -131,7 +133,7 @@ def test_gradients_of_what_was_not_drawn_are_not_looked_at(seed, num):
     means2d.grad = torch.tensor(rng.normal(size=(num, 2)), dtype=torch.float32)
     means2d.grad[radii == 0] = math.nan
     stats = DensityStats.zeros(num)
-    stats.add_gradient(RenderOutput(EMPTY, EMPTY, EMPTY, means2d, radii), 40, 30)
+    density_numba.add_gradient(stats, RenderOutput(EMPTY, EMPTY, EMPTY, means2d, radii), 40, 30)
     assert torch.isfinite(stats.grad2d_ndc_sum).all() and torch.equal(stats.num_seen, radii.float())
 
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
 from endoprior.core.config import TemporalConfig
-from endoprior.training import losses, temporal
-from endoprior.training.loss_kernels import supervised_losses
-from endoprior.training.temporal_kernels import median
+from endoprior.training import losses_torch, temporal, temporal_numba, temporal_torch
+from endoprior.training.losses_numba import supervised_losses
+from endoprior.training.temporal_numba import median
 
 
 @st.composite
@@ -47,11 +47,11 @@ def test_supervised_terms_are_finite_and_those_of_the_definition(made, weights):
     assert torch.isfinite(terms).all() and (terms >= 0).all()
     assert torch.isfinite(color.grad).all() and torch.isfinite(depth.grad).all()
     c, d = (t.detach().double().requires_grad_() for t in (color, depth))
-    shown = losses.inverse_depth(d)
+    shown = losses_torch.inverse_depth(d)
     want = torch.stack([
-        weights[0] * losses.color_l1(c, target.double() / 255, mask),
-        weights[1] * losses.inverse_depth_l1(shown, inverse.double(), measured, min_pixels=1),
-        weights[2] * (losses.total_variation(c) + losses.total_variation(shown)),
+        weights[0] * losses_torch.color_l1(c, target.double() / 255, mask),
+        weights[1] * losses_torch.inverse_depth_l1(shown, inverse.double(), measured),
+        weights[2] * (losses_torch.total_variation(c) + losses_torch.total_variation(shown)),
     ])  # fmt: skip
     want.sum().backward()
     # Each row is summed in float32.
@@ -72,6 +72,12 @@ def test_a_perfect_picture_of_one_color_costs_nothing(made):
     same = torch.full(target.shape, 51, dtype=torch.uint8)
     terms = supervised_losses(color, depth, same, 1 / depth, mask, mask, (1.0, 1.0, 0.03))
     assert terms.abs().max() < 1e-6
+
+
+def with_torch(now, before, indices, pair_weights, cfg):
+    """The PyTorch implementation, given the arrays that the Numba one takes."""
+    indices, pair_weights = torch.as_tensor(indices), torch.as_tensor(pair_weights)
+    return temporal_torch.local_motion(now, before, indices, pair_weights, cfg)
 
 
 @st.composite
@@ -95,16 +101,16 @@ def test_the_temporal_term_is_finite_and_that_of_the_definition(points, k, huber
     cfg = replace(TemporalConfig(), huber_scale=huber)
     if k >= len(points):
         with pytest.raises(ValueError, match="k must be in"):
-            temporal.neighbors(points, k)
+            temporal_numba.neighbors(points, k)
         return
-    indices, distances = temporal.neighbors(points, k)
+    indices, distances = temporal_numba.neighbors(points, k)
     weights = np.random.default_rng(seed).random(len(points))
-    pair_weights = temporal.affinity(distances, indices, weights)
+    pair_weights = temporal_numba.affinity(distances, indices, weights)
     assert np.isfinite(pair_weights).all() and (pair_weights >= 1e-8).all()
     scale = np.abs(points).max()
     moved = points + np.random.default_rng(seed).normal(size=points.shape) * 0.1 * scale
     results = []
-    for function in (temporal.local_motion_loss, temporal.local_motion_definition):
+    for function in (temporal_numba.local_motion, with_torch):
         now, before = (torch.tensor(p).requires_grad_() for p in (moved, points))
         terms = function(now, before, indices, pair_weights, cfg)
         sum(terms).backward()
@@ -119,19 +125,19 @@ def test_the_temporal_term_is_finite_and_that_of_the_definition(points, k, huber
 def test_what_moves_as_one_costs_nothing(points, seed):
     """Eq. (11): a common translation has no displacement part but its floor, a rigid motion no distance part."""
     k = min(4, len(points) - 1)
-    indices, distances = temporal.neighbors(points, k)
-    pair_weights = temporal.affinity(distances, indices, np.ones(len(points)))
+    indices, distances = temporal_numba.neighbors(points, k)
+    pair_weights = temporal_numba.affinity(distances, indices, np.ones(len(points)))
     size = np.abs(points).max()
     shift = np.random.default_rng(seed).normal(size=3) * size
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     before = torch.tensor(points)
-    displacement, distance = temporal.local_motion_loss(
+    displacement, distance = temporal_numba.local_motion(
         before + torch.tensor(shift), before, indices, pair_weights, TemporalConfig()
     )
     assert displacement == pytest.approx(1e-4, abs=1e-6 + 1e-9 * size)
     turned = torch.tensor(points @ turn.T + shift)
     assert distance < 1e-9 * (1 + size)
-    assert temporal.local_motion_loss(turned, before, indices, pair_weights, TemporalConfig())[1] < 1e-9 * (1 + size)
+    assert temporal_numba.local_motion(turned, before, indices, pair_weights, TemporalConfig())[1] < 1e-9 * (1 + size)
 
 
 @given(SEEDS, st.integers(1, 400), st.integers(1, 8), st.sampled_from(["random", "equal", "two values", "sorted"]))

@@ -18,7 +18,8 @@ from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.data.sequence import FrameSequence
 from endoprior.evaluation import metrics
-from endoprior.evaluation.scoring import EXACT, Evaluation, evaluate
+from endoprior.evaluation.context import EXACT, Evaluation
+from endoprior.evaluation.scoring import evaluate
 from endoprior.training.trainer import Trainer
 
 IMAGE_SCORES = (metrics.psnr, metrics.psnr_tissue, metrics.ssim, metrics.ssim_tissue)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
 from endoprior.core.config import InitConfig, PriorConfig, SalienceConfig
+from endoprior.core.geometry import FARTHEST_MM
 from endoprior.initialization.sampling import eroded_mask, pixel_probability, sampling_distribution
 from endoprior.priors import edge_magnitude, joint_texture_prior, salience, specular_likelihood
 
@@ -105,6 +106,7 @@ def test_pixels_without_tissue_or_usable_depth_are_never_drawn(frame, sampler, a
     cfg = InitConfig(sampler=sampler, adaptive_specular=adaptive, salience_on_eroded_mask=on_eroded)
     weights = pixel_probability(frame, cfg, PriorConfig())
     assert np.isfinite(weights).all() and (weights >= 0).all()
-    assert (weights[~frame.tissue_mask | ~frame.depth_valid | (frame.depth <= 0.2) | (frame.depth >= 1e9)] == 0).all()
+    too_near_or_far = (frame.depth <= 0.2) | (frame.depth >= FARTHEST_MM)
+    assert (weights[~frame.tissue_mask | ~frame.depth_valid | too_near_or_far] == 0).all()
     darker = replace(frame, rgb_u8=np.zeros_like(frame.rgb_u8))
     assert (pixel_probability(darker, cfg, PriorConfig()) > 0).any() >= (weights > 0).any()

@@ -96,7 +96,7 @@ def test_depth_that_no_gaussian_can_be_drawn_at_is_refused_in_one_line(depth, sa
     """Meters that pass for millimeters lie in front of the near plane: training would never show anything."""
     camera, z = Camera(30, 20, 50.0, 50.0, 15.0, 10.0, np.eye(4)), np.full((20, 30), depth, np.float32)
     frame = Frame(0, 0.0, camera, np.full((20, 30, 3), 90, np.uint8), np.ones((20, 30), bool), z, z > 0)
-    with pytest.raises(InputError, match=r"between 0\.2 and 1e\+09 mm .*, got 0\. Fix: Check masks, depth"):
+    with pytest.raises(InputError, match=r"between 0\.2 and 1e\+06 mm .*, got 0\. Fix: Check masks, depth"):
         initial_points([frame] * 3, InitConfig(sampler=sampler, budget=100))
     assert not caplog.records  # a refusal is one line, without a warning before it
 

@@ -15,8 +15,7 @@ from subprocess import CalledProcessError
 import numpy as np
 import pytest
 import torch
-from render_scenes import NAMES, camera, draw, one, pick, poison, splats
-from test_render_parity import compare
+from render_scenes import NAMES, camera, compare, draw, one, pick, poison, splats
 
 from endoprior import render
 from endoprior.core.checks import InputError

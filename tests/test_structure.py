@@ -1,13 +1,15 @@
 """The architecture, checked: imports point one way, files stay short, heavy libraries have one owner."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-SRC = Path(__file__).parents[1] / "src" / "endoprior"
+ROOT = Path(__file__).parents[1]
+SRC = ROOT / "src" / "endoprior"
 FILES = sorted(SRC.rglob("*.py"))
 
 FLOORS = [
@@ -23,13 +25,25 @@ FLOORS = [
 """Packages, lowest first. A package imports from floors below its own, never from its own or from above."""
 FLOOR_OF = {name: level for level, names in enumerate(FLOORS) for name in names}
 ROOT_FILES = {"__init__.py", "__main__.py", "py.typed"}
+CHECKED_PAGES = ("docs/development.md",)
+"""Pages whose lines are short. Add a page when it complies."""
+PRIVATE_WORDS = ("house", "storey")
+"""Words of this project's past that the source no longer uses. Add a word when its last use is gone."""
+MAY_IMPORT_TESTS = ("test_definitions.py", "test_device_loop.py", "test_hexplane_definition.py", "test_recorded.py")
+"""Test files that are about to go or to be rewritten."""
 NO_TORCH = ("priors", "data", "evaluation/metrics/stability.py", "phantom", "core", "footage", "check")
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    """A file's syntax tree."""
+    return ast.parse(path.read_text())
 
 
 @cache
 def nodes(path: Path) -> list[ast.AST]:
     """Every node of a file's syntax tree."""
-    return list(ast.walk(ast.parse(path.read_text())))
+    return list(ast.walk(tree(path)))
 
 
 def imports(path: Path) -> Iterator[tuple[str, ...]]:
@@ -85,12 +99,12 @@ def test_files_are_short_and_say_what_they_are():
     for path in FILES:
         text = path.read_text()
         assert len(text.splitlines()) <= 400, path
-        assert not text.strip() or ast.get_docstring(ast.parse(text)), path
+        assert not text.strip() or ast.get_docstring(tree(path)), path
 
 
 def test_public_functions_and_classes_have_docstrings():
     for path in FILES:
-        for node in ast.parse(path.read_text()).body:
+        for node in tree(path).body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                 if any("njit" in ast.unparse(decorator) for decorator in node.decorator_list):
                     continue  # kernels say their contract in a comment on the first line
@@ -122,6 +136,36 @@ def test_no_pickle_and_no_eval_anywhere():
                 assert not names & {"pickle", "dill", "joblib"}, path
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 assert node.func.id not in ("eval", "exec"), path
+
+
+def test_no_test_file_imports_another():
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        for node in nodes(path):
+            module = node.module if isinstance(node, ast.ImportFrom) else None
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [module or ""]
+            for name in names:
+                message = f"{path} imports {name}: move what both need into a helper module"
+                assert path.name in MAY_IMPORT_TESTS or not name.startswith("test_"), message
+
+
+def test_lines_of_pages_are_at_most_100_characters_long():
+    """Tables, code and the targets of links do not count."""
+    for page in CHECKED_PAGES:
+        is_code = False
+        for number, line in enumerate((ROOT / page).read_text().splitlines(), 1):
+            is_code ^= line.startswith("```")
+            if not is_code and not line.startswith(("|", "    ", "```")):
+                length = len(re.sub(r"\]\([^)]*\)|https?://\S+", "", line))
+                assert length <= 100, f"{page}:{number}: expected at most 100 characters, got {length}"
+
+
+def test_the_source_has_no_private_vocabulary():
+    words = "|".join(PRIVATE_WORDS).replace(" ", "[ _]")
+    pattern = re.compile(rf"(?<![a-z])(?:{words})(?:s|ed|ing)?(?![a-z])", re.IGNORECASE)
+    for path in sorted(SRC.rglob("*")):
+        if path.suffix in (".py", ".js", ".html", ".css"):
+            for number, line in enumerate(path.read_text().splitlines(), 1):
+                assert not (word := pattern.search(line)), f"{path}:{number}: say {word[0]!r} in the field's words"
 
 
 def test_help_and_import_are_light():

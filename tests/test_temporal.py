@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from endoprior.core.config import TemporalConfig
-from endoprior.training import temporal
+from endoprior.training import temporal, temporal_numba, temporal_torch
 
 CFG = TemporalConfig()
 
@@ -17,10 +17,16 @@ def points(num=40, seed=0):
     return np.random.default_rng(seed).uniform(-10, 10, (num, 3))
 
 
+def with_torch(now, before, indices, pair_weights, cfg):
+    """The PyTorch implementation, given the arrays that the Numba one takes."""
+    indices, pair_weights = torch.as_tensor(indices), torch.as_tensor(pair_weights)
+    return temporal_torch.local_motion(now, before, indices, pair_weights, cfg)
+
+
 def loss(now, before, weights=None, cfg=CFG):
-    indices, distances = temporal.neighbors(before.detach().numpy(), cfg.num_neighbors)
+    indices, distances = temporal_numba.neighbors(before.detach().numpy(), cfg.num_neighbors)
     weights = np.ones(len(before)) if weights is None else weights
-    return temporal.local_motion_loss(now, before, indices, temporal.affinity(distances, indices, weights), cfg)
+    return temporal_numba.local_motion(now, before, indices, temporal_numba.affinity(distances, indices, weights), cfg)
 
 
 def test_motion_weight_is_half_at_the_threshold():
@@ -66,7 +72,7 @@ def test_choose_needs_enough_points():
 
 def test_neighbors_agree_with_a_full_search():
     p = points(60)
-    indices, distances = temporal.neighbors(p, 5)
+    indices, distances = temporal_numba.neighbors(p, 5)
     table = np.linalg.norm(p[:, None] - p[None], axis=-1)
     np.fill_diagonal(table, np.inf)
     assert indices.tolist() == table.argsort(1)[:, :5].tolist()
@@ -74,15 +80,15 @@ def test_neighbors_agree_with_a_full_search():
 
 
 def test_neighbors_of_coincident_points_leave_out_oneself():
-    indices, _ = temporal.neighbors(np.zeros((12, 3)), 8)
+    indices, _ = temporal_numba.neighbors(np.zeros((12, 3)), 8)
     assert indices.shape == (12, 8)
     assert not (indices == np.arange(12)[:, None]).any()
 
 
 def test_affinity_is_equation_10():
     p, weights = points(30), np.random.default_rng(1).uniform(0.1, 1, 30)
-    indices, distances = temporal.neighbors(p, 4)
-    got = temporal.affinity(distances, indices, weights)
+    indices, distances = temporal_numba.neighbors(p, 4)
+    got = temporal_numba.affinity(distances, indices, weights)
     sigma = np.median(distances)
     for i in range(30):
         for k in range(4):
@@ -94,9 +100,9 @@ def test_affinity_is_equation_10():
 def test_loss_is_the_literal_double_loop():
     before, now = torch.from_numpy(points(20, 1)), torch.from_numpy(points(20, 2))
     weights = np.random.default_rng(3).uniform(0.2, 1, 20)
-    indices, distances = temporal.neighbors(before.numpy(), 8)
-    pair = temporal.affinity(distances, indices, weights)
-    disp, dist = temporal.local_motion_loss(now, before, indices, pair, CFG)
+    indices, distances = temporal_numba.neighbors(before.numpy(), 8)
+    pair = temporal_numba.affinity(distances, indices, weights)
+    disp, dist = temporal_numba.local_motion(now, before, indices, pair, CFG)
     top_disp = top_dist = total = 0.0
     for i in range(20):
         for k, j in enumerate(indices[i]):
@@ -130,18 +136,18 @@ def test_a_rigid_motion_costs_no_distance():
 
 def test_released_huber_is_the_literal_one_over_delta():
     x = torch.tensor([0.0, 0.003, 0.01, 0.5])
-    literal, scaled = temporal.huber(x, 0.01, "literal"), temporal.huber(x, 0.01, "released")
+    literal, scaled = temporal_torch.huber(x, 0.01, "literal"), temporal_torch.huber(x, 0.01, "released")
     assert literal.tolist() == pytest.approx([0, 4.5e-6, 5e-5, 0.01 * 0.495])
     torch.testing.assert_close(scaled, literal / 0.01)
 
 
 def test_gradient_against_central_differences():
     now, before = (torch.from_numpy(points(15, seed)).requires_grad_() for seed in (5, 6))
-    indices, distances = temporal.neighbors(before.detach().numpy(), 8)
-    pair = temporal.affinity(distances, indices, np.ones(15))
+    indices, distances = temporal_numba.neighbors(before.detach().numpy(), 8)
+    pair = temporal_numba.affinity(distances, indices, np.ones(15))
 
     def terms(a, b):
-        return temporal.local_motion_loss(a, b, indices, pair, replace(CFG, huber_delta=2.0))
+        return temporal_numba.local_motion(a, b, indices, pair, replace(CFG, huber_delta=2.0))
 
     assert torch.autograd.gradcheck(terms, (now, before), eps=1e-6, atol=1e-6)
 
@@ -158,8 +164,8 @@ def motion(num=600, seed=0, dtype=torch.float32):
     rng = np.random.default_rng(seed)
     before = torch.from_numpy(rng.uniform([-10, -10, 70], [10, 10, 90], (num, 3))).to(dtype)
     now = before + torch.from_numpy(rng.normal(0.5, 0.05, (num, 3))).to(dtype)
-    indices, distances = temporal.neighbors(before.numpy(), 8)
-    return now, before, indices, temporal.affinity(distances, indices, rng.uniform(0.1, 1, num))
+    indices, distances = temporal_numba.neighbors(before.numpy(), 8)
+    return now, before, indices, temporal_numba.affinity(distances, indices, rng.uniform(0.1, 1, num))
 
 
 def loss_and_gradients(function, now, before, indices, pair, cfg, upstream=(2.0, -3.0)):
@@ -172,11 +178,11 @@ def loss_and_gradients(function, now, before, indices, pair, cfg, upstream=(2.0,
 # In float32 the change of a length is the difference of two roots near 1 mm: 1e-7 mm of error in changes of 0.01 mm.
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float32, 1e-4), (torch.float64, 1e-11)])
 @pytest.mark.parametrize("scale", ["literal", "released"])
-def test_fused_loss_and_gradient_are_those_of_the_definition(dtype, rtol, scale):
+def test_fused_loss_and_gradient_are_those_of_the_torch_implementation(dtype, rtol, scale):
     cfg = replace(CFG, huber_scale=scale)
     now, before, indices, pair = motion(dtype=dtype)
-    got = loss_and_gradients(temporal.local_motion_loss, now, before, indices, pair, cfg)
-    want = loss_and_gradients(temporal.local_motion_definition, now.double(), before.double(), indices, pair, cfg)
+    got = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, cfg)
+    want = loss_and_gradients(with_torch, now.double(), before.double(), indices, pair, cfg)
     for g, w in zip(got[:2], want[:2], strict=True):
         assert g.dtype == dtype and g.item() == pytest.approx(w.item(), rel=min(rtol, 1e-5))
     for g, w in zip(got[2:], want[2:], strict=True):
@@ -187,25 +193,25 @@ def test_fused_loss_and_gradient_are_those_of_the_definition(dtype, rtol, scale)
 def test_a_point_that_is_everybodys_neighbor_gets_all_their_pulls():
     now, before, indices, pair = motion(dtype=torch.float64)
     indices[1:, 3] = 0
-    got = loss_and_gradients(temporal.local_motion_loss, now, before, indices, pair, CFG)
-    want = loss_and_gradients(temporal.local_motion_definition, now, before, indices, pair, CFG)
+    got = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, CFG)
+    want = loss_and_gradients(with_torch, now, before, indices, pair, CFG)
     for g, w in zip(got, want, strict=True):
         torch.testing.assert_close(g, w, rtol=1e-10, atol=1e-14)
 
 
 def test_only_the_end_that_wants_a_gradient_gets_one():
     now, before, indices, pair = motion()
-    both = loss_and_gradients(temporal.local_motion_loss, now, before, indices, pair, CFG, (1.0, 1.0))
+    both = loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, CFG, (1.0, 1.0))
     for wanted in (0, 1):
         ends = [now.clone(), before.clone()]
         ends[wanted].requires_grad_()
-        sum(temporal.local_motion_loss(*ends, indices, pair, CFG)).backward()
+        sum(temporal_numba.local_motion(*ends, indices, pair, CFG)).backward()
         assert torch.equal(ends[wanted].grad, both[2 + wanted]) and ends[1 - wanted].grad is None
-    assert not temporal.local_motion_loss(now, before, indices, pair, CFG)[0].requires_grad
+    assert not temporal_numba.local_motion(now, before, indices, pair, CFG)[0].requires_grad
 
 
 def test_pulls_within_the_cloud_cancel():
-    _, _, on_now, on_before = loss_and_gradients(temporal.local_motion_loss, *motion(dtype=torch.float64), CFG)
+    _, _, on_now, on_before = loss_and_gradients(temporal_numba.local_motion, *motion(dtype=torch.float64), CFG)
     for gradient in (on_now, on_before):  # the loss does not change when one end moves as a whole
         assert gradient.sum(0).abs().max() < 1e-12 < gradient.abs().max()
 
@@ -219,7 +225,7 @@ def test_the_number_of_threads_changes_no_bit():
             results.append(
                 (
                     torch.from_numpy(pair),
-                    *loss_and_gradients(temporal.local_motion_loss, now, before, indices, pair, CFG),
+                    *loss_and_gradients(temporal_numba.local_motion, now, before, indices, pair, CFG),
                 )
             )
     finally:
@@ -240,20 +246,20 @@ def test_median_is_numpys(num, kind):
         # The rows that are looked at first tell nothing of the others.
         "skewed rows": lambda: rng.gamma(3, size=(num, 8)) + 100 * (np.arange(num) % max(num // 512, 1) == 0)[:, None],
     }[kind]()
-    assert temporal.median(values) == np.median(values)
+    assert temporal_numba.median(values) == np.median(values)
 
 
 def test_pairs_without_weight_keep_a_little():
     p = points(30)
-    indices, distances = temporal.neighbors(p, 4)
-    assert (temporal.affinity(distances, indices, np.zeros(30)) == temporal.SUM_EPS).all()
+    indices, distances = temporal_numba.neighbors(p, 4)
+    assert (temporal_numba.affinity(distances, indices, np.zeros(30)) == temporal_torch.SUM_EPS).all()
 
 
 def test_a_point_at_nan_shows():
     now, before, indices, pair = motion()
     now[7] = torch.nan
     displacement, distance, on_now, on_before = loss_and_gradients(
-        temporal.local_motion_loss, now, before, indices, pair, CFG
+        temporal_numba.local_motion, now, before, indices, pair, CFG
     )
     assert displacement.isnan() and distance.isnan() and on_now[7].isnan().all() and on_before[7].isnan().all()
 
@@ -261,10 +267,10 @@ def test_a_point_at_nan_shows():
 def test_what_does_not_fit_together_is_an_error():
     now, before, indices, pair = motion()
     with pytest.raises(ValueError, match="before must have shape"):
-        temporal.local_motion_loss(now, before[:-1], indices, pair, CFG)
+        temporal_numba.local_motion(now, before[:-1], indices, pair, CFG)
     with pytest.raises(ValueError, match="before must have the type"):
-        temporal.local_motion_loss(now, before.double(), indices, pair, CFG)
+        temporal_numba.local_motion(now, before.double(), indices, pair, CFG)
     for wrong in (-1, len(now)):
         indices[3, 2] = wrong
         with pytest.raises(ValueError, match="indices must be in"):
-            temporal.local_motion_loss(now, before, indices, pair, CFG)
+            temporal_numba.local_motion(now, before, indices, pair, CFG)

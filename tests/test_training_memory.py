@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_train import tiny_config
+from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.core.presets import preset

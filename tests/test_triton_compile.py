@@ -27,6 +27,7 @@ backend, *modules = (
     importlib.import_module(f"endoprior.render.{name}")
     for name in ("triton", "triton_bins", "triton_project", "triton_composite")
 )
+pytestmark = pytest.mark.slow
 KERNELS = {
     *("project_forward", "count_pairs", "write_pairs", "index_pairs", "composite_forward"),
     *("composite_backward", "gather", "project_backward"),

@@ -22,6 +22,7 @@ from endoprior.view.server import Viewer
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.view.viewport import bounded_aspect, endoscope_viewport
 
+pytestmark = pytest.mark.slow
 PICTURES = pictures_folder("view")
 WIDTH, HEIGHT = 1100, 760
 FRAME = 3

@@ -12,7 +12,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 
 from conftest import write_tiny_sequence  # noqa: E402 - the tests' folder is not a package
-from test_train import KINDS, losses_of, tiny_config  # noqa: E402
+from tiny_training import KINDS, losses_of, tiny_config  # noqa: E402
 
 with tempfile.TemporaryDirectory() as folder:
     data = write_tiny_sequence(Path(folder) / "tiny")

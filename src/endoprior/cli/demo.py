@@ -37,7 +37,7 @@ def run(argv: list[str]) -> None:
     from ..model.scene import load_scene
     from ..phantom import PhantomConfig, write_phantom
     from ..runs.folder import prepare_run_folder
-    from ..visualization.report import write_report
+    from ..runs.report import write_report
     from .render import Render, render
     from .train import train_and_evaluate
 

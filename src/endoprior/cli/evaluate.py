@@ -25,17 +25,17 @@ class Eval:
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder."""
     data: Path | None = None
-    """Sequence folder; the one the run was trained on if not given."""
+    """Sequence folder; default: the one the run was trained on."""
     split: Literal["test", "train", "video"] = "test"
     """Frames to score."""
     out: Path | None = None
     """Folder for the two files."""
     networks: bool = True
-    """Also score with RAFT and LPIPS where their weights can be had."""
+    """Also compute the scores that need a network (RAFT, LPIPS), where their weights are found."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     device: Wanted = "auto"
-    """Where to draw; auto takes CUDA only where all of it works (`endoprior doctor`)."""
+    """Where to render; `auto` uses CUDA only if everything it needs works (see `endoprior doctor`)."""
 
 
 def run(argv: list[str]) -> None:
@@ -45,7 +45,9 @@ def run(argv: list[str]) -> None:
     from .output_paths import require_writable_folder
 
     if args.weights_dir and not args.weights_dir.is_dir():
-        raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
+        raise InputError(
+            f"{args.weights_dir}: expected a folder of network weights; got none. Fix: correct --weights-dir."
+        )
     scene = load_scene(args.run)
     require_writable_folder(
         "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
@@ -66,9 +68,10 @@ def evaluate_run(
 ) -> None:
     """Score `scene` on the sequence folder `data`, write the two files into `out`, print a table.
 
-    Depth is scored against what was measured, whatever the run's preset took for measured in training.
+    Depth is scored against measured depth, even where the run's preset trained on filled-in depth.
     """
     from ..data import load_sequence
+    from ..evaluation.registry import all_scores
     from ..evaluation.scoring import evaluate, scored_data
 
     sequence = load_sequence(data, scored_data(scene.config.data))
@@ -77,23 +80,24 @@ def evaluate_run(
     result.save(out)
     say(f"\nscores on the {split} split ({len(sequence.indices(split))} frames)")
     for name, value in result.scores.items():
-        say(f"  {name:<28}{value:.4g}" if isinstance(value, float) else f"  {name:<28}{value}")
+        say(f"  {name:<28}{all_scores()[name].text(value)}")
     for name, reason in result.skipped.items():
         say(f"  {name:<28}skipped: {reason}")
-    if bad := result.badly_explained():
+    if outliers := result.outlier_frames():
+        frames = ", ".join(map(str, outliers))
         say(
-            f"note: frames {', '.join(map(str, bad))} lie more than 3 dB below the median; `endoprior render` shows why"
+            f"note: tissue PSNR of frames {frames} is more than 3 dB below the median; see them with `endoprior render`"
         )
     if sequence.depth_is_relative:
-        say("note: the sequence's depth is relative: scores in mm tell runs on it apart, they are not mm")
+        say("note: the sequence's depth is relative: scores in mm compare runs on it, but are not millimeters")
     say(f"{out / 'metrics.json'}")
 
 
 def sequence_of_run(run_folder: Path) -> Path:
-    """The sequence folder a run was trained on, by its config.json.
+    """The sequence folder a run was trained on, from its config.json.
 
     Raises:
-        InputError: config.json is missing or says nothing, or the folder has gone.
+        InputError: config.json is missing or does not name the folder, or the folder is gone.
     """
     from ..data.files import read_json
     from ..data.reading import kind_of

@@ -21,7 +21,7 @@ class Export(ExportOptions):
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder, or a scene.safetensors."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
-    """File, if it ends in the format's suffix and there is one moment to write; else a new folder."""
+    """File, if it ends in the format's suffix and there is one time step to write; else a new folder."""
 
 
 def run(argv: list[str]) -> None:
@@ -37,4 +37,4 @@ def run(argv: list[str]) -> None:
     for path in written:
         say(f"{path}")
     if scene.lengths_are_relative:
-        say("note: the scale of this scene was assumed: its mm are not mm")
+        say("note: the scale of this scene is assumed: its lengths are not millimeters")

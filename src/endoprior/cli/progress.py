@@ -70,7 +70,7 @@ class _PlainLines:
         self.done_before: int | None = None
 
     def __call__(self, report: StepReport, trainer: Trainer) -> None:
-        done, total = iterations_done(trainer)
+        done, total = trainer.progress()
         if self.done_before is None:
             self.done_before = done - 1
         now = clock.monotonic()
@@ -102,7 +102,7 @@ def _bar() -> Iterator:
         task = progress.add_task("starting", total=None, rate="", facts="")
 
         def callback(report: StepReport, trainer: Trainer) -> None:
-            done, total = iterations_done(trainer)
+            done, total = trainer.progress()
             progress.update(
                 task,
                 completed=done,
@@ -113,12 +113,3 @@ def _bar() -> Iterator:
             )
 
         yield callback
-
-
-def iterations_done(trainer: Trainer) -> tuple[int, int]:
-    """Number of iterations done, and their total, over both stages."""
-    from ..training.state import Stage
-
-    coarse, fine = trainer.stage_length(Stage.COARSE), trainer.stage_length(Stage.FINE)
-    before = coarse if trainer.state.stage is Stage.FINE else 0
-    return before + trainer.state.iteration, coarse + fine

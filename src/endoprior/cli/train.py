@@ -100,20 +100,11 @@ def train_and_evaluate(
         resume, checkpoint_seconds: as in `runs.training_run.train`.
     """
     from ..data import load_sequence
-    from ..runs import kernel_cache
-    from ..runs.folder import refuse_unusable_folder
-    from ..runs.training_run import train
-    from ..training.memory_check import refuse_too_large
+    from ..runs.training_run import TrainingRun
     from ..training.trainer import device_for
     from .evaluate import evaluate_run
 
-    sequence = load_sequence(data, cfg.data)
-    refuse_unusable_folder(out, resume=resume)
-    refuse_too_large(sequence, cfg)
-    kernel_cache.fill(cfg, say)
-    say(f"{data}: {len(sequence)} frames; backend {cfg.render.backend}")
-    for remark in sequence.validate():
-        say(f"note: {remark}")
+    training = TrainingRun(load_sequence(data, cfg.data), cfg, out, resume=resume, say=say)
     began = clock.perf_counter()
     try:
         with training_progress() as show_progress, live_view(view_port) as show_scene:
@@ -122,12 +113,12 @@ def train_and_evaluate(
                 show_progress(report, trainer)
                 show_scene(report, trainer)
 
-            scene = train(sequence, cfg, out, resume=resume, checkpoint_seconds=checkpoint_seconds, on_step=on_step)
+            scene = training.complete(on_step, checkpoint_seconds=checkpoint_seconds)
     except KeyboardInterrupt:
         say(f"Stopped; the state is saved in {out}. To resume, run the same command with --resume.")
         raise
     seconds = clock.perf_counter() - began
-    del sequence  # frees its cached frames; scoring loads its own
+    del training  # frees its cached frames; scoring loads its own
     done = _logged_seconds(out / "log.jsonl")
     speed = {"train_seconds": seconds, "iterations_per_second": done}
     scene = scene.to(device_for(cfg.render.backend))  # score on the training device

@@ -114,7 +114,7 @@ def open_viewable(path: Path, data: Path | None, device: Wanted = "cpu") -> tupl
 
     scene = load_scene(folder)
     originals = _originals(scene, folder, data)
-    return ViewableScene(on_device(scene, device, half_planes=True), str(folder), originals), folder / "view"
+    return ViewableScene(on_device(scene, device, fp16_planes=True), str(folder), originals), folder / "view"
 
 
 def _originals(scene: Scene, folder: Path, data: Path | None) -> FrameSequence | None:

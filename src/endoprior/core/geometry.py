@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from .types import Camera
 
+FARTHEST_MM = 1e6
+"""Largest coordinate or depth that is accepted: a kilometer. Beyond it float32 does not resolve 0.1 mm."""
+
 
 def pixel_centers(width: int, height: int) -> NDArray[np.float32]:
     """(H, W, 2) coordinates (x, y) of the pixel centers, px."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.config import DataConfig
+from ..core.geometry import FARTHEST_MM
 from ..core.types import Camera, Frame
 from .depth import clean_depth
 from .reading import complaint
@@ -20,9 +21,7 @@ Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]]
 """(H, W, 3) color 0..255, (H, W) True on usable tissue, (H, W) depth in mm with 0 where it is missing."""
 
 LEAST_FOCAL_PX, MOST_PX = 1e-2, 1e6
-"""Of a lens."""
-FARTHEST_MM = 1e6
-"""Of a camera: a kilometer."""
+"""Range of focal lengths; the principal point, too, lies within the upper one."""
 
 
 def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1) -> range:

@@ -18,6 +18,7 @@ from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import read_values
 from .files import list_files, read_table
+from .formats import Format
 from .images import read_color
 from .omnidirectional import Omnidirectional
 from .poses import demand_rotations, world_to_camera
@@ -162,3 +163,6 @@ def _number(file: Path) -> int:
     if not digits:
         raise complaint(file, "a name that starts with the frame's number", file.name, "Rename or remove it.")
     return int(digits[0])
+
+
+FORMAT = Format(is_c3vd, load_c3vd)

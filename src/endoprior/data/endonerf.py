@@ -16,6 +16,7 @@ from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .description import check_frames, intrinsics_of, read_description
 from .files import demand_count, list_files, unequal_names
+from .formats import Format
 from .images import read_color, read_depth, read_tool_mask
 from .numpy_files import read_numpy
 from .poses import demand_rotations, world_to_camera
@@ -136,3 +137,6 @@ def _cameras(
         )
     flip = np.array([1.0, 1.0, 1.0] if pose_axes == "opencv" else [1.0, -1.0, -1.0])
     return [Camera(width, height, *intrinsics, world_to_camera(pose[:, :3] * flip, pose[:, 3])) for pose in poses]
+
+
+FORMAT = Format(is_endonerf, load_endonerf)

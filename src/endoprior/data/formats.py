@@ -1,40 +1,43 @@
-"""The layouts that can be opened, in the order in which they are tried; docs/datasets.md describes each."""
+"""Every folder layout that can be opened. To add one, write a module with a `FORMAT` here and name it in `FORMATS`.
+
+docs/datasets.md describes each layout, and shows how to add one.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 from ..core.config import DataConfig
-from .c3vd import is_c3vd, load_c3vd
-from .endonerf import is_endonerf, load_endonerf
-from .hamlyn import is_hamlyn, load_hamlyn
-from .plain import is_plain, load_plain
-from .scared import is_scared, load_scared
-from .sequence import FrameSequence
-from .stereomis import is_stereomis, load_stereomis
-from .stir import is_stir, load_stir
 
-
-class Format(NamedTuple):
-    """One layout of a dataset folder."""
-
-    name: str
-    """Its name in `DataConfig.format`."""
-    recognizes: Callable[[Path], bool]
-    """Whether a folder looks like it, by the names in it alone."""
-    load: Callable[[Path, DataConfig], FrameSequence]
-    """Opens the folder, or raises InputError."""
-
+if TYPE_CHECKING:
+    from .sequence import FrameSequence
 
 FORMATS = (
-    Format("scared", is_scared, load_scared),
-    Format("c3vd", is_c3vd, load_c3vd),
-    Format("stir", is_stir, load_stir),
-    # StereoMIS and Hamlyn before EndoNeRF, whose layout they extend; plain folders last, they promise least.
-    Format("stereomis", is_stereomis, load_stereomis),
-    Format("hamlyn", is_hamlyn, load_hamlyn),
-    Format("endonerf", is_endonerf, load_endonerf),
-    Format("plain", is_plain, load_plain),
+    "scared",
+    "c3vd",
+    "stir",
+    "stereomis",  # before EndoNeRF, whose layout it extends
+    "hamlyn",  # likewise
+    "endonerf",
+    "plain",  # last: it recognizes every folder with images
 )
+"""Modules of this package by the name that `DataConfig.format` takes, in the order in which `auto` tries them."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """One folder layout."""
+
+    recognizes: Callable[[Path], bool]
+    """Whether a folder has this layout, by the names in it alone."""
+    load: Callable[[Path, DataConfig], FrameSequence]
+    """Opens a folder; raises InputError where it cannot be used."""
+
+
+def load_format(name: str) -> Format:
+    """The layout of that name in `FORMATS`; imports its module."""
+    return import_module(f".{name}", __package__).FORMAT

@@ -15,6 +15,7 @@ from .assemble import Pixels, assemble, kept_frames
 from .depth_files import read_depth_file
 from .endonerf import read_poses_bounds
 from .files import IMAGE_SUFFIXES, demand_count, list_files, read_table, unequal_names
+from .formats import Format
 from .images import read_color, read_tool_mask
 from .poses import identity_poses
 from .reading import complaint
@@ -124,3 +125,6 @@ def _load_rectified(path: Path, cfg: DataConfig) -> FrameSequence:
         mask_folder="image01",
         sources={"depth": "stereo matching"},
     )
+
+
+FORMAT = Format(is_hamlyn, load_hamlyn)

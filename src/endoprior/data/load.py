@@ -1,4 +1,4 @@
-"""Opens a folder of any known layout."""
+"""Open a folder of any known layout."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 from ..core.config import DataConfig
 from .endonerf import load_endonerf
 from .files import entries
-from .formats import FORMATS, Format
+from .formats import FORMATS, load_format
 from .reading import complaint, kind_of
 from .sequence import FrameSequence
 
@@ -23,7 +23,7 @@ def load_sequence(
         cfg: its layout, which frames and masks are read, and how depth is cleaned.
         pose_axes: meaning of the stored poses of the EndoNeRF layout, see `load_endonerf`.
     Raises:
-        InputError: the folder is not a sequence; one line with file, expectation, finding and next step.
+        InputError: the folder is not a sequence; the message names the file, what is expected, what is there and a fix.
         ValueError: unknown `pose_axes`, or `opengl` for another layout.
     """
     if pose_axes not in ("opencv", "opengl"):
@@ -33,24 +33,29 @@ def load_sequence(
     if (kind := kind_of(path)) != "a folder":
         got = "no such folder" if kind == "nothing" else kind
         raise complaint(path, "a sequence folder", got, "Pass the folder that holds images/, masks/ and depth/.")
-    chosen = find_format(path, cfg)
+    name = find_format(path, cfg)
     if pose_axes == "opencv":
-        return chosen.load(path, cfg)
-    if chosen.name != "endonerf":
-        raise ValueError(f"pose_axes must be opencv for the {chosen.name} layout, which fixes it; got {pose_axes!r}")
+        return load_format(name).load(path, cfg)
+    if name != "endonerf":
+        raise ValueError(f"pose_axes must be opencv for the {name} layout, which defines it; got {pose_axes!r}")
     return load_endonerf(path, cfg, pose_axes=pose_axes)
 
 
-def find_format(path: Path, cfg: DataConfig) -> Format:
-    """The layout that `cfg.format` names, or the first that recognizes the folder.
+def find_format(path: Path, cfg: DataConfig) -> str:
+    """The name in `FORMATS` that `cfg.format` gives; for `auto` the first layout that recognizes the folder.
 
     Raises:
-        InputError: none does.
+        InputError: there is no layout of that name, or none recognizes the folder.
     """
-    for candidate in FORMATS:
-        if cfg.format == candidate.name or (cfg.format == "auto" and candidate.recognizes(path)):
-            return candidate
+    if cfg.format in FORMATS:
+        return cfg.format
+    if cfg.format != "auto":
+        choices = f"auto, {', '.join(FORMATS)}"
+        raise complaint("data.format", f"one of {choices}", repr(cfg.format), "Fix: see docs/datasets.md.")
+    for name in FORMATS:
+        if load_format(name).recognizes(path):
+            return name
     names = sorted(entry.name + "/" * entry.is_dir() for entry in entries(path) if not entry.name.startswith("."))
     got = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-    known = ", ".join(candidate.name for candidate in FORMATS)
-    raise complaint(path, f"one of the layouts {known}", got or "an empty folder", "See docs/datasets.md.")
+    known = ", ".join(FORMATS)
+    raise complaint(path, f"one of the layouts {known}", got or "an empty folder", "Fix: see docs/datasets.md.")

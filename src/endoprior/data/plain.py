@@ -12,6 +12,7 @@ from .assemble import Pixels, assemble, kept_frames
 from .depth_files import DEPTH_SUFFIXES, read_depth_file
 from .description import check_frames, intrinsics_of, read_description
 from .files import IMAGE_SUFFIXES, demand_count, list_files, unequal_names
+from .formats import Format
 from .images import read_color, read_tool_mask
 from .poses import identity_poses
 from .sequence import FrameSequence
@@ -80,3 +81,6 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
         depth_is_relative=described.get("depth_relative", not unit),
         sources=described.get("sources"),
     )
+
+
+FORMAT = Format(is_plain, load_plain)

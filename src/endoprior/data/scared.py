@@ -20,6 +20,7 @@ from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import read_values
 from .files import list_files, read_json, read_matrix
+from .formats import Format
 from .images import read_color
 from .poses import demand_rotations
 from .reading import complaint
@@ -170,3 +171,6 @@ def _remarks(path: Path, number: int | None, cfg: DataConfig) -> list[str]:
     if number in BADLY_CALIBRATED:
         remarks.append(f"{path}: dataset {number} of SCARED is badly calibrated; its depth does not fit its images")
     return remarks
+
+
+FORMAT = Format(is_scared, load_scared)

@@ -14,6 +14,7 @@ from ..core.config import DataConfig
 from .depth_files import read_values
 from .endonerf import load_endonerf
 from .files import list_files, read_json
+from .formats import Format
 from .images import decode_image
 from .reading import complaint
 from .sequence import FrameSequence, is_test_frame
@@ -75,3 +76,6 @@ def _check_split(path: Path, count: int) -> None:
             got = f"{len(stored)} frames that differ"
             want = f"{key} of the rule (i - 1) % 8 == 0, {len(indices)} frames"
             raise complaint(path, want, got, "Remove split.json to use that rule.")
+
+
+FORMAT = Format(is_stereomis, load_stereomis)

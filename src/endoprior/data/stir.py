@@ -17,6 +17,7 @@ from ..core.config import DataConfig
 from ..core.types import Frame
 from ..system.atomic import whole_file
 from .endonerf import load_endonerf
+from .formats import Format
 from .images import decode_image, single_channel
 from .reading import complaint, kind_of
 from .sequence import FrameSequence
@@ -146,3 +147,6 @@ def _lift(spots: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
             z = float(np.median(measured))
             found.append(((x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z))
     return np.array(found).reshape(-1, 3)
+
+
+FORMAT = Format(is_stir, load_stir)

@@ -1,5 +1,5 @@
-"""Benchmarks: methods x sequences x budgets x seeds under one protocol, resumable, with intervals and plain verdicts.
+"""Benchmarks: methods x sequences x budgets x seeds under one protocol, resumable, with intervals and verdicts.
 
-`spec` says what, `matrix` keeps the books, `worker` does one cell, `execute` runs workers, `statistics` and `results`
-compare, `tables`, `plots`, `pictures` and `report` show.
+`spec` reads what to compare, `matrix` knows which cells are finished, `worker` trains and scores one cell, `execute`
+runs workers, `statistics` and `results` compare, `tables`, `plots`, `image_grids` and `report` write the results.
 """

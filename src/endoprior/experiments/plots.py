@@ -1,4 +1,4 @@
-"""Figures with axes: Gaussians against flow error per budget, and curves over the held-out frames."""
+"""Plots: Gaussians against flow error for each budget, and curves over the held-out frames."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from ..evaluation.registry import all_scores
 from ..system.atomic import whole_file
 from .matrix import Matrix
 from .results import Results
 from .spec import Cell
-from .tables import LABELS
 
 FLOW_SCORES = ("flow_error", "flow_error_raft_small", "flow_error_dis")
-"""The first that all methods have is drawn."""
+"""The figure shows the first of these that all methods have."""
 CURVE_SCORE = "psnr_tissue"
 
 
 def budget_figure(results: Results, path: Path) -> None:
-    """Gaussians of the finished scene against flow error, a line through the budgets of each method."""
+    """Number of Gaussians against flow error: one line through the budgets of each method."""
     spec = results.spec
 
-    def draw(axis: Axes, sequence: str) -> None:
+    def plot(axis: Axes, sequence: str) -> None:
         score = _flow_score(results, sequence)
         for method in spec.methods:
             budgets = spec.budgets or (None,)
@@ -42,17 +42,17 @@ def budget_figure(results: Results, path: Path) -> None:
                 label=spec.label(method),
             )
         axis.set_xlabel("Gaussians")
-        axis.set_ylabel(LABELS.get(score, score))
+        axis.set_ylabel(all_scores()[score].heading)
 
-    _panels(list(spec.sequences), draw, path)
+    _panels(list(spec.sequences), plot, path)
 
 
 def curve_figure(results: Results, matrix: Matrix, path: Path) -> None:
-    """PSNR on tissue of each held-out frame, mean over seeds, a line for each method at its last budget."""
+    """Tissue PSNR of each held-out frame, mean over seeds: one line for each method, at its last budget."""
     spec = results.spec
     budget = spec.budgets[-1] if spec.budgets else None
 
-    def draw(axis: Axes, sequence: str) -> None:
+    def plot(axis: Axes, sequence: str) -> None:
         for method in spec.methods:
             curves = [_curve(matrix.done.get(Cell(sequence, method, budget, seed))) for seed in spec.seeds]
             known = [curve for curve in curves if curve]
@@ -61,13 +61,13 @@ def curve_figure(results: Results, matrix: Matrix, path: Path) -> None:
                 means = [float(np.mean([curve[i] for curve in known])) for i in frames]
                 axis.plot(frames, means, marker=".", label=spec.label(method))
         axis.set_xlabel("frame")
-        axis.set_ylabel(LABELS[CURVE_SCORE])
+        axis.set_ylabel(all_scores()[CURVE_SCORE].heading)
 
-    _panels(list(spec.sequences), draw, path)
+    _panels(list(spec.sequences), plot, path)
 
 
 def _curve(folder: Path | None) -> dict[int, float]:
-    """Score by index of frame."""
+    """Score by frame index."""
     if folder is None:
         return {}
     rows = json.loads((folder / "per_frame.json").read_text())
@@ -79,14 +79,14 @@ def _flow_score(results: Results, sequence: str) -> str:
     return next((s for s in FLOW_SCORES if cells and all(s in results.scores[c] for c in cells)), FLOW_SCORES[-1])
 
 
-def _panels(sequences: list[str], draw: Callable[[Axes, str], None], path: Path) -> None:
+def _panels(sequences: list[str], plot: Callable[[Axes, str], None], path: Path) -> None:
     """One panel for each sequence, side by side, with one legend."""
-    # A canvas of its own: choosing a backend for the whole process would be the caller's affair.
+    # An own canvas: `pyplot` would choose a backend for the whole process.
     figure = Figure(figsize=(5 * len(sequences), 3.8), layout="constrained", dpi=120)
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, len(sequences), squeeze=False)[0]
     for axis, sequence in zip(axes, sequences, strict=True):
-        draw(axis, sequence)
+        plot(axis, sequence)
         axis.set_title(sequence, fontsize=10)
         axis.grid(alpha=0.3)
     handles, labels = axes[0].get_legend_handles_labels()

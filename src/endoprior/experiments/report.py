@@ -1,27 +1,27 @@
-"""What a benchmark leaves: results.md, results.tex, results.csv, results.json and figures."""
+"""Write what a benchmark measured: results.md, results.tex, results.csv, results.json and figures."""
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 from ..core.config_io import to_dict
+from ..evaluation.registry import all_scores
 from ..system.atomic import whole_file, write_json
+from .image_grids import GRIDS, write_image_grids
 from .matrix import Matrix, commits_of, scores_of
-from .pictures import PICTURES, write_pictures
 from .plots import budget_figure, curve_figure
 from .results import Results
 from .spec import ClaimSpec
-from .statistics import ABSOLUTE, IN_DB, MIN_PAIRS, RARE, Difference
-from .tables import LABELS, csv_lines, latex, markdown, score_table
+from .statistics import MIN_PAIRS, Difference
+from .tables import csv_lines, latex, markdown, score_table
 
 SHOWN_NAMES = 6
 
 
 def write_report(matrix: Matrix, out: Path) -> Path:
-    """Write tables, differences, claims and figures of what is done into `out`; names what is not.
+    """Write tables, differences, claims and figures of the finished cells into `out`, and list the others.
 
     Returns:
         Path of `results.md`.
@@ -50,13 +50,13 @@ def write_overview(reports: dict[Path, Matrix], out: Path) -> Path:
 
 
 def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int) -> list[str]:
-    """All blocks of one spec, its title at heading `level`; pictures in `folder` are linked from `base`."""
+    """All blocks of one spec, its title at heading `level`; links to figures in `folder` are relative to `base`."""
     below = "#" * (level + 1)
     return [
         *_head(matrix, "#" * level),
         *_tables(matrix, results, below),
         *_claims(results, below),
-        *_pictures(matrix, folder, base, below),
+        *_figure_links(matrix, folder, base, below),
     ]
 
 
@@ -85,7 +85,7 @@ def _head(matrix: Matrix, mark: str) -> list[str]:
 
 
 def _some(names: list[str]) -> str:
-    """The first few names, and how many more there are."""
+    """The first names, and how many more there are."""
     rest = len(names) - SHOWN_NAMES
     return ", ".join(names[:SHOWN_NAMES]) + (f" and {rest} more" if rest > 0 else "")
 
@@ -107,11 +107,11 @@ def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
             continue
         blocks += [f"{mark} {name}", "Best in bold, second best underlined.", markdown(score_table(results, name))]
         others = [method for method in spec.methods if method != spec.reference]
-        found = {s: [results.difference(s, method, spec.reference, name) for method in others] for s in spec.scores}
-        known = [score for score in spec.scores if any(f.count for f in found[score])]
-        rows = [[spec.label(m), *(change(s, found[s][i]) for s in known)] for i, m in enumerate(others)]
+        changes = {s: [results.difference(s, method, spec.reference, name) for method in others] for s in spec.scores}
+        known = [score for score in spec.scores if any(difference.count for difference in changes[score])]
+        rows = [[spec.label(m), *(change(s, changes[s][i]) for s in known)] for i, m in enumerate(others)]
         if known:
-            lines = [["method", *(LABELS.get(s, s) for s in known)], ["---"] * (len(known) + 1), *rows]
+            lines = [["method", *(all_scores()[s].heading for s in known)], ["---"] * (len(known) + 1), *rows]
             table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
             than = spec.label(spec.reference)
             about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over seeds]:"
@@ -119,22 +119,22 @@ def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
     return blocks
 
 
-def change(score: str, found: Difference) -> str:
+def change(score: str, difference: Difference) -> str:
     """`+3.1 % [+1.0, +5.2]` or `+0.31 dB [+0.10, +0.52]`; a dash where there is nothing to compare."""
-    if not found.count:
+    if not difference.count:
         return "-"
-    if score in IN_DB:
-        factor, digits, unit = 1, 2, " dB"
-    elif score in ABSOLUTE:
-        factor, digits, unit = 1, 0 if score in RARE else 4, ""
-    else:
-        factor, digits, unit = 100, 1, " %"
-    mean, low, high = (f"{factor * value:+.{digits}f}" for value in (found.mean, found.low, found.high))
-    return f"{mean}{unit} [{low}, {high}]" if math.isfinite(found.low) else mean + unit
+    about = all_scores()[score]
+    relative = about.compare == "relative"
+    factor, digits, unit = (100, 1, "%") if relative else (1, about.digits, about.unit)
+    numbers = (difference.mean, difference.low, difference.high)
+    mean, low, high = (f"{factor * value:+.{digits}f}" for value in numbers)
+    interval = f"[{low}, {high}]" if math.isfinite(difference.low) else ""
+    return " ".join(filter(None, (mean, unit, interval)))
 
 
 def _amount(score: str, by: float) -> str:
-    return f"{by:g} dB" if score in IN_DB else f"{by:g}" if score in ABSOLUTE else f"{100 * by:g} %"
+    about = all_scores()[score]
+    return f"{100 * by:g} %" if about.compare == "relative" else f"{by:g} {about.unit}".rstrip()
 
 
 def _claims(results: Results, mark: str) -> list[str]:
@@ -142,27 +142,27 @@ def _claims(results: Results, mark: str) -> list[str]:
         return []
     lines = []
     for claim in results.spec.claims:
-        found, said = results.judge(claim)
+        measured, verdict = results.check(claim)
         parts = []
         if len(results.spec.sequences) > 1:
             for name in results.spec.sequences:
-                alone, alone_said = results.judge(claim, name)
-                if alone.count:
-                    parts.append(f"{name}: {alone_said}, {change(claim.score, alone)}")
+                own, own_verdict = results.check(claim, name)
+                if own.count:
+                    parts.append(f"{name}: {own_verdict}, {change(claim.score, own)}")
         detail = f" ({'; '.join(parts)})" if len(parts) > 1 else ""
         source = f" [{claim.text}]" if claim.text else ""
         lines.append(
-            f"- {sentence(results, claim)}{source}: **{said}**, {change(claim.score, found)}, "
-            f"{found.count} pairs{detail}."
+            f"- {sentence(results, claim)}{source}: **{verdict}**, {change(claim.score, measured)}, "
+            f"{measured.count} pairs{detail}."
         )
-    note = f"A claim holds, or does not, if the whole interval says so; fewer than {MIN_PAIRS} pairs tell nothing."
+    note = f"A verdict needs the whole interval on one side, and at least {MIN_PAIRS} pairs."
     return [f"{mark} Claims", "\n".join(lines), note]
 
 
 def sentence(results: Results, claim: ClaimSpec) -> str:
     """The claim in words."""
     ours, theirs = results.spec.label(claim.method), results.spec.label(claim.than)
-    score, by = LABELS.get(claim.score, claim.score), _amount(claim.score, claim.by)
+    score, by = all_scores()[claim.score].heading, _amount(claim.score, claim.by)
     at = f" at {claim.budget:,} initial Gaussians" if claim.budget else ""
     if claim.expect == "better":
         return f"{ours} is better than {theirs} in {score}" + (f" by at least {by}" if claim.by else "") + at
@@ -179,18 +179,18 @@ def _figures(matrix: Matrix, results: Results, folder: Path) -> None:
         budget_figure(results, folder / "budgets.png")
     if "curves" in kinds:
         curve_figure(results, matrix, folder / "curves.png")
-    write_pictures(matrix, folder, kinds)
+    write_image_grids(matrix, folder, kinds)
 
 
-def _pictures(matrix: Matrix, folder: Path, base: Path, mark: str) -> list[str]:
-    names = ["budgets", "curves", *(f"{kind}-{name}" for name in matrix.data for kind in PICTURES)]
-    drawn = [folder / "figures" / f"{name}.png" for name in names if name.split("-")[0] in matrix.spec.figures]
-    found = [path for path in drawn if path.exists()]
-    return [f"{mark} Figures", *(f"![{f.stem}]({f.relative_to(base).as_posix()})" for f in found)] if found else []
+def _figure_links(matrix: Matrix, folder: Path, base: Path, mark: str) -> list[str]:
+    names = ["budgets", "curves", *(f"{kind}-{name}" for name in matrix.data for kind in GRIDS)]
+    wanted = [folder / "figures" / f"{name}.png" for name in names if name.split("-")[0] in matrix.spec.figures]
+    links = [f"![{path.stem}]({path.relative_to(base).as_posix()})" for path in wanted if path.exists()]
+    return [f"{mark} Figures", *links] if links else []
 
 
 def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
-    """All that is in the tables, for programs."""
+    """Everything in the tables, for other programs."""
     spec = matrix.spec
     cells = [
         {"sequence": c.sequence, "method": c.method, "budget": c.budget, "seed": c.seed, "folder": folder.name}
@@ -199,10 +199,9 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
     ]
     claims = []
     for claim in spec.claims:
-        found, said = results.judge(claim)
-        claims.append(
-            to_dict(claim) | {"verdict": said, "difference": _json(found), "sentence": sentence(results, claim)}
-        )
+        measured, verdict = results.check(claim)
+        about = {"verdict": verdict, "difference": _json(measured), "sentence": sentence(results, claim)}
+        claims.append(to_dict(claim) | about)
     differences = [
         {"sequence": name, "method": method, "than": spec.reference, "score": score}
         | _json(results.difference(score, method, spec.reference, name))
@@ -222,6 +221,7 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
     }
 
 
-def _json(found: Difference) -> dict[str, Any]:
-    values = json.loads(json.dumps(vars(found)), parse_constant=lambda _: None)
-    return {"mean": values["mean"], "low": values["low"], "high": values["high"], "pairs": values["count"]}
+def _json(difference: Difference) -> dict[str, Any]:
+    numbers = {"mean": difference.mean, "low": difference.low, "high": difference.high}
+    finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+    return finite | {"pairs": difference.count}

@@ -1,4 +1,4 @@
-"""The scores of a matrix in memory, and what they say: means over seeds, paired differences, claims."""
+"""The scores of all finished cells: their means over seeds, paired differences, and claims about them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .statistics import Difference, Summary, Verdict, difference, gains, summary
 
 @dataclass(frozen=True)
 class Results:
-    """Scores by cell; cells without a result are not in it."""
+    """Scores by cell; cells without a result are left out."""
 
     spec: Spec
     scores: dict[Cell, dict[str, float]]
@@ -27,7 +27,7 @@ class Results:
         return Results(matrix.spec, {cell: scores_of(matrix.done[cell])["scores"] for cell in order})
 
     def value(self, cell: Cell, score: str) -> float:
-        """A score; NaN where it could not be had."""
+        """A score; NaN where it was skipped."""
         return float(self.scores.get(cell, {}).get(score, math.nan))
 
     def summary(self, sequence: str, budget: int | None, method: str, score: str) -> Summary:
@@ -51,7 +51,7 @@ class Results:
         """Mean paired difference with its interval."""
         return difference(self.gains(score, method, than, sequence=sequence))
 
-    def judge(self, claim: ClaimSpec, sequence: str | None = None) -> tuple[Difference, Verdict]:
-        """What the results say of a claim, on one sequence or on all."""
-        found = difference(self.gains(claim.score, claim.method, claim.than, sequence=sequence, budget=claim.budget))
-        return found, verdict(found, claim.expect, claim.by)
+    def check(self, claim: ClaimSpec, sequence: str | None = None) -> tuple[Difference, Verdict]:
+        """Whether a claim holds, on one sequence or on all."""
+        measured = difference(self.gains(claim.score, claim.method, claim.than, sequence=sequence, budget=claim.budget))
+        return measured, verdict(measured, claim.expect, claim.by)

@@ -17,8 +17,10 @@ from ..core.checks import InputError
 from ..core.config import Config
 from ..core.config_io import from_dict, to_dict
 from ..core.presets import PresetName, preset
+from ..data.formats import FORMATS
 from ..data.reading import read_text
 from ..data.yaml_text import load_yaml
+from ..evaluation.registry import all_scores
 from ..phantom import PhantomConfig
 
 Expectation = Literal["better", "no worse", "no effect"]
@@ -218,6 +220,8 @@ def _check(spec: Spec) -> None:
             raise InputError(f"sequences.{name}: expected either path or phantom; got both or none. Keep one.")
         if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
             raise InputError(f"sequences.{name}: a phantom is written at its size; remove shrink and first_frames.")
+        if sequence.format not in ("auto", *FORMATS):
+            raise InputError(f"sequences.{name}.format: expected auto, {', '.join(FORMATS)}; got {sequence.format!r}.")
     for name in spec.set_for:
         if name not in PresetName.__args__:
             raise InputError(f"set_for: expected one of {', '.join(PresetName.__args__)}; got {name!r}. Choose one.")
@@ -229,6 +233,9 @@ def _check(spec: Spec) -> None:
     for name in named:
         if name not in spec.methods:
             raise InputError(f"claims, compare_with: expected one of {', '.join(spec.methods)}; got {name!r}.")
+    for name in (*spec.scores, *(claim.score for claim in spec.claims)):
+        if name not in all_scores():
+            raise InputError(f"scores, claims: expected names of scores; got {name!r}. Fix: see docs/scores.md.")
     if not spec.seeds or len(set(spec.seeds)) < len(spec.seeds):
         raise InputError(f"seeds: expected different numbers; got {list(spec.seeds)}. Correct them.")
     count = len(spec.seeds) * len(spec.sequences) * max(len(spec.budgets), 1) * len(spec.methods)

@@ -12,21 +12,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-Verdict = Literal["holds", "does not hold", "cannot be told"]
+from ..evaluation.registry import all_scores
 
-IN_DB = frozenset({"psnr", "psnr_tissue", "psnr_behind_tool", "strict_psnr"})
-RATES = frozenset({"ssim", "strict_ssim", "track_fold_rate", "track_tear_rate"})
-RARE = frozenset({"num_low_prior", "num_low_opacity", "num_large_scale"})
-"""Counts that may well be 0."""
-ABSOLUTE = IN_DB | RATES | RARE
-"""Scores whose differences mean something as they are; of all others they are relative."""
-HIGHER_IS_BETTER = IN_DB | {"ssim", "strict_ssim", "fps", "fps_cached", "iterations_per_second"}
-"""Every other score is an error, a count or a time."""
+Verdict = Literal["holds", "does not hold", "cannot be told"]
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
 MIN_PAIRS = 3
-"""With fewer pairs nothing is said: the interval of two is the two."""
+"""Fewer pairs give no verdict: the bootstrap interval of two pairs is the two values themselves."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +34,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Difference:
-    """Paired differences, positive where the first method is better: in units of `ABSOLUTE` scores, else relative."""
+    """Paired differences, positive where the first method is better; absolute or relative as `Score.compare` says."""
 
     mean: float
     low: float
@@ -58,12 +51,12 @@ def summary(values: ArrayLike) -> Summary:
 
 
 def gains(score: str, ours: ArrayLike, theirs: ArrayLike) -> np.ndarray:
-    """(K,) differences ours - theirs, relative to |theirs| unless `ABSOLUTE`, turned so that positive is better."""
-    ours, theirs = np.asarray(ours, float), np.asarray(theirs, float)
+    """(K,) differences between ours and theirs, positive where ours is better; relative ones are shares of |theirs|."""
+    ours, theirs, about = np.asarray(ours, float), np.asarray(theirs, float), all_scores()[score]
     change = ours - theirs
-    if score not in ABSOLUTE:
+    if about.compare == "relative":
         change = change / np.maximum(np.abs(theirs), 1e-12)
-    return change if score in HIGHER_IS_BETTER else -change
+    return change if about.higher_is_better else -change
 
 
 def difference(values: ArrayLike, seed: int = 0) -> Difference:
@@ -72,25 +65,25 @@ def difference(values: ArrayLike, seed: int = 0) -> Difference:
     values = values[np.isfinite(values)]
     if len(values) < 2:
         return Difference(float(values.mean()) if len(values) else math.nan, math.nan, math.nan, len(values))
-    drawn = np.random.default_rng(seed).integers(len(values), size=(RESAMPLES, len(values)))
+    resampled = np.random.default_rng(seed).integers(len(values), size=(RESAMPLES, len(values)))
     tail = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(values[drawn].mean(1), (tail, 100 - tail))
+    low, high = np.percentile(values[resampled].mean(1), (tail, 100 - tail))
     return Difference(float(values.mean()), float(low), float(high), len(values))
 
 
-def verdict(found: Difference, expect: str, by: float) -> Verdict:
+def verdict(measured: Difference, expect: str, by: float) -> Verdict:
     """Whether a claim holds, by the interval alone.
 
     Args:
         expect: `better`: at least `by` better; `no worse`: at most `by` worse; `no effect`: within `by` either way.
         by: >= 0, in the unit of the difference.
     """
-    if found.count < MIN_PAIRS:
+    if measured.count < MIN_PAIRS:
         return "cannot be told"
     if expect == "no effect":
-        inside, outside = -by <= found.low and found.high <= by, found.high < -by or found.low > by
+        inside, outside = -by <= measured.low and measured.high <= by, measured.high < -by or measured.low > by
     elif expect == "no worse":
-        inside, outside = found.low >= -by, found.high < -by
-    else:  # better by nothing is not better
-        inside, outside = found.low >= by and found.low > 0, found.high < by or found.high <= 0
+        inside, outside = measured.low >= -by, measured.high < -by
+    else:  # a difference of 0 is not better
+        inside, outside = measured.low >= by and measured.low > 0, measured.high < by or measured.high <= 0
     return "holds" if inside else "does not hold" if outside else "cannot be told"

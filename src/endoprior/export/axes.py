@@ -1,8 +1,8 @@
 """Axes of exported coordinates: proper rotations of positions, orientations and direction-dependent color.
 
 World axes are OpenCV's, those of the stored poses: x right, y down, z forward (away from the viewer). Without
-registration to a patient, the anatomical axes assume the view that an anatomical atlas has: the picture's right is the
-patient's left, up is superior, forward is posterior. Nothing is scaled or moved.
+registration to a patient, the anatomical axes assume the view of an anatomical atlas: the right of the image is the
+patient's left, up is superior, forward is posterior. Nothing is scaled or translated.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..core.types import Splats
 from ..render import sh as harmonics
-from .options import Axes
+from .formats import Axes
 
 ROTATIONS: dict[str, NDArray[np.float64]] = {
     "opencv": np.eye(3),
@@ -28,33 +28,33 @@ ROTATIONS: dict[str, NDArray[np.float64]] = {
 """(3, 3) from OpenCV axes to each of the others; determinant +1."""
 
 
-def turned_points(points: NDArray, axes: Axes) -> NDArray:
+def points_in_axes(points: NDArray, axes: Axes) -> NDArray:
     """(..., 3) positions or directions in OpenCV axes, in `axes`; same type of numbers."""
     return points @ ROTATIONS[axes].T.astype(points.dtype)
 
 
-def turned(splats: Splats, axes: Axes) -> Splats:
-    """Gaussians of OpenCV axes in `axes`: the same bodies, the same colors from the same sides."""
+def splats_in_axes(splats: Splats, axes: Axes) -> Splats:
+    """Gaussians of OpenCV axes in `axes`: the same ellipsoids, with the same color from each side."""
     return rotated(splats, ROTATIONS[axes])
 
 
 def rotated(splats: Splats, rotation: NDArray[np.float64]) -> Splats:
-    """Gaussians turned about the origin by a (3, 3) proper rotation; the identity leaves every bit."""
+    """Gaussians rotated about the origin by a (3, 3) proper rotation; the identity changes nothing."""
     if np.array_equal(rotation, np.eye(3)):
         return splats
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
     matrix = torch.from_numpy(rotation)
     return Splats(
         means=(splats.means.double() @ matrix.T).to(splats.means.dtype),
-        quats=multiplied(torch.tensor([w, x, y, z]), splats.quats.double()).to(splats.quats.dtype),
+        quats=quaternion_product(torch.tensor([w, x, y, z]), splats.quats.double()).to(splats.quats.dtype),
         scales=splats.scales,
         opacities=splats.opacities,
         sh=rotated_sh(splats.sh, rotation),
     )
 
 
-def multiplied(left: Tensor, right: Tensor) -> Tensor:
-    """Hamilton product of quaternions (w, x, y, z), shapes (..., 4): first `right` turns, then `left`."""
+def quaternion_product(left: Tensor, right: Tensor) -> Tensor:
+    """Hamilton product of quaternions (w, x, y, z), shapes (..., 4): the rotation `right`, then `left`."""
     a, b, c, d = left.unbind(-1)
     w, x, y, z = right.unbind(-1)
     return torch.stack(
@@ -69,17 +69,17 @@ def multiplied(left: Tensor, right: Tensor) -> Tensor:
 
 
 def rotated_sh(sh: Tensor, rotation: NDArray[np.float64]) -> Tensor:
-    """Coefficients (N, K, 3) of colors turned with their Gaussians: what was seen along d is seen along R d."""
+    """Coefficients (N, K, 3) rotated with their Gaussians: the color from direction d becomes that from R d."""
     matrix = torch.from_numpy(sh_rotation(harmonics.degree_of(sh.shape[1]), rotation.tobytes()))
     return torch.einsum("kj,njc->nkc", matrix, sh.double()).to(sh.dtype)
 
 
 @cache
 def sh_rotation(degree: int, rotation: bytes) -> NDArray[np.float64]:
-    """(K, K) matrix that turns spherical-harmonic coefficients up to `degree`.
+    """(K, K) matrix that rotates spherical-harmonic coefficients up to `degree`.
 
-    Each degree turns within itself. Its block solves Y(R d) block = Y(d) over directions d, more than there are
-    unknowns, spread evenly on a spiral; the equations have an exact solution.
+    Degrees do not mix. The block of each solves Y(R d) block = Y(d) by least squares over directions d on a spiral,
+    more of them than unknowns; the equations have an exact solution.
 
     Args:
         rotation: (3, 3) float64 as bytes.
@@ -88,8 +88,10 @@ def sh_rotation(degree: int, rotation: bytes) -> NDArray[np.float64]:
     height, angle = 1 - (2 * k + 1) / 64, k * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt(1 - height**2)
     directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1)
-    moved = directions @ np.frombuffer(rotation).reshape(3, 3).T
-    before, after = (harmonics.basis(torch.from_numpy(d.copy()), degree).numpy() for d in (directions, moved))
+    rotated_directions = directions @ np.frombuffer(rotation).reshape(3, 3).T
+    before, after = (
+        harmonics.basis(torch.from_numpy(d.copy()), degree).numpy() for d in (directions, rotated_directions)
+    )
     matrix = np.zeros(((degree + 1) ** 2,) * 2)
     for band in range(degree + 1):
         own = slice(band**2, (band + 1) ** 2)

@@ -9,17 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.scene import Scene
-from .moments import Moment
+from .formats import Format
 from .options import ExportOptions
-from .surface import seen_surface
+from .surface import render_surface
+from .time_steps import TimeStep
 
 PNG_STEPS_PER_MM = 100
 """Depth in a PNG is counted in 0.01 mm, so 65535 is 655.35 mm."""
 
 
-def files(scene: Scene, moment: Moment, options: ExportOptions) -> dict[str, bytes]:
-    """Expected depth from the moment's own camera, as .png and .npy; 0 where there is no surface."""
-    depth = seen_surface(scene, moment.time, moment.camera(scene), options.min_alpha).depth
+def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+    """Expected depth from the frame's own camera, as .png and .npy; 0 where there is no surface."""
+    depth = render_surface(scene, step.time, step.camera(scene), options.min_alpha).depth
     stored = io.BytesIO()
     np.save(stored, depth)
     return {".png": depth_png(depth), ".npy": stored.getvalue()}
@@ -33,3 +34,11 @@ def depth_png(depth: NDArray[np.float32]) -> bytes:
     if not done:
         raise OSError("could not encode a depth image")
     return png.tobytes()
+
+
+FORMAT = Format(
+    suffixes=(".png", ".npy"),
+    options=("times", "split", "min_alpha"),
+    files=files,
+    index_facts={"png_unit_mm": 1 / PNG_STEPS_PER_MM, "npy_unit_mm": 1.0, "missing": 0},
+)

@@ -17,25 +17,26 @@ from numpy.typing import NDArray
 from ..core.types import Splats
 from ..model.gaussians import SH_C0
 from ..model.scene import Scene
-from .moments import Moment
+from .formats import TIME_STEP_OPTIONS, Format
 from .options import ExportOptions
+from .time_steps import TimeStep
 
 EXTENSION = "KHR_gaussian_splatting"
 _FLOAT, _POINTS, _VERTEX_BUFFER = 5126, 0, 34962
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def files(scene: Scene, moment: Moment, options: ExportOptions) -> dict[str, bytes]:
-    """The .glb file of one moment."""
-    extras = {"unit": "mm", "axes": options.frame, "time": moment.time}
-    return {".glb": encode_glb(moment.splats(scene, options.frame), extras)}
+def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+    """The .glb file of one time step."""
+    extras = {"unit": "mm", "axes": options.frame, "time": step.time}
+    return {".glb": encode_glb(step.splats(scene, options.frame), extras)}
 
 
 def encode_glb(splats: Splats, extras: dict[str, Any] | None = None) -> bytes:
     """One scene, one node, one primitive of POINTS.
 
     Args:
-        extras: free facts for the file's `asset`.
+        extras: `extras` of the file's `asset`.
     """
     attributes = splat_attributes(splats)
     views, accessors, offset = [], [], 0
@@ -70,7 +71,7 @@ def splat_attributes(splats: Splats) -> dict[str, NDArray[np.float32]]:
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     sh, opacities = splats.sh.numpy(), splats.opacities.numpy()
     linear = decoded_srgb(np.clip(sh[:, 0] * SH_C0 + 0.5, 0, 1))
-    found = {
+    attributes = {
         "POSITION": splats.means.numpy(),
         "COLOR_0": np.column_stack([linear, opacities]),
         f"{EXTENSION}:ROTATION": unit[:, [1, 2, 3, 0]],
@@ -79,8 +80,8 @@ def splat_attributes(splats: Splats) -> dict[str, NDArray[np.float32]]:
     }
     for k in range(sh.shape[1]):
         band = int(np.sqrt(k))
-        found[f"{EXTENSION}:SH_DEGREE_{band}_COEF_{k - band * band}"] = sh[:, k]
-    return {name: np.ascontiguousarray(values, "<f4") for name, values in found.items()}
+        attributes[f"{EXTENSION}:SH_DEGREE_{band}_COEF_{k - band * band}"] = sh[:, k]
+    return {name: np.ascontiguousarray(values, "<f4") for name, values in attributes.items()}
 
 
 def decoded_srgb(encoded: NDArray) -> NDArray:
@@ -96,3 +97,6 @@ def glb_bytes(document: dict[str, Any], binary: bytes) -> bytes:
         content += filler * (-len(content) % 4)
         chunks += struct.pack("<I4s", len(content), kind) + content
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+FORMAT = Format(suffixes=(".glb",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, default_axes="opengl")

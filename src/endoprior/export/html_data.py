@@ -1,4 +1,4 @@
-"""The moving Gaussians of a scene as small integers, coded over time: what the HTML player carries.
+"""The moving Gaussians of a scene as small integers, coded over time: the data of the HTML player.
 
 Every Gaussian has 14 channels, each `low + step * q` with q a 16-bit integer: center x, y, z (mm), quaternion w, x, y,
 z, the logarithms of the three scales (mm), opacity, red, green, blue. A channel that never changes is stored once. The
@@ -37,12 +37,12 @@ SMALLEST_SCALE_PX = 0.02
 """Scales below this at the working distance are stored as this: the renderer's blur is 27 times wider."""
 OPACITY_STEP = 1 / 1020
 COLOR_STEP = 1 / 255
-NOTHING_SEEN = "scene: expected Gaussians in front of the camera; found none that can be drawn. Train it again."
+NOTHING_VISIBLE = "scene: expected Gaussians in front of the camera; got none that is visible. Fix: train it again."
 
 
 @dataclass(frozen=True)
 class Quantized:
-    """A scene at some moments, as integers."""
+    """A scene at some times, as integers."""
 
     values: NDArray[np.uint16]
     """(C, T, N)."""
@@ -51,33 +51,33 @@ class Quantized:
     step: NDArray[np.float64]
     """(C,)."""
     working_distance: float
-    """Nearest depth that matters: 1st percentile of z of what is in front of the cameras, mm."""
+    """1st percentile of z of the visible Gaussians, mm."""
     depth_range: tuple[float, float]
-    """1st and 99th percentile of z, widened to be apart, mm."""
+    """1st and 99th percentile of z, at least 1 % apart, mm."""
     focus: float
-    """Median z, mm: what a free view turns around."""
+    """Median z, mm: a free view turns around a point at this depth."""
 
 
 def quantize(scene: Scene, times: list[float]) -> Quantized:
-    """The Gaussians of `scene` at `times`, without those that are never drawn.
+    """The Gaussians of `scene` at `times`, without those that are never visible.
 
-    Colors are those seen from the recorded camera of each moment, all degrees of the harmonics included. An opacity
-    below 1/255 is stored as 0, and a Gaussian that is so at every moment is left out; so is, at a moment, one that is
-    not finite or too far away for 16 bits.
+    Colors are those seen from the sequence's camera at each time, with all degrees of the harmonics. A Gaussian counts
+    as invisible at a time, and its opacity is stored as 0, if its opacity is below 1/255, if a value of it is not
+    finite, or if it is too far away for 16 bits.
 
     Args:
-        times: T moments in [0, 1].
+        times: T times in [0, 1].
     Raises:
         ValueError: a time is not in [0, 1].
-        InputError: nothing is left to be drawn.
+        InputError: no Gaussian is visible.
     """
     raw, depths = _sample(scene, times)
     opacity = raw[CHANNELS.index("opacity")]
     finite = np.isfinite(raw).all(0)
-    seen = depths[finite & (depths > NEAR_Z) & (opacity >= ALPHA_MIN)]
-    if not len(seen):
-        raise InputError(NOTHING_SEEN)
-    near, focus, far = (float(v) for v in np.percentile(seen, [1, 50, 99]))
+    visible_depths = depths[finite & (depths > NEAR_Z) & (opacity >= ALPHA_MIN)]
+    if not len(visible_depths):
+        raise InputError(NOTHING_VISIBLE)
+    near, focus, far = (float(v) for v in np.percentile(visible_depths, [1, 50, 99]))
     focal = max(max(camera.fx, camera.fy) for camera in scene.cameras)
     step = np.array(
         [min(MAX_STEP_MM, STEP_PX * near / focal)] * 3
@@ -90,21 +90,21 @@ def quantize(scene: Scene, times: list[float]) -> Quantized:
     centers = raw[:3].reshape(3, -1)
     middle = np.median(centers[:, finite.ravel()], axis=1)
     within = (np.abs(centers - middle[:, None]) < step[:3, None] * (LARGEST // 2)).all(0).reshape(finite.shape)
-    drawn = finite & within & (opacity >= ALPHA_MIN)
-    kept = drawn.any(0)
+    visible = finite & within & (opacity >= ALPHA_MIN)
+    kept = visible.any(0)
     if not kept.any():
-        raise InputError(NOTHING_SEEN)
-    raw, drawn = raw[:, :, kept], drawn[:, kept]
+        raise InputError(NOTHING_VISIBLE)
+    raw, visible = raw[:, :, kept], visible[:, kept]
 
     low = np.zeros(len(CHANNELS))
-    low[:3] = np.where(drawn, raw[:3], np.inf).min((1, 2))
+    low[:3] = np.where(visible, raw[:3], np.inf).min((1, 2))
     low[3:7] = -1
     low[7:10] = np.log(SMALLEST_SCALE_PX * near / focal)
-    raw[CHANNELS.index("opacity")] *= drawn
+    raw[CHANNELS.index("opacity")] *= visible
     values = np.empty(raw.shape, np.uint16)
     for c in range(len(CHANNELS)):
         values[c] = np.rint((raw[c] - float(low[c])) / float(step[c])).clip(0, LARGEST)
-    _hold_hidden(values, drawn)
+    _repeat_hidden(values, visible)
     return Quantized(values, low, step, near, (near, max(far, near * 1.01)), focus)
 
 
@@ -144,13 +144,13 @@ def _predict(plane: NDArray[np.uint16]) -> tuple[int, NDArray[np.uint16]]:
 
 
 def _sample(scene: Scene, times: list[float]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(C, T, N) channels before rounding, and (T, N) z in the camera of each moment, mm."""
+    """(C, T, N) channels before rounding, and (T, N) z in the camera at each time, mm."""
     raw = np.empty((len(CHANNELS), len(times), len(scene)), np.float32)
     depths = np.empty((len(times), len(scene)), np.float32)
     for t, time in enumerate(times):
         splats, camera = scene.at(time), scene.camera_at(time)
         raw[:, t], depths[t] = _channels(splats, camera)
-        if t:  # q and -q are one rotation: take the one that continues
+        if t:  # q and -q are one rotation: take the one nearer to the time step before
             raw[3:7, t] *= np.where((raw[3:7, t] * raw[3:7, t - 1]).sum(0) < 0, -1, 1)
     return raw, depths
 
@@ -171,11 +171,11 @@ def _channels(splats: Splats, camera: Camera) -> tuple[NDArray, NDArray]:
     return torch.cat(parts, 1).T.numpy(), (splats.means @ pose[2, :3] + pose[2, 3]).numpy()
 
 
-def _hold_hidden(values: NDArray[np.uint16], drawn: NDArray[np.bool_]) -> None:
-    """Give Gaussians that are not drawn at a moment the numbers of the moment before, which cost nothing."""
+def _repeat_hidden(values: NDArray[np.uint16], visible: NDArray[np.bool_]) -> None:
+    """Where a Gaussian is invisible, repeat its numbers of the time step before: they compress to nothing."""
     opacity = CHANNELS.index("opacity")
     for t in range(1, values.shape[1]):
-        hidden = ~drawn[t]
+        hidden = ~visible[t]
         values[:opacity, t, hidden] = values[:opacity, t - 1, hidden]
         values[opacity + 1 :, t, hidden] = values[opacity + 1 :, t - 1, hidden]
 

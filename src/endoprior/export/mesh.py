@@ -1,4 +1,4 @@
-"""Surface meshes of one moment: a net over the rendered depth, or the depths of all camera positions fused.
+"""Surface meshes of one time step: a grid mesh of the rendered depth, or the depths of all cameras fused.
 
 Triangles turn counterclockwise as seen from the camera, so normals point at it. `V` vertices, `F` triangles.
 """
@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from ..core.checks import InputError
 from ..core.geometry import back_project, pixel_centers
 from ..model.scene import Scene
-from .axes import turned_points
+from .axes import points_in_axes
+from .formats import TIME_STEP_OPTIONS, Format
 from .mesh_files import encode_mesh
-from .moments import Moment
 from .options import ExportOptions
-from .surface import Surface, seen_surface
+from .surface import Surface, render_surface
+from .time_steps import TimeStep
 from .tsdf import fused_mesh, viewpoints
 
 
@@ -33,45 +34,49 @@ class Mesh:
     """(V, 3) red, green, blue."""
 
 
-def files(scene: Scene, moment: Moment, options: ExportOptions) -> dict[str, bytes]:
-    """The mesh of one moment in the file format asked for.
+def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+    """The mesh of one time step in the file format of the options.
 
     Raises:
-        InputError: no surface is drawn, or a fusion has fewer than two camera positions.
+        InputError: no surface is rendered, or a fusion has fewer than two camera positions.
     """
     if options.mesh_method == "tsdf":
-        views = [seen_surface(scene, moment.time, c, options.min_alpha) for c in viewpoints(scene.cameras)]
+        views = [render_surface(scene, step.time, c, options.min_alpha) for c in viewpoints(scene.cameras)]
         mesh = Mesh(*fused_mesh(views, options.voxel_mm))
     else:
-        seen = seen_surface(scene, moment.time, moment.camera(scene), options.min_alpha)
-        mesh = depth_grid(seen, options.mesh_step, options.max_slope)
+        surface = render_surface(scene, step.time, step.camera(scene), options.min_alpha)
+        mesh = depth_grid(surface, options.mesh_step, options.max_slope)
     if not len(mesh.triangles):
         raise InputError(
-            f"--min-alpha: expected one at which a surface is left at time {moment.time:.3f}; got {options.min_alpha}. "
-            "Lower it, or raise --max-slope."
+            f"--min-alpha: expected a value that leaves a surface at time {step.time:.3f}; got {options.min_alpha}. "
+            "Fix: lower it, or raise --max-slope."
         )
     return {
         f".{options.mesh_format}": encode_mesh(
-            turned_points(mesh.vertices, options.frame), mesh.triangles, mesh.colors, options.mesh_format, options.frame
+            points_in_axes(mesh.vertices, options.frame),
+            mesh.triangles,
+            mesh.colors,
+            options.mesh_format,
+            options.frame,
         )
     }
 
 
-def depth_grid(seen: Surface, step: int, max_slope: float) -> Mesh:
-    """A net with a vertex at every `step`-th pixel that shows a surface, torn at jumps of depth.
+def depth_grid(surface: Surface, step: int, max_slope: float) -> Mesh:
+    """A grid mesh with a vertex at every `step`-th pixel that shows a surface, cut at jumps of depth.
 
     A triangle is kept if along none of its edges depth changes by more than `max_slope` times the distance between the
     pixels at the nearer depth. World axes, mm.
     """
-    depth = seen.depth[::step, ::step].astype(np.float64)
-    pixels = pixel_centers(seen.camera.width, seen.camera.height)[::step, ::step]
+    depth = surface.depth[::step, ::step].astype(np.float64)
+    pixels = pixel_centers(surface.camera.width, surface.camera.height)[::step, ::step]
     numbers = np.arange(depth.size, dtype=np.int32).reshape(depth.shape)
     a, b, c, d = numbers[:-1, :-1], numbers[:-1, 1:], numbers[1:, :-1], numbers[1:, 1:]
     triangles = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
-    triangles = triangles[_is_whole(depth.ravel(), pixels.reshape(-1, 2), triangles, seen.camera.fx, max_slope)]
+    triangles = triangles[_is_continuous(depth.ravel(), pixels.reshape(-1, 2), triangles, surface.camera.fx, max_slope)]
     used, renumbered = np.unique(triangles, return_inverse=True)
-    vertices = back_project(pixels.reshape(-1, 2)[used].astype(np.float64), depth.ravel()[used], seen.camera)
-    colors = seen.color[::step, ::step].reshape(-1, 3)[used]
+    vertices = back_project(pixels.reshape(-1, 2)[used].astype(np.float64), depth.ravel()[used], surface.camera)
+    colors = surface.color[::step, ::step].reshape(-1, 3)[used]
     return Mesh(
         vertices.astype(np.float32),
         renumbered.reshape(-1, 3).astype(np.int32),
@@ -79,12 +84,29 @@ def depth_grid(seen: Surface, step: int, max_slope: float) -> Mesh:
     )
 
 
-def _is_whole(depth: NDArray, pixels: NDArray, triangles: NDArray, focal: float, max_slope: float) -> NDArray[np.bool_]:
+def _is_continuous(
+    depth: NDArray, pixels: NDArray, triangles: NDArray, focal: float, max_slope: float
+) -> NDArray[np.bool_]:
     """(F,) whether all corners show a surface and no edge is a jump."""
-    whole = np.ones(len(triangles), bool)
+    continuous = np.ones(len(triangles), bool)
     for k in range(3):
         one, other = triangles[:, k], triangles[:, k - 1]
         near = np.minimum(depth[one], depth[other])
         sideways = near / focal * np.linalg.norm(pixels[one] - pixels[other], axis=1)
-        whole &= (near > 0) & (np.abs(depth[one] - depth[other]) <= max_slope * sideways)
-    return whole
+        continuous &= (near > 0) & (np.abs(depth[one] - depth[other]) <= max_slope * sideways)
+    return continuous
+
+
+FORMAT = Format(
+    suffixes=(".ply", ".obj", ".stl"),
+    options=(
+        *TIME_STEP_OPTIONS,
+        "mesh_format",
+        "mesh_method",
+        "mesh_step",
+        "max_slope",
+        "voxel_mm",
+        "min_alpha",
+    ),
+    files=files,
+)

@@ -12,7 +12,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from .options import Axes
+from .formats import Axes
 from .ply import ply_bytes, vertex_table
 
 
@@ -51,5 +51,5 @@ def _stl(vertices: NDArray, triangles: NDArray, axes: Axes) -> bytes:
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     facets = np.zeros(len(triangles), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     facets["normal"], facets["corners"] = normals / np.where(length > 0, length, 1), corners
-    # A header that began with "solid" would be taken for the format's text form.
+    # The header must not begin with "solid": readers would take the file for STL in text form.
     return _about(axes).encode().ljust(80) + struct.pack("<I", len(triangles)) + facets.tobytes()

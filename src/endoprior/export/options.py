@@ -1,4 +1,4 @@
-"""What can be asked of an export: the options of `endoprior export`, with their ranges."""
+"""The options of `endoprior export`, with their ranges."""
 
 from __future__ import annotations
 
@@ -7,27 +7,24 @@ from pathlib import Path
 from typing import Literal
 
 from ..core.checks import check_range
-
-FormatName = Literal["ply", "splat", "spz", "gltf", "points", "mesh", "depth", "tracks", "video", "scene", "html"]
-Axes = Literal["opencv", "opengl", "ras", "lps"]
-"""Axes that exported coordinates refer to; docs/format.md defines them."""
+from .formats import FORMATS, Axes
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Options of an export. Each format takes some of them and refuses the others."""
+    """Options of an export. Each format takes some of them and rejects the others."""
 
-    format: FormatName
+    format: Literal[FORMATS]
     """What to write."""
     times: tuple[float, ...] = ()
-    """Moments in [0, 1] in place of a split; frame i of T is at i / T."""
+    """Times in [0, 1] to export, instead of the frames of a split; frame i of T is at i / T."""
     split: Literal["video", "test", "train"] = "video"
-    """Frames of the sequence, one set of files each; `video` is all of them."""
+    """Frames of the sequence to export, one set of files each; `video` is all of them."""
     canonical: bool = False
-    """The Gaussians as they are stored, before any motion, in place of moments."""
+    """Export the Gaussians as they are stored, before any motion, instead of time steps."""
     frame: Axes | None = None
     """Axes of the coordinates: opencv (x right, y down, z forward), opengl (y up, z back), ras or lps (for 3D Slicer).
-    If not given: opengl for spz and gltf, whose specifications demand it, else opencv."""
+    Default: opengl for spz and gltf, whose specifications require it; else opencv."""
     min_alpha: float = 0.5
     """A pixel shows a surface if its accumulated opacity is at least this (depth, mesh, tracks)."""
     min_opacity: float = 0.5
@@ -35,19 +32,19 @@ class ExportOptions:
     mesh_format: Literal["ply", "obj", "stl"] = "ply"
     """File format of a mesh; STL has no colors."""
     mesh_method: Literal["grid", "tsdf"] = "grid"
-    """`grid`: a net over the depth that the moment's camera sees; `tsdf`: the depths of all camera positions fused."""
+    """`grid`: a grid mesh of the depth that the frame's camera sees; `tsdf`: the depths of all cameras fused."""
     mesh_step: int = 2
-    """Pixels between the vertices of a depth grid."""
+    """Pixels between the vertices of a grid mesh."""
     max_slope: float = 5.0
-    """Depth change per mm sideways above which a depth grid is torn."""
+    """Depth change per mm sideways above which a grid mesh is cut."""
     voxel_mm: float = 1.0
     """Edge of a voxel of the fusion, mm."""
     points: Path | None = None
-    """CSV with columns x, y, frame: pixels to follow; a grid on the first frame if not given (tracks)."""
+    """CSV with columns x, y, frame: pixels to track; default: a grid on the first frame (tracks)."""
     grid_px: int = 32
     """Pixels between the points of that grid."""
     title: str = ""
-    """Shown above the player (html)."""
+    """Title above the player (html)."""
     max_mb: float = 20.0
     """Largest player to write, MB (html)."""
 
@@ -63,5 +60,5 @@ class ExportOptions:
         check_range("max_mb", self.max_mb, 0.1, 1000)
 
 
-DEFAULTS = ExportOptions(format="ply")
-"""To tell which options were given."""
+DEFAULTS = ExportOptions(format=FORMATS[0])
+"""What every option is where it is not given."""

@@ -1,6 +1,6 @@
-"""PLY in the layout of 3D Gaussian splatting, and the PLY container that point clouds and meshes share.
+"""PLY in the layout of 3D Gaussian splatting, and the PLY file that point clouds and meshes share.
 
-Source of the layout: the files written by 3DGS (Kerbl et al. 2023); of the container: Turk, "The PLY Polygon File
+Source of the layout: the files that 3DGS writes (Kerbl et al. 2023); of the file format: Turk, "The PLY Polygon File
 Format", 1994. `K` spherical-harmonic coefficients per channel.
 """
 
@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 
 from ..core.types import Splats
 from ..model.scene import Scene
-from .moments import Moment
-from .options import Axes, ExportOptions
+from .formats import TIME_STEP_OPTIONS, Axes, Format
+from .options import ExportOptions
+from .time_steps import TimeStep
 
 LEAST_OPACITY = 1e-7
-"""Opacities this close to 0 or 1 are moved away from them: their logits would be infinite."""
+"""Opacities are clipped to this distance from 0 and 1, because their logits would be infinite."""
 _TYPES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
 
-def files(scene: Scene, moment: Moment, options: ExportOptions) -> dict[str, bytes]:
-    """The PLY file of one moment."""
-    return {".ply": encode_ply(moment.splats(scene, options.frame), options.frame)}
+def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+    """The PLY file of one time step."""
+    return {".ply": encode_ply(step.splats(scene, options.frame), options.frame)}
 
 
 def encode_ply(splats: Splats, axes: Axes = "opencv") -> bytes:
@@ -73,3 +74,6 @@ def ply_bytes(vertices: NDArray, axes: Axes, triangles: NDArray[np.int32] | None
         faces["count"], faces["corners"] = 3, triangles
         body += faces.tobytes()
     return ("\n".join([*lines, "end_header"]) + "\n").encode() + body
+
+
+FORMAT = Format(suffixes=(".ply",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files)

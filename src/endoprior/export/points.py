@@ -8,30 +8,35 @@ import torch
 from ..core.checks import InputError
 from ..model.scene import Scene
 from ..render import sh
-from .axes import turned_points
-from .moments import Moment
+from .axes import points_in_axes
+from .formats import TIME_STEP_OPTIONS, Format
 from .options import ExportOptions
 from .ply import ply_bytes, vertex_table
+from .time_steps import TimeStep
 
 
-def files(scene: Scene, moment: Moment, options: ExportOptions) -> dict[str, bytes]:
-    """A PLY file with x, y, z (mm) and red, green, blue (0..255), as seen from the moment's camera.
+def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+    """A PLY file with x, y, z (mm) and red, green, blue (0..255), as seen from the frame's camera.
 
     Raises:
         InputError: no Gaussian is that opaque.
     """
-    splats = moment.splats(scene, "opencv")
-    chosen = splats.opacities >= options.min_opacity
-    if not chosen.any():
+    splats = step.splats(scene, "opencv")
+    opaque = splats.opacities >= options.min_opacity
+    if not opaque.any():
         most = float(splats.opacities.max())
         raise InputError(
-            f"--min-opacity: expected at most {most:.3f}, the largest there is; got {options.min_opacity}."
+            f"--min-opacity: expected at most {most:.3f}, the largest opacity; got {options.min_opacity}. "
+            "Fix: lower it."
         )
-    means = splats.means[chosen]
-    towards = torch.nn.functional.normalize(means - torch.from_numpy(moment.camera(scene).center).to(means.dtype))
-    colors = sh.colors(splats.sh[chosen], towards).numpy()
+    means = splats.means[opaque]
+    towards = torch.nn.functional.normalize(means - torch.from_numpy(step.camera(scene).center).to(means.dtype))
+    colors = sh.colors(splats.sh[opaque], towards).numpy()
     rgb = np.rint(colors.clip(0, 1) * 255).astype(np.uint8)
-    turned = turned_points(means.numpy(), options.frame)
-    columns = {name: turned[:, i] for i, name in enumerate("xyz")}
+    positions = points_in_axes(means.numpy(), options.frame)
+    columns = {name: positions[:, i] for i, name in enumerate("xyz")}
     columns |= {name: rgb[:, i] for i, name in enumerate(("red", "green", "blue"))}
     return {".ply": ply_bytes(vertex_table(columns), options.frame)}
+
+
+FORMAT = Format(suffixes=(".ply",), options=(*TIME_STEP_OPTIONS, "canonical", "min_opacity"), files=files)

@@ -15,20 +15,21 @@ from ..core.checks import InputError
 from ..core.types import Splats
 from ..model.scene import Scene
 from ..render.sh import degree_of
-from .moments import Moment
+from .formats import TIME_STEP_OPTIONS, Format
 from .options import ExportOptions
+from .time_steps import TimeStep
 
 MAGIC, VERSION = 0x5053474E, 2
 FRACTIONAL_BITS = 12
-"""Of a coordinate, as in the format's own writer: steps of 1/4096 mm, 2 m of room; fewer where that is not enough."""
+"""Of a coordinate, as in the format's own writer: steps of 1/4096 mm, range 2 m; fewer for a larger scene."""
 COLOR_SCALE = 0.15
 """Stored color = 255 (0.15 dc + 0.5)."""
 _LARGEST = 2**23 - 1
 
 
-def files(scene: Scene, moment: Moment, options: ExportOptions) -> dict[str, bytes]:
-    """The SPZ file of one moment."""
-    return {".spz": encode_spz(moment.splats(scene, options.frame))}
+def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+    """The SPZ file of one time step."""
+    return {".spz": encode_spz(step.splats(scene, options.frame))}
 
 
 def encode_spz(splats: Splats) -> bytes:
@@ -42,7 +43,7 @@ def encode_spz(splats: Splats) -> bytes:
     """
     means, sh = splats.means.numpy().astype(np.float64), splats.sh.numpy()
     if not np.isfinite(means).all():
-        raise InputError("spz: expected finite positions; got some that are not. Train the scene again.")
+        raise InputError("spz: expected finite positions; got NaN or infinity. Fix: train the scene again.")
     fractional_bits = _fractional_bits(np.abs(means).max(initial=0.0))
     fixed = np.rint(means * 2.0**fractional_bits).astype("<i4")
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(means), degree_of(sh.shape[1]), fractional_bits, 0, 0)
@@ -71,11 +72,14 @@ def _bytes(values: NDArray) -> NDArray[np.uint8]:
 def _well_conditioned(quats: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit quaternions (w, x, y, z) of the same ellipsoids with w at least 1/2.
 
-    Readers find w as sqrt(1 - x^2 - y^2 - z^2), which 8 bits cannot carry near w = 0. Half a turn about one of its own
-    axes leaves an ellipsoid as it is, and multiplies the quaternion by i, j or k: one of the four has a large w.
+    Readers compute w as sqrt(1 - x^2 - y^2 - z^2), which 8 bits cannot carry near w = 0. Half a turn about one of its
+    own axes leaves an ellipsoid unchanged, and multiplies the quaternion by i, j or k: one of the four has a large w.
     """
     w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
     same = np.stack([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])  # q, q i, q j, q k
     best = np.abs(same[:, 0]).argmax(0)
     chosen = same[best, :, np.arange(len(quats))]
     return chosen * np.where(chosen[:, :1] < 0, -1, 1)
+
+
+FORMAT = Format(suffixes=(".spz",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, default_axes="opengl")

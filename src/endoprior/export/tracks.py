@@ -1,11 +1,10 @@
-"""Paths of chosen material points over the whole sequence, as CSV and NPZ."""
+"""Tracks of chosen material points over the whole sequence, as CSV and NPZ."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,129 +16,134 @@ from ..core.geometry import back_project, bilinear, project
 from ..model.carry import carry_points
 from ..model.scene import Scene
 from ..system.atomic import whole_folder
-from .axes import turned_points
+from .axes import points_in_axes
+from .formats import Format, Progress
 from .options import ExportOptions
-from .surface import Surface, seen_surface
+from .surface import Surface, render_surface
 
 COLUMNS = ("frame", "time", "point", "x", "y", "z", "u", "v", "visible")
 HIDDEN_SHARE = 0.02
-"""A point is hidden if it lies deeper than what is drawn at its pixel by more than this share of its depth."""
+"""A point is hidden if it lies deeper than the rendered surface at its pixel by more than this share."""
 
 
 @dataclass(frozen=True)
-class Picks:
-    """Where to start following: `P` pixels."""
+class QueryPoints:
+    """The points to track: `P` pixels."""
 
     pixels: NDArray[np.float64]
     """(P, 2) x, y, px; pixel (0, 0) is centered at (0.5, 0.5)."""
     frames: NDArray[np.intp]
-    """(P,) frame each is picked in."""
+    """(P,) frame of each pixel."""
 
 
-def write(scene: Scene, out: Path, options: ExportOptions, progress: Callable[[int, int], None]) -> None:
-    """Follow the points and write `out/tracks.csv` and `out/tracks.npz`.
+def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
+    """Track the points and write `out/tracks.csv` and `out/tracks.npz`.
 
     Raises:
-        InputError: the picks cannot be read, or a pick shows no surface.
+        InputError: the file of query points cannot be read, or a query point shows no surface.
     """
     cameras = scene.cameras
     times = [i / len(cameras) for i in range(len(cameras))]
     with whole_folder(out) as folder:
-        picks = read_picks(options.points, scene) if options.points else None
-        first = seen_surface(scene, times[0], cameras[0], options.min_alpha)
-        picks = picks or grid_picks(first, options.grid_px)
-        starts = _lifted(scene, picks, options.min_alpha)
-        carried = carry_points(scene, starts, picks.frames, times)
+        if options.points:
+            queries = read_query_points(options.points, scene)
+        else:
+            first = render_surface(scene, times[0], cameras[0], options.min_alpha)
+            queries = grid_query_points(first, options.grid_px)
+        starts = _back_projected(scene, queries, options.min_alpha)
+        carried = carry_points(scene, starts, queries.frames, times)
         pixels = np.empty((len(times), len(starts), 2), np.float32)
         visible = np.empty(pixels.shape[:2], bool)
         for i, camera in enumerate(cameras):
-            seen = seen_surface(scene, times[i], camera, options.min_alpha)
-            pixels[i], visible[i] = _seen(carried[i], seen)
+            surface = render_surface(scene, times[i], camera, options.min_alpha)
+            pixels[i], visible[i] = project_visible(carried[i], surface)
             progress(i + 1, len(cameras))
-        positions = turned_points(carried, options.frame)
+        positions = points_in_axes(carried, options.frame)
         np.savez_compressed(
             folder / "tracks.npz",
             points=positions,
             pixels=pixels,
             visible=visible,
             times=np.array(times),
-            start_frame=picks.frames,
-            start_pixel=picks.pixels,
+            start_frame=queries.frames,
+            start_pixel=queries.pixels,
             axes=np.array(options.frame),
         )
         (folder / "tracks.csv").write_text(_table(positions, pixels, visible, times), encoding="utf-8")
 
 
-def read_picks(file: Path, scene: Scene) -> Picks:
+def read_query_points(file: Path, scene: Scene) -> QueryPoints:
     """Read a CSV file with a header that names at least x, y and frame.
 
     Raises:
-        InputError: it is missing, has other columns, no rows, or a row outside the picture or the sequence.
+        InputError: it is missing, has other columns, no rows, or a row outside the image or the sequence.
     """
     wanted = f"{file}: expected a CSV file with columns x, y, frame"
     try:
         with file.open(newline="", encoding="utf-8-sig") as text:
             rows = [(float(row["x"]), float(row["y"]), int(row["frame"])) for row in csv.DictReader(text)]
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise InputError(f"{wanted}; got {error!r}. Correct the file.") from None
+        raise InputError(f"{wanted}; got {error!r}. Fix: correct the file.") from None
     if not rows:
-        raise InputError(f"{wanted}; got no rows. Add one.")
+        raise InputError(f"{wanted}; got no rows. Fix: add one.")
     camera, total = scene.cameras[0], len(scene.cameras)
     for k, (x, y, frame) in enumerate(rows):
         if not (0 <= x <= camera.width and 0 <= y <= camera.height and 0 <= frame < total):
             raise InputError(
                 f"{file}: expected x in [0, {camera.width}], y in [0, {camera.height}], frame in 0..{total - 1}; "
-                f"got {x:g}, {y:g}, {frame} for point {k}. Correct the row."
+                f"got {x:g}, {y:g}, {frame} for point {k}. Fix: correct the row."
             )
-    return Picks(np.array([row[:2] for row in rows]), np.array([row[2] for row in rows], np.intp))
+    return QueryPoints(np.array([row[:2] for row in rows]), np.array([row[2] for row in rows], np.intp))
 
 
-def grid_picks(seen: Surface, spacing: int) -> Picks:
-    """Pixel centers of the first frame, `spacing` px apart, where all around shows a surface.
+def grid_query_points(surface: Surface, spacing: int) -> QueryPoints:
+    """Pixel centers of the first frame, `spacing` px apart, where a surface is all around.
 
     Raises:
         InputError: there is none.
     """
-    rows, columns = (np.arange(spacing // 2, n, spacing) for n in seen.depth.shape)
+    rows, columns = (np.arange(spacing // 2, n, spacing) for n in surface.depth.shape)
     row, column = (part.ravel() for part in np.meshgrid(rows, columns, indexing="ij"))
-    shown = np.isfinite(_depth_at(seen, np.column_stack([column + 0.5, row + 0.5])))
-    if not shown.any():
-        raise InputError(f"--grid-px: expected a grid that meets tissue in the first frame; got {spacing}. Lower it.")
-    pixels = np.column_stack([column + 0.5, row + 0.5])[shown]
-    return Picks(pixels, np.zeros(len(pixels), np.intp))
+    pixels = np.column_stack([column + 0.5, row + 0.5])
+    pixels = pixels[np.isfinite(_depth_at(surface, pixels))]
+    if not len(pixels):
+        raise InputError(
+            f"--grid-px: expected a grid with points on tissue in the first frame; got {spacing}. Fix: lower it."
+        )
+    return QueryPoints(pixels, np.zeros(len(pixels), np.intp))
 
 
-def _depth_at(seen: Surface, pixels: NDArray) -> NDArray[np.float64]:
+def _depth_at(surface: Surface, pixels: NDArray) -> NDArray[np.float64]:
     """(P,) depth between the pixel centers around; NaN where one of them shows no surface."""
-    depth = np.where(seen.depth > 0, seen.depth, np.nan).astype(np.float64)
+    depth = np.where(surface.depth > 0, surface.depth, np.nan).astype(np.float64)
     return bilinear(depth, pixels)
 
 
-def _lifted(scene: Scene, picks: Picks, min_alpha: float) -> NDArray[np.float64]:
-    """(P, 3) world positions of the picks, mm."""
-    found = np.empty((len(picks.pixels), 3))
-    for frame in np.unique(picks.frames):
-        own = picks.frames == frame
+def _back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDArray[np.float64]:
+    """(P, 3) world positions of the query points, mm."""
+    positions = np.empty((len(queries.pixels), 3))
+    for frame in np.unique(queries.frames):
+        own = queries.frames == frame
         camera = scene.cameras[frame]
-        seen = seen_surface(scene, frame / len(scene.cameras), camera, min_alpha)
-        depth = _depth_at(seen, picks.pixels[own])
+        surface = render_surface(scene, frame / len(scene.cameras), camera, min_alpha)
+        depth = _depth_at(surface, queries.pixels[own])
         if not np.isfinite(depth).all():
             point = np.flatnonzero(own)[np.flatnonzero(~np.isfinite(depth))[0]]
-            x, y = picks.pixels[point]
+            x, y = queries.pixels[point]
             raise InputError(
                 f"--points: expected pixels that show tissue; got ({x:g}, {y:g}) in frame {frame} for point {point}, "
-                "where nothing is drawn. Move it."
+                "where no surface is rendered. Fix: move it."
             )
-        found[own] = back_project(picks.pixels[own], depth, camera)
-    return found
+        positions[own] = back_project(queries.pixels[own], depth, camera)
+    return positions
 
 
-def _seen(points: NDArray, seen: Surface) -> tuple[NDArray, NDArray[np.bool_]]:
-    """(P, 2) pixels of world points (P, 3), and (P,) whether they are inside the picture and not behind tissue."""
-    pixels, z = project(points.astype(np.float64), seen.camera)
-    inside = (z > 0) & (pixels >= 0).all(1) & (pixels <= (seen.camera.width, seen.camera.height)).all(1)
-    depth = _depth_at(seen, pixels)
-    with np.errstate(invalid="ignore"):  # NaN: nothing is drawn there, and nothing can be seen
+def project_visible(points: NDArray, surface: Surface) -> tuple[NDArray, NDArray[np.bool_]]:
+    """(P, 2) pixels of world points (P, 3), and (P,) whether they are inside the image and not behind tissue."""
+    pixels, z = project(points.astype(np.float64), surface.camera)
+    inside = (z > 0) & (pixels >= 0).all(1) & (pixels <= (surface.camera.width, surface.camera.height)).all(1)
+    depth = _depth_at(surface, pixels)
+    with np.errstate(invalid="ignore"):  # NaN: no surface, so nothing is visible
         return pixels, inside & (z <= depth * (1 + HIDDEN_SHARE))
 
 
@@ -153,3 +157,6 @@ def _table(positions: NDArray, pixels: NDArray, visible: NDArray, times: list[fl
             u, v = (f"{value:.3f}" if math.isfinite(value) else "" for value in pixels[i, p])
             rows.writerow((i, f"{time:.6f}", p, x, y, z, u, v, int(visible[i, p])))
     return text.getvalue()
+
+
+FORMAT = Format(suffixes=(), options=("frame", "points", "grid_px", "min_alpha"), write=write)

@@ -1,7 +1,7 @@
 """Fusing the depths of several cameras: a truncated signed distance on a grid, and the surface where it is zero.
 
 Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996. The surface is
-found in tetrahedra, six to a cube, which leave no ambiguous case (Doi and Koide, 1991).
+extracted from tetrahedra, six to a cube, which leave no ambiguous case (Doi and Koide, 1991).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ..core.types import Camera
 from .surface import Surface
 
 TRUNCATION_VOXELS = 3.0
-"""Distance, in voxels, from which on a surface only says that there is space, or nothing behind it."""
+"""Distances to a surface are truncated at so many voxels, before and behind it."""
 MAX_VIEWS = 24
 MAX_VOXELS = 20_000_000
 # Six tetrahedra around the diagonal from corner 0 to corner 7; bits of a corner's number are its steps along x, y, z.
@@ -32,12 +32,10 @@ def viewpoints(cameras: tuple[Camera, ...]) -> list[Camera]:
     kept: dict[bytes, Camera] = {}
     for camera in cameras:
         kept.setdefault(np.round(camera.world_to_camera, 4).tobytes(), camera)
-    found = list(kept.values())
-    if len(found) < 2:
-        raise InputError(
-            "--mesh-method tsdf: expected a sequence with several camera positions; got one. Use --mesh-method grid."
-        )
-    return [found[i] for i in np.unique(np.linspace(0, len(found) - 1, MAX_VIEWS).round().astype(int))]
+    different = list(kept.values())
+    if len(different) < 2:
+        raise InputError("--mesh-method tsdf: expected several camera positions; got one. Fix: use --mesh-method grid.")
+    return [different[i] for i in np.unique(np.linspace(0, len(different) - 1, MAX_VIEWS).round().astype(int))]
 
 
 def fused_mesh(
@@ -59,8 +57,8 @@ def fused_mesh(
     plane = np.stack(np.meshgrid(*(np.arange(n) for n in shape[1:]), indexing="ij"), -1)
     for x in range(shape[0]):  # a slice at a time, so that memory stays small
         points = low + voxel_mm * np.concatenate([np.full((*shape[1:], 1), x), plane], -1)
-        for seen in views:
-            _add(seen, points, TRUNCATION_VOXELS * voxel_mm, distance[x], weight[x], color[x])
+        for surface in views:
+            _add(surface, points, TRUNCATION_VOXELS * voxel_mm, distance[x], weight[x], color[x])
     share = np.maximum(weight, 1)
     vertices, triangles, colors = _zero_surface(distance / share, weight > 0, color / share[..., None])
     return (
@@ -71,38 +69,40 @@ def fused_mesh(
 
 
 def _grid(views: list[Surface], voxel_mm: float) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
-    """First corner (3,), mm, and number of voxels of a grid with room around everything seen."""
+    """First corner (3,), mm, and number of voxels of a grid with a margin around every visible point."""
     points = [
-        back_project(pixel_centers(seen.camera.width, seen.camera.height)[seen.depth > 0], z, seen.camera)
-        for seen in views
-        if len(z := seen.depth[seen.depth > 0])
+        back_project(pixel_centers(surface.camera.width, surface.camera.height)[surface.depth > 0], z, surface.camera)
+        for surface in views
+        if len(z := surface.depth[surface.depth > 0])
     ]
     if not points:
-        raise InputError("--min-alpha: expected one at which a surface is left; got one too high. Lower it.")
-    everything = np.concatenate(points)
+        raise InputError("--min-alpha: expected a value that leaves a surface; got one too high. Fix: lower it.")
+    visible = np.concatenate(points)
     margin = (TRUNCATION_VOXELS + 1) * voxel_mm
-    low = everything.min(0) - margin
-    shape = tuple(int(n) for n in np.ceil((everything.max(0) + margin - low) / voxel_mm) + 1)
+    low = visible.min(0) - margin
+    shape = tuple(int(n) for n in np.ceil((visible.max(0) + margin - low) / voxel_mm) + 1)
     if np.prod(shape, dtype=np.float64) > MAX_VOXELS:
         least = voxel_mm * (np.prod(shape, dtype=np.float64) / MAX_VOXELS) ** (1 / 3)
         raise InputError(
-            f"--voxel-mm: expected at least {least:.2f} for a scene of this size; got {voxel_mm}. Raise it."
+            f"--voxel-mm: expected at least {least:.2f} for a scene of this size; got {voxel_mm}. Fix: raise it."
         )
     return low, shape
 
 
-def _add(seen: Surface, points: NDArray, truncation: float, distance: NDArray, weight: NDArray, color: NDArray) -> None:
-    """Add what one view says about points (..., 3) to the sums of distance, weight and color."""
-    pixels, z = project(points, seen.camera)
+def _add(
+    surface: Surface, points: NDArray, truncation: float, distance: NDArray, weight: NDArray, color: NDArray
+) -> None:
+    """Add the distance, weight and color of points (..., 3) in one view to their sums."""
+    pixels, z = project(points, surface.camera)
     column, row = np.floor(pixels[..., 0]), np.floor(pixels[..., 1])
-    inside = (z > 0) & (column >= 0) & (row >= 0) & (column < seen.camera.width) & (row < seen.camera.height)
+    inside = (z > 0) & (column >= 0) & (row >= 0) & (column < surface.camera.width) & (row < surface.camera.height)
     row, column = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
-    depth = seen.depth[row, column]
+    depth = surface.depth[row, column]
     before = depth - z  # positive in front of the surface
     known = inside & (depth > 0) & (before > -truncation)
     distance += np.where(known, np.minimum(before, truncation), 0)
     weight += known
-    color += np.where(known[..., None], seen.color[row, column], 0)
+    color += np.where(known[..., None], surface.color[row, column], 0)
 
 
 def _zero_surface(

@@ -1,8 +1,8 @@
-"""A film of the frames of a split, from where they were taken."""
+"""A video of the frames of a split, rendered from the cameras of the sequence."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,17 +11,21 @@ from numpy.typing import NDArray
 from ..model.scene import Scene
 from ..visualization.image_tools import to_u8
 from ..visualization.video import write_video
-from .moments import frame_indices
+from .formats import Format, Progress
 from .options import ExportOptions
+from .time_steps import frame_indices
 
 
-def write(scene: Scene, out: Path, options: ExportOptions, progress: Callable[[int, int], None]) -> None:
+def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
     """H.264 mp4 at the sequence's frame rate."""
-    chosen = frame_indices(len(scene.cameras), options.split)
+    indices = frame_indices(len(scene.cameras), options.split)
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
-        for k, i in enumerate(chosen):
+    def images() -> Iterator[NDArray[np.uint8]]:
+        for k, i in enumerate(indices):
             yield to_u8(scene.render(i / len(scene.cameras), scene.cameras[i]).color.numpy())
-            progress(k + 1, len(chosen))
+            progress(k + 1, len(indices))
 
-    write_video(out, pictures(), scene.frames_per_second)
+    write_video(out, images(), scene.frames_per_second)
+
+
+FORMAT = Format(suffixes=(".mp4",), options=("split",), write=write)

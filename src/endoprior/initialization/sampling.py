@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from ..core.checks import check_shape, input_error
 from ..core.config import InitConfig, PriorConfig
-from ..core.geometry import back_project
+from ..core.geometry import FARTHEST_MM, back_project
 from ..core.types import Frame
 from ..priors import joint_texture_prior
 from ..render.constants import NEAR_Z
@@ -34,8 +34,6 @@ PRIOR_BYTES = 200
 """Memory per pixel while sampling the points of a frame, bytes."""
 MIN_POINTS = 4
 """The initial scale needs three neighbors."""
-FARTHEST_MM = 1e9
-"""Larger depths are invalid; their squares would overflow float32."""
 
 log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""How canonical Gaussians move: the offsets of one moment, and the HexPlane field that predicts them.
+"""How canonical Gaussians move: the offsets at one time, and the HexPlane field that predicts them.
 
 Offsets are added to the raw parameters: centers (mm), log scales, quaternions before normalization, opacity logits.
 """
@@ -9,18 +9,21 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..core.checks import InputError, check_shape
 from ..core.config import DeformationConfig
-from .heads import OUTPUT_WIDTH, OffsetHeads
+from .attributes import offset_widths
+from .heads import OffsetHeads
 from .hexplane import PLANE_NAMES, PlaneGrid, plane_shapes
+from .ops import ModelOps
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """What one moment adds to the raw parameters of N Gaussians; None where nothing is added."""
+    """What one time step adds to the raw parameters of N Gaussians; None where nothing is added."""
 
     means: Tensor
     """(N, 3) displacement of the centers, mm."""
@@ -33,22 +36,18 @@ class Offsets:
     sh_dc: Tensor | None = None
     """(N, 3), added to the spherical-harmonic coefficient of degree 0."""
 
-
-def offset_names(cfg: DeformationConfig) -> tuple[str, ...]:
-    """Fields of `Offsets` that both kinds of deformation predict under `cfg`, in their order of storage."""
-    wanted = {
-        "means": True,
-        "quats": cfg.deform_quats,
-        "log_scales": cfg.deform_scales,
-        "opacity_logits": cfg.deform_opacity,
-    }
-    return tuple(name for name, used in wanted.items() if used)
+    @staticmethod
+    def from_channels(channels: dict[str, Tensor]) -> Offsets:
+        """Offsets from tensors (N, width) by name, as `attributes.offset_widths` names them."""
+        if "opacity_logits" in channels:
+            channels["opacity_logits"] = channels["opacity_logits"][:, 0]
+        return Offsets(**channels)
 
 
 class HexPlaneField:
     """The paper's deformation field: box, planes, trunk and heads.
 
-    `grid` and its `PlaneAdam` own the planes; `parameters_by_group` names what autograd trains.
+    Autograd trains `heads.parameters` and, if it needs a gradient, `box` (2, 3); the planes get theirs in `grid.grads`.
     """
 
     def __init__(self, box: Tensor, cfg: DeformationConfig, generator: torch.Generator, *, draw: bool = True) -> None:
@@ -66,7 +65,7 @@ class HexPlaneField:
             self.grid.initialize(generator)
         self.box = box.detach().to(torch.float32).clone().requires_grad_(cfg.hexplane.learn_box)
         self.heads = OffsetHeads(
-            self.grid.num_features, cfg.hexplane.width, offset_names(cfg), cfg.hexplane.bias_init, generator
+            self.grid.num_features, cfg.hexplane.width, offset_widths(cfg), cfg.hexplane.bias_init, generator
         )
 
     @classmethod
@@ -85,59 +84,47 @@ class HexPlaneField:
         field.load_state_arrays(arrays)
         return field
 
-    def to(self, device: torch.device | str, *, half_planes: bool = False) -> HexPlaneField:
+    def to(self, device: torch.device | str, *, fp16_planes: bool = False) -> HexPlaneField:
         """This field on a device; itself if it is there. A copy starts without gradients.
 
         Args:
-            half_planes: planes of half precision, on any device but the CPU, to draw with and no more.
+            fp16_planes: keep the planes in half precision, on any device but the CPU: for rendering only.
         """
         device = torch.device(device)
-        if self.box.device.type == device.type and not half_planes:
+        if self.box.device.type == device.type and not fp16_planes:
             return self
         moved = copy(self)
-        moved.grid = self.grid.halved(device) if half_planes else self.grid.to(device)
+        moved.grid = self.grid.to_fp16(device) if fp16_planes else self.grid.to(device)
         moved.heads = self.heads.to(device)
         moved.box = self.box.detach().to(device).requires_grad_(self.box.requires_grad)
         return moved
 
-    @property
-    def num_plane_values(self) -> int:
-        """Trained numbers in the planes."""
-        return self.grid.num_values
-
-    def offsets(self, means: Tensor, time: float | Tensor) -> Offsets:
-        """What `time` adds to Gaussians with canonical centers `means`.
+    def offsets(self, means: Tensor, time: float, ops: ModelOps) -> Offsets:
+        """Offsets at `time` of Gaussians with canonical centers `means`.
 
         Args:
             means: (N, 3) float32, world axes, mm; any subset of the Gaussians, N may be 0.
-            time: in [0, 1); off the CPU also as a () float64 tensor.
+            time: in [0, 1).
         Returns:
             Offsets with a gradient path to `means`, the box and the network; the planes' gradient goes to `grid.grads`.
         """
-        return self._read(*self._trunk(means, (time,)))
+        (trunk,) = self._trunk(means, (time,), ops)
+        return Offsets.from_channels(self.heads(trunk, ops))
 
     def offsets_and_displacement(
-        self, means: Tensor, time: float | Tensor, other: float | Tensor
+        self, means: Tensor, time: float, other: float, ops: ModelOps
     ) -> tuple[Offsets, Tensor]:
-        """`offsets` at `time`, and of the centers alone, (N, 3) mm, at an `other` time: cheaper than two calls."""
-        here, there = self._trunk(means, (time, other))
-        return self._read(here), self.heads(there, ("means",))["means"]
+        """`offsets` at `time`, and those of the centers alone, (N, 3) mm, at an `other` time: faster than two calls."""
+        here, there = self._trunk(means, (time, other), ops)
+        return Offsets.from_channels(self.heads(here, ops)), self.heads(there, ops, ("means",))["means"]
 
-    def _trunk(self, means: Tensor, times: tuple[float | Tensor, ...]) -> tuple[Tensor, ...]:
-        """What the trunk makes of the features, (N, W) per moment."""
+    def _trunk(self, means: Tensor, times: tuple[float, ...], ops: ModelOps) -> tuple[Tensor, ...]:
+        """Output of the trunk on the features, (N, W) per time."""
         # As in the paper's code the first corner is the maximum, so coordinates run against the axes.
         unit = (means - self.box[0]) / (self.box[1] - self.box[0])
-        return self.grid.linear(unit, times, *self.heads.trunk)
-
-    def _read(self, trunk: Tensor) -> Offsets:
-        found = self.heads(trunk)
-        if "opacity_logits" in found:
-            found["opacity_logits"] = found["opacity_logits"][:, 0]
-        return Offsets(**found)
-
-    def parameters_by_group(self) -> dict[str, list[Tensor] | Tensor]:
-        """Tensors that autograd trains: `network` (a list) and `box` (2, 3), which needs no gradient if it is fixed."""
-        return {"network": list(self.heads.parameters.values()), "box": self.box}
+        if not np.isfinite(times).all():
+            raise ValueError(f"time must be finite; got {times!r}")
+        return ops.hexplane_linear(self.grid, unit, times, *self.heads.trunk)
 
     def state_arrays(self) -> dict[str, Tensor]:
         """Every number that defines the field, by name; views of live memory, not copies."""
@@ -170,8 +157,8 @@ def state_shapes(cfg: DeformationConfig) -> dict[str, tuple[int, ...]]:
     for scale, rows_and_columns in enumerate(plane_shapes(planes)):
         shapes |= {f"hexplane.{scale}.{name}": (*size, planes.channels) for name, size in rows_and_columns.items()}
     layers = {"trunk": (width, len(planes.multires) * planes.channels)}
-    for name in offset_names(cfg):
-        layers |= {f"{name}.hidden": (width, width), f"{name}.output": (OUTPUT_WIDTH[name], width)}
+    for name, outputs in offset_widths(cfg).items():
+        layers |= {f"{name}.hidden": (width, width), f"{name}.output": (outputs, width)}
     for name, weight in layers.items():
         shapes |= {f"heads.{name}.weight": weight, f"heads.{name}.bias": weight[:1]}
     return shapes

@@ -25,14 +25,14 @@ SH_C0 = 0.28209479177387814
 class Gaussians:
     """Trainable per-Gaussian tensors, by name.
 
-    Names and shapes: `means` (N, 3) mm, `quats` (N, 4) wxyz, `log_scales` (N, 3), `opacity_logits` (N,),
-    `sh_dc` (N, 1, 3), `sh_rest` (N, (D+1)**2 - 1, 3) and, with the basis deformation, `motion` (N, B, C).
+    Names are those of `attributes.ATTRIBUTES`, shapes those of `attribute_shapes`: centers in mm, quaternions wxyz,
+    spherical harmonics (coefficient, channel). With the basis deformation there is `motion` too.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
         self.tensors = {name: value.detach().contiguous().requires_grad_() for name, value in tensors.items()}
         self.motion_gradients: list[RankOneGradient] = []
-        """Gradient of `motion` since the last optimizer step, one entry per moment."""
+        """Gradient of `motion` since the last optimizer step, one entry per time step."""
 
     def to(self, device: torch.device | str) -> Gaussians:
         """These Gaussians on a device; themselves if they are there."""

@@ -1,4 +1,4 @@
-"""The small network that reads offsets from a feature: one shared linear trunk, one head per kind of offset.
+"""The small network that predicts offsets from a feature: one shared linear trunk, one head per attribute.
 
 trunk: linear F -> W. Head: ReLU, linear W -> W, ReLU, linear W -> outputs (EndoGaussian). Weights start Xavier
 uniform, so the offsets are not zero at the start.
@@ -15,9 +15,7 @@ from torch import Tensor
 from torch.nn.functional import linear, relu
 from torch.nn.init import xavier_uniform_
 
-from ..compute.compiled import compiled
-
-OUTPUT_WIDTH = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1}
+from .ops import ModelOps
 
 
 class OffsetHeads:
@@ -27,7 +25,7 @@ class OffsetHeads:
         self,
         num_features: int,
         width: int,
-        outputs: tuple[str, ...],
+        outputs: dict[str, int],
         bias_init: Literal["default", "zero"],
         generator: torch.Generator,
     ) -> None:
@@ -36,14 +34,14 @@ class OffsetHeads:
         Args:
             num_features: F, width of the feature.
             width: W, hidden width.
-            outputs: which of `OUTPUT_WIDTH` to predict; the others have no head.
+            outputs: what to predict and how many numbers of each, as `attributes.offset_widths` gives them.
             bias_init: `default` draws biases from U[-1, 1] / sqrt(inputs) as PyTorch does; `zero` sets them to 0.
         """
-        self.outputs = outputs
+        self.outputs = tuple(outputs)
         self.parameters: dict[str, Tensor] = {}
         layers = [("trunk", num_features, width)]
-        for name in outputs:
-            layers += [(f"{name}.hidden", width, width), (f"{name}.output", width, OUTPUT_WIDTH[name])]
+        for name, num in outputs.items():
+            layers += [(f"{name}.hidden", width, width), (f"{name}.output", width, num)]
         for layer, fan_in, fan_out in layers:
             weight, bias = torch.empty(fan_out, fan_in), torch.zeros(fan_out)
             xavier_uniform_(weight, generator=generator)
@@ -62,18 +60,18 @@ class OffsetHeads:
 
     @property
     def trunk(self) -> tuple[Tensor, Tensor]:
-        """Weight (W, F) and bias (W,) of the linear trunk, which whoever makes the features applies to them."""
+        """Weight (W, F) and bias (W,) of the linear trunk; `ops.hexplane_linear` applies it to the features."""
         return self.parameters["trunk.weight"], self.parameters["trunk.bias"]
 
-    def __call__(self, trunk: Tensor, only: tuple[str, ...] | None = None) -> dict[str, Tensor]:
-        """Offsets (N, outputs) by name, from what the trunk makes of the features, (N, W); of `only` some heads."""
+    def __call__(self, trunk: Tensor, ops: ModelOps, only: tuple[str, ...] | None = None) -> dict[str, Tensor]:
+        """Offsets (N, outputs) by name from the output of the trunk, (N, W); of the heads in `only`, if given."""
         shared, names = relu(trunk), only or self.outputs
-        if compiled(trunk):
-            hidden = [self._linear(f"{name}.hidden", shared) for name in names]
-        else:  # one product for all: matrices of 32 columns leave a GPU idle, and each launch costs as much as its work
+        if ops.fuse_heads:
             weight = torch.cat([self.parameters[f"{name}.hidden.weight"] for name in names])
             bias = torch.cat([self.parameters[f"{name}.hidden.bias"] for name in names])
             hidden = linear(shared, weight, bias).chunk(len(names), -1)
+        else:
+            hidden = [self._linear(f"{name}.hidden", shared) for name in names]
         return {name: self._linear(f"{name}.output", relu(part)) for name, part in zip(names, hidden, strict=True)}
 
     def _linear(self, layer: str, inputs: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
-"""HexPlane: features of (x, y, z, t) as products of six planes, at several spatial scales.
+"""HexPlane: features of (x, y, z, t) as products of six planes, at several spatial scales. Here: the planes themselves.
 
 The planes hold tens of millions of numbers of which one step reads a small part, so they live outside the autograd
-graph: `PlaneGrid.sample` and `PlaneGrid.linear` are differentiable in the position, and their backward adds the
-gradient of the planes to the persistent buffer `PlaneGrid.grads`. `plane_adam.py` consumes that buffer.
+graph: `hexplane_linear` (of `hexplane_numba.py` or `hexplane_torch.py`) is differentiable in the position, and its
+backward pass adds the gradient of the planes to the persistent buffer `PlaneGrid.grads`, which the optimizer consumes.
 
 Sampling is that of the published field: bilinear, corners aligned, border padding; product over the planes, features
 of the scales concatenated (EndoGaussian; Cao and Johnson, "HexPlane", CVPR 2023).
@@ -13,30 +13,27 @@ from __future__ import annotations
 import math
 from copy import copy
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import linear
 
-from ..compute.compiled import compiled
-from ..core.checks import check_shape
 from ..core.config import HexPlaneConfig
-from . import hexplane_kernels as kernels
-from .hexplane_definition import Layout, features, layout_of
-from .hexplane_lookup import Linear, Sample
 
 PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
-_CACHE_LINE = 64
+TOUCHED, FRESH = 1, 2
+"""Bits of `PlaneGrid.marks`: the cell ever had a gradient; it has one now."""
+CACHE_LINE = 64
 """Bytes."""
 
 
 def mapped_zeros(*shape: int) -> Tensor:
     """float32 zeros that begin on a cache line and take memory only where written: NumPy maps, torch would fill."""
     size = math.prod(shape)
-    room = np.zeros(size + _CACHE_LINE // 4, dtype=np.float32)
-    start = -room.ctypes.data % _CACHE_LINE // 4
-    return torch.from_numpy(room[start : start + size]).view(shape)
+    buffer = np.zeros(size + CACHE_LINE // 4, dtype=np.float32)
+    start = -buffer.ctypes.data % CACHE_LINE // 4
+    return torch.from_numpy(buffer[start : start + size]).view(shape)
 
 
 def plane_shapes(cfg: HexPlaneConfig) -> list[dict[str, tuple[int, int]]]:
@@ -49,6 +46,23 @@ def plane_shapes(cfg: HexPlaneConfig) -> list[dict[str, tuple[int, int]]]:
         for m in cfg.multires
     ]
     return [{name: (cells[name[1]], cells[name[0]]) for name in PLANE_NAMES} for cells in scales]
+
+
+class Layout(NamedTuple):
+    """Where the planes lie in `PlaneGrid.values`; `S` scales, `R` columns of all time planes."""
+
+    resolution: Tensor
+    """(S, 3) float32 cells along x, y, z."""
+    space_start: Tensor
+    """(S, 3) first cell of the planes xy, xz, yz."""
+    space_width: Tensor
+    """(S, 3) cells from one row of the planes xy, xz, yz to the next."""
+    table_start: Tensor
+    """(S, 3) first column of the planes xt, yt, zt."""
+    time_first: Tensor
+    """(R,) cell that holds each column of the time planes in their first row."""
+    time_step: Tensor
+    """(R,) cells from one row of that column to the next."""
 
 
 class PlaneGrid:
@@ -86,11 +100,6 @@ class PlaneGrid:
         """Width of a feature, S * C."""
         return self.num_scales * self.channels
 
-    @property
-    def num_values(self) -> int:
-        """Trained numbers in all planes."""
-        return self.num_cells * self.channels
-
     def plane(self, scale: int, name: str, of: Tensor | None = None) -> Tensor:
         """View (rows, columns, C) of one plane of `values`, or of another tensor with one row per cell.
 
@@ -117,8 +126,8 @@ class PlaneGrid:
         moved.grads = moved.zeros()
         return moved
 
-    def halved(self, device: torch.device) -> PlaneGrid:
-        """A copy in half precision on a device, to look up and no more: without gradients, and nothing to train."""
+    def to_fp16(self, device: torch.device) -> PlaneGrid:
+        """A copy in half precision on a device, for look-ups only: it has no gradients and cannot be trained."""
         return self._copy(self.values.detach().to(device, torch.float16))
 
     def _copy(self, values: Tensor) -> PlaneGrid:
@@ -129,8 +138,22 @@ class PlaneGrid:
 
     @cached_property
     def layout(self) -> Layout:
-        """Where the planes lie, for look-ups off the CPU."""
-        return layout_of(self)
+        """Where the planes lie, as tensors on the device of `values`."""
+        size = torch.from_numpy(self.resolution)
+        first, step = [], []
+        for starts, cells in zip(self.time_start.tolist(), self.resolution.tolist(), strict=True):
+            for start, count in zip(starts, cells, strict=True):
+                first.append(start + torch.arange(count))
+                step.append(torch.full((count,), count))
+        tables = (
+            size.float(),
+            torch.from_numpy(self.space_start),
+            torch.stack([size[:, 0], size[:, 0], size[:, 1]], 1),
+            torch.from_numpy(self.table_start),
+            torch.cat(first),
+            torch.cat(step),
+        )
+        return Layout(*(table.to(self.values.device) for table in tables))
 
     def zeros(self) -> Tensor:
         """Zeros like `values`, where they are; on the CPU they take memory only once written."""
@@ -139,9 +162,9 @@ class PlaneGrid:
 
     def clear_grads(self) -> None:
         """Forget gradients that no optimizer step consumed; cells stay marked as touched."""
-        fresh = (self.marks & kernels.FRESH).nonzero()[:, 0]
+        fresh = (self.marks & FRESH).nonzero()[:, 0]
         self.grads[fresh] = 0
-        self.marks &= kernels.TOUCHED
+        self.marks &= TOUCHED
 
     def time_row(self, time: float) -> tuple[int, np.float32]:
         """Row r and fraction f of the time planes at `time`: the sample is (1 - f) * row r + f * row r + 1.
@@ -153,48 +176,3 @@ class PlaneGrid:
         position = min(max(position, 0.0), float(last))
         row = min(int(position), last - 1)
         return row, np.float32(position - row)
-
-    def sample(self, unit: Tensor, time: float) -> Tensor:
-        """Features at one moment.
-
-        Args:
-            unit: (N, 3) float32 positions, 0..1 from the first to the second corner of the box; clamped outside.
-            time: in [0, 1].
-        Returns:
-            (N, S * C) float32. When gradients are enabled its backward also adds to `grads`, even if `unit` itself
-            needs no gradient.
-        Raises:
-            ValueError: a wrong shape or a time that is not finite.
-        """
-        self._check(unit, (time,))
-        if torch.is_grad_enabled() and not unit.requires_grad:
-            unit = unit.detach().requires_grad_(True)
-        return Sample.apply(unit, time, self) if compiled(unit) else features(self, unit, (time,))[0]
-
-    def linear(
-        self, unit: Tensor, times: tuple[float | Tensor, ...], weight: Tensor, bias: Tensor
-    ) -> tuple[Tensor, ...]:
-        """A linear layer on the features of one or more moments.
-
-        Equal to `sample(unit, time) @ weight.T + bias`, but the features, many times wider than what is made of them,
-        do not leave the cache, and what does not depend on time is looked up once.
-
-        Args:
-            unit: (N, 3), as in `sample`.
-            times: M moments in [0, 1]; off the CPU also as () float64 tensors.
-            weight: (W, S * C). bias: (W,).
-        Returns:
-            (N, W) float32 per moment. With gradients, backward also adds to `grads`.
-        Raises:
-            ValueError: a wrong shape or a time that is not finite.
-        """
-        self._check(unit, times)
-        check_shape(f"weight:W,{self.num_features} bias:W", weight=weight, bias=bias)
-        if not compiled(unit):
-            return tuple(linear(found, weight, bias) for found in features(self, unit, times))
-        return Linear.apply(unit, weight, bias, times, self)
-
-    def _check(self, unit: Tensor, times: tuple[float | Tensor, ...]) -> None:
-        check_shape("unit:N,3", unit=unit)
-        if not all(isinstance(time, Tensor) or np.isfinite(time) for time in times):
-            raise ValueError(f"time must be finite; got {times!r}")

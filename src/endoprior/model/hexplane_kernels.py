@@ -1,15 +1,15 @@
-"""HexPlane look-up on the CPU: gather forward, differentiate and scatter backward, at several moments at once.
+"""HexPlane look-up on the CPU: gather forward, differentiate and scatter backward, at several times at once.
 
-Shared letters: `N` Gaussians, `M` moments, `S` scales, `C` channels of a plane. Samples of the planes xy, xz, yz are
-the same at every moment, so each is read once, and what all moments owe it is added up before it is written. Shared
+Shared letters: `N` Gaussians, `M` times, `S` scales, `C` channels of a plane. Samples of the planes xy, xz, yz do
+not depend on time, so each is read once, and the gradients of all times are added up before they are written. Shared
 arrays (all C-contiguous, trusted; "flat" ones are one-dimensional views of the shape that is given):
 
 - `unit` (N, 3) float32: position in the box, 0 at its first corner, 1 at its second; anything outside is clamped.
 - `values`, `grads` (cells, C) float32, flat: every plane of every scale; a plane is a block of cells.
 - `space_start` (S, 3) int64: first cell of planes xy, xz, yz. The cell (row r, column c) of plane `ab` is
   `start + r * resolution[a] + c`, where c runs along a and r along b.
-- `time_start` (S, 3) int64: first cell of planes xt, yt, zt (rows are moments, columns run along the space axis).
-- `tables`, `v_tables` (columns, M, C), flat: the time planes at the moments; `table_start` (S, 3): first columns.
+- `time_start` (S, 3) int64: first cell of planes xt, yt, zt (rows are time steps, columns run along the space axis).
+- `tables`, `v_tables` (columns, M, C), flat: the time planes at these times; `table_start` (S, 3): first columns.
 - `features` (M, N, S, C) float32, flat.
 - `resolution` (S, 3) int64: cells along x, y, z of each scale, at least 2. `layout` is (space_start, table_start,
   resolution).
@@ -29,10 +29,7 @@ import numpy as np
 from numba import njit, prange
 
 from ..compute.simd import LANES, fma, load_some, prefetch, splat, store_some, total
-
-MAX_CHANNELS = 256
-TOUCHED = 1
-FRESH = 2
+from .hexplane import FRESH, TOUCHED
 
 _CHUNK = 64  # Gaussians per task of the gather
 _AHEAD = 4  # Gaussians between asking for cells and using them
@@ -130,56 +127,57 @@ def _expect(array, cells, c, steps):
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def slice_time(values, channels, time_start, table_start, resolution, rows, fractions, tables):
-    # Cuts the time planes at the moments: tables = lerp of plane rows `rows[m]` and `rows[m] + 1`. One task per plane.
-    num_moments = len(rows)
+    # Interpolates the time planes at the given times: tables = lerp of plane rows `rows[m]` and `rows[m] + 1`. One task
+    # per plane.
+    num_times = len(rows)
     for task in prange(time_start.size):
         s, a = task // 3, task % 3
         width = resolution[s, a]
         for j in range(width):
-            for m in range(num_moments):
+            for m in range(num_times):
                 below = (time_start[s, a] + rows[m] * width + j) * channels
-                above, target = below + width * channels, ((table_start[s, a] + j) * num_moments + m) * channels
+                above, target = below + width * channels, ((table_start[s, a] + j) * num_times + m) * channels
                 for c in range(channels):
                     tables[target + c] = values[below + c] + fractions[m] * (values[above + c] - values[below + c])
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def gather(unit, values, channels, tables, num_moments, layout, features):
+def gather(unit, values, channels, tables, num_times, layout, features):
     # Writes `features`, the products of the six plane samples. One task per chunk of Gaussians.
     num = len(unit)
     for task in prange((num + _CHUNK - 1) // _CHUNK):
         last = min(num, (task + 1) * _CHUNK)
-        _gather_chunk(task * _CHUNK, last, unit, values, channels, tables, num_moments, layout, features)
+        _gather_chunk(task * _CHUNK, last, unit, values, channels, tables, num_times, layout, features)
 
 
 @njit(cache=True, error_model="numpy")
-def _gather_chunk(first, last, unit, values, channels, tables, num_moments, layout, features):
+def _gather_chunk(first, last, unit, values, channels, tables, num_times, layout, features):
     # `gather` for Gaussians first..last-1.
     resolution = layout[2]
     num, num_scales, whole = len(unit), len(resolution), channels // LANES * LANES
     for n in range(first, last):
         for s in range(num_scales):
             cells, columns, fractions, _ = _find(unit, n, s, layout)
-            steps = (channels, resolution[s, 0] * channels, resolution[s, 1] * channels, num_moments * channels)
+            steps = (channels, resolution[s, 0] * channels, resolution[s, 1] * channels, num_times * channels)
             ahead, _, _, _ = _find(unit, min(n + _AHEAD, num - 1), s, layout)
             place, stride = (n * num_scales + s) * channels, num * num_scales * channels
             for c in range(0, whole, LANES):
                 _expect(values, ahead, c, steps)
                 _gather_block(
                     c, None,
-                    values, tables, num_moments, cells, columns, fractions, steps, features, place, stride,
+                    values, tables, num_times, cells, columns, fractions, steps, features, place, stride,
                 )  # fmt: skip
             if whole < channels:
                 _gather_block(
                     whole, channels - whole,
-                    values, tables, num_moments, cells, columns, fractions, steps, features, place, stride,
+                    values, tables, num_times, cells, columns, fractions, steps, features, place, stride,
                 )  # fmt: skip
 
 
 @njit(inline="always")
-def _gather_block(c, lanes, values, tables, num_moments, cells, columns, fractions, steps, features, place, stride):
+def _gather_block(c, lanes, values, tables, num_times, cells, columns, fractions, steps, features, place, stride):
     # `gather` for one Gaussian, one scale and the channels from `c` on. `steps`: elements between cells of a row,
-    # between rows of planes over x and over y, between columns of the tables. Moment m writes to `place + m * stride`.
+    # between rows of planes over x and over y, between columns of the tables. Time m writes to `place + m * stride`.
     step, down_x, down_y, step_t = steps
     ux, uy, uz = fractions
     xy, xz, yz = cells[0] * step + c, cells[1] * step + c, cells[2] * step + c
@@ -187,18 +185,18 @@ def _gather_block(c, lanes, values, tables, num_moments, cells, columns, fractio
     sample_xz, _, _ = _bilinear(values, xz, xz + down_x, step, ux, uz, lanes)
     sample_yz, _, _ = _bilinear(values, yz, yz + down_y, step, uy, uz, lanes)
     space = sample_xy * (sample_xz * sample_yz)
-    for m in range(num_moments):
+    for m in range(num_times):
         at = m * step + c
         sample_xt, _ = _linear(tables, columns[0] * step_t + at, step_t, ux, lanes)
         sample_yt, _ = _linear(tables, columns[1] * step_t + at, step_t, uy, lanes)
         sample_zt, _ = _linear(tables, columns[2] * step_t + at, step_t, uz, lanes)
-        moment = sample_xt * (sample_yt * sample_zt)
-        store_some(features, m * stride + place + c, space * moment, lanes)
+        in_time = sample_xt * (sample_yt * sample_zt)
+        store_some(features, m * stride + place + c, space * in_time, lanes)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def scatter(
-    unit, values, channels, tables, num_moments, layout, features, grads, v_tables, marks, table_marks, v_unit, share
+    unit, values, channels, tables, num_times, layout, features, grads, v_tables, marks, table_marks, v_unit, share
 ):
     # The backward pass. `features` holds dL/d(features) on entry and the features themselves on return. Adds to
     # `grads` and `v_tables`, marks cells and columns, and writes v_unit (S, blocks, N, 3), where a block is a vector of
@@ -210,21 +208,21 @@ def scatter(
         turn, first = task % num_scales, task // num_scales * share
         s = turn // 2 if turn % 2 else num_scales - 1 - turn // 2
         _scatter_share(
-            s, first, min(channels, first + share), unit, values, channels, tables, num_moments, layout,
+            s, first, min(channels, first + share), unit, values, channels, tables, num_times, layout,
             features, grads, v_tables, marks, table_marks, v_unit[s],
         )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
 def _scatter_share(
-    s, first, last, unit, values, channels, tables, num_moments, layout,
+    s, first, last, unit, values, channels, tables, num_times, layout,
     features, grads, v_tables, marks, table_marks, v_unit,
 ):  # fmt: skip
     # `scatter` for one scale and channels first..last-1.
     resolution = layout[2]
     num, num_scales, whole = len(unit), len(resolution), first + (last - first) // LANES * LANES
     width, depth = resolution[s, 0], resolution[s, 1]
-    steps = (channels, width * channels, depth * channels, num_moments * channels)
+    steps = (channels, width * channels, depth * channels, num_times * channels)
     for n in range(num):
         cells, columns, fractions, slopes = _find(unit, n, s, layout)
         ahead, _, _, _ = _find(unit, min(n + _AHEAD, num - 1), s, layout)
@@ -233,12 +231,12 @@ def _scatter_share(
             _expect(values, ahead, c, steps)
             _expect(grads, ahead, c, steps)
             _scatter_block(
-                c, None, values, tables, num_moments, cells, columns, fractions, slopes, steps,
+                c, None, values, tables, num_times, cells, columns, fractions, slopes, steps,
                 features, place, stride, grads, v_tables, v_unit, n,
             )  # fmt: skip
         if whole < last:
             _scatter_block(
-                whole, last - whole, values, tables, num_moments, cells, columns, fractions, slopes, steps,
+                whole, last - whole, values, tables, num_times, cells, columns, fractions, slopes, steps,
                 features, place, stride, grads, v_tables, v_unit, n,
             )  # fmt: skip
         if first == 0:
@@ -251,7 +249,7 @@ def _scatter_share(
 
 @njit(inline="always")
 def _scatter_block(
-    c, lanes, values, tables, num_moments, cells, columns, fractions, slopes, steps,
+    c, lanes, values, tables, num_times, cells, columns, fractions, slopes, steps,
     features, place, stride, grads, v_tables, v_unit, n,
 ):  # fmt: skip
     # `scatter` for one Gaussian, one scale and the channels from `c` on; arguments as in `_gather_block`.
@@ -265,19 +263,19 @@ def _scatter_block(
     of_z = sample_xz * sample_yz
     space = sample_xy * of_z
     v_x = v_y = v_z = v_space = splat(_ZERO)
-    for m in range(num_moments):
+    for m in range(num_times):
         at = m * step + c
         xt, yt, zt = columns[0] * step_t + at, columns[1] * step_t + at, columns[2] * step_t + at
         sample_xt, xt_x = _linear(tables, xt, step_t, ux, lanes)
         sample_yt, yt_y = _linear(tables, yt, step_t, uy, lanes)
         sample_zt, zt_z = _linear(tables, zt, step_t, uz, lanes)
         of_yz = sample_yt * sample_zt
-        moment = sample_xt * of_yz
+        in_time = sample_xt * of_yz
         v_feature = load_some(features, m * stride + place + c, lanes)
-        store_some(features, m * stride + place + c, space * moment, lanes)
-        v_space = fma(v_feature, moment, v_space)
-        v_moment = v_feature * space
-        v_xt, v_rest = v_moment * of_yz, v_moment * sample_xt
+        store_some(features, m * stride + place + c, space * in_time, lanes)
+        v_space = fma(v_feature, in_time, v_space)
+        v_in_time = v_feature * space
+        v_xt, v_rest = v_in_time * of_yz, v_in_time * sample_xt
         v_yt, v_zt = v_rest * sample_zt, v_rest * sample_yt
         v_x, v_y, v_z = fma(v_xt, xt_x, v_x), fma(v_yt, yt_y, v_y), fma(v_zt, zt_z, v_z)
         _add_linear(v_tables, xt, step_t, ux, v_xt, lanes)
@@ -304,15 +302,15 @@ def slice_time_backward(
     v_tables, channels, table_marks, time_start, table_start, resolution, rows, fractions, grads, marks
 ):
     # Adds `v_tables` to rows `rows[m]` and `rows[m] + 1` of the time planes, where marked. One task per plane.
-    num_moments = len(rows)
+    num_times = len(rows)
     for task in prange(time_start.size):
         s, a = task // 3, task % 3
         width = resolution[s, a]
-        for m in range(num_moments):
+        for m in range(num_times):
             for j in range(width):
                 column, cell = table_start[s, a] + j, time_start[s, a] + rows[m] * width + j
                 if table_marks[column]:
-                    source = (column * num_moments + m) * channels
+                    source = (column * num_times + m) * channels
                     below, above = cell * channels, (cell + width) * channels
                     for c in range(channels):
                         grads[below + c] += (_ONE - fractions[m]) * v_tables[source + c]

@@ -11,21 +11,17 @@ from typing import TYPE_CHECKING, Any
 from ..core.checks import InputError
 from ..core.config import Config
 from ..core.config_io import to_dict
-from ..model.deformation import HexPlaneField
-from ..model.gaussians import Gaussians
-from ..model.hexplane import plane_shapes
-from ..model.hexplane_kernels import TOUCHED
+from ..model.hexplane import TOUCHED, plane_shapes
 from ..model.schema import model_schema
-from ..system.arrays_file import ArraySpec, load_arrays, part, rejecting, save_arrays
+from ..system.arrays_file import ArraySpec, load_arrays, rejecting, save_arrays
 from ..training.density import DensityStats
-from ..training.optimizer import Optimizer
-from ..training.state import Stage, TrainState
-from .identity import refuse_other_run
+from ..training.state import Stage
+from ..training.step import stage_length
+from ..training.trainer import Trainer
+from .identity import reject_other_run
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from ..training.trainer import Trainer
 
 FORMAT = "endoprior-checkpoint-1"
 
@@ -34,25 +30,19 @@ def save_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
     """Write everything that the next iteration depends on.
 
     Args:
-        fingerprint: of the sequence; a run is only continued on the same data.
+        fingerprint: of the sequence; a run only resumes on the same data.
     """
-    state = trainer.state
-    arrays = {f"gaussians.{name}": value.detach() for name, value in state.gaussians.tensors.items()}
-    arrays |= {f"stats.{name}": value for name, value in state.stats.tensors().items()}
-    arrays |= {f"optimizer.{name}": value for name, value in state.optimizer.state_arrays().items()}
-    if state.field is not None:
-        arrays |= {f"field.{name}": value for name, value in state.field.state_arrays().items()}
     about = {
-        "stage": int(state.stage),
-        "iteration": state.iteration,
+        "stage": int(trainer.state.stage),
+        "iteration": trainer.state.iteration,
         "config": to_dict(trainer.cfg),
         "fingerprint": fingerprint,
     }
-    save_arrays(path, arrays, about, FORMAT)
+    save_arrays(path, trainer.state.arrays(), about, FORMAT)
 
 
 def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
-    """Put `trainer` into the saved state.
+    """Restore the saved state in `trainer`.
 
     Raises:
         InputError: the file is missing or damaged, or belongs to another config or other data.
@@ -62,26 +52,19 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
     cfg, next_step = trainer.cfg, "Train again without --resume."
 
     def schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
-        refuse_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, trainer.sequence.path)
+        reject_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, trainer.sequence.path)
         return checkpoint_schema(cfg)
 
     arrays, about = load_arrays(path, FORMAT, schema, next_step)
     with rejecting(path, "a training state", next_step):
         stage, iteration = Stage(about["stage"]), about["iteration"]
-        if type(iteration) is not int or not 0 <= iteration <= trainer.stage_length(stage):
-            expected = f"0 to {trainer.stage_length(stage)}"
+        length = stage_length(cfg, stage)
+        if type(iteration) is not int or not 0 <= iteration <= length:
             raise InputError(
-                f"expected {expected} as iteration of the {stage.name.lower()} stage; got {iteration!r:.80}."
+                f"expected 0 to {length} as iteration of the {stage.name.lower()} stage; got {iteration!r:.80}."
             )
         check_state(arrays, iteration)
-    gaussians = Gaussians(part(arrays, "gaussians.")).to(trainer.device)
-    field = None
-    if cfg.deformation.kind == "hexplane":
-        field = HexPlaneField.from_state_arrays(part(arrays, "field."), cfg.deformation).to(trainer.device)
-    optimizer = Optimizer(gaussians, field, cfg, trainer.spatial_scale)
-    optimizer.load_state_arrays(part(arrays, "optimizer."))
-    stats = DensityStats(**{name: value.to(trainer.device) for name, value in part(arrays, "stats.").items()})
-    trainer.state = TrainState(stage, iteration, gaussians, field, optimizer, stats)
+    trainer.restore(stage, iteration, arrays)
 
 
 def checkpoint_schema(cfg: Config) -> dict[str, ArraySpec]:
@@ -109,21 +92,21 @@ def checkpoint_schema(cfg: Config) -> dict[str, ArraySpec]:
 
 
 def check_state(arrays: Mapping[str, Tensor], iteration: int) -> None:
-    """Refuse arrays of a checkpoint, finite and of the right shapes, that no training arrives at.
+    """Reject arrays of a checkpoint, finite and of the right shapes, that no training can produce.
 
     Raises:
         InputError: naming the array.
     """
     for name, value in arrays.items():
         if name.startswith("stats.") or name.endswith((".second", ".exp_avg_sq")):
-            sensible, expected = bool((value >= 0).all()), "no negative number"
+            valid, expected = bool((value >= 0).all()), "no negative number"
         elif name.endswith(".steps"):
-            sensible, expected = bool(((value >= 0) & (value <= iteration)).all()), f"0 to {iteration} steps"
+            valid, expected = bool(((value >= 0) & (value <= iteration)).all()), f"0 to {iteration} steps"
         elif name.endswith(".marks"):
             touched = len(arrays["optimizer.plane_adam.exp_avg"])
-            sensible = bool((value <= TOUCHED).all()) and int(value.count_nonzero()) == touched
+            valid = bool((value <= TOUCHED).all()) and int(value.count_nonzero()) == touched
             expected = f"{touched} touched cells"
         else:
             continue
-        if not sensible:
+        if not valid:
             raise InputError(f"expected {expected} in {name}; got something else.")

@@ -1,4 +1,4 @@
-"""Whether what a folder holds is the run that is to be continued."""
+"""Whether a folder holds the run that is to be resumed."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from ..core.config import Config
 from ..core.config_io import to_dict
 
 
-def refuse_other_run(
+def reject_other_run(
     file: Path, stored_config: Any, stored_fingerprint: Any, cfg: Config, fingerprint: str, data: Path
 ) -> None:
-    """Refuse to continue with another config or on other data.
+    """Refuse to resume with another config or on other data.
 
     Args:
         file: where the stored ones come from; named in the message.
-        stored_config, stored_fingerprint: as they were read from it.
-        cfg, fingerprint: those of now.
+        stored_config, stored_fingerprint: as read from it.
+        cfg, fingerprint: the current ones.
         data: folder of the sequence, for the message.
     Raises:
         InputError: the config differs, or the data do.

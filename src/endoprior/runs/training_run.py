@@ -1,21 +1,34 @@
-"""From a sequence to a scene, in memory or in a run folder."""
+"""From a sequence to a scene, in memory or in a run folder. Interruption saves; resuming is bit-identical."""
 
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from ..core.checks import InputError
 from ..core.config import Config
 from ..data import FrameSequence
+from ..data.files import read_json
 from ..model.scene import Scene
-from ..training.memory_check import refuse_too_large
-from ..training.state import StepReport
-from ..training.trainer import Trainer
+from ..system.atomic import write_json, writing
+from ..training.divergence import Diverged
+from ..training.memory_check import reject_too_large
+from ..training.trainer import Observer, Trainer
 from . import kernel_cache
-from .folder import CHECKPOINT_SECONDS, RunOptions, train_in_folder
+from .checkpoint import load_checkpoint, save_checkpoint
+from .folder import locked, prepare_run_folder, reject_unusable_folder
+from .identity import reject_other_run
+from .interrupt import deferred_interrupt
+from .observers import CHECKPOINT_SECONDS, CheckpointWriter, LogWriter, cut_log
+from .provenance import run_facts
 
 log = logging.getLogger(__name__)
+
+CHECKPOINT = "checkpoint.safetensors"
+LAST_GOOD = "last_good.safetensors"
+"""The scene just before its training diverged."""
 
 
 def train(
@@ -25,7 +38,7 @@ def train(
     *,
     resume: bool = False,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
-    on_step: Callable[[StepReport, Trainer], None] | None = None,
+    on_step: Observer | None = None,
 ) -> Scene:
     """Train one scene.
 
@@ -38,19 +51,97 @@ def train(
         on_step: called after each iteration.
     Raises:
         InputError: the sequence cannot be used, needs more memory than there is, or `out` holds another run.
-        Diverged: the loss or a gradient is not finite, or the pictures show nothing; `out` keeps the state before.
-        CannotWrite: the disk does not take what is written; the last whole state is kept.
+        Diverged: the loss or a gradient is not finite, or the images show nothing; `out` keeps the state before.
+        CannotWrite: a file cannot be written; the last complete state is kept.
         KeyboardInterrupt: the user stopped; a checkpoint has been written.
     """
-    refuse_too_large(sequence, cfg)
-    kernel_cache.fill(cfg, log.info)
-    sequence.validate()
-    trainer = Trainer(sequence, cfg)
-    if out is not None:
-        return train_in_folder(trainer, Path(out), RunOptions(resume, checkpoint_seconds), on_step=on_step)
-    trainer.start()
-    while not trainer.finished:
-        report = trainer.step()
-        if on_step:
-            on_step(report, trainer)
-    return trainer.scene()
+    run = TrainingRun(sequence, cfg, out, resume=resume, say=log.info)
+    return run.complete(on_step, checkpoint_seconds=checkpoint_seconds)
+
+
+class TrainingRun:
+    """A run whose sequence, config and folder have been checked, and which is ready to compute."""
+
+    def __init__(
+        self,
+        sequence: FrameSequence,
+        cfg: Config,
+        out: str | Path | None = None,
+        *,
+        resume: bool = False,
+        say: Callable[[str], None],
+    ) -> None:
+        """Check everything, cheap checks first, and compile the kernels if that was not done before.
+
+        Args:
+            say: takes lines for the user: what takes long, and what is suspicious about the sequence.
+        Raises:
+            InputError: see `train`.
+        """
+        self.out = Path(out) if out is not None else None
+        self.resume = resume
+        if self.out:
+            reject_unusable_folder(self.out, resume=resume)
+        reject_too_large(sequence, cfg)
+        kernel_cache.fill(cfg, say)
+        say(f"{sequence.path}: {len(sequence)} frames; backend {cfg.render.backend}")
+        for warning in sequence.validate():
+            say(f"note: {warning}")
+        self.trainer = Trainer(sequence, cfg)
+
+    def complete(self, on_step: Observer | None = None, *, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> Scene:
+        """Train to the end; see `train`."""
+        observers = [on_step] if on_step else []
+        if self.out is None:
+            self.trainer.start()
+            self.trainer.run(observers)
+            return self.trainer.scene()
+        created = prepare_run_folder(self.out, resume=self.resume)
+        with locked(self.out):
+            fingerprint = self.trainer.sequence.fingerprint()
+            try:
+                self._begin(self.out, fingerprint)
+            except InputError:
+                if created:  # nothing was begun
+                    shutil.rmtree(self.out, ignore_errors=True)
+                elif not self.resume:
+                    (self.out / "config.json").unlink(missing_ok=True)
+                raise
+            self._train_in(self.out, fingerprint, observers, checkpoint_seconds)
+            scene = self.trainer.scene()
+            scene.save(self.out / "scene.safetensors")
+        return scene
+
+    def _begin(self, out: Path, fingerprint: str) -> None:
+        """Start or restore the trainer, and write what must be known to repeat the run."""
+        trainer, checkpoint, about = self.trainer, out / CHECKPOINT, out / "config.json"
+        if self.resume and checkpoint.is_file():
+            load_checkpoint(trainer, checkpoint, fingerprint)
+        elif self.resume and about.is_file():  # stopped before its first checkpoint
+            stored = read_json(about)
+            data = stored.get("data")
+            known = data.get("fingerprint") if isinstance(data, dict) else None
+            reject_other_run(about, stored.get("config"), known, trainer.cfg, fingerprint, trainer.sequence.path)
+        elif self.resume:
+            raise InputError(f"{checkpoint}: expected a checkpoint to resume from; found none. Start without --resume.")
+        write_json(about, run_facts(trainer, fingerprint))
+        if trainer.state is None:
+            trainer.start()
+        cut_log(out / "log.jsonl", trainer.state.stage, trainer.state.iteration)
+
+    def _train_in(self, out: Path, fingerprint: str, observers: list[Observer], checkpoint_seconds: float) -> None:
+        """Iterate to the end or to an interruption, with log and checkpoints in `out`."""
+        trainer, checkpoint, lines = self.trainer, out / CHECKPOINT, out / "log.jsonl"
+        try:
+            with writing(lines), open(lines, "a", buffering=1) as file, deferred_interrupt() as interrupted:
+                writer = CheckpointWriter(checkpoint, fingerprint, checkpoint_seconds, interrupted)
+                trainer.run([LogWriter(file), *observers, writer])
+                save_checkpoint(trainer, checkpoint, fingerprint)
+        except Diverged as error:
+            save_checkpoint(trainer, checkpoint, fingerprint)
+            trainer.scene().save(out / LAST_GOOD)
+            state = trainer.state
+            raise Diverged(
+                f"{out}: {state.stage.name.lower()} iteration {state.iteration + 1}: {error}; the scene before is "
+                f"{LAST_GOOD}."
+            ) from error

@@ -1,9 +1,13 @@
 """Stop a training run before it goes wrong: no NaN and no infinity may ever reach a parameter.
 
-Each iteration is judged after its gradients are known and before anything is changed. That suffices: Adam moves a
+Each iteration is checked after its gradients are known and before anything changes. That suffices: Adam moves a
 parameter by at most 0.1 / sqrt(0.001) / sqrt(1 - 0.81 / 0.999) = 7.3 times its learning rate (Cauchy-Schwarz), rates
 are bounded (`OptimConfig`), and gradients below `LARGEST_GRADIENT` have squares that float32 can hold, so that moments
 and parameters stay finite.
+
+On the CPU the result is known at once. On a device the host would have to wait for it, so it reads the results only
+every `CHECK_EVERY` iterations. Until then the device itself keeps a flag, `skip`: from the first unusable iteration on
+it is 1, and optimizer and statistics, which read it there, leave the state unchanged.
 """
 
 from __future__ import annotations
@@ -11,23 +15,22 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+import torch
+from torch import Tensor
 
-from ..compute.compiled import compiled
 from ..core.checks import InputError
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-LARGEST_GRADIENT = np.float32(1e15)
+LARGEST_GRADIENT = 1e15
 """Beyond this, or without a value, a gradient means that the run has diverged."""
+CHECK_EVERY = 20
+"""Iterations between two checks on a device: each check makes the host wait once."""
 WINDOW = 300
-"""Iterations over which a picture that is no better than black counts as divergence."""
+"""Iterations over which images that are no better than black ones count as divergence."""
 NO_BETTER = 0.95
-"""... when its color error is this share of black's."""
+"""... when their color error is this share of black's."""
 DARK = 0.02
 """Mean brightness of the frames, 0..1, below which black is a fair guess and nothing is concluded."""
 
@@ -35,94 +38,120 @@ ADVICE = "Lower the learning rates (--optim...), or look for wrong depth and pos
 
 
 class Diverged(InputError):
-    """Training cannot go on; the state before the iteration it is about is untouched."""
-
-    ago: int = 0
-    """Iterations that were begun after that one: on a device the host looks only now and then."""
+    """Training cannot continue; the state before the iteration it is about is unchanged."""
 
 
-def check_step(terms: Mapping[str, float], unusable: Mapping[str, int]) -> None:
-    """Refuse an iteration whose loss or gradients are not usable numbers.
+@dataclass(frozen=True)
+class Divergence:
+    """Why a run has diverged."""
+
+    reason: str
+    last_good: int
+    """Iteration of the stage after which the state was left unchanged."""
+
+
+def unusable_numbers(terms: Mapping[str, float], unusable: Mapping[str, int]) -> str | None:
+    """What is wrong with the numbers of an iteration, if anything is.
 
     Args:
         terms: weighted terms of the loss.
-        unusable: entries of each gradient that `count_unusable` counted, by name.
-    Raises:
-        Diverged: a term is not finite, or a gradient has such an entry.
+        unusable: entries of each gradient that are not finite or beyond `LARGEST_GRADIENT`, by name.
     """
-    counted = [f"{count:,} unusable entries in the gradient of {name}" for name, count in unusable.items() if count]
-    _refuse(terms, counted)
+    found = [f"{name} {value}" for name, value in terms.items() if not math.isfinite(value)]
+    found += [f"{count:,} unusable entries in the gradient of {name}" for name, count in unusable.items() if count]
+    return f"expected a finite loss and gradient; got {', '.join(found)}. {ADVICE}" if found else None
 
 
-def check_largest(terms: Mapping[str, float], largest: Mapping[str, float]) -> None:
-    """`check_step`, where of each gradient the largest magnitude is known; NaN stands for any NaN."""
-    limit = float(LARGEST_GRADIENT)
-    _refuse(terms, [f"{value:.3g} in the gradient of {name}" for name, value in largest.items() if not value <= limit])
+@dataclass(frozen=True)
+class _Numbers:
+    """What an iteration is checked by; `values` may lie on a device."""
+
+    iteration: int
+    brightness: float
+    terms: tuple[str, ...]
+    gradients: tuple[str, ...]
+    values: Tensor
+    """(terms + gradients,) weighted terms of the loss, then counts of unusable entries."""
 
 
-def _refuse(terms: Mapping[str, float], unusable: list[str]) -> None:
-    found = [f"{name} {value}" for name, value in terms.items() if not math.isfinite(value)] + unusable
-    if found:
-        raise Diverged(f"expected a finite loss and gradient; got {', '.join(found)}. {ADVICE}")
+class DivergenceCheck:
+    """Checks every iteration of a run, in order."""
 
+    def __init__(self, device: torch.device, *, blocking: bool) -> None:
+        """Args: blocking: check each iteration at once, as suits a CPU; else every `CHECK_EVERY`."""
+        self.skip: Tensor | None = None if blocking else torch.zeros((), device=device)
+        """() float32 on the device, 1 once an iteration was unusable; None where each is checked at once."""
+        self._watch = Watch()
+        self._pending: list[_Numbers] = []
 
-def count_unusable(gradient: Tensor) -> int:
-    """Number of entries of a float32 tensor that are NaN, infinite, or beyond `LARGEST_GRADIENT`."""
-    if not compiled(gradient):
-        return int((~(gradient.detach().abs() <= float(LARGEST_GRADIENT))).sum())
-    return int(_count(gradient.detach().contiguous().reshape(-1).numpy(), LARGEST_GRADIENT))
+    def after_backward(
+        self,
+        iteration: int,
+        terms: Mapping[str, Tensor],
+        unusable: Mapping[str, int | Tensor],
+        brightness: float,
+        *,
+        wait: bool,
+    ) -> Divergence | None:
+        """Take in an iteration before its update; on a device the answer may come some iterations later.
 
+        Args:
+            terms: weighted terms of the loss, () each.
+            unusable: entries of each gradient that are not finite or beyond `LARGEST_GRADIENT`, by name.
+            brightness: see `Watch.see`.
+            wait: read the results now: what follows cannot be undone.
+        """
+        counts = [torch.as_tensor(count, dtype=torch.float64) for count in unusable.values()]
+        values = torch.stack([*(value.detach().double() for value in terms.values()), *counts])
+        self._pending.append(_Numbers(iteration, brightness, tuple(terms), tuple(unusable), values))
+        if self.skip is not None:
+            usable = values.isfinite().all() & (values[len(terms) :] == 0).all()
+            self.skip.copy_(torch.maximum(self.skip, (~usable).float()))
+            if not wait and len(self._pending) < CHECK_EVERY:
+                return None
+        return self.results(applied=iteration - 1)
 
-def count_unusable_rows(gradients: Tensor, marks: Tensor, mark: int) -> int:
-    """The same over the rows (n, C) float32, contiguous, whose entry of `marks` (n,) uint8 has the bits of `mark`."""
-    if not compiled(gradients):  # other rows hold zeros
-        return count_unusable(gradients)
-    return int(_count_rows(gradients.detach().numpy(), marks.numpy(), mark, LARGEST_GRADIENT))
+    def results(self, applied: int) -> Divergence | None:
+        """Check what is pending; on a device the host waits for it.
 
-
-@njit(parallel=True, cache=True)
-def _count(values, limit):
-    bad = 0
-    for i in prange(values.size):
-        if not abs(values[i]) <= limit:
-            bad += 1
-    return bad
-
-
-@njit(parallel=True, cache=True)
-def _count_rows(values, marks, mark, limit):
-    bad = 0
-    for i in prange(values.shape[0]):
-        found = 0
-        if marks[i] & mark:
-            for c in range(values.shape[1]):
-                if not abs(values[i, c]) <= limit:
-                    found += 1
-        bad += found
-    return bad
+        Args:
+            applied: last iteration whose update was made or skipped.
+        """
+        pending, self._pending = self._pending, []
+        values = iter(torch.cat([each.values for each in pending]).tolist() if pending else [])
+        for each in pending:
+            terms = {name: next(values) for name in each.terms}
+            reason = unusable_numbers(terms, {name: int(next(values)) for name in each.gradients})
+            if reason is not None:
+                return Divergence(reason, each.iteration - 1)
+            reason = self._watch.see(terms["color"], each.brightness)
+            if reason is not None:
+                return Divergence(reason, applied)
+        return None
 
 
 class Watch:
-    """Notices a run that explains nothing: everything flew away, faded out, or burns."""
+    """Notices a run that explains nothing: everything moved out of view, faded, or saturated."""
 
     def __init__(self) -> None:
         self._errors: deque[tuple[float, float]] = deque(maxlen=WINDOW)
 
-    def see(self, color_error: float, brightness: float) -> None:
+    def see(self, color_error: float, brightness: float) -> str | None:
         """Take in one iteration.
 
         Args:
-            color_error: mean absolute error of the picture over tissue.
-            brightness: mean of the frame over tissue, in [0, 1]: the error that a black picture has.
-        Raises:
-            Diverged: over the last `WINDOW` iterations the pictures were no better than black ones.
+            color_error: mean absolute error of the image over tissue.
+            brightness: mean of the frame over tissue, in [0, 1]: the error that a black image has.
+        Returns:
+            What is wrong, if over the last `WINDOW` iterations the images were no better than black ones.
         """
         self._errors.append((color_error, brightness))
         if len(self._errors) < WINDOW:
-            return
+            return None
         error, black = np.mean(self._errors, axis=0)
-        if black > DARK and error >= NO_BETTER * black:
-            raise Diverged(
-                f"expected pictures that resemble the frames; over {WINDOW} iterations their mean color error was "
-                f"{error:.3g}, and black pictures would have {black:.3g}. {ADVICE}"
-            )
+        if black <= DARK or error < NO_BETTER * black:
+            return None
+        return (
+            f"expected images that resemble the frames; over {WINDOW} iterations their mean color error was "
+            f"{error:.3g}, and black images would have {black:.3g}. {ADVICE}"
+        )

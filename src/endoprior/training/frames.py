@@ -1,4 +1,4 @@
-"""What the loop needs of each training frame, as tensors made once: targets, masks, the prior, the frame before."""
+"""What an iteration needs of each training frame, as tensors made once: targets, masks, the prior, the frame before."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..priors import joint_texture_prior
 from ..system.memory import BoundedCache, cache_bytes
 
 TENSORS = ("rgb_u8", "tissue_mask", "inverse_depth", "measured")
-"""What of a training frame lies on a device."""
+"""Fields of a training frame that are copied to a device."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class TrainingFrame:
     """One training frame at one resolution."""
 
     index: int
-    time: float | Tensor
-    """In [0, 1); a () float64 tensor where it lies on a `recorded.Desk`."""
+    time: float
+    """In [0, 1)."""
     camera: Camera
     rgb_u8: Tensor
     """(H, W, 3) uint8."""
@@ -46,23 +46,23 @@ class TrainingFrame:
         return self.rgb_u8.float() / 255
 
 
-SHARE_OF_DEVICE = 0.25
-"""Of a device's free memory, that frames may take when training begins; those beyond are copied at each use."""
+DEVICE_SHARE = 0.25
+"""Share of a device's free memory that frames may take; frames beyond it are copied at each use."""
 
 
 class TrainingFrames:
-    """Training frames of a sequence by position; built when first used, kept as memory allows, here and on a device."""
+    """Training frames of a sequence by position, built when first used, cached in memory and on the device."""
 
     def __init__(self, sequence: FrameSequence, prior_cfg: PriorConfig, device: torch.device | str = "cpu") -> None:
-        """Args: sequence: where frames come from. prior_cfg: of the prior. device: where the tensors are wanted."""
+        """Args: sequence: source of the frames. prior_cfg: of the prior. device: where tensors are returned."""
         self.sequence, self.device = sequence, torch.device(device)
         self.indices = sequence.indices("train")
         self._prior_cfg = prior_cfg
         self._frames: BoundedCache[TrainingFrame] = BoundedCache(cache_bytes(), _frame_bytes)
         self._priors: BoundedCache[Tensor] = BoundedCache(cache_bytes() // 4, lambda prior: prior.nbytes)
-        room = device_bytes(self.device)
-        self._frames_there: BoundedCache[TrainingFrame] = BoundedCache(room, _frame_bytes)
-        self._priors_there: BoundedCache[Tensor] = BoundedCache(room // 4, lambda prior: prior.nbytes)
+        device_limit = device_bytes(self.device)
+        self._device_frames: BoundedCache[TrainingFrame] = BoundedCache(device_limit, _frame_bytes)
+        self._device_priors: BoundedCache[Tensor] = BoundedCache(device_limit // 4, lambda prior: prior.nbytes)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -76,7 +76,7 @@ class TrainingFrames:
         key = (position, half)
         if self.device.type == "cpu":
             return self._frames.get(key, build)
-        return self._frames_there.get(key, lambda: _moved(self._frames.get(key, build), self.device))
+        return self._device_frames.get(key, lambda: _moved(self._frames.get(key, build), self.device))
 
     def before(self, position: int) -> TrainingFrame | None:
         """The frame just before in the sequence if it is itself a training frame (released code), else None."""
@@ -94,21 +94,21 @@ class TrainingFrames:
         if self.device.type == "cpu":
             prior = self._priors.get(position, build)
         else:
-            prior = self._priors_there.get(position, lambda: _queued(self._priors.get(position, build), self.device))
+            prior = self._device_priors.get(position, lambda: _copied(self._priors.get(position, build), self.device))
         return prior, self.frame(position).tissue_mask
 
 
 def device_bytes(device: torch.device) -> int:
-    """Memory of a device that frames may take."""
-    return int(SHARE_OF_DEVICE * torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else cache_bytes()
+    """Memory of a device that frames may take, bytes."""
+    return int(DEVICE_SHARE * torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else cache_bytes()
 
 
 def _moved(frame: TrainingFrame, device: torch.device) -> TrainingFrame:
-    return replace(frame, **{name: _queued(getattr(frame, name), device) for name in TENSORS})
+    return replace(frame, **{name: _copied(getattr(frame, name), device) for name in TENSORS})
 
 
-def _queued(tensor: Tensor, device: torch.device) -> Tensor:
-    """A copy on a device that nobody waits for: from memory that stays in place while it is read."""
+def _copied(tensor: Tensor, device: torch.device) -> Tensor:
+    """A non-blocking copy on a device, from pinned memory."""
     return (tensor.pin_memory() if device.type == "cuda" else tensor).to(device, non_blocking=True)
 
 

@@ -1,7 +1,7 @@
-"""The least memory that a training needs, so that one that cannot succeed is refused at once, with a number.
+"""The least memory that a training needs, so that one that cannot succeed is rejected at once, with a number.
 
-Closed form, calibrated on measured runs (docs/reliability.md): frames of any number are read again when they do not
-fit, but parameters, Adam's moments, the tracks of the first points and the work on one picture must be there at once.
+Closed form, calibrated on measured runs (docs/reliability.md). Frames are read again when they do not fit; parameters,
+Adam's moments, the tracks of the first points and the buffers of one image must be in memory at once.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from ..system.memory import available_bytes
 
 FLOAT = 4
 PICTURE_BYTES = 150
-"""Per pixel: a decoded frame, its prior, a drawn picture and its gradients."""
+"""Per pixel: a decoded frame, its prior, a rendered image and its gradients."""
 LEAST_BYTES = 300 * 2**20
 """Compiled kernels, lists of the renderer, buffers of the libraries."""
 MOMENTS = 2
 """Adam keeps two numbers of each parameter."""
 TRACK_BYTES = 64
-"""Per point and frame while motion is fitted: pixel, place and offset in float64."""
+"""Per point and frame while motion is fitted: pixel, position and offset in float64."""
 
 
 def least_bytes(cfg: Config, num_train: int, width: int, height: int) -> int:
-    """Memory that training needs beyond what the process has already.
+    """Memory that training needs beyond what the process uses already.
 
     Args:
         cfg: fitted to the sequence (`Config.fitted`).
@@ -46,7 +46,7 @@ def least_bytes(cfg: Config, num_train: int, width: int, height: int) -> int:
     return LEAST_BYTES + PICTURE_BYTES * width * height + max(state + growing, tracks)
 
 
-def refuse_too_large(sequence: FrameSequence, cfg: Config) -> None:
+def reject_too_large(sequence: FrameSequence, cfg: Config) -> None:
     """Refuse a training that the free memory cannot hold.
 
     Raises:

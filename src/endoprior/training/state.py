@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 
-import torch
 from torch import Tensor
 
 from ..model.deformation import HexPlaneField
 from ..model.gaussians import Gaussians
 from .density import DensityStats
+from .divergence import Divergence
 from .optimizer import Optimizer
 
 
@@ -35,31 +35,14 @@ class TrainState:
     optimizer: Optimizer
     stats: DensityStats
 
-    def tensors(self) -> list[Tensor]:
-        """Every tensor that an iteration may change in place."""
-        found = [*self.gaussians.tensors.values(), *self.stats.tensors().values(), *self.optimizer.tensors()]
+    def arrays(self) -> dict[str, Tensor]:
+        """Every tensor by the name that it has in a checkpoint."""
+        arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
+        arrays |= {f"stats.{name}": value for name, value in self.stats.tensors().items()}
+        arrays |= {f"optimizer.{name}": value for name, value in self.optimizer.state_arrays().items()}
         if self.field is not None:
-            grid = self.field.grid
-            found += [grid.values, grid.grads, grid.marks, self.field.box, *self.field.heads.parameters.values()]
-        return [tensor.detach() for tensor in found]
-
-
-class Losses:
-    """Weighted terms of Eq. (12) that took part in one iteration; asking for `numbers` waits for a device."""
-
-    def __init__(self, names: tuple[str, ...], values: Tensor) -> None:
-        """Args: values: (len(names),)."""
-        self.names, self.values = names, values
-
-    @staticmethod
-    def of(terms: Mapping[str, Tensor]) -> Losses:
-        """Of terms () each, by name, on one device."""
-        return Losses(tuple(terms), torch.stack([value.detach() for value in terms.values()]))
-
-    @cached_property
-    def numbers(self) -> dict[str, float]:
-        """The terms by name."""
-        return dict(zip(self.names, self.values.tolist(), strict=True))
+            arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
+        return arrays
 
 
 @dataclass(frozen=True)
@@ -68,12 +51,14 @@ class StepReport:
 
     stage: Stage
     iteration: int
-    losses: Losses
+    losses: Mapping[str, Tensor]
+    """Weighted terms of Eq. (12) that took part, () each."""
     num_gaussians: int
     seconds: float
-    """That it took; on a device a mean over some before it."""
+    divergence: Divergence | None = None
+    """Why training cannot continue, if it cannot; on a device it may concern an earlier iteration."""
 
-    @property
+    @cached_property
     def terms(self) -> dict[str, float]:
-        """Weighted terms of Eq. (12) that took part."""
-        return self.losses.numbers
+        """`losses` as numbers; the host waits for the device."""
+        return {name: float(value) for name, value in self.losses.items()}

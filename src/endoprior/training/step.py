@@ -1,182 +1,155 @@
-"""The work of one iteration: deform, draw, compare, differentiate, judge, update.
-
-All of it can be queued on a device, and recorded there: what differs between two tasks of one kind is in tensors, and
-nothing asks for a value.
-"""
+"""One training iteration, from the choice of a frame to the update: read `TrainingStep.__call__` to follow it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING
+import time as clock
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..compute.compiled import compiled
 from ..core.config import Config
-from ..core.geometry import project
-from ..core.types import RenderOutput
+from ..core.types import RenderOutput, Splats
 from ..model.deformation import Offsets
 from ..model.scene import offsets_at
-from . import density, temporal
-from .frames import TrainingFrame
-from .inspector import Evidence, Inspector
-from .loss_kernels import supervised_losses
-from .state import Losses, TrainState
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-KEPT_POSES = 1024
+from ..render import Rasterizer
+from . import density
+from .densify import apply_plan
+from .divergence import ADVICE, Diverged, DivergenceCheck
+from .frames import TrainingFrame, TrainingFrames
+from .losses import supervised_terms
+from .ops import TrainingOps
+from .state import Stage, StepReport, TrainState
+from .temporal import temporal_terms
 
 
 @dataclass(frozen=True)
-class Task:
-    """What one iteration looks at."""
+class Batch:
+    """The data of one iteration: one frame, and what the terms of the loss need beside it."""
 
-    iteration: int | Tensor
-    """1-based, within the stage; off the CPU () float64."""
     frame: TrainingFrame
     before: TrainingFrame | None
     """The frame before, where the temporal term takes part."""
     prior: Tensor | None
-    """(H, W) rho of the frame at full size, where it is sampled, and"""
+    """(H, W) rho of the frame at full resolution, where it is sampled, and"""
     prior_mask: Tensor | None
     """(H, W) bool, its tissue."""
-    fine: bool
-    """Whether the Gaussians are deformed."""
-    sh_degree: int
 
 
-class Work:
-    """Does one iteration after the other on one state."""
+@dataclass
+class TrainingStep:
+    """Does one iteration after the other. What it needs beside the state does not change while training.
 
-    def __init__(
-        self,
-        cfg: Config,
-        rasterize: Callable[..., RenderOutput],
-        background: Tensor,
-        inspector: Inspector,
-        incomplete: Callable[[], Tensor] | None = None,
-    ) -> None:
-        """Prepare to work.
+    Every random choice is a pure function of (seed, stage, iteration), so a resumed run repeats an uninterrupted one.
+    """
 
-        Args:
-            incomplete: says on the device whether a picture must be drawn again; None: never.
-        """
-        self.cfg, self.rasterize, self.background, self.inspector = cfg, rasterize, background, inspector
-        self.incomplete = incomplete
+    cfg: Config
+    frames: TrainingFrames
+    camera_centers: Tensor
+    """(T, 3) camera positions of the training frames, mm."""
+    rasterize: Rasterizer
+    ops: TrainingOps
+    check: DivergenceCheck
+    background: Tensor = field(default_factory=lambda: torch.zeros(3))
+    """(3,) color behind everything."""
 
-    def __call__(self, state: TrainState, task: Task) -> Evidence:
-        """Draw, compare, differentiate and update, as far as the evidence allows.
+    def __call__(self, state: TrainState) -> StepReport:
+        """Deform, render, compare, differentiate, check, update, then grow or prune.
+
+        Where the report has a `divergence`, the state is the one after the last good iteration.
 
         Raises:
-            Diverged: as `Inspector.judge`; gradients are left, and nothing was changed.
+            Diverged: no Gaussian is left, or a split would give one of infinite size.
         """
-        frame, cfg = task.frame, self.cfg
-        offsets, means_before = self._deform(state, task) if task.fine else (None, None)
-        splats = state.gaussians.splats(offsets, task.sh_degree)
+        began = clock.perf_counter()
+        cfg, iteration, fine = self.cfg, state.iteration + 1, state.stage is Stage.FINE
+        rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
+        batch = self._batch(iteration, int(rng.integers(len(self.frames))) if fine else 0, fine)
+
+        splats, means_before = self._deform(state, batch, iteration)
         out = self.rasterize(
-            splats,
-            frame.camera,
-            background=self.background,
-            depth_grad_to_means=cfg.render.depth_grad_to_means,
+            splats, batch.frame.camera, background=self.background, depth_grad_to_means=cfg.render.depth_grad_to_means
         )
         out.means2d.retain_grad()
-        terms = supervised_terms(out, frame, cfg)
-        if task.before is not None:
-            terms |= self._temporal_terms(state, task, splats.means, means_before, out)
+        terms = supervised_terms(out, batch.frame, cfg.loss, self.ops)
+        if batch.before is not None:
+            terms |= temporal_terms(state, batch.frame, batch.before, splats.means, means_before, out, cfg, self.ops)
         sum(terms.values()).backward()
-        incomplete = self.incomplete() if self.incomplete else None
-        evidence = self.inspector.judge(Losses.of(terms), state.optimizer, frame.brightness, incomplete)
-        with torch.no_grad():
-            self._observe(state, task, out)
-            state.optimizer.step(task.iteration, self.inspector.frozen)
-        return evidence
 
-    def _deform(self, state: TrainState, task: Task) -> tuple[Offsets, Tensor | None]:
-        """Offsets at the frame and, where one call gives both with gradients, centers (N, 3) at the frame before."""
-        time, before = task.frame.time, task.before
-        if before is None or state.field is None or self.cfg.temporal.gradient != "both":
-            return offsets_at(state.gaussians, state.field, time, self.cfg), None
-        means = state.gaussians["means"]
-        offsets, displacement = state.field.offsets_and_displacement(means, time, before.time)
-        return offsets, means + displacement
+        last = iteration == stage_length(cfg, state.stage)
+        densify = density.due(iteration, fine and last, cfg.density)
+        divergence = self.check.after_backward(
+            iteration, terms, state.optimizer.count_unusable(), batch.frame.brightness, wait=densify or last
+        )
+        if divergence is not None:
+            state.optimizer.drop_gradients()
+            state.iteration = divergence.last_good
+        else:
+            with torch.no_grad():
+                self._observe(state, batch, out)
+                state.optimizer.step(iteration, self.check.skip)
+                if densify:
+                    self._densify(state, rng)
+            state.iteration = iteration
+        losses = {name: value.detach() for name, value in terms.items()}
+        seconds = clock.perf_counter() - began
+        return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, divergence)
 
-    def _temporal_terms(
-        self, state: TrainState, task: Task, means: Tensor, means_before: Tensor | None, out: RenderOutput
-    ) -> dict[str, Tensor]:
-        """L_local of Eq. (11), weighted; nothing with few Gaussians."""
-        cfg, stats = self.cfg.temporal, state.stats
-        drawn = out.radii > 0
-        if cfg.valid_at_both:
-            drawn = density.valid_projection(out.means2d, out.radii, task.frame.tissue_mask)
-        eligible = drawn & (stats.num_valid >= cfg.min_valid)
-        score = stats.score(self.cfg.density.unobserved_score)
-        index, weights = temporal.choose_on(score, eligible, cfg)
-        if len(index) < temporal.least_points(cfg):
-            return {}
-        before = self.means_before(state, task.before.time, index) if means_before is None else means_before[index]
-        if cfg.valid_at_both:
-            kept = on_tissue(before.detach(), task.before)
-            if not compiled(weights):
-                weights = torch.where(kept, weights, 0)
+    def _batch(self, iteration: int, position: int, fine: bool) -> Batch:
+        """Training frame number `position`, at half resolution early in the fine stage."""
+        cfg = self.cfg
+        compared = fine and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration
+        sampled = cfg.density.score_mode == "every" or density.due(iteration, False, cfg.density)
+        prior, prior_mask = self.frames.prior(position) if sampled else (None, None)
+        return Batch(
+            frame=self.frames.frame(position, half=fine and iteration <= cfg.schedule.half_resolution_iterations),
+            before=self.frames.before(position) if compared else None,
+            prior=prior,
+            prior_mask=prior_mask,
+        )
+
+    def _deform(self, state: TrainState, batch: Batch, iteration: int) -> tuple[Splats, Tensor | None]:
+        """The Gaussians at the frame and, where one call gives both, the centers (N, 3) at the frame before."""
+        gaussians, field, time, before = state.gaussians, state.field, batch.frame.time, batch.before
+        offsets: Offsets | None = None
+        means_before = None
+        if state.stage is Stage.FINE:
+            if before is None or field is None or self.cfg.temporal.gradient != "both":
+                offsets = offsets_at(gaussians, field, time, self.cfg, self.ops.model)
             else:
-                index, weights, before = index[kept], weights[kept], before[kept]
-                if len(index) < temporal.least_points(cfg):
-                    return {}
-        displacement, distance = temporal.local_consistency(means[index], before, weights, cfg)
-        return {
-            "displacement": cfg.weight * cfg.displacement_weight * displacement,
-            "distance": cfg.weight * cfg.distance_weight * distance,
-        }
+                offsets, displacement = field.offsets_and_displacement(
+                    gaussians["means"], time, before.time, self.ops.model
+                )
+                means_before = gaussians["means"] + displacement
+        return gaussians.splats(offsets, sh_degree(self.cfg, state.stage, iteration)), means_before
 
-    def means_before(self, state: TrainState, time: float | Tensor, index: Tensor) -> Tensor:
-        """(P, 3) centers of the chosen Gaussians at an earlier moment, with a gradient only if that end is trained."""
-        if self.cfg.temporal.gradient == "both":
-            # Moving all and then choosing is cheaper than the scattered gradient of choosing first.
-            moved = state.gaussians["means"] + offsets_at(state.gaussians, state.field, time, self.cfg).means
-            return moved[index]
-        with torch.no_grad():
-            offsets = offsets_at(state.gaussians, state.field, time, self.cfg, index)
-            return state.gaussians["means"][index] + offsets.means
+    def _observe(self, state: TrainState, batch: Batch, out: RenderOutput) -> None:
+        """Add to the running statistics: the gradient always, the prior's score where there is a prior."""
+        camera, skip = batch.frame.camera, self.check.skip
+        self.ops.add_gradient(state.stats, out, camera.width, camera.height, skip)
+        if batch.prior is not None:
+            scale = batch.prior.shape[1] / camera.width
+            opacities = state.gaussians.opacities
+            self.ops.add_score(state.stats, out, batch.prior, batch.prior_mask, opacities, scale, skip)
 
-    def _observe(self, state: TrainState, task: Task, out: RenderOutput) -> None:
-        """Feed the running statistics: the gradient always, the prior's score where there is a prior."""
-        camera, frozen = task.frame.camera, self.inspector.frozen
-        state.stats.add_gradient(out, camera.width, camera.height, frozen)
-        if task.prior is not None:
-            scale = task.prior.shape[1] / camera.width
-            state.stats.add_score(out, task.prior, task.prior_mask, state.gaussians.opacities, scale, frozen)
+    def _densify(self, state: TrainState, rng: np.random.Generator) -> None:
+        cfg, gaussians = self.cfg.density, state.gaussians
+        extent = density.scene_extent(self.camera_centers, gaussians["means"], cfg)
+        planned = density.plan(state.stats, gaussians.scales, gaussians.opacities, extent, cfg)
+        if bool(planned.remove.all()):
+            raise Diverged(f"expected Gaussians that explain the frames; all {len(planned.remove):,} faded. {ADVICE}")
+        state.stats = apply_plan(state.optimizer, planned, state.stats, rng)
 
 
-def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: Config) -> dict[str, Tensor]:
-    """Weighted color, depth and total-variation terms of Eq. (12)."""
-    depth = out.depth / out.alpha.clamp(min=1e-6) if cfg.loss.depth_mode == "expected" else out.depth
-    enough = frame.num_measured >= cfg.loss.min_depth_pixels
-    weights = (1.0, cfg.loss.depth_weight if enough else 0.0, cfg.loss.tv_weight)
-    terms = supervised_losses(
-        out.color, depth, frame.rgb_u8, frame.inverse_depth, frame.tissue_mask, frame.measured, weights
-    )
-    return dict(zip(("color", "depth", "tv"), terms, strict=True))
+def stage_length(cfg: Config, stage: Stage) -> int:
+    """Iterations of a stage."""
+    return cfg.schedule.coarse_iterations if stage is Stage.COARSE else cfg.schedule.fine_iterations
 
 
-def on_tissue(points: Tensor, frame: TrainingFrame) -> Tensor:
-    """(P,) bool: whether world points (P, 3) mm project in front of the camera, into the image, onto tissue."""
-    if not compiled(points):
-        camera = frame.camera
-        view = _pose_on(camera.world_to_camera.astype(np.float32).tobytes(), points.device)
-        x, y, z = (points @ view[:3, :3].T + view[:3, 3]).unbind(-1)
-        means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
-        return density.valid_projection(means2d, (z > 0).int(), frame.tissue_mask)
-    pixels, z = project(points.numpy(), frame.camera)
-    means2d, in_front = torch.from_numpy(pixels.astype(np.float32)), torch.from_numpy(z > 0).int()
-    return density.valid_projection(means2d, in_front, frame.tissue_mask)
-
-
-@lru_cache(maxsize=KEPT_POSES)
-def _pose_on(pose: bytes, device: torch.device) -> Tensor:
-    """(4, 4) float32 world to camera on a device: copied there once."""
-    return torch.from_numpy(np.frombuffer(pose, np.float32).reshape(4, 4).copy()).to(device)
+def sh_degree(cfg: Config, stage: Stage, iteration: int) -> int:
+    """Degree of color in use: +1 per `sh_every` iterations of each stage, never falling back (method of 3DGS)."""
+    done = iteration // cfg.schedule.sh_every
+    if stage is Stage.FINE:
+        done += cfg.schedule.coarse_iterations // cfg.schedule.sh_every
+    return min(done, cfg.schedule.sh_degree)

@@ -1,7 +1,7 @@
 """Texture-aware temporal consistency: neighbors move together, the more so the better their texture. Eqs. (9)-(11).
 
-Shared letters: `N` Gaussians of the scene, `P` of them chosen for one step, `K` neighbors. "now" is frame t,
-"before" the adjacent training frame t - dt.
+Here: which Gaussians take part in an iteration, with which motion weights, and where they were before. The term itself
+is computed by `temporal_numba.py` or `temporal_torch.py`. `N` Gaussians of the scene, `P` of them chosen.
 """
 
 from __future__ import annotations
@@ -11,19 +11,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..compute.compiled import compiled
-from ..compute.neighbors import MAX_COORDINATE, nearest
-from ..core.checks import check_shape
-from ..core.config import TemporalConfig
-from .temporal_kernels import SQRT_EPS, SUM_EPS, local_motion, median, weigh_pairs
+from ..core.config import Config, TemporalConfig
+from ..core.geometry import project
+from ..core.types import RenderOutput
+from ..model.scene import offsets_at
+from .frames import TrainingFrame
+from .ops import TrainingOps
+from .state import TrainState
 
-NEIGHBOR_CHUNK = 4096
-"""Points whose distances to all others are held at a time, where no kernel searches."""
 MIN_WEIGHT = 1e-4
 """Motion weights up to this are treated as zero (released code)."""
-
-SAMPLE_STEPS = 2**30
-"""Into which a weight of 1 is divided to add it up off the CPU."""
 RELAX_TRIES, RELAX_THRESHOLD_STEP, RELAX_TEMPERATURE_FACTOR = 8, 0.05, 1.5
 RELAX_THRESHOLD_FLOOR, RELAX_TEMPERATURE_CAP = 0.25, 0.30
 
@@ -81,12 +78,12 @@ def systematic_sample(weights: NDArray, count: int) -> NDArray[np.intp]:
 
 
 def choose(score: NDArray, eligible: NDArray, cfg: TemporalConfig) -> tuple[NDArray[np.intp], NDArray]:
-    """The Gaussians that take part in one step, and their motion weights.
+    """The Gaussians that take part in one iteration, and their motion weights.
 
     Args:
         score: (N,) in [0, 1]. eligible: (N,) bool, the set S_t.
     Returns:
-        (P,) indices and (P,) weights; P = 0 when fewer than `min_points` qualify.
+        (P,) indices and (P,) weights; P = 0 when fewer than `least_points` qualify.
     """
     weights = relaxed_motion_weight(score, cfg) if cfg.pair_weights else np.ones_like(score)
     weights = np.where(eligible, weights, 0)
@@ -98,187 +95,65 @@ def choose(score: NDArray, eligible: NDArray, cfg: TemporalConfig) -> tuple[NDAr
 
 
 def least_points(cfg: TemporalConfig) -> int:
-    """With fewer Gaussians a step goes without the term."""
+    """Fewest Gaussians with which the term is computed."""
     return max(cfg.min_points, cfg.num_neighbors + 1)
 
 
-def choose_on(score: Tensor, eligible: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
-    """`choose`, of tensors and where they lie.
-
-    On a device the result has the length min(max_points, N) whatever was found, so that the host need not know it; who
-    takes no part has weight 0.
-
-    Args:
-        score: (N,) in [0, 1]. eligible: (N,) bool.
-    Returns:
-        (P,) int64 indices and (P,) float32 weights; P may be too small for the term.
-    """
-    if compiled(score):
-        chosen, weights = choose(score.numpy(), eligible.numpy(), cfg)
-        return torch.from_numpy(chosen), torch.from_numpy(weights)
-    weights = relaxed_definition(score, cfg) if cfg.pair_weights else torch.ones_like(score)
-    weights = torch.where(eligible, weights, 0)
-    count = cfg.max_points
-    if not 0 < count < len(weights):
-        return torch.arange(len(weights), device=score.device), weights
-    index, taken = systematic_definition(weights, count)
-    return index, torch.where(taken, weights[index], 0)
-
-
-def relaxed_definition(score: Tensor, cfg: TemporalConfig) -> Tensor:
-    """`relaxed_motion_weight` in plain torch, on any device: all tries are made, and the first that does is kept."""
-    threshold, temperature = cfg.motion_threshold, cfg.motion_temperature
-    weights = ((score - threshold) / temperature).sigmoid()
-    for _ in range(RELAX_TRIES if cfg.adaptive_motion_weight else 0):
-        square = weights.square().sum()
-        size = torch.where(square > 0, weights.sum().square() / square, 0)
-        threshold = max(threshold - RELAX_THRESHOLD_STEP, RELAX_THRESHOLD_FLOOR)
-        temperature = min(temperature * RELAX_TEMPERATURE_FACTOR, RELAX_TEMPERATURE_CAP)
-        weights = torch.where(size >= cfg.min_effective, weights, ((score - threshold) / temperature).sigmoid())
-    return torch.where(weights > MIN_WEIGHT, weights, 0)
-
-
-def systematic_definition(weights: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """`systematic_sample` in plain torch, on any device: always `count` < N indices, and which of them are taken."""
-    positive = weights > 0
-    # Whole numbers: on a GPU sums of others depend on who comes first, and with them who is chosen.
-    cumulative = (weights.double() * SAMPLE_STEPS).round().to(torch.int64).cumsum(0).double()
-    marks = (torch.arange(count, device=weights.device) + 0.5) / count * cumulative[-1]
-    index = torch.searchsorted(cumulative, marks).clamp(max=len(weights) - 1)
-    first = torch.ones_like(index[:1], dtype=torch.bool)
-    several = torch.cat([first, index[1:] != index[:-1]]) & positive[index]
-    few = (~positive).to(torch.uint8).argsort(stable=True)[:count]  # the positive ones first
-    all_fit = positive.sum() <= count
-    index = torch.where(all_fit, few, index)
-    return index, torch.where(all_fit, positive[few], several)
-
-
-def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
-    """The `k` nearest other points of each point; of equally near ones those with the smallest indices.
+def temporal_terms(
+    state: TrainState,
+    frame: TrainingFrame,
+    before: TrainingFrame,
+    means: Tensor,
+    means_before: Tensor | None,
+    out: RenderOutput,
+    cfg: Config,
+    ops: TrainingOps,
+) -> dict[str, Tensor]:
+    """L_local of Eq. (11), weighted, () each; nothing with few Gaussians.
 
     Args:
-        points: (P, 3) mm, finite, 0 < k < P.
-    Returns:
-        (P, k) indices, nearest first, and (P, k) distances, mm.
-    Raises:
-        ValueError: too few points, or a coordinate that is not finite or too large to be squared.
+        frame, before: at t and t - dt.
+        means: (N, 3) deformed centers at t, mm. means_before: those at t - dt, if they are known already.
+        out: the rendered image at t.
     """
-    check_shape("points:P,3", points=points)
-    if not 0 < k < len(points):
-        raise ValueError(f"k must be in [1, {len(points) - 1}], the number of other points; got {k}")
-    if not float(np.abs(points).max()) <= MAX_COORDINATE:
-        raise ValueError(f"points must be finite, of magnitude up to {MAX_COORDINATE:g} mm")
-    return nearest(np.ascontiguousarray(points), k)
-
-
-def neighbors_definition(points: Tensor, k: int, taking_part: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """`neighbors` in plain torch, on any device: all distances, some points at a time. Ties may fall otherwise.
-
-    Args:
-        taking_part: (P,) bool; the others are nobody's neighbors, unless fewer than k + 1 take part: then infinitely
-            far ones.
-    """
-    found = []
-    for start in range(0, len(points), NEIGHBOR_CHUNK):
-        distances = torch.cdist(
-            points[start : start + NEIGHBOR_CHUNK], points, compute_mode="donot_use_mm_for_euclid_dist"
-        )
-        distances.diagonal(start).fill_(torch.inf)
-        if taking_part is not None:
-            distances.masked_fill_(~taking_part, torch.inf)
-        found.append(distances.topk(k, largest=False))
-    return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
-
-
-def affinity_definition(distances: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
-    """`affinity` in plain torch, on any device; (P, K) pair weights. Who has no weight is in no pair."""
-    pairs = (weights[:, None] > 0) & (weights[indices] > 0) & distances.isfinite()
-    distances = torch.where(pairs, distances, torch.nan)
-    # The median of an even number of distances lies between the middle two, as NumPy has it.
-    sigma = distances.flatten().nanquantile(0.5).clamp(min=1e-8)
-    weighed = (-(distances**2) / (2 * sigma**2)).exp() * weights[:, None] * weights[indices]
-    return torch.where(pairs, weighed.clamp(min=SUM_EPS), 0)
-
-
-def affinity(distances: NDArray, indices: NDArray, weights: NDArray) -> NDArray:
-    """w_ij = exp(-|mu_i - mu_j|^2 / (2 sigma_loc^2)) w_i w_j, Eq. (10), floored at 1e-8.
-
-    sigma_loc, which the paper leaves open, is the median neighbor distance of the step (released code).
-
-    Args:
-        distances: (P, K) mm. indices: (P, K) of the neighbors. weights: (P,) motion weights.
-    Returns:
-        (P, K) pair weights.
-    """
-    sigma = max(median(distances), 1e-8)
-    return weigh_pairs(distances, indices, weights, sigma)
-
-
-def huber(x: Tensor, delta: float, scale: str) -> Tensor:
-    """Huber's penalty of x >= 0: x^2 / 2 up to delta, delta (x - delta / 2) above; `released` divides it by delta."""
-    literal = torch.where(x <= delta, 0.5 * x * x, delta * (x - 0.5 * delta))
-    return literal / delta if scale == "released" else literal
-
-
-def local_motion_loss(
-    now: Tensor, before: Tensor, indices: NDArray, pair_weights: NDArray, cfg: TemporalConfig
-) -> tuple[Tensor, Tensor]:
-    """The two halves of L_local, Eq. (11), unweighted: displacement and distance.
-
-    Args:
-        now, before: (P, 3) deformed centers at t and t - dt, mm. Detach `before` to train one end only.
-        indices: (P, K) neighbors, found at t - dt. pair_weights: (P, K) from `affinity`.
-    Returns:
-        Mean |d_i - d_j| (mm) and mean Huber penalty of the change of |mu_i - mu_j|, both weighted by w_ij.
-    """
-    check_shape(
-        "now:P,3 before:P,3 indices:P,K pair_weights:P,K",
-        now=now,
-        before=before,
-        indices=indices,
-        pair_weights=pair_weights,
+    temporal, stats = cfg.temporal, state.stats
+    seen = out.radii > 0
+    if temporal.valid_at_both:
+        seen = ops.valid_projection(out.means2d, out.radii, frame.tissue_mask)
+    eligible = seen & (stats.num_valid >= temporal.min_valid)
+    score = stats.score(cfg.density.unobserved_score)
+    index, weights = (
+        torch.from_numpy(each).to(means.device)
+        for each in choose(score.cpu().numpy(), eligible.cpu().numpy(), temporal)
     )
-    if now.dtype != before.dtype:
-        raise ValueError(f"before must have the type of now, {now.dtype}; got {before.dtype}")
-    if not 0 <= indices.min() <= indices.max() < len(now):
-        raise ValueError(f"indices must be in [0, {len(now) - 1}]; got {indices.min()} to {indices.max()}")
-    factor = 1 / cfg.huber_delta if cfg.huber_scale == "released" else 1.0
-    return local_motion(now, before, indices, pair_weights, cfg.huber_delta, factor)
+    if not len(index):
+        return {}
+    earlier = _means_before(state, before.time, index, cfg, ops) if means_before is None else means_before[index]
+    if temporal.valid_at_both:
+        kept = _on_tissue(earlier.detach(), before, ops)
+        index, weights, earlier = index[kept], weights[kept], earlier[kept]
+        if len(index) < least_points(temporal):
+            return {}
+    displacement, distance = ops.local_consistency(means[index], earlier, weights, temporal)
+    return {
+        "displacement": temporal.weight * temporal.displacement_weight * displacement,
+        "distance": temporal.weight * temporal.distance_weight * distance,
+    }
 
 
-def local_consistency(now: Tensor, before: Tensor, weights: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
-    """L_local, Eq. (11), of chosen Gaussians: neighbors found and weighed at t - dt, then compared; on any device.
-
-    Args:
-        now, before: (P, 3) deformed centers, mm; `before` detached trains one end only.
-        weights: (P,) motion weights from `choose_on`; on a device, 0 for who takes no part, and both terms are 0 unless
-            enough do. On the CPU there are enough, all of positive weight.
-    Returns:
-        Displacement and distance term, as `local_motion_loss`.
-    """
-    if compiled(now):
-        indices, distances = neighbors(before.detach().numpy(), cfg.num_neighbors)
-        return local_motion_loss(now, before, indices, affinity(distances, indices, weights.numpy()), cfg)
-    taking_part = weights > 0
-    enough = taking_part.sum() >= least_points(cfg)
-    index, apart = neighbors_definition(before.detach(), cfg.num_neighbors, taking_part)
-    terms = local_motion_definition(now, before, index, affinity_definition(apart, index, weights), cfg)
-    return enough * terms[0], enough * terms[1]
+def _means_before(state: TrainState, time: float, index: Tensor, cfg: Config, ops: TrainingOps) -> Tensor:
+    """(P, 3) centers of the chosen Gaussians at an earlier time, with a gradient only if that end is trained."""
+    if cfg.temporal.gradient == "both":
+        # Moving all and then choosing is cheaper than the scattered gradient of choosing first.
+        moved = state.gaussians["means"] + offsets_at(state.gaussians, state.field, time, cfg, ops.model).means
+        return moved[index]
+    with torch.no_grad():
+        offsets = offsets_at(state.gaussians, state.field, time, cfg, ops.model, index)
+        return state.gaussians["means"][index] + offsets.means
 
 
-def local_motion_definition(
-    now: Tensor, before: Tensor, indices: NDArray, pair_weights: NDArray, cfg: TemporalConfig
-) -> tuple[Tensor, Tensor]:
-    """`local_motion_loss` in plain torch: same arguments, same result but for rounding, more passes."""
-    index = torch.as_tensor(indices, device=now.device)
-    weight = torch.as_tensor(pair_weights, device=now.device).to(now.dtype)
-    weight = weight / weight.sum().clamp(min=SUM_EPS)
-    displacement = now - before
-    difference = displacement[:, None] - displacement[index]
-    disp = (difference.square().sum(-1) + SQRT_EPS).sqrt()
-    stretch = (_length(now[:, None] - now[index]) - _length(before[:, None] - before[index])).abs()
-    return (weight * disp).sum(), (weight * huber(stretch, cfg.huber_delta, cfg.huber_scale)).sum()
-
-
-def _length(vectors: Tensor) -> Tensor:
-    return (vectors.square().sum(-1) + SQRT_EPS**2).sqrt()
+def _on_tissue(points: Tensor, frame: TrainingFrame, ops: TrainingOps) -> Tensor:
+    """(P,) bool: whether world points (P, 3) mm project in front of the camera, into the image, onto tissue."""
+    pixels, z = project(points.cpu().numpy(), frame.camera)
+    means2d, in_front = torch.from_numpy(pixels.astype(np.float32)), torch.from_numpy(z > 0).int()
+    return ops.valid_projection(means2d.to(points.device), in_front.to(points.device), frame.tissue_mask)

@@ -13,6 +13,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from ..core.checks import input_error
+from ..core.geometry import FARTHEST_MM
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 MAX_MESSAGE_BYTES = 2**16
@@ -21,8 +22,6 @@ MAX_BROWSERS = 32
 """Largest number of simultaneous connections."""
 MAX_PER_SECOND = 500
 """Largest message rate of one connection; dragging sends one per screen refresh."""
-FARTHEST_MM = 1e7
-"""Largest distance of a camera from the origin."""
 LARGEST_CANVAS = 100_000
 """Largest side of a canvas, px."""
 

@@ -1,0 +1,150 @@
+"""What a scorer gets to see: the scene, the frames, the rendered frames, and where its scores go."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data import FrameList, FrameSequence, Split
+from ..model.scene import Scene
+from ..system.atomic import write_json
+from ..system.memory import BoundedCache, cache_bytes
+from .metrics import ScoreUnavailable, mean_over_frames, to_uint8
+
+OUTLIER_DB = 3.0
+"""A frame whose PSNR lies this far below the median of its split is an outlier."""
+EXACT = "infinite: the rendered frames equal the true ones exactly"
+"""Why there is no PSNR where no frame has any error; black frames, for example."""
+NETWORKS_OFF = "network scores were not asked for"
+
+
+@dataclass
+class Evaluation:
+    """Scores of one scene on one split."""
+
+    protocol: dict[str, Any]
+    scores: dict[str, float] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    """Why a score has no value, by name."""
+    per_frame: list[dict[str, Any]] = field(default_factory=list)
+    """One row for each frame of the split: `index`, `time`, and the scores that a single frame has."""
+
+    def add(self, name: str, value: float, reason: str = "not finite") -> None:
+        """Record a score, or `reason` where it is not finite; an int stays one."""
+        if math.isfinite(value):
+            self.scores[name] = value if isinstance(value, int) else float(value)
+        else:
+            self.skipped[name] = reason
+
+    def outlier_frames(self) -> list[int]:
+        """Frames whose `psnr_tissue` lies more than `OUTLIER_DB` below the median of the split."""
+        scored = [(row["index"], row["psnr_tissue"]) for row in self.per_frame if row.get("psnr_tissue") is not None]
+        median = float(np.median([value for _, value in scored])) if scored else 0.0
+        return [index for index, value in scored if value < median - OUTLIER_DB]
+
+    def save(self, folder: Path) -> None:
+        """Write `metrics.json` and `per_frame.json`."""
+        write_json(folder / "metrics.json", {k: getattr(self, k) for k in ("protocol", "scores", "skipped")})
+        write_json(folder / "per_frame.json", self.per_frame)
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """One frame as the scene renders it."""
+
+    color: NDArray[np.float32] | None
+    """(H, W, 3) in [0, 1], not rounded; kept for frames of the split only."""
+    rgb_u8: NDArray[np.uint8]
+    """(H, W, 3) rounded to 8 bits: what the published protocol scores."""
+    depth: NDArray[np.float32]
+    """(H, W) sum of weight * z, mm."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory it takes."""
+        return sum(array.nbytes for array in (self.color, self.rgb_u8, self.depth) if array is not None)
+
+
+class RenderedFrames:
+    """Rendered frames by index: each is rendered when first asked for, and kept as memory allows."""
+
+    def __init__(self, scene: Scene, sequence: FrameSequence, split: Split) -> None:
+        """Args: scene: what to render. sequence: times and cameras. split: frames that keep their unrounded color."""
+        self._scene, self._sequence = scene, sequence
+        self._scored = set(sequence.indices(split))
+        self._cache: BoundedCache[RenderedFrame] = BoundedCache(cache_bytes(), lambda rendered: rendered.nbytes)
+
+    def __getitem__(self, index: int) -> RenderedFrame:
+        return self._cache.get(index, lambda: self._render(index))
+
+    def _render(self, index: int) -> RenderedFrame:
+        frame = self._sequence.frame(index)
+        out = self._scene.render(frame.time, frame.camera)
+        color = out.color.cpu().numpy()
+        exact = np.clip(color, 0, 1) if index in self._scored else None
+        return RenderedFrame(exact, to_uint8(color), out.depth.cpu().numpy())
+
+
+@dataclass(frozen=True)
+class EvaluationContext:
+    """One evaluation, as every scorer's `compute` takes it."""
+
+    scene: Scene
+    sequence: FrameSequence
+    split: Split
+    networks: bool
+    """Whether scores that need a network may be computed."""
+    weights_dir: Path | None
+    """Folder to look for network weights in first."""
+    result: Evaluation
+    """Where scores go; `add`, `add_mean`, `add_frames` and `skip` write to it."""
+
+    @cached_property
+    def frames(self) -> FrameList:
+        """Frames of the split."""
+        return self.sequence.frames(self.split)
+
+    @cached_property
+    def rendered(self) -> RenderedFrames:
+        """All frames of the sequence as the scene renders them, by index."""
+        return RenderedFrames(self.scene, self.sequence, self.split)
+
+    def add(self, name: str, value: float, reason: str = "not finite") -> None:
+        """Record a score, or `reason` where it is not finite; an int stays one."""
+        self.result.add(name, value, reason)
+
+    def skip(self, name: str, reason: str) -> None:
+        """Record why a score has no value."""
+        self.result.skipped[name] = reason
+
+    def add_mean(self, name: str, values: Sequence[float], reason: str) -> None:
+        """Record the mean of the finite `values`, or `reason` where there is none."""
+        self.add(name, mean_over_frames(values), EXACT if math.inf in values else reason)
+
+    def add_frames(self, rows: Sequence[dict[str, float]], reason: str) -> None:
+        """Record scores that every frame has: finite values in `per_frame`, their mean as the score.
+
+        Args:
+            rows: one value by score name for each frame of the split.
+            reason: of a score without a finite value.
+        """
+        for stored, row in zip(self.result.per_frame, rows, strict=True):
+            stored |= {name: float(value) for name, value in row.items() if math.isfinite(value)}
+        for name in rows[0]:
+            self.add_mean(name, [row[name] for row in rows], reason)
+
+    @contextmanager
+    def skip_if_unavailable(self, name: str) -> Iterator[None]:
+        """Turn `ScoreUnavailable` into the reason why the score has no value."""
+        try:
+            yield
+        except ScoreUnavailable as reason:
+            self.skip(name, str(reason))

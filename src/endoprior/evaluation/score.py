@@ -1,0 +1,35 @@
+"""What is known of a score before it is computed: its name, its unit, and which way is better."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Score:
+    """One number that says how good a scene is. Tables, reports and comparisons read from here how to show it."""
+
+    name: str
+    """Key in `metrics.json`."""
+    label: str
+    """What tables and figures call it, without the unit."""
+    unit: str
+    """Such as dB, mm or px; empty for a plain number."""
+    higher_is_better: bool | None
+    """None: neither way. Tables do not rank such a score, and comparisons count fewer as better."""
+    digits: int
+    """Decimals in printed summaries."""
+    description: str
+    """One sentence for docs/scores.md."""
+    compare: Literal["absolute", "relative"] = "relative"
+    """How two methods differ: in the score's own unit, or as a share of the second one's value."""
+
+    @property
+    def heading(self) -> str:
+        """Label and unit: `tissue PSNR, dB`."""
+        return f"{self.label}, {self.unit}" if self.unit else self.label
+
+    def text(self, value: float) -> str:
+        """A value with its unit: `31.27 dB`."""
+        return f"{value:,.{self.digits}f} {self.unit}".rstrip()

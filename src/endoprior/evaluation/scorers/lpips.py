@@ -1,0 +1,35 @@
+"""LPIPS of the rendered frames."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .. import metrics
+from ..context import NETWORKS_OFF, EvaluationContext
+from ..score import Score
+
+SCORES = (
+    Score(
+        "lpips", "LPIPS", "", False, 4,
+        "The published one: perceptual distance of the masked images by AlexNet; needs its weights.",
+    ),
+    Score(
+        "lpips_squeeze", "LPIPS (squeeze)", "", False, 4,
+        "The same by SqueezeNet, where its weights are on this machine.",
+    ),
+)  # fmt: skip
+
+
+def compute(context: EvaluationContext) -> None:
+    """Score every frame of the split with each network whose weights are there."""
+    if not context.networks:
+        context.skip("lpips", NETWORKS_OFF)
+        return
+    for name, backbone in (("lpips", "alex"), ("lpips_squeeze", "squeeze")):
+        with context.skip_if_unavailable(name):
+            distance = metrics.lpips_distance(backbone, context.weights_dir, download=backbone == "alex")
+            values = [
+                distance(context.rendered[frame.index].rgb_u8 / np.float32(255), frame.rgb, frame.tissue_mask)
+                for frame in context.frames
+            ]
+            context.add_mean(name, values, "no tissue in the split")

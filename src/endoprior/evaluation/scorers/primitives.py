@@ -1,0 +1,37 @@
+"""Counts of Gaussians: all of them, and those that the paper's diagnostics distrust."""
+
+from __future__ import annotations
+
+from ..context import EvaluationContext
+from ..score import Score
+
+LOW_PRIOR, LOW_PRIOR_OBSERVATIONS, LOW_OPACITY, LARGE_SCALE_MM = 0.2, 20, 0.01, 40.0
+"""The paper's thresholds."""
+SCORES = (
+    Score("num_gaussians", "Gaussians", "", None, 0, "Gaussians of the scene."),
+    Score(
+        "num_low_prior", "low prior", "", None, 0,
+        f"Gaussians seen at least {LOW_PRIOR_OBSERVATIONS} times whose texture-prior score is below {LOW_PRIOR}.",
+        "absolute",
+    ),
+    Score("num_low_opacity", "low opacity", "", None, 0, f"Gaussians of opacity below {LOW_OPACITY}.", "absolute"),
+    Score(
+        "num_large_scale", "large scale", "", None, 0,
+        f"Gaussians whose largest standard deviation exceeds {LARGE_SCALE_MM:g} mm.",
+        "absolute",
+    ),
+)  # fmt: skip
+
+
+def compute(context: EvaluationContext) -> None:
+    """Count; no frame is needed."""
+    scene = context.scene
+    seen = scene.num_valid >= LOW_PRIOR_OBSERVATIONS
+    counts = {
+        "num_gaussians": len(scene),
+        "num_low_prior": int((seen & (scene.prior_score < LOW_PRIOR)).sum()),
+        "num_low_opacity": int((scene.gaussians.opacities < LOW_OPACITY).sum()),
+        "num_large_scale": int((scene.gaussians.scales.amax(-1) > LARGE_SCALE_MM).sum()),
+    }
+    for name, count in counts.items():
+        context.add(name, count)

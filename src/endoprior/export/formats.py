@@ -1,0 +1,68 @@
+"""Every export format. To add one, write a module with a `FORMAT` in this folder and name it in `FORMATS`.
+
+docs/export.md shows how; docs/format.md says what the files of each format hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from ..model.scene import Scene
+    from .options import ExportOptions
+    from .time_steps import TimeStep
+
+Axes = Literal["opencv", "opengl", "ras", "lps"]
+"""Axes that exported coordinates refer to; docs/format.md defines them."""
+Progress = Callable[[int, int], None]
+"""Takes how much is done and how much there is."""
+
+FORMATS = (
+    "ply",
+    "splat",
+    "spz",
+    "gltf",
+    "points",
+    "mesh",
+    "depth",
+    "tracks",
+    "video",
+    "scene",
+    "html",
+)
+"""Modules of this package by the name that --format takes, in the order of `endoprior export --help`."""
+TIME_STEP_OPTIONS = ("times", "split", "frame")
+"""Options of most formats that have a file for each time step."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """One export format: what it writes, and which options it takes. Either `files` or `write` is set."""
+
+    suffixes: tuple[str, ...]
+    """Suffixes of its files; empty for a `write` that makes a folder."""
+    options: tuple[str, ...]
+    """Fields of `ExportOptions` that the format uses; others are rejected."""
+    files: Callable[[Scene, TimeStep, ExportOptions], dict[str, bytes]] | None = None
+    """The contents of the files of one time step, by suffix."""
+    write: Callable[[Scene, Path, ExportOptions, Progress], None] | None = None
+    """Writes one output for the whole sequence."""
+    default_axes: Axes = "opencv"
+    """What --frame stands for where it is not given."""
+    index_facts: Mapping[str, Any] | None = None
+    """What `index.json` says of the files' units, for a format without axes in mm."""
+
+
+def load_format(name: str) -> Format:
+    """The format of that name; imports its module.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if name not in FORMATS:
+        raise ValueError(f"format must be one of {', '.join(FORMATS)}; got {name!r}")
+    return import_module(f".{name}", __package__).FORMAT

@@ -1,0 +1,18 @@
+"""The whole scene, motion included, in the program's own open file; docs/format.md says how to read it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..model.scene import Scene
+from .formats import Format, Progress
+from .options import ExportOptions
+
+
+def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
+    """One safetensors file, of equal bytes to the run's own if this version wrote that."""
+    scene.save(out)
+    progress(1, 1)
+
+
+FORMAT = Format(suffixes=(".safetensors",), options=(), write=write)

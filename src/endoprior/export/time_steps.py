@@ -1,0 +1,68 @@
+"""Which time steps of a scene to export, and the Gaussians of one of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..core.checks import InputError
+from ..core.types import Camera, Splats
+from ..data.sequence import Split, is_test_frame
+from ..model.scene import Scene
+from .axes import splats_in_axes
+from .formats import Axes
+from .options import ExportOptions
+
+
+@dataclass(frozen=True)
+class TimeStep:
+    """The state of a scene at one time."""
+
+    name: str
+    """Of its files, without suffix: the frame's index, or the position in --times, in six digits."""
+    time: float | None
+    """In [0, 1]; None is the canonical state."""
+    frame: int | None = None
+    """Index of the frame in the sequence, if it is one."""
+
+    def splats(self, scene: Scene, axes: Axes) -> Splats:
+        """The Gaussians, activated, in `axes`."""
+        return splats_in_axes(scene.canonical() if self.time is None else scene.at(self.time), axes)
+
+    def camera(self, scene: Scene) -> Camera:
+        """The sequence's camera at this time; the first one for the canonical state."""
+        return scene.camera_at(self.time or 0.0)
+
+    def facts(self) -> dict[str, Any]:
+        """What `index.json` says about it."""
+        return {"time": self.time} | ({} if self.frame is None else {"frame": self.frame})
+
+
+def frame_indices(num_frames: int, split: Split) -> list[int]:
+    """Ascending indices of the frames of a split, as `FrameSequence.indices` without a sequence.
+
+    Raises:
+        InputError: the split is empty.
+    """
+    indices = [i for i in range(num_frames) if split == "video" or is_test_frame(i) == (split == "test")]
+    if not indices:
+        raise InputError(
+            f"--split: expected a split with frames; {split} has none of {num_frames}. Fix: choose another."
+        )
+    return indices
+
+
+def selected_time_steps(scene: Scene, options: ExportOptions) -> list[TimeStep]:
+    """The time steps that `options` select: the canonical state, some times, or the frames of a split.
+
+    Raises:
+        InputError: `options` select in more than one way, or the split is empty.
+    """
+    if options.canonical + bool(options.times) + (options.split != "video") > 1:
+        raise InputError("--canonical, --times, --split: expected one of them; got several. Fix: leave the others out.")
+    if options.canonical:
+        return [TimeStep("canonical", None)]
+    if options.times:
+        return [TimeStep(f"{k:06d}", time) for k, time in enumerate(options.times)]
+    total = len(scene.cameras)
+    return [TimeStep(f"{i:06d}", i / total, i) for i in frame_indices(total, options.split)]

@@ -1,0 +1,54 @@
+"""What must be known to repeat a run: config, versions, commit, backend, device and data."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from ..core.config_io import to_dict
+from ..system.devices import name_of
+from ..training.trainer import Trainer
+
+
+def run_facts(trainer: Trainer, fingerprint: str) -> dict[str, Any]:
+    """Contents of `config.json`: every config field, versions, commit, backend, device, and the data."""
+    backend = trainer.cfg.render.backend
+    libraries = {"cuda": ("gsplat",), "triton": ("triton",)}.get(backend, ())
+    names = ("endoprior", "torch", "numpy", "numba", "scipy", "opencv-python-headless", *libraries)
+    return {
+        "config": to_dict(trainer.cfg),
+        "seed": trainer.cfg.seed,
+        "backend": backend,
+        "device": name_of(trainer.device),
+        "commit": source_commit(),
+        "versions": {name: version(name) for name in names} | {"python": sys.version.split()[0]},
+        "data": {
+            "path": str(trainer.sequence.path.resolve()),
+            "fingerprint": fingerprint,
+            "frames": len(trainer.sequence),
+        },
+    }
+
+
+def source_commit() -> str | None:
+    """Commit of the checkout this package runs from, with `+` if files differ from it; None outside a checkout."""
+    here = Path(__file__).parent
+    try:
+        commit = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
+            cwd=here,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+        # An installed package can lie inside somebody else's checkout: only a tracked file speaks for its repository.
+        subprocess.run(
+            ["git", "ls-files", "--error-unmatch", __file__], cwd=here, capture_output=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return commit.stdout.strip()

@@ -1,0 +1,117 @@
+"""One image that summarizes a run: test frames beside their renders, curves, and the scores."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ..core.config import PriorConfig
+from ..data import FrameSequence
+from ..evaluation.registry import all_scores
+from ..model.scene import Scene
+from ..priors import joint_texture_prior
+from ..system.atomic import whole_file
+from ..visualization.image_tools import colorize, to_u8
+from ..visualization.rendered_views import depth_span
+
+SHOWN_SCORES = (
+    "psnr_tissue",
+    "psnr",
+    "ssim",
+    "depth_rmse_mm",
+    "flow_error_dis",
+    "depth_instability_mm",
+    "psnr_behind_tool",
+    "depth_rmse_behind_tool_mm",
+    "track_error_mm",
+    "num_gaussians",
+    "fps",
+    "fps_cached",
+    "train_seconds",
+)
+ERROR_FULL_SCALE = 0.15
+"""Color error, in [0, 1], at the end of the error map's color scale."""
+
+
+def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path) -> None:
+    """Write the report of a finished run folder as one PNG.
+
+    Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; then the
+    training curve, the PSNR of each test frame, and the scores of `metrics.json`.
+    """
+    metrics = json.loads((run / "metrics.json").read_text())
+    per_frame = json.loads((run / "per_frame.json").read_text())
+    log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    rows = _image_rows(scene, sequence)
+    # An own canvas: `pyplot` would choose a backend for the whole process.
+    figure = Figure(figsize=(2.6 * len(rows[0]), 2.1 * len(rows) + 3.4), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    top, bottom = figure.subfigures(2, 1, height_ratios=[2.1 * len(rows), 3.4])
+    axes = np.atleast_2d(top.subplots(len(rows), len(rows[0])))
+    for row, cells in zip(axes, rows, strict=True):
+        for axis, (title, image) in zip(row, cells, strict=True):
+            axis.imshow(image)
+            axis.set_title(title, fontsize=8)
+            axis.set_axis_off()
+    loss_axis, psnr_axis, table_axis = bottom.subplots(1, 3, width_ratios=[1, 1, 1.1])
+    _plot_loss(loss_axis, log)
+    _plot_psnr(psnr_axis, per_frame)
+    _write_scores(table_axis, metrics)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary)
+
+
+def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, NDArray[np.uint8]]]]:
+    frames = sequence.frames("test")
+    shown = sorted({int(k) for k in np.linspace(0, len(frames) - 1, 3)})
+    span, unit = depth_span(scene), "relative" if sequence.depth_is_relative else "mm"
+    rows = []
+    for frame in (frames[k] for k in shown):
+        out = scene.render(frame.time, frame.camera)
+        color, depth = np.clip(out.color.cpu().numpy(), 0, 1), out.depth.cpu().numpy()
+        error = np.abs(color - frame.rgb).mean(-1)
+        cells = [(f"input, frame {frame.index} (test)", frame.rgb_u8), ("rendered, tool removed", to_u8(color))]
+        tissue = sequence.truth.tissue(frame.index) if sequence.truth else None
+        if tissue is not None:
+            cells.append(("true tissue", tissue))
+        rho = joint_texture_prior(frame.rgb, frame.tissue_mask, PriorConfig())
+        cells += [
+            (f"error on tissue, 0..{ERROR_FULL_SCALE}", colorize(error, 0, ERROR_FULL_SCALE, frame.tissue_mask)),
+            (f"depth, {span[0]:.0f}..{span[1]:.0f} {unit}", colorize(depth, *span, depth > 0)),
+            ("joint texture prior", colorize(rho, 0, 1)),
+        ]
+        rows.append(cells)
+    return rows
+
+
+def _plot_loss(axis: Axes, log: list[dict]) -> None:
+    axis.semilogy([sum(line["terms"].values()) for line in log], linewidth=0.6, color="tab:red")
+    starts = [k for k in range(1, len(log)) if log[k]["stage"] != log[k - 1]["stage"]]
+    for k in starts:
+        axis.axvline(k, color="gray", linestyle=":", label="fine stage begins")
+    axis.set_title("training objective", fontsize=9)
+    axis.set_xlabel("log line (every 10 iterations)", fontsize=8)
+    if starts:
+        axis.legend(fontsize=7)
+
+
+def _plot_psnr(axis: Axes, per_frame: list[dict]) -> None:
+    points = [(row["index"], row["psnr_tissue"]) for row in per_frame if "psnr_tissue" in row]
+    if points:
+        axis.plot(*zip(*points, strict=True), "o-", color="tab:blue", markersize=4)
+    axis.set_title(f"{all_scores()['psnr_tissue'].heading}, test frames", fontsize=9)
+    axis.set_xlabel("frame", fontsize=8)
+    axis.grid(alpha=0.3)
+
+
+def _write_scores(axis: Axes, metrics: dict) -> None:
+    scores, known = metrics["scores"], all_scores()
+    lines = [f"{known[name].label:<20}{known[name].text(scores[name]):>16}" for name in SHOWN_SCORES if name in scores]
+    axis.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=axis.transAxes)
+    axis.set_axis_off()

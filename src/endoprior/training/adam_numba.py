@@ -1,0 +1,116 @@
+"""Adam in Numba: one pass over memory per step. CPU, float32.
+
+Plain torch makes about six passes over parameter, gradient and moments; on a CPU the step is bound by memory, so one
+pass is several times faster. Elements are independent: results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..compute.simd import LANES, prefetch
+from ..model.basis import RankOneGradient
+from .adam import BETA1, BETA2, AdamState
+
+FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
+CHUNK = 128  # rows per task
+_AHEAD = 4  # rows between asking for the basis functions of one and updating them
+
+
+def adam_step(
+    states: list[AdamState], params: list[Tensor], rate: float, epsilon: float, skip: Tensor | None = None
+) -> None:
+    """See `adam_torch.adam_step`; `skip` has no use here: the divergence check comes first on a CPU."""
+    for state, param in zip(states, params, strict=True):
+        state.steps += 1
+        rates, root_scale = _corrected(np.array([rate]), _counts(state))
+        tensors = (param, param.grad.contiguous(), state.first, state.second)
+        _adam_flat(*(t.detach().reshape(-1).numpy() for t in tensors), rates[0], root_scale[0], *_constants(epsilon))
+
+
+def adam_basis_step(
+    state: AdamState,
+    param: Tensor,
+    gradients: list[RankOneGradient],
+    rates: NDArray,
+    epsilon: float,
+    skip: Tensor | None = None,
+) -> None:
+    """See `adam_torch.adam_basis_step`; `skip` has no use here."""
+    weights = np.stack([gradient.weights for gradient in gradients]).astype(np.float32)
+    active = np.flatnonzero(weights.any(0))
+    if len(active) == 0:
+        return
+    begin, end = int(active[0]), int(active[-1]) + 1
+    state.steps[begin:end] += 1
+    scaled, root_scale = _corrected(rates[None, :], _counts(state)[begin:end, None])
+    v_offsets = np.stack([gradient.v_offsets.numpy() for gradient in gradients])
+    views = (param.detach().numpy(), weights, v_offsets, state.first.numpy(), state.second.numpy())
+    _adam_outer(*views, begin, scaled, root_scale[:, 0], *_constants(epsilon))
+
+
+def _counts(state: AdamState) -> NDArray[np.int64]:
+    return state.steps.numpy().astype(np.int64)
+
+
+def _corrected(rates: NDArray, steps: NDArray) -> tuple[NDArray, NDArray]:
+    """Learning rates / (1 - beta1^steps), and 1 / sqrt(1 - beta2^steps): Adam's bias corrections."""
+    return (rates / (1 - BETA1**steps)).astype(np.float32), (1 / np.sqrt(1 - BETA2**steps)).astype(np.float32)
+
+
+def _constants(epsilon: float) -> tuple[np.float32, np.float32, np.float32]:
+    return np.float32(BETA1), np.float32(BETA2), np.float32(epsilon)
+
+
+@njit(parallel=True, cache=True, fastmath=FLAGS)
+def _adam_flat(param, grad, first, second, rate, root_scale, beta1, beta2, epsilon):
+    # Update every element; param, grad, first, second (n,) float32, all scalars float32. Inputs are trusted.
+    # rate = lr / (1 - beta1**step), root_scale = 1 / sqrt(1 - beta2**step).
+    one = np.float32(1)
+    for i in prange(param.size):
+        g = grad[i]
+        m = beta1 * first[i] + (one - beta1) * g
+        v = beta2 * second[i] + (one - beta2) * g * g
+        first[i] = m
+        second[i] = v
+        param[i] -= rate * m / (np.sqrt(v) * root_scale + epsilon)
+
+
+@njit(parallel=True, cache=True, fastmath=FLAGS)
+def _adam_outer(param, weights, v, first, second, begin, rate, root_scale, beta1, beta2, epsilon):
+    # Like `_adam_flat` for a gradient that is a sum of outer products: grad[r, b, c] = sum_k weights[k, b] v[k, r, c].
+    # param, first, second (R, B, C); weights (K, B), v (K, R, C) float32. Updates basis functions begin .. begin +
+    # rate.shape[0]; rate (b, C) and root_scale (b,).
+    num_rows, num_bases, channels = param.shape
+    bases = rate.shape[0]
+    width, start = bases * channels, begin * channels
+    # Basis functions and channels of a row are contiguous: one long loop over both vectorizes, 13 channels do not.
+    rates, root_scales = np.empty(width, np.float32), np.empty(width, np.float32)
+    for i in range(width):
+        rates[i], root_scales[i] = rate[i // channels, i % channels], root_scale[i // channels]
+    stride = num_bases * channels
+    params, firsts, seconds = param.reshape(-1), first.reshape(-1), second.reshape(-1)
+    one = np.float32(1)
+    for task in prange((num_rows + CHUNK - 1) // CHUNK):
+        grad = np.empty(width, np.float32)
+        for r in range(task * CHUNK, min(num_rows, (task + 1) * CHUNK)):
+            # Each row is updated in one short piece, too short for the hardware prefetcher to foresee the next row.
+            ahead = (r + _AHEAD) * stride + start
+            for i in range(0, width + LANES, LANES):
+                prefetch(params, ahead + i)
+                prefetch(firsts, ahead + i)
+                prefetch(seconds, ahead + i)
+            grad[:] = np.float32(0)
+            for k in range(weights.shape[0]):
+                for b in range(bases):
+                    for c in range(channels):
+                        grad[b * channels + c] += weights[k, begin + b] * v[k, r, c]
+            place = r * stride + start
+            p, m, u = params[place : place + width], firsts[place : place + width], seconds[place : place + width]
+            for i in range(width):
+                m[i] = beta1 * m[i] + (one - beta1) * grad[i]
+                u[i] = beta2 * u[i] + (one - beta2) * grad[i] * grad[i]
+                p[i] -= rates[i] * m[i] / (np.sqrt(u[i]) * root_scales[i] + epsilon)

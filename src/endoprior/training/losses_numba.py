@@ -1,0 +1,128 @@
+"""The supervised terms of Eq. (12) in Numba: values and gradients in one pass over the image. CPU, float32.
+
+Computes what `losses_torch.py` computes. A dozen small torch operations and their backward passes each read the whole
+image, which costs as much as rendering it; here each row of pixels is read once. Sums run over rows, then over the rows
+in order, so they are bit-identical whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
+
+
+def supervised_losses(
+    color: Tensor,
+    depth: Tensor,
+    target_u8: Tensor,
+    target_inverse: Tensor,
+    tissue_mask: Tensor,
+    measured: Tensor,
+    weights: tuple[float, float, float],
+) -> Tensor:
+    """See `losses_torch.supervised_losses`. The terms must be summed, not scaled: their gradients are added already."""
+    return _SupervisedLosses.apply(color, depth, target_u8, target_inverse, tissue_mask, measured, weights)
+
+
+class _SupervisedLosses(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, color, depth, target_u8, target_inverse, tissue_mask, measured, weights) -> Tensor:
+        height, width = depth.shape
+        arrays = [
+            t.detach().contiguous().numpy() for t in (color, depth, target_u8, target_inverse, tissue_mask, measured)
+        ]
+        num_color, num_depth = (max(np.count_nonzero(mask), 1) for mask in arrays[4:])
+        num_pixels = height * width
+        color, depth, tv = weights
+        factors = np.array(
+            [color / (3 * num_color), depth / num_depth, tv / (3 * num_pixels), tv / num_pixels], np.float32
+        )
+        v_color, v_depth = np.empty_like(arrays[0]), np.empty_like(arrays[1])
+        inverse = np.empty_like(arrays[1])
+        sums = np.zeros((height, 4), np.float64)
+        _invert(arrays[1], inverse)
+        _rows(*arrays, inverse, factors, v_color, v_depth, sums)
+        ctx.grads = torch.from_numpy(v_color), torch.from_numpy(v_depth)
+        totals = sums.sum(0) * factors
+        return torch.tensor([totals[0], totals[1], totals[2] + totals[3]], dtype=torch.float32)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_terms: Tensor) -> tuple:
+        # Gradients of the three terms are already added up: valid only if all are summed with weight one.
+        if not bool((v_terms == 1).all()):
+            raise ValueError("the terms of supervised_losses must be added, not scaled; pass `weights` instead")
+        return *ctx.grads, None, None, None, None, None
+
+
+@njit(parallel=True, cache=True, fastmath=FLAGS)
+def _invert(depth, inverse):
+    for y in prange(depth.shape[0]):
+        for x in range(depth.shape[1]):
+            d = depth[y, x]
+            inverse[y, x] = np.float32(1) / d if d != 0 else np.float32(0)
+
+
+@njit(cache=True, inline="always")
+def _sign(x):
+    return np.float32(x > 0) - np.float32(x < 0)
+
+
+@njit(parallel=True, cache=True, fastmath=FLAGS)
+def _rows(color, depth, target_u8, target_inverse, tissue_mask, measured, inverse, factors, v_color, v_depth, sums):
+    # One task per row y: writes v_color[y], v_depth[y] and sums[y], the unweighted (color, depth, two variations).
+    # The variation's gradient is the signs of the differences to the four neighbors: no task writes another's row.
+    # A row is one flat run of numbers, three per pixel for color: loops over it vectorize, loops over channels do not.
+    height, width = depth.shape
+    scale = np.float32(1 / 255)
+    f_color, f_depth, f_tv, f_tvd = factors
+    colors, targets = color.reshape(height, 3 * width), target_u8.reshape(height, 3 * width)
+    v_colors = v_color.reshape(height, 3 * width)
+    for y in prange(height):
+        up, down = max(y - 1, 0), min(y + 1, height - 1)
+        weight = np.empty(3 * width, np.float32)
+        for x in range(width):
+            weight[3 * x] = weight[3 * x + 1] = weight[3 * x + 2] = np.float32(tissue_mask[y, x])
+        sums[y, 0] = _fidelity(colors[y], targets[y], scale, weight, f_color, v_colors[y])
+        sums[y, 2] = _variation(colors[up], colors[y], colors[down], 3, f_tv, v_colors[y])
+        for x in range(width):
+            weight[x] = np.float32(measured[y, x])
+        sums[y, 1] = _fidelity(inverse[y], target_inverse[y], np.float32(1), weight[:width], f_depth, v_depth[y])
+        sums[y, 3] = _variation(inverse[up], inverse[y], inverse[down], 1, f_tvd, v_depth[y])
+        for x in range(width):
+            v_depth[y, x] *= -inverse[y, x] * inverse[y, x]
+
+
+@njit(cache=True, inline="always")
+def _fidelity(row, target, scale, weight, factor, v_row):
+    # Weighted sum of |row - scale * target|; sets v_row to `factor` times its gradient.
+    total = np.float32(0)
+    for i in range(len(row)):
+        e = row[i] - np.float32(target[i]) * scale
+        total += weight[i] * abs(e)
+        v_row[i] = factor * weight[i] * _sign(e)
+    return total
+
+
+@njit(cache=True, inline="always")
+def _variation(above, row, below, step, factor, v_row):
+    # Sum of |differences| to the next pixel, `step` numbers on, and to the row below; adds `factor` times the gradient
+    # of the whole image's variation to v_row.
+    total = np.float32(0)
+    size = len(row)
+    for i in range(size):
+        total += abs(below[i] - row[i])
+        v_row[i] += factor * (_sign(row[i] - above[i]) - _sign(below[i] - row[i]))
+    for i in range(size - step):
+        total += abs(row[i + step] - row[i])
+        v_row[i] -= factor * _sign(row[i + step] - row[i])
+    for i in range(step, size):
+        v_row[i] += factor * _sign(row[i] - row[i - step])
+    return total

@@ -1,0 +1,70 @@
+"""Supervised terms of Eq. (12) in PyTorch: masked color, inverse depth, total variation. `H, W` is the image."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def color_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
+    """L_rgb: mean absolute color difference over tissue pixels and channels.
+
+    Args:
+        color, target: (H, W, 3). tissue_mask: (H, W) bool, True on tissue.
+    """
+    count = (tissue_mask.sum() * color.shape[-1]).clamp(min=1)
+    return ((color - target).abs() * tissue_mask[..., None]).sum() / count
+
+
+def inverse_depth(depth: Tensor) -> Tensor:
+    """1 / depth where depth is not 0, else 0; same shape, 1 / mm."""
+    rendered = depth != 0
+    return torch.where(rendered, 1 / torch.where(rendered, depth, 1), 0)
+
+
+def inverse_depth_l1(inverse: Tensor, target: Tensor, measured: Tensor) -> Tensor:
+    """L_depth: mean absolute difference of inverse depths over measured tissue pixels, 1 / mm.
+
+    Args:
+        inverse, target: (H, W) 1 / mm. measured: (H, W) bool, True where tissue has a depth.
+    """
+    return ((inverse - target).abs() * measured).sum() / measured.sum().clamp(min=1)
+
+
+def total_variation(image: Tensor) -> Tensor:
+    """Sum of absolute forward differences along both axes, divided by the number of values.
+
+    Args:
+        image: (H, W) or (H, W, C).
+    """
+    down = (image[1:] - image[:-1]).abs().sum()
+    right = (image[:, 1:] - image[:, :-1]).abs().sum()
+    return (down + right) / image.numel()
+
+
+def supervised_losses(
+    color: Tensor,
+    depth: Tensor,
+    target_u8: Tensor,
+    target_inverse: Tensor,
+    tissue_mask: Tensor,
+    measured: Tensor,
+    weights: tuple[float, float, float],
+) -> Tensor:
+    """Weighted color, depth and total-variation terms.
+
+    Args:
+        color: (H, W, 3) float32. depth: (H, W) float32 mm, 0 where nothing is rendered.
+        target_u8: (H, W, 3) uint8. target_inverse: (H, W) 1 / mm.
+        tissue_mask, measured: (H, W) bool, True where color, respectively depth, is compared.
+        weights: factors of the three terms; the depth term is 0 where its factor is.
+    Returns:
+        (3,) the weighted terms, differentiable in `color` and `depth`.
+    """
+    inverse = inverse_depth(depth)
+    terms = [
+        color_l1(color, target_u8.float() / 255, tissue_mask),
+        inverse_depth_l1(inverse, target_inverse, measured),
+        total_variation(color) + total_variation(inverse),
+    ]
+    return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)])

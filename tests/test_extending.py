@@ -1,0 +1,118 @@
+"""A new score, layout or export format is one new file and one line of a registry: the documents' examples, tried."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import endoprior
+from endoprior.core.presets import preset
+from endoprior.data import load_sequence
+from endoprior.model.gaussians import create_gaussians
+from endoprior.model.scene import Scene
+
+PACKAGE, DOCS = Path(endoprior.__file__).parent, Path(__file__).parents[1] / "docs"
+EVALUATE = """
+import sys
+from dataclasses import replace
+import torch
+from endoprior import evaluate, load_scene, load_sequence
+from endoprior.experiments.results import Results
+from endoprior.experiments.spec import Cell, MethodSpec, SequenceSpec, Spec
+from endoprior.experiments.tables import markdown, score_table
+from endoprior.model.deformation import Offsets
+
+
+class Static:
+    def offsets(self, means, time, ops):
+        return Offsets(torch.zeros_like(means))
+
+
+scene = replace(load_scene(sys.argv[1]), field=Static())  # so that no kernel has to be compiled
+scores = evaluate(scene, load_sequence(sys.argv[2]), networks=False).scores
+spec = Spec("t", {"s": SequenceSpec(path="s")}, {"m": MethodSpec()}, scores=("brightness",))
+print(scores["brightness"])
+print(markdown(score_table(Results(spec, {Cell("s", "m", None, 0): scores}), "s")))
+"""
+LOAD = """
+import sys
+from endoprior import load_sequence
+from endoprior.core.config import DataConfig
+
+for name in ("auto", "frames"):
+    sequence = load_sequence(sys.argv[1], DataConfig(format=name))
+    print(name, len(sequence), *sequence.frame(3).rgb_u8.shape)
+"""
+
+
+@pytest.fixture
+def extend(tmp_path):
+    """Copies the package, and adds a file and a line to the copy."""
+
+    def add(page: str, module: str, registry: str, variable: str) -> None:
+        shutil.copytree(PACKAGE, tmp_path / "src" / "endoprior", ignore=shutil.ignore_patterns("__pycache__"))
+        example = (DOCS / page).read_text(encoding="utf-8").split("\n## Add a ")[1]
+        file = tmp_path / "src" / "endoprior" / module
+        assert f"{file.parent.name}/NAME.py" in example and registry in example
+        file.write_text(re.search(r"```python\n(.*?)```", example, re.DOTALL)[1])
+        lines = (tmp_path / "src" / "endoprior" / registry).read_text()
+        start = f"{variable} = (\n"
+        assert start in lines
+        added = lines.replace(start, f'{start}    "{file.stem}",\n')
+        (tmp_path / "src" / "endoprior" / registry).write_text(added)
+
+    return add
+
+
+def run(tmp_path: Path, *words: str | Path) -> str:
+    """What Python prints with the extended copy."""
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "src")}
+    command = [sys.executable, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def tiny_scene(folder: Path) -> Scene:
+    """Twenty Gaussians before the camera of a sequence, rendered by the reference backend."""
+    sequence = load_sequence(folder)
+    cfg = preset("default").fitted(len(sequence))
+    cfg = replace(cfg, render=replace(cfg.render, backend="reference"))
+    points = np.random.default_rng(0).uniform([-10, -8, 55], [10, 8, 65], (20, 3)).astype(np.float32)
+    gaussians = create_gaussians(points, np.full((20, 3), 0.5, np.float32), np.zeros(20, np.float32), cfg)
+    cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
+    return Scene(gaussians, None, cfg, cameras, 15.0, torch.zeros(20), torch.zeros(20))
+
+
+def test_a_new_score_is_computed_and_stands_in_tables(extend, tmp_path, make_tiny_sequence):
+    extend("scores.md", "evaluation/scorers/brightness.py", "evaluation/registry.py", "SCORERS")
+    data = make_tiny_sequence(num_frames=3)
+    tiny_scene(data).save(tmp_path / "scene.safetensors")
+    value, *table = run(tmp_path, "-c", EVALUATE, tmp_path / "scene.safetensors", data).splitlines()
+    assert 0 < float(value) < 100
+    assert table[0] == "| method | brightness, % |" and table[2] != "| m | - |"
+
+
+def test_a_new_layout_is_recognized_and_opened(extend, tmp_path, tiny_sequence):
+    extend("datasets.md", "data/frames.py", "data/formats.py", "FORMATS")
+    shutil.copytree(tiny_sequence / "images", tmp_path / "new" / "frames")
+    assert run(tmp_path, "-c", LOAD, tmp_path / "new").splitlines() == ["auto 17 40 48 3", "frames 17 40 48 3"]
+
+
+def test_a_new_export_format_is_offered_and_written(extend, tmp_path, tiny_sequence):
+    extend("export.md", "export/xyz.py", "export/formats.py", "FORMATS")
+    scene = tiny_scene(tiny_sequence)
+    scene.save(tmp_path / "scene.safetensors")
+    command = ("-m", "endoprior", "export")
+    run(tmp_path, *command, tmp_path / "scene.safetensors", tmp_path / "a.xyz", "--format", "xyz", "--canonical")
+    assert np.loadtxt(tmp_path / "a.xyz") == pytest.approx(scene.gaussians["means"].detach().numpy(), abs=1e-4)
+    assert "xyz" in run(tmp_path, *command, "--help")
