@@ -223,8 +223,8 @@ def test_occupied_output_is_refused(tmp_path):
         {"baseline_mm": -4.2},
     ],
 )
-def test_values_out_of_range_are_errors(change):
-    with pytest.raises(ValueError, match="must be in") as caught:
+def test_values_out_of_range_are_input_errors(change):
+    with pytest.raises(InputError, match="expected") as caught:
         PhantomConfig(**change)
     assert "\n" not in str(caught.value)
 

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..core.checks import check_range, input_error
+from ..core.checks import input_error
 
 MOST_PIXELS = 3840 * 2160
 GB_PER_PIXEL = 1.3e-6
 """Memory for writing, measured at 1920x1080."""
+
+
+def _require(name: str, value: float, low: float, high: float) -> None:
+    """Raise InputError unless low <= value <= high (NaN fails)."""
+    if not low <= value <= high:
+        raise input_error(name, f"a value in [{low:g}, {high:g}]", repr(value), "Choose a value in this range.")
 
 
 @dataclass(frozen=True)
@@ -61,14 +67,14 @@ class PhantomConfig:
             ("depth_noise_px", 0, 2),
             ("tracks", 1, 20000),
         ):
-            check_range(name, getattr(self, name), low, high)
+            _require(name, getattr(self, name), low, high)
         if self.width * self.height > MOST_PIXELS:
             got = f"{self.width}x{self.height}, which needs about {self.width * self.height * GB_PER_PIXEL:.0f} GB"
             raise input_error("width, height", "at most 3840x2160 px in all", got, "Choose a smaller size.")
-        check_range("width / height", self.width / self.height, 0.6, 2.0)
+        _require("width / height", self.width / self.height, 0.6, 2.0)
         # With a principal point far off center, the image would extend beyond the modeled tissue.
-        check_range("principal_x", self.center[0], 0.35 * self.width, 0.65 * self.width)
-        check_range("principal_y", self.center[1], 0.35 * self.height, 0.65 * self.height)
+        _require("principal_x", self.center[0], 0.35 * self.width, 0.65 * self.width)
+        _require("principal_y", self.center[1], 0.35 * self.height, 0.65 * self.height)
 
     @property
     def focal(self) -> float:
