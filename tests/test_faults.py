@@ -21,7 +21,7 @@ from endoprior.runs.training_run import train
 from endoprior.system import atomic
 from endoprior.system.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder
 from endoprior.training.trainer import Trainer
-from endoprior.visualization.video import _num_frames, write_video
+from endoprior.visualization.video import num_frames, write_video
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
 
@@ -221,13 +221,13 @@ def test_a_limit_for_files_stops_training_in_one_line_and_keeps_the_checkpoint(t
 def test_a_film_that_was_cut_short_is_noticed(tmp_path):
     path = tmp_path / "film.mp4"
     write_video(path, [np.full((33, 48, 3), 20 * i, np.uint8) for i in range(7)], 10.0)
-    assert _num_frames(path) == 7
+    assert num_frames(path) == 7
     (tmp_path / "cut.mp4").write_bytes(path.read_bytes()[:-200])  # the table at its end is missing
-    assert _num_frames(tmp_path / "cut.mp4") == 0
+    assert num_frames(tmp_path / "cut.mp4") == 0
 
 
 def test_an_encoder_that_dies_leaves_no_film(tmp_path, monkeypatch):
-    monkeypatch.setattr("endoprior.visualization.video._num_frames", lambda path: 3)
+    monkeypatch.setattr("endoprior.visualization.video.num_frames", lambda path: 3)
     with pytest.raises(CannotWrite, match="an encoder that stopped"):
         write_video(tmp_path / "film.mp4", [np.zeros((32, 32, 3), np.uint8)] * 7, 10.0)
     assert list(tmp_path.iterdir()) == []

@@ -56,7 +56,7 @@ def test_unsure_where_nothing_speaks():
         assert mask_polarity([high], [image]).certainty < 0.3
     for high in (np.zeros_like(left), np.ones_like(left)):
         found = mask_polarity([high], [image])
-        assert found.certainty == 0 and "nothing" in found.reason
+        assert found.certainty == 0 and 'unknown' in found.reason
         assert found.tool_is_high != high.all()  # no tools rather than nothing but tools
 
 
