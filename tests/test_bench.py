@@ -24,6 +24,10 @@ from endoprior.render import cpu
 
 BENCH = Path(common.__file__).parent
 TINY = Size(40, 48, 40)
+WITHOUT_COMMON = (
+    "plain.py", "gpu_parity.py", "gpu_training.py",  # imported by other scripts only
+    "publish.py", "figures.py", "prepared.py", "golden.py",  # do not import torch
+)  # fmt: skip
 REPEATED = 7
 """An iteration whose frame has a training frame before it."""
 
@@ -111,7 +115,15 @@ def test_idle_threads_are_told_to_sleep_before_torch_is_imported(path):
     if path.name == "common.py":
         assert any("OMP_WAIT_POLICY" in line for line in lines[: imported[1]])
     # The first is imported by stages only, the others do without torch.
-    elif path.name not in ("plain.py", "publish.py", "figures.py", "prepared.py", "gpu_parity.py", "gpu_training.py"):
+    elif path.name not in (
+        "plain.py",
+        "publish.py",
+        "figures.py",
+        "prepared.py",
+        "golden.py",
+        "gpu_parity.py",
+        "gpu_training.py",
+    ):
         assert path.stem == "run" or next(lines[i] for i in imported if is_foreign(lines[i])) == "import common"
 
 

@@ -4,9 +4,19 @@ Names are imported when first used, so that `import endoprior` and `endoprior --
 """
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-_HOME = {
+if TYPE_CHECKING:
+    from .core.checks import InputError
+    from .core.config import Config
+    from .core.presets import preset
+    from .data import load_sequence
+    from .evaluation.scoring import evaluate
+    from .model.scene import Scene, load_scene
+    from .priors import joint_texture_prior
+    from .runs.training_run import train
+
+HOMES = {
     "Config": "core.config",
     "InputError": "core.checks",
     "Scene": "model.scene",
@@ -17,14 +27,25 @@ _HOME = {
     "preset": "core.presets",
     "train": "runs.training_run",
 }
+"""Module of each public name. No module or package directly below this one has such a name: it would replace it."""
 
-__all__ = sorted(_HOME)
+__all__ = [
+    "Config",
+    "InputError",
+    "Scene",
+    "evaluate",
+    "joint_texture_prior",
+    "load_scene",
+    "load_sequence",
+    "preset",
+    "train",
+]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in HOMES:
         raise AttributeError(f"module 'endoprior' has no attribute {name!r}")
-    value = getattr(import_module(f".{_HOME[name]}", __name__), name)
+    value = getattr(import_module(f".{HOMES[name]}", __name__), name)
     globals()[name] = value
     return value
 

@@ -1,7 +1,7 @@
 """An order of points along a curve that fills space: points that follow each other lie near each other.
 
-Gaussians are kept in this order because what belongs to neighbors (cells of a plane, tiles of a picture) then lies in
-the cache when it is needed again. The order changes no result but for the rounding of sums.
+Gaussians are kept in this order because memory that belongs to neighbors (cells of a plane, tiles of an image) is then
+still in the cache when it is needed again. The order changes nothing but the rounding of sums.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ def curve_order(points: NDArray) -> NDArray[np.int64]:
         ends = np.r_[0, np.flatnonzero(np.diff(cells)) + 1, num]
         for i in np.flatnonzero(np.diff(ends) > _LONG_RUN):
             run = order[ends[i] : ends[i + 1]]
-            crowd = points[run]
-            if np.ptp(crowd.astype(np.float64), axis=0).max() > _TINY:
-                run[:] = run[curve_order(crowd)]
+            cluster = points[run]
+            if np.ptp(cluster.astype(np.float64), axis=0).max() > _TINY:
+                run[:] = run[curve_order(cluster)]
     return order
 
 

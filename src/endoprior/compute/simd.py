@@ -1,4 +1,5 @@
-"""Sixteen float32 side by side, as a Numba type: a kernel says itself what is a vector, instead of hoping for it.
+"""Sixteen float32 side by side, as a Numba type: kernels use vectors explicitly instead of relying on
+the compiler to vectorize.
 
 Every operation rounds once, so that two kernels that use the same lines take bit-identical decisions.
 """

@@ -1,48 +1,19 @@
 """Every number of the method, one frozen dataclass per concern: schema, defaults, command line and manual.
 
-Defaults are the paper's; where it is silent, EndoGaussian's. `presets.py` says how the other presets differ. Anyone may
-import this module; it imports nothing of ours but `checks`. "mm" below means the unit of the sequence's depth.
+Defaults are the paper's; where it is silent, EndoGaussian's. `presets.py` says how the other presets differ. "mm" below
+means the unit of the sequence's depth.
 
-The type of a field says its range. Beyond it lie exhausted memory, endless loops and NaN; strangers write files too.
+The type of a field states its range. Values beyond it exhaust memory, loop for ever or give NaN, and config files may
+come from anywhere.
 """
 
 from __future__ import annotations
 
-import functools
-import typing
-from collections import namedtuple
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 from .checks import InputError, check_range
-
-Range = namedtuple("Range", "low high")
-"""Both ends are allowed, NaN is not. Of a tuple every element is meant."""
-Count = Annotated[int, Range(0, 10_000_000)]
-Positive = Annotated[int, Range(1, 10_000_000)]
-Share = Annotated[float, Range(0, 1)]
-Percent = Annotated[float, Range(0, 100)]
-Weight = Annotated[float, Range(0, 1e6)]
-Threshold = Annotated[float, Range(-1e3, 1e3)]
-Rate = Annotated[float, Range(0, 1e3)]
-DecayedRate = Annotated[float, Range(1e-30, 1e3)]  # its logarithm is taken
-
-
-@functools.cache
-def _ranges(cls: type) -> dict[str, Range]:
-    """The ranges in the annotations of a config's fields."""
-    hints = typing.get_type_hints(cls, include_extras=True)
-    return {name: hint.__metadata__[0] for name, hint in hints.items() if hasattr(hint, "__metadata__")}
-
-
-class Checked:
-    """A config that refuses values outside the ranges of its fields."""
-
-    def __post_init__(self) -> None:
-        for name, allowed in _ranges(type(self)).items():
-            value = getattr(self, name)
-            for part in value if isinstance(value, tuple | list) else (value,):
-                check_range(name, part, *allowed)
+from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
 
 @dataclass(frozen=True)
@@ -56,7 +27,7 @@ class DataConfig(Checked):
     depth_clip_high_percentile: Percent = 99.8
     """... and from above at this one."""
     lift_missing_depth: bool = False
-    """EndoGaussian's habit: missing depth becomes the near clip value and counts as measured."""
+    """As EndoGaussian does: missing depth becomes the near clip value and counts as measured."""
     shrink: Annotated[int, Range(1, 64)] = 1
     """Read frames at this fraction of their width and height: 2 averages blocks of 2 x 2 pixels."""
     first_frames: Count = 0
@@ -114,7 +85,7 @@ class InitConfig(Checked):
     sampler: Literal["prior", "uniform", "pool"] = "prior"
     """`prior`: Eq. (6), equal share per frame; `uniform`: the same shares, no prior; `pool`: EndoGaussian's."""
     budget: Positive = 20_000
-    """Pixels drawn over all training frames."""
+    """Pixels sampled over all training frames."""
     uniform_fraction: Share = 0.45
     """eta_app: share of the probability spread evenly over the eroded tissue mask."""
     erosion_px: Annotated[int, Range(1, 1001)] = 9
@@ -130,17 +101,17 @@ class InitConfig(Checked):
     voxel_divisions: Annotated[int, Range(1, 100_000)] = 400
     """Voxels along the longest side of the point cloud's box."""
     outlier_neighbors: Annotated[int, Range(1, 1000)] = 20
-    """Neighbors whose mean distance is judged."""
+    """Neighbors over which the mean distance is taken."""
     outlier_std: Weight = 1.5
     """Points farther than mean + this many standard deviations are dropped."""
     pixel_offset: Literal["exact", "legacy"] = "exact"
-    """`legacy` back-projects integer pixels, half a pixel up and left of where they are drawn (EndoGaussian)."""
+    """`legacy` back-projects integer pixels, half a pixel up and left of their centers (EndoGaussian)."""
     variance_factor: Annotated[float, Range(1e-12, 1e6)] = 1.0
     """Initial variance = this times the mean squared distance to the 3 nearest points (released code: 0.4)."""
     opacity: Annotated[float, Range(1e-4, 0.9999)] = 0.1
     """Initial opacity."""
     motion: Literal["rest", "flow"] = "rest"
-    """Start of the temporal coefficients (`kind` basis): at rest, or along tracks of optical flow and depth."""
+    """Start of the temporal coefficients (`kind` basis): no motion, or along tracks of optical flow and depth."""
 
 
 @dataclass(frozen=True)
@@ -177,11 +148,11 @@ class BasisConfig(Checked):
     """One coefficient per Gaussian, temporal basis function and channel: a linear map, no network."""
 
     num_bases: Annotated[int, Range(0, 1000)] = 31
-    """B: Gaussian bumps over time, centered evenly on [0, 1]; 0 takes one for every `frames_per_basis` frames."""
+    """B: basis functions over time, centered evenly on [0, 1]; 0 takes one for every `frames_per_basis` frames."""
     frames_per_basis: Annotated[float, Range(0.5, 1000)] = 2.2
-    """Frames of the sequence for each bump, where `num_bases` is 0; there are never fewer than 4 bumps."""
+    """Frames of the sequence for each basis function, where `num_bases` is 0; there are never fewer than 4."""
     relative_width: Annotated[float, Range(1e-3, 1e3)] = 1.2
-    """Standard deviation of a bump in units of 1 / B."""
+    """Standard deviation of a basis function in units of 1 / B."""
     deform_color: bool = True
     """Also let the view-independent color change with time."""
 
@@ -190,7 +161,7 @@ class BasisConfig(Checked):
         check_range("num_bases", self.num_bases or 2, 2, 1000)
 
     def fitted(self, num_frames: int) -> BasisConfig:
-        """The same with a number of bumps, chosen for a sequence of `num_frames` if there is none yet."""
+        """This config with a number of basis functions, chosen for `num_frames` if there is none yet."""
         chosen = min(max(round(num_frames / self.frames_per_basis), 4), 1000)
         return self if self.num_bases else replace(self, num_bases=chosen)
 
@@ -208,17 +179,17 @@ class DeformationConfig:
     deform_quats: bool = True
     """Let rotations change with time."""
     deform_opacity: bool = False
-    """Draw the deformed opacity (released code); EndoGaussian computes it and draws the canonical one."""
+    """Render the deformed opacity (released code); EndoGaussian computes it and renders the canonical one."""
 
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """How splats are drawn."""
+    """How splats are rendered."""
 
     backend: Literal["cpu", "cuda", "triton", "reference"] = "cpu"
     """`cpu`: Numba kernels; `cuda`, `triton`: an NVIDIA GPU, by gsplat or our own kernels; `reference`: plain torch."""
     depth_grad_to_means: bool = False
-    """Let the gradient of rendered depth reach the composited z; EndoGaussian's rasteriser drops it."""
+    """Let the gradient of rendered depth reach the composited z; EndoGaussian's rasterizer drops it."""
 
 
 @dataclass(frozen=True)
@@ -266,11 +237,11 @@ class TemporalConfig(Checked):
     min_valid: Count = 20
     """n_min: projections a Gaussian needs before it takes part."""
     valid_at_both: bool = True
-    """Demand a projection onto tissue at both times; False: being drawn at time t is enough (released code)."""
+    """Require a projection onto tissue at both times; False: being rendered at time t is enough (released code)."""
     max_points: Count = 0
-    """Gaussians drawn by weight for each step; 0 takes all that are eligible."""
+    """Gaussians sampled by weight for each iteration; 0 takes all that are eligible."""
     min_points: Count = 128
-    """With fewer eligible Gaussians the step goes without the term."""
+    """With fewer eligible Gaussians the iteration has no temporal term."""
     gradient: Literal["both", "current"] = "both"
     """Which end of the displacement is trained: both, or only time t (released code)."""
 
@@ -296,11 +267,11 @@ class DensityConfig(Checked):
     split_shrink: Annotated[float, Range(1e-3, 1e3)] = 1.6
     """Children of a split have the parent's scale divided by this."""
     prune_opacity: Share = 0.005
-    """Gaussians below this opacity go."""
+    """Gaussians below this opacity are removed."""
     prune_max_scale_mm: Annotated[float, Range(0, 1e9)] = 0.0
-    """Gaussians with a larger scale go; 0 switches the rule off (released code: 40)."""
+    """Gaussians with a larger scale are removed; 0 switches the rule off (released code: 40)."""
     prior_prune: bool = True
-    """Also remove what the prior distrusts: n >= n_min, score < tau_prior, mean opacity < tau_alpha."""
+    """Also remove Gaussians of low prior: n >= n_min, score < tau_prior, mean opacity < tau_alpha."""
     min_valid: Count = 20
     """n_min."""
     prior_threshold: Threshold = 0.2
@@ -351,7 +322,7 @@ class OptimConfig(Checked):
     epsilon: Annotated[float, Range(1e-30, 1)] = 1e-15
     """Adam's epsilon."""
     still_camera_scale: Weight = 10.0
-    """Spatial scale of a sequence whose camera stands still."""
+    """Spatial scale of a sequence with a static camera."""
 
 
 @dataclass(frozen=True)
@@ -365,14 +336,14 @@ class ScheduleConfig(Checked):
     sh_degree: Annotated[int, Range(0, 3)] = 3
     """Highest degree of the color's spherical harmonics."""
     half_resolution_iterations: Count = 0
-    """Fine iterations, from the first on, that see frames of half the width and height."""
+    """Fine iterations, from the first on, that use frames of half the width and height."""
     sh_every: Positive = 500
     """The degree in use rises by one each time this many iterations of a stage have passed."""
 
 
 @dataclass(frozen=True)
 class Config(Checked):
-    """All of it. Equal configs, data and machine give equal bits on a CPU."""
+    """The whole config. Equal configs, data and machine give bit-identical results on a CPU."""
 
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of sampling, initial weights, frame order and splits."""
@@ -396,5 +367,5 @@ class Config(Checked):
             )
 
     def fitted(self, num_frames: int) -> Config:
-        """The config with what it leaves to the length of the sequence filled in."""
+        """The config with the fields filled in that depend on the length of the sequence."""
         return replace(self, deformation=replace(self.deformation, basis=self.deformation.basis.fitted(num_frames)))

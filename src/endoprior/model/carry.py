@@ -23,7 +23,7 @@ def carry_points(
     Args:
         points: (P, 3) world positions, mm.
         from_frame: (P,) position in `times` at which each point is where `points` says.
-        times: T moments in [0, 1].
+        times: T times in [0, 1].
     Returns:
         (T, P, 3) world positions, mm.
     """

@@ -1,4 +1,4 @@
-"""Playing a scene: its own frames, deformed once and kept, so that drawing one again costs no deformation."""
+"""Playing a scene: frames are deformed once and cached, so that rendering one again needs no deformation."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from ..core.types import Camera, RenderOutput, Splats
 from .scene import Scene
 
 DEFAULT_MAX_BYTES = 1 << 30
-"""Memory that kept frames may take; about 2 MB a frame for 40,000 Gaussians of one color each."""
+"""Memory that cached frames may take; about 2 MB a frame for 40,000 Gaussians of one color each."""
 
 
 class Playback:
-    """Frames of a scene by index, kept once deformed; the one not drawn for longest goes first when room runs out.
+    """Frames of a scene by index, cached once deformed; the least recently used one is dropped when memory is full.
 
-    The pictures are those of `Scene.render`, bit for bit. For a moment between frames use the scene itself.
+    Images are bit-identical to those of `Scene.render`. For a time between frames use the scene itself.
     """
 
     def __init__(self, scene: Scene, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
-        """Keep nothing yet.
+        """Start with an empty cache.
 
         Args:
             scene: what to play.
-            max_bytes: for the kept frames together; at least one frame is always kept.
+            max_bytes: for all cached frames together; at least one frame is always cached.
         """
         self.scene, self.max_bytes = scene, max_bytes
         self._kept: OrderedDict[int, Splats] = OrderedDict()
@@ -45,8 +45,8 @@ class Playback:
             raise IndexError(f"frame must be in 0..{len(self) - 1}; got {index}")
         if index not in self._kept:
             splats = self.scene.at(index / len(self))
-            room = max(self.max_bytes // max(_num_bytes(splats), 1), 1)
-            while len(self._kept) >= room:
+            capacity = max(self.max_bytes // max(_num_bytes(splats), 1), 1)
+            while len(self._kept) >= capacity:
                 self._kept.popitem(last=False)
             self._kept[index] = splats
         self._kept.move_to_end(index)
@@ -54,12 +54,12 @@ class Playback:
 
     @torch.no_grad()
     def render(self, index: int, camera: Camera | None = None) -> RenderOutput:
-        """Draw frame `index`, from `camera` or else from where it was taken. See `Scene.render`."""
+        """Render frame `index`, from `camera` or else from its own. See `Scene.render`."""
         return self._rasterize(self.splats(index), camera or self.scene.cameras[index], background=self._background)
 
     @torch.no_grad()
     def render_many(self, indices: list[int]) -> list[RenderOutput]:
-        """Draw several frames from where they were taken. See `Scene.render_many`."""
+        """Render several frames from their own cameras. See `Scene.render_many`."""
         splats, cameras = [self.splats(i) for i in indices], [self.scene.cameras[i] for i in indices]
         return render.load_many(self.scene.backend)(splats, cameras, background=self._background)
 

@@ -1,4 +1,4 @@
-"""A trained scene: canonical Gaussians, how they move, and the cameras that saw them. Look at it, save it, load it."""
+"""A trained scene: canonical Gaussians, their motion and the cameras of the sequence; rendering, saving, loading."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from torch import Tensor
 
 from .. import render
 from ..core.checks import InputError, check_range
-from ..core.config import Checked, Config, Range
+from ..core.config import Config
 from ..core.config_io import from_dict, to_dict
 from ..core.geometry import FARTHEST_MM
+from ..core.ranges import Checked, Range
 from ..core.types import Camera, RenderOutput, Splats
 from ..system.arrays_file import ArraySpec, load_arrays, part, rejecting, save_arrays
 from .basis import basis_offsets
@@ -29,9 +30,9 @@ from .schema import model_schema
 FORMAT = "endoprior-scene-1"
 """Name and version of the file format, in the file's metadata."""
 LARGEST_SIDE = 2**16
-"""Of a picture, px."""
-LARGEST_PICTURE = 2**26
-"""Pixels that are drawn at most: 8192 x 8192."""
+"""Largest width or height of an image, px."""
+LARGEST_IMAGE = 2**26
+"""Largest number of pixels of an image: 8192 x 8192."""
 MOST_GAUSSIANS, MOST_FRAMES = 10_000_000, 1_000_000
 LARGEST_DEVIATION = 5e-3
 """Largest entry of R R^T - I that still passes for a rotation; readers accept 1e-3 of R^T R."""
@@ -58,7 +59,7 @@ def offsets_at(
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything needed to draw the tissue at any time from anywhere."""
+    """Everything needed to render the tissue at any time from any viewpoint."""
 
     gaussians: Gaussians
     field: HexPlaneField | None
@@ -72,9 +73,9 @@ class Scene:
     num_valid: Tensor
     """(N,) projections that score was averaged over."""
     lengths_are_relative: bool = False
-    """Whether the scale of the sequence's depth was assumed: then what is called mm is not mm."""
-    drawn_by: render.Backend | None = None
-    """What draws it; None: what it was trained with, where it can be used."""
+    """Whether the scale of the sequence's depth was assumed: lengths are then not in mm."""
+    rendered_by: render.Backend | None = None
+    """Rendering backend; None: the one it was trained with, where it can be used."""
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -97,12 +98,12 @@ class Scene:
 
     def _splats(self, offsets: Offsets | None) -> Splats:
         found = self.gaussians.splats(offsets, self.config.schedule.sh_degree)
-        # What no deformation touches is the trained tensor itself, and tied to its gradient.
+        # A tensor that no deformation changes is the trained tensor itself, with its gradient.
         return Splats(**{name: value.detach() for name, value in vars(found).items()})
 
     @torch.no_grad()
     def render(self, time: float, camera: Camera | None = None) -> RenderOutput:
-        """Draw the scene at `time` in [0, 1], from `camera` or else the camera of the frame nearest in time.
+        """Render the scene at `time` in [0, 1], from `camera` or else the camera of the frame nearest in time.
 
         Returns:
             color (H, W, 3), depth (H, W) mm as the sum of weight * z, alpha (H, W).
@@ -113,24 +114,24 @@ class Scene:
 
     @torch.no_grad()
     def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderOutput]:
-        """`render` of several moments, one camera each, in one call where the backend can: a GPU waits less.
+        """`render` at several times, one camera each, in one call where the backend can: faster on a GPU.
 
         Raises:
-            ValueError: a time is not in [0, 1], or cameras differ in size where the backend draws them together.
+            ValueError: a time is not in [0, 1], or cameras differ in size where the backend renders them together.
         """
         splats = [self.at(time) for time in times]
         return render.load_many(self.backend)(splats, cameras, background=splats[0].means.new_zeros(3))
 
     @property
     def device(self) -> torch.device:
-        """Where it lies and is drawn."""
+        """Device that holds the scene and renders it."""
         return self.gaussians["means"].device
 
     @property
     def backend(self) -> render.Backend:
-        """What draws it: what was asked for, else what it was trained with, if it draws where the Gaussians lie."""
+        """Rendering backend: `rendered_by`, else the one of the config, if it works on the scene's device."""
         on_gpu = self.device.type != "cpu"
-        for backend in (self.drawn_by, self.config.render.backend):
+        for backend in (self.rendered_by, self.config.render.backend):
             if backend is not None and (backend in render.ON_GPU) == on_gpu:
                 return backend
         return "cuda" if on_gpu else "cpu"
@@ -138,19 +139,19 @@ class Scene:
     def to(
         self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
     ) -> Scene:
-        """This scene on a device: what it is asked is computed and drawn there; itself if it is there.
+        """This scene on a device; itself if it is there.
 
         Args:
-            backend: what draws it there; None: what it was trained with, or gsplat on a GPU.
+            backend: renders it there; None: the one it was trained with, or gsplat on a GPU.
             fp16_planes: HexPlane in half precision, half the memory and faster: for rendering, cannot be saved.
         """
         gaussians = self.gaussians.to(device)
         field = self.field and self.field.to(device, fp16_planes=fp16_planes)
-        if gaussians is self.gaussians and field is self.field and backend in (None, self.drawn_by):
+        if gaussians is self.gaussians and field is self.field and backend in (None, self.rendered_by):
             return self
         return replace(
             self,
-            drawn_by=backend,
+            rendered_by=backend,
             gaussians=gaussians,
             field=field,
             prior_score=self.prior_score.to(device),
@@ -162,7 +163,7 @@ class Scene:
         return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
 
     def save(self, path: Path) -> None:
-        """Write the scene as one safetensors file, whole or not at all.
+        """Write the scene as one safetensors file, completely or not at all.
 
         Raises:
             ValueError: its planes are in half precision.
@@ -202,7 +203,7 @@ def load_scene(path: str | Path) -> Scene:
 
 @dataclass(frozen=True)
 class SceneFacts(Checked):
-    """The description in a scene's file."""
+    """Metadata of a scene's file."""
 
     config: Config
     width: Annotated[int, Range(1, LARGEST_SIDE)]
@@ -212,7 +213,7 @@ class SceneFacts(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("width times height", self.width * self.height, 1, LARGEST_PICTURE)
+        check_range("width times height", self.width * self.height, 1, LARGEST_IMAGE)
 
 
 def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
@@ -226,7 +227,7 @@ def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
 
 
 def check_values(arrays: Mapping[str, Tensor]) -> None:
-    """Refuse arrays of a scene, finite and of the right shapes, that no scene can have.
+    """Reject arrays of a scene, finite and of the right shapes, that no scene can have.
 
     Raises:
         InputError: naming the array.
@@ -241,7 +242,7 @@ def check_values(arrays: Mapping[str, Tensor]) -> None:
 
 
 def check_cameras(cameras: tuple[Camera, ...]) -> None:
-    """Refuse cameras that no scene can be loaded with again.
+    """Reject cameras with which a saved scene could not be loaded.
 
     Raises:
         InputError: naming what is wrong with them.
@@ -249,7 +250,7 @@ def check_cameras(cameras: tuple[Camera, ...]) -> None:
     first = cameras[0]
     _demand(
         ("width and height", max(first.width, first.height) <= LARGEST_SIDE, f"at most {LARGEST_SIDE:,} px"),
-        ("pictures", first.width * first.height <= LARGEST_PICTURE, f"at most {LARGEST_PICTURE:,} px"),
+        ("width times height", first.width * first.height <= LARGEST_IMAGE, f"at most {LARGEST_IMAGE:,} px"),
     )
     _check_cameras(*_camera_arrays(cameras))
 

@@ -18,7 +18,7 @@ from ..training.density import DensityStats
 from ..training.state import Stage
 from ..training.step import stage_length
 from ..training.trainer import Trainer
-from .identity import refuse_other_run
+from .identity import reject_other_run
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,7 +52,7 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
     cfg, next_step = trainer.cfg, "Train again without --resume."
 
     def schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
-        refuse_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, trainer.sequence.path)
+        reject_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, trainer.sequence.path)
         return checkpoint_schema(cfg)
 
     arrays, about = load_arrays(path, FORMAT, schema, next_step)

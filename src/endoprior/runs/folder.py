@@ -16,7 +16,7 @@ LOCK = ".lock"
 """File that a process holds while it trains in a folder."""
 
 
-def refuse_unusable_folder(out: Path, *, resume: bool) -> None:
+def reject_unusable_folder(out: Path, *, resume: bool) -> None:
     """Reject a folder that cannot take a run; nothing is created yet.
 
     Raises:
@@ -35,9 +35,9 @@ def prepare_run_folder(out: Path, *, resume: bool) -> bool:
     Returns:
         Whether the folder is new.
     Raises:
-        InputError: as `refuse_unusable_folder`, or it cannot be made.
+        InputError: as `reject_unusable_folder`, or it cannot be made.
     """
-    refuse_unusable_folder(out, resume=resume)
+    reject_unusable_folder(out, resume=resume)
     existed = out.is_dir()
     try:
         out.mkdir(parents=True, exist_ok=True)

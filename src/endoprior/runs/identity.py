@@ -11,7 +11,7 @@ from ..core.config import Config
 from ..core.config_io import to_dict
 
 
-def refuse_other_run(
+def reject_other_run(
     file: Path, stored_config: Any, stored_fingerprint: Any, cfg: Config, fingerprint: str, data: Path
 ) -> None:
     """Refuse to resume with another config or on other data.

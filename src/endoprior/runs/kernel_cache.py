@@ -1,8 +1,8 @@
-"""Have Numba's kernels compiled by a process of their own, so that every run, the first one too, loads them.
+"""Compile Numba's kernels in a separate process, so that every run, the first one too, loads them from the cache.
 
-Code that was compiled in a process is not always the code that Numba loads from its cache in the next one: kernels of
-parallel loops are optimized once more when they are linked for the cache, and sums that may be reordered then differ in
-their last bits. Whoever compares a run with its repetition, or resumes it, must not meet both (docs/log.md).
+The code that Numba compiles in a process is not always the code that it loads from its cache in the next one: parallel
+loops are optimized once more when they are linked for the cache, and sums that may be reordered then differ in their
+last bits. A run and its repetition, or its resumed part, must not use both (docs/log.md).
 """
 
 from __future__ import annotations
@@ -24,19 +24,17 @@ from ..render import ON_GPU
 
 PACKAGE = Path(__file__).parents[1]
 LIMIT_S = 900.0
-"""Longest wait; then, or when the process fails, kernels are compiled where they are needed."""
+"""Longest time to wait, s; then, or when the process fails, kernels are compiled when they are first used."""
 _filled: set[str] = set()
 
 
 def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
     """Make sure that the kernels which training and scoring with `cfg` need are in Numba's cache.
 
-    Does nothing where that was done before, and after the first time in a process.
-
     Args:
-        say: told once if there is something to wait for.
+        say: takes one line if kernels must be compiled, which takes about a minute.
     """
-    if cfg.render.backend in ON_GPU:  # which needs no kernels of ours
+    if cfg.render.backend in ON_GPU:  # which needs no Numba kernels
         return
     key = _key(cfg)
     if key in _filled:
@@ -52,14 +50,14 @@ def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
                 return
             say("compiling kernels, once after installation (about a minute)")
             words = [sys.executable, "-m", "endoprior.runs.warm_up"]
-            told = json.dumps(to_dict(cfg))
-            done = subprocess.run(words, input=told, text=True, capture_output=True, timeout=LIMIT_S, check=False)
+            config = json.dumps(to_dict(cfg))
+            done = subprocess.run(words, input=config, text=True, capture_output=True, timeout=LIMIT_S, check=False)
             if done.returncode == 0:
                 marker.touch()
 
 
 def _key(cfg: Config) -> str:
-    """Of everything that decides which kernels there are: source, compiler, processor, and parts of the config."""
+    """Hash of everything that decides which kernels are needed: source, compiler, processor, parts of the config."""
     import llvmlite.binding
     import numba
 

@@ -14,12 +14,12 @@ from ..data.files import read_json
 from ..model.scene import Scene
 from ..system.atomic import write_json, writing
 from ..training.divergence import Diverged
-from ..training.memory_check import refuse_too_large
+from ..training.memory_check import reject_too_large
 from ..training.trainer import Observer, Trainer
 from . import kernel_cache
 from .checkpoint import load_checkpoint, save_checkpoint
-from .folder import locked, prepare_run_folder, refuse_unusable_folder
-from .identity import refuse_other_run
+from .folder import locked, prepare_run_folder, reject_unusable_folder
+from .identity import reject_other_run
 from .interrupt import deferred_interrupt
 from .observers import CHECKPOINT_SECONDS, CheckpointWriter, LogWriter, cut_log
 from .provenance import run_facts
@@ -81,8 +81,8 @@ class TrainingRun:
         self.out = Path(out) if out is not None else None
         self.resume = resume
         if self.out:
-            refuse_unusable_folder(self.out, resume=resume)
-        refuse_too_large(sequence, cfg)
+            reject_unusable_folder(self.out, resume=resume)
+        reject_too_large(sequence, cfg)
         kernel_cache.fill(cfg, say)
         say(f"{sequence.path}: {len(sequence)} frames; backend {cfg.render.backend}")
         for warning in sequence.validate():
@@ -121,7 +121,7 @@ class TrainingRun:
             stored = read_json(about)
             data = stored.get("data")
             known = data.get("fingerprint") if isinstance(data, dict) else None
-            refuse_other_run(about, stored.get("config"), known, trainer.cfg, fingerprint, trainer.sequence.path)
+            reject_other_run(about, stored.get("config"), known, trainer.cfg, fingerprint, trainer.sequence.path)
         elif self.resume:
             raise InputError(f"{checkpoint}: expected a checkpoint to resume from; found none. Start without --resume.")
         write_json(about, run_facts(trainer, fingerprint))

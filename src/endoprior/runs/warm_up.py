@@ -20,7 +20,7 @@ WIDTH, HEIGHT, FRAMES = 64, 48, 10
 
 
 def tiny_sequence() -> FrameSequence:
-    """Frames that never were on a disk: textured, moving, with a tool and with missing depth."""
+    """A sequence made in memory: textured, moving, with a tool and with missing depth."""
     camera = Camera(WIDTH, HEIGHT, 60.0, 60.0, WIDTH / 2, HEIGHT / 2, np.eye(4))
     y, x = np.mgrid[:HEIGHT, :WIDTH]
 
@@ -36,7 +36,7 @@ def tiny_sequence() -> FrameSequence:
 
 
 def shortened(cfg: Config) -> Config:
-    """The same method within a few iterations: both stages, growth, the temporal term, half resolution."""
+    """The config with a few iterations in which everything runs: stages, growth, temporal term, half resolution."""
     return replace(
         cfg,
         init=replace(cfg.init, budget=400, cleanup=False, erosion_px=3),

@@ -46,7 +46,7 @@ def least_bytes(cfg: Config, num_train: int, width: int, height: int) -> int:
     return LEAST_BYTES + PICTURE_BYTES * width * height + max(state + growing, tracks)
 
 
-def refuse_too_large(sequence: FrameSequence, cfg: Config) -> None:
+def reject_too_large(sequence: FrameSequence, cfg: Config) -> None:
     """Refuse a training that the free memory cannot hold.
 
     Raises:

@@ -1,0 +1,60 @@
+"""The public Python API: README's block as it stands, in any order of imports, with types."""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import endoprior
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = Path(endoprior.__file__).parent
+SHORT = """
+import dataclasses, endoprior
+full = endoprior.preset
+def preset(name):
+    cfg = full(name)
+    return dataclasses.replace(
+        cfg,
+        init=dataclasses.replace(cfg.init, budget=200),
+        schedule=dataclasses.replace(cfg.schedule, fine_iterations=3),
+    )
+endoprior.preset = preset
+"""
+"""Runs before README's block: the same preset with three iterations."""
+
+
+def test_readmes_python_block_runs_as_it_stands(tiny_sequence, tmp_path):
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert '"DATA"' in block and '"RUN"' in block
+    checks = 'assert view.color.shape == (40, 48, 3) and "psnr" in scores and len(splats.means)\n'
+    script = tmp_path / "readme.py"
+    script.write_text(SHORT + block.replace("DATA", str(tiny_sequence)).replace("RUN", str(tmp_path / "run")) + checks)
+    subprocess.run([sys.executable, script], check=True)
+
+
+def test_no_import_replaces_a_public_name():
+    """`from endoprior.train import ...` once turned `endoprior.train` into a module."""
+    homes = sorted(set(endoprior.HOMES.values()))
+    imports = [f"import endoprior.{home}" for home in homes]
+    check = "import endoprior; assert all(callable(getattr(endoprior, n)) for n in endoprior.__all__)"
+    orders = [imports, imports[::-1], [check, *imports], list(itertools.chain(*((check, line) for line in imports)))]
+    processes = [subprocess.Popen([sys.executable, "-c", "\n".join([*order, check])]) for order in orders]
+    assert [process.wait() for process in processes] == [0] * len(orders)
+
+
+def test_no_module_below_the_package_has_a_public_name():
+    modules = {path.stem for path in PACKAGE.iterdir()}
+    assert not modules & set(endoprior.__all__)
+
+
+def test_public_names_are_typed_and_listed_once():
+    assert (PACKAGE / "py.typed").is_file()
+    tree = ast.parse((PACKAGE / "__init__.py").read_text())
+    (guarded,) = (node for node in tree.body if isinstance(node, ast.If))
+    typed = {alias.name: node.module for node in guarded.body for alias in node.names}
+    assert typed == endoprior.HOMES and sorted(typed) == endoprior.__all__ == dir(endoprior)
