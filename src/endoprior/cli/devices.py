@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from ..model.scene import Scene
 
 
-def on_device(scene: Scene, wanted: Wanted, *, half_planes: bool = False) -> Scene:
+def on_device(scene: Scene, wanted: Wanted, *, fp16_planes: bool = False) -> Scene:
     """The scene on the chosen device. Prints the device and the reason, unless the user asked for the CPU.
 
     Args:
-        half_planes: on a GPU, store a HexPlane as fp16 (`Scene.to`): for viewing, not for scores.
+        fp16_planes: on a GPU, store a HexPlane as fp16 (`Scene.to`): for viewing, not for scores.
     Raises:
         InputError: CUDA was requested and is not usable.
     """
@@ -23,4 +23,4 @@ def on_device(scene: Scene, wanted: Wanted, *, half_planes: bool = False) -> Sce
     if wanted != "cpu":
         say(choice.why)
     on_gpu = choice.device != "cpu"
-    return scene.to(choice.device, backend=choice.backend if on_gpu else None, half_planes=half_planes and on_gpu)
+    return scene.to(choice.device, backend=choice.backend if on_gpu else None, fp16_planes=fp16_planes and on_gpu)
