@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from export_scenes import moving_scene
-from view_client import Client, at_work
+from view_client import Client, at_work, control_id
 from websockets.exceptions import ConnectionClosed
 
 from endoprior.core.checks import InputError
@@ -144,7 +144,7 @@ def messages(viewer, client) -> list[dict]:
         "x" * 10_000,
         [[]] * 50,
     ]
-    ids = {name: handle._impl.uuid for name, handle in vars(viewer.panel).items() if hasattr(handle, "_impl")}
+    ids = {name: control_id(handle) for name, handle in vars(viewer.panel).items() if hasattr(handle, "_impl")}
     found = [{"type": kind} for kind in ("", "Message", "GuiUpdateMessage", "RunJavascriptMessage", "ShareUrlRequest")]
     for number, (name, uuid) in enumerate(ids.items()):
         pressed = [True] if hasattr(getattr(viewer.panel, name), "on_click") else []  # which is what a button is for
@@ -212,7 +212,7 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
         good.set(viewer.panel.camera, ORBIT)
         good.picture(quiet=0.2)
     state = {name: handle.value for name, handle in vars(viewer.panel).items() if hasattr(handle, "value")}
-    before, stranger = resident_mb(), Stranger(viewer.port)
+    before, stranger = resident_mb(), Stranger(viewer.port, max_queue=None)
     stranger.look()
     for message in messages(viewer, stranger):
         if not orbit or message["type"] == "ViewerCameraMessage":
@@ -224,13 +224,9 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
     now = {name: getattr(viewer.panel, name).value for name in state}
     assert {name for name in state if state[name] != now[name]} <= allowed
     assert now["clip"] == state["clip"] and 0 <= now["frame"] <= 9
-    assert viewer.panel.frame._impl.update_cb and not viewer.panel.frame._impl.removed
-    assert not viewer._server.gui._current_file_upload_states
     assert resident_mb() - before < 100
     for name in ("measure", "tool", "tracks"):
-        getattr(viewer.panel, name).value = False
-    viewer._jobs.put(viewer._read_panel)
-    viewer._jobs.put(viewer._read_measuring)
+        good.set(getattr(viewer.panel, name), False)
     if orbit:
         good.set(viewer.panel.camera, panels.ENDOSCOPE)
         good.picture(quiet=0.2)
@@ -248,7 +244,7 @@ ORIGINS = ("http://evil.example", "null", "http://127.0.0.1:1", "http://localhos
 def test_a_foreign_page_neither_sees_nor_commands(viewer, good):
     """Browsers let any page open a WebSocket to this machine; what it sends at once must not be carried out."""
     at, own = viewer.look.frame, f"Origin: http://127.0.0.1:{viewer.port}\r\n"
-    orders = [Stranger.camera(good), gui(viewer.panel.frame._impl.uuid, value=(at + 3) % 9)] * 2
+    orders = [Stranger.camera(good), gui(control_id(viewer.panel.frame), value=(at + 3) % 9)] * 2
     said = b"".join(frame(msgspec.msgpack.encode(order)) for order in orders)
     headers = [f"Origin: {origin.format(port=viewer.port)}\r\n" for origin in ORIGINS]
     requests = [upgraded(viewer, header) for header in [*headers, own + headers[0], headers[0] + own]]
@@ -270,12 +266,17 @@ def test_no_more_browsers_than_there_can_be(viewer, good):
         with suppress(ConnectionClosed):
             crowd.append(Client(viewer.port, close_timeout=0.2))
     time.sleep(0.3)
-    assert len(viewer._server._websock_server._live_connections) <= MOST_BROWSERS
+    assert 0 < sum(client.connected for client in [good, *crowd]) <= MOST_BROWSERS
     for client in crowd:
         client.socket.close()
-    end = time.monotonic() + 10
-    while len(viewer._server._websock_server._live_connections) > 1 and time.monotonic() < end:
-        time.sleep(0.05)
+    end, free = time.monotonic() + 10, False
+    while not free and time.monotonic() < end:  # until their places are free again
+        with suppress(ConnectionClosed):
+            late = Client(viewer.port, close_timeout=0.2)
+            late.look()
+            free = late.picture(quiet=0.1).any()
+            late.socket.close()
+    assert free
 
 
 def test_a_flood_neither_stops_the_work_nor_fills_the_memory(viewer, good):
@@ -297,7 +298,7 @@ def test_a_flood_neither_stops_the_work_nor_fills_the_memory(viewer, good):
     threads = [threading.Thread(target=flood) for _ in range(2)]
     for thread in threads:
         thread.start()
-    end = time.monotonic() + 3
+    end = time.monotonic() + 20  # on a busy machine it takes a while to be too fast
     while len(ended) < 2 and time.monotonic() < end:
         with suppress(TimeoutError):
             good.read(0.1)
@@ -325,10 +326,10 @@ def test_views_for_a_film_are_bounded(viewer, good):
         good.set(viewer.panel.keep, True)
         time.sleep(0.002)
     end = time.monotonic() + 5
-    while len(viewer._kept) < MOST_KEPT and time.monotonic() < end:
+    while f"{MOST_KEPT} views" not in viewer.panel.status.content and time.monotonic() < end:
         time.sleep(0.05)
     time.sleep(0.2)
-    assert len(viewer._kept) == MOST_KEPT
+    assert f"{MOST_KEPT} views kept" in viewer.panel.status.content
     good.set(viewer.panel.forget, True)
 
 
@@ -339,7 +340,8 @@ def test_messages_are_judged():
         return sensible("ViewerCameraMessage", camera | changes, lambda *_: True)
 
     assert sane() and sane(image_width=0) and not sane(fov=np.nan) and not sane(position=(np.inf, 0, 0))
-    assert not sensible("RemoveSceneNodeMessage", {}, lambda *_: True)
+    for kind in ("RemoveSceneNodeMessage", "FileTransferStartUpload", "FileTransferPart"):
+        assert not sensible(kind, {}, lambda *_: True)
     assert not trusted("http://[", "127.0.0.1", "127.0.0.1") and trusted(None, None, "127.0.0.1")
     assert bounded_aspect(1e300, 1) == 4 and bounded_aspect(np.nan, 1) == bounded_aspect(0, 0) == 1
 

@@ -12,9 +12,15 @@ import msgspec
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
+from websockets.protocol import State
 from websockets.sync.client import connect
 
 VISER = "viser-v1.1.1"
+
+
+def control_id(handle: Any) -> str:
+    """The id by which the page names a control of the panel; viser does not say it otherwise."""
+    return handle._impl.uuid
 
 
 class Client:
@@ -37,7 +43,12 @@ class Client:
 
     def set(self, handle: Any, value: Any) -> None:
         """Change a control of the panel."""
-        self.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
+        self.send("GuiUpdateMessage", uuid=control_id(handle), updates={"value": value})
+
+    @property
+    def connected(self) -> bool:
+        """Whether the viewer has not thrown it out."""
+        return self.socket.protocol.state is State.OPEN
 
     def click(self, x: float, y: float) -> None:
         """Click the canvas; (0, 0) is its upper left corner, (1, 1) its lower right."""
