@@ -14,7 +14,7 @@ demo: $(VENV)/.installed
 
 # Two processes, because most of a first run is compiling kernels, which takes one core. Files stay together.
 test: $(VENV)/.test-installed lint browser
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # One process: slow tests start processes of their own and watch the clock.
 test-all: test
