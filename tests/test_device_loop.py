@@ -129,34 +129,6 @@ def test_the_last_iteration_and_a_checkpoint_are_not_taken_on_trust(tiny_sequenc
     assert trainer.state.iteration == 0
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("saved", [False, True])
-def test_iterations_that_lacked_room_are_done_again(tiny_sequence, kind, saved, on_definitions):
-    """To the same bits as if there had been room: nothing of them is kept, whenever the host looks."""
-    cfg, states = quiet(tiny_config(kind, coarse=0, fine=30)), []
-    for short in (False, True):
-        trainer = Trainer(load_sequence(tiny_sequence), cfg)
-        trainer.start()
-        room = {"lacks": short, "made": 0}
-
-        def make_room(device, room=room):
-            room["made"] += 1
-            room["lacks"] = False
-
-        trainer._make_room = make_room
-        trainer._work.work.incomplete = lambda room=room, t=trainer: torch.tensor(
-            room["lacks"] and t.state.iteration >= 6
-        )
-        done = []
-        while not trainer.finished:
-            done.append(trainer.step().iteration)
-            if saved and done[-1] == 9:
-                trainer.settle()
-        states.append(state_of(trainer))
-        assert room["made"] == short and (done == list(range(1, 31))) is not short
-    assert all(torch.equal(states[0][name], value) for name, value in states[1].items())
-
-
 @pytest.mark.parametrize("frozen", [0.0, 1.0])
 def test_a_frozen_step_changes_nothing(frozen):
     generator = torch.Generator().manual_seed(0)
@@ -240,13 +212,13 @@ def test_points_are_on_tissue_by_the_definition_too(tiny_sequence):
     assert want.any() and not want.all()
 
 
-def test_planes_of_half_precision_change_no_picture(tiny_sequence, tmp_path):
+def test_fp16_planes_change_no_image(tiny_sequence, tmp_path):
     """Within 0.02 dB of what full precision scores, as the tissue is drawn after training; and they are not saved."""
     sequence = load_sequence(tiny_sequence)
     cfg = quiet(tiny_config("hexplane", coarse=20, fine=80))
     scene = train(sequence, cfg)
     with definitions_only():
-        halved = scene.to("cpu", half_planes=True)
+        halved = scene.to("cpu", fp16_planes=True)
         scores = []
         for each in (scene, halved):
             pictures = [(each.render(f.time, f.camera).color.numpy(), f.rgb) for f in sequence.frames("video")]
@@ -254,5 +226,5 @@ def test_planes_of_half_precision_change_no_picture(tiny_sequence, tmp_path):
     assert not np.array_equal(*scores)
     np.testing.assert_allclose(*scores, rtol=0, atol=0.02)
     assert halved.field.grid.values.dtype == torch.float16 and not halved.field.grid.grads.numel()
-    with pytest.raises(ValueError, match="half precision"):
+    with pytest.raises(ValueError, match="fp16 planes"):
         halved.save(tmp_path / "scene.safetensors")

@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from ..model.scene import Scene
 
 
-def on_device(scene: Scene, wanted: Wanted, *, half_planes: bool = False) -> Scene:
+def on_device(scene: Scene, wanted: Wanted, *, fp16_planes: bool = False) -> Scene:
     """The scene on the chosen device; which one, and why, is said unless it is the CPU as asked.
 
     Args:
-        half_planes: on a GPU a HexPlane may be halved (`Scene.to`): for pictures to look at, not for scores.
+        fp16_planes: on a GPU, planes in half precision (`Scene.to`): for images to look at, not for scores.
     Raises:
         InputError: CUDA was asked for and cannot be had.
     """
@@ -23,4 +23,4 @@ def on_device(scene: Scene, wanted: Wanted, *, half_planes: bool = False) -> Sce
     if wanted != "cpu":
         say(choice.why)
     on_gpu = choice.device != "cpu"
-    return scene.to(choice.device, backend=choice.backend if on_gpu else None, half_planes=half_planes and on_gpu)
+    return scene.to(choice.device, backend=choice.backend if on_gpu else None, fp16_planes=fp16_planes and on_gpu)

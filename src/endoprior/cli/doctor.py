@@ -15,23 +15,23 @@ if TYPE_CHECKING:
 
 @dataclass
 class Doctor:
-    """Say whether this machine can use CUDA and what to install, before anything needs it."""
+    """Check whether this machine can use CUDA, and what to install for it."""
 
     compile: bool = False
-    """Have gsplat compile itself now, which takes minutes, time it, and draw with it. Without a GPU, as where an image
-    is built, it compiles for those that TORCH_CUDA_ARCH_LIST names. Ends with status 1 if that does not work."""
+    """Compile gsplat now, which takes minutes, and render with it. Without a GPU, as in a container build, it compiles
+    for the GPUs that TORCH_CUDA_ARCH_LIST names. Exit status 1 if it fails."""
     json: bool = False
     """Print JSON instead of a table."""
 
 
 def run(argv: list[str]) -> int:
-    """Look, judge, print. What is missing is no failure: the exit status is 0, unless gsplat was to be compiled."""
+    """Print what works. The exit status is 0 whatever is missing, except 1 if --compile fails."""
     args = parse(Doctor, argv, "doctor")
-    from ..doctor import examine, look
+    from ..doctor import examine, read_facts
     from ..doctor.choice import choose
     from ..doctor.report import as_json, table
 
-    facts, compiling = look(), ""
+    facts, compiling = read_facts(), ""
     if args.compile:
         facts, compiling = _compile(facts, quiet=args.json)
     report = examine(facts)
@@ -52,16 +52,16 @@ def run(argv: list[str]) -> int:
 
 
 def _compile(facts: Facts, quiet: bool) -> tuple[Facts, str]:
-    """Have gsplat compile itself, if nothing hinders it; the facts then, and what came of it."""
+    """Compile gsplat if that is possible; the facts after it, and the result in one line."""
     from ..doctor import examine
     from ..doctor.facts import compile_gsplat
 
-    if hinders := examine(facts).hinders_compiling:
-        return facts, f"gsplat was not compiled: {hinders}"
+    if problem := examine(facts).compile_problem:
+        return facts, f"gsplat was not compiled: {problem}"
     if not quiet:
-        say("gsplat compiles; this takes minutes")
+        say("compiling gsplat; this takes minutes")
     facts = compile_gsplat(facts)
     if not facts.gsplat.loads:
         return facts, f"gsplat did not compile: {facts.gsplat.error}"
-    where = "" if facts.torch.available else "; here is no GPU to draw on"
+    where = "" if facts.torch.available else "; there is no GPU to test it on"
     return facts, f"gsplat is compiled, ready in {facts.gsplat.compile_seconds or 0:.0f} s{where}"

@@ -10,6 +10,7 @@ from typing import TypeVar
 import tyro
 
 from ..core.checks import InputError
+from ..core.config_io import current_value
 
 A = TypeVar("A")
 BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
@@ -24,17 +25,29 @@ def parse(cls: type[A], argv: list[str], command: str, default: A | None = None)
     if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in argv):
         said = "expected a name or a value in each place; got an empty one. Is a variable of the shell not set?"
         raise InputError(f"endoprior {command}: {said}")
-    said = io.StringIO()
+    words, said = _current(argv), io.StringIO()
     extra = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(cls, args=argv, prog=f"endoprior {command}", description=cls.__doc__, **extra)
+            return tyro.cli(cls, args=words, prog=f"endoprior {command}", description=cls.__doc__, **extra)
     except SystemExit as exit_:
         if exit_.code == 0:
             raise
         raise InputError(f"{_one_line(said.getvalue())}. Try `endoprior {command} --help`.") from None
     except ValueError as error:  # a range check of the config
         raise InputError(f"{str(error).removesuffix('.')}. Try `endoprior {command} --help`.") from None
+
+
+def _current(argv: list[str]) -> list[str]:
+    """The words with values of earlier versions replaced: `--render.backend cpu` is `--render.backend numba`."""
+    words = []
+    for word, before in zip(argv, ["", *argv], strict=False):
+        option, equals, value = word.partition("=")
+        if equals:
+            words.append(f"{option}={current_value(option.removeprefix('--'), value, hint=True)}")
+        else:
+            words.append(current_value(before.removeprefix("--"), word, hint=True))
+    return words
 
 
 def _one_line(page: str) -> str:

@@ -54,7 +54,7 @@ def draw(scene: Scene, args: Render) -> None:
     from .places import demand_folder_place
 
     demand_folder_place("OUT" if args.out else "RUN", args.out or args.run)
-    scene = on_device(scene, args.device, half_planes=True)
+    scene = on_device(scene, args.device, fp16_planes=True)
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
     from ..show.camera_paths import read_path, sway_path, times_path

@@ -114,7 +114,7 @@ def open_subject(path: Path, data: Path | None, device: Wanted = "cpu") -> tuple
 
     scene = load_scene(folder)
     originals = _originals(scene, folder, data)
-    return SceneSubject(on_device(scene, device, half_planes=True), str(folder), originals), folder / "view"
+    return SceneSubject(on_device(scene, device, fp16_planes=True), str(folder), originals), folder / "view"
 
 
 def _originals(scene: Scene, folder: Path, data: Path | None) -> FrameSequence | None:

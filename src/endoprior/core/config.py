@@ -1,9 +1,8 @@
 """Every number of the method, one frozen dataclass per concern: schema, defaults, command line and manual.
 
 Defaults are the paper's; where it is silent, EndoGaussian's. `presets.py` says how the other presets differ. Anyone may
-import this module; it imports nothing of ours but `checks`. "mm" below means the unit of the sequence's depth.
-
-The type of a field says its range. Beyond it lie exhausted memory, endless loops and NaN; strangers write files too.
+import this module. "mm" below means the unit of the sequence's depth. The type of a field says its range: beyond it lie
+exhausted memory, endless loops and NaN; strangers write files too.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ Weight = Annotated[float, Range(0, 1e6)]
 Threshold = Annotated[float, Range(-1e3, 1e3)]
 Rate = Annotated[float, Range(0, 1e3)]
 DecayedRate = Annotated[float, Range(1e-30, 1e3)]  # its logarithm is taken
+Backend = Literal["reference", "numba", "triton", "gsplat"]  # what renders: see `render`
 
 
 @functools.cache
@@ -213,10 +213,10 @@ class DeformationConfig:
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """How splats are drawn."""
+    """How splats are rendered."""
 
-    backend: Literal["cpu", "cuda", "triton", "reference"] = "cpu"
-    """`cpu`: Numba kernels; `cuda`, `triton`: an NVIDIA GPU, by gsplat or our own kernels; `reference`: plain torch."""
+    backend: Backend = "numba"
+    """`numba`: the CPU; `triton`, `gsplat`: an NVIDIA GPU, by our own kernels or gsplat's; `reference`: PyTorch."""
     depth_grad_to_means: bool = False
     """Let the gradient of rendered depth reach the composited z; EndoGaussian's rasteriser drops it."""
 

@@ -15,7 +15,7 @@ import yaml
 
 from ..core.checks import InputError
 from ..core.config import Config
-from ..core.config_io import from_dict, to_dict
+from ..core.config_io import current_value, from_dict, to_dict
 from ..core.presets import PresetName, preset
 from ..data.reading import read_text
 from ..data.yaml_text import load_yaml
@@ -151,7 +151,7 @@ def _override(values: dict[str, Any], name: str, value: Any, where: str) -> None
         raise InputError(f"{where}: expected the dotted name of a config field; got {name}. See `endoprior train -h`.")
     if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(values[last]) in (int, float):
         value = type(values[last])(values[last] * float(factor[1]))
-    values[last] = value
+    values[last] = current_value(name, value, hint=True)
 
 
 def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:

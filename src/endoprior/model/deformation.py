@@ -85,17 +85,17 @@ class HexPlaneField:
         field.load_state_arrays(arrays)
         return field
 
-    def to(self, device: torch.device | str, *, half_planes: bool = False) -> HexPlaneField:
+    def to(self, device: torch.device | str, *, fp16_planes: bool = False) -> HexPlaneField:
         """This field on a device; itself if it is there. A copy starts without gradients.
 
         Args:
-            half_planes: planes of half precision, on any device but the CPU, to draw with and no more.
+            fp16_planes: planes in half precision, on any device but the CPU, for rendering only.
         """
         device = torch.device(device)
-        if self.box.device.type == device.type and not half_planes:
+        if self.box.device.type == device.type and not fp16_planes:
             return self
         moved = copy(self)
-        moved.grid = self.grid.halved(device) if half_planes else self.grid.to(device)
+        moved.grid = self.grid.to_fp16(device) if fp16_planes else self.grid.to(device)
         moved.heads = self.heads.to(device)
         moved.box = self.box.detach().to(device).requires_grad_(self.box.requires_grad)
         return moved

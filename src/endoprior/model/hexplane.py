@@ -117,8 +117,8 @@ class PlaneGrid:
         moved.grads = moved.zeros()
         return moved
 
-    def halved(self, device: torch.device) -> PlaneGrid:
-        """A copy in half precision on a device, to look up and no more: without gradients, and nothing to train."""
+    def to_fp16(self, device: torch.device) -> PlaneGrid:
+        """A copy in half precision on a device, for look-ups only: without gradients, not to be trained."""
         return self._copy(self.values.detach().to(device, torch.float16))
 
     def _copy(self, values: Tensor) -> PlaneGrid:

@@ -134,19 +134,19 @@ class Scene:
         for backend in (self.drawn_by, self.config.render.backend):
             if backend is not None and (backend in render.ON_GPU) == on_gpu:
                 return backend
-        return "cuda" if on_gpu else "cpu"
+        return "gsplat" if on_gpu else "numba"
 
     def to(
-        self, device: torch.device | str, *, backend: render.Backend | None = None, half_planes: bool = False
+        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
     ) -> Scene:
         """This scene on a device: what it is asked is computed and drawn there; itself if it is there.
 
         Args:
             backend: what draws it there; None: what it was trained with, or gsplat on a GPU.
-            half_planes: HexPlane in half precision: half the memory and less to read, for pictures; not to be saved.
+            fp16_planes: HexPlane planes in half precision: half the memory, for rendering only; not to be saved.
         """
         gaussians = self.gaussians.to(device)
-        field = self.field and self.field.to(device, half_planes=half_planes)
+        field = self.field and self.field.to(device, fp16_planes=fp16_planes)
         if gaussians is self.gaussians and field is self.field and backend in (None, self.drawn_by):
             return self
         return replace(
@@ -166,10 +166,10 @@ class Scene:
         """Write the scene as one safetensors file, whole or not at all.
 
         Raises:
-            ValueError: its planes were halved for drawing.
+            ValueError: its planes are fp16.
         """
         if self.field is not None and self.field.grid.values.dtype != torch.float32:
-            raise ValueError("save the scene itself, not a copy with planes of half precision")
+            raise ValueError("save the scene itself, not a copy with fp16 planes")
         intrinsics, poses = _camera_arrays(self.cameras)
         arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
         arrays |= {"prior_score": self.prior_score, "num_valid": self.num_valid}

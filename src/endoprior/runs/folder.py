@@ -22,6 +22,7 @@ from ..core.checks import InputError
 from ..core.config_io import to_dict
 from ..data.files import read_json
 from ..data.reading import kind_of
+from ..render import ON_GPU
 from ..system.atomic import refuse_occupied, remove_leftovers, whole_file, write_json, writing
 from ..system.devices import name_of
 from ..training.divergence import Diverged
@@ -214,8 +215,8 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
 def run_facts(trainer: Trainer, fingerprint: str) -> dict[str, Any]:
     """What must be known to repeat the run: every config field, versions, commit, backend, and the data."""
     backend = trainer.cfg.render.backend
-    draws = {"cuda": ("gsplat",), "triton": ("triton",)}.get(backend, ())
-    names = ("endoprior", "torch", "numpy", "numba", "scipy", "opencv-python-headless", *draws)
+    names = ["endoprior", "torch", "numpy", "numba", "scipy", "opencv-python-headless"]
+    names += [backend] if backend in ON_GPU else []
     return {
         "config": to_dict(trainer.cfg),
         "seed": trainer.cfg.seed,

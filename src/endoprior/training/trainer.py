@@ -7,7 +7,6 @@ Every random choice is a pure function of (seed, stage, iteration), so a resumed
 from __future__ import annotations
 
 import time as clock
-from functools import partial
 
 import numpy as np
 import torch
@@ -31,7 +30,7 @@ from .divergence import ADVICE, Diverged
 from .frames import TrainingFrames
 from .inspector import Inspector, Redo
 from .optimizer import Optimizer
-from .recorded import GraphRecorder, Recorder, recording_wanted
+from .recorded import Recorder
 from .state import Stage, StepReport, TrainState
 from .step import Task, Work
 
@@ -48,13 +47,8 @@ class Trainer:
         self.frames = TrainingFrames(sequence, cfg.prior, self.device)
         background = torch.zeros(3, device=self.device)
         self._inspector = Inspector(self.device, waits=compiled(background))
-        queued = None if compiled(background) else render.load_queued(cfg.render.backend)
-        rasterize = queued.rasterize if queued else render.load(cfg.render.backend)
-        incomplete = partial(queued.incomplete, self.device) if queued else None
-        work = Work(self.cfg, rasterize, background, self._inspector, incomplete)
-        self._make_room = queued.make_room if queued else None
-        record = GraphRecorder() if queued and recording_wanted() else None
-        self._work = work if compiled(background) else Recorder(work, self.device, record)
+        work = Work(self.cfg, render.load(cfg.render.backend), background, self._inspector)
+        self._work = work if compiled(background) else Recorder(work, self.device, None)
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
         try:
             check_cameras(self.cameras)
@@ -168,9 +162,7 @@ class Trainer:
             self._prepare_again()
 
     def _prepare_again(self) -> None:
-        """Before iterations that lacked room are done again."""
-        if self._make_room:
-            self._make_room(self.device)
+        """Before iterations are done again."""
         self._work.forget()  # a recording keeps the room that it was made with
 
     def _sh_degree(self, iteration: int) -> int:

@@ -1,4 +1,4 @@
-"""The GPU backend without a GPU, on a stand-in for gsplat written here from its contracts.
+"""The gsplat backend without a GPU, on a stand-in for gsplat written here from its contracts.
 
 The stand-in keeps gsplat's shapes, its bounds and its traps: what it culls it neither reads nor writes, and unwritten
 rows are NaN. What only a GPU can show is for `bench/gpu.py` to check.
@@ -31,8 +31,8 @@ def fully_fused_projection(
     means, covars, quats, scales, viewmats, Ks, width, height, *, eps2d, near_plane, far_plane, opacities
 ):
     """(B, 1, N, ...) radii int32 x and y, means2d, depths, conics, None; packed and compensations off."""
-    moments = len(means)
-    assert covars is None and viewmats.shape == (moments, 1, 4, 4) and Ks.shape == (moments, 1, 3, 3)
+    steps = len(means)
+    assert covars is None and viewmats.shape == (steps, 1, 4, 4) and Ks.shape == (steps, 1, 3, 3)
     assert not opacities.requires_grad and opacities.shape == means.shape[:2]
     each = [
         project_one(*one_of, width, height, eps2d, near_plane, far_plane)
@@ -81,7 +81,7 @@ def spherical_harmonics(degree, dirs, coeffs, masks=None):
 def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
     """Tiles per Gaussian (B, N), sorted 64-bit ids (picture, tile, bits of z), and the Gaussian of each (P,) int32."""
     ids, owners = [], []
-    bits, (moments, num) = depths.contiguous().view(torch.int32).tolist(), depths.shape
+    bits, (steps, num) = depths.contiguous().view(torch.int32).tolist(), depths.shape
     for m, n in torch.nonzero((radii > 0).all(-1)).tolist():
         low = ((means2d[m, n] - radii[m, n]) / tile_size).floor().long().clamp(min=0).tolist()
         high = ((means2d[m, n] + radii[m, n]) / tile_size).ceil().long().tolist()
@@ -90,7 +90,7 @@ def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
                 ids.append(((m * tile_height + row) * tile_width + column) << 32 | bits[m][n])
                 owners.append(m * num + n)
     order = np.argsort(np.array(ids, np.int64), kind="stable")
-    counts = torch.bincount(torch.tensor(owners, dtype=torch.int64), minlength=moments * num).int().view(moments, num)
+    counts = torch.bincount(torch.tensor(owners, dtype=torch.int64), minlength=steps * num).int().view(steps, num)
     return counts, torch.tensor(ids, dtype=torch.int64)[order], torch.tensor(owners, dtype=torch.int32)[order]
 
 
@@ -105,8 +105,8 @@ def rasterize_to_pixels(
     means2d, conics, colors, opacities, width, height, tile_size, isect_offsets, flatten_ids, backgrounds=None
 ):
     """(B, H, W, C) color and (B, H, W, 1) alpha, tile by tile."""
-    channels, (moments, num) = colors.shape[-1], opacities.shape
-    assert backgrounds is None and means2d.shape == (moments, num, 2) and conics.shape == (moments, num, 3)
+    channels, (steps, num) = colors.shape[-1], opacities.shape
+    assert backgrounds is None and means2d.shape == (steps, num, 2) and conics.shape == (steps, num, 3)
     flat = [values.flatten(0, 1) for values in (means2d, conics, colors, opacities)]
     starts = isect_offsets.flatten(1).tolist()
     ends = [*(row[0] for row in starts[1:]), len(flatten_ids)]
@@ -143,8 +143,8 @@ def pixels_of_one(means2d, conics, colors, opacities, width, height, tile_size, 
 
 
 @pytest.fixture
-def cuda(monkeypatch):
-    """The backend's module on the stand-in, drawing on the CPU."""
+def gsplat(monkeypatch):
+    """The backend's module on the stand-in, rendering on the CPU."""
     return loaded(monkeypatch, kernels=object())
 
 
@@ -158,22 +158,22 @@ def loaded(monkeypatch, kernels):
         monkeypatch.setitem(sys.modules, name, module)
     fake._C = kernels
     forget(monkeypatch)
-    module = importlib.import_module("endoprior.render.cuda")
+    module = importlib.import_module("endoprior.render.gsplat")
     monkeypatch.setattr(module, "DEVICE", "cpu")
     return module
 
 
 def forget(monkeypatch):
     """Make the next import of the backend a real one, now and after the test."""
-    monkeypatch.delitem(sys.modules, "endoprior.render.cuda", raising=False)
-    monkeypatch.setitem(sys.modules, "endoprior.render.cuda", ModuleType("put aside"))  # undone last: nothing stays
-    del sys.modules["endoprior.render.cuda"]
+    monkeypatch.delitem(sys.modules, "endoprior.render.gsplat", raising=False)
+    monkeypatch.setitem(sys.modules, "endoprior.render.gsplat", ModuleType("put aside"))  # undone last: nothing stays
+    del sys.modules["endoprior.render.gsplat"]
 
 
 def compare(scene, view, **options):
     """Picture within 1e-4 of the reference (depth: of its largest), gradients within 1 %."""
     want, want_grads = draw("reference", scene, view, **options)
-    got, grads = draw("cuda", scene, view, **options)
+    got, grads = draw("gsplat", scene, view, **options)
     assert (got.color - want.color).abs().max() < 1e-4
     assert (got.alpha - want.alpha).abs().max() < 1e-4
     assert (got.depth - want.depth).abs().max() < 1e-4 * want.depth.abs().max().clamp(min=1)
@@ -195,7 +195,7 @@ def below_the_cap(scene):
 
 @pytest.mark.parametrize("depth_grad_to_means", [True, False])
 @pytest.mark.parametrize("degree", range(4))
-def test_agrees_with_reference(cuda, degree, depth_grad_to_means):
+def test_agrees_with_reference(gsplat, degree, depth_grad_to_means):
     view = camera(seed=degree)
     scene = below_the_cap(splats(view, degree=degree, seed=degree))
     got, grads = compare(scene, view, depth_grad_to_means=depth_grad_to_means)
@@ -204,25 +204,25 @@ def test_agrees_with_reference(cuda, degree, depth_grad_to_means):
 
 
 @pytest.mark.parametrize("width, height", [(1, 1), (16, 32), (33, 31), (7, 50)])
-def test_agrees_at_any_size(cuda, width, height):
+def test_agrees_at_any_size(gsplat, width, height):
     view = camera(width, height, seed=1)
     compare(below_the_cap(splats(view, 40, degree=1, seed=2, widths=(0.5, 6.0))), view)
 
 
-def test_stopped_depth_reaches_z_no_more(cuda):
+def test_stopped_depth_reaches_z_no_more(gsplat):
     """Depth alone, of one Gaussian on the axis: its z gets the pixel's weight, or only what its footprint gives."""
     view = camera(seed=None)
     pulled = {}
     for stopped in (False, True):
         scene = one(view, view.cx, view.cy, 40.0)
         scene.means.requires_grad_()
-        out = render.load("cuda")(scene, view, background=torch.zeros(3), depth_grad_to_means=not stopped)
+        out = render.load("gsplat")(scene, view, background=torch.zeros(3), depth_grad_to_means=not stopped)
         out.depth.sum().backward()
         pulled[stopped] = scene.means.grad[0, 2]
     assert torch.isclose(pulled[False] - pulled[True], out.alpha.detach().sum(), rtol=1e-4)
 
 
-def test_only_what_reaches_a_pixel_center_counts_as_drawn(cuda, monkeypatch):
+def test_only_what_reaches_a_pixel_center_counts_as_drawn(gsplat, monkeypatch):
     """gsplat's box is rounded up to whole pixels, and so reaches the image from where the footprint does not."""
     boxes = []
 
@@ -234,108 +234,112 @@ def test_only_what_reaches_a_pixel_center_counts_as_drawn(cuda, monkeypatch):
     monkeypatch.setattr(sys.modules["gsplat"], "fully_fused_projection", kept)
     view = camera(seed=None)
     scene = replace(one(view, -3.0, 10.5, 40.0), opacities=torch.tensor([0.12]))
-    out = render.load("cuda")(scene, view, background=torch.zeros(3))
+    out = render.load("gsplat")(scene, view, background=torch.zeros(3))
     assert (boxes[0] > 0).all() and boxes[0].shape == (1, 1, 1, 2) and out.radii.tolist() == [0] and not out.alpha.any()
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("value", [NAN, float("inf"), -float("inf"), 3e38])
-def test_poison_is_culled_and_carries_no_gradient(cuda, name, value):
+def test_poison_is_culled_and_carries_no_gradient(gsplat, name, value):
     view = camera()
     scene = below_the_cap(splats(view, degree=1))
     row = int(torch.nonzero(draw("reference", scene, view)[0].radii)[0])
-    got, grads = draw("cuda", poison(scene, name, row, value), view)
+    got, grads = draw("gsplat", poison(scene, name, row, value), view)
     others = torch.arange(len(scene)) != row
-    want, _ = draw("cuda", pick(scene, others), view)
+    want, _ = draw("gsplat", pick(scene, others), view)
     assert got.radii[row] == 0 and torch.equal(got.color, want.color) and torch.equal(got.depth, want.depth)
     assert all(grads[field].isfinite().all() and not grads[field][row].any() for field in (*NAMES, "means2d"))
 
 
-def test_what_would_overflow_or_has_no_direction_is_culled(cuda):
+def test_what_would_overflow_or_has_no_direction_is_culled(gsplat):
     view = camera(seed=None)
     scene = one(view, 20.5, 10.5, 40.0)
     for changes in ({"scales": torch.full((1, 3), 1e12)}, {"quats": torch.full((1, 4), 1e-13)}):
-        out = render.load("cuda")(replace(scene, **changes), view, background=torch.zeros(3))
+        out = render.load("gsplat")(replace(scene, **changes), view, background=torch.zeros(3))
         assert out.radii.tolist() == [0] and not out.alpha.any()
 
 
-def test_near_plane_itself_is_culled(cuda):
+def test_near_plane_itself_is_culled(gsplat):
     view = camera(seed=None)
     at = float(np.float32(NEAR_Z))
     radii = []
     for z in (at, float(np.nextafter(np.float32(at), np.float32(1)))):
         scene = replace(one(view, view.cx, view.cy, 1.0), means=torch.tensor([[0.0, 0.0, z]]))
-        radii.append(render.load("cuda")(scene, view, background=torch.zeros(3)).radii.item())
+        radii.append(render.load("gsplat")(scene, view, background=torch.zeros(3)).radii.item())
     assert radii[0] == 0 and radii[1] > 0
 
 
-def test_a_camera_far_from_the_origin_still_has_a_behind(cuda):
+def test_a_camera_far_from_the_origin_still_has_a_behind(gsplat):
     view = camera(seed=None)
     view.world_to_camera[:3, 3] = (3e8, -5e8, 9e8)
-    lens = cuda.lens_of(view, torch.device("cpu"))
+    lens = gsplat.lens_of(view, torch.device("cpu"))
     assert (lens.behind * lens.z_row).sum() + lens.z_shift < 0
 
 
-def test_several_moments_in_one_call_are_the_pictures_of_each(cuda):
+def test_several_time_steps_in_one_call_equal_one_call_each(gsplat):
     views = [camera(seed=seed) for seed in range(3)]
     scenes = [splats(view, degree=1, seed=seed) for seed, view in enumerate(views)]
     background = torch.tensor([0.1, 0.2, 0.3])
-    for got, scene, view in zip(cuda.rasterize_many(scenes, views, background=background), scenes, views, strict=True):
-        want = cuda.rasterize(scene, view, background=background)
+    for got, scene, view in zip(
+        gsplat.rasterize_many(scenes, views, background=background), scenes, views, strict=True
+    ):
+        want = gsplat.rasterize(scene, view, background=background)
         for name in ("color", "alpha", "depth", "means2d", "radii"):
             torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=1e-5, atol=1e-5)
     empty = [pick(scene, torch.arange(0)) for scene in scenes]
-    assert len(cuda.rasterize_many(empty, views, background=background)) == 3
+    assert len(gsplat.rasterize_many(empty, views, background=background)) == 3
     with pytest.raises(ValueError, match="must agree"):
-        cuda.rasterize_many([scenes[0], pick(scenes[1], torch.arange(5))], views[:2], background=background)
+        gsplat.rasterize_many([scenes[0], pick(scenes[1], torch.arange(5))], views[:2], background=background)
     with pytest.raises(ValueError, match="must agree"):
-        cuda.rasterize_many(scenes[:2], [views[0], replace(views[1], width=9)], background=background)
+        gsplat.rasterize_many(scenes[:2], [views[0], replace(views[1], width=9)], background=background)
 
 
 @pytest.mark.parametrize("num", [0, 3])
-def test_nothing_to_draw_is_the_background(cuda, num):
+def test_without_visible_gaussians_the_image_is_the_background(gsplat, num):
     view = camera()
     scene = pick(splats(view), torch.arange(num))
     scene = replace(scene, means=scene.means - 1e4 * torch.tensor(view.world_to_camera[2, :3]).float())
-    got, grads = draw("cuda", scene, view)
+    got, grads = draw("gsplat", scene, view)
     assert (got.color == torch.tensor([0.1, 0.2, 0.3])).all() and not got.alpha.any() and not got.depth.any()
     assert got.means2d.shape == (num, 2) and not got.radii.any()
     assert all(not grads[name].any() for name in (*NAMES, "means2d")) and grads["background"].any()
 
 
-def test_cameras_are_kept_by_value(cuda):
+def test_cameras_are_kept_by_value(gsplat):
     view, device = camera(), torch.device("cpu")
-    assert cuda.lens_of(view, device) is cuda.lens_of(camera(), device)
-    before = cuda.lens_of(view, device)
+    assert gsplat.lens_of(view, device) is gsplat.lens_of(camera(), device)
+    before = gsplat.lens_of(view, device)
     view.world_to_camera[0, 3] += 1
-    assert not torch.equal(cuda.lens_of(view, device).viewmats, before.viewmats)
+    assert not torch.equal(gsplat.lens_of(view, device).viewmats, before.viewmats)
 
 
-def test_other_types_and_devices_are_refused(cuda, monkeypatch):
+def test_other_types_and_devices_are_rejected(gsplat, monkeypatch):
     view = camera()
     scene = splats(view, 3)
     doubled = Splats(*(getattr(scene, name).double() for name in NAMES))
     with pytest.raises(ValueError, match=r"float32 on one cpu device; got torch.float64"):
-        cuda.rasterize(doubled, view, background=torch.zeros(3).double())
+        gsplat.rasterize(doubled, view, background=torch.zeros(3).double())
     with pytest.raises(ValueError, match=r"on one cpu device; got torch.float32 on .'cpu', 'meta'"):
-        cuda.rasterize(replace(scene, sh=scene.sh.to("meta")), view, background=torch.zeros(3))
-    monkeypatch.setattr(cuda, "DEVICE", "cuda")
+        gsplat.rasterize(replace(scene, sh=scene.sh.to("meta")), view, background=torch.zeros(3))
+    monkeypatch.setattr(gsplat, "DEVICE", "cuda")
     with pytest.raises(ValueError, match=r"one cuda device; got torch.float32 on .'cpu'"):
-        cuda.rasterize(scene, view, background=torch.zeros(3))
+        gsplat.rasterize(scene, view, background=torch.zeros(3))
 
 
 def test_without_gsplat_one_line_says_what_to_install(monkeypatch):
     forget(monkeypatch)
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(InputError, match=r"^backend: cuda needs gsplat.*endoprior\[cuda\].*endoprior doctor[^\n]*$"):
-        render.load("cuda")
+    with pytest.raises(
+        InputError, match=r"^backend: gsplat cannot be imported.*endoprior\[cuda\].*endoprior doctor[^\n]*$"
+    ):
+        render.load("gsplat")
 
 
 def test_without_a_toolkit_one_line_says_so(monkeypatch):
     loaded(monkeypatch, kernels=None)
     view = camera()
     with pytest.raises(InputError, match=r"no CUDA toolkit.*endoprior doctor"):
-        render.load("cuda")(splats(view, 3), view, background=torch.zeros(3))
+        render.load("gsplat")(splats(view, 3), view, background=torch.zeros(3))
 
 
 def test_a_build_that_fails_is_told_in_one_line(monkeypatch):
@@ -347,5 +351,5 @@ def test_a_build_that_fails_is_told_in_one_line(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", Failing())
     view = camera()
-    with pytest.raises(InputError, match=r"could not build its CUDA kernels \(Ninja is required\)\. Install"):
+    with pytest.raises(InputError, match=r"cannot build its CUDA kernels \(Ninja is required\)\. Install"):
         module.rasterize(splats(view, 3), view, background=torch.zeros(3))
