@@ -9,7 +9,7 @@ import common
 import plain
 import scenes
 
-from endoprior.render.numba import KERNELS, tiles
+from endoprior.render.numba import KERNELS
 from endoprior.render.projection import project
 
 
@@ -18,11 +18,11 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     measured = []
     for size in sizes:
         splats, camera = scenes.splats(size)
-        inputs = (splats.means, splats.quats, splats.scales, splats.sh, splats.opacities)
-        *projected, radii = KERNELS.project_forward(*inputs, camera)
-        arrays = [t.numpy() for t in (*projected, splats.opacities, radii)]
+        inputs = (splats.means, splats.quats, splats.scales, splats.sh)
+        *projected, radii = KERNELS.project_forward(inputs, splats.opacities, camera)
+        gaussians = (*projected, splats.opacities)
         seen, image = project(splats, camera), (size.width, size.height)
-        ours = {"": lambda _, a=arrays, p=image: tiles.build(*a, *p)}
+        ours = {"": lambda _, g=gaussians, r=radii, s=image: KERNELS.bin_tiles(g, r, s)}
         theirs = {"": lambda _, s=seen, o=splats.opacities, p=image: plain.bin_tiles(s, o, *p)}
         measured += common.rows("binning + sort", common.race(ours, theirs), size.num, image)
     return measured

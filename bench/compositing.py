@@ -36,8 +36,8 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
 def our_steps(splats: Splats, camera: Camera, cotangents: Tensor) -> common.Steps:
     """The kernels on Gaussians that are already in the image and sorted into tiles."""
     inputs, size = (splats.means, splats.quats, splats.scales, splats.sh), (camera.width, camera.height)
-    *projected, radii = KERNELS.project_forward(*inputs, splats.opacities, camera)
-    tiles = KERNELS.bin_tiles(*projected, splats.opacities, radii, size)
+    *projected, radii = KERNELS.project_forward(inputs, splats.opacities, camera)
+    tiles = KERNELS.bin_tiles((*projected, splats.opacities), radii, size)
     shape = (projected[1], splats.opacities)
     given = tuple(part.contiguous() for part in by_image(cotangents))
     return {

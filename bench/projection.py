@@ -25,7 +25,7 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
         inputs = [t.requires_grad_() for t in (splats.means, splats.quats, splats.scales, splats.sh)]
         cotangents = [torch.randn(shape) for shape in ((num, 2), (num, 3), (num,), (num, 3))]
         ours = {
-            "forward": lambda _, i=inputs, s=splats, c=camera: Project.apply(*i, s.opacities, c, KERNELS)[:4],
+            "forward": lambda _, i=inputs, s=splats, c=camera: Project.apply(KERNELS, c, s.opacities, *i)[:4],
             "backward": lambda out, i=inputs, v=cotangents: torch.autograd.grad(out, i, v),
         }
         theirs = ours | {"forward": lambda _, s=splats, c=camera: list(vars(project(s, c)).values())[:4]}

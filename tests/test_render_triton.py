@@ -150,9 +150,9 @@ def test_without_visible_gaussians_the_image_is_the_background(num):
 
 def tiles_of(scene, view):
     """(L, N) how often each tile lists each Gaussian."""
-    inputs = (scene.means, scene.quats, scene.scales, scene.sh, scene.opacities)
-    *projected, radii = backend.KERNELS.project_forward(*inputs, view)
-    lists = backend.KERNELS.bin_tiles(*projected, scene.opacities, radii, (view.width, view.height))
+    inputs = (scene.means, scene.quats, scene.scales, scene.sh)
+    *projected, radii = backend.KERNELS.project_forward(inputs, scene.opacities, view)
+    lists = backend.KERNELS.bin_tiles((*projected, scene.opacities), radii, (view.width, view.height))
     listed = torch.zeros(len(lists.tile_starts) - 1, len(scene), dtype=torch.int64)
     ranks = lists.order[lists.ranks.long()]
     for tile, (start, end) in enumerate(zip(lists.tile_starts[:-1], lists.tile_starts[1:], strict=True)):

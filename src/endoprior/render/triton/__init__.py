@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ...core.checks import InputError
 from ...core.types import Camera, RenderOutput, Splats
-from ..autograd import rasterize_with
+from ..autograd import Kernels, Tensors, empty, rasterize_with
 from ..projection import check, check_device
 from ..sh import degree_of
 
@@ -70,65 +70,47 @@ def _start_driver() -> None:
         ) from error
 
 
-class _Kernels:
-    """See `autograd.Kernels`."""
-
-    def project_forward(
-        self, means: Tensor, quats: Tensor, scales: Tensor, sh: Tensor, opacities: Tensor, camera: Camera
-    ) -> tuple[Tensor, ...]:
-        num, lens = len(means), lens_of(camera, means.device)
-        outputs = [means.new_empty(shape) for shape in [(num, 2), (num, 3), (num,), (num, 3)]]
-        outputs.append(means.new_empty(num, dtype=torch.int32))
-        inputs = (means, quats, scales, opacities, sh, lens, num, camera.width, camera.height)
-        options = {"DEGREE": degree_of(sh.shape[1]), "BLOCK": BLOCK, **WARPS}
-        launch(project_forward, triton.cdiv(num, BLOCK), *inputs, *outputs, **options)
-        return tuple(outputs)
-
-    def project_backward(
-        self, inputs: tuple[Tensor, ...], camera: Camera, radii: Tensor, cotangents: tuple[Tensor, ...]
-    ) -> tuple[Tensor, ...]:
-        num, lens = len(radii), lens_of(camera, radii.device)
-        grads = tuple(torch.empty_like(tensor) for tensor in inputs)
-        options = {"DEGREE": degree_of(inputs[3].shape[1]), "BLOCK": BLOCK, **WARPS}
-        arguments = (*inputs, lens, num, radii, *cotangents, *grads)
-        launch(project_backward, triton.cdiv(num, BLOCK), *arguments, **options)
-        return grads
-
-    def bin_tiles(self, *gaussians: Tensor | tuple[int, int]) -> tiles.Tiles:
-        *tensors, (width, height) = gaussians
-        return tiles.build(*tensors, width, height)
-
-    def composite_forward(
-        self, lists: tiles.Tiles, background: Tensor, size: tuple[int, int]
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        width, height = size
-        color = background.new_empty((height, width, 3))
-        depth, transmittance = background.new_empty((height, width)), background.new_empty((height, width))
-        tile_ends = torch.empty_like(lists.tile_starts[:-1])
-        inputs = (lists.records, lists.ranks, lists.tile_starts, background, width, height, tiles.columns(width))
-        outputs = (color, depth, transmittance, tile_ends)
-        launch(composite_forward, len(tile_ends), *inputs, *outputs, ROWS=tiles.ROWS_PER_LANE, **WARP)
-        return outputs
-
-    def composite_backward(
-        self,
-        lists: tiles.Tiles,
-        tile_ends: Tensor,
-        conic_ldl: Tensor,
-        opacities: Tensor,
-        images: tuple[Tensor, ...],
-        cotangents: tuple[Tensor, ...],
-    ) -> tuple[Tensor, ...]:
-        num, (height, width) = len(opacities), images[1].shape
-        sums = opacities.new_empty((len(lists.slots), NUM_SUMS.value))
-        work = (lists.records, lists.ranks, lists.slots, lists.tile_starts, tile_ends)
-        arguments = (*work, width, height, tiles.columns(width), *images, *cotangents, sums)
-        launch(composite_backward, len(tile_ends), *arguments, ROWS=tiles.ROWS_PER_LANE, **WARP)
-        grads = tuple(opacities.new_empty(shape) for shape in [(num, 2), (num, 3), (num,), (num, 3), (num,)])
-        arguments = (sums, lists.slot_ends, lists.order, conic_ldl, opacities, num, *grads)
-        options = {"BLOCK": GATHERED, "SIDE_BY_SIDE": SIDE_BY_SIDE, **WARP}
-        launch(gather, triton.cdiv(num, GATHERED), *arguments, **options)
-        return grads
+def _project_forward(gaussians: Tensors, opacities: Tensor, camera: Camera) -> Tensors:
+    means, quats, scales, sh = gaussians
+    num, lens = len(means), lens_of(camera, means.device)
+    outputs = (*empty(means, (num, 2), (num, 3), (num,), (num, 3)), means.new_empty(num, dtype=torch.int32))
+    inputs = (means, quats, scales, opacities, sh, lens, num, camera.width, camera.height)
+    options = {"DEGREE": degree_of(sh.shape[1]), "BLOCK": BLOCK, **WARPS}
+    launch(project_forward, triton.cdiv(num, BLOCK), *inputs, *outputs, **options)
+    return outputs
 
 
-KERNELS = _Kernels()
+def _project_backward(gaussians: Tensors, camera: Camera, radii: Tensor, cotangents: Tensors) -> Tensors:
+    num, lens = len(radii), lens_of(camera, radii.device)
+    grads = tuple(torch.empty_like(tensor) for tensor in gaussians)
+    options = {"DEGREE": degree_of(gaussians[3].shape[1]), "BLOCK": BLOCK, **WARPS}
+    arguments = (*gaussians, lens, num, radii, *cotangents, *grads)
+    launch(project_backward, triton.cdiv(num, BLOCK), *arguments, **options)
+    return grads
+
+
+def _composite_forward(
+    lists: tiles.Tiles, background: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    shape = size[::-1]
+    outputs = (*empty(background, (*shape, 3), shape, shape), torch.empty_like(lists.tile_starts[:-1]))
+    inputs = (lists.records, lists.ranks, lists.tile_starts, background, *size, tiles.columns(size[0]))
+    launch(composite_forward, len(outputs[3]), *inputs, *outputs, ROWS=tiles.ROWS_PER_LANE, **WARP)
+    return outputs
+
+
+def _composite_backward(
+    lists: tiles.Tiles, tile_ends: Tensor, conic_ldl: Tensor, opacities: Tensor, images: Tensors, cotangents: Tensors
+) -> Tensors:
+    num, (height, width) = len(opacities), images[1].shape
+    sums = opacities.new_empty((len(lists.slots), NUM_SUMS.value))
+    work = (lists.records, lists.ranks, lists.slots, lists.tile_starts, tile_ends)
+    arguments = (*work, width, height, tiles.columns(width), *images, *cotangents, sums)
+    launch(composite_backward, len(tile_ends), *arguments, ROWS=tiles.ROWS_PER_LANE, **WARP)
+    grads = empty(opacities, (num, 2), (num, 3), (num,), (num, 3), (num,))
+    arguments = (sums, lists.slot_ends, lists.order, conic_ldl, opacities, num, *grads)
+    launch(gather, triton.cdiv(num, GATHERED), *arguments, BLOCK=GATHERED, SIDE_BY_SIDE=SIDE_BY_SIDE, **WARP)
+    return grads
+
+
+KERNELS = Kernels(_project_forward, _project_backward, tiles.build, _composite_forward, _composite_backward)

@@ -190,17 +190,9 @@ def columns(width: int) -> int:
     return -(-width // TILE_WIDTH)
 
 
-def build(
-    means2d: Tensor,
-    conic_ldl: Tensor,
-    z: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
-    radii: Tensor,
-    width: int,
-    height: int,
-) -> Tiles:
-    """Sort the Gaussians with `radii` > 0 by z (ties by index) and list their tiles; all tensors are contiguous."""
+def build(gaussians: tuple[Tensor, ...], radii: Tensor, size: tuple[int, int]) -> Tiles:
+    """Sort the Gaussians with `radii` > 0 by z (ties by index) and list their tiles: see `autograd.Kernels`."""
+    (width, height), z = size, gaussians[2]
     num, device = len(z), z.device
     tiles_x = columns(width)
     num_tiles = tiles_x * -(-height // TILE_HEIGHT)
@@ -210,8 +202,7 @@ def build(
     programs = triton.cdiv(num, BLOCK)
     # Without fused operations both kernels come to the same tiles, however they are compiled.
     options = {"BLOCK": BLOCK, "num_warps": 1, "enable_fp_fusion": False}
-    gaussians = (means2d, conic_ldl, z, colors, opacities, radii, order)
-    launch(count_pairs, programs, *gaussians, num, width, height, records, counts, **options)
+    launch(count_pairs, programs, *gaussians, radii, order, num, width, height, records, counts, **options)
     slot_ends = counts.cumsum(0)
     num_pairs = _last(slot_ends)
     dtype = torch.int16 if num_tiles < FEW_TILES else torch.int32
