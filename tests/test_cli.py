@@ -59,7 +59,7 @@ def test_every_command_explains_itself(command, capsys):
         (["train", "nowhere", "out", "--density.min-densify-weight", "2"], "min_densify_weight"),
         pytest.param(["train", "nowhere", "out", "--device", "cuda"], "--device", marks=pytest.mark.slow),
         (["train", "nowhere", "out", "--render.backend", "triton"], "--device cuda"),
-        (["train", "nowhere", "out", "--render.backend", "cuda", "--device", "cpu"], "--render.backend cuda"),
+        (["train", "nowhere", "out", "--render.backend", "gsplat", "--device", "cpu"], "--render.backend gsplat"),
         (["eval", "nowhere", "--device", "gpu"], "gpu"),
         (["train", "nowhere", "out", "--weights-dir", "no-weights"], "no-weights"),
         (["eval", "nowhere"], "nowhere"),
