@@ -115,7 +115,7 @@ def choose(viewer, handle, value) -> None:
     client.flush()
 
 
-def test_the_slider_changes_the_picture_and_play_advances(viewer, page, scene):
+def test_the_slider_changes_the_image_and_play_advances(viewer, page, scene):
     first = settled(page, "first_frame")
     page.evaluate("document.querySelector('[role=slider]').focus()")
     for _ in range(FRAME):
@@ -180,7 +180,7 @@ def test_layers_tracks_tool_and_orbit(viewer, page):
     assert np.abs(settled(page, "orbit") - before).mean() > 2
 
 
-def test_the_browser_draws_what_the_server_draws(viewer):
+def test_the_browser_renders_like_the_server(viewer):
     with open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
         page.wait_for("document.querySelector('[role=slider]') !== null")
         wait_until(lambda: canvas(page).std() > 20, 30)
