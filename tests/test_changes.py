@@ -1,4 +1,4 @@
-"""Copies, exposure jumps, cuts, blur and other places in a clip: each made on purpose, none where there is none."""
+"""Duplicates, exposure jumps, cuts, blur and other scenes: each is created on purpose and detected."""
 
 import cv2
 import numpy as np

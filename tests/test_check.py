@@ -1,4 +1,4 @@
-"""`endoprior check`: a phantom broken in one way at a time is caught, with the fix to type; a whole one is not."""
+"""`endoprior check`: each defect of a phantom is reported with its fix; a good sequence gives no findings."""
 
 import json
 import shutil

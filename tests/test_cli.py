@@ -1,4 +1,4 @@
-"""The command line: exit statuses, one-line complaints, and the main path from a folder to scores and a film."""
+"""The command line: exit statuses, one-line error messages, and the main path from a folder to scores and a video."""
 
 import json
 import shutil

@@ -37,7 +37,7 @@ def test_a_strip_with_static_text_counts_and_a_static_red_one_does_not():
         image[-12:], image[-9:-4, 20:60] = 60, 220
     assert find_strips(images).bottom == 12
     for image in images:
-        image[-12:] = (150, 40, 40)  # a still piece of tissue is still tissue
+        image[-12:] = (150, 40, 40)  # a static piece of tissue is tissue
     assert not find_strips(images)
 
 

@@ -1,4 +1,4 @@
-"""What strangers can do to a viewer that is listening: nothing. One server takes it all, then serves a picture."""
+"""A viewer under attack: malformed requests and messages, floods, foreign pages. It keeps serving images."""
 
 import base64
 import os
@@ -188,7 +188,7 @@ class Stranger(Client):
         self.again()
 
     def camera(self, **changes) -> dict:
-        """The message that says where the camera is."""
+        """The message with the position of the camera."""
         place = {"wxyz": [1, 0, 0, 0], "position": [0, 0, 0], "look_at": [0, 0, 60], "up_direction": [0, -1, 0]}
         size = {"fov": 0.9, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 600}
         return {"type": "ViewerCameraMessage", **place, **size, **changes}
@@ -239,7 +239,7 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
     if orbit:
         good.set(viewer.panel.camera, panels.ENDOSCOPE)
         good.picture(quiet=0.2)
-    assert "view/" not in capfd.readouterr().err  # what viser says about broken messages is its own matter
+    assert "view/" not in capfd.readouterr().err  # messages of viser itself are allowed
 
 
 def test_only_the_output_folder_is_written_to(viewer, good):

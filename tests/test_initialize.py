@@ -1,4 +1,4 @@
-"""Where points are drawn and how they are lifted."""
+"""Sampling of initial points and their back-projection."""
 
 from __future__ import annotations
 

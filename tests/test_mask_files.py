@@ -1,4 +1,4 @@
-"""Masks of users in all their forms, their polarity, complaints that name file, expectation, finding and fix."""
+"""Mask files in all formats, their polarity, and error messages that name file, problem and fix."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Burned-in writing: found where it stands still before a moving image, and nowhere else."""
+"""Detection of burned-in text: static text in a changing image, and nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The texture prior on generated pictures: range, masks, symmetries; and the sampling distribution of Eq. (6)."""
+"""The texture prior on generated images: range, masks, symmetries; and the sampling distribution of Eq. (6)."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def test_depth_outside_the_renderable_range_is_one_error_line(depth, sampler, ca
     frame = Frame(0, 0.0, camera, np.full((20, 30, 3), 90, np.uint8), np.ones((20, 30), bool), z, z > 0)
     with pytest.raises(InputError, match=r"between 0\.2 and 1e\+06 mm .*, got 0\. Fix: Check masks, depth"):
         initial_points([frame] * 3, InitConfig(sampler=sampler, budget=100))
-    assert not caplog.records  # a refusal is one line, without a warning before it
+    assert not caplog.records  # the error is one line, without a warning before it
 
 
 @given(st.integers(0, 500), st.integers(0, 30))

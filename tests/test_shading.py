@@ -120,7 +120,7 @@ def test_relative_disparity_is_linear_in_inverse_depth():
     assert np.percentile(depth, 2) == pytest.approx(60 / NEAR_RATIO, rel=1e-2)
     slope, shift = np.polyfit(disparity.ravel().astype(np.float64), 1 / depth.ravel().astype(np.float64), 1)
     np.testing.assert_allclose(slope * disparity + shift, 1 / depth, rtol=1e-4)
-    # Scale and shift of the network do not matter, and another frame is judged by the same reference.
+    # Scale and shift of the network do not matter, and another frame uses the same reference.
     again = relative_to_mm(
         7 * disparity + 2, "disparity", fit_reference([7 * disparity + 2], [usable], "disparity", 60)
     )

@@ -1,4 +1,4 @@
-"""Images from files: every one, in order, at its moment; damaged files named in one line."""
+"""Video files and image folders: all images, in order, with their times; errors for damaged files."""
 
 import cv2
 import numpy as np

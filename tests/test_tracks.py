@@ -1,4 +1,4 @@
-"""Initial motion: points followed through synthetic frames whose motion is known."""
+"""Initial motion: points tracked through synthetic frames with known motion."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WIDTH, HEIGHT, NUM_FRAMES, DEPTH = 160, 128, 7, 50.0
 def moving_frames(
     step_px: tuple[float, float], *, tool: slice | None = None, moving: slice = slice(None)
 ) -> list[Frame]:
-    """A textured plane at 50 mm that shifts by `step_px` a frame in the columns `moving` and rests elsewhere."""
+    """A textured plane at 50 mm that shifts by `step_px` a frame in the columns `moving` and is static elsewhere."""
     noise = np.random.default_rng(0).random((HEIGHT + 160, WIDTH + 160, 3)).astype(np.float32)
     texture = cv2.GaussianBlur(noise, (0, 0), 3)
     texture = (texture - texture.min()) / (texture.max() - texture.min())
@@ -197,7 +197,7 @@ def test_training_starts_along_the_tracks(tmp_path):
     motion = trainer.state.gaussians["motion"].detach()
     assert motion[..., :3].abs().amax() > 0.3  # mm; the plane slides by 3 mm
     assert not motion[..., 3:].any()
-    # The points drift with the plane: most of the track's way is theirs at every moment.
+    # The points drift with the plane: most of the track's motion is theirs at every time.
     moved = torch.einsum("b,nbc->nc", torch.from_numpy(basis_weights(0.25, cfg.deformation.basis)).float(), motion)
     still = torch.einsum("b,nbc->nc", torch.from_numpy(basis_weights(0.75, cfg.deformation.basis)).float(), motion)
     assert (moved - still)[:, 0].median() == pytest.approx(3.0, abs=1.0)

@@ -1,4 +1,4 @@
-"""The unit of a depth map, guessed: every usual unit, disparity, and what cannot be told."""
+"""The guessed unit of depth maps: every usual unit, disparity, and ambiguous cases."""
 
 import numpy as np
 import pytest

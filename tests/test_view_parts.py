@@ -1,4 +1,4 @@
-"""The viewer's pure parts: clock, canvas, marks, measuring, paths, dots, who may connect, files."""
+"""Pure functions of the viewer: playback, canvas, lines, measuring, video paths, points, access control, files."""
 
 import socket
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The viewer spoken to over its own protocol: pictures, clicks, garbage, foreign pages; scenes, sequences, training."""
+"""The viewer over its own protocol: images, clicks, malformed data, foreign pages; scenes, sequences, training."""
 
 import hashlib
 import json
@@ -58,7 +58,7 @@ def viewer(scene, tmp_path):
 
 @pytest.fixture
 def client(viewer):
-    """A connected stand-in for a browser, past its first picture."""
+    """A connected stand-in for a browser, after its first image."""
     client = Client(viewer.port)
     client.send_camera()
     client.picture()
@@ -67,7 +67,7 @@ def client(viewer):
 
 
 def close(a, b, levels: float = 3.0) -> bool:
-    """Whether two pictures agree but for JPEG."""
+    """Whether two images agree up to JPEG errors."""
     return a.shape == b.shape and np.abs(a.astype(float) - b).mean() < levels
 
 
@@ -240,7 +240,7 @@ def test_a_raw_sequence_is_shown_before_training(tiny_sequence):
         for x in (0.45, 0.55):
             client.click(x, 0.7)
         time.sleep(0.5)
-        assert np.isfinite(viewer.measured.distances).sum() == 1  # nothing says where the points go
+        assert np.isfinite(viewer.measured.distances).sum() == 1  # the motion of the points is unknown
         client.socket.close()
 
 
