@@ -13,14 +13,14 @@ from endoprior.data import load_sequence
 
 
 def assert_refused(folder: Path, named: str, words: str, cfg: DataConfig | None = None) -> None:
-    """Loading, or decoding every frame, must fail with one line: PATH: expected X; got Y. Next step."""
+    """Loading, or decoding every frame, must fail with one line: PATH: expected X, got Y. Next step."""
     with pytest.raises(InputError) as caught:
         load_sequence(folder, cfg).validate()
     message = str(caught.value)
     path, rest = message.split(": expected ", 1)
     assert path.endswith(named) and path.startswith(str(folder)), message
     assert words in message, message
-    assert "; got " in rest and "\n" not in message and message.endswith(".") and rest.count(". ") >= 1, message
+    assert ", got " in rest and "\n" not in message and message.endswith(".") and rest.count(". ") >= 1, message
 
 
 def remark_with(folder: Path, words: str, cfg: DataConfig | None = None) -> bool:

@@ -69,7 +69,7 @@ def test_a_file_extends_others(tmp_path):
     assert (spec.title, spec.seeds, list(spec.sequences), spec.budgets) == ("top", (5,), ["only"], (100, 200))
     assert spec.set == {"schedule.fine_iterations": 9, "temporal.weight": 0.125, "init.opacity": 0.5}
     (tmp_path / "small.yaml").write_text("extends: [top.yaml]")
-    with pytest.raises(InputError, match="extends itself"):
+    with pytest.raises(InputError, match="does not extend itself"):
         load_spec(tmp_path / "top.yaml")
 
 
@@ -106,7 +106,7 @@ def test_toml_says_the_same(tmp_path):
         ({"sequences": {"a/b": {"path": "x"}}}, "sequences: expected a name"),
         ({"sequences": {"a": {}}}, "sequences.a: expected either path or phantom"),
         ({"sequences": {"a": {"phantom": {"frames": 1}}}}, "frames"),
-        ({"sequences": {"a": {"phantom": {}, "shrink": 2}}}, "a phantom is written at its size"),
+        ({"sequences": {"a": {"phantom": {}, "shrink": 2}}}, "a phantom has its own size"),
         ({"sequences": {"a": {"path": "x", "format": "endo"}}}, "sequences.a.format: expected auto, scared"),
         ({"methods": {"m": {"preset": "best"}}}, "methods.m.preset: expected one of default"),
         ({"methods": {"m": {"set": {"init": 3}}}}, "methods.m.set: expected the dotted name"),
@@ -115,8 +115,8 @@ def test_toml_says_the_same(tmp_path):
         ({"set_for": {"best": {}}}, "set_for: expected one of default"),
         ({"extends": "spec.yaml"}, "`extends` a list of files"),
         ({"set": {"density.min_densify_weight": 3.0}}, "min_densify_weight must be in"),
-        ({"scores": ["psnr", "speed"]}, "names of scores; got 'speed'"),
-        ({"claims": [{"score": "speed", "method": "ours", "than": "base"}]}, "names of scores; got 'speed'"),
+        ({"scores": ["psnr", "speed"]}, "names of scores, got 'speed'"),
+        ({"claims": [{"score": "speed", "method": "ours", "than": "base"}]}, "names of scores, got 'speed'"),
         ({"compare_with": "them"}, "compare_with: expected one of base, ours"),
         ({"claims": [{"score": "psnr", "method": "ours", "than": "nobody"}]}, "expected one of base, ours"),
         ({"claims": [{"score": "psnr", "method": "ours", "than": "base", "expect": "magic"}]}, "expect: expected one"),
@@ -134,7 +134,7 @@ def test_unreadable_files_are_named(tmp_path):
     for name, said in (("a.yaml", "expected valid yaml"), ("a.txt", "expected a .yaml"), ("b.yaml", "readable file")):
         with pytest.raises(InputError, match=said):
             load_spec(tmp_path / name)
-    with pytest.raises(InputError, match="--data x: no such sequence"):
+    with pytest.raises(InputError, match="--data x: expected one of clip, ph"):
         load_spec(written(tmp_path), {"x": tmp_path})
 
 

@@ -85,13 +85,13 @@ AT_LOAD = {
     "empty images": (empty("images"), "images", "got none"),
     "empty depth": (empty("depth"), "depth", "got none"),
     "jpeg": (jpeg_only, "images", "only .jpg"),
-    "fewer masks": (delete("masks/000005.png"), "masks", "expected 17 files, one per image; got 16"),
-    "fewer depths": (delete("depth/000005.png"), "depth", "expected 17 files, one per image; got 16"),
+    "fewer masks": (delete("masks/000005.png"), "masks", "expected 17 files, one per image, got 16"),
+    "fewer depths": (delete("depth/000005.png"), "depth", "expected 17 files, one per image, got 16"),
     "one frame": (one_frame, "images", "at least 2 frames"),
     "first image unreadable": (lambda f: (f / "images/000000.png").write_bytes(b"x"), "000000.png", "1 bytes"),
     "first image empty": (lambda f: (f / "images/000000.png").write_bytes(b""), "000000.png", "0 bytes"),
     "no poses": (delete("poses_bounds.npy"), "poses_bounds.npy", "no such file"),
-    "poses of other count": (poses(lambda p: p[:5]), "poses_bounds.npy", "expected shape (17, 17); got (5, 17)"),
+    "poses of other count": (poses(lambda p: p[:5]), "poses_bounds.npy", "expected shape (17, 17), got (5, 17)"),
     "poses of other width": (poses(lambda p: p[:, :15]), "poses_bounds.npy", "got (17, 15)"),
     "poses not numbers": (poses(lambda p: p.astype(str)), "poses_bounds.npy", "finite numbers"),
     "poses not an array": (lambda f: (f / "poses_bounds.npy").write_text("x"), "poses_bounds.npy", "a NumPy file"),
@@ -111,9 +111,9 @@ AT_LOAD = {
         "sequence.json",
         "depth_scale to be a number in [",
     ),
-    "description unit": (lambda f: describe(f, depth_unit="m"), "sequence.json", "depth_unit mm; got 'm'"),
+    "description unit": (lambda f: describe(f, depth_unit="m"), "sequence.json", "depth_unit mm, got 'm'"),
     "description polarity": (lambda f: describe(f, mask_tool_value=1), "sequence.json", "mask_tool_value 255 or 0"),
-    "description size": (lambda f: describe(f, width=640), "sequence.json", "size 48x40; got 640x40"),
+    "description size": (lambda f: describe(f, width=640), "sequence.json", "size 48x40, got 640x40"),
 }
 ON_VALIDATE = {
     "image unreadable": (cut_short, "images/000004.png", "cannot be decoded"),
@@ -129,12 +129,12 @@ ON_VALIDATE = {
     "mask of 0 and 1": (
         replaced("masks/000003.png", np.eye(*SIZE, dtype=np.uint8)),
         "masks/000003.png",
-        "got 1. Multiply",
+        "got 1. Fix: multiply",
     ),
     "mask smoothed": (
         replaced("masks/000003.png", np.arange(1920, dtype=np.uint8).reshape(SIZE)),
         "masks/000003.png",
-        "expected mask values 0 and 255; got 1, 2, 3, 4 and more. Threshold",
+        "expected mask values 0 and 255, got 1, 2, 3, 4 and more. Fix: threshold",
     ),
     "mask 16 bit": (replaced("masks/000003.png", np.zeros(SIZE, np.uint16)), "masks/000003.png", "an 8-bit mask"),
     "mask in color": (
@@ -162,7 +162,7 @@ def assert_one_line_about(caught, folder: Path, named: str, words: str) -> None:
     message = str(caught.value)
     path, rest = message.split(": expected ", 1)
     assert path.endswith(named) and path.startswith(str(folder))
-    assert words in message and "; got " in rest
+    assert words in message and ", got " in rest
     assert "\n" not in message and message.endswith(".") and rest.count(". ") >= 1  # the next step follows
 
 
@@ -195,5 +195,5 @@ def test_float_tiff_depth_under_png_name_is_refused(tiny_sequence):
     path = tiny_sequence / "depth/000003.png"
     write(path.with_suffix(".tiff"), np.ones(SIZE, np.float32))
     path.with_suffix(".tiff").rename(path)
-    with pytest.raises(InputError, match="16-bit depth image; got float, 1 channel"):
+    with pytest.raises(InputError, match="16-bit depth image, got float, 1 channel"):
         load_sequence(tiny_sequence).frame(3)

@@ -212,7 +212,7 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
         good.set(viewer.panel.camera, ORBIT)
         good.picture(quiet=0.2)
     state = {name: handle.value for name, handle in vars(viewer.panel).items() if hasattr(handle, "value")}
-    before, stranger = resident_mb(), Stranger(viewer.port)
+    before, stranger = resident_mb(), Stranger(viewer.port, max_queue=None)
     stranger.send_camera()
     for message in messages(viewer, stranger):
         if not orbit or message["type"] == "ViewerCameraMessage":
@@ -224,18 +224,9 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
     now = {name: getattr(viewer.panel, name).value for name in state}
     assert {name for name in state if state[name] != now[name]} <= allowed
     assert now["clip"] == state["clip"] and 0 <= now["frame"] <= 9
-
-    assert not viewer.server.gui._current_file_upload_states
     assert resident_mb() - before < 100
     for name in ("measure", "tool", "tracks"):
-        getattr(viewer.panel, name).value = False
-    viewer.jobs.put(viewer.read_panel)
-    viewer.jobs.put(viewer.read_measuring)
-    wanted, end = (viewer.settings.frame + 1) % 9, time.monotonic() + 5
-    good.set(viewer.panel.frame, wanted)
-    while viewer.settings.frame != wanted and time.monotonic() < end:
-        time.sleep(0.01)
-    assert viewer.settings.frame == wanted, "the slider does not work any more"
+        good.set(getattr(viewer.panel, name), False)
     if orbit:
         good.set(viewer.panel.camera, panels.ENDOSCOPE)
         good.picture(quiet=0.2)
@@ -275,12 +266,17 @@ def test_the_number_of_browsers_is_limited(viewer, good):
         with suppress(ConnectionClosed):
             crowd.append(Client(viewer.port, close_timeout=0.2))
     time.sleep(0.3)
-    assert len(viewer.connections) <= MAX_BROWSERS
+    assert 0 < sum(client.connected for client in [good, *crowd]) <= MAX_BROWSERS
     for client in crowd:
         client.socket.close()
-    end = time.monotonic() + 10
-    while len(viewer.connections) > 1 and time.monotonic() < end:
-        time.sleep(0.05)
+    end, free = time.monotonic() + 10, False
+    while not free and time.monotonic() < end:  # until their places are free again
+        with suppress(ConnectionClosed):
+            late = Client(viewer.port, close_timeout=0.2)
+            late.send_camera()
+            free = late.picture(quiet=0.1).any()
+            late.socket.close()
+    assert free
 
 
 def test_a_flood_of_messages_is_limited(viewer, good):
@@ -302,7 +298,7 @@ def test_a_flood_of_messages_is_limited(viewer, good):
     threads = [threading.Thread(target=flood) for _ in range(2)]
     for thread in threads:
         thread.start()
-    end = time.monotonic() + 3
+    end = time.monotonic() + 20  # on a busy machine it takes a while to be too fast
     while len(ended) < 2 and time.monotonic() < end:
         with suppress(TimeoutError):
             good.read(0.1)
@@ -330,10 +326,10 @@ def test_saved_views_are_limited(viewer, good):
         good.set(viewer.panel.keep, True)
         time.sleep(0.002)
     end = time.monotonic() + 5
-    while len(viewer.kept_views) < MAX_KEPT and time.monotonic() < end:
+    while f"{MAX_KEPT} views" not in viewer.panel.status.content and time.monotonic() < end:
         time.sleep(0.05)
     time.sleep(0.2)
-    assert len(viewer.kept_views) == MAX_KEPT
+    assert f"{MAX_KEPT} views kept" in viewer.panel.status.content
     good.set(viewer.panel.forget, True)
 
 
@@ -344,7 +340,8 @@ def test_messages_are_validated():
         return is_valid_message("ViewerCameraMessage", camera | changes, lambda *_: True)
 
     assert sane() and sane(image_width=0) and not sane(fov=np.nan) and not sane(position=(np.inf, 0, 0))
-    assert not is_valid_message("RemoveSceneNodeMessage", {}, lambda *_: True)
+    for kind in ("RemoveSceneNodeMessage", "FileTransferStartUpload", "FileTransferPart"):
+        assert not is_valid_message(kind, {}, lambda *_: True)
     assert not is_trusted("http://[", "127.0.0.1", "127.0.0.1") and is_trusted(None, None, "127.0.0.1")
     assert bounded_aspect(1e300, 1) == 4 and bounded_aspect(np.nan, 1) == bounded_aspect(0, 0) == 1
 

@@ -146,10 +146,10 @@ def test_the_page_refers_to_nothing_outside(player):
 
 def test_what_cannot_be_written_is_refused_in_one_line(scene, tmp_path):
     with pytest.raises(
-        InputError, match=r"scene\.html: expected at most 0\.0 MB; got 0\.\d MB for 6 time steps of 2997"
+        InputError, match=r"scene\.html: expected at most 0\.0 MB, got 0\.\d MB for 6 time steps of 2997"
     ):
         write_html(scene, tmp_path / "scene.html", max_bytes=1000)
-    with pytest.raises(InputError, match=r"expected a file to write; got a folder"):
+    with pytest.raises(InputError, match=r"expected a file to write, got a folder"):
         write_html(scene, tmp_path)
     for times in ([], [0.5, 0.5], [0.5, 0.2]):
         with pytest.raises(InputError, match="increasing times"):

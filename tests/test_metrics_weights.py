@@ -167,7 +167,7 @@ def test_names_and_shapes_must_be_those_of_the_network(tmp_path):
     save_file({"a": torch.zeros(2), "unused": torch.zeros(1)}, tmp_path / "toy.safetensors")
     found = FoundWeights(tmp_path / "toy.safetensors", "weights folder")
     assert list(select_weights(found, {"net.a": torch.ones(2)}, {"net.a": "a"})) == ["net.a"]
-    with pytest.raises(WeightsMissing, match=r"expected a of shape \(3,\); got shape \(2,\)"):
+    with pytest.raises(WeightsMissing, match=r"expected a of shape \(3,\), got shape \(2,\)"):
         select_weights(found, {"net.a": torch.ones(3)}, {"net.a": "a"})
-    with pytest.raises(WeightsMissing, match=r"expected b of shape \(2,\); got nothing"):
+    with pytest.raises(WeightsMissing, match=r"expected b of shape \(2,\), got nothing"):
         select_weights(found, {"net.b": torch.ones(2)}, {"net.b": "b"})

@@ -127,7 +127,7 @@ def test_exactly_the_unusable_is_refused(made):
             else "depth > 0 in at least one frame" if not any(k.any() for k in known)
             else "depth on tissue in a training frame"
         )  # fmt: skip
-        assert f"expected {expected}; got " in str(refusal.value) and "\n" not in str(refusal.value)
+        assert f"expected {expected}, got " in str(refusal.value) and "\n" not in str(refusal.value)
 
 
 @examples(25)

@@ -199,7 +199,7 @@ def pose_line(number, text):
 
 BAD = {
     "depth gone": (lambda f: (f / "0004_depth.tiff").unlink(), "0004_depth.tiff", "the depth of 4_color.png"),
-    "no depth": (lambda f: [p.unlink() for p in f.glob("*.tiff")], "cecum_t1_a", "TIFF files; got none"),
+    "no depth": (lambda f: [p.unlink() for p in f.glob("*.tiff")], "cecum_t1_a", "TIFF files, got none"),
     "fewer poses": (lambda f: write_poses(f, frames=5), "pose.txt", "11 rows of 16 numbers"),
     "short row": (pose_line(3, "1,2,3"), "pose.txt", "equally many numbers"),
     "word": (pose_line(3, ",".join("x" * 16)), "pose.txt", "rows of numbers"),
@@ -208,7 +208,7 @@ BAD = {
     "scaled": (pose_line(3, "2,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1"), "pose.txt", "something else in row 3"),
     "no pose.txt row": (pose_line(3, ",".join("1" * 16)), "pose.txt", "no row 0, 0, 0, 1"),
     "other camera": (lambda f: (f / "config.ini").unlink(), "0_color.png", "1350x1080 px, the calibrated size"),
-    "no a2": (lambda f: write_lens(f, LENS, a2=None), "config.ini", "a number a2; got 'none'"),
+    "no a2": (lambda f: write_lens(f, LENS, a2=None), "config.ini", "a number a2, got 'none'"),
     "no camera": (lambda f: write_lens(f, replace(LENS, a0=-1.0)), "config.ini", "the calibration of a camera"),
     "image cut": (lambda f: (f / "3_color.png").write_bytes(b"\x89PNG\r\n\x1a\n"), "3_color.png", "cannot be decoded"),
     "depth of other size": (

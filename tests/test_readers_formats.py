@@ -53,7 +53,7 @@ def test_layouts_are_recognized_by_names(tmp_path, case):
 
 
 def test_an_unknown_name_is_an_error(tmp_path):
-    with pytest.raises(InputError, match=r"data\.format: expected one of auto, scared, .*; got 'endo'\. Fix: "):
+    with pytest.raises(InputError, match=r"data\.format: expected one of auto, scared, .*, got 'endo'\. Fix: "):
         load_sequence(tmp_path, DataConfig(format="endo"))
 
 
@@ -70,7 +70,7 @@ def test_option_wins_over_what_the_folder_looks_like(tmp_path, name):
 
 def test_unknown_folder_is_described(tmp_path):
     known = "scared, c3vd, stir, stereomis, hamlyn, endonerf, plain"
-    assert_refused(tmp_path, tmp_path.name, f"the layouts {known}; got an empty folder. Fix: see docs/datasets.md.")
+    assert_refused(tmp_path, tmp_path.name, f"the layouts {known}, got an empty folder. Fix: see docs/datasets.md.")
     touch(tmp_path, *"abcdef", "g/x", ".hidden")
     assert_refused(tmp_path, tmp_path.name, "got a, b, c, d, e and 2 more")
 
@@ -117,12 +117,12 @@ def test_origins_of_an_endonerf_folder(tiny_sequence):
     assert remark_with(tiny_sequence, "scale of its depth is unknown")
     assert remark_with(tiny_sequence, "1 frames are marked as unexplained, the first is frame 3")
     edit_json(tiny_sequence / "sequence.json", unexplained_frames=[-1])
-    assert_refused(tiny_sequence, "sequence.json", "unexplained_frames in 0..16; got -1")
+    assert_refused(tiny_sequence, "sequence.json", "unexplained_frames in 0..16, got -1")
 
 
 def test_description_is_checked_before_pictures_are_read(tiny_sequence):
     (tiny_sequence / "sequence.json").write_text(json.dumps({"format_version": 99}))
-    with pytest.raises(InputError, match="Update endoprior"):
+    with pytest.raises(InputError, match="update endoprior"):
         load_sequence(tiny_sequence)
 
 

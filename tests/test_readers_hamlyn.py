@@ -90,7 +90,7 @@ def test_rectified_calibration_of_the_whole_set(rectified):
 
 
 FORPLANE_BAD = {
-    "fewer depths": (lambda f: (f / "gt_depth/000003.png").unlink(), "gt_depth", "10 files, one per image; got 9"),
+    "fewer depths": (lambda f: (f / "gt_depth/000003.png").unlink(), "gt_depth", "10 files, one per image, got 9"),
     "no masks": (lambda f: shutil.rmtree(f / "gt_masks"), "masks", "no such folder"),
     "no poses": (lambda f: (f / "poses_bounds.npy").unlink(), "poses_bounds.npy", "no such file"),
     "pose NaN": (lambda f: change_poses(f, lambda p: p * np.nan), "poses_bounds.npy", "finite numbers"),

@@ -107,24 +107,24 @@ def describe(**described):
 
 
 BAD = {
-    "fewer depths": (lambda f: (f / "depth/3.npy").unlink(), "depth", "12 files, one per image; got 11"),
+    "fewer depths": (lambda f: (f / "depth/3.npy").unlink(), "depth", "12 files, one per image, got 11"),
     "depth cut": (lambda f: (f / "depth/3.npy").write_bytes(b"x"), "depth/3.npy", "a NumPy file"),
     "depth of other size": (lambda f: np.save(f / "depth/3.npy", np.ones((2, 3))), "depth/3.npy", "got 3x2"),
-    "empty masks": (lambda f: (f / "masks").mkdir(), "masks", "PNG files; got none"),
+    "empty masks": (lambda f: (f / "masks").mkdir(), "masks", "PNG files, got none"),
     "picture cut": (
         lambda f: (f / "images/3.jpg").write_bytes((f / "images/3.jpg").read_bytes()[:300]),
         "images/3.jpg",
         "cannot be decoded",
     ),
-    "size": (describe(width=31, height=20), "sequence.json", "size 30x20; got 31x20"),
+    "size": (describe(width=31, height=20), "sequence.json", "size 30x20, got 31x20"),
     "fx": (describe(fx=-1), "sequence.json", "fx to be a number in [1e-06, 1e+06]"),
-    "relative": (describe(depth_relative=1), "sequence.json", "depth_relative true or false; got 1"),
+    "relative": (describe(depth_relative=1), "sequence.json", "depth_relative true or false, got 1"),
     "sources": (describe(sources={"depth": 1}), "sequence.json", "sources to map names to texts"),
     "sources list": (describe(sources=["a"]), "sequence.json", "sources to map names to texts"),
     "frames": (describe(unexplained_frames=[1.5]), "sequence.json", "a list of frame numbers"),
-    "frames outside": (describe(unexplained_frames=[12]), "sequence.json", "in 0..11; got 12"),
-    "version": (describe(format_version=2), "sequence.json", "format_version 1 to 1; got 2"),
-    "version text": (describe(format_version="1"), "sequence.json", "format_version 1 to 1; got '1'"),
+    "frames outside": (describe(unexplained_frames=[12]), "sequence.json", "in 0..11, got 12"),
+    "version": (describe(format_version=2), "sequence.json", "format_version 1 to 1, got 2"),
+    "version text": (describe(format_version="1"), "sequence.json", "format_version 1 to 1, got '1'"),
 }
 
 

@@ -187,13 +187,13 @@ def bad_geometry(key, value):
 RECORD, GEOMETRY = "frame_data/frame_data000002.json", "reprojection_data/frame_data000002.json"
 BAD = {
     "raw": (lambda f: shutil.rmtree(f / "data/disparity"), "data/disparity", "no such folder"),
-    "counts": (lambda f: frame(f, "disparity", ".tiff").unlink(), "disparity", "9 frames of frame_data; got 8"),
+    "counts": (lambda f: frame(f, "disparity", ".tiff").unlink(), "disparity", "9 frames of frame_data, got 8"),
     "names": (
         lambda f: frame(f, "left_finalpass", ".png").rename(frame(f, "left_finalpass", ".png", 77)),
         "left_finalpass",
         "frame_data000002 is in one",
     ),
-    "no pose": (bad_record("camera-pose", None), RECORD, "camera-pose, 4x4 numbers; got no such key"),
+    "no pose": (bad_record("camera-pose", None), RECORD, "camera-pose, 4x4 numbers, got no such key"),
     "no calibration": (bad_record("camera-calibration", None), RECORD, "camera-calibration.KL"),
     "calibration text": (bad_record("camera-calibration", {"KL": "x"}), RECORD, "camera-calibration.KL"),
     "pose NaN": (nan_pose, RECORD, "NaN or infinity"),
@@ -201,7 +201,7 @@ BAD = {
     "focal zero": (bad_record("camera-calibration", {"KL": np.zeros((3, 3)).tolist()}), RECORD, "focal lengths > 0"),
     "no Q": (bad_geometry("reprojection-matrix", None), GEOMETRY, "reprojection-matrix"),
     "Q of other shape": (bad_geometry("reprojection-matrix", [[1]]), GEOMETRY, "got shape (1, 1)"),
-    "version 3": (bad_geometry("schema_version", 3), GEOMETRY, "schema_version 1 or 2; got 3"),
+    "version 3": (bad_geometry("schema_version", 3), GEOMETRY, "schema_version 1 or 2, got 3"),
     "broken json": (lambda f: frame(f, "reprojection_data", ".json").write_text("{"), GEOMETRY, "a JSON object"),
     "image cut": (
         lambda f: frame(f, "left_finalpass", ".png").write_bytes(frame(f, "left_finalpass", ".png").read_bytes()[:40]),
@@ -226,7 +226,7 @@ def test_bad_keyframes_are_refused(keyframe, case):
 def test_mixed_versions_are_refused(keyframe, tmp_path):
     other = write_keyframe(tmp_path / "two", version=2)
     shutil.copy(frame(other, "reprojection_data", ".json"), frame(keyframe, "reprojection_data", ".json"))
-    assert_refused(keyframe, "reprojection_data", "files of one version; got versions 1 and 2")
+    assert_refused(keyframe, "reprojection_data", "files of one version, got versions 1 and 2")
 
 
 def test_version_2_of_another_size_is_refused(tmp_path):
@@ -238,7 +238,7 @@ def test_version_2_of_another_size_is_refused(tmp_path):
 def test_raw_keyframe_is_recognized_and_refused(tmp_path):
     (tmp_path / "data").mkdir()
     (tmp_path / "data/frame_data.tar.gz").write_bytes(b"")
-    assert_refused(tmp_path, "data/frame_data", "Process the keyframe first, see docs/datasets.md.")
+    assert_refused(tmp_path, "data/frame_data", "process the keyframe first, see docs/datasets.md.")
 
 
 def test_depth_survives_shrinking(keyframe):

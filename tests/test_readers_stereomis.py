@@ -78,18 +78,18 @@ def test_fingerprint_knows_the_calibration(prepared):
 def test_raw_sequence_is_sent_to_prepare(tmp_path):
     (tmp_path / "masks").mkdir()
     (tmp_path / "StereoCalibration.ini").write_text("[StereoLeft]\n")
-    assert_refused(tmp_path, "StereoCalibration.ini", "Run endoprior prepare on its video")
+    assert_refused(tmp_path, "StereoCalibration.ini", "run endoprior prepare on its video")
 
 
 BAD = {
     "other split": (
         lambda f: edit_json(f / "split.json", test_indices=[0, 8]),
         "split.json",
-        "test_indices of the rule (i - 1) % 8 == 0, 2 frames; got 2 frames that differ. Remove split.json",
+        "test_indices of the rule (i - 1) % 8 == 0, 2 frames, got 2 frames that differ. Fix: remove split.json",
     ),
     "missing key": (lambda f: edit_json(f / "split.json", train_indices=None), "split.json", "a list train_indices"),
     "broken split": (lambda f: (f / "split.json").write_text("["), "split.json", "a JSON object"),
-    "fewer masks": (lambda f: (f / "masks/000003.png").unlink(), "masks", "17 files, one per image; got 16"),
+    "fewer masks": (lambda f: (f / "masks/000003.png").unlink(), "masks", "17 files, one per image, got 16"),
     "no depth": (lambda f: shutil.rmtree(f / "depth"), "depth", "no such folder"),
     "matrix shape": (lambda f: np.save(f / "intrinsics.npy", np.eye(4)), "intrinsics.npy", "shape (4, 4)"),
     "matrix zero": (lambda f: np.save(f / "intrinsics.npy", np.zeros((3, 3))), "intrinsics.npy", "a 3x3 camera"),

@@ -36,7 +36,7 @@ def clip(tmp_path):
 
 def test_clip_is_sent_to_prepare(clip):
     video = clip / "frames/00000ms-01000ms-visible.mp4"
-    words = f"Run endoprior prepare {video} OUT --border keep --stir {clip}"
+    words = f"run endoprior prepare {video} OUT --border keep --stir {clip}"
     assert_refused(clip, "seq00", words)
     assert_refused(clip.parents[1], "7", words)
 
@@ -81,13 +81,13 @@ def test_errors_go_to_the_nearest_end():
 
 
 def test_a_cropped_folder_is_refused(clip, make_tiny_sequence):
-    with pytest.raises(InputError, match=r"whole picture of .*icgstartseg\.png; got 48x30 px for 96x80\. Prepare"):
+    with pytest.raises(InputError, match=r"whole picture of .*icgstartseg\.png, got 48x30 px for 96x80\. Fix: prepare"):
         write_stir_tracks(clip, make_tiny_sequence("cropped", height=30))
 
 
 def test_clips_without_points_are_refused(clip, tiny_sequence):
     write(clip / "segmentation/icgendseg.png", spots())
-    with pytest.raises(InputError, match=r"icgendseg\.png: expected spots where the frame has depth; got none of 0"):
+    with pytest.raises(InputError, match=r"icgendseg\.png: expected spots where the frame has depth, got none of 0"):
         write_stir_tracks(clip, tiny_sequence)
     (clip / "segmentation/icgendseg.png").unlink()
     with pytest.raises(InputError, match=r"icgendseg\.png: expected a readable file"):

@@ -49,11 +49,11 @@ def test_kinds_are_told_apart_without_opening(tmp_path):
 def test_files_too_large_are_refused_by_their_size_in_mb(tmp_path, monkeypatch):
     with open(tmp_path / "sparse", "wb") as file:
         file.truncate((1 << 30) + 1)
-    with pytest.raises(InputError, match="at most 1024 MB; got 1024 MB"):
+    with pytest.raises(InputError, match="at most 1024 MB, got 1024 MB"):
         read_bytes(tmp_path / "sparse")
     monkeypatch.setattr(reading, "MOST_TEXT_BYTES", 1 << 20)
     (tmp_path / "text").write_bytes(bytes(3 << 20))
-    with pytest.raises(InputError, match="at most 1 MB; got 3 MB"):
+    with pytest.raises(InputError, match="at most 1 MB, got 3 MB"):
         read_text(tmp_path / "text", "words", HINT)
 
 

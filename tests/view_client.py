@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
+from websockets.protocol import State
 from websockets.sync.client import connect
 
 from endoprior.view.panel import control_id
@@ -40,6 +41,11 @@ class Client:
     def set(self, handle: Any, value: Any) -> None:
         """Change a control of the panel."""
         self.send("GuiUpdateMessage", uuid=control_id(handle), updates={"value": value})
+
+    @property
+    def connected(self) -> bool:
+        """Whether the viewer has not thrown it out."""
+        return self.socket.protocol.state is State.OPEN
 
     def click(self, x: float, y: float) -> None:
         """Click the canvas; (0, 0) is its upper left corner, (1, 1) its lower right."""

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from .parsing import parse
 from .progress import say
 
@@ -53,23 +53,21 @@ def run(argv: list[str]) -> int:
 
     for option, value, least in (("--threads", args.threads, 1), ("--cores", args.cores, 0)):
         if not least <= value <= MOST_CORES:
-            raise InputError(f"{option}: expected {least} to {MOST_CORES}; got {value}. Correct it.")
+            raise input_error(option, f"{least} to {MOST_CORES}", f"{value}", "correct it.")
     if args.weights_dir and not args.weights_dir.is_dir():
-        raise InputError(f"{args.weights_dir}: expected a folder with weights; found none. Correct --weights-dir.")
+        raise input_error(args.weights_dir, "a folder of network weights", "none", "correct --weights-dir.")
     specs = _specs(args.spec)
     loaded = {path: load_spec(path, _folders(args.data)) for path in specs}
     require_writable_folder("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{args.out}: expected a place for a folder; got {error.strerror}. Choose another.") from None
+        raise input_error(args.out, "a place for a folder", f"{error.strerror}", "choose another.") from None
     lock = FileLock(args.out / ".lock", timeout=0)
     try:
         lock.acquire()
     except Timeout:
-        raise InputError(
-            f"{args.out}: expected a folder of our own; another benchmark is running there. Wait."
-        ) from None
+        raise input_error(args.out, "a folder for this benchmark alone", "one in which another runs", "wait.") from None
     failed, reports = 0, {}
     with lock:
         if args.report_only:
@@ -104,7 +102,7 @@ def _specs(path: Path) -> list[Path]:
         return [path]
     found = sorted(file for file in path.iterdir() if file.suffix in (".yaml", ".yml", ".toml"))
     if not found:
-        raise InputError(f"{path}: expected .yaml or .toml files; got none. Pass a folder of specs.")
+        raise input_error(path, ".yaml or .toml files", "none", "pass a folder of specs.")
     return found
 
 
@@ -113,6 +111,6 @@ def _folders(data: tuple[str, ...]) -> dict[str, Path]:
     for item in data:
         name, separator, folder = item.partition("=")
         if not separator or not folder:
-            raise InputError(f"--data: expected NAME=FOLDER; got {item!r}. Name a sequence of the spec.")
+            raise input_error("--data", "NAME=FOLDER", f"{item!r}", "name a sequence of the spec.")
         found[name] = Path(folder).expanduser()
     return found

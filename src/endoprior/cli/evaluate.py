@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..doctor.choice import Wanted
 from .devices import on_device
 from .parsing import parse
@@ -45,9 +45,7 @@ def run(argv: list[str]) -> None:
     from .output_paths import require_writable_folder
 
     if args.weights_dir and not args.weights_dir.is_dir():
-        raise InputError(
-            f"{args.weights_dir}: expected a folder of network weights; got none. Fix: correct --weights-dir."
-        )
+        raise input_error(args.weights_dir, "a folder of network weights", "none", "correct --weights-dir.")
     scene = load_scene(args.run)
     require_writable_folder(
         "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
@@ -102,12 +100,12 @@ def sequence_of_run(run_folder: Path) -> Path:
     from ..data.files import read_json
     from ..data.reading import kind_of
 
-    file, hint = run_folder / "config.json", "Pass --data FOLDER."
+    file, hint = run_folder / "config.json", "pass --data FOLDER."
     facts = read_json(file, hint).get("data")
     path = facts.get("path") if isinstance(facts, dict) else None
     if not isinstance(path, str) or not path:
-        raise InputError(f"{file}: expected the path of the sequence; got {path!r}. {hint}")
+        raise input_error(file, "the path of the sequence", repr(path), hint)
     data = Path(path)
     if kind_of(data) != "a folder":
-        raise InputError(f"{data}: the sequence this run was trained on is not there. Pass --data FOLDER.")
+        raise input_error(data, "the sequence this run was trained on", "no such folder", hint)
     return data

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.geometry import FARTHEST_MM
 from ..core.types import Camera, Frame
 from .depth import clean_depth
-from .reading import complaint
 from .sequence import FrameSequence
 from .shrink import shrunk, shrunk_camera
 from .truth import Truth
@@ -67,8 +67,8 @@ def assemble(
     """
     count, width, height = len(cameras), cameras[0].width, cameras[0].height
     if count < 2 or min(width, height) // cfg.shrink < 1:
-        hint = "Lower data.shrink or data.stride, or raise data.first_frames."
-        raise complaint(path, "2 frames of 1x1 px to be left", f"{count} of {width}x{height} / {cfg.shrink}", hint)
+        hint = "lower data.shrink or data.stride, or raise data.first_frames."
+        raise input_error(path, "2 frames of 1x1 px to be left", f"{count} of {width}x{height} / {cfg.shrink}", hint)
 
     _demand_usable(path, cameras)
 
@@ -102,7 +102,7 @@ def _demand_usable(path: Path, cameras: list[Camera]) -> None:
         if not (all(abs(value) <= MOST_PX for value in lens) and min(camera.fx, camera.fy) >= LEAST_FOCAL_PX):
             got = ", ".join(f"{value:g}" for value in lens)
             want = f"fx, fy, cx, cy up to {MOST_PX:g} px, fx and fy at least {LEAST_FOCAL_PX:g}"
-            raise complaint(path, want, f"{got} in frame {index}", "Correct the intrinsics.")
+            raise input_error(path, want, f"{got} in frame {index}", "correct the intrinsics.")
         if not np.abs(camera.world_to_camera[:3, 3]).max() <= FARTHEST_MM:
             got = f"{np.abs(camera.world_to_camera[:3, 3]).max():g} mm in frame {index}"
-            raise complaint(path, f"cameras within {FARTHEST_MM:g} mm of the origin", got, "Correct the poses.")
+            raise input_error(path, f"cameras within {FARTHEST_MM:g} mm of the origin", got, "correct the poses.")

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
@@ -22,7 +23,7 @@ from .formats import Format
 from .images import read_color
 from .omnidirectional import Omnidirectional
 from .poses import demand_rotations, world_to_camera
-from .reading import complaint, read_text
+from .reading import read_text
 from .sequence import FrameSequence
 
 CF_HQ190L = Omnidirectional(
@@ -41,7 +42,7 @@ CF_HQ190L = Omnidirectional(
 """The endoscope of the first edition, as its authors calibrated it."""
 FARTHEST = 65535
 """Stored depth of everything at or beyond 100 mm; 0 is outside of the picture or of the model."""
-POSES_HINT = "Take pose.txt of the same video: 16 numbers per frame, camera to world."
+POSES_HINT = "take pose.txt of the same video: 16 numbers per frame, camera to world."
 
 
 def is_c3vd(path: Path) -> bool:
@@ -60,19 +61,19 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     missing = [file for file in images if _number(file) not in stored]
     if missing:
         name = f"{_number(missing[0]):04d}_depth.tiff"
-        raise complaint(path / name, f"the depth of {missing[0].name}", "no such file", "Unpack the video again.")
+        raise input_error(path / name, f"the depth of {missing[0].name}", "no such file", "unpack the video again.")
     poses = camera_to_world(path / "pose.txt", len(images))
     calibration = path / "config.ini"
     lens = read_lens(calibration) if calibration.exists() else CF_HQ190L
     height, width = read_color(images[0]).shape[:2]
     if (width, height) != (lens.width, lens.height):
-        hint = "Put the camera's width, height, cx, cy, a0, a2, a3, a4, c, d, e into config.ini beside them."
-        raise complaint(images[0], f"{lens.width}x{lens.height} px, the calibrated size", f"{width}x{height}", hint)
+        hint = "put the camera's width, height, cx, cy, a0, a2, a3, a4, c, d, e into config.ini beside them."
+        raise input_error(images[0], f"{lens.width}x{lens.height} px, the calibrated size", f"{width}x{height}", hint)
     undistorter = Undistorter(lens)
     try:
         _ = undistorter.maps
     except ValueError as error:
-        raise complaint(calibration, "the calibration of a camera", str(error), "Correct it or remove it.") from None
+        raise input_error(calibration, "the calibration of a camera", str(error), "correct it or remove it.") from None
     focal, cx, cy = lens.pinhole()
     kept = kept_frames(len(images), cfg)
     images = [images[i] for i in kept]
@@ -131,12 +132,12 @@ def camera_to_world(path: Path, count: int) -> NDArray[np.float64]:
     """
     rows = read_table(path, POSES_HINT)
     if rows.shape != (count, 16):
-        raise complaint(path, f"{count} rows of 16 numbers, one per picture", f"shape {rows.shape}", POSES_HINT)
+        raise input_error(path, f"{count} rows of 16 numbers, one per picture", f"shape {rows.shape}", POSES_HINT)
     for poses in (rows.reshape(-1, 4, 4).transpose(0, 2, 1), rows.reshape(-1, 4, 4)):
         if (poses[:, 3] == (0, 0, 0, 1)).all() and np.isfinite(poses).all():
             demand_rotations(path, poses[:, :3, :3], "each pose", POSES_HINT)
             return poses
-    raise complaint(path, "finite rigid transforms", "NaN, infinity or no row 0, 0, 0, 1", POSES_HINT)
+    raise input_error(path, "finite rigid transforms", "NaN, infinity or no row 0, 0, 0, 1", POSES_HINT)
 
 
 def read_lens(path: Path) -> Omnidirectional:
@@ -145,15 +146,15 @@ def read_lens(path: Path) -> Omnidirectional:
     Raises:
         InputError: unreadable, or a parameter is missing.
     """
-    text = read_text(path, "camera parameters", "Write it again.")
+    text = read_text(path, "camera parameters", "write it again.")
     found = dict(re.findall(r"^\s*(\w+)\s*[=:]\s*([-+.\deE]+)\s*;?\s*$", text, re.MULTILINE))
     values = {}
     for name, field in Omnidirectional.__dataclass_fields__.items():
         try:
             values[name] = int(found[name]) if field.type == "int" else float(found[name])
         except (KeyError, ValueError):
-            hint = "Add a line such as a0 = 769.2."
-            raise complaint(path, f"a number {name}", repr(found.get(name, "none")), hint) from None
+            hint = "add a line such as a0 = 769.2."
+            raise input_error(path, f"a number {name}", repr(found.get(name, "none")), hint) from None
     return Omnidirectional(**values)
 
 
@@ -161,7 +162,7 @@ def _number(file: Path) -> int:
     """Frame number in a name such as `12_color.png` or `0012_depth.tiff`."""
     digits = re.match(r"[0-9]+", file.name)
     if not digits:
-        raise complaint(file, "a name that starts with the frame's number", file.name, "Rename or remove it.")
+        raise input_error(file, "a name that starts with the frame's number", file.name, "rename or remove it.")
     return int(digits[0])
 
 

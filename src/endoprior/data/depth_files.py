@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
 from .images import MOST_PIXELS, decode_image, describe_pixels, single_channel
 from .numpy_files import read_only_array
-from .reading import complaint, demand_file
+from .reading import demand_file
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
 """Files this module reads, in lower case."""
@@ -36,7 +37,7 @@ def read_values(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.f
     """(H, W) numbers of a one-channel file as they are stored; kinds, `size` and errors as `read_depth_file`."""
     suffix = path.suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
-        raise complaint(path, f"one of {', '.join(DEPTH_SUFFIXES)}", suffix or "no suffix", "Convert the file.")
+        raise input_error(path, f"one of {', '.join(DEPTH_SUFFIXES)}", suffix or "no suffix", "convert the file.")
     if suffix in (".npy", ".npz"):
         pixels = _read_numpy(path)
     elif suffix == ".exr":
@@ -45,21 +46,21 @@ def read_values(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.f
         pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
         kind = describe_pixels(pixels) if pixels.dtype.kind in "iuf" else str(pixels.dtype)
-        raise complaint(path, "8-bit, 16-bit or float values", kind, "Save it as float or 16-bit.")
+        raise input_error(path, "8-bit, 16-bit or float values", kind, "save it as float or 16-bit.")
     if size is not None and pixels.shape != (size[1], size[0]):
         got = f"{pixels.shape[1]}x{pixels.shape[0]}"
-        raise complaint(path, f"{size[0]}x{size[1]} px like the first image", got, "Bring all files to one size.")
+        raise input_error(path, f"{size[0]}x{size[1]} px like the first image", got, "bring all files to one size.")
     with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinity, which is missing
         return pixels.astype(np.float32)
 
 
 def _read_numpy(path: Path) -> NDArray:
     """The (H, W) array of an .npy file, or of an .npz file that holds nothing else; no pickles."""
-    hint = "Write it again with numpy.save."
+    hint = "write it again with numpy.save."
     array = read_only_array(path, hint)
     array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
     if array.ndim != 2:
-        raise complaint(path, "an array of shape (H, W)", f"shape {array.shape}", hint)
+        raise input_error(path, "an array of shape (H, W)", f"shape {array.shape}", hint)
     return array
 
 
@@ -68,8 +69,8 @@ def _read_exr(path: Path) -> NDArray:
     try:
         import OpenEXR  # optional: OpenCV's own decoder is switched off in its packages
     except ImportError:
-        raise complaint(path, "the OpenEXR package", "none", "Run pip install 'endoprior[exr]'.") from None
-    demand_file(path, "an EXR image", "Write the file again.")
+        raise input_error(path, "the OpenEXR package", "none", "run pip install 'endoprior[exr]'.") from None
+    demand_file(path, "an EXR image", "write the file again.")
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             (left, top), (right, bottom) = (np.asarray(corner, int).tolist() for corner in file.header()["dataWindow"])
@@ -78,11 +79,11 @@ def _read_exr(path: Path) -> NDArray:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # the library raises its own kinds, RuntimeError among them
-        raise complaint(path, "an EXR image", str(error).split("\n")[0], "Write the file again.") from None
+        raise input_error(path, "an EXR image", str(error).split("\n")[0], "write the file again.") from None
     if "Z" in channels:
         return channels["Z"]
     first, *others = [channels[name] for name in channels if name != "A"] or [None]
     if first is None or any(not np.array_equal(first, other, equal_nan=True) for other in others):
-        hint = "Save depth alone, as channel Z."
-        raise complaint(path, "one channel, or one called Z", ", ".join(channels) or "none", hint)
+        hint = "save depth alone, as channel Z."
+        raise input_error(path, "one channel, or one called Z", ", ".join(channels) or "none", hint)
     return first

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from ..core.checks import input_error
 from .files import read_json
-from .reading import complaint
 
 LEAST, MOST = 1e-6, 1e6
 """Of every measure in the file."""
@@ -28,13 +28,13 @@ def read_description(path: Path) -> dict[str, Any]:
         value = described.get(key, 1)
         if isinstance(value, bool) or not isinstance(value, int | float) or not LEAST <= value <= MOST:
             want = f"{key} to be a number in [{LEAST:g}, {MOST:g}]"
-            raise complaint(path, want, repr(value)[:60], "Correct it or remove it.")
+            raise input_error(path, want, repr(value)[:60], "correct it or remove it.")
     if described.get("depth_unit", "mm") != "mm":
-        hint = "Give mm, and mm per stored unit as depth_scale."
-        raise complaint(path, "depth_unit mm", repr(described["depth_unit"]), hint)
+        hint = "give mm, and mm per stored unit as depth_scale."
+        raise input_error(path, "depth_unit mm", repr(described["depth_unit"]), hint)
     if described.get("mask_tool_value", 255) not in (0, 255):
-        hint = "Say which of the two marks tools."
-        raise complaint(path, "mask_tool_value 255 or 0", repr(described["mask_tool_value"]), hint)
+        hint = "say which of the two marks tools."
+        raise input_error(path, "mask_tool_value 255 or 0", repr(described["mask_tool_value"]), hint)
     _check_origins(path, described)
     return described
 
@@ -44,7 +44,7 @@ def check_frames(path: Path, described: dict[str, Any], count: int) -> list[str]
     marked = described.get("unexplained_frames", [])
     outside = [index for index in marked if not 0 <= index < count]
     if outside:
-        raise complaint(path, f"unexplained_frames in 0..{count - 1}", str(outside[0]), "Correct it or remove it.")
+        raise input_error(path, f"unexplained_frames in 0..{count - 1}", str(outside[0]), "correct it or remove it.")
     if not marked:
         return []
     return [f"{path}: {len(marked)} frames are marked as unexplained, the first is frame {min(marked)}"]
@@ -60,8 +60,8 @@ def intrinsics_of(
     """
     if {"width", "height"} <= described.keys() and (described["width"], described["height"]) != (width, height):
         got = f"{described['width']}x{described['height']}"
-        hint = "Scale fx, fy, cx, cy to the images, or remove the file."
-        raise complaint(path, f"the images' size {width}x{height}", got, hint)
+        hint = "scale fx, fy, cx, cy to the images, or remove the file."
+        raise input_error(path, f"the images' size {width}x{height}", got, hint)
     fx = float(described.get("fx", focal))
     fy = float(described.get("fy", fx))
     return fx, fy, float(described.get("cx", width / 2)), float(described.get("cy", height / 2))
@@ -69,17 +69,17 @@ def intrinsics_of(
 
 def _check_origins(path: Path, described: dict[str, Any]) -> None:
     """Refuse wrong values of the keys that say how a sequence was made."""
-    hint = "Correct it or remove it."
+    hint = "correct it or remove it."
     relative = described.get("depth_relative", False)
     if not isinstance(relative, bool):
-        raise complaint(path, "depth_relative true or false", repr(relative), hint)
+        raise input_error(path, "depth_relative true or false", repr(relative), hint)
     sources = described.get("sources", {})
     if not isinstance(sources, dict) or not all(isinstance(value, str) for value in sources.values()):
-        raise complaint(path, "sources to map names to texts", repr(sources), hint)
+        raise input_error(path, "sources to map names to texts", repr(sources), hint)
     frames = described.get("unexplained_frames", [])
     if not isinstance(frames, list) or not all(type(index) is int for index in frames):
-        raise complaint(path, "unexplained_frames to be a list of frame numbers", repr(frames), hint)
+        raise input_error(path, "unexplained_frames to be a list of frame numbers", repr(frames), hint)
     version = described.get("format_version", FORMAT_VERSION)
     if type(version) is not int or not 1 <= version <= FORMAT_VERSION:
-        hint = "Update endoprior, or prepare the folder again."
-        raise complaint(path, f"format_version 1 to {FORMAT_VERSION}", repr(version), hint)
+        hint = "update endoprior, or prepare the folder again."
+        raise input_error(path, f"format_version 1 to {FORMAT_VERSION}", repr(version), hint)

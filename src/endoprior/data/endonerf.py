@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
@@ -20,11 +21,10 @@ from .formats import Format
 from .images import read_color, read_depth, read_tool_mask
 from .numpy_files import read_numpy
 from .poses import demand_rotations, world_to_camera
-from .reading import complaint
 from .sequence import FrameSequence
 from .truth import Truth
 
-POSES_HINT = "Write one row of 17 numbers per frame: 3x5 [R | t | (H, W, focal)], near, far."
+POSES_HINT = "write one row of 17 numbers per frame: 3x5 [R | t | (H, W, focal)], near, far."
 STILL_HINT = f"{POSES_HINT[:-1]}; for a camera that stands still, set data.format to plain."
 
 
@@ -59,7 +59,7 @@ def load_endonerf(
     for name, files in zip(folders[1:], (masks, depths), strict=True):
         demand_count(files, path / name, len(images))
     if len(images) < 2:
-        raise complaint(path / "images", "at least 2 frames, 1 to train and 1 to test", "1", "Add frames.")
+        raise input_error(path / "images", "at least 2 frames, 1 to train and 1 to test", "1", "add frames.")
     own_description = read_description(path / "sequence.json")
     described = (facts or {}) | own_description
     height, width = read_color(images[0]).shape[:2]
@@ -105,12 +105,12 @@ def read_poses_bounds(path: Path, num_frames: int) -> NDArray[np.float64]:
         InputError: missing, of another shape, not finite, or not rotations.
     """
     if not path.exists():
-        raise complaint(path, "camera poses", "no such file", STILL_HINT)
+        raise input_error(path, "camera poses", "no such file", STILL_HINT)
     stored = read_numpy(path, "a NumPy file", POSES_HINT)
     if not isinstance(stored, np.ndarray) or stored.shape != (num_frames, 17):
-        raise complaint(path, f"shape ({num_frames}, 17)", str(getattr(stored, "shape", "an archive")), POSES_HINT)
+        raise input_error(path, f"shape ({num_frames}, 17)", str(getattr(stored, "shape", "an archive")), POSES_HINT)
     if not np.issubdtype(stored.dtype, np.number) or not np.isfinite(stored[:, :15].astype(np.float64)).all():
-        raise complaint(path, "finite numbers", "NaN, infinity or other values", POSES_HINT)
+        raise input_error(path, "finite numbers", "NaN, infinity or other values", POSES_HINT)
     poses = stored[:, :15].astype(np.float64).reshape(-1, 3, 5)
     demand_rotations(path, poses[:, :, :3], "columns 0-2", POSES_HINT)
     return poses
@@ -128,7 +128,7 @@ def _cameras(
     """One camera per frame. Intrinsics come from `sequence.json` where it has them, else from row 0 of the poses."""
     stored_height, stored_width, focal = poses[0, :, 4]
     if "fx" not in described and focal <= 0:
-        raise complaint(path / "poses_bounds.npy", "a focal length > 0 px", f"{focal:g}", "Correct row 0, column 14.")
+        raise input_error(path / "poses_bounds.npy", "a focal length > 0 px", f"{focal:g}", "correct row 0, column 14.")
     intrinsics = intrinsics_of(path / "sequence.json", described, width, height, focal)
     if "fx" not in described and (stored_width, stored_height) != (width, height):
         remarks.append(

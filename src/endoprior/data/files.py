@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
-from .reading import ACCESS_HINT, complaint, read_text
+from ..core.checks import InputError, input_error
+from .reading import ACCESS_HINT, read_text
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 """Pictures that color readers take."""
@@ -29,7 +29,7 @@ def entries(folder: Path) -> list[Path]:
     try:
         return list(folder.iterdir())
     except OSError as error:
-        raise complaint(folder, "a readable folder", error.strerror or str(error), ACCESS_HINT) from None
+        raise input_error(folder, "a readable folder", error.strerror or str(error), ACCESS_HINT) from None
 
 
 def natural_order(file: Path) -> list[int | str]:
@@ -51,20 +51,22 @@ def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str
     """
     kind = "/".join(sorted({suffix.removeprefix(".").upper() for suffix in suffixes} - {"JPEG", "TIF"}, reverse=True))
     if not folder.is_dir():
-        raise complaint(folder, f"a folder of {kind} files", "no such folder", f"Pass a folder in the {layout} layout.")
+        raise input_error(
+            folder, f"a folder of {kind} files", "no such folder", f"pass a folder in the {layout} layout."
+        )
     everything = [file for file in entries(folder) if not file.name.startswith(".")]
     files = [file for file in everything if file.suffix.lower() in suffixes and file.stem.endswith(ending)]
     if not files:
         other = sorted({file.suffix for file in everything if file.suffix})
         got = f"none (only {', '.join(other)})" if other else "none"
-        raise complaint(folder, f"{kind} files", got, f"Put one {kind} per frame there.")
+        raise input_error(folder, f"{kind} files", got, f"put one {kind} per frame there.")
     return sorted(files, key=natural_order)
 
 
 def demand_count(files: list[Path], folder: Path, count: int) -> None:
     """Refuse a list of files that are not one per image."""
     if len(files) != count:
-        raise complaint(folder, f"{count} files, one per image", f"{len(files)}", "Add or remove files to match.")
+        raise input_error(folder, f"{count} files, one per image", f"{len(files)}", "add or remove files to match.")
 
 
 def unequal_names(images: list[Path], others: list[Path]) -> list[str]:
@@ -76,20 +78,20 @@ def unequal_names(images: list[Path], others: list[Path]) -> list[str]:
     return []
 
 
-def read_json(path: Path, next_step: str = "Correct it or remove it.") -> dict[str, Any]:
+def read_json(path: Path, fix: str = "correct it or remove it.") -> dict[str, Any]:
     """The object in a JSON file.
 
     Raises:
         InputError: unreadable, not JSON, or not an object.
     """
     try:
-        stored = json.loads(read_text(path, "a JSON object", next_step))
+        stored = json.loads(read_text(path, "a JSON object", fix))
     except (ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise complaint(path, "a JSON object", str(error).split("\n")[0], next_step) from None
+        raise input_error(path, "a JSON object", str(error).split("\n")[0], fix) from None
     if not isinstance(stored, dict):
-        raise complaint(path, "a JSON object", type(stored).__name__, next_step)
+        raise input_error(path, "a JSON object", type(stored).__name__, fix)
     return stored
 
 
@@ -104,29 +106,29 @@ def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, 
         value = value.get(part) if isinstance(value, dict) else None
     want = f"{key}, {shape[0]}x{shape[1]} numbers"
     if value is None:
-        raise complaint(path, want, "no such key", "Process the dataset again.")
+        raise input_error(path, want, "no such key", "process the dataset again.")
     try:
         matrix = np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape != shape or not np.isfinite(matrix).all():
         got = "NaN or infinity" if matrix.shape == shape else f"shape {matrix.shape}"
-        raise complaint(path, want, got, "Process the dataset again.")
+        raise input_error(path, want, got, "process the dataset again.")
     return matrix
 
 
-def read_table(path: Path, next_step: str) -> NDArray[np.float64]:
+def read_table(path: Path, fix: str) -> NDArray[np.float64]:
     """(N, K) numbers of a text file, separated by commas or blanks, one row per line; '#' starts a comment.
 
     Raises:
         InputError: unreadable, not numbers, or rows of different lengths.
     """
-    lines = read_text(path, "rows of numbers", next_step).splitlines()
+    lines = read_text(path, "rows of numbers", fix).splitlines()
     try:
         rows = [re.split(r"[,\s]+", line.split("#")[0].strip(", \t")) for line in lines]
         numbers = [[float(entry) for entry in row] for row in rows if row != [""]]
     except ValueError as error:
-        raise complaint(path, "rows of numbers", str(error).split("\n")[0], next_step) from None
+        raise input_error(path, "rows of numbers", str(error).split("\n")[0], fix) from None
     if not numbers or len({len(row) for row in numbers}) != 1:
-        raise complaint(path, "rows of equally many numbers", "other rows", next_step)
+        raise input_error(path, "rows of equally many numbers", "other rows", fix)
     return np.array(numbers)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
@@ -18,7 +19,6 @@ from .files import IMAGE_SUFFIXES, demand_count, list_files, read_table, unequal
 from .formats import Format
 from .images import read_color, read_tool_mask
 from .poses import identity_poses
-from .reading import complaint
 from .sequence import FrameSequence
 
 CROP_LEFT_PX = 40
@@ -57,11 +57,11 @@ def _load_forplane(path: Path, cfg: DataConfig) -> FrameSequence:
     demand_count(depths, path / depth_folder, len(images))
     height, width = read_color(images[0]).shape[:2]
     if width <= CROP_LEFT_PX:
-        raise complaint(images[0], f"more than {CROP_LEFT_PX} columns", f"{width}", "Pass images of full size.")
+        raise input_error(images[0], f"more than {CROP_LEFT_PX} columns", f"{width}", "pass images of full size.")
     # All rows must be there and finite, but only size and focal length are used: Forplane's camera stands still.
     _, _, focal = read_poses_bounds(path / "poses_bounds.npy", len(images))[0, :, 4]
     if focal <= 0:
-        raise complaint(path / "poses_bounds.npy", "a focal length > 0 px", f"{focal:g}", "Correct row 0, column 14.")
+        raise input_error(path / "poses_bounds.npy", "a focal length > 0 px", f"{focal:g}", "correct row 0, column 14.")
     remarks = unequal_names(images, masks) + unequal_names(images, depths)
     remarks.append(f"{path}: {CROP_LEFT_PX} columns without picture are cut off at the left, as in Forplane")
     if not cfg.depth_unit_mm:
@@ -98,10 +98,10 @@ def _load_rectified(path: Path, cfg: DataConfig) -> FrameSequence:
     number = path.name[-2:]
     places = [path / "intrinsics.txt", path.parent / "calibration" / number / "intrinsics.txt"]
     calibration = next((place for place in places if place.exists()), places[0])
-    hint = "Put the dataset's intrinsics.txt, a 3x3 camera matrix, beside image01/."
+    hint = "put the dataset's intrinsics.txt, a 3x3 camera matrix, beside image01/."
     matrix = read_table(calibration, hint)
     if matrix.shape not in ((3, 3), (3, 4)) or min(matrix[0, 0], matrix[1, 1]) <= 0 or not np.isfinite(matrix).all():
-        raise complaint(calibration, "a 3x3 camera matrix", f"shape {matrix.shape} or other numbers", hint)
+        raise input_error(calibration, "a 3x3 camera matrix", f"shape {matrix.shape} or other numbers", hint)
     height, width = read_color(images[0]).shape[:2]
     remarks = [*unequal_names(images, depths), f"{path}: no tool masks, every pixel counts as tissue"]
     remarks.append(f"{path}: no camera poses, the camera is taken to stand still")

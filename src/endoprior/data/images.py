@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
 from .image_header import is_whole, stored_size
-from .reading import complaint, read_bytes
+from .reading import read_bytes
 
 MOST_PIXELS = 64_000_000
 """Of one picture; 7680x4320 has half as many."""
@@ -28,7 +29,7 @@ def read_color(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.ui
     """
     pixels = decode_image(path, size)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
-        raise complaint(path, "an 8-bit RGB image", describe_pixels(pixels), "Convert it to 8-bit RGB.")
+        raise input_error(path, "an 8-bit RGB image", describe_pixels(pixels), "convert it to 8-bit RGB.")
     return np.ascontiguousarray(pixels[..., 2::-1])
 
 
@@ -46,14 +47,14 @@ def read_tool_mask(path: Path, tool_value: int = 255, size: tuple[int, int] | No
     """
     pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype != np.uint8:
-        raise complaint(path, "an 8-bit mask", describe_pixels(pixels), "Save it with values 0 and 255.")
+        raise input_error(path, "an 8-bit mask", describe_pixels(pixels), "save it with values 0 and 255.")
     high = pixels == 255
     other = pixels[~high & (pixels != 0)]
     if other.size:
         values = np.unique(other)
         zero_and_one = values.tolist() == [1] and not high.any()
-        hint = "Multiply it by 255." if zero_and_one else "Threshold it, without smoothing."
-        raise complaint(path, "mask values 0 and 255", _list_some(values), hint)
+        hint = "multiply it by 255." if zero_and_one else "threshold it, without smoothing."
+        raise input_error(path, "mask values 0 and 255", _list_some(values), hint)
     return high if tool_value == 255 else ~high
 
 
@@ -71,7 +72,7 @@ def read_depth(path: Path, scale: float = 1.0, size: tuple[int, int] | None = No
     """
     pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise complaint(path, "an 8-bit or 16-bit depth image", describe_pixels(pixels), "Save it as 16-bit PNG.")
+        raise input_error(path, "an 8-bit or 16-bit depth image", describe_pixels(pixels), "save it as 16-bit PNG.")
     return pixels.astype(np.float32) * np.float32(scale)
 
 
@@ -92,7 +93,7 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
     promised = stored_size(data)
     if promised and promised[0] * promised[1] > MOST_PIXELS:
         got = f"{promised[0]}x{promised[1]} px by its header"
-        raise complaint(path, f"a picture of at most {MOST_PIXELS // 1_000_000} Mpx", got, "Scale it down.")
+        raise input_error(path, f"a picture of at most {MOST_PIXELS // 1_000_000} Mpx", got, "scale it down.")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is said below, on one line
     try:
         pixels = cv2.imdecode(encoded, flags) if promised and is_whole(data) else None
@@ -100,14 +101,14 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
         pixels = None
     if pixels is None:
         got = f"{encoded.size} bytes that cannot be decoded"
-        raise complaint(path, "an image (PNG, JPEG, TIFF, BMP, WebP)", got, "Write the file again.")
+        raise input_error(path, "an image (PNG, JPEG, TIFF, BMP, WebP)", got, "write the file again.")
     got = (pixels.shape[1], pixels.shape[0])
     if size is not None and got != size:
-        raise complaint(
+        raise input_error(
             path,
             f"{size[0]}x{size[1]} px like the first image",
             f"{got[0]}x{got[1]}",
-            "Bring all images, masks and depth to one size.",
+            "bring all images, masks and depth to one size.",
         )
     return pixels
 
@@ -132,7 +133,7 @@ def single_channel(path: Path, pixels: NDArray) -> NDArray:
         return pixels
     first = pixels[..., 0]
     if any((pixels[..., c] != first).any() for c in range(1, min(pixels.shape[2], 3))):
-        raise complaint(path, "one channel", "a color image", "Save the values themselves, not a color map.")
+        raise input_error(path, "one channel", "a color image", "save the values themselves, not a color map.")
     return first
 
 

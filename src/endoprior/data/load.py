@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from ..core.checks import input_error
 from ..core.config import DataConfig
 from .endonerf import load_endonerf
 from .files import entries
 from .formats import FORMATS, load_format
-from .reading import complaint, kind_of
+from .reading import kind_of
 from .sequence import FrameSequence
 
 
@@ -32,7 +33,7 @@ def load_sequence(
     path = Path(path).expanduser()
     if (kind := kind_of(path)) != "a folder":
         got = "no such folder" if kind == "nothing" else kind
-        raise complaint(path, "a sequence folder", got, "Pass the folder that holds images/, masks/ and depth/.")
+        raise input_error(path, "a sequence folder", got, "pass the folder that holds images/, masks/ and depth/.")
     name = find_format(path, cfg)
     if pose_axes == "opencv":
         return load_format(name).load(path, cfg)
@@ -51,11 +52,11 @@ def find_format(path: Path, cfg: DataConfig) -> str:
         return cfg.format
     if cfg.format != "auto":
         choices = f"auto, {', '.join(FORMATS)}"
-        raise complaint("data.format", f"one of {choices}", repr(cfg.format), "Fix: see docs/datasets.md.")
+        raise input_error("data.format", f"one of {choices}", repr(cfg.format), "see docs/datasets.md.")
     for name in FORMATS:
         if load_format(name).recognizes(path):
             return name
     names = sorted(entry.name + "/" * entry.is_dir() for entry in entries(path) if not entry.name.startswith("."))
     got = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     known = ", ".join(FORMATS)
-    raise complaint(path, f"one of the layouts {known}", got or "an empty folder", "Fix: see docs/datasets.md.")
+    raise input_error(path, f"one of the layouts {known}", got or "an empty folder", "see docs/datasets.md.")

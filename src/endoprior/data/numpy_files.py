@@ -12,35 +12,36 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from .reading import MOST_BYTES, complaint, read_bytes
+from ..core.checks import input_error
+from .reading import MOST_BYTES, read_bytes
 
 MOST_ARRAYS = 1000
 """In one .npz file."""
 ZIP_START = b"PK"
 
 
-def read_numpy(path: Path, expected: str, next_step: str) -> NDArray | dict[str, NDArray]:
+def read_numpy(path: Path, expected: str, fix: str) -> NDArray | dict[str, NDArray]:
     """The array of an .npy file, or the named arrays of an .npz file; no pickles.
 
     Raises:
         InputError: unreadable, not NumPy's, or larger than `MOST_BYTES`; `expected` says what should be there.
     """
-    stored = read_bytes(path, expected, next_step).tobytes()
+    stored = read_bytes(path, expected, fix).tobytes()
     try:
         return _archive(stored) if stored.startswith(ZIP_START) else _array(stored)
     except (OSError, ValueError, TypeError, EOFError, BadZipFile, zlib.error, LZMAError) as error:
         found = (str(error) or type(error).__name__).split("\n")[0][:120]
     except (RuntimeError, MemoryError, OverflowError) as error:  # encrypted, unknown compression, nested header
         found = (str(error) or type(error).__name__).split("\n")[0][:120]
-    raise complaint(path, expected, found, next_step)
+    raise input_error(path, expected, found, fix)
 
 
-def read_only_array(path: Path, next_step: str) -> NDArray:
+def read_only_array(path: Path, fix: str) -> NDArray:
     """The array of an .npy file, or the only one of an .npz file; otherwise as `read_numpy`."""
-    stored = read_numpy(path, "a NumPy file", next_step)
+    stored = read_numpy(path, "a NumPy file", fix)
     arrays = [stored] if isinstance(stored, np.ndarray) else list(stored.values())
     if len(arrays) != 1:
-        raise complaint(path, "one array", f"{len(arrays)}", next_step)
+        raise input_error(path, "one array", f"{len(arrays)}", fix)
     return arrays[0]
 
 

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .reading import complaint
+from ..core.checks import input_error
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R^T R - I that still passes for a rotation: far above float32 rounding, far below a real scale."""
 
 
-def demand_rotations(path: Path, rotations: NDArray[np.float64], where: str, next_step: str) -> None:
+def demand_rotations(path: Path, rotations: NDArray[np.float64], where: str, fix: str) -> None:
     """Refuse finite (N, 3, 3) matrices that are not rotations; `where` names them in the message."""
     deviation = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max((1, 2))
     wrong = np.flatnonzero((deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0))
     if wrong.size:
-        raise complaint(path, f"rotations in {where}", f"something else in row {wrong[0]}", next_step)
+        raise input_error(path, f"rotations in {where}", f"something else in row {wrong[0]}", fix)
 
 
 def world_to_camera(rotation: NDArray[np.float64], center: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,19 +9,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 
 MOST_BYTES = 1 << 30
 """Of one file, and of what one compressed file may unfold to."""
 MOST_TEXT_BYTES = 64 << 20
 """Of a JSON, YAML or text file."""
-ACCESS_HINT = "Check the path and the rights."
+ACCESS_HINT = "check the path and the rights."
 Kind = Literal["a file", "a folder", "nothing", "a device or a pipe"]
-
-
-def complaint(path: Path | str, expected: str, got: str, next_step: str) -> InputError:
-    """The error for a file or folder that cannot be used, on one line."""
-    return InputError(f"{path}: expected {expected}; got {got}. {next_step}")
 
 
 def kind_of(path: Path) -> Kind:
@@ -35,9 +30,9 @@ def kind_of(path: Path) -> Kind:
     except OSError as error:
         if isinstance(error, FileNotFoundError | NotADirectoryError) or "symbolic links" in str(error):
             return "nothing"
-        raise complaint(shortened(path), "a usable path", error.strerror or str(error), ACCESS_HINT) from None
+        raise input_error(shortened(path), "a usable path", error.strerror or str(error), ACCESS_HINT) from None
     except ValueError as error:  # a zero byte in a name that came out of a file
-        raise complaint(ascii(str(path)), "a usable path", str(error), ACCESS_HINT) from None
+        raise input_error(ascii(str(path)), "a usable path", str(error), ACCESS_HINT) from None
     if stat.S_ISREG(mode):
         return "a file"
     return "a folder" if stat.S_ISDIR(mode) else "a device or a pipe"
@@ -49,33 +44,33 @@ def shortened(path: Path, most: int = 120) -> str:
     return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 2 :]}"
 
 
-def read_bytes(path: Path, expected: str = "a readable file", next_step: str = ACCESS_HINT) -> NDArray[np.uint8]:
+def read_bytes(path: Path, expected: str = "a readable file", fix: str = ACCESS_HINT) -> NDArray[np.uint8]:
     """(N,) bytes of a file.
 
     Raises:
         InputError: missing, unreadable, not a regular file (reading a pipe would wait for ever), or of more than
             `MOST_BYTES`; `expected` says what should be there.
     """
-    demand_file(path, expected, next_step, MOST_BYTES)
+    demand_file(path, expected, fix, MOST_BYTES)
     try:
         return np.fromfile(path, np.uint8)
     except OSError as error:
-        raise complaint(path, expected, error.strerror or str(error), next_step) from None
+        raise input_error(path, expected, error.strerror or str(error), fix) from None
 
 
-def read_text(path: Path, expected: str, next_step: str) -> str:
+def read_text(path: Path, expected: str, fix: str) -> str:
     """The text of a UTF-8 file; as `read_bytes`, up to `MOST_TEXT_BYTES`."""
-    demand_file(path, expected, next_step, MOST_TEXT_BYTES)
+    demand_file(path, expected, fix, MOST_TEXT_BYTES)
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise complaint(path, expected, str(error).split("\n")[0], next_step) from None
+        raise input_error(path, expected, str(error).split("\n")[0], fix) from None
 
 
-def demand_file(path: Path, expected: str, next_step: str, most: int = MOST_BYTES) -> None:
+def demand_file(path: Path, expected: str, fix: str, most: int = MOST_BYTES) -> None:
     """Refuse what is not a regular file, and more than `most` bytes."""
     kind = kind_of(path)
     if kind != "a file":
-        raise complaint(path, expected, "No such file" if kind == "nothing" else kind, next_step)
+        raise input_error(path, expected, "No such file" if kind == "nothing" else kind, fix)
     if (size := path.stat().st_size) > most:
-        raise complaint(path, f"at most {most >> 20} MB", f"{size >> 20} MB", next_step)
+        raise input_error(path, f"at most {most >> 20} MB", f"{size >> 20} MB", fix)

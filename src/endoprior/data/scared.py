@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
@@ -23,7 +24,6 @@ from .files import list_files, read_json, read_matrix
 from .formats import Format
 from .images import read_color
 from .poses import demand_rotations
-from .reading import complaint
 from .sequence import FrameSequence
 
 STRIDES = {1: 2, 2: 1, 3: 4, 6: 8, 7: 8}
@@ -32,7 +32,7 @@ BADLY_CALIBRATED = (4, 5)
 NEAR_MM, FAR_MM = 0.03, 300.0
 """Depth outside is missing. The near end looks like a slip for 30, but it is the published one."""
 FOLDERS = {"left_finalpass": ".png", "disparity": ".tiff", "reprojection_data": ".json"}
-HINT = "Process the keyframe first, see docs/datasets.md."
+HINT = "process the keyframe first, see docs/datasets.md."
 VERSION_2 = ("left_rectification_rotation", "left_projection_matrix", "reprojection_matrix")
 
 
@@ -51,14 +51,14 @@ def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
     data = path / "data"
     for folder in ("frame_data", *FOLDERS):
         if not (data / folder).is_dir():
-            raise complaint(data / folder, "a folder of processed SCARED frames", "no such folder", HINT)
+            raise input_error(data / folder, "a folder of processed SCARED frames", "no such folder", HINT)
     records = list_files(data / "frame_data", (".json",), "SCARED")
     for folder, suffix in FOLDERS.items():
         others = {file.stem for file in list_files(data / folder, (suffix,), "SCARED")}
         odd = sorted({file.stem for file in records} ^ others)
         if odd:
             got = f"{len(others)}; {odd[0]} is in one of the two only"
-            raise complaint(data / folder, f"the {len(records)} frames of frame_data", got, HINT)
+            raise input_error(data / folder, f"the {len(records)} frames of frame_data", got, HINT)
     number = dataset_number(path)
     remarks = _remarks(path, number, cfg)
     records = [records[i] for i in kept_frames(len(records), cfg, STRIDES.get(number or 0, 1))]
@@ -69,8 +69,8 @@ def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
     geometry = [_geometry(*files, size) for files in zip(records, geometries, strict=True)]
     versions = sorted({version for *_, version in geometry})
     if len(versions) > 1:
-        hint = "Process all frames by the same program."
-        raise complaint(data / "reprojection_data", "files of one version", "versions 1 and 2", hint)
+        hint = "process all frames by the same program."
+        raise input_error(data / "reprojection_data", "files of one version", "versions 1 and 2", hint)
     if versions == [1]:
         remarks.append(f"{data}: version 1, whose camera and pose are those of the images before rectification")
     to_camera = np.stack([pose for _, pose, _, _ in geometry])
@@ -148,10 +148,10 @@ def _geometry(
         reprojection = read_matrix(geometry, stored, VERSION_2[2], (4, 4))
         if stored.get("image_size", list(size)) != list(size):
             got = f"{stored['image_size']}"
-            raise complaint(geometry, f"image_size {list(size)} like the image", got, HINT)
+            raise input_error(geometry, f"image_size {list(size)} like the image", got, HINT)
         pose = np.block([[rotation, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]) @ pose
     if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
-        raise complaint(record, "focal lengths > 0 px", f"{intrinsics[0, 0]:g}, {intrinsics[1, 1]:g}", HINT)
+        raise input_error(record, "focal lengths > 0 px", f"{intrinsics[0, 0]:g}, {intrinsics[1, 1]:g}", HINT)
     return intrinsics, pose, reprojection, version
 
 
@@ -159,7 +159,7 @@ def _version(path: Path, stored: dict[str, Any]) -> int:
     """1 or 2, as the file says or as its keys show."""
     version = stored.get("schema_version", 2 if VERSION_2[0] in stored else 1)
     if type(version) is not int or version not in (1, 2):
-        raise complaint(path, "schema_version 1 or 2", repr(version), HINT)
+        raise input_error(path, "schema_version 1 or 2", repr(version), HINT)
     return version
 
 

@@ -12,9 +12,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, overload
 
+from ..core.checks import input_error
 from ..core.types import Camera, Frame
 from ..system.memory import BoundedCache, cache_bytes, workers
-from .images import complaint
 from .truth import Truth
 
 Split = Literal["train", "test", "video"]
@@ -127,14 +127,14 @@ class FrameSequence:
             seen = list(pool.map(lambda index: _contents(self.frame(index)), range(len(self))))
         tissue = [share for share, _, _ in seen]
         if not any(tissue):
-            hint = "The polarity may be inverted: masks are 255 on tools."
-            raise complaint(self._masks, "tissue in at least one frame", "tool everywhere", hint)
+            hint = "the polarity may be inverted: masks are 255 on tools."
+            raise input_error(self._masks, "tissue in at least one frame", "tool everywhere", hint)
         if not any(has_depth for _, has_depth, _ in seen):
-            hint = "Provide depth in mm, 0 where it is missing."
-            raise complaint(self.path / "depth", "depth > 0 in at least one frame", "0 everywhere", hint)
+            hint = "provide depth in mm, 0 where it is missing."
+            raise input_error(self.path / "depth", "depth > 0 in at least one frame", "0 everywhere", hint)
         if not any(seen[index][2] for index in self.indices("train")):
-            hint = "The mask's polarity may be inverted, or the depth may be of the tool only."
-            raise complaint(self.path / "depth", "depth on tissue in a training frame", "none", hint)
+            hint = "the mask's polarity may be inverted, or the depth may be of the tool only."
+            raise input_error(self.path / "depth", "depth on tissue in a training frame", "none", hint)
         remarks = self.remarks
         tool = 1 - sum(tissue) / len(tissue)
         if tool > TOOL_FRACTION_WARNING:

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from ..core.checks import input_error
 from ..core.config import DataConfig
 from .depth_files import read_values
 from .endonerf import load_endonerf
 from .files import list_files, read_json
 from .formats import Format
 from .images import decode_image
-from .reading import complaint
 from .sequence import FrameSequence, is_test_frame
 
 RAW_FILE = "StereoCalibration.ini"
@@ -36,8 +36,8 @@ def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
         InputError: a raw sequence, another split than every 8th frame, or files that cannot be used.
     """
     if not (path / "images").is_dir():
-        hint = "Run endoprior prepare on its video with this calibration and masks/."
-        raise complaint(path / RAW_FILE, "a prepared sequence", "a raw one", hint)
+        hint = "run endoprior prepare on its video with this calibration and masks/."
+        raise input_error(path / RAW_FILE, "a prepared sequence", "a raw one", hint)
     count = len(list_files(path / "images", (".png",), "StereoMIS"))
     _check_split(path / "split.json", count)
     depth = decode_image(list_files(path / "depth", (".png",), "StereoMIS")[0], None)
@@ -53,10 +53,10 @@ def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
 
 def _read_intrinsics(path: Path) -> dict[str, float]:
     """fx, fy, cx, cy of the (3, 3) matrix in `intrinsics.npy`, whose pixel centers are integers."""
-    hint = "Write the 3x3 camera matrix of the rectified images."
+    hint = "write the 3x3 camera matrix of the rectified images."
     matrix = read_values(path)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise complaint(path, "a 3x3 camera matrix", f"shape {matrix.shape} or other numbers", hint)
+        raise input_error(path, "a 3x3 camera matrix", f"shape {matrix.shape} or other numbers", hint)
     fx, fy, cx, cy = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     return {"fx": fx, "fy": fy, "cx": cx + 0.5, "cy": cy + 0.5}
 
@@ -71,11 +71,11 @@ def _check_split(path: Path, count: int) -> None:
     for key, indices in expected.items():
         stored = split.get(key)
         if not isinstance(stored, list):
-            raise complaint(path, f"a list {key}", repr(stored), "Prepare the sequence again.")
+            raise input_error(path, f"a list {key}", repr(stored), "prepare the sequence again.")
         if stored != indices:
             got = f"{len(stored)} frames that differ"
             want = f"{key} of the rule (i - 1) % 8 == 0, {len(indices)} frames"
-            raise complaint(path, want, got, "Remove split.json to use that rule.")
+            raise input_error(path, want, got, "remove split.json to use that rule.")
 
 
 FORMAT = Format(is_stereomis, load_stereomis)

@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Frame
 from ..system.atomic import whole_file
 from .endonerf import load_endonerf
 from .formats import Format
 from .images import decode_image, single_channel
-from .reading import complaint, kind_of
+from .reading import kind_of
 from .sequence import FrameSequence
 from .truth import Tracks
 
@@ -44,8 +45,8 @@ def load_stir(path: Path, cfg: DataConfig) -> FrameSequence:
     clips = [path] if (path / SEGMENTATIONS[0]).exists() else sorted(path.glob("left*/seq*"))
     videos = sorted((clips[0] / "frames").glob("*.mp4")) if clips else []
     video = videos[0] if videos else clips[0] / "frames" / "*.mp4" if clips else path
-    hint = f"Run endoprior prepare {video} OUT --border keep --stir {clips[0] if clips else path} (docs/datasets.md)."
-    raise complaint(path, "a prepared sequence", "a STIR clip, which has no depth", hint)
+    hint = f"run endoprior prepare {video} OUT --border keep --stir {clips[0] if clips else path} (docs/datasets.md)."
+    raise input_error(path, "a prepared sequence", "a STIR clip, which has no depth", hint)
 
 
 def tattoo_centers(path: Path) -> NDArray[np.float64]:
@@ -100,7 +101,7 @@ def demand_stir_clip(clip: Path) -> None:
     """Refuse a folder that is no `left/seqNN` of STIR, before work that would be lost."""
     for name in SEGMENTATIONS:
         if kind_of(clip / name) != "a file":
-            raise complaint(clip / name, "a clip of STIR", "no such file", "Pass its folder left/seqNN.")
+            raise input_error(clip / name, "a clip of STIR", "no such file", "pass its folder left/seqNN.")
 
 
 def write_stir_tracks(clip: Path, prepared: Path) -> Path:
@@ -123,13 +124,13 @@ def write_stir_tracks(clip: Path, prepared: Path) -> Path:
         scale = np.array([frame.camera.width / width, frame.camera.height / height])
         if abs(scale[0] / scale[1] - 1) > ASPECT_TOLERANCE:
             got = f"{frame.camera.width}x{frame.camera.height} px for {width}x{height}"
-            raise complaint(prepared, f"the whole picture of {path}", got, "Prepare the clip with --border keep.")
+            raise input_error(prepared, f"the whole picture of {path}", got, "prepare the clip with --border keep.")
         spots.append(tattoo_centers(path) * scale)
     tracks = stir_tracks(*spots, *frames, len(sequence))
     for time, name in ((0, SEGMENTATIONS[0]), (-1, SEGMENTATIONS[1])):
         if not tracks.visible[time].any():
             got = f"none of {len(spots[time])}"
-            raise complaint(Path(clip) / name, "spots where the frame has depth", got, "Use another clip.")
+            raise input_error(Path(clip) / name, "spots where the frame has depth", got, "use another clip.")
     target = Path(prepared) / "truth" / "tracks.npz"
     target.parent.mkdir(exist_ok=True)
     with whole_file(target) as part:

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
 from .images import read_color
 from .numpy_files import read_numpy
-from .reading import complaint
 
-_FILE = ("a NumPy file", "Write the truth again.")
+_FILE = ("a NumPy file", "write the truth again.")
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class Truth:
         stored = read_numpy(path, *_FILE)
         if not isinstance(stored, dict) or not {"points", "visible"} <= stored.keys():
             got = ", ".join(stored) if isinstance(stored, dict) else "one array"
-            raise complaint(path, "arrays points and visible", got, "Write the truth again.")
+            raise input_error(path, "arrays points and visible", got, "write the truth again.")
         points, visible = np.asarray(stored["points"], np.float32), np.asarray(stored["visible"], bool)
         tracks = Tracks(points, visible, bool(stored.get("paired", True)))
         frames, count = tracks.visible.shape if tracks.visible.ndim == 2 else (-1, -1)
         if frames != len(self._names) or tracks.points.shape != (frames, count, 3):
             got = f"{tracks.points.shape} and {tracks.visible.shape}"
             want = f"shapes (T, P, 3) and (T, P) with T = {len(self._names)}"
-            raise complaint(path, want, got, "Write the truth again.")
+            raise input_error(path, want, got, "write the truth again.")
         return tracks

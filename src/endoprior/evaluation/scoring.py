@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..data import FrameSequence, Split
 from ..model.scene import Scene
@@ -36,10 +36,8 @@ def evaluate(
         InputError: the sequence is not the one the scene was trained on (the number of frames differs).
     """
     if len(sequence) != len(scene.cameras):
-        raise InputError(
-            f"{sequence.path}: expected the {len(scene.cameras)} frames the scene was trained on; got {len(sequence)}. "
-            "Pass the same sequence."
-        )
+        frames = f"the {len(scene.cameras)} frames the scene was trained on"
+        raise input_error(sequence.path, frames, str(len(sequence)), "pass the same sequence.")
     result = Evaluation(_protocol(sequence, split, scene))
     result.per_frame = [{"index": i, "time": i / len(sequence)} for i in sequence.indices(split)]
     context = EvaluationContext(scene, sequence, split, networks, weights_dir, result)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from .worker import Job
 
 SHOWN_LOG_LINES = 3
@@ -63,8 +63,8 @@ def run_job(job: Job, started: list[subprocess.Popen] | None = None) -> Outcome:
         job_file.unlink()
         return Outcome(job, seconds)
     lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    said = " | ".join(lines[-SHOWN_LOG_LINES:]) or "nothing"
-    return Outcome(job, seconds, f"exit status {code}; {log} ends: {said}")
+    end = " | ".join(lines[-SHOWN_LOG_LINES:]) or "(empty)"
+    return Outcome(job, seconds, f"exit status {code}; end of {log}: {end}")
 
 
 @contextmanager
@@ -102,11 +102,11 @@ def ray_executor(address: str, threads: int) -> Iterator[Executor]:
     try:
         ray: Any = importlib.import_module("ray")
     except ImportError:
-        raise InputError("--ray: expected Ray to be installed; it is not. Try `pip install endoprior[ray]`.") from None
+        raise input_error("--ray", "Ray", "none", "`pip install endoprior[ray]`.") from None
     try:
         ray.init(**({} if address == "local" else {"address": address}), log_to_driver=False, include_dashboard=False)
     except (ConnectionError, OSError, ValueError, RuntimeError) as error:
-        raise InputError(f"--ray {address}: expected a running cluster; {error}. Start it or correct --ray.") from error
+        raise input_error(f"--ray {address}", "a running cluster", f"{error}", "start it or correct --ray.") from error
 
     def execute(jobs: list[Job]) -> Iterator[Outcome]:
         remote = ray.remote(num_cpus=threads, max_retries=0)(run_job)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..core.config_io import to_dict
 from ..data.files import read_json
 from .execute import Executor
@@ -131,9 +131,7 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]
 
     folder, chosen = sequence_folder(spec, name, out), spec.sequences[name]
     if unset := re.search(r"\$\{?(\w+)", str(folder)):
-        raise InputError(
-            f"{chosen.path}: expected {unset[1]} to be set; it is not. Set it, or use --data {name}=FOLDER."
-        )
+        raise input_error(chosen.path, f"the variable {unset[1]}", "none", f"set it, or use --data {name}=FOLDER.")
     if chosen.phantom and write and not folder.is_dir():
         write_phantom(folder, chosen.phantom)
     data = DataConfig(**chosen.reading)

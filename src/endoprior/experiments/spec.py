@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import yaml
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.config_io import from_dict, to_dict
 from ..core.presets import PresetName, preset
@@ -150,7 +150,7 @@ def _override(values: dict[str, Any], name: str, value: Any, where: str) -> None
         if not isinstance(values, dict):
             break
     if not isinstance(values, dict) or last not in values or isinstance(values[last], dict):
-        raise InputError(f"{where}: expected the dotted name of a config field; got {name}. See `endoprior train -h`.")
+        raise input_error(where, "the dotted name of a config field", f"{name}", "see `endoprior train -h`.")
     if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(values[last]) in (int, float):
         value = type(values[last])(values[last] * float(factor[1]))
     values[last] = value
@@ -169,11 +169,11 @@ def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
     try:
         for name in ("title", "sequences", "methods"):
             if not values.get(name):
-                raise InputError(f"{name}: expected an entry; found none. Add it.")
+                raise input_error(name, "an entry", "none", "add it.")
         spec = replace(from_dict(Spec, values, "spec"), folder=str(path.parent))
         for name, folder in (data or {}).items():
             if name not in spec.sequences:
-                raise InputError(f"--data {name}: no such sequence; expected one of {', '.join(spec.sequences)}.")
+                raise InputError(f"--data {name}: expected one of {', '.join(spec.sequences)}. Fix: correct the name.")
             known = replace(spec.sequences[name], path=str(folder.absolute()), phantom=None)
             spec = replace(spec, sequences=spec.sequences | {name: known})
         _check(spec)
@@ -190,19 +190,19 @@ def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
     """
     readers = {".yaml": load_yaml, ".yml": load_yaml, ".toml": tomllib.loads}
     if path.suffix not in readers:
-        raise InputError(f"{path}: expected a .yaml or .toml file; got {path.suffix or 'no suffix'}. Rename it.")
+        raise input_error(path, "a .yaml or .toml file", f"{path.suffix or 'no suffix'}", "rename it.")
     text = read_text(path, "a readable file", "Correct the path.")
     if path.resolve() in chain:
-        raise InputError(f"{path}: expected to end somewhere; it extends itself. Remove one `extends`.")
+        raise InputError(f"{path}: expected a file that does not extend itself. Fix: remove one `extends`.")
     if len(chain) >= MOST_EXTENDED:
-        raise InputError(f"{path}: expected at most {MOST_EXTENDED} files that extend each other. Merge some.")
+        raise InputError(f"{path}: expected at most {MOST_EXTENDED} files that extend each other. Fix: merge some.")
     try:
         values = readers[path.suffix](text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # a number of 5000 digits is a plain ValueError
-        raise InputError(f"{path}: expected valid {path.suffix[1:]}; {error}. Correct it.") from None
+        raise input_error(path, f"valid {path.suffix[1:]}", f"{error}", "correct it.") from None
     extends = values.pop("extends", []) if isinstance(values, dict) else None
     if not isinstance(extends, list) or not all(isinstance(name, str) for name in extends):
-        raise InputError(f"{path}: expected named entries, `extends` a list of files; got something else. Correct it.")
+        raise input_error(path, "named entries, `extends` a list of files", "something else", "correct it.")
     merged: dict[str, Any] = {}
     for part in [*(_read(path.parent / name, (*chain, path.resolve())) for name in extends), values]:
         both = {k for k in ("set", "set_for") if isinstance(merged.get(k), dict) and isinstance(part.get(k), dict)}
@@ -214,33 +214,38 @@ def _check(spec: Spec) -> None:
     for kind, names in (("sequences", spec.sequences), ("methods", spec.methods)):
         for name in names:
             if not NAME.fullmatch(name):
-                raise InputError(f"{kind}: expected a name of letters, digits and . _ + -; got {name!r}. Rename it.")
+                raise input_error(kind, "a name of letters, digits and . _ + -", f"{name!r}", "rename it.")
     for name, sequence in spec.sequences.items():
         if bool(sequence.path) == (sequence.phantom is not None):
-            raise InputError(f"sequences.{name}: expected either path or phantom; got both or none. Keep one.")
+            raise input_error(f"sequences.{name}", "either path or phantom", "both or none", "keep one.")
         if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
-            raise InputError(f"sequences.{name}: a phantom is written at its size; remove shrink and first_frames.")
+            raise InputError(f"sequences.{name}: a phantom has its own size. Fix: remove shrink and first_frames.")
         if sequence.format not in ("auto", *FORMATS):
-            raise InputError(f"sequences.{name}.format: expected auto, {', '.join(FORMATS)}; got {sequence.format!r}.")
+            raise input_error(
+                f"sequences.{name}.format",
+                f"auto, {', '.join(FORMATS)}",
+                f"{sequence.format!r}",
+                "see docs/datasets.md.",
+            )
     for name in spec.set_for:
         if name not in PresetName.__args__:
-            raise InputError(f"set_for: expected one of {', '.join(PresetName.__args__)}; got {name!r}. Choose one.")
+            raise input_error("set_for", f"one of {', '.join(PresetName.__args__)}", f"{name!r}", "choose one.")
     for name, method in spec.methods.items():
         if method.preset not in PresetName.__args__:
             choice = ", ".join(PresetName.__args__)
-            raise InputError(f"methods.{name}.preset: expected one of {choice}; got {method.preset!r}. Choose one.")
+            raise input_error(f"methods.{name}.preset", f"one of {choice}", f"{method.preset!r}", "choose one.")
     named = [spec.reference, *(name for claim in spec.claims for name in (claim.method, claim.than))]
     for name in named:
         if name not in spec.methods:
-            raise InputError(f"claims, compare_with: expected one of {', '.join(spec.methods)}; got {name!r}.")
+            raise input_error("claims, compare_with", f"one of {', '.join(spec.methods)}", f"{name!r}", "correct it.")
     for name in (*spec.scores, *(claim.score for claim in spec.claims)):
         if name not in all_scores():
-            raise InputError(f"scores, claims: expected names of scores; got {name!r}. Fix: see docs/scores.md.")
+            raise input_error("scores, claims", "names of scores", f"{name!r}", "see docs/scores.md.")
     if not spec.seeds or len(set(spec.seeds)) < len(spec.seeds):
-        raise InputError(f"seeds: expected different numbers; got {list(spec.seeds)}. Correct them.")
+        raise input_error("seeds", "different numbers", f"{list(spec.seeds)}", "correct them.")
     count = len(spec.seeds) * len(spec.sequences) * max(len(spec.budgets), 1) * len(spec.methods)
     if count > MOST_CELLS:
-        raise InputError(f"methods x sequences x budgets x seeds: expected at most {MOST_CELLS}; got {count}. Split.")
+        raise input_error("methods x sequences x budgets x seeds", f"at most {MOST_CELLS}", f"{count}", "split.")
     for cell in cells(spec):
         spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
 

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..system.atomic import whole_file, whole_folder, write_json
 from .formats import FORMATS, Format, Progress, load_format
 from .options import DEFAULTS, ExportOptions
@@ -44,9 +44,11 @@ def _reject_unused_options(options: ExportOptions, chosen: Format) -> None:
         given = getattr(options, field.name) != getattr(DEFAULTS, field.name)
         if given and field.name not in ("format", *chosen.options):
             known = ", ".join(f"--{name.replace('_', '-')}" for name in chosen.options) or "no options"
-            raise InputError(
-                f"--{field.name.replace('_', '-')}: expected an option of --format {options.format}; got one that it "
-                f"does not use. Fix: leave it out. The format takes {known}."
+            raise input_error(
+                f"--{field.name.replace('_', '-')}",
+                f"an option of --format {options.format}",
+                "one that it does not use",
+                f"leave it out. The format takes {known}.",
             )
 
 
@@ -57,9 +59,8 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
     if out.suffix in {suffix for name in FORMATS for suffix in load_format(name).suffixes}:
         _check_file(out, chosen.suffixes, options.format)
         if len(steps) != 1:
-            raise InputError(
-                f"{out}: expected one time step for one file; got {len(steps)}. "
-                "Fix: pass --times T, or a folder instead of a file."
+            raise input_error(
+                out, "one time step for one file", f"{len(steps)}", "pass --times T, or a folder instead of a file."
             )
         contents = chosen.files(scene, steps[0], options)
         _check_file(out, tuple(contents), options.format)
@@ -82,15 +83,15 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
 
 def _check_file(out: Path, suffixes: tuple[str, ...], name: str) -> None:
     if suffixes and out.suffix not in suffixes:
-        raise InputError(
-            f"{out}: expected a file name that ends in {' or '.join(suffixes)} for --format {name}; "
-            f"got {out.suffix or 'no suffix'}. Fix: choose another name."
+        raise input_error(
+            out,
+            f"a file name that ends in {' or '.join(suffixes)} for --format {name}",
+            out.suffix or "no suffix",
+            "choose another name.",
         )
     if suffixes and out.is_dir():
-        raise InputError(f"{out}: expected the name of a file; got a folder. Fix: choose another name.")
+        raise input_error(out, "the name of a file", "a folder", "choose another name.")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f"{out}: expected a place where a file can be written; got {error.strerror}. Fix: choose another."
-        ) from error
+        raise input_error(out, "a place where a file can be written", f"{error.strerror}", "choose another.") from error

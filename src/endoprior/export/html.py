@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..model.scene import Scene
 from ..system.atomic import whole_file
 from .formats import Format, Progress
@@ -63,21 +63,21 @@ def write_html(
     """
     out = Path(out)
     if out.is_dir():
-        raise InputError(
-            f"{out}: expected a file to write; got a folder. Fix: add a name such as {out / 'scene.html'}."
-        )
+        raise input_error(out, "a file to write", "a folder", f"add a name such as {out / 'scene.html'}.")
     if times is None:
         times = [i / len(scene.cameras) for i in range(len(scene.cameras))]
     if not times or any(b <= a for a, b in pairwise(times)):
-        raise InputError(f"times: expected one or more increasing times; got {times}. Fix: list each time once.")
+        raise input_error("times", "one or more increasing times", f"{times}", "list each time once.")
     quantized = quantize(scene, times)
     data, channels = pack(quantized.values, DEFLATE_LEVEL)
     page = _page(title or DEFAULT_TITLE, _about(scene, times, quantized, channels), data).encode()
     if len(page) > max_bytes:
         what = f"{len(times)} time steps of {quantized.values.shape[2]} Gaussians"
-        raise InputError(
-            f"{out}: expected at most {max_bytes / 1e6:.1f} MB; got {len(page) / 1e6:.1f} MB for {what}. "
-            "Fix: choose fewer with --times (the size grows with their number), or raise --max-mb."
+        raise input_error(
+            out,
+            f"at most {max_bytes / 1e6:.1f} MB",
+            f"{len(page) / 1e6:.1f} MB for {what}",
+            "choose fewer with --times (the size grows with their number), or raise --max-mb.",
         )
     with whole_file(out) as temporary:
         temporary.write_bytes(page)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..core.geometry import back_project, pixel_centers
 from ..model.scene import Scene
 from .axes import points_in_axes
@@ -47,9 +47,11 @@ def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, byt
         surface = render_surface(scene, step.time, step.camera(scene), options.min_alpha)
         mesh = depth_grid(surface, options.mesh_step, options.max_slope)
     if not len(mesh.triangles):
-        raise InputError(
-            f"--min-alpha: expected a value that leaves a surface at time {step.time:.3f}; got {options.min_alpha}. "
-            "Fix: lower it, or raise --max-slope."
+        raise input_error(
+            "--min-alpha",
+            f"a value that leaves a surface at time {step.time:.3f}",
+            f"{options.min_alpha}",
+            "lower it, or raise --max-slope.",
         )
     return {
         f".{options.mesh_format}": encode_mesh(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..model.scene import Scene
 from ..render import sh
 from .axes import points_in_axes
@@ -25,9 +25,8 @@ def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, byt
     opaque = splats.opacities >= options.min_opacity
     if not opaque.any():
         most = float(splats.opacities.max())
-        raise InputError(
-            f"--min-opacity: expected at most {most:.3f}, the largest opacity; got {options.min_opacity}. "
-            "Fix: lower it."
+        raise input_error(
+            "--min-opacity", f"at most {most:.3f}, the largest opacity", f"{options.min_opacity}", "lower it."
         )
     means = splats.means[opaque]
     towards = torch.nn.functional.normalize(means - torch.from_numpy(step.camera(scene).center).to(means.dtype))

@@ -11,7 +11,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..core.types import Splats
 from ..model.scene import Scene
 from ..render.sh import degree_of
@@ -43,7 +43,7 @@ def encode_spz(splats: Splats) -> bytes:
     """
     means, sh = splats.means.numpy().astype(np.float64), splats.sh.numpy()
     if not np.isfinite(means).all():
-        raise InputError("spz: expected finite positions; got NaN or infinity. Fix: train the scene again.")
+        raise input_error("spz", "finite positions", "NaN or infinity", "train the scene again.")
     fractional_bits = _fractional_bits(np.abs(means).max(initial=0.0))
     fixed = np.rint(means * 2.0**fractional_bits).astype("<i4")
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(means), degree_of(sh.shape[1]), fractional_bits, 0, 0)

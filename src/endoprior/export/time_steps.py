@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..core.types import Camera, Splats
 from ..data.sequence import Split, is_test_frame
 from ..model.scene import Scene
@@ -46,9 +46,7 @@ def frame_indices(num_frames: int, split: Split) -> list[int]:
     """
     indices = [i for i in range(num_frames) if split == "video" or is_test_frame(i) == (split == "test")]
     if not indices:
-        raise InputError(
-            f"--split: expected a split with frames; {split} has none of {num_frames}. Fix: choose another."
-        )
+        raise input_error("--split", "a split with frames", f"{split}, which has none", "choose another.")
     return indices
 
 
@@ -59,7 +57,7 @@ def selected_time_steps(scene: Scene, options: ExportOptions) -> list[TimeStep]:
         InputError: `options` select in more than one way, or the split is empty.
     """
     if options.canonical + bool(options.times) + (options.split != "video") > 1:
-        raise InputError("--canonical, --times, --split: expected one of them; got several. Fix: leave the others out.")
+        raise input_error("--canonical, --times, --split", "one of them", "several", "leave the others out.")
     if options.canonical:
         return [TimeStep("canonical", None)]
     if options.times:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..core.geometry import back_project, bilinear, project
 from ..model.carry import carry_points
 from ..model.scene import Scene
@@ -78,21 +78,19 @@ def read_query_points(file: Path, scene: Scene) -> QueryPoints:
     Raises:
         InputError: it is missing, has other columns, no rows, or a row outside the image or the sequence.
     """
-    wanted = f"{file}: expected a CSV file with columns x, y, frame"
+    wanted = "a CSV file with columns x, y, frame"
     try:
         with file.open(newline="", encoding="utf-8-sig") as text:
             rows = [(float(row["x"]), float(row["y"]), int(row["frame"])) for row in csv.DictReader(text)]
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise InputError(f"{wanted}; got {error!r}. Fix: correct the file.") from None
+        raise input_error(file, wanted, repr(error), "correct the file.") from None
     if not rows:
-        raise InputError(f"{wanted}; got no rows. Fix: add one.")
+        raise input_error(file, wanted, "no rows", "add one.")
     camera, total = scene.cameras[0], len(scene.cameras)
     for k, (x, y, frame) in enumerate(rows):
         if not (0 <= x <= camera.width and 0 <= y <= camera.height and 0 <= frame < total):
-            raise InputError(
-                f"{file}: expected x in [0, {camera.width}], y in [0, {camera.height}], frame in 0..{total - 1}; "
-                f"got {x:g}, {y:g}, {frame} for point {k}. Fix: correct the row."
-            )
+            want = f"x in [0, {camera.width}], y in [0, {camera.height}], frame in 0..{total - 1}"
+            raise input_error(file, want, f"{x:g}, {y:g}, {frame} for point {k}", "correct the row.")
     return QueryPoints(np.array([row[:2] for row in rows]), np.array([row[2] for row in rows], np.intp))
 
 
@@ -107,9 +105,7 @@ def grid_query_points(surface: Surface, spacing: int) -> QueryPoints:
     pixels = np.column_stack([column + 0.5, row + 0.5])
     pixels = pixels[np.isfinite(_depth_at(surface, pixels))]
     if not len(pixels):
-        raise InputError(
-            f"--grid-px: expected a grid with points on tissue in the first frame; got {spacing}. Fix: lower it."
-        )
+        raise input_error("--grid-px", "a grid with points on tissue in the first frame", f"{spacing}", "lower it.")
     return QueryPoints(pixels, np.zeros(len(pixels), np.intp))
 
 
@@ -130,9 +126,11 @@ def _back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDA
         if not np.isfinite(depth).all():
             point = np.flatnonzero(own)[np.flatnonzero(~np.isfinite(depth))[0]]
             x, y = queries.pixels[point]
-            raise InputError(
-                f"--points: expected pixels that show tissue; got ({x:g}, {y:g}) in frame {frame} for point {point}, "
-                "where no surface is rendered. Fix: move it."
+            raise input_error(
+                "--points",
+                "pixels that show tissue",
+                f"({x:g}, {y:g}) in frame {frame} for point {point}, where no surface is rendered",
+                "move it.",
             )
         positions[own] = back_project(queries.pixels[own], depth, camera)
     return positions

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..core.geometry import back_project, pixel_centers, project
 from ..core.types import Camera
 from .surface import Surface
@@ -34,7 +34,7 @@ def viewpoints(cameras: tuple[Camera, ...]) -> list[Camera]:
         kept.setdefault(np.round(camera.world_to_camera, 4).tobytes(), camera)
     different = list(kept.values())
     if len(different) < 2:
-        raise InputError("--mesh-method tsdf: expected several camera positions; got one. Fix: use --mesh-method grid.")
+        raise input_error("--mesh-method tsdf", "several camera positions", "one", "use --mesh-method grid.")
     return [different[i] for i in np.unique(np.linspace(0, len(different) - 1, MAX_VIEWS).round().astype(int))]
 
 
@@ -76,16 +76,14 @@ def _grid(views: list[Surface], voxel_mm: float) -> tuple[NDArray[np.float64], t
         if len(z := surface.depth[surface.depth > 0])
     ]
     if not points:
-        raise InputError("--min-alpha: expected a value that leaves a surface; got one too high. Fix: lower it.")
+        raise input_error("--min-alpha", "a value that leaves a surface", "one too high", "lower it.")
     visible = np.concatenate(points)
     margin = (TRUNCATION_VOXELS + 1) * voxel_mm
     low = visible.min(0) - margin
     shape = tuple(int(n) for n in np.ceil((visible.max(0) + margin - low) / voxel_mm) + 1)
     if np.prod(shape, dtype=np.float64) > MAX_VOXELS:
         least = voxel_mm * (np.prod(shape, dtype=np.float64) / MAX_VOXELS) ** (1 / 3)
-        raise InputError(
-            f"--voxel-mm: expected at least {least:.2f} for a scene of this size; got {voxel_mm}. Fix: raise it."
-        )
+        raise input_error("--voxel-mm", f"at least {least:.2f} for a scene of this size", f"{voxel_mm}", "raise it.")
     return low, shape
 
 

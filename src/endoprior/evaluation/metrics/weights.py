@@ -19,7 +19,7 @@ from pathlib import Path
 from pickle import UnpicklingError
 from typing import TYPE_CHECKING
 
-from ...core.checks import InputError
+from ...core.checks import input_error
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -104,7 +104,7 @@ def find_weights(files: WeightFiles, weights_dir: Path | None = None, *, downloa
     looked = ", ".join(f"{source} {folder}" for source, folder in places)
     raise WeightsMissing(
         f"no weights for {files.network}: expected {' or '.join(files.names)} in {looked}; {tried}. "
-        f"Put the file in a folder and name it with --weights-dir or {ENVIRONMENT_VARIABLE}."
+        f"Fix: put the file in a folder and name it with --weights-dir or {ENVIRONMENT_VARIABLE}."
     )
 
 
@@ -127,10 +127,10 @@ def load_weights(found: FoundWeights) -> Mapping[str, Tensor]:
             stored = torch.load(found.path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, RuntimeError, ValueError, UnpicklingError, SafetensorError) as error:
         raise WeightsMissing(
-            f"{found.path}: expected network weights; got an unreadable file ({_first_line(error)}). Replace it."
+            f"{found.path}: expected network weights, got an unreadable file ({_first_line(error)}). Fix: replace it."
         ) from error
     if not (isinstance(stored, Mapping) and all(isinstance(value, torch.Tensor) for value in stored.values())):
-        raise WeightsMissing(f"{found.path}: expected network weights; got no named tensors. Replace it.")
+        raise WeightsMissing(f"{found.path}: expected network weights, got no named tensors. Fix: replace it.")
     return stored
 
 
@@ -153,7 +153,7 @@ def select_weights(found: FoundWeights, keys: Mapping[str, Tensor], origin: Mapp
         if tensor is None or tensor.shape != keys[name].shape:
             got = "nothing" if tensor is None else f"shape {tuple(tensor.shape)}"
             raise WeightsMissing(
-                f"{found.path}: expected {stored_name} of shape {tuple(keys[name].shape)}; got {got}. "
+                f"{found.path}: expected {stored_name} of shape {tuple(keys[name].shape)}, got {got}. "
                 "Replace the file with torchvision's weights of this network."
             )
         selected[name] = tensor
@@ -163,9 +163,7 @@ def select_weights(found: FoundWeights, keys: Mapping[str, Tensor], origin: Mapp
 def _existing_folder(name: str, folder: Path) -> Path:
     """The folder itself, or InputError naming the option that gave it."""
     if not folder.is_dir():
-        raise InputError(
-            f"{name}: expected a folder of network weights; got {folder}, which is not one. Check the path."
-        )
+        raise input_error(name, "a folder of network weights", f"{folder}, which is not one", "check the path.")
     return folder
 
 
