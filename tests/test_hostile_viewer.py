@@ -329,7 +329,7 @@ def test_saved_views_are_limited(viewer, good):
     while f"{MAX_KEPT} views" not in viewer.panel.status.content and time.monotonic() < end:
         time.sleep(0.05)
     time.sleep(0.2)
-    assert f"{MAX_KEPT} views kept" in viewer.panel.status.content
+    assert f"{MAX_KEPT} saved views" in viewer.panel.status.content
     good.set(viewer.panel.forget, True)
 
 

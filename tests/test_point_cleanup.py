@@ -113,7 +113,7 @@ def test_invalid_points_are_named(points):
 def test_concatenated_keeps_order_and_origins():
     rng = np.random.default_rng(5)
     cloud = cloud_of(rng.random((10, 3), np.float32), rng.random((10, 3), np.float32))
-    again = concatenated([cloud.taken(np.arange(4)), cloud.taken(np.arange(10) >= 4)])
+    again = concatenated([cloud.subset(np.arange(4)), cloud.subset(np.arange(10) >= 4)])
     for name in ("points", "colors", "origins"):
         np.testing.assert_array_equal(getattr(again, name), getattr(cloud, name))
     assert len(concatenated([])) == 0

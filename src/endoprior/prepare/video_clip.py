@@ -25,7 +25,6 @@ class StereoFrame:
 
     index: int
     """Position of the frame in the source, from 0."""
-
     left: NDArray[np.uint8]
     """(h, w, 3)."""
     right: NDArray[np.uint8] | None

@@ -136,7 +136,7 @@ def status(viewable: Viewable, settings: ViewSettings, num_kept: int) -> str:
     lines = [f"**{plain(viewable.title)}**", f"frame {settings.frame} of {len(viewable.cameras)}"]
     if legend := viewable.legend(settings):
         lines.append(legend)
-    if settings.in_browser and not viewable.sent(settings):
+    if settings.in_browser and not viewable.renders_in_browser(settings):
         lines.append("This layer is rendered by the server.")
     if not settings.endoscope and settings.layer in ORIGINALS and "color" in viewable.layers:
         lines.append("Input frames are available in the endoscope view only; showing color.")

@@ -128,8 +128,8 @@ class ViewableScene:
         frames = np.linspace(0, len(self.cameras) - 1, min(MOTION_SAMPLES, len(self.cameras))).astype(int)
         return max(*(float(np.percentile(self._moved(int(i)).cpu().numpy(), 98)) for i in frames), 1e-3)
 
-    def sent(self, settings: ViewSettings) -> bool:
-        """See `Viewable.sent`: layers that are not a color per Gaussian are rendered on the server."""
+    def renders_in_browser(self, settings: ViewSettings) -> bool:
+        """See `Viewable.renders_in_browser`: layers that are not a color per Gaussian are rendered on the server."""
         return settings.in_browser and settings.layer in BROWSER_LAYERS
 
     @torch.no_grad()
