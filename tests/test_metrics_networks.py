@@ -176,7 +176,7 @@ def test_missing_weights_give_a_reason_and_no_other_network(no_weights):
         lpips_distance("alex", no_weights, download=False)
 
 
-def test_weights_of_another_network_are_refused(no_weights):
+def test_weights_of_another_network_are_rejected(no_weights):
     save_file(constant_weights(import_torchvision().models.optical_flow.raft_small), no_weights / RAFT_LARGE.names[0])
     with pytest.raises(WeightsMissing, match=r"raft_large.safetensors: expected .* of shape"):
         raft_flow("large", no_weights, download=False)
