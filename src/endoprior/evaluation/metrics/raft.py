@@ -33,14 +33,14 @@ class RaftFlow:
     score_name: str
     """`flow_error` for RAFT-large, `flow_error_raft_small` for RAFT-small."""
     weights: FoundWeights
-    """Where the weights came from."""
+    """File of the weights."""
     device: str
 
     def __call__(self, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(H, W, 2) displacement (x, y) in px from `first` to `second`, both (H, W, 3) 8-bit RGB.
 
-        Sides that are no multiple of 8 are continued to the right and below by repeating the last column and row, and
-        the flow is cut back to the image.
+        Sides that are not a multiple of 8 are padded at the right and bottom by the last column and row; the flow is
+        cropped to the image.
 
         Raises:
             ValueError: shapes differ.
@@ -59,7 +59,7 @@ class RaftFlow:
 
 
 def _network_input(image: NDArray[np.uint8]) -> Tensor:
-    """(1, 3, H', W') image in [-1, 1] as torchvision's preset scales it, sides continued to multiples of 8."""
+    """(1, 3, H', W') image in [-1, 1] as torchvision's preset scales it, sides padded to multiples of 8."""
     import torch
 
     height, width = image.shape[:2]
@@ -83,14 +83,14 @@ def raft_flow(
         download: False never touches the network.
     Raises:
         InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
-        ScoreUnavailable: torchvision or the weights cannot be had, with the reason.
+        ScoreUnavailable: torchvision or the weights are missing, with the reason.
     """
     import torch
 
     files, score_name = {"large": (RAFT_LARGE, "flow_error"), "small": (RAFT_SMALL, "flow_error_raft_small")}[variant]
     models = import_torchvision().models.optical_flow
     found = find_weights(files, weights_dir, download=download)
-    # A new network draws random weights; those draws must not shift the caller's random numbers.
+    # A new network has random weights; creating them must not change the caller's random numbers.
     with torch.random.fork_rng(devices=[]):
         network = (models.raft_large if variant == "large" else models.raft_small)(weights=None)
     state = network.state_dict()
