@@ -12,9 +12,11 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
 
+# Two processes, because most of a first run is compiling kernels, which takes one core. Files stay together.
 test: $(VENV)/.test-installed lint browser
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
+# One process: slow tests start processes of their own and watch the clock.
 test-all: test
 	$(BIN)/python -m pytest -m slow
 

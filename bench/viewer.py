@@ -24,9 +24,10 @@ from websockets.sync.client import connect
 import endoprior.view.server as server_module
 from endoprior.core.presets import preset
 from endoprior.model.scene import Scene
-from endoprior.view import stage
-from endoprior.view.scene_subject import SceneSubject
-from endoprior.view.session import REST_SECONDS, Look
+from endoprior.view import browsers
+from endoprior.view.panel import control_id
+from endoprior.view.view_settings import REST_SECONDS, ViewSettings
+from endoprior.view.viewable_scene import ViewableScene
 
 FRAMES = 24
 LAYERS = ("color", "depth", "motion")
@@ -76,7 +77,7 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     """For each size and layer the time from slider to picture; drawing and JPEG alone."""
     measured = []
     for size in sizes:
-        viewer = server_module.Viewer(make_subject(size))
+        viewer = server_module.Viewer(make_viewable(size))
         worker = threading.Thread(target=work, args=(viewer, stop := threading.Event()), daemon=True)
         worker.start()
         client = Client(viewer.port)
@@ -88,29 +89,29 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
 
         def move(_: object, client=client, viewer=viewer, moves=moves) -> None:
             slider = {"value": 1 + next(moves) * 7 % (FRAMES - 1)}
-            client.send("GuiUpdateMessage", uuid=viewer.panel.frame._impl.uuid, updates=slider)
+            client.send("GuiUpdateMessage", uuid=control_id(viewer.panel.frame), updates=slider)
             client.wait_for("BackgroundImageMessage")
 
         picture = (size.width, size.height)
         for layer in LAYERS:
             name = server_module.panel.LAYER_NAMES[layer]
-            client.send("GuiUpdateMessage", uuid=viewer.panel.layer._impl.uuid, updates={"value": name})
+            client.send("GuiUpdateMessage", uuid=control_id(viewer.panel.layer), updates={"value": name})
             steps = {"_settle": settle, "": move}
             measured += common.rows(f"viewer {layer}", common.race(steps), size.num, picture)
         stop.set()
         worker.join()
         viewer.close()
-        measured += part_rows(viewer.subject, size)
+        measured += part_rows(viewer.viewable, size)
     return measured
 
 
-def part_rows(subject: SceneSubject, size: common.Size) -> list[common.Row]:
+def part_rows(viewable: ViewableScene, size: common.Size) -> list[common.Row]:
     """Drawing alone, and JPEG alone, at full size."""
-    camera = subject.cameras[0]
-    pixels = cv2.cvtColor(subject.picture(Look(frame=1), camera), cv2.COLOR_RGB2BGR)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, stage.HASTY_QUALITY]
+    camera = viewable.cameras[0]
+    pixels = cv2.cvtColor(viewable.picture(ViewSettings(frame=1), camera), cv2.COLOR_RGB2BGR)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, browsers.PREVIEW_QUALITY]
     steps = {
-        "drawing alone": lambda _: subject.picture(Look(frame=1), camera),
+        "drawing alone": lambda _: viewable.picture(ViewSettings(frame=1), camera),
         "JPEG alone": lambda _: cv2.imencode(".jpg", pixels, quality),
     }
     return common.rows("viewer", common.race(steps), size.num, (size.width, size.height))
@@ -122,13 +123,13 @@ def work(viewer: server_module.Viewer, stop: threading.Event) -> None:
         viewer.work(0.2)
 
 
-def make_subject(size: common.Size) -> SceneSubject:
+def make_viewable(size: common.Size) -> ViewableScene:
     """A scene of FRAMES frames that stands still; deforming costs the same as if it moved."""
     splats, camera = scenes.splats(size)
     cfg = preset("default").fitted(68)
     nothing = torch.zeros(len(splats))
     scene = Scene(scenes.gaussians(splats, cfg), None, cfg, (camera,) * FRAMES, 25.0, nothing, nothing)
-    return SceneSubject(scene, "bench")
+    return ViewableScene(scene, "bench")
 
 
 if __name__ == "__main__":

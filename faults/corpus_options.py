@@ -103,7 +103,7 @@ OPTIONS = [
     with_data("check, masks that are not there", "check data --data.use-gt-masks", "gt_masks"),
     with_data("train --init-budget -5", "train data out --init-budget -5", "--init-budget"),
     with_data("train on a device there is none of", "train data out --device cuda", "--device"),
-    Case("phantom of 16 Mpx", given("phantom out --width 4096 --height 4096"), ("`width`", "4096x4096", "22 GB")),
+    Case("phantom of 16 Mpx", given("phantom out --width 4096 --height 4096"), ("width", "4096x4096", "22 GB")),
     Case("demo --frames 1", given("demo out --frames 1"), ("frames",)),
     Case("demo --frames 10^9", given(f"demo out --frames {HUGE}"), ("frames",)),
     Case("demo --seed -1", given("demo out --seed -1"), ("seed",)),

@@ -65,7 +65,7 @@ TAG = "K_left: !!python/object/apply:os.system ['touch executed']\n"
 CALIBRATIONS = [
     Case("no calibration", beside("--calibration", "c.yaml"), ("c.yaml", "o such file")),
     Case("a calibration of another kind", calibrated("c.txt", "x"), ("c.txt", ".yaml")),
-    Case("an empty calibration", calibrated("c.yaml", ""), ("c.yaml", "named quantities")),
+    Case("an empty calibration", calibrated("c.yaml", ""), ("c.yaml", "named values")),
     Case("a calibration that is a list", calibrated("c.json", "[1, 2]"), ("c.json", "list")),
     Case("YAML aliases that explode", calibrated("c.yaml", BOMB), ("c.yaml", "aliases")),
     Case("YAML that executes", calibrated("c.yaml", TAG), ("c.yaml", "python/object")),
@@ -213,8 +213,8 @@ PARTS = [
     ),
     Case("the video is the output", preparing("clip.mkv"), ("clip.mkv", "a file")),
     Case("an output that is in use", preparing("out", put("out/x", "x")), ("out", "files in it")),
-    Case("an output below a file", preparing("clip.mkv/out"), ("clip.mkv/out", "a place")),
-    Case("an output where nothing can be", preparing("/proc/x/out"), ("/proc/x/out", "a place")),
+    Case("an output below a file", preparing("clip.mkv/out"), ("clip.mkv/out", "a path")),
+    Case("an output where nothing can be", preparing("/proc/x/out"), ("/proc/x/out", "a path")),
     Case("an output of no name", preparing(""), ("empty",)),
     Case("an output inside the pictures", pictures_folder(out="clip/out"), leaves=("clip/out", "clip")),
 ]

@@ -107,7 +107,7 @@ CASES = [
     Case("a picture called .mp4", video("clip.mp4", SOUND), ("clip.mp4", "a video")),
     Case("a Matroska file cut short", cut_video(".mkv"), ("clip.mkv", "Copy it again")),
     Case("an MP4 file cut short", cut_video(".mp4"), ("clip.mp4", "a video file")),
-    Case("sound without pictures", given("prepare clip.mp4 out", sound_only), ("clip.mp4", "without pictures")),
+    Case("sound without pictures", given("prepare clip.mp4 out", sound_only), ("clip.mp4", "without images")),
     Case("a video of no pictures", encoded([]), ("clip.mkv",)),
     Case("a video of one picture", encoded([(64, 48)]), ("clip.mkv", "at least 2")),
     Case("a video of 1x1 px", encoded([(1, 1)] * 3), ("32",)),
@@ -149,6 +149,6 @@ CASES = [
     Case(
         "a second eye that ends",
         second_eye([(96, 80)] * 3, "--calibration c.json"),
-        ("right.mkv", "picture 3"),
+        ("right.mkv", "frame 3"),
     ),
 ]

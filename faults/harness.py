@@ -49,7 +49,7 @@ class Done:
     @property
     def in_words(self) -> str:
         """What it said, for a row: the reason of a refusal, else status and the end of the complaint."""
-        if self.one_line and (reason := re.search(r"[,;] got (.*?)\. ", self.err)):
+        if self.one_line and (reason := re.search(r"[;,] got (.*?)\. ", self.err)):
             return f"refused: {reason[1]}"
         return f"exit {self.status}: {' '.join(self.err.split())[-160:] or 'nothing on stderr'}"
 

@@ -139,9 +139,7 @@ def test_round_border(data):
     inside = np.zeros((HEIGHT, WIDTH, 1), np.uint8)
     cv2.circle(inside, (WIDTH // 2, HEIGHT // 2), 120, 1, -1)
     edit(data / "images", lambda image, _: image * inside)
-    assert (
-        only(data, "round-border").what == "the image is round (radius 120 px) and its outside counts as tissue"
-    )
+    assert only(data, "round-border").what == "the image is round (radius 120 px) and its outside counts as tissue"
 
 
 def test_burned_in_writing(data):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_training import tiny_config
+from tiny_training import KINDS, tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import HexPlaneConfig
@@ -27,9 +27,6 @@ from endoprior.training.divergence import (
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.optimizer import Optimizer
 from endoprior.training.trainer import Trainer
-
-KINDS = ("basis", "hexplane")
-
 
 BAD = [float("nan"), float("inf"), -float("inf"), 2 * LARGEST_GRADIENT, -1e30]
 
@@ -96,23 +93,23 @@ def poison(trainer, name, value):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e20])
-@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sh_dc"])
-def test_an_unusable_gradient_stops_before_anything_changes(tiny_sequence, kind, name, value):
-    trainer = Trainer(load_sequence(tiny_sequence), tiny_config(kind))
+def test_an_unusable_gradient_stops_before_anything_changes(tiny_sequence, kind):
+    trainer = Trainer(load_sequence(tiny_sequence), tiny_config(kind, fine=40))
     trainer.start()
     for _ in range(8):
         trainer.step()
-    before, iteration = state_of(trainer), trainer.state.iteration
-    handle = poison(trainer, name, value)
-    with pytest.raises(Diverged, match=f"gradient of {name}"):
-        trainer.step()
-    after = state_of(trainer)
-    assert trainer.state.iteration == iteration
-    assert all(torch.equal(before[key], after[key]) for key in before)
-    handle.remove()
-    trainer.step()  # and it could go on
-    assert all(bool(value.isfinite().all()) for value in state_of(trainer).values())
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh_dc"):
+        for value in (float("nan"), float("inf"), 1e20):
+            before, iteration = state_of(trainer), trainer.state.iteration
+            handle = poison(trainer, name, value)
+            with pytest.raises(Diverged, match=f"gradient of {name}"):
+                trainer.step()
+            after = state_of(trainer)
+            assert trainer.state.iteration == iteration
+            assert all(torch.equal(before[key], after[key]) for key in before), (name, value)
+            handle.remove()
+            trainer.step()  # and it could go on
+            assert all(bool(values.isfinite().all()) for values in state_of(trainer).values()), (name, value)
 
 
 def test_a_poisoned_plane_is_noticed(tiny_sequence):

@@ -33,7 +33,7 @@ from endoprior.model.deformation import Offsets
 
 
 class Static:
-    def offsets(self, means, time):
+    def offsets(self, means, time, ops):
         return Offsets(torch.zeros_like(means))
 
 

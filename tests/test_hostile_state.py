@@ -45,13 +45,17 @@ def seconds(most: int):
         signal.signal(signal.SIGALRM, before)
 
 
-def complaint(path: Path) -> str:
-    """What is said about a scene that cannot be used: one line, no control characters, naming the file."""
-    with seconds(20), pytest.raises(InputError) as caught:
-        load_scene(path)
-    text = str(caught.value)
-    assert text.startswith(f"{path}: ") and ("expected" in text or "must be" in text or "no such field" in text), text
-    assert text.isprintable() and len(text) < 1500
+def complaint(path: Path, case: str = "") -> str:
+    """The message about a scene that cannot be used: one line, no control characters, naming the file."""
+    with seconds(20):
+        try:
+            load_scene(path)
+        except InputError as error:
+            text = str(error)
+        else:
+            pytest.fail(f"{case}: the scene was loaded")
+    assert text.startswith(f"{path}: ") and any(word in text for word in ("expected", "must be", "no such field")), case
+    assert text.isprintable() and len(text) < 1500, case
     return text
 
 
@@ -66,7 +70,12 @@ def scene_file(tmp_path_factory) -> StateFile:
 @pytest.fixture
 def scene(scene_file) -> StateFile:
     """A copy to change."""
-    return StateFile(json.loads(json.dumps(scene_file.about)), {k: v.copy() for k, v in scene_file.arrays.items()})
+    return copy_of(scene_file)
+
+
+def copy_of(file: StateFile) -> StateFile:
+    """The same file, to change."""
+    return StateFile(json.loads(json.dumps(file.about)), {name: values.copy() for name, values in file.arrays.items()})
 
 
 @pytest.fixture
@@ -98,10 +107,10 @@ BYTES = {
 }
 
 
-@pytest.mark.parametrize("name", BYTES)
-def test_bytes_that_are_no_such_file(scene, path, name):
-    path.write_bytes(BYTES[name](json.dumps(scene.header()).encode(), scene.data()))
-    complaint(path)
+def test_bytes_that_are_no_such_file(scene, path):
+    for name, change in BYTES.items():
+        path.write_bytes(change(json.dumps(scene.header()).encode(), scene.data()))
+        complaint(path, name)
 
 
 MEANS = "gaussians.means"
@@ -129,10 +138,10 @@ HEADERS = {
 }
 
 
-@pytest.mark.parametrize("name", HEADERS)
-def test_headers_that_lie(scene, path, name):
-    scene.write(path, HEADERS[name])
-    complaint(path)
+def test_headers_that_lie(scene, path):
+    for name, change in HEADERS.items():
+        scene.write(path, change)
+        complaint(path, name)
 
 
 def config(**changes):
@@ -177,12 +186,13 @@ ABOUT = {
 }
 
 
-@pytest.mark.parametrize("name", ABOUT)
-def test_descriptions_that_do_not_fit(scene, path, name, monkeypatch):
+def test_descriptions_that_do_not_fit(scene_file, path, monkeypatch):
     monkeypatch.setattr(hexplane.PlaneGrid, "__init__", lambda *_: pytest.fail("planes made before they were seen"))
-    ABOUT[name](scene.about)
-    scene.write(path)
-    complaint(path)
+    for name, change in ABOUT.items():
+        scene = copy_of(scene_file)
+        change(scene.about)
+        scene.write(path)
+        complaint(path, name)
 
 
 def set_entry(name, index, value):
@@ -213,11 +223,12 @@ ARRAYS = {
 }
 
 
-@pytest.mark.parametrize("name", ARRAYS)
-def test_arrays_that_no_scene_has(scene, path, name):
-    ARRAYS[name](scene.arrays)
-    scene.write(path)
-    complaint(path)
+def test_arrays_that_no_scene_has(scene_file, path):
+    for name, change in ARRAYS.items():
+        scene = copy_of(scene_file)
+        change(scene.arrays)
+        scene.write(path)
+        complaint(path, name)
 
 
 def test_each_array_must_be_there_of_its_type_and_shape_and_finite(scene_file, path):

@@ -18,12 +18,12 @@ from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
 from endoprior.initialization.cleanup import PointCloud, merge_voxels, remove_outliers
 from endoprior.initialization.sampling import (
-    draw_pixels,
     eroded_mask,
     initial_log_scales,
     initial_points,
     pixel_probability,
     quotas,
+    sample_pixels,
     sampling_distribution,
 )
 from endoprior.priors import joint_texture_prior
@@ -150,7 +150,7 @@ def test_single_draws_follow_the_distribution(rho, mask):
     rng = np.random.default_rng(7)
     draws = 50_000
     drawn = np.bincount(
-        [draw_pixels(probability, 1, rng)[0] for _ in range(draws)], minlength=probability.size
+        [sample_pixels(probability, 1, rng)[0] for _ in range(draws)], minlength=probability.size
     ).reshape(probability.shape)
     possible = probability > 0
     assert not drawn[~possible].any()
@@ -166,7 +166,7 @@ def test_a_million_draws_without_replacement_follow_the_distribution(rho, mask):
     rng = np.random.default_rng(8)
     drawn = np.zeros(probability.size)
     for _ in range(200):
-        flat = draw_pixels(field, 5000, rng)
+        flat = sample_pixels(field, 5000, rng)
         assert len(np.unique(flat)) == 5000
         drawn += np.bincount(flat % probability.size, minlength=probability.size)
     expected = 1_000_000 * probability.ravel()
@@ -178,7 +178,7 @@ def test_pairs_are_drawn_in_turn():
     weights = np.array([[1.0, 2.0, 3.0]])
     rng = np.random.default_rng(9)
     draws = 20_000
-    pairs = np.array([draw_pixels(weights, 2, rng) for _ in range(draws)])
+    pairs = np.array([sample_pixels(weights, 2, rng) for _ in range(draws)])
     # P{1,2} = 2/6 * 3/4 + 3/6 * 2/3
     share = (pairs == [1, 2]).all(1).mean()
     assert share == pytest.approx(2 / 6 * 3 / 4 + 3 / 6 * 2 / 3, abs=4 * 0.5 / math.sqrt(draws))  # 4 standard errors
@@ -187,9 +187,9 @@ def test_pairs_are_drawn_in_turn():
 def test_draws_take_what_there_is():
     weights = np.array([[0, 0.5, 0, 1e-300]])
     rng = np.random.default_rng(0)
-    np.testing.assert_array_equal(draw_pixels(weights, 10, rng), [1, 3])
-    assert len(draw_pixels(weights, 0, rng)) == 0
-    assert len(draw_pixels(np.zeros((2, 2)), 3, rng)) == 0
+    np.testing.assert_array_equal(sample_pixels(weights, 10, rng), [1, 3])
+    assert len(sample_pixels(weights, 0, rng)) == 0
+    assert len(sample_pixels(np.zeros((2, 2)), 3, rng)) == 0
 
 
 @pytest.mark.parametrize(("budget", "frames"), [(20_000, 55), (20_000, 136), (3, 5), (7, 1), (10, 5)])
@@ -274,7 +274,7 @@ def test_frame_that_is_too_small_gives_what_it_has_and_says_so(mask, caplog):
         cloud = initial_points(frames, InitConfig(budget=90))
     assert len(cloud) == 30 + 5
     assert [record.getMessage() for record in caplog.records] == [
-        "initialization: 55 of 90 points could not be drawn, too few tissue pixels"
+        "initialization: 55 of 90 points are missing, too few tissue pixels"
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 from dataclasses import replace
@@ -26,29 +27,35 @@ def cold(tmp_path, monkeypatch):
 
     instead.status = 0
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(kernel_cache, "_filled", set())
     monkeypatch.setattr(kernel_cache.subprocess, "run", instead)
-    return asked, instead
+    next_process()
+    yield asked, instead
+    next_process()
 
 
-def test_it_is_filled_once_for_what_needs_the_same_kernels(cold, monkeypatch):
+def next_process():
+    """Forget what this process knows of the cache."""
+    importlib.reload(kernel_cache)
+
+
+def test_it_is_filled_once_for_what_needs_the_same_kernels(cold):
     asked, _ = cold
     cfg, said = preset("default"), []
     kernel_cache.fill(cfg, said.append)
     kernel_cache.fill(replace(cfg, seed=7, init=replace(cfg.init, budget=99)), said.append)
     assert asked == [json.loads(json.dumps(to_dict(cfg)))] and len(said) == 1
-    monkeypatch.setattr(kernel_cache, "_filled", set())  # as in the next process
+    next_process()
     kernel_cache.fill(cfg, said.append)
     assert len(asked) == 1 and len(said) == 1
     kernel_cache.fill(preset("paper"), said.append)
     assert len(asked) == 2
 
 
-def test_a_warm_up_that_fails_is_tried_again_by_the_next_process(cold, monkeypatch):
+def test_a_warm_up_that_fails_is_tried_again_by_the_next_process(cold):
     asked, instead = cold
     instead.status = 1
     kernel_cache.fill(preset("default"))
-    monkeypatch.setattr(kernel_cache, "_filled", set())
+    next_process()
     kernel_cache.fill(preset("default"))
     assert len(asked) == 2
 

@@ -7,7 +7,7 @@ from numba import njit
 
 from endoprior.compute import float64_lanes as f8
 from endoprior.compute.neighbors import MAX_COORDINATE, curve_order
-from endoprior.training.temporal import neighbors
+from endoprior.training.temporal_numba import neighbors
 
 NUM = 700
 """Points of a cloud: more than 64 blocks of eight, so there are three levels of groups, and the last block is short."""

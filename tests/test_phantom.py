@@ -14,7 +14,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.geometry import bilinear
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.phantom.generate import build_scene, visible_points
-from endoprior.phantom.instrument import JAW_MM, draw_tools, pack_tool
+from endoprior.phantom.instrument import JAW_MM, pack_tool, render_tools
 from endoprior.phantom.motion import ToolPose, build_motion, smooth_step
 from endoprior.phantom.noise import cells, fractal
 from endoprior.phantom.raster import FAR, rasterize, vertex_normals
@@ -90,7 +90,7 @@ def test_mask_marks_a_tool_of_sensible_size(folder):
     for index in range(SMALL.frames):
         image, mask, _, truth, _ = frame(folder, index)
         assert 0.02 < mask.mean() < 0.40
-        # Inside the mask the picture is mostly something else than tissue: metal has little color.
+        # Inside the mask the image is mostly something else than tissue: metal has little color.
         gap = np.abs(image.astype(float) - truth).max(-1)
         assert np.median(gap[mask]) > 20 > np.percentile(gap[~mask], 99)
 
@@ -109,7 +109,7 @@ def test_depth_is_tissue_depth_with_stereo_errors(folder):
         measured = (depth > 0) & ~mask
         error = np.abs(depth - z)[measured]
         assert 0.05 < np.median(error) < 1.0  # about 0.3 mm is intended; 0 would mean no error model
-        assert 0 < (depth == 0).mean() < 0.2  # 3-5 % at full size; bands one pixel wide weigh more in a small picture
+        assert 0 < (depth == 0).mean() < 0.2  # 3-5 % at full size; bands one pixel wide weigh more in a small image
         # A tool is nearer than the tissue behind it, and depth sees the tool.
         inside = (depth > 0) & cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
         assert np.median((z - depth)[inside]) > 3
@@ -159,7 +159,7 @@ def test_right_eye_sees_the_left_picture_shifted_by_disparity(folder):
         shift: np.abs(bilinear(right, np.stack([x - shift * disparity, y], -1)) - image)[interior].mean()
         for shift in (0.0, 0.7, 1.0, 1.3)
     }
-    # Highlights and noise differ between the eyes; the match must still be clearly best at the true disparity.
+    # Highlights and noise differ between the cameras; the match must still be clearly best at the true disparity.
     assert gap[1.0] < 0.85 * min(gap[0.7], gap[1.3]) and gap[1.0] < 0.5 * gap[0.0]
 
 
@@ -223,7 +223,7 @@ def test_occupied_output_is_refused(tmp_path):
         {"baseline_mm": -4.2},
     ],
 )
-def test_bad_sizes_are_input_errors(change):
+def test_values_out_of_range_are_input_errors(change):
     with pytest.raises(InputError, match="expected") as caught:
         PhantomConfig(**change)
     assert "\n" not in str(caught.value)
@@ -281,7 +281,7 @@ def test_plane_coordinates_and_grid_are_inverse():
     cfg = PhantomConfig(seed=5)
     plane = build_plane(cfg)
     assert np.allclose(plane.axes @ plane.axes.T, np.eye(3), atol=1e-12)
-    assert plane.axes[2, 2] < 0 and plane.axes[1, 1] > 0  # normal to the camera, e_b down the picture
+    assert plane.axes[2, 2] < 0 and plane.axes[1, 1] > 0  # normal to the camera, e_b down the image
     grid_u, grid_v = np.meshgrid([0.0, 0.3, 1.0], [0.1, 0.8], indexing="xy")
     a, b = plane.coordinates(grid_u, grid_v)
     assert np.allclose(plane.grid(a, b), (grid_u, grid_v), atol=1e-12)
@@ -349,8 +349,8 @@ def test_tool_depth_closed_form():
     pose = ToolPose(np.array([-80.0, 0.0, 60.0]), np.array([20.0, 0.0, 60.0]), 0.2, 0.0)
     tool = pack_tool(pose, (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)).astype(float)
     wrist, back = tool[3:6], tool[6:9]
-    eye = np.zeros(3, np.float32)
-    color, depth = draw_tools((pose, pose), np.full((80, 96), 90, np.float32), eye, 80.0, (48.0, 40.5))
+    camera = np.zeros(3, np.float32)
+    color, depth = render_tools((pose, pose), np.full((80, 96), 90, np.float32), camera, 80.0, (48.0, 40.5))
     y, x = np.nonzero(depth < FAR)
     points = np.stack([(x + 0.5 - 48) / 80, (y + 0.5 - 40.5) / 80, np.ones(len(x))], -1) * depth[y, x, None]
     along = (points - wrist) @ back
@@ -360,7 +360,7 @@ def test_tool_depth_closed_form():
     assert radial.max() < 0.5 * JAW_MM and along.min() > -JAW_MM - 0.5
     assert (depth[40] < FAR).sum() > 60 and depth[0, 0] == FAR
     assert (color[depth < FAR] > 0).all() and np.isfinite(color).all() and (color[depth >= FAR] == 0).all()
-    _, hidden = draw_tools((pose, pose), np.full((80, 96), 50, np.float32), eye, 80.0, (48.0, 40.5))
+    _, hidden = render_tools((pose, pose), np.full((80, 96), 50, np.float32), camera, 80.0, (48.0, 40.5))
     assert (hidden == FAR).all()  # nearer tissue hides the tool
 
 

@@ -31,9 +31,9 @@ def test_half_occluded_strip_lies_left_of_the_near_object():
 
 
 def test_glints_have_no_depth():
-    picture = np.zeros((40, 640, 3), np.uint8)
-    picture[20, 100] = 255
-    depth = stereo_depth(np.full((40, 640), 75, np.float32), picture, PhantomConfig(), np.random.default_rng(0))
+    image = np.zeros((40, 640, 3), np.uint8)
+    image[20, 100] = 255
+    depth = stereo_depth(np.full((40, 640), 75, np.float32), image, PhantomConfig(), np.random.default_rng(0))
     assert (depth == 0).sum() == 9 and depth[20, 100] == 0
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from endoprior.initialization.cleanup import PointCloud, joined, merge_voxels, remove_outliers
+from endoprior.initialization.cleanup import PointCloud, concatenated, merge_voxels, remove_outliers
 from endoprior.initialization.sampling import initial_log_scales
 
 
@@ -113,7 +113,7 @@ def test_poisoned_points_are_named(points):
 def test_joined_keeps_order_and_origins():
     rng = np.random.default_rng(5)
     cloud = cloud_of(rng.random((10, 3), np.float32), rng.random((10, 3), np.float32))
-    again = joined([cloud.taken(np.arange(4)), cloud.taken(np.arange(10) >= 4)])
+    again = concatenated([cloud.taken(np.arange(4)), cloud.taken(np.arange(10) >= 4)])
     for name in ("points", "colors", "origins"):
         np.testing.assert_array_equal(getattr(again, name), getattr(cloud, name))
-    assert len(joined([])) == 0
+    assert len(concatenated([])) == 0

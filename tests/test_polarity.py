@@ -15,9 +15,7 @@ def scene(tool_color=(120, 120, 125), tissue_color=(190, 90, 85), columns=20, se
     """A tool of some columns that enters from below in front of tissue, noisy: (mask, image)."""
     tool = np.zeros((HEIGHT, WIDTH), bool)
     tool[20:, 30 : 30 + columns] = True
-    image = np.where(tool[..., None], tool_color, tissue_color) + np.random.default_rng(seed).normal(
-        0, 6, (60, 80, 3)
-    )
+    image = np.where(tool[..., None], tool_color, tissue_color) + np.random.default_rng(seed).normal(0, 6, (60, 80, 3))
     return tool, np.clip(image, 0, 255).astype(np.uint8)
 
 
@@ -56,7 +54,7 @@ def test_unsure_where_nothing_speaks():
         assert mask_polarity([high], [image]).certainty < 0.3
     for high in (np.zeros_like(left), np.ones_like(left)):
         found = mask_polarity([high], [image])
-        assert found.certainty == 0 and "nothing" in found.reason
+        assert found.certainty == 0 and "unknown" in found.reason
         assert found.tool_is_high != high.all()  # no tools rather than nothing but tools
 
 

@@ -171,9 +171,7 @@ def test_depth_in_another_unit_than_declared(tmp_path, phantom):
     for index, frame in enumerate(load_sequence(phantom).frames("video")):
         np.save(tmp_path / f"depth/{index}.npy", frame.depth / 1000)
     before = options(phantom, depth=str(tmp_path / "depth"), depth_unit_mm=1.0, layout="mono")
-    with pytest.raises(
-        InputError, match=r"--depth-unit-mm: expected tissue 20 to 250 mm away.*look like m: multiply it by 1000"
-    ):
+    with pytest.raises(InputError, match=r"expected tissue 20 to 250 mm away.*multiply --depth-unit-mm by 1000"):
         prepare(phantom / "images", tmp_path / "out", before)
     for index, frame in enumerate(load_sequence(phantom).frames("video")):
         cv2.imwrite(str(tmp_path / f"depth/{index}.png"), frame.depth.astype(np.uint8))
@@ -234,7 +232,7 @@ def test_frames_out_of_the_body_can_be_dropped(tmp_path, phantom):
     video = write_video(tmp_path / "v.mkv", images)
     kept = prepare(video, tmp_path / "kept", PrepareConfig(layout="mono"))
     assert json.loads((kept.out / "sequence.json").read_text())["unexplained_frames"] == [2]
-    assert any("not explained" in remark and "frames 2;" in remark for remark in kept.notes)
+    assert any("no camera pose" in note and "frames 2;" in note for note in kept.notes)
     dropped = prepare(video, tmp_path / "dropped", PrepareConfig(layout="mono", drop_out_of_body=True))
     assert dropped.num_frames == FRAMES
 

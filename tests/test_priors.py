@@ -226,6 +226,7 @@ def test_zero_border_reaches_the_joint_prior(rgb):
     assert joint_texture_prior(flat, ones(), cfg)[0].min() > 0.9
 
 
+@pytest.mark.slow
 def test_prior_of_a_full_frame_is_fast():
     rgb = np.random.default_rng(0).random((512, 640, 3), dtype=np.float32)
     seconds = []

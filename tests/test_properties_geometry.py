@@ -16,7 +16,7 @@ from endoprior.core.config import BasisConfig
 from endoprior.core.geometry import back_project, bilinear, expected_depth, pixel_centers, project, quaternion_to_matrix
 from endoprior.data.shrink import shrunk_camera
 from endoprior.model.basis import basis_weights
-from endoprior.training.temporal import neighbors
+from endoprior.training.temporal_numba import neighbors
 
 SEEDS = st.integers(0, 2**31 - 1)
 SIDES = st.integers(1, 60)

@@ -21,7 +21,13 @@ from endoprior.data.sequence import FrameSequence
 from endoprior.data.shrink import shrunk
 from endoprior.initialization.cleanup import PointCloud, merge_voxels, remove_outliers
 from endoprior.initialization.flow_tracks import initial_motion
-from endoprior.initialization.sampling import draw_pixels, initial_log_scales, initial_points, pixel_probability, quotas
+from endoprior.initialization.sampling import (
+    initial_log_scales,
+    initial_points,
+    pixel_probability,
+    quotas,
+    sample_pixels,
+)
 from endoprior.training.trainer import Trainer
 
 
@@ -90,7 +96,7 @@ def test_depth_that_no_gaussian_can_be_drawn_at_is_refused_in_one_line(depth, sa
     """Meters that pass for millimeters lie in front of the near plane: training would never show anything."""
     camera, z = Camera(30, 20, 50.0, 50.0, 15.0, 10.0, np.eye(4)), np.full((20, 30), depth, np.float32)
     frame = Frame(0, 0.0, camera, np.full((20, 30, 3), 90, np.uint8), np.ones((20, 30), bool), z, z > 0)
-    with pytest.raises(InputError, match=r"between 0\.2 and 1e\+06 mm .*, got 0\. Check masks, depth and its unit"):
+    with pytest.raises(InputError, match=r"between 0\.2 and 1e\+06 mm .*, got 0\. Fix: Check masks, depth"):
         initial_points([frame] * 3, InitConfig(sampler=sampler, budget=100))
     assert not caplog.records  # a refusal is one line, without a warning before it
 
@@ -106,7 +112,7 @@ def test_quotas_are_equal_shares_of_the_whole_budget(budget, num_frames):
 def test_drawn_pixels_are_distinct_and_have_weight(seed, height, width, count, exponent):
     rng = np.random.default_rng(seed)
     weights = np.where(rng.random((height, width)) < 0.6, rng.random((height, width)) * 10.0**exponent, 0)
-    drawn = draw_pixels(weights, count, rng)
+    drawn = sample_pixels(weights, count, rng)
     assert len(drawn) == min(count, np.count_nonzero(weights))
     assert (np.diff(drawn) > 0).all() and (weights.reshape(-1)[drawn] > 0).all()
 

@@ -55,7 +55,7 @@ def cloud_at(pixels: list[tuple[float, float]], origin: int, camera: Camera) -> 
 
 def followed(frames: list[Frame], cloud: PointCloud) -> np.ndarray:
     """(T, N, 2) tracks of the cloud."""
-    return tracks.follow(frames, cloud.points.astype(np.float64), cloud.origins)
+    return tracks.track_points(frames, cloud.points.astype(np.float64), cloud.origins)
 
 
 @pytest.mark.parametrize("origin", [0, 3, 6])
@@ -204,5 +204,5 @@ def test_training_starts_along_the_tracks(tmp_path):
 
 
 def test_only_the_basis_can_start_along_tracks():
-    with pytest.raises(InputError, match=r"init\.motion: expected rest with deformation\.kind hexplane, got flow"):
+    with pytest.raises(InputError, match=r"init\.motion: expected rest with deformation\.kind hexplane[;,] got flow"):
         Config(init=InitConfig(motion="flow"))

@@ -11,15 +11,15 @@ import pytest
 from browser import open_page, pictures_folder, require_chromium
 from view_client import at_work
 
-from endoprior.cli.view import open_subject
+from endoprior.cli.view import open_viewable
 from endoprior.core.geometry import back_project
 from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.runs.training_run import train
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT
-from endoprior.view.scene_subject import SceneSubject
 from endoprior.view.server import Viewer
+from endoprior.view.viewable_scene import ViewableScene
 from endoprior.view.viewport import bounded_aspect, endoscope_viewport
 
 pytestmark = pytest.mark.slow
@@ -52,7 +52,7 @@ def scene(phantom):
 @pytest.fixture
 def viewer(scene, phantom, tmp_path):
     """A viewer of the trained phantom, at work."""
-    with at_work(Viewer(SceneSubject(scene, "phantom", phantom), out=tmp_path / "view")) as viewer:
+    with at_work(Viewer(ViewableScene(scene, "phantom", phantom), out=tmp_path / "view")) as viewer:
         yield viewer
 
 
@@ -109,9 +109,9 @@ def wait_until(condition, seconds: float = 15) -> None:
 
 def choose(viewer, handle, value) -> None:
     """Set a control as a browser would; the page's own drop-downs are viser's matter."""
-    client = next(iter(viewer._server.get_clients().values()))
+    client = next(iter(viewer.server.get_clients().values()))
     handle.value = value
-    viewer._jobs.put(viewer._read_panel if handle is not viewer.panel.measure else viewer._read_measuring)
+    viewer.jobs.put(viewer.read_panel if handle is not viewer.panel.measure else viewer.read_measuring)
     client.flush()
 
 
@@ -120,11 +120,11 @@ def test_the_slider_changes_the_picture_and_play_advances(viewer, page, scene):
     page.evaluate("document.querySelector('[role=slider]').focus()")
     for _ in range(FRAME):
         page.press("ArrowRight")
-    wait_until(lambda: viewer.look.frame == FRAME)
+    wait_until(lambda: viewer.settings.frame == FRAME)
     assert np.abs(settled(page, "slider_moved") - first).mean() > 2
     press_button(page, "Play")
     seen = set()
-    wait_until(lambda: seen.add(viewer.look.frame) or len(seen) > 5)
+    wait_until(lambda: seen.add(viewer.settings.frame) or len(seen) > 5)
     press_button(page, "Pause")
     wait_until(lambda: viewer._playing is None)
     settled(page, "played")
@@ -134,7 +134,7 @@ def test_two_clicks_measure_the_true_distance(viewer, page, phantom):
     page.evaluate("document.querySelector('[role=slider]').focus()")
     for _ in range(FRAME):
         page.press("ArrowRight")
-    wait_until(lambda: viewer.look.frame == FRAME)
+    wait_until(lambda: viewer.settings.frame == FRAME)
     choose(viewer, viewer.panel.measure, True)
     settled(page)
     left, top, width, height = page.box("canvas")
@@ -159,11 +159,11 @@ def test_layers_tracks_tool_and_orbit(viewer, page):
     page.evaluate("document.querySelector('[role=slider]').focus()")
     for _ in range(FRAME):
         page.press("ArrowRight")
-    wait_until(lambda: viewer.look.frame == FRAME)
+    wait_until(lambda: viewer.settings.frame == FRAME)
     pictures = {}
     for layer, name in LAYER_NAMES.items():
         choose(viewer, viewer.panel.layer, name)
-        wait_until(lambda layer=layer: viewer.look.layer == layer)
+        wait_until(lambda layer=layer: viewer.settings.layer == layer)
         pictures[layer] = settled(page, f"layer_{layer}")
     for a in pictures:
         assert all(a == b or np.abs(pictures[a] - pictures[b]).mean() > 1 for b in pictures), a
@@ -185,8 +185,8 @@ def test_the_browser_draws_what_the_server_draws(viewer):
         page.wait_for("document.querySelector('[role=slider]') !== null")
         wait_until(lambda: canvas(page).std() > 20, 30)
         ours = settled(page)
-        choose(viewer, viewer.panel.drawn_by, BROWSER)
-        wait_until(lambda: viewer.look.in_browser)
+        choose(viewer, viewer.panel.rendered_by, BROWSER)
+        wait_until(lambda: viewer.settings.in_browser)
         time.sleep(2)
         theirs = settled(page, "browser_splats")
     margin = round(0.2 * ours.shape[1])  # the server's picture ends where the endoscope's does
@@ -195,8 +195,8 @@ def test_the_browser_draws_what_the_server_draws(viewer):
 
 
 def test_a_raw_sequence(phantom):
-    subject, _ = open_subject(phantom.path, None)
-    with at_work(Viewer(subject)) as viewer, open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
+    viewable, _ = open_viewable(phantom.path, None)
+    with at_work(Viewer(viewable)) as viewer, open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
         page.wait_for("document.querySelector('[role=slider]') !== null")
         wait_until(lambda: canvas(page).std() > 20, 30)
         seen = settled(page, "sequence_frame")

@@ -9,13 +9,13 @@ import pytest
 from endoprior.core.checks import InputError
 from endoprior.core.geometry import project
 from endoprior.core.types import Camera
-from endoprior.view.dots import draw_dots
-from endoprior.view.guard import check_address, trusted
-from endoprior.view.marks import draw_marks, joined, no_marks, ruler, trails
-from endoprior.view.measure import Measurement, pick, sentence
-from endoprior.view.path import Place, sweep, through
+from endoprior.view.access_control import check_address, is_trusted
+from endoprior.view.line_overlay import concatenated, draw_lines, no_lines, ruler, track_lines
+from endoprior.view.measure import Measurement, measurement_text, pick
+from endoprior.view.point_rendering import render_points
 from endoprior.view.saving import keep, mp4_bytes, png_bytes
-from endoprior.view.session import frame_due, shrink_factor
+from endoprior.view.video_path import PathPoint, follow_frames, interpolate
+from endoprior.view.view_settings import frame_due, shrink_factor
 from endoprior.view.viewport import bounded_aspect, endoscope_viewport, free_viewport
 
 CAMERA = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
@@ -84,22 +84,22 @@ def test_trails_end_at_the_frame_and_leave_out_what_is_unknown():
     paths = np.zeros((12, 2, 3))
     paths[:, 0, 0] = np.arange(12)
     paths[5, 1] = np.nan
-    marks = trails(paths, 10)
+    marks = track_lines(paths, 10)
     first = marks.segments[(marks.colors == marks.colors[0]).all(1)]
     assert len(first) == 8 and first[-1, 1, 0] == 10 and first[0, 0, 0] == 2
     assert np.isfinite(marks.segments).all() and len(marks) == 8 + 6
-    assert marks.knobs.sum() == 2 and len(trails(paths, 0)) == 2
+    assert marks.dots.sum() == 2 and len(track_lines(paths, 0)) == 2
 
 
 def test_marks_are_drawn_where_they_project():
     ends = np.array([[-5.0, 0, 50], [5, 0, 50]])
-    marks = joined(no_marks(), ruler(ends))
-    picture = draw_marks(np.zeros((48, 64, 3), np.uint8), CAMERA, marks)
+    marks = concatenated(no_lines(), ruler(ends))
+    picture = draw_lines(np.zeros((48, 64, 3), np.uint8), CAMERA, marks)
     rows, columns = np.nonzero(picture.any(-1))
     assert abs(rows.mean() - 23.5) < 0.6 and 19 <= columns.min() and columns.max() <= 44
     assert picture[23:25, 25:40].any(0).any(-1).all()
     behind = replace(marks, segments=marks.segments * [1, 1, -1])
-    assert not draw_marks(np.zeros((48, 64, 3), np.uint8), CAMERA, behind).any()
+    assert not draw_lines(np.zeros((48, 64, 3), np.uint8), CAMERA, behind).any()
     assert len(ruler(ends[:0])) == 0 and len(ruler(ends[:1])) == 1
 
 
@@ -116,22 +116,24 @@ def test_a_measurement_says_distance_and_change():
     paths[:, 1, 0] = 4, 5, 7
     measured = Measurement(1, paths)
     assert measured.distances.tolist() == [4, 5, 7]
-    text = sentence(measured, 2, relative=False)
+    text = measurement_text(measured, 2, relative=False)
     assert "7.00 mm" in text and "+2.00 since frame 1" in text and "4.00 to 7.00" in text
-    assert "relative" in sentence(measured, 2, relative=True) and "7.00 mm" not in sentence(measured, 2, relative=True)
+    text = measurement_text(measured, 2, relative=True)
+    assert "relative" in text and "7.00 mm" not in text
     paths[[0, 2]] = np.nan
-    assert "**5.00 mm**" == sentence(measured, 1, relative=False)
-    assert "frame 1" in sentence(measured, 0, relative=False) and len(measured.ends(0)) == 0
-    assert "second" in sentence(Measurement(0, paths[:, :1]), 0, relative=False)
+    assert "**5.00 mm**" == measurement_text(measured, 1, relative=False)
+    assert "frame 1" in measurement_text(measured, 0, relative=False) and len(measured.ends(0)) == 0
+    assert "second" in measurement_text(Measurement(0, paths[:, :1]), 0, relative=False)
 
 
 def test_a_film_follows_the_frames_or_the_places_kept():
     cameras = (CAMERA, OFF_CENTER)
-    assert [place.camera for place in sweep(cameras, None)] == list(cameras)
-    assert {place.camera.cx for place in sweep(cameras, OFF_CENTER)} == {30.0}
+    assert [place.camera for place in follow_frames(cameras, None)] == list(cameras)
+    assert {place.camera.cx for place in follow_frames(cameras, OFF_CENTER)} == {30.0}
     away = np.eye(4)
     away[:3, 3] = -10, 0, 0
-    path = through([Place(2, CAMERA), Place(6, replace(CAMERA, world_to_camera=away)), Place(5, CAMERA)])
+    moved = replace(CAMERA, world_to_camera=away)
+    path = interpolate([PathPoint(frame, camera) for frame, camera in ((2, CAMERA), (6, moved), (5, CAMERA))])
     assert [place.frame for place in path] == [2, 3, 4, 5, 6, 5]
     assert [place.camera.center[0] for place in path] == pytest.approx([0, 2.5, 5, 7.5, 10, 0])
     assert len({(place.camera.width, place.camera.height) for place in path}) == 1
@@ -141,10 +143,10 @@ def test_the_nearest_dot_is_on_top():
     points = np.array([[0.0, 0, 60], [0, 0, 50], [0, 0, -5]], np.float32)
     colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
     for order in ([0, 1, 2], [2, 1, 0]):
-        picture, depth = draw_dots(points[order], colors[order], 1.0, CAMERA)
+        picture, depth = render_points(points[order], colors[order], 1.0, CAMERA)
         assert picture[24, 32].tolist() == [0, 255, 0] and depth[24, 32] == 50
         assert (depth > 0).sum() < 16
-    assert not draw_dots(points[2:], colors[2:], 1.0, CAMERA)[0].any()
+    assert not render_points(points[2:], colors[2:], 1.0, CAMERA)[0].any()
 
 
 @pytest.mark.parametrize(
@@ -161,7 +163,7 @@ def test_the_nearest_dot_is_on_top():
     ),
 )
 def test_pages_of_other_sites_are_not_served(origin, asked, bound, admitted):
-    assert trusted(origin, asked, bound) is admitted
+    assert is_trusted(origin, asked, bound) is admitted
 
 
 def test_an_address_that_cannot_be_had_is_refused():

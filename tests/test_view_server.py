@@ -15,7 +15,7 @@ from view_client import Client, at_work
 from websockets.exceptions import ConnectionClosed
 
 from endoprior.cli import main
-from endoprior.cli.view import live_view, open_subject
+from endoprior.cli.view import live_view, open_viewable
 from endoprior.core.config import Config
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera
@@ -24,10 +24,10 @@ from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
 from endoprior.runs.training_run import train
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT, POINTS
-from endoprior.view.scene_subject import SceneSubject
-from endoprior.view.sequence_subject import SequenceSubject
 from endoprior.view.server import Viewer
-from endoprior.view.session import Look
+from endoprior.view.view_settings import ViewSettings
+from endoprior.view.viewable_scene import ViewableScene
+from endoprior.view.viewable_sequence import ViewableSequence
 from endoprior.visualization.image_tools import to_u8
 
 NUM_FRAMES = 6
@@ -36,7 +36,7 @@ CAMERA = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """A wall of Gaussians at 50 mm that slides 2 mm to the right over the film."""
+    """A wall of Gaussians at 50 mm that slides 2 mm to the right over the video."""
     cfg: Config = preset("default").fitted(20)
     x, y = np.meshgrid(np.linspace(-24, 24, 40), np.linspace(-18, 18, 30))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, 50.0)], -1).astype(np.float32)
@@ -52,7 +52,7 @@ def scene() -> Scene:
 @pytest.fixture
 def viewer(scene, tmp_path):
     """A viewer of that scene, at work."""
-    with at_work(Viewer(SceneSubject(scene, "wall"), out=tmp_path / "view")) as viewer:
+    with at_work(Viewer(ViewableScene(scene, "wall"), out=tmp_path / "view")) as viewer:
         yield viewer
 
 
@@ -60,7 +60,7 @@ def viewer(scene, tmp_path):
 def client(viewer):
     """A connected stand-in for a browser, past its first picture."""
     client = Client(viewer.port)
-    client.look()
+    client.send_camera()
     client.picture()
     yield client
     client.socket.close()
@@ -72,16 +72,16 @@ def close(a, b, levels: float = 3.0) -> bool:
 
 
 def test_the_picture_is_the_scenes_own(scene):
-    look, subject = Look(frame=3), SceneSubject(scene, "wall")
-    assert np.array_equal(subject.picture(look, CAMERA), to_u8(scene.render(3 / NUM_FRAMES).color.numpy()))
-    assert subject.surface(look, CAMERA)[24, 32] == pytest.approx(50, abs=1e-3)
+    settings, viewable = ViewSettings(frame=3), ViewableScene(scene, "wall")
+    assert np.array_equal(viewable.picture(settings, CAMERA), to_u8(scene.render(3 / NUM_FRAMES).color.numpy()))
+    assert viewable.surface(settings, CAMERA)[24, 32] == pytest.approx(50, abs=1e-3)
 
 
 def test_the_slider_changes_the_picture(viewer, client, scene):
     client.set(viewer.panel.frame, 5)
     expected = to_u8(scene.render(5 / NUM_FRAMES).color.numpy())
     canvas = client.picture()
-    assert viewer.look.frame == 5 and canvas.shape[:2] == (52, 64)  # 600 x 480 is narrower than 64 x 48
+    assert viewer.settings.frame == 5 and canvas.shape[:2] == (52, 64)  # 600 x 480 is narrower than 64 x 48
     assert np.array_equal(canvas[2:50], expected) and not canvas[0].any()
 
 
@@ -98,14 +98,14 @@ def test_every_layer_is_a_different_picture(viewer, client):
 def test_the_free_camera_and_clipping(viewer, client):
     client.set(viewer.panel.camera, ORBIT)
     client.picture()
-    client.look()
+    client.send_camera()
     facing = client.picture()
-    client.look(position=(0, 0, -50))
+    client.send_camera(position=(0, 0, -50))
     assert not close(client.picture(), facing)
     client.set(viewer.panel.clip, (0.0, 40.0))
     assert client.picture().max() < 10  # the wall is behind the far end
-    client.look()
-    client.look(position=(np.nan, 0, 0))  # nothing can be seen from nowhere: it stays where it was
+    client.send_camera()
+    client.send_camera(position=(np.nan, 0, 0))  # nothing can be seen from nowhere: it stays where it was
     client.set(viewer.panel.clip, (0.0, viewer.panel.clip_end))
     assert np.array_equal(client.picture(), facing)
 
@@ -133,14 +133,14 @@ def test_play_advances_and_pauses(viewer, client):
     client.set(viewer.panel.play, True)
     seen, end = set(), time.monotonic() + 3
     while len(seen) < 4 and time.monotonic() < end:
-        seen.add(viewer.look.frame)
+        seen.add(viewer.settings.frame)
         time.sleep(0.01)
     assert len(seen) >= 4
     client.set(viewer.panel.play, True)
     client.picture()
-    at = viewer.look.frame
+    at = viewer.settings.frame
     time.sleep(0.4)
-    assert viewer.look.frame == at == viewer.panel.frame.value
+    assert viewer.settings.frame == at == viewer.panel.frame.value
 
 
 def test_a_browser_can_draw_the_gaussians_itself(viewer, client):
@@ -154,9 +154,9 @@ def test_a_browser_can_draw_the_gaussians_itself(viewer, client):
                 break
         return kinds
 
-    kinds = nodes(viewer.panel.drawn_by, BROWSER)
+    kinds = nodes(viewer.panel.rendered_by, BROWSER)
     assert "GaussianSplatsMessage" in kinds and "BackgroundImageMessage" in kinds
-    assert "PointCloudMessage" in nodes(viewer.panel.drawn_as, POINTS)
+    assert "PointCloudMessage" in nodes(viewer.panel.rendered_as, POINTS)
     assert "BackgroundImageMessage" in nodes(viewer.panel.layer, LAYER_NAMES["depth"])  # no color of a Gaussian
 
 
@@ -165,10 +165,10 @@ def test_screenshot_and_film_are_kept_in_the_run(viewer, client):
     client.set(viewer.panel.camera, ORBIT)
     client.set(viewer.panel.keep, True)
     client.picture()
-    client.look(position=(2, 0, 0))
+    client.send_camera(position=(2, 0, 0))
     client.set(viewer.panel.frame, 3)
     client.set(viewer.panel.keep, True)
-    client.set(viewer.panel.film, True)
+    client.set(viewer.panel.video, True)
     end = time.monotonic() + 20
     while not list(viewer.out.glob("color*.mp4")) and time.monotonic() < end:
         time.sleep(0.05)
@@ -197,7 +197,7 @@ def test_garbage_ends_its_own_connection_only(viewer, client, capfd):
     time.sleep(0.5)
     client.set(viewer.panel.frame, 2)
     client.picture()
-    assert viewer.look.frame == 2
+    assert viewer.settings.frame == 2
     capfd.readouterr()  # what the server said about it
 
 
@@ -206,32 +206,31 @@ def test_a_page_of_another_site_sees_nothing(viewer):
     with pytest.raises(ConnectionClosed):
         stranger.socket.recv(timeout=5)
     own = Client(viewer.port, origin=f"http://127.0.0.1:{viewer.port}")
-    own.look()
+    own.send_camera()
     assert own.picture().any()
     own.socket.close()
 
 
 def test_only_this_machine_is_listened_to(viewer):
-    listening = viewer._server._websock_server
-    assert listening._host == "127.0.0.1" and viewer._server.request_share_url() is None
+    assert viewer.server.get_host() == "127.0.0.1" and viewer.server.request_share_url() is None
 
 
 def test_a_raw_sequence_is_shown_before_training(tiny_sequence):
     sequence = load_sequence(tiny_sequence)
-    subject = SequenceSubject(sequence)
+    viewable = ViewableSequence(sequence)
     frame, camera = sequence.frame(2), sequence.camera(2)
-    assert np.array_equal(subject.picture(Look(frame=2, layer="frame"), camera), frame.rgb_u8)
-    kinds = [subject.picture(Look(frame=2, layer=layer), camera) for layer in subject.layers]
+    assert np.array_equal(viewable.picture(ViewSettings(frame=2, layer="frame"), camera), frame.rgb_u8)
+    kinds = [viewable.picture(ViewSettings(frame=2, layer=layer), camera) for layer in viewable.layers]
     assert len({kind.tobytes() for kind in kinds}) == 3
-    cloud = subject.cloud(Look(frame=2, layer="frame", endoscope=False))
+    cloud = viewable.cloud(ViewSettings(frame=2, layer="frame", endoscope=False))
     assert len(cloud.points) == (frame.depth_valid & frame.tissue_mask).sum()
-    free = Look(frame=2, layer="frame", endoscope=False)
-    seen = subject.surface(free, camera)
+    free = ViewSettings(frame=2, layer="frame", endoscope=False)
+    seen = viewable.surface(free, camera)
     both = (seen > 0) & frame.depth_valid & frame.tissue_mask
     assert both.sum() > 1000 and np.median(np.abs(seen - frame.depth)[both]) < 0.2
-    with at_work(Viewer(subject)) as viewer:
+    with at_work(Viewer(viewable)) as viewer:
         client = Client(viewer.port)
-        client.look()
+        client.send_camera()
         first = client.picture()
         client.set(viewer.panel.layer, LAYER_NAMES["depth"])
         assert not close(client.picture(), first)
@@ -248,9 +247,9 @@ def test_a_raw_sequence_is_shown_before_training(tiny_sequence):
 def test_lengths_of_relative_depth_are_not_called_mm(tiny_sequence):
     file = tiny_sequence / "sequence.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"depth_relative": True}))
-    subject, out = open_subject(tiny_sequence, None)
-    assert subject.relative and out is None and "mm" not in subject.legend(Look(layer="depth"))
-    viewer = Viewer(subject)
+    viewable, out = open_viewable(tiny_sequence, None)
+    assert viewable.relative and out is None and "mm" not in viewable.legend(ViewSettings(layer="depth"))
+    viewer = Viewer(viewable)
     assert "not mm" in viewer.panel.status.content and "relative" in viewer.panel.clip.label
     viewer.close()
 
@@ -274,7 +273,7 @@ def test_watching_does_not_change_the_training(tiny_sequence, tmp_path):
                 if watched:
                     if client is None:
                         client = Client(on_step.viewer.port)
-                        client.look()
+                        client.send_camera()
                         threading.Event().wait(0.3)
                     on_step._due = 0.0
                     client.set(on_step.viewer.panel.layer, LAYER_NAMES["motion" if report.iteration % 2 else "prior"])

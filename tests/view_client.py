@@ -12,7 +12,10 @@ import msgspec
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
+from websockets.protocol import State
 from websockets.sync.client import connect
+
+from endoprior.view.panel import control_id
 
 VISER = "viser-v1.1.1"
 
@@ -25,7 +28,7 @@ class Client:
             f"ws://127.0.0.1:{port}", subprotocols=[VISER], max_size=None, compression=None, **options
         )
 
-    def look(self, **changes: Any) -> None:
+    def send_camera(self, **changes: Any) -> None:
         """Say where its camera is."""
         camera = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "look_at": (0, 0, 60), "up_direction": (0, -1, 0)}
         camera |= {"fov": 0.9, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 600}
@@ -37,7 +40,12 @@ class Client:
 
     def set(self, handle: Any, value: Any) -> None:
         """Change a control of the panel."""
-        self.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
+        self.send("GuiUpdateMessage", uuid=control_id(handle), updates={"value": value})
+
+    @property
+    def connected(self) -> bool:
+        """Whether the viewer has not thrown it out."""
+        return self.socket.protocol.state is State.OPEN
 
     def click(self, x: float, y: float) -> None:
         """Click the canvas; (0, 0) is its upper left corner, (1, 1) its lower right."""

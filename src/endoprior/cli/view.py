@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..training.state import StepReport
     from ..training.trainer import Trainer
     from ..view.server import Viewer
-    from ..view.subject import Subject
+    from ..view.viewable import Viewable
 
 DEFAULT_PORT = 8080
 
@@ -47,12 +47,12 @@ class View:
 def run(argv: list[str]) -> None:
     """Serve until interrupted."""
     args = parse(View, argv, "view")
-    from ..view.guard import check_address
+    from ..view.access_control import check_address
 
     check_address(args.host, args.port)
-    subject, out = open_subject(args.path, args.data, args.device)
-    viewer = import_viewer()(subject, host=args.host, port=args.port, out=out)
-    say(f"{subject.title}: {viewer.url}  (Ctrl-C stops)")
+    viewable, out = open_viewable(args.path, args.data, args.device)
+    viewer = import_viewer()(viewable, host=args.host, port=args.port, out=out)
+    say(f"{viewable.title}: {viewer.url}  (Ctrl-C stops)")
     viewer.run()
 
 
@@ -80,7 +80,7 @@ def live_view(port: int | None) -> Iterator[Callable[[StepReport, Trainer], None
         yield lambda report, trainer: None
         return
     import_viewer()
-    from ..view.guard import check_address
+    from ..view.access_control import check_address
     from ..view.live import LiveView
 
     check_address("127.0.0.1", port)
@@ -91,7 +91,7 @@ def live_view(port: int | None) -> Iterator[Callable[[StepReport, Trainer], None
         view.close()
 
 
-def open_subject(path: Path, data: Path | None, device: Wanted = "cpu") -> tuple[Subject, Path | None]:
+def open_viewable(path: Path, data: Path | None, device: Wanted = "cpu") -> tuple[Viewable, Path | None]:
     """Open the run or sequence at `path`. Also returns the folder for its screenshots: None for a sequence.
 
     Args:
@@ -101,20 +101,20 @@ def open_subject(path: Path, data: Path | None, device: Wanted = "cpu") -> tuple
         InputError: neither a run nor a sequence.
     """
     from ..data import load_sequence
-    from ..view.sequence_subject import SequenceSubject
+    from ..view.viewable_sequence import ViewableSequence
 
     folder = path.parent if path.name == "scene.safetensors" else path
     if not os.path.isfile(folder / "scene.safetensors"):  # pathlib raises for a name that is too long
         if (folder / "config.json").is_file() and (folder / "log.jsonl").is_file():
             fix = "Wait until training is done; `endoprior train --view` shows a scene during training."
             raise input_error(folder / "scene.safetensors", "a trained scene", "none yet", fix)
-        return SequenceSubject(load_sequence(path)), None
+        return ViewableSequence(load_sequence(path)), None
     from ..model.scene import load_scene
-    from ..view.scene_subject import SceneSubject
+    from ..view.viewable_scene import ViewableScene
 
     scene = load_scene(folder)
     originals = _originals(scene, folder, data)
-    return SceneSubject(on_device(scene, device, fp16_planes=True), str(folder), originals), folder / "view"
+    return ViewableScene(on_device(scene, device, fp16_planes=True), str(folder), originals), folder / "view"
 
 
 def _originals(scene: Scene, folder: Path, data: Path | None) -> FrameSequence | None:

@@ -1,4 +1,4 @@
-"""Configs as JSON: written with every field, read back strictly."""
+"""Convert configs to and from JSON: all fields are written, unknown ones are rejected."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import types
 import typing
 from typing import Any, TypeVar
 
-from .checks import InputError
+from .checks import InputError, input_error
 
 C = TypeVar("C")
 _hints = functools.cache(typing.get_type_hints)
@@ -25,27 +25,26 @@ def to_dict(cfg: Any) -> Any:
 
 
 def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
-    """Build a config dataclass from a nested dict; unknown fields and wrong types are refused, missing ones default.
+    """Build a config dataclass from a nested dict. Unknown fields and wrong types are errors; missing ones default.
 
-    Numbers must be finite: JSON as Python reads it has NaN and infinity.
+    Numbers must be finite; Python's JSON reader also accepts NaN and infinity.
 
     Raises:
-        InputError: naming the field, what was expected and what was found.
+        InputError: names the field, the expected and the actual value.
     """
     if not isinstance(values, dict):
-        raise InputError(
-            f"{where}: expected an object of fields; got {type(values).__name__}. Use a file this program wrote."
-        )
+        fix = "Use a file written by endoprior."
+        raise input_error(where, "an object with fields", type(values).__name__, fix)
     hints = _hints(cls)
     unknown = sorted(map(str, set(values) - set(hints)))
     if unknown:
         name = unknown[0] if unknown[0].isidentifier() else repr(unknown[0])
-        raise InputError(f"{where}.{name[:80]}: no such field. Fields: {', '.join(hints)}.")
+        raise input_error(f"{where}.{name[:80]}", f"one of {', '.join(hints)}", "no such field", "Correct the name.")
     built = {name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()}
     try:
         return cls(**built)
     except ValueError as error:
-        raise InputError(f"{where}: {error}. Correct the value.") from error
+        raise InputError(f"{where}: {error}. Fix: correct the value.") from error
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
@@ -76,19 +75,19 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     else:
         ok, want = type(value) is hint, hint.__name__
     if not ok:
-        raise InputError(f"{where}: expected {want}; got {_shown(value)}. Correct the value.")
+        raise input_error(where, want, _shown(value), "Correct the value.")
     return value
 
 
 def _is_usable(value: Any) -> bool:
-    """Whether arithmetic can go on with it, if it is a number."""
+    """Whether a number is finite, and an integer fits into 64 bits; True for other types."""
     if isinstance(value, float):
         return math.isfinite(value)
     return not isinstance(value, int) or abs(value) < 2**63
 
 
 def _shown(value: Any) -> str:
-    """A value in a message: one line, not too long, however it was nested."""
+    """A value for a message: one line of at most 80 characters."""
     if isinstance(value, dict | list | tuple):
         return f"{type(value).__name__} of {len(value)}"
     text = "a larger one" if isinstance(value, int) and not _is_usable(value) else repr(value)

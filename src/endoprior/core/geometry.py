@@ -37,7 +37,7 @@ def project(points: NDArray, camera: Camera) -> tuple[NDArray, NDArray]:
 
 
 def back_project(pixels: NDArray, depth: NDArray, camera: Camera) -> NDArray:
-    """Lift pixels to world points: the inverse of `project`.
+    """Back-project pixels to world points: the inverse of `project`.
 
     Args:
         pixels: (..., 2) pixel coordinates, centers at half integers.
@@ -57,13 +57,13 @@ def back_project(pixels: NDArray, depth: NDArray, camera: Camera) -> NDArray:
 
 
 def expected_depth(depth: NDArray, alpha: NDArray, min_alpha: float = 0.5) -> NDArray[np.float32]:
-    """(H, W) z of the surface that is drawn, mm: the sum of weight * z over alpha; 0 where alpha < `min_alpha`."""
-    shown = alpha >= min_alpha
-    return np.where(shown, depth / np.where(shown, alpha, 1), 0).astype(np.float32)
+    """(H, W) z of the rendered surface, mm: the sum of weight * z over alpha; 0 where alpha < `min_alpha`."""
+    covered = alpha >= min_alpha
+    return np.where(covered, depth / np.where(covered, alpha, 1), 0).astype(np.float32)
 
 
 def bilinear(image: NDArray, pixels: NDArray) -> NDArray:
-    """Bilinear interpolation with values at pixel centers; the border value is held outside them.
+    """Bilinear interpolation with values at pixel centers; outside, the border value is repeated.
 
     Args:
         image: (H, W) or (H, W, C).

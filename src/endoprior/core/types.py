@@ -1,4 +1,4 @@
-"""The records that pass between modules: frozen, almost no logic.
+"""Data types shared by all packages: frozen dataclasses with almost no logic.
 
 Shared letters: `H, W` image size, `N` Gaussians, `T` frames. Conventions (axes, pixel centers, units) are decided in
 `docs/conventions.md`: OpenCV camera axes, millimeters, pixel (0, 0) centered at (0.5, 0.5), quaternions (w, x, y, z).
@@ -44,21 +44,21 @@ class Camera:
 
 @dataclass(frozen=True)
 class Frame:
-    """One moment of a sequence: what the left eye saw, and what is known of its depth."""
+    """One frame of a sequence: the image of the left camera, its tissue mask and its depth."""
 
     index: int
-    """Position in the sequence, 0-based, counting every frame whatever its split."""
+    """Position in the sequence, 0-based, over all splits."""
     time: float
     """index / T, in [0, 1)."""
     camera: Camera
     rgb_u8: NDArray[np.uint8]
     """(H, W, 3) color, 0..255, as stored in the file."""
     tissue_mask: NDArray[np.bool_]
-    """(H, W) True where the pixel shows usable tissue (no tool)."""
+    """(H, W) True on usable tissue (no tool)."""
     depth: NDArray[np.float32]
     """(H, W) z of the surface, mm; 0 where `depth_valid` is False."""
     depth_valid: NDArray[np.bool_]
-    """(H, W) True where the depth was measured."""
+    """(H, W) True where depth was measured."""
 
     @property
     def rgb(self) -> NDArray[np.float32]:
@@ -68,12 +68,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians ready to be drawn, at one moment: every value is activated."""
+    """Gaussians at one time, ready to render: all values are activated."""
 
     means: Tensor
     """(N, 3) centers, world axes, mm."""
     quats: Tensor
-    """(N, 4) rotations (w, x, y, z); any length from 1e-12, the renderer normalizes; shorter ones are culled."""
+    """(N, 4) rotations (w, x, y, z) of length at least 1e-12. The renderer normalizes them and culls shorter ones."""
     scales: Tensor
     """(N, 3) standard deviations along the local axes, mm, > 0."""
     opacities: Tensor
@@ -87,7 +87,7 @@ class Splats:
 
 @dataclass(frozen=True)
 class RenderOutput:
-    """What every backend returns. After `means2d.retain_grad()`, its `.grad` (px) is what density control reads."""
+    """Output of every backend. Density control reads `means2d.grad` (px) after `means2d.retain_grad()`."""
 
     color: Tensor
     """(H, W, 3) composited color, background included; not clamped."""
@@ -98,4 +98,4 @@ class RenderOutput:
     means2d: Tensor
     """(N, 2) projected centers, px; pixel (0, 0) is centered at (0.5, 0.5)."""
     radii: Tensor
-    """(N,) int32 radius of the drawn footprint, px; 0 where culled."""
+    """(N,) int32 radius of the rendered footprint, px; 0 where culled."""

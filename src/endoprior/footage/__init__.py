@@ -1,1 +1,1 @@
-"""What images of a clip show, measured by pure functions: borders, labels, motion, changes, units."""
+"""Image analysis of a clip, as pure functions: borders, labels, motion, changes, stereo order, mask polarity, units."""

@@ -1,7 +1,7 @@
-"""What surrounds the endoscope's image: black bars, console strips, the round border of a lens.
+"""Detect borders around the endoscope image: black bars, console strips, the round border of a lens.
 
-Shared letters: `K` sample images of one clip, (H, W, 3) uint8 each. An image is never black in the same place for
-long, and never still: what is, does not belong to it.
+Shared letters: `K` sample images of one clip, (H, W, 3) uint8 each. Borders are the regions that stay black or static
+in all samples.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 BLACK_LEVEL = 28
-"""Brightest level, 0..255, of what passes for black: limited-range video and its coding noise stay below."""
+"""Levels 0..255 below this are black, including limited-range video with coding noise."""
 MIN_STRIP_PX = 3
-"""Thinner strips are left to the coding noise of border rows."""
+"""Thinner strips are ignored; they can be coding noise."""
 MAX_STRIP_FRACTION = 0.25
-"""A strip never takes more of the image than this."""
-STILL_RATIO = 0.3
-"""A strip changes less than this share of what the middle of the image changes ..."""
+"""Largest share of the image for one strip."""
+STATIC_RATIO = 0.3
+"""The change over time of a strip is below this share of the change in the image center ..."""
 STRIP_CHROMA = 40
-"""... and is gray: half of its pixels have channels closer together than this."""
+"""... and a strip is gray: the channels of half of its pixels differ by less than this."""
 EDGE_SHARE = 0.55
-"""Share of the strip's edge along which the level must jump: strips end in straight lines, shadows do not."""
+"""Share of the strip's edge with a brightness step: strips have straight edges, shadows do not."""
 EDGE_STEP = 12
-"""Smallest jump, levels."""
+"""Smallest brightness step, levels."""
 CIRCLE_RESIDUAL = 0.012
 """Largest median distance of border points from the fitted circle, in radii."""
 
 
 @dataclass(frozen=True)
 class Strips:
-    """Rows and columns at each side that do not belong to the image, px."""
+    """Rows and columns at each side that are outside of the endoscope image, px."""
 
     top: int
     bottom: int
@@ -46,24 +46,24 @@ class Strips:
 
 @dataclass(frozen=True)
 class Circle:
-    """The round border of the endoscope's image, px; the center of the top-left pixel is (0.5, 0.5)."""
+    """The round border of the endoscope image, px; the center of the top-left pixel is (0.5, 0.5)."""
 
     center_x: float
     center_y: float
     radius: float
 
     def mask(self, width: int, height: int, margin_px: float = 0.0) -> NDArray[np.bool_]:
-        """(H, W) True inside the circle drawn `margin_px` smaller."""
+        """(H, W) True inside the circle with its radius reduced by `margin_px`."""
         x = np.arange(width) + 0.5 - self.center_x
         y = np.arange(height)[:, None] + 0.5 - self.center_y
         return x * x + y * y < (self.radius - margin_px) ** 2
 
 
 def find_strips(images: Sequence[NDArray[np.uint8]]) -> Strips:
-    """Black bars and still, gray console strips at the sides.
+    """Detect black bars and static gray console strips at the sides.
 
     Args:
-        images: K of one size, some time apart; one image alone shows black bars only.
+        images: K of one size, at different times; from a single image only black bars are detected.
     """
     grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in images]
     mean = sum(grays) / len(grays)
@@ -71,34 +71,36 @@ def find_strips(images: Sequence[NDArray[np.uint8]]) -> Strips:
     low = np.maximum.reduce([image.max(-1) for image in images])
     chroma = sum(image.max(-1) - image.min(-1).astype(np.float32) for image in images) / len(images)
     middle = tuple(slice(n // 4, n - n // 4) for n in low.shape)
-    lively = float(np.median(change[middle]))
+    central_change = float(np.median(change[middle]))
     found = []
     for turns in (0, 2, 1, 3):  # turned so that the side in question is on top: top, bottom, right, left
         maps = (np.rot90(m, turns) for m in (low, chroma, change, mean))
-        found.append(_strip_on_top(*maps, lively))
+        found.append(_strip_on_top(*maps, central_change))
     return Strips(top=found[0], bottom=found[1], left=found[3], right=found[2])
 
 
-def _strip_on_top(low: NDArray[np.uint8], chroma: NDArray, change: NDArray, mean: NDArray, lively: float) -> int:
+def _strip_on_top(
+    low: NDArray[np.uint8], chroma: NDArray, change: NDArray, mean: NDArray, central_change: float
+) -> int:
     """Number of rows of a strip at the top of these (H, W) maps, 0 for none."""
     limit = int(MAX_STRIP_FRACTION * len(low))
     black = np.quantile(low[: limit + 1], 0.98, axis=1) < BLACK_LEVEL
-    still = np.quantile(change[: limit + 1], 0.8, axis=1) < STILL_RATIO * lively  # never, if there is one image
+    static = np.quantile(change[: limit + 1], 0.8, axis=1) < STATIC_RATIO * central_change  # False for one image
     gray = np.median(chroma[: limit + 1], axis=1) < STRIP_CHROMA
-    belongs = black | (still & gray)
+    belongs = black | (static & gray)
     rows = limit + 1 if belongs.all() else int(np.argmin(belongs))
     if rows < MIN_STRIP_PX or rows > limit:
         return 0
-    # A row of coding noise may lie between strip and image.
+    # A row of coding noise can lie between strip and image.
     jumps = [np.abs(mean[rows + d] - mean[rows - 1]) > EDGE_STEP for d in (0, 1) if rows + d < len(mean)]
     return rows if max(jump.mean() for jump in jumps) > EDGE_SHARE else 0
 
 
 def find_circle(images: Sequence[NDArray[np.uint8]]) -> Circle | None:
-    """The round border, if the corners stay black and what is lit ends in a circle.
+    """Detect a round border: the corners stay black and the lit region has a circular outline.
 
     Args:
-        images: K of one size, some time apart.
+        images: K of one size, at different times.
     """
     low = np.stack(images).max(-1).max(0)
     height, width = low.shape
@@ -112,7 +114,7 @@ def find_circle(images: Sequence[NDArray[np.uint8]]) -> Circle | None:
         return None
     circle = _fit_circle(points)
     residuals = np.abs(np.hypot(*(points - circle[:2]).T) - circle[2])
-    points = points[residuals < np.maximum(3 * np.median(residuals), 2)]  # dark tissue reaches the border in places
+    points = points[residuals < np.maximum(3 * np.median(residuals), 2)]  # dark tissue touches the border
     circle = _fit_circle(points)
     residual = float(np.median(np.abs(np.hypot(*(points - circle[:2]).T) - circle[2])))
     found = Circle(*(float(v) for v in circle))
@@ -125,7 +127,7 @@ def find_circle(images: Sequence[NDArray[np.uint8]]) -> Circle | None:
 
 
 def _outline(lit: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(P, 2) x, y where rows of `lit` (H, W) begin and end, and columns likewise, but for where the lit part is cut."""
+    """(P, 2) x, y of the ends of rows and columns of `lit` (H, W), except where the image edge cuts the lit region."""
     found = []
     for swapped, image in ((False, lit), (True, lit.T)):
         some, across = np.flatnonzero(image.any(1)), np.flatnonzero(image.any(0))

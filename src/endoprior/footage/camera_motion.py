@@ -1,4 +1,4 @@
-"""Does the camera move? Tissue moves in places and comes back; a moving camera shifts, turns or zooms everything."""
+"""Detect camera motion. Tissue moves locally and returns; a moving camera shifts, rotates or zooms the whole image."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 WORK_WIDTH = 320
-"""Images are brought to this width, px: enough for hundreds of corners, quick to follow."""
+"""Images are resized to this width, px: enough for hundreds of corners, and fast."""
 MAX_CORNERS = 400
 MIN_TRACKS = 24
-"""Fewer followed corners say nothing about a pair of images."""
+"""With fewer tracked corners, no motion is estimated for a pair of images."""
 MIN_INLIERS = 0.4
-"""Share of corners that must agree on one motion; below, the pair is not explained by the camera."""
+"""Share of corners that must be inliers; below, camera motion does not explain the pair."""
 MOVING_FRACTION = 0.06
-"""The camera moves if the image as a whole ends up or passes farther away than this share of its width.
-Breathing shifts it by 3 % and back."""
+"""The camera moves if the whole image shifts by more than this share of its width. Breathing shifts it by 3 %."""
 
 
 @dataclass(frozen=True)
@@ -26,23 +25,23 @@ class CameraMotion:
     """Motion of the image as a whole."""
 
     pixels_per_frame: NDArray[np.float64]
-    """(K - 1,) mean shift of the image from each to the next, px of the given images; NaN where nothing agrees."""
+    """(K - 1,) mean shift between successive images, px of the given images; NaN where no motion fits."""
     path_px: NDArray[np.float64]
-    """(K,) how far the image as a whole has come from the first one, px, unexplained steps counted as none."""
+    """(K,) shift of the whole image from the first one, px; unexplained steps count as 0."""
     moving: bool
-    """Whether a camera that stands still is implausible."""
+    """Whether the camera moves."""
     reason: str
-    """One line."""
+    """The measurements in one line."""
 
 
 def camera_motion(
     images: Iterable[NDArray[np.uint8]], tissue_masks: Iterable[NDArray[np.bool_]] | None = None
 ) -> CameraMotion:
-    """Follow corners from image to image and chain the similarity transforms that most of them agree on.
+    """Track corners between successive images, and chain the similarity transforms fitted by RANSAC.
 
     Args:
-        images: K of (H, W, 3), in order; only two are held at a time.
-        tissue_masks: (H, W) each, True where corners may lie; None allows all.
+        images: K of (H, W, 3), in order; only two are in memory at a time.
+        tissue_masks: (H, W) each, True where corners are allowed; None allows all.
     """
     shifts, path = [], [0.0]
     chain, before, size, factor = np.eye(3), None, (1, 1), 1.0
@@ -72,14 +71,14 @@ def camera_motion(
     moving = bool(farthest > MOVING_FRACTION * size[0] / factor)
     explained = float(np.isfinite(steps).mean()) if len(steps) else 1.0
     reason = (
-        f"the image as a whole comes up to {farthest:.0f} px away from the first frame "
+        f"the whole image shifts by up to {farthest:.0f} px from the first frame "
         f"({np.nanmedian(steps) if np.isfinite(steps).any() else 0:.1f} px a step; {explained:.0%} of steps explained)"
     )
     return CameraMotion(steps, distances, moving, reason)
 
 
 def _step(before: NDArray[np.uint8], allowed: NDArray[np.uint8] | None, now: NDArray[np.uint8]) -> NDArray | None:
-    """(3, 3) similarity from one small gray image to the next, None if corners do not agree on one."""
+    """(3, 3) similarity transform between two small gray images; None if too few corners are inliers."""
     corners = cv2.goodFeaturesToTrack(before, MAX_CORNERS, 0.01, 5, mask=allowed)
     if corners is None or len(corners) < MIN_TRACKS:
         return None
@@ -88,7 +87,7 @@ def _step(before: NDArray[np.uint8], allowed: NDArray[np.uint8] | None, now: NDA
     good = (found & found_back).ravel().astype(bool) & (np.abs(back - corners).max((1, 2)) < 1)
     if good.sum() < MIN_TRACKS:
         return None
-    cv2.setRNGSeed(0)  # RANSAC draws from OpenCV's own generator
+    cv2.setRNGSeed(0)  # RANSAC uses OpenCV's own random generator
     matrix, inliers = cv2.estimateAffinePartial2D(corners[good], there[good], ransacReprojThreshold=1.5)
     if matrix is None or inliers.mean() < MIN_INLIERS:
         return None
@@ -96,7 +95,7 @@ def _step(before: NDArray[np.uint8], allowed: NDArray[np.uint8] | None, now: NDA
 
 
 def _grid(width: int, height: int) -> NDArray[np.float64]:
-    """(9, 2) points all over the image: a zoom about the center moves most of them."""
+    """(9, 2) points spread over the image; also a zoom about the center moves most of them."""
     x, y = np.meshgrid(np.array([1, 3, 5]) * width / 6, np.array([1, 3, 5]) * height / 6)
     return np.stack([x.ravel(), y.ravel()], 1)
 

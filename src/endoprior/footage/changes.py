@@ -1,6 +1,6 @@
-"""What changes from image to image that tissue does not do: copies, exposure jumps, cuts, blur, another place.
+"""Detect changes that tissue motion does not cause: duplicates, exposure jumps, cuts, blur, views outside the body.
 
-Shared letters: `T` successive images of one clip. Everything is measured on thumbnails, so noise hardly counts.
+Shared letters: `T` successive images of one clip. All measurements use thumbnails, which suppresses noise.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from numpy.typing import NDArray
 THUMB_WIDTH = 160
 """Images are compared at this width, px."""
 SAME_LEVELS = 0.03
-"""Images that differ by less than this on average, levels of 255, are the same image."""
+"""Images with a smaller mean difference, in levels of 255, are duplicates."""
 COPY_LEVELS, COPY_SHARE = 0.12, 0.08
-"""So are those that differ by less than this after video coding, if it is less than this share of what is usual
-around them: a scene that has come to rest changes by 0.15 levels and more."""
+"""After video coding, so are images with a mean difference below this, if it is also below this share of the usual
+difference around them. A static scene changes by at least 0.15 levels."""
 JUMP = 0.13
 """Smallest exposure jump: change of the logarithm of brightness (14 %) between two images."""
 JUMP_RATIO = 6.0
 """An exposure jump is this many times the usual change of brightness ..."""
 JUMP_AGREEMENT = 0.85
-"""... and this share of the image changes in the same direction: a tool that comes in darkens only a part."""
+"""... and this share of the image changes in the same direction. A tool that enters darkens only a part."""
 CUT_CORRELATION = 0.4
-"""Successive images of one scene are correlated better than this."""
+"""Successive images of one scene have a higher correlation."""
 BLUR_RATIO = 0.45
-"""An image with less than this share of its neighbors' sharpness is blurred."""
+"""An image is blurred if its sharpness is below this share of that of its neighbors."""
 NEIGHBORS = 5
-"""What is usual is judged by this many images to each side."""
+"""Number of images on each side that define the usual value."""
 COLOR_DISTANCE = 0.07
-"""An image whose mean red or green share is this far from the clip's median shows another place."""
+"""An image shows another scene if its mean red or green share differs by this from the median of the clip."""
 
 
 @dataclass(frozen=True)
 class Changes:
-    """Curves over the clip, and the images that stand out; positions count from 0."""
+    """Curves over the clip, and the positions, from 0, of conspicuous images."""
 
     brightness: NDArray[np.float64]
     """(T,) mean gray level in [0, 1]."""
@@ -49,17 +49,17 @@ class Changes:
     duplicates: tuple[int, ...]
     """Images that repeat the one before."""
     exposure_jumps: tuple[int, ...]
-    """Images that are suddenly brighter or darker as a whole than the one before."""
+    """Images that are suddenly brighter or darker than the one before."""
     cuts: tuple[int, ...]
     """Images that show another view than the one before."""
     blurred: tuple[int, ...]
     """Images much less sharp than their neighbors."""
     off_color: tuple[int, ...]
-    """Images of another color than the clip: out of the body, or covered by smoke or blood."""
+    """Images of another color than the clip: outside the body, or covered by smoke or blood."""
 
 
 def find_changes(images: Iterable[NDArray[np.uint8]]) -> Changes:
-    """Measure the curves and pick what stands out.
+    """Measure the curves and detect conspicuous images.
 
     Args:
         images: T of (H, W, 3) and of one size, in order, T >= 1; each is used once.
@@ -94,7 +94,7 @@ def find_duplicates(difference: NDArray[np.floating]) -> tuple[int, ...]:
     Args:
         difference: (T - 1,) mean absolute difference of successive images, levels of 255.
     """
-    # The upper end, not the median: a clip brought to twice its rate consists of copies by half.
+    # A high percentile, not the median: half of the images are duplicates if the frame rate was doubled.
     windows = (difference[max(0, i - NEIGHBORS) : i + NEIGHBORS + 1] for i in range(len(difference)))
     usual = np.array([np.percentile(window, 80) for window in windows])
     limit = np.maximum(SAME_LEVELS, np.minimum(COPY_LEVELS, COPY_SHARE * usual))
@@ -125,7 +125,7 @@ def _sharpness(image: NDArray[np.uint8]) -> float:
 
 
 def _reduced(image: NDArray, share: float) -> NDArray:
-    """The image at a share of its size, of 1 px at least."""
+    """The image resized by a factor, to at least 1 px."""
     height, width = image.shape[:2]
     fx, fy = max(share, 1 / width), max(share, 1 / height)
     return cv2.resize(image, None, fx=fx, fy=fy, interpolation=cv2.INTER_AREA)

@@ -1,6 +1,6 @@
-"""Burned-in labels and console text: high contrast that stays put while the image changes around it.
+"""Detect burned-in labels and console text: static regions of high contrast in a changing image.
 
-Says where such writing lies, not what it says. Faint or changing writing (a running clock) is not found.
+Returns their positions; the text itself is not read. Faint or changing text (a running clock) is not detected.
 """
 
 from __future__ import annotations
@@ -13,38 +13,38 @@ from numpy.typing import NDArray
 
 from ..core.checks import check_shape
 
-LEAST_PICTURES = 5
-"""Fewer samples say too little about what stays put."""
+LEAST_IMAGES = 5
+"""With fewer samples, static text cannot be detected."""
 LEAST_CONTRAST = 60
-"""Levels, 0..255, between ink and ground: writing is made to be read."""
-STILL = 0.035
-"""Writing varies in time (one standard deviation) by less than this share of its contrast; moving edges by a third."""
-STILL_SCENE = 0.3
-"""If more than this share of all edges is still, the scene itself stands still and nothing can be said."""
+"""Least contrast between text and background, levels 0..255."""
+STATIC = 0.035
+"""The standard deviation over time of text is below this share of its contrast; that of moving edges is a third."""
+STATIC_SCENE = 0.3
+"""If more than this share of all edges is static, the scene itself is static and no text can be detected."""
 GAP = 0.025
 """Letters closer together than this share of the image's height belong to one label."""
 LEAST_PX, MOST_HEIGHT = 7, 0.2
-"""Sides of a label: no readable letter is smaller; a share of the image's height, for a block of several lines.
-The straight edge of a bar or a console is thinner or longer."""
+"""Smallest side of a label, px, and its largest height, as a share of the image height. Edges of bars and consoles are
+thinner or longer."""
 LINE_ASPECT, BLOCK_SHARE = 1.5, 0.003
-"""A line of two letters is this much wider than high; a block covers this share of the image. Resting highlights of a
-static camera are neither."""
+"""Least aspect ratio of a line of text, or least share of the image for a block. Highlights of a static camera have
+neither."""
 LEAST_FILL = 0.25
-"""Share of a label's rectangle that lies along strokes; on a round border or a resting tool it is far less."""
+"""Least share of the rectangle covered by strokes; on a round border or a static tool it is far less."""
 
 
 def find_static_overlays(images: Sequence[NDArray[np.uint8]]) -> list[tuple[int, int, int, int]]:
-    """Rectangles around writing that is burned into every image of a clip; words far apart get one each.
+    """Rectangles around text that is burned into every image of a clip; distant words get separate rectangles.
 
     Args:
         images: (H, W, 3) each, 0..255, spread over the clip (about 20); fewer than 5 give no rectangles.
     Returns:
-        (x, y, width, height) each, px, with a margin of about half a letter, from top to bottom. Empty where
-        the scene itself stands still.
+        (x, y, width, height) each, px, with a margin of about half a letter, from top to bottom. Empty for a static
+        scene.
     Raises:
         ValueError: images of unequal shapes.
     """
-    if len(images) < LEAST_PICTURES:
+    if len(images) < LEAST_IMAGES:
         return []
     height, width = images[0].shape[:2]
     total, squares = np.zeros((2, height, width))
@@ -58,14 +58,14 @@ def find_static_overlays(images: Sequence[NDArray[np.uint8]]) -> list[tuple[int,
     mean = total / len(images)
     deviation = np.sqrt(np.maximum(squares / len(images) - mean * mean, 0))
     contrast = _contrast(mean)
-    still = (contrast > LEAST_CONTRAST) & (deviation < STILL * contrast)
-    if still.sum() > STILL_SCENE * any_edge.sum():
+    static = (contrast > LEAST_CONTRAST) & (deviation < STATIC * contrast)
+    if static.sum() > STATIC_SCENE * any_edge.sum():
         return []
     gap = max(2, round(GAP * height / 2))
-    joined = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * gap + 1, 2 * gap + 1), np.uint8))
+    joined = cv2.morphologyEx(static.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * gap + 1, 2 * gap + 1), np.uint8))
     found = []
     for x, y, w, h, _ in cv2.connectedComponentsWithStats(joined)[2][1:].tolist():
-        strokes = still[y : y + h, x : x + w].mean()
+        strokes = static[y : y + h, x : x + w].mean()
         shaped = w >= LINE_ASPECT * h or w * h >= BLOCK_SHARE * width * height
         if min(w, h) >= LEAST_PX and h <= MOST_HEIGHT * height and shaped and strokes >= LEAST_FILL:
             left, top = max(x - gap, 0), max(y - gap, 0)

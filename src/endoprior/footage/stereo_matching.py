@@ -1,6 +1,6 @@
-"""Dense matching of a rectified pair, from the left camera and from the right one. `H, W` image size.
+"""Dense matching of a rectified pair, from left to right and from right to left. `H, W` image size.
 
-The matcher is OpenCV's semi-global one (H. Hirschmüller, "Stereo processing by semiglobal matching and mutual
+The matcher is OpenCV's semi-global matching (H. Hirschmüller, "Stereo processing by semiglobal matching and mutual
 information", PAMI 2008, with Birchfield and Tomasi's cost over blocks), along all eight directions.
 """
 
@@ -11,37 +11,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 SMALL_STEP, LARGE_STEP = 16, 64
-"""Price, per pixel of a block, of a disparity that changes by one px from neighbor to neighbor, and by more."""
+"""Penalty per block pixel for a disparity change of one px between neighbors, and for a larger change."""
 UNIQUENESS_PERCENT = 10
-"""The best match must be better by this much than any that is not beside it."""
+"""Margin by which the best match must beat the second best."""
 CONTRAST_LIMIT = 31
-"""Slopes of the image are clipped here, levels, before they are compared."""
+"""Image gradients are clipped to this before matching, levels."""
 
 
 def match_both_ways(
     left: NDArray[np.uint8], right: NDArray[np.uint8], lowest: int, highest: int, block: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Disparity x_left - x_right as each camera finds it.
+    """Disparity x_left - x_right at the pixels of either image.
 
-    A pixel whose partner lies outside the other image still gets a value, which its neighbors suggest.
+    A pixel whose match lies outside the other image still gets a value, extrapolated from its neighbors.
 
     Args:
         left, right: (H, W) gray.
-        lowest, highest: disparities to search, px, negative ones too.
-        block: side of the blocks that are compared, px, odd.
+        lowest, highest: range of disparities, px; may be negative.
+        block: side of the matching blocks, px, odd.
     Returns:
-        (H, W) disparity at the left image's pixels and (H, W) at the right one's, px in steps of 1/16; NaN where no
-        match stands out.
+        (H, W) disparity of the left image and (H, W) of the right image, px in steps of 1/16; NaN where no match is
+        unique.
     """
-    # Mirrored and exchanged, the right image is matched like a left one.
+    # After mirroring both images, the right image is matched like a left one.
     mirrored = _match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]), lowest, highest, block)
     return _match(left, right, lowest, highest, block), np.ascontiguousarray(mirrored[:, ::-1])
 
 
 def disagreement(from_left: NDArray[np.float32], from_right: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) how far the right camera's disparity differs from the left one's at the point it names, px.
+    """(H, W) left-right consistency: difference of the two disparities at matching pixels, px.
 
-    Infinite where either found nothing, and where the partner lies outside the right image.
+    Infinite where either is unknown, and where the match lies outside the right image.
     """
     height, width = from_left.shape
     known = np.isfinite(from_left)
@@ -52,7 +52,7 @@ def disagreement(from_left: NDArray[np.float32], from_right: NDArray[np.float32]
 
 
 def _match(near: NDArray[np.uint8], other: NDArray[np.uint8], lowest: int, highest: int, block: int) -> NDArray:
-    """(H, W) disparity of `near`'s pixels, px; NaN where no match stands out."""
+    """(H, W) disparity of `near`'s pixels, px; NaN where no match is unique."""
     count = -(-(highest - lowest + 1) // 16) * 16
     matcher = cv2.StereoSGBM_create(
         minDisparity=lowest,
@@ -65,7 +65,7 @@ def _match(near: NDArray[np.uint8], other: NDArray[np.uint8], lowest: int, highe
         uniquenessRatio=UNIQUENESS_PERCENT,
         mode=cv2.STEREO_SGBM_MODE_HH,
     )
-    # OpenCV gives no value in columns whose partner could fall off the image: move those into a margin.
+    # OpenCV leaves columns empty whose match could lie outside the image: add a margin.
     before, after = max(lowest + count, 0), max(-lowest, 0)
     wide = [cv2.copyMakeBorder(camera, 0, 0, before, after, cv2.BORDER_REPLICATE) for camera in (near, other)]
     sixteenths = matcher.compute(*wide)[:, before : before + near.shape[1]]

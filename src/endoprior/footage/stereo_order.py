@@ -1,4 +1,4 @@
-"""Whether two images are what a left and a right camera see, row by row. `H, W` image size."""
+"""Check a stereo pair: which image is the left one, and are the rows aligned? `H, W` image size."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from ..core.checks import check_shape
 from .stereo_matching import disagreement, match_both_ways
 
 LOOK_WIDTH = 320
-"""Width at which the cameras are told apart, px."""
+"""Images are matched at this width, px."""
 NEAREST_SHARE = 0.2
-"""Largest disparity looked for, as a share of the width: cameras 4 mm apart see 20 mm away at about that."""
+"""Largest disparity of the search, as a share of the width: about that of a point 20 mm away at a 4 mm baseline."""
 BLOCK_PX = 7
-"""Side of the blocks that are compared at that width, px."""
+"""Side of the matching blocks, px."""
 AGREE_PX = 1.0
-"""The cameras' disparities of a point may differ by this much at that width, px."""
+"""Tolerance of the left-right consistency check, px."""
 CLEARLY = 0.2
-"""The exchanged order must explain this much more of the image before it is believed."""
+"""The pair counts as swapped if the swapped order matches this much more of the image."""
 FEATURES = 1000
-"""Most features looked at in each image."""
+"""Largest number of features per image."""
 RATIO = 0.75
 """A feature's best match must be nearer than this times its second best (D. Lowe, IJCV 2004)."""
 FEWEST_MATCHES = 20
-"""Fewer say nothing about rows."""
+"""With fewer matches the vertical offset is unknown."""
 
 
 @dataclass(frozen=True)
 class StereoOrder:
-    """How much of the image each order of the cameras explains by surfaces in front of them, each in [0, 1]."""
+    """Share of the image that matches in each order of the cameras, with positive depth; in [0, 1]."""
 
     as_given: float
     exchanged: float
 
     @property
     def swapped(self) -> bool:
-        """Whether the first image is clearly the right camera's."""
+        """Whether the first image is clearly that of the right camera."""
         return self.exchanged > self.as_given + CLEARLY
 
 
 def stereo_order(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8], center_shift_px: float = 0.0) -> StereoOrder:
-    """Match a rectified pair both as it is and exchanged: in the right order nothing lies behind infinity.
+    """Match a rectified pair as given and swapped. In the correct order all disparities are positive.
 
     Args:
         left_u8, right_u8: (H, W, 3) rectified images, 0..255.
         center_shift_px: cx_left - cx_right, the disparity of infinity, px.
     Returns:
-        the share of pixels on which both cameras agree, in either order.
+        the share of pixels that pass the left-right consistency check, in either order.
     Raises:
-        ValueError: other shapes.
+        ValueError: wrong shapes.
     """
     left, right = _gray(left_u8, right_u8)
     height, width = left.shape
@@ -63,16 +63,16 @@ def stereo_order(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8], center
 
 
 def vertical_offset_px(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> float:
-    """How far the rows of two images are apart: the median |y_left - y_right| of matching features.
+    """Vertical offset of a stereo pair: the median |y_left - y_right| of matching features.
 
-    A rectified pair stays below about half a pixel.
+    A rectified pair has less than about half a pixel.
 
     Args:
         left_u8, right_u8: (H, W, 3) images, 0..255.
     Returns:
-        px; NaN where too few features match to say.
+        px; NaN if too few features match.
     Raises:
-        ValueError: other shapes.
+        ValueError: wrong shapes.
     """
     finder = cv2.SIFT_create(FEATURES)
     (left, left_marks), (right, right_marks) = (
@@ -94,8 +94,8 @@ def _gray(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> tuple[NDAr
 
 
 def _explained(left: NDArray[np.uint8], right: NDArray[np.uint8], shift: float) -> float:
-    """Share of the left image's pixels whose disparity both cameras agree on, all of it in front of infinity."""
-    # The disparity of infinity itself belongs to neither order: black margins and burned-in text have it.
+    """Share of the left image's pixels that pass the left-right consistency check with positive disparity."""
+    # Exclude the disparity of infinity, which black margins and burned-in text have in either order.
     lowest = int(np.floor(shift)) + 1
     highest = lowest + max(int(NEAREST_SHARE * left.shape[1]), 16)
     apart = disagreement(*match_both_ways(left, right, lowest, highest, BLOCK_PX))

@@ -1,7 +1,7 @@
-"""What unit a depth map is in, judged by how far an endoscope is from tissue, and whether it is depth at all.
+"""Guess the unit of depth maps from the usual distance of an endoscope, and detect disparity.
 
-A laparoscope works 20 to 250 mm away and carries its own light: near tissue is bright, and instruments are nearer than
-the tissue around them. Values that are larger where things are nearer are disparity or inverse depth.
+A laparoscope is 20 to 250 mm away from tissue and carries its own light: near tissue is bright, and instruments are
+nearer than the tissue around them. If larger values are nearer, the values are disparity or inverse depth.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ RANGES: tuple[tuple[Unit, float, float, float], ...] = (
     ("0.1 mm", FAR_MM, FAR_MM * 10, 0.1),
     ("0.01 mm", FAR_MM * 10, FAR_MM * 100, 0.01),
 )
-"""Unit, median it begins at and ends before, mm per unit. Where two units fit, the more common one has the range."""
+"""Unit, range of the median, mm per unit. Where two units are possible, the range belongs to the more common one."""
 SHADING_LIMIT = 0.3
 """Rank correlation of brightness and value above which larger means nearer."""
 TOOL_LIMIT = 1.1
-"""Value on a tool, divided by that of the tissue around it, above which larger means nearer."""
+"""Ratio of the value on a tool to that of the tissue around it above which larger means nearer."""
 SAMPLES = 4000
-"""Pixels of an image that enter its correlation."""
+"""Number of pixels per image for the correlation."""
 MIN_PIXELS = 50
-"""Fewer pixels give no figure."""
+"""With fewer pixels no statistic is computed."""
 
 
 @dataclass(frozen=True)
 class UnitGuess:
-    """The unit of a depth, and why."""
+    """The guessed unit of depth values, and the reason."""
 
     unit: Unit
-    """`ambiguous`: no unit puts the tissue at an endoscope's distance; `none`: there is no depth."""
+    """`ambiguous`: no unit gives a plausible distance; `none`: there is no depth."""
     mm_per_unit: float | None
-    """Factor that brings the values to mm; None where the unit is not a length, or not known."""
+    """Factor to mm; None if the unit is unknown or not a length."""
     median: float
     """Median of the values, in their own unit; 0 without any."""
     shading: float
@@ -51,7 +51,7 @@ class UnitGuess:
     tool_ratio: float
     """Median value on tools divided by that of the tissue around them: about 0.6 for depth; NaN if unknown."""
     reason: str
-    """One line."""
+    """The measurements in one line."""
 
 
 def guess_unit(
@@ -60,8 +60,7 @@ def guess_unit(
     """Guess the unit of a clip's depth from a few frames of it.
 
     Args:
-        frames: of each frame the values (H, W), where they were measured (H, W), the image (H, W, 3) and the
-            tissue mask (H, W), True on tissue.
+        frames: for each frame the values (H, W), their validity (H, W), the image (H, W, 3) and the tissue mask (H, W).
     """
     medians, shadings, ratios = [], [], []
     for values, valid, image, tissue in frames:
@@ -89,7 +88,7 @@ def _decide(median: float, shading: float, tool: float) -> tuple[Unit, float | N
 
 
 def _larger_is_nearer(shading: float, tool: float) -> bool:
-    """Shading decides where it is clear and tools do not object; where it is weak, tools decide."""
+    """Use shading if it is clear and tools do not contradict it; if it is weak, use tools."""
     if shading > SHADING_LIMIT:
         return not tool < 1 / TOOL_LIMIT
     return shading > -SHADING_LIMIT / 2 and tool > TOOL_LIMIT
@@ -106,7 +105,7 @@ def _reason(median: float, shading: float, tool: float) -> str:
 
 
 def _shading(values: NDArray, image: NDArray[np.uint8], where: NDArray[np.bool_]) -> list[float]:
-    """Rank correlation of smoothed brightness and value; none where there are few pixels or only one value."""
+    """Rank correlation of smoothed brightness and value; empty for too few pixels or a constant value."""
     brightness = cv2.GaussianBlur(image.max(-1).astype(np.float32), (0, 0), max(image.shape[1] / 80, 1.0))
     picked = np.flatnonzero(where)
     picked = picked[:: max(1, len(picked) // SAMPLES)]
@@ -117,7 +116,7 @@ def _shading(values: NDArray, image: NDArray[np.uint8], where: NDArray[np.bool_]
 
 
 def _tool_ratio(values: NDArray, valid: NDArray[np.bool_], tissue: NDArray[np.bool_]) -> list[float]:
-    """Median on tools over median of the tissue around them; none where either has few pixels."""
+    """Median on tools divided by the median of the tissue around them; empty if either has too few pixels."""
     reach = max(3, values.shape[1] // 40)
     near_tool = cv2.dilate((~tissue).astype(np.uint8), np.ones((reach, reach), np.uint8)).astype(bool)
     on_tool, around = values[valid & ~tissue], values[valid & tissue & near_tool]

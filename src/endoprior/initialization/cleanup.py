@@ -1,4 +1,4 @@
-"""Thinning and cleaning of a point cloud: one point per voxel, and no point far from its neighbors. `N` points."""
+"""Clean-up of a point cloud: voxel downsampling and outlier removal. `N` points."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ class PointCloud:
     colors: NDArray[np.float32]
     """(N, 3) red, green, blue in [0, 1]."""
     origins: NDArray[np.int32]
-    """(N,) position of the frame each point was lifted from, in the list of frames sampled."""
+    """(N,) position of the source frame of each point in the list of sampled frames."""
 
     def __len__(self) -> int:
         return len(self.points)
 
     def taken(self, rows: NDArray) -> PointCloud:
-        """The points that `rows`, an index or a mask, picks."""
+        """The points selected by `rows`, indices or a mask."""
         return PointCloud(self.points[rows], self.colors[rows], self.origins[rows])
 
 
-def joined(clouds: list[PointCloud]) -> PointCloud:
-    """One cloud of all; an empty list gives an empty cloud."""
+def concatenated(clouds: list[PointCloud]) -> PointCloud:
+    """One cloud of all points; an empty list gives an empty cloud."""
     empty = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.int32))
     parts = [(cloud.points, cloud.colors, cloud.origins) for cloud in clouds or [empty]]
     return PointCloud(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
@@ -40,7 +40,7 @@ def merge_voxels(cloud: PointCloud, divisions: int) -> PointCloud:
 
     Args:
         cloud: finite points.
-        divisions: the longest side of the cloud's box is this many voxels long; its corner is the center of a voxel.
+        divisions: number of voxels along the longest side of the bounding box, whose corner is the center of a voxel.
     Returns:
         One point per occupied voxel, ordered by voxel (x, then y, then z), with the origin of its first point.
     """
@@ -64,14 +64,14 @@ def merge_voxels(cloud: PointCloud, divisions: int) -> PointCloud:
 
 
 def remove_outliers(cloud: PointCloud, num_neighbors: int, num_std: float) -> PointCloud:
-    """Drop points whose mean distance to their neighbors is unusually large.
+    """Remove points whose mean distance to their neighbors is unusually large.
 
     Args:
         cloud: finite points.
-        num_neighbors: nearest points that are averaged, the point itself (distance 0) counted as one of them.
-        num_std: points above mean + this many standard deviations of those averages are dropped.
+        num_neighbors: number of nearest points in the mean, including the point itself (distance 0).
+        num_std: points above the mean plus this many standard deviations are removed.
     Returns:
-        The other points, in their order; the cloud itself when it has no more than `num_neighbors` points.
+        The other points, in order; the cloud itself if it has at most `num_neighbors` points.
     """
     if len(cloud) <= num_neighbors:
         return cloud

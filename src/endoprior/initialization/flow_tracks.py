@@ -1,8 +1,8 @@
-"""Where surface points travel: optical flow from frame to frame, lifted by measured depth, as temporal coefficients.
+"""Initialize the motion: track surface points by optical flow and depth, and fit temporal coefficients.
 
-Coefficients that start at zero have to learn every motion from color, whose gradient reaches a few pixels only; tissue
-that moves farther than that between frames is then explained by Gaussians that fade in and out. Following each point by
-dense inverse search (Kroeger et al. 2016, OpenCV) first gives training the motion, and leaves it to refine it.
+Coefficients that start at zero learn motion from color alone, whose gradient reaches only a few pixels. Tissue that
+moves farther between frames is then explained by Gaussians that fade in and out. Tracking each point by dense inverse
+search (Kroeger et al. 2016, OpenCV) provides an initial motion, which training refines.
 
 Shared letters: `T` training frames, `N` points, `B` basis functions.
 """
@@ -27,31 +27,31 @@ from .cleanup import PointCloud
 from .sampling import has_surface
 
 MIN_SIZE_PX = 32
-"""Smallest image side that dense inverse search can work on."""
+"""Smallest image side that dense inverse search supports."""
 HALVED_FROM_PX = 256
-"""Frames whose shorter side is at least this long are followed at half their size: four times faster, hardly worse."""
+"""Frames with at least this shorter side are tracked at half size: four times faster, almost as accurate."""
 RETURN_PX, RETURN_SHARE = 1.0, 0.05
 """A point is lost where forward and backward flow disagree by more than this, plus this share of the step."""
-STILL_MARGIN = 1.1
-"""A point stands still if its color explains the frames there, up to this factor as well as along its track."""
+STATIC_MARGIN = 1.1
+"""A point is static if its color error at the static position is at most this factor times that along its track."""
 BLUR_PX = 1.5
-"""Standard deviation of the blur under which colors are compared."""
+"""Standard deviation of the blur before colors are compared."""
 FLOW_BYTES = 40
-"""Per pixel of a frame, while the flow of a pair is computed."""
+"""Memory per pixel while the flow of a pair of frames is computed, bytes."""
 FLOW_CHUNK = 16
-"""Pairs of frames whose flow is computed, kept and forgotten together."""
+"""Number of frame pairs whose flow is computed and cached together."""
 RIDGE = 1e-2
-"""Of the least squares that turn tracks into coefficients; frames count 1 each."""
+"""Ridge term of the least-squares fit of coefficients to tracks; each frame has weight 1."""
 
 log = logging.getLogger(__name__)
 
 
 def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig) -> NDArray[np.float32]:
-    """Temporal coefficients that carry every point of the cloud along its track.
+    """Temporal coefficients that move every point of the cloud along its track.
 
     Args:
         frames: T training frames (never test frames), in order.
-        cloud: points with the frames they were lifted from.
+        cloud: points with their source frames.
     Returns:
         (N, B, 3) coefficients of the centers, mm; 0 for frames too small for optical flow.
     """
@@ -60,8 +60,8 @@ def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig)
         log.warning("initial motion: frames of %d x %d px are too small for optical flow", width, height)
         return np.zeros((len(cloud), cfg.num_bases, 3), np.float32)
     points = cloud.points.astype(np.float64)
-    pixels = follow(frames, points, cloud.origins)
-    moving = ~stands_still(frames, points, cloud.origins, pixels)
+    pixels = track_points(frames, points, cloud.origins)
+    moving = ~is_static(frames, points, cloud.origins, pixels)
     log.info("initial motion: %d of %d points move", moving.sum(), len(cloud))
     offsets = lift(frames, pixels[:, moving]) - points[moving]
     kernels.fill_gaps(offsets)
@@ -70,13 +70,13 @@ def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig)
     return motion
 
 
-def follow(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Pixels of each point in every frame, by chaining flow away from its own frame in both directions.
+def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Pixels of each point in every frame, by chaining optical flow from its source frame in both directions.
 
-    A point is lost, from there on, where it leaves image or tissue or where the flow back does not return to it.
+    A track ends where the point leaves the image or the tissue, or where backward flow does not return to it.
 
     Args:
-        points: (N, 3) world, mm. origins: (N,) position in `frames` that each was lifted from.
+        points: (N, 3) world, mm. origins: (N,) positions of their source frames in `frames`.
     Returns:
         (T, N, 2) px; NaN where a point is lost.
     """
@@ -98,7 +98,7 @@ FlowPair = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def _flows(frames: Sequence[Frame]) -> Callable[[int], FlowPair]:
-    """A function that gives the flows between frames k and k + 1; as many are kept as memory allows."""
+    """A function that returns the flows between frames k and k + 1; it caches as many as memory allows."""
     height, width = frames[0].tissue_mask.shape
     shrink = 2 if min(height, width) >= HALVED_FROM_PX else 1
     size = (width // shrink, height // shrink)
@@ -112,7 +112,7 @@ def _flows(frames: Sequence[Frame]) -> Callable[[int], FlowPair]:
         grays = [gray(k) for k in range(first, min(first + FLOW_CHUNK + 1, len(frames)))]
 
         def both_ways(k: int) -> FlowPair:
-            # A new estimator for each pair: it keeps buffers, and a pair must not depend on the one before.
+            # A new estimator for each pair: it keeps buffers, and a result must not depend on the previous pair.
             estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
             forward = estimator.calc(grays[k], grays[k + 1], None)
             return forward, estimator.calc(grays[k + 1], grays[k], None)
@@ -120,35 +120,35 @@ def _flows(frames: Sequence[Frame]) -> Callable[[int], FlowPair]:
         with ThreadPoolExecutor(workers(FLOW_BYTES * width * height)) as pool:  # OpenCV releases the interpreter lock
             return list(pool.map(both_ways, range(len(grays) - 1)))
 
-    kept: BoundedCache[list[FlowPair]] = BoundedCache(
+    cache: BoundedCache[list[FlowPair]] = BoundedCache(
         cache_bytes(), lambda pairs: sum(flow.nbytes for pair in pairs for flow in pair)
     )
-    return lambda k: kept.get(k // FLOW_CHUNK, lambda: chunk(k // FLOW_CHUNK))[k % FLOW_CHUNK]
+    return lambda k: cache.get(k // FLOW_CHUNK, lambda: chunk(k // FLOW_CHUNK))[k % FLOW_CHUNK]
 
 
-def stands_still(
+def is_static(
     frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer], pixels: NDArray
 ) -> NDArray[np.bool_]:
-    """(N,) whether a point left at rest matches the frames as well as its track does.
+    """(N,) whether a static point matches the frames as well as its track does.
 
-    Chained flow drifts, and depth jitters: where nothing moves, rest is the better guess.
+    Chained flow drifts and depth jitters, so without motion the static position is the better estimate.
 
     Args:
-        points: (N, 3) world, mm. origins: (N,) positions in `frames`. pixels: (T, N, 2) from `follow`.
+        points: (N, 3) world, mm. origins: (N,) positions in `frames`. pixels: (T, N, 2) from `track_points`.
     """
 
     def blurred(position: int) -> NDArray[np.uint8]:
         return cv2.GaussianBlur(cv2.cvtColor(frames[position].rgb_u8, cv2.COLOR_RGB2GRAY), (0, 0), BLUR_PX)
 
-    own_gray, along_track, at_rest = np.zeros((3, len(points)))
+    own_gray, along_track, if_static = np.zeros((3, len(points)))
     for position in np.unique(origins):
         own = origins == position
         own_gray[own] = bilinear(blurred(position), pixels[position, own])
     for position in range(len(frames)):
         image = blurred(position)
-        resting = _project_in_front(points, frames[position].camera)
-        kernels.add_mismatch(image, pixels[position], origins != position, resting, own_gray, along_track, at_rest)
-    return at_rest <= STILL_MARGIN * along_track
+        static = _project_in_front(points, frames[position].camera)
+        kernels.add_mismatch(image, pixels[position], origins != position, static, own_gray, along_track, if_static)
+    return if_static <= STATIC_MARGIN * along_track
 
 
 def _project_in_front(points: NDArray, camera: Camera) -> NDArray[np.float64]:
@@ -158,7 +158,7 @@ def _project_in_front(points: NDArray, camera: Camera) -> NDArray[np.float64]:
 
 
 def lift(frames: Sequence[Frame], pixels: NDArray) -> NDArray[np.float64]:
-    """World points (T, N, 3) mm of pixels (T, N, 2); NaN where the pixel is unknown or has no measured depth."""
+    """Back-project pixels (T, N, 2) to world points (T, N, 3), mm; NaN without a pixel or measured depth."""
     found = np.full((*pixels.shape[:2], 3), np.nan)
     for position, frame in enumerate(frames):
         known = np.flatnonzero(np.isfinite(pixels[position, :, 0]))
@@ -171,7 +171,7 @@ def lift(frames: Sequence[Frame], pixels: NDArray) -> NDArray[np.float64]:
 
 
 def _nearest(pixels: NDArray, width: int, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Column and row of the pixel that each position falls into, held inside the image."""
+    """Column and row of the pixel at each position, clamped to the image."""
     x, y = np.floor(pixels).astype(np.intp).T
     return np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
 

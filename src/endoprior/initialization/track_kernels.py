@@ -1,7 +1,7 @@
-"""Loops over points behind `tracks`: one step along the flow, brightness along a track and at rest, gaps filled.
+"""Numba kernels of `flow_tracks`: one step along the flow, color error of tracks, filling of gaps.
 
-Shared letters: `N` points, `T` frames. Pixels are float64 with centers at half integers; NaN is a lost point. Input is
-trusted.
+Shared letters: `N` points, `T` frames. Pixels are float64 with centers at half integers; NaN is a lost point. Inputs
+are not checked.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from numba import njit, prange
 
 @njit(parallel=True, cache=True)
 def advance(pixels, active, there, back, tissue_mask, return_px, return_share, out):
-    """Move active points (N, 2) by the flow `there` (h, w, 2), which `back` must undo, onto tissue (H, W); else NaN.
+    """Move active points (N, 2) by the flow `there` (h, w, 2); NaN off the tissue (H, W) or if `back` disagrees.
 
-    Flow is in px of its own size. Points that are not active are left as they are in `out`.
+    Flow is in px of its own size. Inactive points in `out` do not change.
     """
     height, width = tissue_mask.shape
     scale_x, scale_y = width / there.shape[1], height / there.shape[0]
@@ -34,17 +34,17 @@ def advance(pixels, active, there, back, tissue_mask, return_px, return_share, o
 
 
 @njit(parallel=True, cache=True)
-def add_mismatch(image, pixels, active, resting, own_gray, along_track, at_rest):
-    """Add |image - own_gray| along the track and at the `resting` pixel, for active points (N, 2) that are in sight."""
+def add_mismatch(image, pixels, active, static, own_gray, along_track, if_static):
+    """Add |image - own_gray| along the track and at the `static` pixel, for active points (N, 2) with a known pixel."""
     for n in prange(len(pixels)):
         if active[n] and pixels[n, 0] == pixels[n, 0]:
             along_track[n] += abs(brightness(image, pixels[n, 0], pixels[n, 1]) - own_gray[n])
-            at_rest[n] += abs(brightness(image, resting[n, 0], resting[n, 1]) - own_gray[n])
+            if_static[n] += abs(brightness(image, static[n, 0], static[n, 1]) - own_gray[n])
 
 
 @njit(parallel=True, cache=True)
 def fill_gaps(offsets):
-    """Replace NaN in offsets (T, N, 3): linear in frames between known ones, held before and after; 0 if none is."""
+    """Replace NaN in offsets (T, N, 3): linear between known frames, constant before and after; 0 if none is known."""
     num_frames = len(offsets)
     for n in prange(offsets.shape[1]):
         last = -1
@@ -63,7 +63,7 @@ def fill_gaps(offsets):
 
 @njit(cache=True)
 def brightness(image, x, y):
-    """Bilinear value of an image (H, W), border held."""
+    """Bilinear value of an image (H, W); outside, the border value is repeated."""
     row, below, column, right, fx, fy = _place(x, y, image.shape[0], image.shape[1])
     above = (1 - fx) * image[row, column] + fx * image[row, right]
     return (1 - fy) * above + fy * ((1 - fx) * image[below, column] + fx * image[below, right])
@@ -85,7 +85,7 @@ def _flow(flow, x, y):
 
 @njit(inline="always")
 def _place(x, y, height, width):
-    # Rows, columns and fractions of the four pixels around a position, as `geometry.bilinear` has them.
+    # Rows, columns and fractions of the four pixels around a position, as in `geometry.bilinear`.
     u, v = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
     column, row = int(u), int(v)
     return row, min(row + 1, height - 1), column, min(column + 1, width - 1), u - column, v - row

@@ -1,4 +1,4 @@
-"""A synthetic operation with full ground truth: the demo's data and the benchmark that knows the answer."""
+"""Synthetic surgical sequences with full ground truth, for the demo and for benchmarks."""
 
 from __future__ import annotations
 

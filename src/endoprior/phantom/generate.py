@@ -1,4 +1,4 @@
-"""Writes a synthetic sequence with its ground truth: build the anatomy once, then move, draw and develop each frame."""
+"""Write a synthetic sequence with ground truth: build the anatomy once, then deform, render and expose each frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..data.writer import SequenceMeta, SequenceWriter
 from .config import PhantomConfig
-from .instrument import draw_tools
+from .instrument import render_tools
 from .motion import Motion, build_motion
 from .raster import FAR, rasterize, vertex_normals
 from .sensor import develop, expose, exposure_gain, stereo_depth, vignette
@@ -28,7 +28,7 @@ _LEFT = np.zeros(3, np.float32)
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything about one seed that does not change with time."""
+    """The static parts of one synthetic sequence."""
 
     cfg: PhantomConfig
     plane: Plane
@@ -36,7 +36,7 @@ class Scene:
     a: NDArray[np.float64]
     """(MH, MW) plane coordinates of the mesh vertices, mm."""
     b: NDArray[np.float64]
-    """(MH, MW) likewise."""
+    """(MH, MW) second plane coordinate, mm."""
     height: NDArray[np.float32]
     """(MH, MW) rest height of the vertices, mm."""
     texture: NDArray[np.float32]
@@ -49,24 +49,24 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class View:
-    """One eye's view of one moment."""
+class RenderedView:
+    """The image of one camera at one time."""
 
     tissue: NDArray[np.float32]
     """(H, W, 3) linear radiance without tools."""
-    picture: NDArray[np.float32]
+    image: NDArray[np.float32]
     """(H, W, 3) linear radiance with tools."""
     tool_share: NDArray[np.float32]
-    """(H, W) share of each pixel that shows a tool, 0..1."""
+    """(H, W) share of each pixel that is covered by a tool, 0..1."""
     tool_depth: NDArray[np.float32]
     """(H, W) z of the nearest tool sample, mm; FAR where there is none."""
 
 
 def build_scene(cfg: PhantomConfig) -> Scene:
-    """Lay out anatomy, texture and motion of one seed."""
+    """Build anatomy, texture and motion of one seed."""
     plane, anatomy = build_plane(cfg), build_anatomy(cfg.seed)
     grown = 1 + 2 * MARGIN
-    # A vertex every two pixels, but never so few that the loops lose their shape.
+    # A vertex every two pixels, but enough for the shape of the loops.
     across = round(grown * min(max(cfg.width / 2, 160), 480))
     down = round(across * cfg.height / cfg.width)
     grid_v, grid_u = np.meshgrid(np.linspace(0, 1, down), np.linspace(0, 1, across), indexing="ij")
@@ -78,24 +78,24 @@ def build_scene(cfg: PhantomConfig) -> Scene:
     return Scene(cfg, plane, build_motion(cfg, plane, anatomy), a, b, height, texture)
 
 
-def draw(scene: Scene, vertices: NDArray, phase: float, eye: NDArray[np.float32]) -> View:
-    """Render one eye's view of the mesh `vertices` (MH, MW, 3) and of the tools at time `phase`."""
+def render_view(scene: Scene, vertices: NDArray, phase: float, camera: NDArray[np.float32]) -> RenderedView:
+    """Render the mesh `vertices` (MH, MW, 3) and the tools at time `phase` from one camera."""
     cfg, n = scene.cfg, SUPERSAMPLE
     focal, center = n * cfg.focal, (n * cfg.center[0], n * cfg.center[1])
-    hits = rasterize(vertices - eye, focal, center, n * cfg.width, n * cfg.height)
-    assert hits[..., 2].max() < FAR, "the material ends inside the picture"
-    tissue = shade(hits, vertex_normals(vertices), scene.texture, scene.plane, eye, focal, center, FAR)
-    color, depth = draw_tools(scene.motion.tools(phase), np.ascontiguousarray(hits[..., 2]), eye, focal, center)
+    hits = rasterize(vertices - camera, focal, center, n * cfg.width, n * cfg.height)
+    assert hits[..., 2].max() < FAR, "the material ends inside the image"
+    tissue = shade(hits, vertex_normals(vertices), scene.texture, scene.plane, camera, focal, center, FAR)
+    color, depth = render_tools(scene.motion.tools(phase), np.ascontiguousarray(hits[..., 2]), camera, focal, center)
     is_tool = depth < FAR
-    picture = np.where(is_tool[..., None], color, tissue)
+    image = np.where(is_tool[..., None], color, tissue)
     size = (cfg.width, cfg.height)
-    pooled = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (tissue, picture, is_tool.astype(np.float32))]
+    pooled = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (tissue, image, is_tool.astype(np.float32))]
     nearest = np.minimum.reduce([depth[i::n, j::n] for i in range(n) for j in range(n)])
-    return View(*pooled, nearest)
+    return RenderedView(*pooled, nearest)
 
 
 def choose_tracks(scene: Scene) -> NDArray[np.int64]:
-    """(P, 2) mesh rows and columns to follow: two thirds all over the first picture, the rest near the pulls."""
+    """(P, 2) mesh rows and columns to track: two thirds spread over the first image, the rest near the pulls."""
     cfg = scene.cfg
     rng = np.random.default_rng([cfg.seed, 5])
     vertices = scene.vertices(0.0)
@@ -104,29 +104,29 @@ def choose_tracks(scene: Scene) -> NDArray[np.int64]:
     rows, columns = np.nonzero(seen)
     pull = sum(p.weight(scene.a, scene.b) for p in scene.motion.pulls)[rows, columns]
     spread = min(cfg.tracks * 2 // 3, len(rows))
-    # np.nonzero lists vertices row by row: even steps through the list spread over the picture.
+    # np.nonzero lists vertices row by row: even steps through the list cover the image.
     even = np.linspace(0, len(rows) - 1, spread).astype(int) if spread else np.zeros(0, int)
     weight = pull**2
     weight[even] = 0
     extra = min(cfg.tracks - spread, int((weight > 0).sum()))
-    drawn = rng.choice(len(rows), extra, replace=False, p=weight / weight.sum())
-    chosen = np.sort(np.concatenate([even, drawn]))
+    near_pulls = rng.choice(len(rows), extra, replace=False, p=weight / weight.sum())
+    chosen = np.sort(np.concatenate([even, near_pulls]))
     return np.stack([rows[chosen], columns[chosen]], -1)
 
 
 def visible_points(
     points: NDArray, z: NDArray[np.float32], tool: NDArray[np.bool_], cfg: PhantomConfig
 ) -> NDArray[np.bool_]:
-    """(...,) True where `points` (..., 3) are in frame and neither nearer tissue `z` (H, W) nor `tool` covers them."""
+    """(...,) True where `points` (..., 3) are in the image and not occluded by tissue `z` (H, W) or `tool`."""
     x = cfg.focal * points[..., 0] / points[..., 2] + cfg.center[0]
     y = cfg.focal * points[..., 1] / points[..., 2] + cfg.center[1]
     inside = (x >= 0) & (x < cfg.width) & (y >= 0) & (y < cfg.height)
-    # The depth of the four pixels around the point: on a slope the point may lie behind some of them, never behind all.
+    # Depth of the four pixels around the point: on a slope the point may lie behind some of them, never behind all.
     j = np.clip(np.floor(x - 0.5).astype(int), 0, cfg.width - 2)
     i = np.clip(np.floor(y - 0.5).astype(int), 0, cfg.height - 2)
     around = np.stack([z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]])
     covered = tool[np.clip(y, 0, cfg.height - 1).astype(int), np.clip(x, 0, cfg.width - 1).astype(int)]
-    # Points beside a silhouette, where the four depths differ by more than a slope of 4 would make, are called hidden.
+    # Points next to a silhouette count as occluded: there the four depths differ by more than a slope of 4.
     smooth = np.ptp(around, axis=0) < 0.3 + 4 * points[..., 2] / cfg.focal
     return inside & smooth & (points[..., 2] <= around.max(0) + 0.15) & ~covered
 
@@ -134,10 +134,10 @@ def visible_points(
 def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], None] | None = None) -> None:
     """Write a synthetic sequence folder with ground truth to `out`.
 
-    Beside the sequence (images, masks, depth, poses, `sequence.json`) it writes `truth/tissue/*.png` (the picture
+    Beside the sequence (images, masks, depth, poses, `sequence.json`) it writes `truth/tissue/*.png` (the image
     without tools and without sensor noise), `truth/depth/*.npy` ((H, W) float32 z of the tool-free tissue, mm) and
     `truth/tracks.npz` (`points` (T, P, 3) float32 mm in camera axes, `visible` (T, P) bool); with `cfg.stereo` also
-    `right/*.png` and `calibration.json`. Tools cast no shadow, so outside them a picture is the truth plus noise.
+    `right/*.png` and `calibration.json`. Tools cast no shadow, so outside them a image is the truth plus noise.
 
     Args:
         out: a new or empty folder; it appears when complete.
@@ -163,30 +163,28 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
         scene = build_scene(cfg)
         tracked = choose_tracks(scene)
         lens = vignette(cfg.width, cfg.height)
-        right_eye = np.array([cfg.baseline_mm, 0, 0], np.float32)
+        right_camera = np.array([cfg.baseline_mm, 0, 0], np.float32)
         # Masks cover the tool's blended rim and one pixel more, as annotators' outlines do.
         rim = np.ones((3, 3), np.uint8)
         points, visible, gain = [], [], None
         for index in range(cfg.frames):
             phase = index / (cfg.frames - 1)
             vertices = scene.vertices(phase)
-            view = draw(scene, vertices, phase, _LEFT)
+            view = render_view(scene, vertices, phase, _LEFT)
             gain = exposure_gain(view.tissue) if gain is None else gain
             truth = develop(view.tissue, gain, lens)
             rng = np.random.default_rng([cfg.seed, 6, index])
-            picture = expose(develop(view.picture, gain, lens), cfg.noise, rng)
+            image = expose(develop(view.image, gain, lens), cfg.noise, rng)
             mask = cv2.dilate((view.tool_share > 0).astype(np.uint8), rim) > 0
             z = rasterize(vertices, focal, cfg.center, cfg.width, cfg.height)[..., 2]
-            measured = stereo_depth(np.minimum(z, view.tool_depth), picture, cfg, rng)
+            measured = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
             writer.write_image("truth/tissue", np.round(truth).astype(np.uint8))
             writer.write_array(f"truth/depth/{index:06d}.npy", z)
             right = None
             if cfg.stereo:
-                other = draw(scene, vertices, phase, right_eye)
-                right = expose(
-                    develop(other.picture, gain, lens), cfg.noise, np.random.default_rng([cfg.seed, 7, index])
-                )
-            writer.add(picture, mask, measured, right)
+                other = render_view(scene, vertices, phase, right_camera)
+                right = expose(develop(other.image, gain, lens), cfg.noise, np.random.default_rng([cfg.seed, 7, index]))
+            writer.add(image, mask, measured, right)
             followed = vertices[tracked[:, 0], tracked[:, 1]]
             points.append(followed)
             visible.append(visible_points(followed, z, mask, cfg))

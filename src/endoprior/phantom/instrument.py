@@ -1,4 +1,4 @@
-"""Two laparoscopic graspers: a dark shaft, a metal collar, a wrist and two jaws, as signed distances traced per sample.
+"""Two laparoscopic graspers (shaft, collar, wrist, two jaws), rendered by sphere tracing of signed distances.
 
 A tool's 26 numbers (`pack_tool`): pivot, wrist, backward shaft direction, jaw direction, hinge and side axes (six
 3-vectors in camera axes, mm), cosine and sine of half the opening, linear color of the collar and of the shaft.
@@ -18,19 +18,19 @@ from .shading import HIGHLIGHT_LIMIT, LIGHTS_MM, REFERENCE_MM, ggx
 JAW_MM = 13.0
 """Length of a jaw."""
 GRIP_MM = 2.0
-"""How far behind the jaws' ends the tissue is held."""
+"""Distance of the grasped tissue from the ends of the jaws."""
 STEEL, GOLD = (0.72, 0.70, 0.67), (0.80, 0.52, 0.14)
 CARBON, BLACK = (0.050, 0.053, 0.050), (0.014, 0.014, 0.017)
 _STEPS = 70
 _TASKS = 64
 _SHAFT_BOUND_MM, _JAW_BOUND_MM = 3.6, 11.0
-"""Radii of the cylinder around shaft and collar, and of the ball around jaws and wrist, that hold the whole tool."""
+"""Bounding radii: cylinder around shaft and collar, sphere around jaws and wrist."""
 
 
 def pack_tool(
     pose: ToolPose, collar: tuple[float, float, float], shaft: tuple[float, float, float]
 ) -> NDArray[np.float32]:
-    """(26,) numbers of one instrument at one moment, as the module docstring lists them."""
+    """(26,) numbers of one instrument at one time, as listed in the module docstring."""
     reach = pose.tip - pose.pivot
     direct = reach / np.linalg.norm(reach)
     view = pose.tip / np.linalg.norm(pose.tip)
@@ -40,7 +40,7 @@ def pack_tool(
     wrist = pose.tip - (JAW_MM - GRIP_MM) * jaw
     back = pose.pivot - wrist
     back /= np.linalg.norm(back)
-    # The hinge points roughly at the camera, so that the opening of the jaws is seen.
+    # The hinge points roughly at the camera, so that the opening of the jaws is visible.
     hinge = -view + (view @ jaw) * jaw
     hinge /= np.linalg.norm(hinge)
     side = np.cross(hinge, jaw)
@@ -116,10 +116,10 @@ def _distance(px, py, pz, g):
 
 @njit(cache=True, fastmath=FAST)
 def _light(n, v, p, part, g, lights, grain, out):
-    # Radiance of a tool point: position p, unit normal n, unit direction v to the eye; writes out (3,).
+    # Radiance of a tool point: position p, unit normal n, unit direction v to the camera; writes out (3,).
     zero, one = np.float32(0), np.float32(1)
     facing = max(n[0] * v[0] + n[1] * v[1] + n[2] * v[2], zero)
-    # What a mirror would show: darkness behind the camera, elsewhere lit organs in streaks of light and shade.
+    # Environment reflection: dark behind the camera, elsewhere lit organs as streaks of light and shade.
     rx = np.float32(2) * facing * n[0] - v[0]
     ry = np.float32(2) * facing * n[1] - v[1]
     rz = np.float32(2) * facing * n[2] - v[2]
@@ -153,7 +153,7 @@ def _light(n, v, p, part, g, lights, grain, out):
 
 
 @njit(parallel=True, cache=True, fastmath=FAST)
-def _draw(tools, tissue_z, eye, lights, focal, cx, cy, far, color, depth):
+def _draw(tools, tissue_z, camera, lights, focal, cx, cy, far, color, depth):
     # A task takes every 64th row, since tools fill only some rows. Sphere-traces each tool in front of the tissue
     # tissue_z (SH, SW), mm; writes color (SH, SW, 3) and depth (SH, SW), only where a tool is nearest.
     zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
@@ -168,12 +168,12 @@ def _draw(tools, tissue_z, eye, lights, focal, cx, cy, far, color, depth):
             for k in range(tools.shape[0]):
                 g = tools[k]
                 # Trace only where the ray is inside a cylinder around the shaft or a ball around the jaws.
-                mx, my, mz = eye[0] - g[3], eye[1] - g[4], eye[2] - g[5]
-                ray_axis, eye_axis = rx * g[6] + ry * g[7] + rz * g[8], mx * g[6] + my * g[7] + mz * g[8]
+                mx, my, mz = camera[0] - g[3], camera[1] - g[4], camera[2] - g[5]
+                ray_axis, camera_axis = rx * g[6] + ry * g[7] + rz * g[8], mx * g[6] + my * g[7] + mz * g[8]
                 enter, leave = np.float32(1e9), np.float32(-1)
                 qa = max(one - ray_axis * ray_axis, np.float32(1e-6))
-                qb = mx * rx + my * ry + mz * rz - eye_axis * ray_axis
-                qc = mx * mx + my * my + mz * mz - eye_axis * eye_axis - np.float32(_SHAFT_BOUND_MM**2)
+                qb = mx * rx + my * ry + mz * rz - camera_axis * ray_axis
+                qc = mx * mx + my * my + mz * mz - camera_axis * camera_axis - np.float32(_SHAFT_BOUND_MM**2)
                 root = qb * qb - qa * qc
                 if root > zero:
                     root = np.sqrt(root)
@@ -189,7 +189,7 @@ def _draw(tools, tissue_z, eye, lights, focal, cx, cy, far, color, depth):
                 if t >= stop:
                     continue
                 for _ in range(_STEPS):
-                    d, part = _distance(eye[0] + t * rx, eye[1] + t * ry, eye[2] + t * rz, g)
+                    d, part = _distance(camera[0] + t * rx, camera[1] + t * ry, camera[2] + t * rz, g)
                     if d < np.float32(0.012):
                         hit = True
                         break
@@ -198,7 +198,7 @@ def _draw(tools, tissue_z, eye, lights, focal, cx, cy, far, color, depth):
                         break
                 if not hit or t >= stop:
                     continue
-                p[0], p[1], p[2] = eye[0] + t * rx, eye[1] + t * ry, eye[2] + t * rz
+                p[0], p[1], p[2] = camera[0] + t * rx, camera[1] + t * ry, camera[2] + t * rz
                 # Gradient of the distance from four corners of a small tetrahedron.
                 e = np.float32(0.03)
                 d0 = _distance(p[0] + e, p[1] - e, p[2] - e, g)[0]
@@ -233,26 +233,26 @@ def _draw(tools, tissue_z, eye, lights, focal, cx, cy, far, color, depth):
                     color[i, j, c] = radiance[c]
 
 
-def draw_tools(
+def render_tools(
     poses: tuple[ToolPose, ToolPose],
     tissue_z: NDArray[np.float32],
-    eye: NDArray[np.float32],
+    camera: NDArray[np.float32],
     focal: float,
     center: tuple[float, float],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Draw both instruments in front of the tissue.
+    """Render both instruments in front of the tissue.
 
     Args:
         poses: the carbon-shafted grasper, and the gold and black one.
         tissue_z: (SH, SW) depth of the tissue, mm.
-        eye: (3,) camera center in the left eye's axes, mm.
+        camera: (3,) camera center in the left camera's axes, mm.
         focal, center: of the sample grid, px.
     Returns:
-        (SH, SW, 3) linear radiance and (SH, SW) z in mm; z = raster.FAR where no tool is seen.
+        (SH, SW, 3) linear radiance and (SH, SW) z in mm; z = raster.FAR where no tool is visible.
     """
     tools = np.stack([pack_tool(poses[0], STEEL, CARBON), pack_tool(poses[1], GOLD, BLACK)])
     color = np.zeros((*tissue_z.shape, 3), np.float32)
     depth = np.full(tissue_z.shape, FAR, np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))
-    _draw(tools, tissue_z, eye.astype(np.float32), LIGHTS_MM, f, cx, cy, FAR, color, depth)
+    _draw(tools, tissue_z, camera.astype(np.float32), LIGHTS_MM, f, cx, cy, FAR, color, depth)
     return color, depth

@@ -1,4 +1,4 @@
-"""How the tissue and the instruments move: breathing of the whole field, pulls by the grasper, the tips' paths.
+"""Motion of tissue and instruments: breathing, pulls by the grasper, paths of the instrument tips.
 
 Every motion is a product of smooth functions of place and time (quintic steps, cosines, Gaussians), so that velocities
 are continuous. `phase` is time as a fraction of the sequence, in [0, 1].
@@ -17,7 +17,7 @@ from .surface import Anatomy, Plane, organs_at
 _BREATH_FRAMES = 40
 _PULL_FRAMES = 48
 _WIDE_MM, _NARROW_MM, _NARROW_SHARE = 14.0, 5.2, 0.45
-"""A pull moves a broad neighborhood and a small tent around the jaws."""
+"""A pull moves a broad neighborhood, plus a narrow peak around the jaws."""
 
 
 def smooth_step(low: float, high: float, x: float) -> float:
@@ -55,7 +55,7 @@ class Pull:
 
 @dataclass(frozen=True)
 class ToolPose:
-    """Where an instrument is at one moment, in camera axes, mm."""
+    """Pose of an instrument at one time, in camera axes, mm."""
 
     pivot: NDArray[np.float64]
     """(3,) point the shaft always passes through (the port in the abdominal wall)."""
@@ -69,7 +69,7 @@ class ToolPose:
 
 @dataclass(frozen=True)
 class Motion:
-    """All that moves, for one seed."""
+    """The motion of tissue and tools for one seed."""
 
     plane: Plane
     anatomy: Anatomy
@@ -77,7 +77,7 @@ class Motion:
     breathing_mm: float
     pulls: tuple[Pull, ...]
     idles: NDArray[np.float64]
-    """(cycles + 1, 3) places (a, b, height) in mm where the grasper waits between grasps."""
+    """(cycles + 1, 3) positions (a, b, height) of the grasper between grasps, mm."""
     hover: NDArray[np.float64]
     """(6,) second tool: center (a, b, height), sweep (a, b) in mm, time shift in rad."""
     side: float
@@ -86,7 +86,7 @@ class Motion:
     def displacement(self, a: NDArray, b: NDArray, phase: float) -> NDArray[np.float64]:
         """(..., 3) motion away from rest along e_a, e_b and the normal, mm, at plane points `a, b`."""
         cycle = 2 * np.pi * phase * (self.frames - 1) / _BREATH_FRAMES
-        # The field swells and slides; far parts lag a little and move a little less.
+        # The tissue swells and slides; distant parts lag slightly and move slightly less.
         lag = 0.006 * a - 0.009 * b
         swell = 0.5 * self.breathing_mm * (np.sin(cycle - lag) + 0.18 * np.sin(2 * (cycle - lag) + 0.7))
         slide = 0.3 * self.breathing_mm * np.sin(cycle - lag - 0.5)
@@ -99,7 +99,7 @@ class Motion:
         return moved
 
     def held(self, pull: Pull, phase: float) -> NDArray[np.float64]:
-        """(3,) camera-space position of the surface point that `pull` takes hold of, mm."""
+        """(3,) camera-space position of the surface point grasped by `pull`, mm."""
         a, b = pull.center
         moved = self.displacement(np.array(a), np.array(b), phase)
         return self.plane.lift(a + moved[0], b + moved[1], pull.height + moved[2])
@@ -127,17 +127,17 @@ class Motion:
 
 
 def build_motion(cfg: PhantomConfig, plane: Plane, anatomy: Anatomy) -> Motion:
-    """Choose the motion of one seed: the grasper takes the hero loop, each time at another place."""
+    """Choose the motion of one seed: the grasper takes the main_loop loop, each time at another place."""
     rng = np.random.default_rng([cfg.seed, 4])
     side = float(rng.choice([-1.0, 1.0]))
     cycles = max(1, round(cfg.frames / _PULL_FRAMES))
-    hero = anatomy.paths[0].astype(float)
-    # Only the part of the loop inside the picture can be seen to move; nearest to the grasper's side first.
-    central = hero[(np.abs(hero[:, 0]) < 20) & (np.abs(hero[:, 1]) < 16)]
+    main_loop = anatomy.paths[0].astype(float)
+    # Grasp only the part of the loop inside the image.
+    central = main_loop[(np.abs(main_loop[:, 0]) < 20) & (np.abs(main_loop[:, 1]) < 16)]
     pulls, idles = [], []
     for k in range(cycles + 1):
         center = central[rng.integers(len(central))] + rng.normal(0, 1.0, 2)
-        # Waiting places stay near the middle, so that the tool never leaves the picture.
+        # Idle positions stay near the center, so that the tool never leaves the image.
         idle = np.clip(center + np.array([side * rng.uniform(2, 10), rng.uniform(3, 9)]), [-11, -10], [11, 6])
         idles.append([*idle, rng.uniform(25, 30)])
         if k < cycles:

@@ -10,7 +10,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
-"""Compiler freedoms that keep NaN and infinity meaningful."""
+"""LLVM fast-math flags that keep NaN and infinity."""
 
 
 @njit(cache=True, inline="always")

@@ -1,4 +1,4 @@
-"""Draws the deformed material mesh: which material point, how far away, each image sample sees.
+"""Rasterize the deformed mesh: material coordinates and depth of each image sample.
 
 Letters: (MH, MW) mesh vertices, (SH, SW) image samples; sample (i, j) is centered at (j + 0.5, i + 0.5).
 """
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from .noise import FAST
 
 _BANDS = 16
-_RIM = np.float32(1e-4)  # by which triangles are widened: a sample on a shared edge must not fall between the two
+_RIM = np.float32(1e-4)  # triangles are widened by this, so that samples on a shared edge belong to one of the two
 FAR = np.float32(1e9)
-"""Depth where nothing was drawn."""
+"""Depth of samples without a surface."""
 
 
 @njit(parallel=True, cache=True, fastmath=FAST)

@@ -1,4 +1,4 @@
-"""From light to files: exposure, tone curve, vignetting, sensor noise, and depth as a stereo matcher would give it."""
+"""The camera model: exposure, tone curve, vignetting, sensor noise, and simulated stereo depth."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _TARGET_MEDIAN = 0.15
 
 
 def exposure_gain(radiance: NDArray[np.float32]) -> float:
-    """The gain that brings the median of a tool-free picture (H, W, 3) to the target; kept for the whole sequence."""
+    """The gain that maps the median of a tool-free image (H, W, 3) to the target; constant over the sequence."""
     return _TARGET_MEDIAN / max(float(np.median(radiance @ np.array([0.30, 0.59, 0.11], np.float32))), 1e-6)
 
 
 def vignette(width: int, height: int) -> NDArray[np.float32]:
-    """(H, W, 1) share of the light that the lens passes: 1 in the middle, about a third in the corners."""
+    """(H, W, 1) transmission of the lens: 1 in the center, about a third in the corners."""
     x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
     y = ((np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1)[:, None]
     square = (x * x + 0.8 * y * y) / np.float32(1.8)
@@ -36,7 +36,7 @@ def develop(radiance: NDArray[np.float32], gain: float, shading: NDArray[np.floa
 
 
 def expose(display: NDArray[np.float32], noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) 8-bit picture with sensor noise, which gamma lifts in dark places.
+    """(H, W, 3) 8-bit image with sensor noise, which gamma amplifies in dark regions.
 
     Args:
         display: (H, W, 3) noise-free values in [0, 255].
@@ -44,7 +44,7 @@ def expose(display: NDArray[np.float32], noise: float, rng: np.random.Generator)
     """
     if noise > 0:
         grain = rng.standard_normal(display.shape, dtype=np.float32)
-        # Shared by the channels in part, as demosaicing leaves it; gamma lifts the noise of dark pixels.
+        # Partly correlated between channels, as after demosaicing; gamma amplifies the noise of dark pixels.
         grain = np.float32(0.8) * grain + np.float32(0.6) * grain.mean(-1, keepdims=True)
         level = np.float32(noise) * (np.float32(1.25) - np.float32(0.5 / 255) * display)
         display = display + level * grain
@@ -52,12 +52,12 @@ def expose(display: NDArray[np.float32], noise: float, rng: np.random.Generator)
 
 
 def stereo_depth(
-    z: NDArray[np.float32], picture: NDArray[np.uint8], cfg: PhantomConfig, rng: np.random.Generator
+    z: NDArray[np.float32], image: NDArray[np.uint8], cfg: PhantomConfig, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """What a stereo matcher would measure of the depth `z` (H, W), mm; 0 where it would find nothing.
+    """Simulate stereo depth of the true depth `z` (H, W), mm; 0 where a matcher fails.
 
-    The disparity fx * baseline / z gets a smooth error (matching windows), an independent one and steps of 1/16 px,
-    all scaled to the image width. Missing: half-occluded strips left of nearer edges, the edges themselves, glints.
+    The disparity fx * baseline / z gets a smooth error (matching windows), an independent error and steps of 1/16 px,
+    all scaled to the image width. Missing: half-occluded strips left of near edges, the edges, and highlights.
     """
     unit = cfg.width / 640
     product = cfg.focal * cfg.baseline_mm
@@ -70,15 +70,15 @@ def stereo_depth(
     step = unit / 16
     measured = product / (np.round((disparity + error) / step) * step)
     square = np.ones((3, 3), np.uint8)
-    # Beside a jump (more than a slope of 4 makes from pixel to pixel) matching windows straddle two surfaces.
+    # Next to a depth edge (steeper than a slope of 4 per pixel) matching windows cover two surfaces.
     far_edge = z - cv2.erode(z, square) > 2 + 4 * z / cfg.focal
     hidden = cv2.dilate(far_edge.astype(np.uint8), square) | _half_occluded(disparity)
-    glint = cv2.dilate((picture.min(-1) >= 246).astype(np.uint8), square)
+    glint = cv2.dilate((image.min(-1) >= 246).astype(np.uint8), square)
     return np.where((hidden | glint) > 0, 0, measured).astype(np.float32)
 
 
 def _half_occluded(disparity: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(H, W) 1 where a nearer surface hides a pixel of `disparity` (H, W), px, from the right eye."""
+    """(H, W) 1 where a nearer surface hides a pixel of `disparity` (H, W), px, from the right camera."""
     column = np.arange(disparity.shape[1], dtype=np.float32)
     seen_at = column - disparity
     # Nearer surfaces shift further left: a pixel is hidden when one to its right lands at or left of its own place.

@@ -1,7 +1,7 @@
-"""Light on wet tissue: inverse-square falloff from two light guides beside the lens, soft diffuse, sharp highlights.
+"""Shading of wet tissue: two light guides next to the lens, inverse-square falloff, diffuse light, highlights.
 
-The diffuse part wraps a little around the edge, more in red, which stands for light that travels under the surface. The
-highlights are GGX lobes on a normal bent by the fine relief, seen from the eye and lit from the guides.
+Wrapped diffuse lighting, stronger in red, approximates subsurface scattering. Highlights are GGX lobes with a normal
+perturbed by the fine relief.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from .noise import FAST
 from .surface import Plane
 
 LIGHTS_MM = np.array([[-3.6, -2.2, 0.0], [3.9, -1.8, 0.0]], np.float32)
-"""(2, 3) light guides in the left eye's axes, mm."""
+"""(2, 3) light guides in the left camera's axes, mm."""
 REFERENCE_MM = 75.0
 """Distance at which each light has unit irradiance."""
 HIGHLIGHT_LIMIT = 3.0
-"""Radiance above which a sample counts no more, so that one glint does not fill a whole pixel."""
+"""Radiance of a sample is clamped to this, so that one highlight does not dominate a whole pixel."""
 
 
 @njit(cache=True, fastmath=FAST, inline="always")
@@ -30,7 +30,7 @@ def ggx(cosine, alpha):
 
 
 @njit(parallel=True, cache=True, fastmath=FAST)
-def _shade(hits, normals, texture, e_a, e_b, eye, lights, focal, cx, cy, far, out):
+def _shade(hits, normals, texture, e_a, e_b, camera, lights, focal, cx, cy, far, out):
     # One task per row of samples. hits (SH, SW, 3) from `rasterize`; normals (MH, MW, 3); texture (TH, TW, 7); writes
     # out (SH, SW, 3) linear radiance. Both look-ups are bilinear; black where nothing was hit.
     mesh_h, mesh_w = normals.shape[:2]
@@ -59,10 +59,10 @@ def _shade(hits, normals, texture, e_a, e_b, eye, lights, focal, cx, cy, far, ou
                 top = texture[iy, ix, k] * (one - fx) + texture[iy, ix + 1, k] * fx
                 low = texture[iy + 1, ix, k] * (one - fx) + texture[iy + 1, ix + 1, k] * fx
                 t[k] = top * (one - fy) + low * fy
-            # Position in the left eye's axes, which also carry the lights.
-            px = (np.float32(j) + half - cx) / focal * z + eye[0]
-            py = (np.float32(i) + half - cy) / focal * z + eye[1]
-            pz = z + eye[2]
+            # Position in the left camera's axes, which also carry the lights.
+            px = (np.float32(j) + half - cx) / focal * z + camera[0]
+            py = (np.float32(i) + half - cy) / focal * z + camera[1]
+            pz = z + camera[2]
             # Bend the normal by the relief: tangents are the plane's axes laid onto the surface.
             da = n[0] * e_a[0] + n[1] * e_a[1] + n[2] * e_a[2]
             db = n[0] * e_b[0] + n[1] * e_b[1] + n[2] * e_b[2]
@@ -71,7 +71,7 @@ def _shade(hits, normals, texture, e_a, e_b, eye, lights, focal, cx, cy, far, ou
             bz = n[2] - t[3] * (e_a[2] - da * n[2]) - t[4] * (e_b[2] - db * n[2])
             norm = one / np.sqrt(bx * bx + by * by + bz * bz)
             bx, by, bz = bx * norm, by * norm, bz * norm
-            vx, vy, vz = eye[0] - px, eye[1] - py, eye[2] - pz
+            vx, vy, vz = camera[0] - px, camera[1] - py, camera[2] - pz
             norm = one / np.sqrt(vx * vx + vy * vy + vz * vz)
             vx, vy, vz = vx * norm, vy * norm, vz * norm
             open_ = t[6]
@@ -81,7 +81,7 @@ def _shade(hits, normals, texture, e_a, e_b, eye, lights, focal, cx, cy, far, ou
                 square = lx * lx + ly * ly + lz * lz
                 norm = one / np.sqrt(square)
                 lx, ly, lz = lx * norm, ly * norm, lz * norm
-                # The guides' cone: full in the middle, dim towards the corners of the picture.
+                # The guides' cone: full in the middle, dim towards the corners of the image.
                 beam = lz * lz
                 power = np.float32(REFERENCE_MM * REFERENCE_MM) / square * beam * beam * half
                 bent = bx * lx + by * ly + bz * lz
@@ -111,7 +111,7 @@ def shade(
     normals: NDArray[np.float32],
     texture: NDArray[np.float32],
     plane: Plane,
-    eye: NDArray[np.float32],
+    camera: NDArray[np.float32],
     focal: float,
     center: tuple[float, float],
     far: float,
@@ -119,15 +119,15 @@ def shade(
     """(SH, SW, 3) linear radiance of the tissue at every sample of `hits`.
 
     Args:
-        hits: (SH, SW, 3) from `raster.rasterize`, for a camera at `eye`.
+        hits: (SH, SW, 3) from `raster.rasterize`, for a camera at `camera`.
         normals: (MH, MW, 3) unit vertex normals.
         texture: (TH, TW, 7) material maps.
-        eye: (3,) camera center in the left eye's axes, mm; the lights stay with the left eye.
+        camera: (3,) camera center in the left camera's axes, mm; the lights stay with the left camera.
         focal, center: of the sample grid, px.
         far: the depth that marks nothing hit.
     """
     out = np.empty_like(hits)
     e_a, e_b = plane.axes[:2].astype(np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))
-    _shade(hits, normals, texture, e_a, e_b, eye.astype(np.float32), LIGHTS_MM, f, cx, cy, np.float32(far), out)
+    _shade(hits, normals, texture, e_a, e_b, camera.astype(np.float32), LIGHTS_MM, f, cx, cy, np.float32(far), out)
     return out

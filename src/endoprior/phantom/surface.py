@@ -1,7 +1,7 @@
 """The anatomy at rest: bowel loops, folded mesentery and a liver edge, as heights over a tilted plane.
 
-Letters: (g_u, g_v) in [0, 1] are material grid coordinates, uniform in the image of the plane at rest and reaching past
-the picture; (a, b) are metric coordinates on the plane, mm (a right, b towards the lower image edge); heights are mm
+Letters: (g_u, g_v) in [0, 1] are material grid coordinates, uniform in the image of the plane at rest and larger than
+the image; (a, b) are metric coordinates on the plane, mm (a right, b towards the lower image edge); heights are mm
 along the plane's normal, towards the camera. Camera axes are OpenCV's.
 """
 
@@ -18,7 +18,7 @@ from .config import PhantomConfig
 from .noise import FAST, fractal
 
 MARGIN = 0.27
-"""How far the material reaches past each image edge, in image sizes, so that no motion uncovers its border."""
+"""Margin of the material around the image, in image sizes, so that no motion uncovers its border."""
 FLOOR, LIVER = -1, -2
 """Owners that are not loops."""
 _RIM = 0.94
@@ -57,7 +57,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Anatomy:
-    """Where the organs lie on the plane."""
+    """Layout of the organs on the plane."""
 
     seed: int
     paths: NDArray[np.float32]
@@ -72,7 +72,7 @@ class Anatomy:
 
 @dataclass(frozen=True)
 class Organs:
-    """What lies at each queried plane point."""
+    """Height and organ at each queried plane point."""
 
     height: NDArray[np.float32]
     """mm above the plane."""
@@ -101,7 +101,7 @@ def build_plane(cfg: PhantomConfig) -> Plane:
 def build_anatomy(seed: int) -> Anatomy:
     """Choose the organs of one patient."""
     rng = np.random.default_rng([seed, 2])
-    # The hero loop swings through the middle of the picture: arching or sagging, from either side, rolled a bit.
+    # The main loop crosses the center of the image: arching or sagging, from either side, slightly rotated.
     side, sag = rng.choice([-1.0, 1.0]), rng.uniform(-6, 14)
     knots = np.array([[-58, 34], [-40, 14], [-25, 2], [-4, -5], [20, -6], [32, 8], [26, 28], [14, 44]], float)
     knots = (knots + rng.normal(0, 3, knots.shape)) * [side, 1.0]
@@ -110,7 +110,7 @@ def build_anatomy(seed: int) -> Anatomy:
     roll = rng.uniform(-0.45, 0.35) * side
     knots = knots @ [[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]]
     loops, radii, bases = [knots], [rng.uniform(11.0, 13.5)], [1.5]
-    # The others are laid where the field is still bare, so that the whole picture is packed with loops.
+    # Each further loop is placed in the emptiest region, so that loops fill the whole image.
     for _ in range(26):
         candidates = rng.uniform([-78, -62], [78, 62], (40, 2))
         placed = np.concatenate(loops)

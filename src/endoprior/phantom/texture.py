@@ -1,4 +1,4 @@
-"""What the tissue looks like, in material coordinates: color, fine relief, wetness and crevice darkening.
+"""Material maps of the tissue: color, fine relief, wetness and ambient occlusion.
 
 Letters: (TH, TW) texels; texel (i, j) is at g_u = (j + 0.5) / TW, g_v = (i + 0.5) / TH.
 """

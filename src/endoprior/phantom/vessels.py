@@ -1,4 +1,4 @@
-"""Branching blood vessels, drawn into a map over the material grid, so that they move with the tissue."""
+"""Branching blood vessels, drawn in material coordinates, so that they move with the tissue."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def vessel_maps(
         for k in range(0, len(fixed) - 1, 4):
             caliber = branch.caliber * (1 - 0.5 * k * _STEP_MM / branch.length)
             width = caliber / mm_per_texel
-            # Lines are at least one texel wide; thinner vessels are drawn fainter instead.
+            # Lines are at least one texel wide; thinner vessels are fainter instead.
             strength = int(255 * min(1.0, width) * (0.55 + 0.45 * min(1.0, caliber / 0.35)))
             piece = fixed[k : k + 5]
             cv2.polylines(target, [piece], False, strength, max(1, round(width)), cv2.LINE_AA, _SUBPIXEL_BITS)
@@ -68,7 +68,7 @@ def vessel_maps(
 def _grow(branch: _Branch, plane: Plane, organs: Organs, rng: np.random.Generator) -> tuple[NDArray, list[_Branch]]:
     """Walk one branch until it is long enough or leaves its organ; return its points (n, 2) and its children."""
     count = max(2, int(branch.length / _STEP_MM))
-    # A slow swing gives the winding course, white noise the small kinks.
+    # A slow oscillation gives the winding course, white noise the small kinks.
     turns = rng.normal(0, 0.16, count) + 0.16 * np.sin(np.arange(count) * rng.uniform(0.2, 0.5) + rng.uniform(0, 6.3))
     headings = branch.heading + np.cumsum(turns)
     steps = _STEP_MM * np.stack([np.cos(headings), np.sin(headings)], -1)

@@ -59,7 +59,7 @@ class PrepareConfig:
     max_frames: int = 500
     """Stop with an error above this number of frames; choose a part of the video or a lower rate."""
     drop_out_of_body: bool = False
-    """Leave out frames that do not look like the inside of a body."""
+    """Leave out frames without the color of the inside of a body."""
 
     crop: str | None = None
     """x,y,width,height in px of one camera's image: keep only this part."""

@@ -1,4 +1,4 @@
-"""Where an image deserves Gaussians: highlights (`specular`), texture (`salience`) and their product (`joint`).
+"""Image priors for sampling Gaussians: highlights (`specular`), texture (`salience`) and their product (`joint`).
 
 NumPy only; every function works on one image.
 """

@@ -1,4 +1,4 @@
-"""The joint texture prior: where tissue shows texture and no highlight. `H, W` image size."""
+"""The joint texture prior: high on textured tissue without highlights. `H, W` image size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .specular import specular_likelihood
 def joint_texture_prior(
     rgb: NDArray[np.floating], tissue_mask: NDArray[np.bool_], cfg: PriorConfig | None = None
 ) -> NDArray[np.float32]:
-    """How much each pixel can be trusted to anchor a Gaussian: rho = M (1 - L^sp) E, paper Eq. (1).
+    """Reliability of each pixel as the position of a Gaussian: rho = M (1 - L^sp) E, paper Eq. (1).
 
     Args:
         rgb: (H, W, 3) floating-point color in [0, 1].
@@ -36,12 +36,12 @@ def joint_texture_prior(
 def _check_values(rgb: NDArray, tissue_mask: NDArray) -> None:
     """Raise ValueError unless `rgb` is an image of floats in [0, 1] and `tissue_mask` is bool."""
     if not np.issubdtype(rgb.dtype, np.floating):
-        raise ValueError(f"rgb must be floating point in [0, 1]; got {rgb.dtype}. Divide 8-bit color by 255.")
+        raise ValueError(f"rgb must be floating point in [0, 1], got {rgb.dtype}. Divide 8-bit color by 255.")
     if tissue_mask.dtype != np.bool_:
-        raise ValueError(f"tissue_mask must be bool, True on tissue; got {tissue_mask.dtype}. Compare it with a value.")
+        raise ValueError(f"tissue_mask must be bool, True on tissue, got {tissue_mask.dtype}. Compare it with a value.")
     if rgb.size == 0:
-        raise ValueError(f"rgb must have at least one pixel; got shape {rgb.shape}.")
+        raise ValueError(f"rgb must have at least one pixel, got shape {rgb.shape}.")
     low, high = float(rgb.min()), float(rgb.max())
-    # The negated test also catches NaN, which min and max hand on.
+    # The negated comparison also catches NaN, which min and max propagate.
     if not (low >= 0 and high <= 1):
-        raise ValueError(f"rgb must be finite and in [0, 1]; got values from {low:g} to {high:g}. Scale the image.")
+        raise ValueError(f"rgb must be finite and in [0, 1], got values from {low:g} to {high:g}. Scale the image.")

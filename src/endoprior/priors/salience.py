@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..core.config import SalienceConfig
 
 EPSILON = 1e-6
-"""Keeps the salience of a featureless image finite, in units of gray (0..1) times the kernel's weight."""
+"""Keeps the salience of a constant image finite; in units of gray (0..1) times the kernel's weight."""
 LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in the gray image (ITU-R BT.601)."""
 
@@ -18,9 +18,9 @@ LUMA = (0.299, 0.587, 0.114)
 def salience(
     rgb: NDArray[np.floating], tissue_mask: NDArray[np.bool_], cfg: SalienceConfig | None = None
 ) -> NDArray[np.float32]:
-    """Strength of edges and texture, relative to the strong ones of the tissue. E, paper Eqs. (3)-(5).
+    """Strength of edges and texture, relative to a high percentile on tissue. E, paper Eqs. (3)-(5).
 
-    Trusts its input; `joint_texture_prior` checks.
+    Does not check its input; `joint_texture_prior` does.
 
     Args:
         rgb: (H, W, 3) color in [0, 1].

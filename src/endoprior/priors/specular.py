@@ -14,7 +14,7 @@ EPSILON = 1e-6
 def specular_likelihood(rgb: NDArray[np.floating], cfg: SpecularConfig | None = None) -> NDArray[np.float32]:
     """How likely each pixel is a highlight: bright and pale, or clipped. L^sp, paper Eq. (2).
 
-    Trusts its input; `joint_texture_prior` checks.
+    Does not check its input; `joint_texture_prior` does.
 
     Args:
         rgb: (H, W, 3) color in [0, 1].

@@ -26,7 +26,7 @@ def reject_unusable_folder(out: Path, *, resume: bool) -> None:
     if exists:
         remove_leftovers(out)
     if not (resume and exists):
-        reject_occupied(out, ", or add --resume to continue a run", spare=LOCK)
+        reject_occupied(out, ", or add --resume to continue a run", ignore=LOCK)
 
 
 def prepare_run_folder(out: Path, *, resume: bool) -> bool:

@@ -1,7 +1,7 @@
-"""Named arrays and a description in one safetensors file: whole, versioned, no pickle, equal bytes if equal content.
+"""Named arrays and metadata in one safetensors file: atomic, versioned, without pickle, deterministic bytes.
 
-A file may come from a stranger. What it claims is compared with its size and with what must be in it before any array
-is read, because kernels trust shapes and types; then every number is looked at once.
+A file may be untrusted. Its header is compared with its size and with a schema before any array is read, because
+kernels trust shapes and types. Then all values are checked to be finite.
 """
 
 from __future__ import annotations
@@ -15,41 +15,41 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from .atomic import whole_file
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 KEY = "endoprior"
-"""The one metadata entry. With several, safetensors would write them in random order, and equal files would differ."""
+"""The single metadata entry. With several, safetensors writes them in random order, and equal files would differ."""
 LARGEST_HEADER = 2**20
-"""Bytes of names, shapes and description; ours have some thousands."""
+"""Largest header (names, shapes, metadata), bytes; normal files have a few thousand."""
 LARGEST_FILE = 2**36
-"""Bytes; a file of holes costs its maker nothing."""
+"""Largest file, bytes; a sparse file could claim any size."""
 DTYPES = {"float32": "F32", "float64": "F64", "int64": "I64", "uint8": "U8"}
-"""What types are called in the file."""
+"""Names of the types in the file."""
 
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """What one array of a file must be."""
+    """Type and shape of one array in a file."""
 
     dtype: str
     """One of the keys of `DTYPES`."""
     shape: tuple[int | str, ...]
-    """A letter stands for one size in all arrays of a file."""
+    """A letter is one size, the same in all arrays of a file."""
 
     def __str__(self) -> str:
         return f"{self.dtype} ({', '.join(map(str, self.shape))})"
 
 
 Schema = Callable[[dict[str, Any]], Mapping[str, ArraySpec]]
-"""From the description of a file to the arrays that must be in it, all of them and no others."""
+"""Maps the metadata of a file to its arrays: all of them and no others."""
 
 
 def save_arrays(path: Path, arrays: Mapping[str, Tensor], about: Mapping[str, Any], file_format: str) -> None:
-    """Write tensors and a JSON-able description.
+    """Write tensors and JSON metadata.
 
     Args:
         file_format: name and version, such as `endoprior-scene-1`.
@@ -58,7 +58,7 @@ def save_arrays(path: Path, arrays: Mapping[str, Tensor], about: Mapping[str, An
 
     text = json.dumps({"format": file_format, **about}, sort_keys=True)
     with whole_file(path) as temporary:
-        # The library writes beside the file it is told, under a name of its own choice that a kill would leave there.
+        # The library writes to a temporary sibling of its own, which would remain after a kill.
         staging = temporary.with_name(f"{temporary.name}.staging")
         staging.mkdir()
         try:
@@ -69,26 +69,26 @@ def save_arrays(path: Path, arrays: Mapping[str, Tensor], about: Mapping[str, An
             shutil.rmtree(staging, ignore_errors=True)
 
 
-def load_arrays(path: Path, file_format: str, schema: Schema, next_step: str) -> tuple[dict[str, Tensor], dict]:
-    """Read what `save_arrays` wrote.
+def load_arrays(path: Path, file_format: str, schema: Schema, fix: str) -> tuple[dict[str, Tensor], dict]:
+    """Read a file written by `save_arrays`.
 
     Args:
-        schema: what must be in it.
-        next_step: what to do when the file cannot be used; ends the message.
+        schema: required arrays.
+        fix: what to do if the file cannot be used; ends the error message.
     Returns:
-        The arrays, of the types and shapes demanded, all numbers finite; and the description.
+        The arrays, which match the schema and are finite; and the metadata.
     Raises:
-        InputError: the file is not a safetensors file, or not of this format, or its arrays are not as demanded.
+        InputError: not a safetensors file, another format, or arrays that do not match the schema.
     """
     from safetensors import SafetensorError, safe_open
 
-    with rejecting(path, f"a file of format {file_format}", next_step, SafetensorError):
+    with rejecting(path, f"a file of format {file_format}", fix, SafetensorError):
         _check_size(path)
         with safe_open(path, "pt") as opened:
             about = _strict_json((opened.metadata() or {})[KEY])
             found = about["format"]
             if found != file_format:
-                raise InputError(f"{path}: expected format {file_format}; got {found!r:.80}. {next_step}")
+                raise input_error(path, f"format {file_format}", f"{found!r:.80}", fix)
             headers = {name: opened.get_slice(name) for name in opened.keys()}
             stored = {name: (header.get_dtype(), tuple(header.get_shape())) for name, header in headers.items()}
             _match(stored, schema(about))
@@ -99,20 +99,21 @@ def load_arrays(path: Path, file_format: str, schema: Schema, next_step: str) ->
 
 
 @contextmanager
-def rejecting(path: Path, expected: str, next_step: str, *others: type[Exception]) -> Iterator[None]:
-    """Turn whatever a wrong file provokes in here, `others` besides the usual errors, into one line about it.
+def rejecting(path: Path, expected: str, fix: str, *others: type[Exception]) -> Iterator[None]:
+    """Convert all errors that a wrong file can cause, including `others`, to an error message about the file.
 
     Raises:
-        InputError: in place of those errors; one that says what is wrong passes, and the file's name is added.
+        InputError: instead of those errors. An InputError passes; the file name is added if it is missing.
     """
     try:
         yield
     except InputError as error:
         if str(error).startswith(f"{path}:"):
             raise
-        raise InputError(f"{path}: {error} {next_step}") from None
+        problem = str(error).split(". Fix: ")[0].removesuffix(".")
+        raise InputError(f"{path}: {problem}. Fix: {fix}") from None
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, OverflowError, RecursionError, *others) as error:
-        raise InputError(f"{path}: expected {expected}; got {_one_line(error)}. {next_step}") from None
+        raise input_error(path, expected, _one_line(error), fix) from None
 
 
 def part(arrays: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -121,37 +122,37 @@ def part(arrays: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def _check_size(path: Path) -> None:
-    """Refuse what is no plain file, and a header or a file too large to be one of ours."""
+    """Reject anything but a regular file, and a header or file that is too large."""
     facts = path.stat()
     if not stat.S_ISREG(facts.st_mode):
-        raise InputError("expected a plain file; got a folder, a pipe or a device.")
+        raise InputError("expected a plain file, got a folder, a pipe or a device")
     with open(path, "rb") as file:
         header = int.from_bytes(file.read(8), "little")
     for name, size, largest in (("header", header, LARGEST_HEADER), ("file", facts.st_size, LARGEST_FILE)):
         if size > largest:
-            raise InputError(f"expected a {name} of at most {largest:,} bytes; got {size:,}.")
+            raise InputError(f"expected a {name} of at most {largest:,} bytes, got {size:,}")
 
 
 def _strict_json(text: str) -> dict[str, Any]:
-    """A JSON object; NaN and infinity, which are no JSON, are refused."""
+    """A JSON object; NaN and infinity are errors because they are not JSON."""
 
-    def refuse(constant: str) -> None:
-        raise ValueError(f"{constant} in the description")
+    def reject(constant: str) -> None:
+        raise ValueError(f"{constant} in the metadata")
 
-    found = json.loads(text, parse_constant=refuse)
+    found = json.loads(text, parse_constant=reject)
     if not isinstance(found, dict):
-        raise ValueError("a description that is no object")
+        raise ValueError("metadata that is not an object")
     return found
 
 
 def _match(stored: Mapping[str, tuple[str, tuple[int, ...]]], schema: Mapping[str, ArraySpec]) -> None:
-    """Refuse arrays that are not exactly those of the schema."""
+    """Reject arrays that are not exactly those of the schema."""
     sizes: dict[str, int] = {}
-    if strange := sorted(stored.keys() - schema.keys()):
-        raise InputError(f"expected no array {strange[0]!r:.80}; got one.")
+    if unknown := sorted(stored.keys() - schema.keys()):
+        raise InputError(f"expected no array {unknown[0]!r:.80}, got one")
     for name, spec in schema.items():
         if name not in stored:
-            raise InputError(f"expected an array {name}: {spec}; got none.")
+            raise InputError(f"expected an array {name}: {spec}, got none")
         dtype, shape = stored[name]
         same = len(shape) == len(spec.shape) and all(
             (sizes.setdefault(want, got) if isinstance(want, str) else want) == got
@@ -160,15 +161,15 @@ def _match(stored: Mapping[str, tuple[str, tuple[int, ...]]], schema: Mapping[st
         if dtype != DTYPES[spec.dtype] or not same:
             bound = ", ".join(f"{letter} = {size}" for letter, size in sizes.items() if letter in spec.shape)
             known = f" with {bound}" if bound else ""
-            raise InputError(f"expected the array {name} to be {spec}{known}; got {dtype} {shape}.")
+            raise InputError(f"expected the array {name} to be {spec}{known}, got {dtype} {shape}")
 
 
 def _demand_finite(name: str, value: Tensor) -> None:
-    """Refuse NaN and infinity. Smallest and largest number take one pass and no memory, and NaN is both."""
+    """Reject NaN and infinity. `aminmax` takes one pass and no memory, and propagates NaN."""
     if value.is_floating_point() and value.numel() and not all(bool(end.isfinite()) for end in value.aminmax()):
-        raise InputError(f"expected finite numbers in {name}; got NaN or infinity.")
+        raise InputError(f"expected finite numbers in {name}, got NaN or infinity")
 
 
 def _one_line(error: Exception) -> str:
-    """The kind of an error and what it says, short."""
+    """Type and message of an error, shortened to one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all: written beside their place, then renamed."""
+"""Atomic writes: files and folders are written to a temporary sibling, then renamed. They are complete or absent."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 
-REFUSALS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO}
-"""Why a system does not take what is written: full, over a quota or limit, read-only, forbidden, broken."""
+DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO}
+"""Errors of a disk: full, over a quota or limit, read-only, no permission, broken."""
 FULL_BYTES = 2**20
-"""With less than this free, a writer that failed without saying why failed because the disk is full."""
+"""If less is free, a write error without a reason means that the disk is full."""
 
 
 class CannotWrite(InputError):
-    """The disk does not take a file. What was at its place before is whole."""
+    """The disk rejects a file. A previous file at this path is unchanged."""
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn the failure of a disk into one line about `path`; other errors pass.
+    """Convert disk errors to an error message about `path`; other errors pass.
 
     Raises:
         CannotWrite: the disk is full, over a limit, read-only or broken.
@@ -34,26 +34,26 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if isinstance(error, InputError) or (refusal := _refusal(error, path)) is None:
+        if isinstance(error, InputError) or (reason := _disk_error(error, path)) is None:
             raise
         raise CannotWrite(
-            f"{path}: expected a disk that takes this file; got {refusal}. Make room or choose another place, "
-            "and repeat; what was there before is whole."
+            f"{path}: expected a disk that accepts this file, got {reason}. Fix: free space or choose another path, "
+            "then repeat. The previous file is unchanged."
         ) from error
 
 
-def _refusal(error: Exception, path: Path) -> str | None:
-    """The system's words if `error` is a disk's refusal, however deep it was wrapped; else None."""
+def _disk_error(error: Exception, path: Path) -> str | None:
+    """The system's message if `error` is, or wraps, a disk error; else None."""
     number = error.errno if isinstance(error, OSError) else None
-    elsewhere = getattr(error, "filename", None)
-    if elsewhere and path.absolute().parent not in Path(os.fsdecode(elsewhere)).absolute().parents:
-        return None  # a file that was read
-    if number is None and (named := re.search(r"os error (\d+)", str(error))):  # a library in Rust
-        number = int(named[1])
-    if number in REFUSALS:
+    named_file = getattr(error, "filename", None)
+    if named_file and path.absolute().parent not in Path(os.fsdecode(named_file)).absolute().parents:
+        return None  # an error of a file that was read
+    if number is None and (match := re.search(r"os error (\d+)", str(error))):  # from a library in Rust
+        number = int(match[1])
+    if number in DISK_ERRORS:
         return os.strerror(number)
     with suppress(OSError):
-        # Encoders only say that they stopped.
+        # Video encoders report no reason.
         if shutil.disk_usage(path.absolute().parent).free < FULL_BYTES:
             return os.strerror(errno.ENOSPC)
     return "an encoder that stopped" if isinstance(error, BrokenPipeError) else None
@@ -61,14 +61,14 @@ def _refusal(error: Exception, path: Path) -> str | None:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling of `path` to write to; rename it onto `path` on success, remove it on failure.
+    """Yield a temporary sibling of `path` to write to; rename it to `path` on success, remove it on failure.
 
-    Contents reach the disk before the name does, so that not even a power cut leaves a part of a file at `path`.
+    The content is flushed before the rename, so that even a power cut never leaves a partial file at `path`.
 
     Raises:
-        CannotWrite: the disk does not take it.
+        CannotWrite: the disk rejects the file.
     """
-    # The suffix stays last, because many writers choose their format by it.
+    # Keep the suffix last: many writers choose the format by it.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         with writing(path):
@@ -85,11 +85,11 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling folder of `path`; rename it onto `path` on success, remove it on failure.
+    """Yield a temporary sibling folder of `path`; rename it to `path` on success, remove it on failure.
 
     Raises:
-        InputError: `path` is in use, or no folder can be made there.
-        CannotWrite: the disk does not take what is written.
+        InputError: `path` is not empty, or the folder cannot be created.
+        CannotWrite: the disk rejects a file.
     """
     reject_current_folder(path)
     reject_occupied(path)
@@ -98,9 +98,8 @@ def whole_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
     except OSError as error:
-        raise InputError(
-            f"{path}: expected a place where a folder can be made; got {error.strerror}. Choose another."
-        ) from error
+        got = error.strerror or str(error)
+        raise input_error(path, "a path where a folder can be created", got, "Choose another path.") from error
     try:
         with writing(path):
             yield temporary
@@ -113,14 +112,14 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def flush_folder(folder: Path) -> None:
-    """Wait until everything in a folder is on the disk: a power cut must not leave names of empty files."""
+    """Flush all files of a folder to the disk, so that a power cut does not leave empty files."""
     for place, _, files in os.walk(folder):
         for name in (*files, "."):
             _to_disk(Path(place, name))
 
 
 def _usual_mode(path: Path) -> int:
-    """Permissions of a file that is made at `path`; some libraries give nobody else any."""
+    """Default permissions of a new file at `path`; some libraries create files without group permissions."""
     path.touch()
     mode = path.stat().st_mode
     path.unlink()
@@ -128,7 +127,7 @@ def _usual_mode(path: Path) -> int:
 
 
 def _to_disk(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk and not only in memory."""
+    """Flush a file, or the entries of a folder, to the disk."""
     if os.name == "nt" and path.is_dir():  # Windows does not open folders
         return
     number = os.open(path, os.O_RDONLY)
@@ -139,7 +138,7 @@ def _to_disk(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what killed processes were writing in `folder` when they died."""
+    """Remove temporary files that killed processes left in `folder`."""
     for file in folder.glob(".*.partial*"):
         owner = re.search(r"\.(\d+)\.partial", file.name)
         if owner and not _alive(int(owner[1])):
@@ -151,26 +150,26 @@ def _alive(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OSError:  # somebody else's process
+    except OSError:  # a process of another user
         return True
     return True
 
 
 def reject_current_folder(path: Path) -> None:
-    """Raise InputError if `path` is the current folder or one above: it cannot be replaced by another one."""
+    """Raise InputError if `path` is the current folder or one of its parents, which cannot be replaced."""
     if path.resolve() in (Path.cwd(), *Path.cwd().parents):
-        raise InputError(f"{path}: expected the name of a new folder; got one that is in use. Choose a name in it.")
+        raise input_error(path, "the name of a new folder", "one that is in use", "Choose a new name in this folder.")
 
 
-def reject_occupied(path: Path, otherwise: str = "", *, spare: str | None = None) -> None:
+def reject_occupied(path: Path, alternative: str = "", *, ignore: str | None = None) -> None:
     """Raise InputError unless `path` does not exist yet or is an empty folder.
 
     Args:
-        otherwise: what else the user could do, appended to the message.
-        spare: name of a file that does not count.
+        alternative: another possible fix, appended to the message.
+        ignore: name of a file that may exist.
     """
     try:
-        if path.is_dir() and any(file.name != spare for file in path.iterdir()):
+        if path.is_dir() and any(file.name != ignore for file in path.iterdir()):
             found = "one with files in it"
         elif not path.is_dir() and (path.exists() or path.is_symlink()):
             found = "a file"
@@ -179,11 +178,11 @@ def reject_occupied(path: Path, otherwise: str = "", *, spare: str | None = None
     except OSError as error:
         text = str(path)
         named = text if len(text) < 120 else f"{text[:60]}...{text[-60:]}"
-        raise InputError(f"{named}: expected a usable path; got {error.strerror}. Choose another.") from None
-    raise InputError(f"{path}: expected a new or empty folder; got {found}. Choose another{otherwise}.")
+        raise input_error(named, "a usable path", error.strerror or str(error), "Choose another path.") from None
+    raise input_error(path, "a new or empty folder", found, f"Choose another folder{alternative}.")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `value` as indented JSON, whole or not at all; NaN is refused (it is not JSON)."""
+    """Write `value` as indented JSON, atomically; NaN is an error because it is not JSON."""
     with whole_file(path) as temporary:
         temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")

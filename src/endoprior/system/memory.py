@@ -1,4 +1,4 @@
-"""How much memory there is, and a cache that takes its share of it and no more."""
+"""Available memory, and a cache of bounded size."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 
 CACHE_SHARE = 0.1
-"""Each cache of frames may take this share of what is free when it is made..."""
+"""Size of each frame cache, as a share of the free memory at its creation ..."""
 LEAST_CACHE = 256 * 2**20
-"""... but at least so many bytes."""
+"""... but at least this many bytes."""
 LEAST_DATA, LEAST_SPACE = 600 * 2**20, 1500 * 2**20
-"""Of memory to write to and of addresses, for the libraries alone, bytes (docs/reliability.md)."""
+"""Writable memory and address space that the libraries alone need, bytes (docs/reliability.md)."""
 VARIABLE = "ENDOPRIOR_CACHE_GB"
-"""Environment variable that sets the size of each cache instead, GB."""
+"""Environment variable that overrides the size of each cache, GB."""
 
 Value = TypeVar("Value")
 
 
 def available_bytes() -> int | None:
-    """Memory that this process can still take, by the system, its container and its own limit; None if unknown."""
+    """Memory that this process can still allocate: limits of system, container and process; None if unknown."""
     found = [_free_in_system(), _left_in_container(), _left_of_limit()]
     known = [value for value in found if value is not None]
     return max(min(known), 0) if known else None
 
 
 def cache_bytes() -> int:
-    """Size of one cache of frames: `ENDOPRIOR_CACHE_GB`, or a share of what is free. No result depends on it."""
+    """Size of one frame cache: `ENDOPRIOR_CACHE_GB`, or a share of the free memory. It does not change any result."""
     try:
         return max(int(float(os.environ[VARIABLE]) * 1e9), 0)
     except (KeyError, ValueError, OverflowError):
@@ -39,33 +39,31 @@ def cache_bytes() -> int:
 
 
 def reject_small_limits() -> None:
-    """Refuse limits of the process under which not even the libraries load: some of them wait for memory for ever.
+    """Reject process limits that are too small to load the libraries; some libraries would hang.
 
     Raises:
-        InputError: with the limit and what it should be.
+        InputError: names the limit and the required value.
     """
     try:
         import resource
-    except ImportError:  # a system without such limits
+    except ImportError:  # the system has no such limits
         return
     for kind, option, least in ((resource.RLIMIT_DATA, "-d", LEAST_DATA), (resource.RLIMIT_AS, "-v", LEAST_SPACE)):
         limit = resource.getrlimit(kind)[0]
         if limit != resource.RLIM_INFINITY and limit < least:
-            raise InputError(
-                f"ulimit {option}: expected at least {least >> 20} MB to load the libraries; got {limit >> 20} MB. "
-                "Raise it."
-            )
+            want, got = f"at least {least >> 20} MB to load the libraries", f"{limit >> 20} MB"
+            raise input_error(f"ulimit {option}", want, got, f"`ulimit {option} {least >> 10}` or more.")
 
 
 class BoundedCache(Generic[Value]):
-    """Values by key; beyond a number of bytes, those that were not used for longest go. Threads may share one."""
+    """A least-recently-used cache of bounded size in bytes. Thread-safe."""
 
     def __init__(self, limit_bytes: int, size_of: Callable[[Value], int]) -> None:
         """Start empty.
 
         Args:
-            limit_bytes: kept in all; the newest value stays whatever its size.
-            size_of: bytes of a value.
+            limit_bytes: total size; the newest value always stays.
+            size_of: returns the size of a value in bytes.
         """
         self._limit, self._size_of = limit_bytes, size_of
         self._values: OrderedDict[Hashable, Value] = OrderedDict()
@@ -76,7 +74,7 @@ class BoundedCache(Generic[Value]):
         return len(self._values)
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """The value of `key`, made now if it is not there. Two threads may make the same one twice."""
+        """The value of `key`, created by `make` if it is missing. Two threads may create the same value twice."""
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)
@@ -117,7 +115,7 @@ def _left_in_container() -> int | None:
 
 
 def _left_of_limit() -> int | None:
-    """Of the limits on what the process may map (`ulimit -v`) and write to (`ulimit -d`)."""
+    """Rest of the limits on address space (`ulimit -v`) and writable memory (`ulimit -d`)."""
     try:
         import resource
 
@@ -132,7 +130,7 @@ def _left_of_limit() -> int | None:
 
 
 def workers(bytes_each: int) -> int:
-    """Threads that may work side by side when each needs so many bytes: one per core, in a quarter of what is free."""
+    """Number of parallel threads that need `bytes_each`: at most one per core, and a quarter of the free memory."""
     free = available_bytes()
     affordable = free // 4 // max(bytes_each, 1) if free is not None else 1
     return max(1, min(os.cpu_count() or 1, affordable))

@@ -1,1 +1,1 @@
-"""Looking at a scene or a sequence in a web browser. `server` is the one place that acts; everything else is pure."""
+"""Web viewer of a trained scene or a raw sequence. Only `server` and `browsers` have side effects."""

@@ -1,4 +1,4 @@
-"""What each layer looks like, as an (H, W, 3) 8-bit picture."""
+"""Convert each layer to an (H, W, 3) 8-bit image."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from ..core.types import Camera
 from ..visualization.image_tools import colorize, to_u8
 
 LARGEST_DIFFERENCE = 0.25
-"""Mean absolute difference of the three colors that is drawn red."""
+"""Mean absolute color difference that is shown in red."""
 SOLID_ALPHA = 0.5
-"""Where the Gaussians cover less than this there is no surface."""
+"""There is no surface where alpha is lower."""
 OUTLINE = (0, 255, 255)
 
 
 def fitted(image: NDArray, camera: Camera) -> NDArray:
-    """An image of a frame, resized to the picture of `camera`, which sees the same; masks stay masks."""
+    """An image of a frame, resized to the image size of `camera`; masks stay masks."""
     if image.shape[:2] == (camera.height, camera.width):
         return image
     if image.dtype == np.bool_:
         return cv2.resize(image.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0
-    nearest = image.dtype.kind == "f"  # between a depth and a missing one there is nothing
+    nearest = image.dtype.kind == "f"  # never interpolate between a depth and a missing one
     how = cv2.INTER_NEAREST if nearest else cv2.INTER_AREA
     return cv2.resize(image, (camera.width, camera.height), interpolation=how)
 
@@ -42,16 +42,16 @@ def gray_picture(value: NDArray) -> NDArray[np.uint8]:
     return np.repeat(to_u8(value)[..., None], 3, -1)
 
 
-def difference_picture(drawn: NDArray[np.uint8], original: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Turbo colors of the mean absolute difference of two (H, W, 3) pictures."""
-    difference = cv2.absdiff(drawn, original).mean(-1) / 255
+def difference_picture(rendered: NDArray[np.uint8], original: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Turbo colors of the mean absolute difference of two (H, W, 3) images."""
+    difference = cv2.absdiff(rendered, original).mean(-1) / 255
     return colorize(difference, 0, LARGEST_DIFFERENCE)
 
 
 def with_tool(
     picture: NDArray[np.uint8], original: NDArray[np.uint8], tissue_mask: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
-    """A copy with the tool of the original laid over it, outlined."""
+    """A copy with the tool of the original image on top, outlined."""
     picture = np.where(tissue_mask[..., None], picture, original)
     outlines, _ = cv2.findContours((~tissue_mask).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(picture, outlines, -1, OUTLINE, 1)

@@ -1,7 +1,7 @@
-"""Watching a scene while it trains: between two iterations, in the thread that trains, parameters are read and drawn.
+"""Live view of a training: renders the scene between two iterations, in the training thread.
 
-Nothing of the training is changed: drawing takes no gradient, touches no random generator, and everything it keeps is
-its own. It costs time, which is bounded.
+The training result does not change: rendering computes no gradient, uses no random generator and writes no training
+state. Its share of the time is bounded.
 """
 
 from __future__ import annotations
@@ -9,24 +9,24 @@ from __future__ import annotations
 import time as clock
 from typing import TYPE_CHECKING
 
-from .scene_subject import SceneSubject
 from .server import Viewer
+from .viewable_scene import ViewableScene
 
 if TYPE_CHECKING:
     from ..training.state import StepReport
     from ..training.trainer import Trainer
 
 REFRESH_SECONDS = 2.0
-"""Training goes on at least this long between two states that are shown."""
+"""Least time between two displayed states."""
 LARGEST_SHARE = 0.2
-"""Of the time, that refreshing may take: a slow picture comes less often. What a person asks for comes at once."""
+"""Largest share of the time for refreshing; slow images are refreshed less often. User input is handled at once."""
 
 
 class LiveView:
-    """An `on_step` of `train.train` that keeps a viewer at the state of the training."""
+    """An `on_step` callback of `runs.training_run.train` that updates a viewer."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Nothing listens until the first iteration is done.
+        """The server starts after the first iteration.
 
         Args:
             host, port: see `Viewer`.
@@ -36,7 +36,7 @@ class LiveView:
         self._due = 0.0
 
     def __call__(self, report: StepReport, trainer: Trainer) -> None:
-        """After an iteration: answer the browsers, and every now and then show the new state."""
+        """After an iteration: handle user input, and from time to time show the new state."""
         if self.viewer is None:
             self.viewer = Viewer(self._subject(report, trainer), host=self.host, port=self.port)
             print(f"view: {self.viewer.url}", flush=True)
@@ -55,6 +55,6 @@ class LiveView:
             self.viewer.close()
 
     @staticmethod
-    def _subject(report: StepReport, trainer: Trainer) -> SceneSubject:
+    def _subject(report: StepReport, trainer: Trainer) -> ViewableScene:
         title = f"{report.stage.name.lower()}, iteration {report.iteration}, {report.num_gaussians} Gaussians"
-        return SceneSubject(trainer.scene(), title, trainer.sequence)
+        return ViewableScene(trainer.scene(), title, trainer.sequence)

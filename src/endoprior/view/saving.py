@@ -1,4 +1,4 @@
-"""Screenshots and films as bytes, and keeping them in a folder."""
+"""Encode screenshots and videos, and store them in a folder."""
 
 from __future__ import annotations
 
@@ -10,42 +10,42 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..system.atomic import whole_file
 from ..visualization.video import write_video
 
 
 def png_bytes(rgb_u8: NDArray[np.uint8]) -> bytes:
-    """An (H, W, 3) picture as a PNG file."""
+    """An (H, W, 3) image as a PNG file."""
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(rgb_u8[..., ::-1]))
     if not done:
-        raise OSError("could not encode the picture")
+        raise OSError("could not encode the image")
     return encoded.tobytes()
 
 
 def mp4_bytes(pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> bytes:
-    """Pictures (H, W, 3) of one size as an H.264 film."""
+    """Images (H, W, 3) of one size as an H.264 video."""
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "film.mp4"
+        file = Path(folder) / "video.mp4"
         write_video(file, pictures, frames_per_second)
         return file.read_bytes()
 
 
 def keep(folder: Path, name: str, content: bytes) -> Path:
-    """Write a file under the first free name `stem_N.suffix` in `folder`; never over another file.
+    """Write a file with the first free name `stem_N.suffix` in `folder`; never overwrite a file.
 
     Args:
         name: a plain file name.
     Returns:
-        Where it is.
+        Path of the file.
     Raises:
-        ValueError: `name` has a folder in it, or no ending.
-        InputError: `folder` is a link: a run from a stranger could point it anywhere.
+        ValueError: `name` contains a folder, or has no suffix.
+        InputError: `folder` is a link: in an untrusted run it could point anywhere.
     """
     if folder.is_symlink():
-        raise InputError(f"{folder}: expected a folder; got a link to one. Remove it.")
+        raise input_error(folder, "a folder", "a link to one", "Remove the link.")
     if Path(name).name != name or not Path(name).suffix:
-        raise ValueError(f"name must be a plain file name with an ending; got {name!r}.")
+        raise ValueError(f"name must be a plain file name with a suffix, got {name!r}")
     stem, suffix = Path(name).stem, Path(name).suffix
     number = 1
     while (file := folder / f"{stem}_{number}{suffix}").exists():

@@ -1,7 +1,7 @@
-"""The viewer: the one place that acts. The only module that imports viser.
+"""The viewer server. The only module that imports viser.
 
-Controls and cameras call back in threads of viser's; all they do is hand a job to one queue. Whoever calls `work` - a
-loop, or a training run between two iterations - runs the jobs and draws, so that nothing is drawn by two threads.
+Callbacks of controls and cameras run in viser's threads; they only add jobs to a queue. The thread that calls `work` (a
+loop, or a training run between two iterations) runs the jobs and renders. Rendering therefore has a single thread.
 """
 
 from __future__ import annotations
@@ -26,72 +26,72 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError
 from . import panel, saving
-from .guard import LARGEST_MESSAGE, MOST_BROWSERS, Pace, check_address, sensible, trusted
-from .jobs import Jobs
-from .marks import Marks, joined, no_marks, ruler, trails
-from .measure import Measurement, pick, sentence
-from .path import Place, sweep, through
-from .session import REST_SECONDS, Look, frame_due
-from .stage import Stage, marked_picture, stance
-from .subject import Subject
+from .access_control import MAX_BROWSERS, MAX_MESSAGE_BYTES, RateLimit, check_address, is_trusted, is_valid_message
+from .browsers import Browsers, camera_pose, picture_with_lines
+from .job_queue import JobQueue
+from .line_overlay import Lines, concatenated, no_lines, ruler, track_lines
+from .measure import Measurement, measurement_text, pick
+from .video_path import PathPoint, follow_frames, interpolate
+from .view_settings import REST_SECONDS, ViewSettings, frame_due
+from .viewable import Viewable
 from .viewport import endoscope_viewport
 
-MOST_KEPT = 100
-"""Views that a film goes through."""
-MOST_PICTURES = 10_000
-"""Pictures of one film."""
+MAX_KEPT = 100
+"""Largest number of saved views."""
+MAX_PICTURES = 10_000
+"""Largest number of images of a video."""
 
 
 class _LocalServer(viser.ViserServer):
-    """A server that keeps to itself: any client of viser's could ask it to publish the scene through a relay."""
+    """A server that never publishes the scene; viser lets any client request a public URL."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
 
 
 class Viewer:
-    """A web page that shows a subject. `work` must be called again and again; `run` does that."""
+    """A web page that shows a scene or a sequence. Call `work` repeatedly, or `run`."""
 
-    def __init__(self, subject: Subject, *, host: str = "127.0.0.1", port: int = 0, out: Path | None = None) -> None:
+    def __init__(self, viewable: Viewable, *, host: str = "127.0.0.1", port: int = 0, out: Path | None = None) -> None:
         """Start listening.
 
         Args:
-            host: address to listen on; anything but this machine's own lets others in.
-            port: 0 takes any free one.
-            out: folder where screenshots and films are kept besides being offered for download; None keeps none.
+            host: address to listen on; with any but the loopback address, other machines can connect.
+            port: 0 uses any free port.
+            out: folder to store screenshots and videos, in addition to the download; None stores none.
         Raises:
-            InputError: the address cannot be listened on.
+            InputError: the address cannot be used.
         """
         check_address(host, port)
-        warnings.filterwarnings("ignore", "Queued a", UserWarning)  # viser's, of every browser that leaves
-        self.subject, self.look, self.out, self.host = subject, Look(layer=subject.layers[0]), out, host
+        warnings.filterwarnings("ignore", "Queued a", UserWarning)  # from viser, when a browser disconnects
+        self.viewable, self.settings, self.out, self.host = viewable, ViewSettings(layer=viewable.layers[0]), out, host
         self.measured: Measurement | None = None
-        self._jobs = Jobs()
+        self.jobs = JobQueue()
         self._playing: tuple[int, float] | None = None
-        """Frame and moment from which the film runs."""
+        """Frame and time at the start of playback."""
         self._picked: list[tuple[NDArray, int]] = []
-        """Points and the frames they were picked in."""
+        """Picked points and their frames."""
         self._tracks: NDArray | None = None
-        self._kept: list[Place] = []
+        self.kept_views: list[PathPoint] = []
         self._version, self._moved_at = 0, clock.monotonic() - REST_SECONDS
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
-            self._server = _LocalServer(host=host, port=port, label="EndoPrior-GS", verbose=False)
-        self._keep_out()
-        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self._server.gui.main_panel.dock_right()
-        self._server.scene.set_up_direction("-y")
-        start = self._server.initial_camera
-        start.position, start.look_at, start.up = stance(subject.cameras[0], subject)
-        start.fov = endoscope_viewport(subject.cameras[0], 1.0).fov
-        self._stage = Stage(self._server)
-        self.panel = panel.Panel(self._server.gui, subject, viser.uplot)
+            self.server = _LocalServer(host=host, port=port, label="EndoPrior-GS", verbose=False)
+        self._install_filter()
+        self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.dock_right()
+        self.server.scene.set_up_direction("-y")
+        start = self.server.initial_camera
+        start.position, start.look_at, start.up = camera_pose(viewable.cameras[0], viewable)
+        start.fov = endoscope_viewport(viewable.cameras[0], 1.0).fov
+        self._browsers = Browsers(self.server)
+        self.panel = panel.Panel(self.server.gui, viewable, viser.uplot)
         self._listen()
-        self._say()
+        self._update_panel()
 
     @property
     def port(self) -> int:
         """The port it listens on."""
-        return self._server.get_port()
+        return self.server.get_port()
 
     @property
     def url(self) -> str:
@@ -100,18 +100,23 @@ class Viewer:
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
 
     @property
+    def connections(self) -> dict[int, Any]:
+        """Open connections of viser, by client id."""
+        return self.server._websock_server._live_connections
+
+    @property
     def watched(self) -> bool:
         """Whether a browser is connected."""
-        return bool(self._server.get_clients())
+        return bool(self.server.get_clients())
 
-    def show(self, subject: Subject) -> None:
-        """Show another state of the same scene: as many frames, the same layers. Call it where `work` is called."""
-        self.subject, self._tracks = subject, None
+    def show(self, viewable: Viewable) -> None:
+        """Show another state of the same scene, with the same frames and layers. Call it in the thread of `work`."""
+        self.viewable, self._tracks = viewable, None
         self._version += 1
         self._clear_measurement()
 
     def run(self) -> None:
-        """Work until interrupted."""
+        """Call `work` until interrupted."""
         try:
             while True:
                 self.work(1.0)
@@ -121,259 +126,264 @@ class Viewer:
     def close(self) -> None:
         """Stop listening."""
         with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+            self.server.stop()
 
     def work(self, wait: float = 0.0) -> None:
-        """Run what was asked for, advance the film, draw what is out of date.
+        """Run waiting jobs, advance playback, render what changed.
 
         Args:
-            wait: the longest to wait for something to do, s.
+            wait: longest time to wait for a job, s.
         """
         wait = min(wait, self._seconds_to_next())
-        for job in self._jobs.take(wait):
+        for job in self.jobs.take(wait):
             self._attempt(job)
         self._attempt(self._advance)
         self._attempt(self._draw)
 
     def _seconds_to_next(self) -> float:
-        """Until there is something to do unasked: the next frame, or a sharp picture after the hasty ones."""
+        """Time until the next frame of the playback, or until the full-size image after a motion."""
         if self._playing:
             return 0.01
         rest = self._moved_at + REST_SECONDS - clock.monotonic()
         return max(rest, 0.0) + 0.01 if rest > -REST_SECONDS else float("inf")
 
     def _attempt(self, job: Callable[[], None]) -> None:
-        """Run a job; a failure is told to the browsers and on stderr, and ends neither the viewer nor a training."""
+        """Run a job. Report a failure on stderr and in the browsers; it stops neither the viewer nor a training."""
         try:
             job()
         except InputError as error:
             print(f"view: {error}", file=sys.stderr)
-            self._stage.notify("That did not work", str(error))
+            self._browsers.notify("That did not work", str(error))
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
-            self._stage.notify("That did not work", f"{type(error).__name__}: {error}")
+            self._browsers.notify("That did not work", f"{type(error).__name__}: {error}")
 
-    # What is listened to.
+    # Callbacks of the controls.
 
     def _listen(self) -> None:
-        controls, ask = self.panel, self._jobs.put
+        controls, ask = self.panel, self.jobs.put
 
         def on_change(job: Callable[[], None], *handles: viser.GuiInputHandle) -> None:
-            for handle in handles:  # values that the viewer itself sets come back without a client
+            for handle in handles:  # values set by the viewer itself arrive without a client
                 handle.on_update(lambda event: ask(job, job) if event.client is not None else None)
 
         def on_press(handle: viser.GuiButtonHandle, job: Callable[[viser.ClientHandle], None]) -> None:
             handle.on_click(lambda event: ask(lambda: job(event.client)) if event.client is not None else None)
 
         on_change(lambda: self._go_to(controls.frame.value), controls.frame)
-        shown = controls.layer, controls.camera, controls.drawn_by, controls.drawn_as
-        on_change(self._read_panel, *shown, controls.tool, controls.tracks, controls.clip)
+        shown = controls.layer, controls.camera, controls.rendered_by, controls.rendered_as
+        on_change(self.read_panel, *shown, controls.tool, controls.tracks, controls.clip)
         on_change(self._restart_clock, controls.speed)
-        on_change(self._read_measuring, controls.measure)
+        on_change(self.read_measuring, controls.measure)
         on_press(controls.play, lambda _: self._toggle_play())
         on_press(controls.clear, lambda _: self._clear_measurement())
         on_press(controls.keep, self._keep_view)
         on_press(controls.forget, lambda _: self._forget_views())
         on_press(controls.screenshot, self._screenshot)
-        on_press(controls.film, self._film)
-        self._server.on_client_connect(lambda client: ask(lambda: self._welcome(client), surely=True))
-        self._server.on_client_disconnect(self._goodbye)
+        on_press(controls.video, self._save_video)
+        self.server.on_client_connect(lambda client: ask(lambda: self._welcome(client), surely=True))
+        self.server.on_client_disconnect(self._goodbye)
 
-    async def _goodbye(self, client: viser.ClientHandle) -> None:  # async: viser's own threads may have ended by then
-        self._jobs.put(lambda: self._stage.leave(client), surely=True)
+    async def _goodbye(self, client: viser.ClientHandle) -> None:  # async: viser's threads may have ended
+        self.jobs.put(lambda: self._browsers.leave(client), surely=True)
 
-    # Who is let in, and what is listened to of what they say.
+    # Access control.
 
-    def _keep_out(self) -> None:
-        """Put the guard between the socket and everything else."""
-        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a traceback for each stranger's garbage
-        server = self._server._websock_server
-        server._handle_incoming_message = self._guarded(server._handle_incoming_message)
+    def _install_filter(self) -> None:
+        """Filter all incoming connections and messages."""
+        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # it logs a traceback for each malformed request
+        server = self.server._websock_server
+        server._handle_incoming_message = self._filtered(server._handle_incoming_message)
         server.on_client_connect(self._admit)
-        for client_id in tuple(server._live_connections):  # who was faster than the line above
-            asyncio.run_coroutine_threadsafe(self._judge(client_id), self._server._event_loop)
+        for client_id in tuple(server._live_connections):  # connected before the line above
+            asyncio.run_coroutine_threadsafe(self._check_connection(client_id), self.server._event_loop)
 
     async def _admit(self, connection: Any) -> None:
-        """Before anything is sent to a connection, or read from it."""
-        connection._handle_incoming_message = self._guarded(connection._handle_incoming_message)
-        await self._judge(connection.client_id)
+        """Check a new connection before anything is sent or read."""
+        connection._handle_incoming_message = self._filtered(connection._handle_incoming_message)
+        await self._check_connection(connection.client_id)
 
-    async def _judge(self, client_id: int) -> None:
-        """Close the connection of a page that is not ours, and one too many."""
-        connections = self._server._websock_server._live_connections
+    async def _check_connection(self, client_id: int) -> None:
+        """Close connections of foreign pages, and those beyond `MAX_BROWSERS`."""
+        connections = self.connections
         if (connection := connections.get(client_id)) is None:
             return
-        connection.protocol.max_message_size = LARGEST_MESSAGE
-        if not self._trusts(client_id):
+        connection.protocol.max_message_size = MAX_MESSAGE_BYTES
+        if not self._is_trusted(client_id):
             await connection.close(1008, "not this viewer's page")
-        elif len(connections) > MOST_BROWSERS:
+        elif len(connections) > MAX_BROWSERS:
             await connection.close(1013, "too many browsers")
 
-    def _trusts(self, client_id: int) -> bool:
-        """Whether a connection that is open may be served."""
-        connection = self._server._websock_server._live_connections.get(client_id)
+    def _is_trusted(self, client_id: int) -> bool:
+        """Whether to serve an open connection."""
+        connection = self.connections.get(client_id)
         if connection is None:
             return False
         origins, hosts = (connection.request.headers.get_all(name) for name in ("Origin", "Host"))
-        return len(origins) < 2 and trusted(next(iter(origins), None), next(iter(hosts), None), self.host)
+        return len(origins) < 2 and is_trusted(next(iter(origins), None), next(iter(hosts), None), self.host)
 
-    def _guarded(self, handle: Callable[[int, Any], Awaitable[None]]) -> Callable[[int, Any], Awaitable[None]]:
-        """`handle` of those messages only that make sense and come from our pages; a flood ends its connection."""
-        paces: defaultdict[int, Pace] = defaultdict(Pace)
+    def _filtered(self, handle: Callable[[int, Any], Awaitable[None]]) -> Callable[[int, Any], Awaitable[None]]:
+        """A version of `handle` that drops invalid messages and foreign pages, and closes a connection that floods."""
+        paces: defaultdict[int, RateLimit] = defaultdict(RateLimit)
 
-        async def guarded(client_id: int, message: Any) -> None:
-            controls = getattr(self, "panel", None)  # there are none yet while the viewer starts
+        async def filtered(client_id: int, message: Any) -> None:
+            controls = getattr(self, "panel", None)  # None while the viewer starts
             accepts = controls.accepts if controls else lambda uuid, value: False
-            connection = self._server._websock_server._live_connections.get(client_id)
+            connection = self.connections.get(client_id)
             if connection is None:
                 paces.pop(client_id, None)
             elif paces[client_id].exceeded(clock.monotonic()):
                 connection.transport.abort()
-            elif self._trusts(client_id) and sensible(type(message).__name__, vars(message), accepts):
+            elif self._is_trusted(client_id) and is_valid_message(type(message).__name__, vars(message), accepts):
                 await handle(client_id, message)
 
-        return guarded
+        return filtered
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        self._stage.join(client)
-        client.camera.on_update(lambda _: self._jobs.put(self._camera_moved, self._camera_moved))
+        self._browsers.join(client)
+        client.camera.on_update(lambda _: self.jobs.put(self._camera_moved, self._camera_moved))
 
     def _camera_moved(self) -> None:
-        if not self.look.endoscope:
+        if not self.settings.endoscope:
             self._moved_at = clock.monotonic()
 
-    def _read_panel(self) -> None:
-        look = self.panel.chosen(self.look)
-        if look.endoscope and not self.look.endoscope:
-            self._stage.return_to_endoscope()
-        self.look = look
-        self._say()
+    def read_panel(self) -> None:
+        """Update the settings from the controls."""
+        settings = self.panel.chosen(self.settings)
+        if settings.endoscope and not self.settings.endoscope:
+            self._browsers.return_to_endoscope()
+        self.settings = settings
+        self._update_panel()
 
     def _go_to(self, frame: int) -> None:
         self._moved_at = clock.monotonic()
-        self.look = replace(self.look, frame=min(max(frame, 0), len(self.subject.cameras) - 1))
+        self.settings = replace(self.settings, frame=min(max(frame, 0), len(self.viewable.cameras) - 1))
         self._restart_clock()
-        self._say()
+        self._update_panel()
 
-    # The clock.
+    # Playback.
 
     def _toggle_play(self) -> None:
-        self._playing = None if self._playing else (self.look.frame, clock.monotonic())
+        self._playing = None if self._playing else (self.settings.frame, clock.monotonic())
         self.panel.play.label = "Pause" if self._playing else "Play"
 
     def _restart_clock(self) -> None:
         if self._playing:
-            self._playing = self.look.frame, clock.monotonic()
+            self._playing = self.settings.frame, clock.monotonic()
 
     def _advance(self) -> None:
         if not self._playing:
             return
         start, since = self._playing
-        rate, total = self.subject.frames_per_second * self.panel.rate, len(self.subject.cameras)
+        rate, total = self.viewable.frames_per_second * self.panel.rate, len(self.viewable.cameras)
         frame = frame_due(start, clock.monotonic() - since, rate, total)
-        if frame != self.look.frame:
+        if frame != self.settings.frame:
             self._moved_at = clock.monotonic()
-            self.look = replace(self.look, frame=frame)
+            self.settings = replace(self.settings, frame=frame)
             self.panel.frame.value = frame
-            self._say()
+            self._update_panel()
 
-    # Drawing.
+    # Rendering.
 
     def _draw(self) -> None:
-        marks = self._marks(self.look)
-        self._stage.draw(self.subject, self._version, self.look, marks, clock.monotonic() - self._moved_at)
+        lines = self._lines(self.settings)
+        self._browsers.draw(self.viewable, self._version, self.settings, lines, clock.monotonic() - self._moved_at)
 
-    def _marks(self, look: Look) -> Marks:
-        marks = no_marks()
-        if look.tracks:
+    def _lines(self, settings: ViewSettings) -> Lines:
+        lines = no_lines()
+        if settings.tracks:
             if self._tracks is None:
-                self._tracks = self.subject.tracks()
+                self._tracks = self.viewable.tracks()
             if self._tracks.shape[1]:
-                marks = trails(self._tracks, look.frame)
-        return joined(marks, ruler(self.measured.ends(look.frame))) if self.measured else marks
+                lines = track_lines(self._tracks, settings.frame)
+        return concatenated(lines, ruler(self.measured.ends(settings.frame))) if self.measured else lines
 
     # Measuring.
 
-    def _read_measuring(self) -> None:
-        scene = self._server.scene
+    def read_measuring(self) -> None:
+        """Switch measuring by clicks on or off, as the control is set."""
+        scene = self.server.scene
         scene.remove_click_callback("all")
         if self.panel.measure.value:
-            scene.on_click()(lambda event: self._jobs.put(lambda: self._pick(event.client, event.screen_pos)))
-        self._say()
+            scene.on_click()(lambda event: self.jobs.put(lambda: self._pick(event.client, event.screen_pos)))
+        self._update_panel()
 
     def _pick(self, client: viser.ClientHandle, screen: tuple[float, float]) -> None:
-        """Take the point under a click: the first, the second, or the first of the next measurement."""
-        viewport = self._stage.viewport(client, self.subject, self.look)
+        """Add the point under a click: the first, the second, or the first of the next measurement."""
+        viewport = self._browsers.viewport(client, self.viewable, self.settings)
         if viewport is None:
             return
-        depth = self.subject.surface(self.look, viewport.camera)
+        depth = self.viewable.surface(self.settings, viewport.camera)
         point = pick(depth, viewport.camera, viewport.pixel(screen))
         if point is None:
-            self._stage.notify("No surface there", "Click where something is drawn.")
+            self._browsers.notify("No surface there", "Click on the tissue.")
             return
         before = self._picked if len(self._picked) < 2 else []
-        self._picked = [*before, (point, self.look.frame)]
+        self._picked = [*before, (point, self.settings.frame)]
         points, frames = zip(*self._picked, strict=True)
-        self.measured = Measurement(self.look.frame, self.subject.carry(np.stack(points), list(frames)))
-        self._say()
+        self.measured = Measurement(self.settings.frame, self.viewable.carry(np.stack(points), list(frames)))
+        self._update_panel()
 
     def _clear_measurement(self) -> None:
         self.measured, self._picked = None, []
-        self._say()
+        self._update_panel()
 
     # Saving.
 
     def _keep_view(self, client: viser.ClientHandle) -> None:
-        viewport = self._stage.viewport(client, self.subject, self.look)
-        if len(self._kept) >= MOST_KEPT:
-            self._stage.notify("Not kept", f"{MOST_KEPT} views are enough for one film.")
+        viewport = self._browsers.viewport(client, self.viewable, self.settings)
+        if len(self.kept_views) >= MAX_KEPT:
+            self._browsers.notify("Not saved", f"The limit is {MAX_KEPT} views.")
         elif viewport is not None:
-            self._kept.append(Place(self.look.frame, viewport.camera))
-        self._say()
+            self.kept_views.append(PathPoint(self.settings.frame, viewport.camera))
+        self._update_panel()
 
     def _forget_views(self) -> None:
-        self._kept = []
-        self._say()
+        self.kept_views = []
+        self._update_panel()
 
     def _screenshot(self, client: viser.ClientHandle) -> None:
-        viewport = self._stage.viewport(client, self.subject, self.look)
+        viewport = self._browsers.viewport(client, self.viewable, self.settings)
         if viewport is None:
             return
-        picture = marked_picture(self.subject, self.look, viewport.camera, self._marks(self.look))
-        self._offer(client, f"{self.look.layer}_{self.look.frame:06d}.png", saving.png_bytes(picture))
+        picture = picture_with_lines(self.viewable, self.settings, viewport.camera, self._lines(self.settings))
+        self._offer(client, f"{self.settings.layer}_{self.settings.frame:06d}.png", saving.png_bytes(picture))
 
-    def _film(self, client: viser.ClientHandle) -> None:
-        viewport = self._stage.viewport(client, self.subject, self.look)
+    def _save_video(self, client: viser.ClientHandle) -> None:
+        viewport = self._browsers.viewport(client, self.viewable, self.settings)
         if viewport is None:
             return
-        look, places = self.look, sweep(self.subject.cameras, None if self.look.endoscope else viewport.camera)
-        if len(self._kept) > 1:
-            look, places = replace(look, endoscope=False), through(self._kept)
-        if len(places) > MOST_PICTURES:
-            self._stage.notify("No film", f"Expected at most {MOST_PICTURES} pictures; got {len(places)}.")
-            return
-        self._stage.notify("Drawing the film", f"{len(places)} pictures")
-        looks = [replace(look, frame=place.frame) for place in places]
-        pictures = (  # one at a time: all of them may not fit into memory
-            marked_picture(self.subject, look, place.camera, self._marks(look))
-            for look, place in zip(looks, places, strict=True)
+        settings, places = (
+            self.settings,
+            follow_frames(self.viewable.cameras, None if self.settings.endoscope else viewport.camera),
         )
-        self._offer(client, f"{look.layer}.mp4", saving.mp4_bytes(pictures, self.subject.frames_per_second))
+        if len(self.kept_views) > 1:
+            settings, places = replace(settings, endoscope=False), interpolate(self.kept_views)
+        if len(places) > MAX_PICTURES:
+            self._browsers.notify("No video", f"Expected at most {MAX_PICTURES} pictures; got {len(places)}.")
+            return
+        self._browsers.notify("Rendering the video", f"{len(places)} images")
+        steps = [replace(settings, frame=place.frame) for place in places]
+        pictures = (  # one at a time: all together may not fit into memory
+            picture_with_lines(self.viewable, settings, place.camera, self._lines(settings))
+            for settings, place in zip(steps, places, strict=True)
+        )
+        self._offer(client, f"{settings.layer}.mp4", saving.mp4_bytes(pictures, self.viewable.frames_per_second))
 
     def _offer(self, client: viser.ClientHandle, name: str, content: bytes) -> None:
-        """Send a file to the browser, and keep it in the folder for such files."""
+        """Send a file to the browser, and store it in `out`."""
         client.send_file_download(name, content)
         if self.out is not None:
-            self._stage.notify("Saved", str(saving.keep(self.out, name, content)))
+            self._browsers.notify("Saved", str(saving.keep(self.out, name, content)))
 
-    # Telling.
+    # Text of the panel.
 
-    def _say(self) -> None:
-        """Bring the words of the panel up to date."""
+    def _update_panel(self) -> None:
+        """Update the texts and the chart of the panel."""
         controls, measuring = self.panel, self.measured or self.panel.measure.value
-        controls.status.content = panel.status(self.subject, self.look, len(self._kept))
-        told = sentence(self.measured, self.look.frame, self.subject.relative) if measuring else ""
-        controls.distance.content = told
+        controls.status.content = panel.status(self.viewable, self.settings, len(self.kept_views))
+        text = measurement_text(self.measured, self.settings.frame, self.viewable.relative) if measuring else ""
+        controls.distance.content = text
         distances = self.measured.distances if self.measured else np.zeros(0)
         controls.chart.visible = bool(np.isfinite(distances).sum() > 1)
         if controls.chart.visible:

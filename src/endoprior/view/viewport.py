@@ -1,7 +1,7 @@
-"""From a browser's canvas to the camera that draws for it, and from a click back to a pixel.
+"""Convert a browser's canvas to a rendering camera, and a click to a pixel.
 
-A browser draws with square pixels and the principal point in the middle of its canvas. The endoscope's picture is
-therefore laid into a canvas so large that this holds, and what the browser draws itself falls on the right place.
+A browser renders with square pixels and the principal point in the center of its canvas. The endoscope image is
+therefore placed in a larger canvas for which this holds, so that objects rendered by the browser are aligned with it.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from ..core.geometry import quaternion_to_matrix
 from ..core.types import Camera
 
 LEAST_ASPECT, LARGEST_ASPECT = 0.25, 4.0
-"""Canvases narrower or wider than this are treated as if they were not."""
+"""The aspect ratio of a canvas is clamped to this range."""
 
 
 @dataclass(frozen=True)
 class Viewport:
-    """A picture on a canvas; all in px of the picture."""
+    """An image on a canvas; all lengths in px of the image."""
 
     camera: Camera
-    """Draws the picture; its pixels are square."""
+    """Renders the image; its pixels are square."""
     width: int
-    """Of the canvas."""
+    """Width of the canvas."""
     height: int
-    """Of the canvas."""
+    """Height of the canvas."""
     left: int
-    """Column of the canvas where the picture begins."""
+    """First column of the image on the canvas."""
     top: int
-    """Row of the canvas where the picture begins."""
+    """First row of the image on the canvas."""
 
     @property
     def fov(self) -> float:
@@ -39,7 +39,7 @@ class Viewport:
         return float(2 * np.arctan(self.height / 2 / self.camera.fy))
 
     def paste(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(height, width, 3): the (H, W, 3) picture in its place, black around it."""
+        """(height, width, 3) canvas with the (H, W, 3) image in place, black around it."""
         if picture.shape[:2] == (self.height, self.width):
             return picture
         canvas = np.zeros((self.height, self.width, 3), np.uint8)
@@ -47,7 +47,7 @@ class Viewport:
         return canvas
 
     def pixel(self, screen: tuple[float, float]) -> tuple[float, float]:
-        """Where in the picture a place on the canvas is, px; `screen` runs from (0, 0) upper left to (1, 1)."""
+        """Pixel of the image at a canvas position; `screen` is (0, 0) at the upper left, (1, 1) at the lower right."""
         return screen[0] * self.width - self.left, screen[1] * self.height - self.top
 
     def screen(self, pixel: tuple[float, float]) -> tuple[float, float]:
@@ -56,12 +56,12 @@ class Viewport:
 
 
 def endoscope_viewport(camera: Camera, aspect: float, shrink: int = 1) -> Viewport:
-    """The whole picture of `camera`, as large as it is stored (divided by `shrink`), on a canvas of this aspect."""
+    """The whole image of `camera` at its stored size divided by `shrink`, on a canvas of this aspect ratio."""
     camera = shrunk_camera(square_pixels(camera), shrink)
     half_width = max(camera.cx, camera.width - camera.cx)
     half_height = max(camera.cy, camera.height - camera.cy)
     height = max(half_height, half_width / aspect)
-    # Even sizes: the middle of the canvas is between pixels, as the principal point of most cameras is.
+    # Even sizes: the center of the canvas is between pixels, like the principal point of most cameras.
     canvas = 2 * int(np.ceil(height * aspect)), 2 * int(np.ceil(height))
     left, top = round(canvas[0] / 2 - camera.cx), round(canvas[1] / 2 - camera.cy)
     return Viewport(camera, max(canvas[0], left + camera.width), max(canvas[1], top + camera.height), left, top)
@@ -70,11 +70,11 @@ def endoscope_viewport(camera: Camera, aspect: float, shrink: int = 1) -> Viewpo
 def free_viewport(
     wxyz: NDArray, position: NDArray, fov: float, aspect: float, height: int, shrink: int = 1
 ) -> Viewport | None:
-    """What a browser's own camera sees, on the whole canvas; None if what the browser sent is no camera.
+    """The view of a browser's own camera on the whole canvas; None if the camera is invalid.
 
     Args:
         wxyz: (4,) rotation from camera to world axes, OpenCV. position: (3,) world, mm. fov: vertical, radians.
-        height: of the picture before it is divided by `shrink`, px.
+        height: image height before division by `shrink`, px.
     """
     finite = np.isfinite([*wxyz, *position, fov]).all()
     if not finite or not 0.01 < fov < 3.1 or np.linalg.norm(wxyz) < 1e-6:
@@ -89,7 +89,7 @@ def free_viewport(
 
 
 def bounded_aspect(width: float, height: float) -> float:
-    """width / height of a canvas, held in a sane range; 1 for a canvas of no size."""
+    """width / height of a canvas, clamped; 1 for an empty canvas."""
     if not (0 < width < float("inf") and 0 < height < float("inf")):
         return 1.0
     return min(max(width / height, LEAST_ASPECT), LARGEST_ASPECT)

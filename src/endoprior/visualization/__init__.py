@@ -1,1 +1,1 @@
-"""Pictures and films for people: color maps, contact sheets, videos, the report. Nothing here feeds a score."""
+"""Images and videos to look at: color maps, contact sheets, rendered videos, the report. No score uses them."""

@@ -1,4 +1,4 @@
-"""Camera paths: a list of (time, camera) to draw a scene along."""
+"""Camera paths: lists of (time, camera) to render."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..core.types import Camera
 from ..data.reading import read_text
 
@@ -20,13 +20,13 @@ SWAY_SHARE = 0.12
 
 
 def times_path(times: list[float], cameras: tuple[Camera, ...]) -> list[View]:
-    """The sequence's own camera at each of `times` in [0, 1]."""
+    """The camera of the sequence at each of `times` in [0, 1]."""
     last = len(cameras) - 1
     return [(time, cameras[min(round(time * len(cameras)), last)]) for time in times]
 
 
 def sway_path(times: list[float], cameras: tuple[Camera, ...], distance_mm: float) -> list[View]:
-    """The sequence's camera moved around a small circle, always looking at the point `distance_mm` straight ahead."""
+    """The camera of the sequence, moved on a small circle, pointing at the point `distance_mm` straight ahead."""
     views = []
     for k, (time, camera) in enumerate(times_path(times, cameras)):
         angle = 2 * np.pi * k / max(len(times), 1)
@@ -36,7 +36,7 @@ def sway_path(times: list[float], cameras: tuple[Camera, ...], distance_mm: floa
 
 
 def _looking(position: NDArray, distance: float) -> NDArray:
-    """(4, 4) from the old camera axes to those of a camera at `position` that looks at (0, 0, distance)."""
+    """(4, 4) transform from camera axes to those of a camera at `position` that points at (0, 0, distance)."""
     forward = np.array([0, 0, distance]) - position
     forward /= np.linalg.norm(forward)
     right = np.cross([0.0, 1.0, 0.0], forward)
@@ -50,10 +50,10 @@ def _looking(position: NDArray, distance: float) -> NDArray:
 def read_path(file: Path, cameras: tuple[Camera, ...]) -> list[View]:
     """Read a camera path: a JSON list of {"time": t in [0, 1], "world_to_camera": 4 x 4, mm, OpenCV axes}.
 
-    A view may leave out the matrix; it then has the sequence's camera of that time. Intrinsics are the sequence's.
+    A view without a matrix uses the camera of the sequence at that time. Intrinsics are those of the sequence.
 
     Raises:
-        InputError: the file is missing, is not such a list, or a matrix is not a rigid motion.
+        InputError: the file is missing, is not such a list, or a matrix is not a rigid transform.
     """
     try:
         entries = json.loads(read_text(file, "a camera path", "Correct the file."))
@@ -61,11 +61,10 @@ def read_path(file: Path, cameras: tuple[Camera, ...]) -> list[View]:
     except InputError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(
-            f'{file}: expected a JSON list of {{"time": .., "world_to_camera": 4 x 4}}; {error!r}. Correct the file.'
-        ) from None
+        want = 'a JSON list of {"time": .., "world_to_camera": 4 x 4}'
+        raise input_error(file, want, repr(error), "Correct the file.") from None
     if not views:
-        raise InputError(f"{file}: expected at least one view; got none. Add one.")
+        raise input_error(file, "at least one view", "none", "Add one.")
     return views
 
 

@@ -1,4 +1,4 @@
-"""Small pieces that pictures are made of: color-mapped maps, labels, tiles, PNG files."""
+"""Helpers for images: color maps, labels, tiling, PNG files."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ..system.atomic import whole_file
 
 
 def write_png(path: Path, rgb_u8: NDArray[np.uint8]) -> None:
-    """Write an (H, W, 3) RGB or (H, W) gray 8-bit picture, whole or not at all."""
+    """Write an (H, W, 3) RGB or (H, W) gray 8-bit image, atomically."""
     with whole_file(path) as temporary:
         save_png(temporary, rgb_u8)
 
 
 def to_u8(unit: NDArray) -> NDArray[np.uint8]:
-    """Values in [0, 1], rounded to 0..255; anything outside is clipped."""
+    """Values in [0, 1], rounded to 0..255; values outside are clipped."""
     return (np.clip(unit, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def colorize(values: NDArray, low: float, high: float, valid: NDArray | None = None) -> NDArray[np.uint8]:
-    """Turbo colors of an (H, W) map: blue at `low`, red at `high`; black where `valid` is False."""
+    """Turbo color map of (H, W) values: blue at `low`, red at `high`; black where `valid` is False."""
     span = max(high - low, 1e-9)
     colors = cv2.applyColorMap(to_u8((np.nan_to_num(values) - low) / span), cv2.COLORMAP_TURBO)[..., ::-1]
     return colors if valid is None else colors * np.asarray(valid, np.uint8)[..., None]
@@ -32,17 +32,17 @@ def colorize(values: NDArray, low: float, high: float, valid: NDArray | None = N
 
 def label(rgb_u8: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
     """A copy with `text` in the lower left corner, white on black."""
-    picture = np.ascontiguousarray(rgb_u8).copy()
-    scale = max(picture.shape[1] / 900, 0.35)
-    at = (int(8 * scale) + 2, picture.shape[0] - int(10 * scale) - 2)
+    image = np.ascontiguousarray(rgb_u8).copy()
+    scale = max(image.shape[1] / 900, 0.35)
+    at = (int(8 * scale) + 2, image.shape[0] - int(10 * scale) - 2)
     for color, width in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, color, width, cv2.LINE_AA)
-    return picture
+        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, color, width, cv2.LINE_AA)
+    return image
 
 
-def tile(pictures: list[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
-    """Pictures of one size, row by row in `columns`; missing ones are black."""
-    blank = np.zeros_like(pictures[0])
-    padded = pictures + [blank] * (-len(pictures) % columns)
+def tile(images: list[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
+    """Images of one size, tiled row by row in `columns`; missing ones are black."""
+    blank = np.zeros_like(images[0])
+    padded = images + [blank] * (-len(images) % columns)
     rows = [np.concatenate(padded[i : i + columns], 1) for i in range(0, len(padded), columns)]
     return np.concatenate(rows, 0)

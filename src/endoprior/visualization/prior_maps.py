@@ -1,4 +1,4 @@
-"""The cue maps and the joint texture prior of a sequence, as pictures."""
+"""Write the cue maps and the joint texture prior of a sequence as images."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def write_prior_maps(sequence: FrameSequence, split: Split, cfg: PriorConfig, ou
             for name, values in maps.items():
                 write_png(folder / name / f"{frame.index:06d}.png", to_u8(values))
             if position in shown:
-                pictures = {f"frame {frame.index}": frame.rgb_u8, "tissue mask": _gray(frame.tissue_mask)}
-                pictures |= {name: colorize(values, 0, 1) for name, values in maps.items()}
-                rows += [label(_small(picture), name) for name, picture in pictures.items()]
+                images = {f"frame {frame.index}": frame.rgb_u8, "tissue mask": _gray(frame.tissue_mask)}
+                images |= {name: colorize(values, 0, 1) for name, values in maps.items()}
+                rows += [label(_small(image), name) for name, image in images.items()]
         write_png(folder / "contact_sheet.png", tile(rows, 5))
     return out / "contact_sheet.png"
 
@@ -51,6 +51,6 @@ def _gray(mask: NDArray) -> NDArray[np.uint8]:
     return np.repeat(to_u8(mask)[..., None], 3, -1)
 
 
-def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    height = max(round(picture.shape[0] * SHEET_WIDTH_PX / picture.shape[1]), 1)
-    return cv2.resize(picture, (SHEET_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height = max(round(image.shape[0] * SHEET_WIDTH_PX / image.shape[1]), 1)
+    return cv2.resize(image, (SHEET_WIDTH_PX, height), interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""Drawn views on disk: color and depth per view, side-by-side pictures, and a video."""
+"""Render views to disk: color and depth of each view, side-by-side images, and a video."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .image_tools import colorize, label, tile, to_u8, write_png
 from .video import write_video
 
 AT_A_TIME = 8
-"""Views that a GPU draws in one call."""
+"""Number of views that a GPU renders in one call."""
 
 
 def write_views(
@@ -27,17 +27,17 @@ def write_views(
     frames: list[Frame] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Draw each view into `out/rgb/*.png`, `out/depth/*.npy` (mm, float32) and `out/side_by_side/*.png`, and a film.
+    """Write each view to `out/rgb/*.png`, `out/depth/*.npy` (mm, float32) and `out/side_by_side/*.png`, and a video.
 
     Args:
-        frames: the originals, one per view; without them the side-by-side shows color and depth only.
-        video: path of the mp4 of the side-by-side pictures.
+        frames: the input frames, one per view; without them the side-by-side shows color and depth only.
+        video: path of the mp4 of the side-by-side images.
     """
     span = depth_span(scene)
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
-        for k, drawn in enumerate(_drawn(scene, views)):
-            color, depth = to_u8(drawn.color.cpu().numpy()), drawn.depth.cpu().numpy()
+    def images() -> Iterator[NDArray[np.uint8]]:
+        for k, rendered in enumerate(_render(scene, views)):
+            color, depth = to_u8(rendered.color.cpu().numpy()), rendered.depth.cpu().numpy()
             name = f"{frames[k].index if frames else k:06d}"
             write_png(out / "rgb" / f"{name}.png", color)
             with whole_file(out / "depth" / f"{name}.npy") as temporary:
@@ -49,11 +49,11 @@ def write_views(
             progress(k + 1, len(views))
             yield beside
 
-    write_video(video, pictures(), scene.frames_per_second)
+    write_video(video, images(), scene.frames_per_second)
 
 
-def _drawn(scene: Scene, views: list[View]) -> Iterator[RenderOutput]:
-    """Each view, several at a time where that is cheaper."""
+def _render(scene: Scene, views: list[View]) -> Iterator[RenderOutput]:
+    """Render each view; in batches on a GPU."""
     at_a_time = 1 if scene.device.type == "cpu" else AT_A_TIME
     for start in range(0, len(views), at_a_time):
         times, cameras = zip(*views[start : start + at_a_time], strict=True)
@@ -61,8 +61,8 @@ def _drawn(scene: Scene, views: list[View]) -> Iterator[RenderOutput]:
 
 
 def depth_span(scene: Scene) -> tuple[float, float]:
-    """Depths, mm, between which nearly all of the first moment lies: one color scale for all pictures of a scene."""
+    """Depth range of nearly all of the first frame, mm: one color scale for all images of a scene."""
     depth = scene.render(0.0).depth.cpu().numpy()
-    drawn = depth[depth > 0]
-    low, high = np.percentile(drawn, (2, 98)) if drawn.size else (0.0, 1.0)
+    covered = depth[depth > 0]
+    low, high = np.percentile(covered, (2, 98)) if covered.size else (0.0, 1.0)
     return float(low), float(high)

@@ -1,4 +1,4 @@
-"""Films, through imageio's bundled ffmpeg."""
+"""Write videos with imageio's bundled ffmpeg."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from numpy.typing import NDArray
 from ..system.atomic import whole_file
 
 
-def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> None:
-    """Write an H.264 mp4, whole or not at all.
+def write_video(path: Path, images: Iterable[NDArray[np.uint8]], frames_per_second: float) -> None:
+    """Write an H.264 mp4, atomically.
 
     Args:
-        pictures: (H, W, 3) 8-bit RGB, one size; an odd last row or column is cut, as the codec demands even sizes.
+        images: (H, W, 3) 8-bit RGB, one size; an odd last row or column is cropped, because the codec needs even sizes.
     """
     with whole_file(path) as temporary:
         options = {"fps": frames_per_second, "codec": "libx264", "quality": 8, "macro_block_size": 1}
         count = 0
         with imageio.get_writer(str(temporary), format="FFMPEG", ffmpeg_log_level="quiet", **options) as writer:
-            for picture in pictures:
-                height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2
-                writer.append_data(np.ascontiguousarray(picture[:height, :width]))
+            for image in images:
+                height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+                writer.append_data(np.ascontiguousarray(image[:height, :width]))
                 count += 1
-        if _num_frames(temporary) != count:  # nobody asks the encoder how it ended
+        if num_frames(temporary) != count:  # imageio does not check the exit status of the encoder
             raise BrokenPipeError(f"{path}: the encoder stopped before the end")
 
 
-def _num_frames(path: Path) -> int:
-    """Frames of a film by its own table, which is written last; 0 for what is no film."""
+def num_frames(path: Path) -> int:
+    """Number of frames in the table of a video, which is written last; 0 if the file is not a complete video."""
     try:
-        with av.open(str(path)) as film:
-            return film.streams.video[0].frames
+        with av.open(str(path)) as video:
+            return video.streams.video[0].frames
     except (av.FFmpegError, OSError, IndexError):
         return 0

@@ -1,4 +1,4 @@
-"""The path a film follows: every frame from where one looks now, or through places that were kept."""
+"""Camera path of a saved video: all frames from one camera, or interpolation between saved views."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..core.types import Camera
 
 LEAST_STEPS = 24
-"""Pictures between two kept places whose frames are the same."""
+"""Images between two saved views of the same frame."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """A moment and where it was looked at from."""
+class PathPoint:
+    """A frame of the sequence and the camera that renders it."""
 
     frame: int
     camera: Camera
 
 
-def sweep(cameras: tuple[Camera, ...], standing: Camera | None) -> list[Place]:
-    """Every frame, from the endoscope's camera of that frame or, if given, from `standing`."""
-    return [Place(i, standing or camera) for i, camera in enumerate(cameras)]
+def follow_frames(cameras: tuple[Camera, ...], standing: Camera | None) -> list[PathPoint]:
+    """Every frame, from the endoscope camera of that frame or, if given, from the static camera `standing`."""
+    return [PathPoint(i, standing or camera) for i, camera in enumerate(cameras)]
 
 
-def through(places: list[Place]) -> list[Place]:
-    """Pictures along two or more places: frames one by one, positions along lines, rotations along great circles."""
+def interpolate(places: list[PathPoint]) -> list[PathPoint]:
+    """A path through two or more views: every frame between them, linear positions, spherical rotations (slerp)."""
     path = []
     for a, b in pairwise(places):
         steps = abs(b.frame - a.frame) or LEAST_STEPS
         shares = np.linspace(0, 1, steps, endpoint=False)
         frames = np.rint(a.frame + shares * (b.frame - a.frame)).astype(int)
-        path += [Place(int(i), _between(a.camera, b.camera, s)) for i, s in zip(frames, shares, strict=True)]
+        path += [PathPoint(int(i), _between(a.camera, b.camera, s)) for i, s in zip(frames, shares, strict=True)]
     last = places[-1]
-    return [*path, Place(last.frame, _between(places[0].camera, last.camera, 1.0))]
+    return [*path, PathPoint(last.frame, _between(places[0].camera, last.camera, 1.0))]
 
 
 def _between(a: Camera, b: Camera, share: float) -> Camera:
-    """A camera of the picture size of `a`, part of the way to `b`."""
+    """A camera with the image size of `a`, the share `share` of the way to `b`."""
     scale = a.height / b.height
     focal = (1 - share) * a.fy + share * b.fy * scale
     rotations = Rotation.from_matrix([a.world_to_camera[:3, :3], b.world_to_camera[:3, :3]])

@@ -1,4 +1,4 @@
-"""A trained scene as the viewer sees it."""
+"""Viewer content: a trained scene."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from ..model.scene import Scene
 from ..visualization.image_tools import to_u8
 from ..visualization.rendered_views import depth_span
 from . import layers
-from .session import Layer, Look
-from .subject import Cloud
+from .view_settings import Layer, ViewSettings
+from .viewable import Cloud
 
 BROWSER_LAYERS = ("color", "motion", "prior")
-"""Layers that are a color of each Gaussian."""
+"""Layers that are one color per Gaussian."""
 DOT_PX = 0.6
-"""Standard deviation of a dot in the endoscope's picture."""
+"""Standard deviation of a dot in the endoscope image, px."""
 DOT_OPACITY = 0.98
 TRACK_COLUMNS = 16
-"""Material points across the picture."""
+"""Number of material points along a row of the image."""
 MOTION_SAMPLES = 8
-"""Moments from which the scale of the motion's colors is taken."""
+"""Number of times used for the color scale of the motion layer."""
 
 
-class SceneSubject:
-    """A scene and, if it is there, the sequence it was trained on."""
+class ViewableScene:
+    """A scene and, if available, the sequence it was trained on."""
 
     def __init__(self, scene: Scene, title: str, sequence: FrameSequence | None = None) -> None:
-        """Draw nothing yet.
+        """Prepare the content; render nothing yet.
 
         Args:
-            sequence: of as many frames as the scene has cameras; None leaves out original, difference and tool.
+            sequence: with as many frames as the scene has cameras; None disables input frames, difference and tool.
         """
         self.scene, self.title, self.sequence = scene, title, sequence
         self.layers: tuple[Layer, ...] = ("color", "depth", "alpha", "motion", "prior")
@@ -57,23 +57,23 @@ class SceneSubject:
 
     @cached_property
     def span(self) -> tuple[float, float]:
-        """Depths, mm, between which nearly all of the first frame lies."""
+        """Depth range of nearly all of the first frame, mm."""
         return depth_span(self.scene)
 
-    def picture(self, look: Look, camera: Camera) -> NDArray[np.uint8]:
-        """See `Subject.picture`. Without the endoscope's view, originals do not fit, and rendered color is shown."""
-        kind = look.layer if look.endoscope or look.layer not in ("frame", "difference") else "color"
-        picture = self._layer(kind, look, camera)
-        if look.tool and look.endoscope and self.sequence is not None:
-            frame = self.sequence.frame(look.frame)
+    def picture(self, settings: ViewSettings, camera: Camera) -> NDArray[np.uint8]:
+        """See `Viewable.picture`. From another camera the input frames do not fit; shows rendered color instead."""
+        kind = settings.layer if settings.endoscope or settings.layer not in ("frame", "difference") else "color"
+        picture = self._layer(kind, settings, camera)
+        if settings.tool and settings.endoscope and self.sequence is not None:
+            frame = self.sequence.frame(settings.frame)
             original, mask = layers.fitted(frame.rgb_u8, camera), layers.fitted(frame.tissue_mask, camera)
             picture = layers.with_tool(picture, original, mask)
         return picture
 
-    def _layer(self, kind: Layer, look: Look, camera: Camera) -> NDArray[np.uint8]:
+    def _layer(self, kind: Layer, settings: ViewSettings, camera: Camera) -> NDArray[np.uint8]:
         if kind == "frame":
-            return layers.fitted(self.sequence.frame(look.frame).rgb_u8, camera)
-        out = self._draw(look, camera, None if kind not in ("motion", "prior") else self._values(look))
+            return layers.fitted(self.sequence.frame(settings.frame).rgb_u8, camera)
+        out = self._draw(settings, camera, None if kind not in ("motion", "prior") else self._values(settings))
         alpha = out.alpha.cpu().numpy()
         if kind == "depth":
             return layers.depth_picture(expected_depth(out.depth.cpu().numpy(), alpha), self.span)
@@ -83,27 +83,27 @@ class SceneSubject:
             return layers.value_picture(out.color[..., 0].cpu().numpy(), alpha)
         color = to_u8(out.color.cpu().numpy())
         if kind == "difference":
-            return layers.difference_picture(color, layers.fitted(self.sequence.frame(look.frame).rgb_u8, camera))
+            return layers.difference_picture(color, layers.fitted(self.sequence.frame(settings.frame).rgb_u8, camera))
         return color
 
-    def surface(self, look: Look, camera: Camera) -> NDArray[np.float32]:
-        """See `Subject.surface`."""
-        out = self._draw(look, camera)
+    def surface(self, settings: ViewSettings, camera: Camera) -> NDArray[np.float32]:
+        """See `Viewable.surface`."""
+        out = self._draw(settings, camera)
         return expected_depth(out.depth.cpu().numpy(), out.alpha.cpu().numpy())
 
     @torch.no_grad()
-    def _draw(self, look: Look, camera: Camera, values: Tensor | None = None) -> RenderOutput:
-        """Composite the chosen Gaussians; `values` (N,) in [0, 1] in place of their colors."""
-        splats = self._splats(look)
+    def _draw(self, settings: ViewSettings, camera: Camera, values: Tensor | None = None) -> RenderOutput:
+        """Render the selected Gaussians; `values` (N,) in [0, 1] replace their colors."""
+        splats = self._splats(settings)
         if values is not None:
             splats = replace(splats, sh=_gray_sh(values))
         return self._rasterize(
-            _clipped(splats, camera, look.near, look.far), camera, background=splats.means.new_zeros(3)
+            _clipped(splats, camera, settings.near, settings.far), camera, background=splats.means.new_zeros(3)
         )
 
-    def _splats(self, look: Look) -> Splats:
-        splats = self._playback.splats(look.frame)
-        if not look.points:
+    def _splats(self, settings: ViewSettings) -> Splats:
+        splats = self._playback.splats(settings.frame)
+        if not settings.points:
             return splats
         scales = torch.full_like(splats.scales, self._dot_mm)
         return replace(splats, scales=scales, opacities=torch.full_like(splats.opacities, DOT_OPACITY))
@@ -112,49 +112,55 @@ class SceneSubject:
     def _dot_mm(self) -> float:
         return DOT_PX * sum(self.span) / 2 / self.cameras[0].fy
 
-    def _values(self, look: Look) -> Tensor:
-        """(N,) in [0, 1] what the layer shows of each Gaussian."""
-        if look.layer == "prior":
+    def _values(self, settings: ViewSettings) -> Tensor:
+        """(N,) value of the layer for each Gaussian, in [0, 1]."""
+        if settings.layer == "prior":
             return self.scene.prior_score.clamp(0, 1)
-        return (self._moved(look.frame) / self.largest_motion).clamp(max=1)
+        return (self._moved(settings.frame) / self.largest_motion).clamp(max=1)
 
     def _moved(self, frame: int) -> Tensor:
-        """(N,) distance of each center from where it is in the first frame, mm."""
+        """(N,) distance of each center from its position in the first frame, mm."""
         return (self._playback.splats(frame).means - self._playback.splats(0).means).norm(dim=-1)
 
     @cached_property
     def largest_motion(self) -> float:
-        """Nearly the largest motion since the first frame, mm: the red end of the motion's colors."""
+        """98th percentile of the motion since the first frame, mm: the red end of the color scale."""
         frames = np.linspace(0, len(self.cameras) - 1, min(MOTION_SAMPLES, len(self.cameras))).astype(int)
         return max(*(float(np.percentile(self._moved(int(i)).cpu().numpy(), 98)) for i in frames), 1e-3)
 
-    def sent(self, look: Look) -> bool:
-        """See `Subject.sent`: layers that are no color of the Gaussians stay with our renderer."""
-        return look.in_browser and look.layer in BROWSER_LAYERS
+    def sent(self, settings: ViewSettings) -> bool:
+        """See `Viewable.sent`: layers that are not a color per Gaussian are rendered on the server."""
+        return settings.in_browser and settings.layer in BROWSER_LAYERS
 
     @torch.no_grad()
-    def cloud(self, look: Look) -> Cloud:
-        """See `Subject.cloud`: view-dependent color is left out."""
-        splats = _clipped(self._splats(look), self.cameras[look.frame], look.near, look.far)
-        if look.layer == "color":
+    def cloud(self, settings: ViewSettings) -> Cloud:
+        """See `Viewable.cloud`: without view-dependent color."""
+        splats = _clipped(self._splats(settings), self.cameras[settings.frame], settings.near, settings.far)
+        if settings.layer == "color":
             colors = to_u8((splats.sh[:, 0] * SH_C0 + 0.5).cpu().numpy())
         else:
-            values = _rows(self._values(look), self._splats(look), self.cameras[look.frame], look.near, look.far)
+            values = _rows(
+                self._values(settings),
+                self._splats(settings),
+                self.cameras[settings.frame],
+                settings.near,
+                settings.far,
+            )
             colors = layers.colorize(values.cpu().numpy()[None], 0, 1)[0]
         points = splats.means.cpu().numpy()
-        if look.points:
+        if settings.points:
             return Cloud(points, colors, None, None, 3 * self._dot_mm)
         return Cloud(points, colors, _covariances(splats), splats.opacities.cpu().numpy(), 0.0)
 
     def carry(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
-        """See `Subject.carry`: the Gaussians around a point take it along."""
+        """See `Viewable.carry`: a point moves with the Gaussians around it."""
         times = [i / len(self.cameras) for i in range(len(self.cameras))]
         return carry_points(self.scene, np.asarray(points), np.array(frames), times).astype(np.float64)
 
     def tracks(self) -> NDArray[np.float64]:
-        """See `Subject.tracks`: a grid on the surface of the first frame, off the tool."""
-        camera, look = self.cameras[0], Look()
-        depth = self.surface(look, camera)
+        """See `Viewable.tracks`: a grid on the surface of the first frame, off the tool."""
+        camera, settings = self.cameras[0], ViewSettings()
+        depth = self.surface(settings, camera)
         if self.sequence is not None:
             depth = depth * self.sequence.frame(0).tissue_mask
         step = max(camera.width // TRACK_COLUMNS, 1)
@@ -165,20 +171,20 @@ class SceneSubject:
             return np.zeros((len(self.cameras), 0, 3))
         return self.carry(points, [0] * len(points))
 
-    def legend(self, look: Look) -> str:
-        """See `Subject.legend`."""
+    def legend(self, settings: ViewSettings) -> str:
+        """See `Viewable.legend`."""
         unit = "(relative)" if self.relative else "mm"
         return {
             "depth": f"blue {self.span[0]:.1f} to red {self.span[1]:.1f} {unit}",
-            "alpha": "black 0 to white 1: how much the Gaussians cover",
+            "alpha": "black 0 to white 1: coverage by the Gaussians",
             "motion": f"moved since frame 0: blue 0 to red {self.largest_motion:.1f} {unit}",
             "prior": "texture-prior score of the Gaussians: blue 0 to red 1",
-            "difference": f"rendered minus original: blue 0 to red {layers.LARGEST_DIFFERENCE:.0%}",
-        }.get(look.layer, "")
+            "difference": f"rendered minus input: blue 0 to red {layers.LARGEST_DIFFERENCE:.0%}",
+        }.get(settings.layer, "")
 
 
 def _gray_sh(values: Tensor) -> Tensor:
-    """(N, 1, 3) coefficients that draw (N,) `values` as gray."""
+    """(N, 1, 3) coefficients that render (N,) `values` as gray."""
     return ((values - 0.5) / SH_C0)[:, None, None].expand(-1, 1, 3).contiguous()
 
 

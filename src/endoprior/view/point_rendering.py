@@ -1,4 +1,4 @@
-"""Points drawn as small squares, nearest on top: a cloud without a renderer."""
+"""Render a point cloud as small squares, nearest on top."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ LARGEST_PX = 6
 """Side of the largest square."""
 
 
-def draw_dots(
+def render_points(
     points: NDArray, colors: NDArray[np.uint8], size: float, camera: Camera
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Draw a cloud.
+    """Render a point cloud.
 
     Args:
         points: (P, 3) world axes, mm. colors: (P, 3). size: width of a point, mm.
     Returns:
-        (H, W, 3) picture, black where there is no point, and (H, W) z of what is seen, mm, 0 there.
+        (H, W, 3) image, black where there is no point, and (H, W) z of the visible points, mm, 0 where there is none.
     """
     picture = np.zeros((camera.height, camera.width, 3), np.uint8)
     depth = np.zeros((camera.height, camera.width), np.float32)
@@ -33,7 +33,7 @@ def draw_dots(
     pixels, z, colors = pixels[far_to_near], z[far_to_near], colors[far_to_near]
     side = int(np.clip(np.ceil(camera.fy * size / np.median(z)), 1, LARGEST_PX))
     corner = np.floor(pixels - (side - 1) / 2).astype(int)
-    # One square after the other, far to near: of equal indices NumPy keeps the last.
+    # Far to near: for repeated indices NumPy keeps the last value.
     offsets = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2)
     x, y = np.moveaxis(corner[:, None] + offsets, -1, 0)
     seen = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)

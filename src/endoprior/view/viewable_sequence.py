@@ -1,4 +1,4 @@
-"""A raw sequence as the viewer sees it: frames, tools, and its measured depth as points, before anything is trained."""
+"""Viewer content: a raw sequence before training, with frames, tools and measured depth as points."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ..core.types import Camera
 from ..data import FrameSequence
 from ..priors import joint_texture_prior
 from . import layers
-from .dots import draw_dots
-from .session import Layer, Look
-from .subject import Cloud
+from .point_rendering import render_points
+from .view_settings import Layer, ViewSettings
+from .viewable import Cloud
 
-MOST_POINTS = 100_000
-"""Points sent to a browser per frame; larger pictures are thinned."""
+MAX_POINTS = 100_000
+"""Largest number of points sent to a browser per frame; larger images are subsampled."""
 DEFAULT_FRAMES_PER_SECOND = 25.0
 
 
-class SequenceSubject:
-    """Frames of a folder."""
+class ViewableSequence:
+    """Frames of a sequence folder."""
 
     layers: tuple[Layer, ...] = ("frame", "depth", "prior")
     has_tool = True
@@ -37,7 +37,7 @@ class SequenceSubject:
 
     @cached_property
     def span(self) -> tuple[float, float]:
-        """Depths, mm, between which nearly all of the first frame with depth lies."""
+        """Depth range of nearly all of the first frame with depth, mm."""
         for i in range(len(self.sequence)):
             frame = self.sequence.frame(i)
             if frame.depth_valid.any():
@@ -45,66 +45,66 @@ class SequenceSubject:
                 return float(low), float(high)
         return 0.0, 1.0
 
-    def picture(self, look: Look, camera: Camera) -> NDArray[np.uint8]:
-        """See `Subject.picture`: off the endoscope's place, the measured points."""
-        if not look.endoscope:
-            return self._dots(look, camera)[0]
-        frame = self.sequence.frame(look.frame)
-        if look.layer == "depth":
-            picture = layers.depth_picture(self.surface(look, camera), self.span)
-        elif look.layer == "prior":
-            picture = layers.colorize(self._prior(look.frame, camera), 0, 1)
+    def picture(self, settings: ViewSettings, camera: Camera) -> NDArray[np.uint8]:
+        """See `Viewable.picture`: from another camera, the measured points."""
+        if not settings.endoscope:
+            return self._dots(settings, camera)[0]
+        frame = self.sequence.frame(settings.frame)
+        if settings.layer == "depth":
+            picture = layers.depth_picture(self.surface(settings, camera), self.span)
+        elif settings.layer == "prior":
+            picture = layers.colorize(self._prior(settings.frame, camera), 0, 1)
         else:
             picture = layers.fitted(frame.rgb_u8, camera)
-            if look.near > 0 or look.far < float("inf"):
-                picture = picture * (self.surface(look, camera) > 0)[..., None]
-        if not look.tool:
+            if settings.near > 0 or settings.far < float("inf"):
+                picture = picture * (self.surface(settings, camera) > 0)[..., None]
+        if not settings.tool:
             return picture
         mask = layers.fitted(frame.tissue_mask, camera)
         return layers.with_tool(picture, layers.fitted(frame.rgb_u8, camera), mask)
 
-    def _dots(self, look: Look, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        cloud = self.cloud(look)
-        return draw_dots(cloud.points, cloud.colors, cloud.size, camera)
+    def _dots(self, settings: ViewSettings, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        cloud = self.cloud(settings)
+        return render_points(cloud.points, cloud.colors, cloud.size, camera)
 
     def _prior(self, index: int, camera: Camera) -> NDArray[np.float32]:
         frame = self.sequence.frame(index)
         return layers.fitted(joint_texture_prior(frame.rgb, frame.tissue_mask), camera)
 
-    def surface(self, look: Look, camera: Camera) -> NDArray[np.float32]:
-        """See `Subject.surface`: what was measured."""
-        if not look.endoscope:
-            return self._dots(look, camera)[1]
-        frame = self.sequence.frame(look.frame)
-        depth = frame.depth * (frame.depth_valid & (frame.depth >= look.near) & (frame.depth <= look.far))
+    def surface(self, settings: ViewSettings, camera: Camera) -> NDArray[np.float32]:
+        """See `Viewable.surface`: the measured depth."""
+        if not settings.endoscope:
+            return self._dots(settings, camera)[1]
+        frame = self.sequence.frame(settings.frame)
+        depth = frame.depth * (frame.depth_valid & (frame.depth >= settings.near) & (frame.depth <= settings.far))
         return layers.fitted(depth.astype(np.float32), camera)
 
-    def sent(self, look: Look) -> bool:
-        """See `Subject.sent`: off the endoscope's place there is nothing but the points."""
-        return not look.endoscope
+    def sent(self, settings: ViewSettings) -> bool:
+        """See `Viewable.sent`: from another camera there are only the points."""
+        return not settings.endoscope
 
-    def cloud(self, look: Look) -> Cloud:
-        """See `Subject.cloud`: measured points, the tool's only with the tool laid over."""
-        frame, camera = self.sequence.frame(look.frame), self.cameras[look.frame]
-        look = replace(look, endoscope=True)
-        depth = self.surface(look, camera)
-        seen = (depth > 0) & (frame.tissue_mask | look.tool)
-        step = int(np.ceil(np.sqrt(max(seen.sum() / MOST_POINTS, 1))))
+    def cloud(self, settings: ViewSettings) -> Cloud:
+        """See `Viewable.cloud`: measured points; those of the tool only with the tool overlay."""
+        frame, camera = self.sequence.frame(settings.frame), self.cameras[settings.frame]
+        settings = replace(settings, endoscope=True)
+        depth = self.surface(settings, camera)
+        seen = (depth > 0) & (frame.tissue_mask | settings.tool)
+        step = int(np.ceil(np.sqrt(max(seen.sum() / MAX_POINTS, 1))))
         rows, columns = (indices * step for indices in np.nonzero(seen[::step, ::step]))
         pixels = pixel_centers(camera.width, camera.height)[rows, columns]
         points = back_project(pixels.astype(np.float64), depth[rows, columns].astype(np.float64), camera)
-        colors = self.picture(look, camera)[rows, columns]
+        colors = self.picture(settings, camera)[rows, columns]
         return Cloud(points.astype(np.float32), colors, None, None, step * sum(self.span) / 2 / camera.fy)
 
     def carry(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
-        """See `Subject.carry`: nothing is known of the other frames; two points of one frame are known there."""
+        """See `Viewable.carry`: a point is known only in the frame in which it was picked."""
         paths = np.full((len(self.cameras), *np.shape(points)), np.nan)
         for k, frame in enumerate(frames):
             paths[frame, k] = points[k]
         return paths
 
     def tracks(self) -> NDArray[np.float64]:
-        """See `Subject.tracks`: those of the ground truth, where there are any."""
+        """See `Viewable.tracks`: the tracks of the ground truth, if there are any."""
         tracks = self.sequence.truth.tracks if self.sequence.truth else None
         if tracks is None or not tracks.paired:
             return np.zeros((len(self.cameras), 0, 3))
@@ -112,10 +112,10 @@ class SequenceSubject:
         world = np.einsum("tij,tpj->tpi", poses[:, :3, :3], tracks.points) + poses[:, None, :3, 3]
         return np.where(tracks.visible[..., None], world, np.nan)
 
-    def legend(self, look: Look) -> str:
-        """See `Subject.legend`."""
+    def legend(self, settings: ViewSettings) -> str:
+        """See `Viewable.legend`."""
         unit = "(relative)" if self.relative else "mm"
         return {
             "depth": f"blue {self.span[0]:.1f} to red {self.span[1]:.1f} {unit}",
             "prior": "joint texture prior: blue 0 to red 1",
-        }.get(look.layer, "")
+        }.get(settings.layer, "")

@@ -1,7 +1,7 @@
-"""Who may talk to the viewer, and what may be said: its own pages, and messages that make sense.
+"""Access control of the viewer: which connections it accepts, and which messages are valid.
 
-Any program of this machine can connect, and the library behind the page takes what it is sent at its word: it would set
-any attribute of a control, or keep the parts of an upload that nobody asked for.
+Any program on this machine can connect, and viser trusts every message: a message could set any attribute of a control,
+or store parts of an upload that was not requested.
 """
 
 from __future__ import annotations
@@ -12,28 +12,28 @@ from collections.abc import Callable, Mapping
 from typing import Any
 from urllib.parse import urlsplit
 
-from ..core.checks import InputError
+from ..core.checks import input_error
 from ..core.geometry import FARTHEST_MM
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-LARGEST_MESSAGE = 2**16
-"""Bytes a browser may send at once; what it does send has some hundreds."""
-MOST_BROWSERS = 32
-"""Connections at a time."""
-MOST_PER_SECOND = 500
-"""Messages of one connection; dragging sends as many as the screen draws pictures."""
+MAX_MESSAGE_BYTES = 2**16
+"""Largest message of a browser, bytes; normal messages have a few hundred."""
+MAX_BROWSERS = 32
+"""Largest number of simultaneous connections."""
+MAX_PER_SECOND = 500
+"""Largest message rate of one connection; dragging sends one per screen refresh."""
 LARGEST_CANVAS = 100_000
-"""Pixels along a side."""
+"""Largest side of a canvas, px."""
 
 
 def check_address(host: str, port: int) -> None:
-    """Make sure the address can be listened on; the server itself would search or wait without a word.
+    """Check that the address is free; viser would silently use another port, or wait.
 
     Raises:
-        InputError: it cannot.
+        InputError: the address cannot be used.
     """
     if not 0 <= port <= 65535:
-        raise InputError(f"--port: expected 0 to 65535; got {port}. Take 0 for any free one.")
+        raise input_error("--port", "0 to 65535", str(port), "`--port 0` for any free port.")
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(found[0], socket.SOCK_STREAM) as trial:
@@ -41,17 +41,17 @@ def check_address(host: str, port: int) -> None:
             trial.bind(found[4])
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{host}:{port}: expected a free address; got: {reason}. Try --port 0.") from None
+        raise input_error(f"{host}:{port}", "a free address", reason, "`--port 0`.") from None
 
 
-def trusted(origin: str | None, asked_host: str | None, bound_host: str) -> bool:
-    """Whether a connection may be served.
+def is_trusted(origin: str | None, asked_host: str | None, bound_host: str) -> bool:
+    """Whether to accept a connection.
 
-    A page of another site that is open in the same browser can connect to 127.0.0.1 too; it must not see the scene.
+    A page of another site, open in the same browser, can connect to 127.0.0.1 too; it must not see the scene.
 
     Args:
-        origin: the `Origin` header: the page that connects; programs that are not browsers send none.
-        asked_host: the `Host` header: what the client believes to talk to.
+        origin: the `Origin` header: the page that connects. Programs other than browsers send none.
+        asked_host: the `Host` header: the server name that the client uses.
         bound_host: the address the viewer listens on.
     """
     if origin is None:
@@ -60,31 +60,31 @@ def trusted(origin: str | None, asked_host: str | None, bound_host: str) -> bool
         same, name = urlsplit(origin).netloc == asked_host, urlsplit(f"//{asked_host}").hostname
     except ValueError:
         return False
-    # A foreign name that was made to point at this machine is not us either.
+    # Reject other names that resolve to this machine (DNS rebinding).
     return same and (name in LOOPBACK if bound_host in LOOPBACK else True)
 
 
-class Pace:
-    """How much one connection says."""
+class RateLimit:
+    """Message rate of one connection."""
 
     def __init__(self) -> None:
-        self._since, self._said = 0.0, 0
+        self._since, self._count = 0.0, 0
 
     def exceeded(self, now: float) -> bool:
-        """Count a message that came at `now`, s; whether that makes more than `MOST_PER_SECOND` in this second."""
+        """Count a message received at `now`, s; whether there are more than `MAX_PER_SECOND` in this second."""
         if now - self._since >= 1:
-            self._since, self._said = now, 0
-        self._said += 1
-        return self._said > MOST_PER_SECOND
+            self._since, self._count = now, 0
+        self._count += 1
+        return self._count > MAX_PER_SECOND
 
 
-def sensible(kind: str, message: Mapping[str, Any], accepts: Callable[[str, Any], bool]) -> bool:
-    """Whether a browser that shows the viewer's page could have sent this.
+def is_valid_message(kind: str, message: Mapping[str, Any], accepts: Callable[[str, Any], bool]) -> bool:
+    """Whether the viewer's own page could have sent this message.
 
     Args:
-        kind: name of the message's type.
+        kind: name of the message type.
         message: its fields.
-        accepts: whether the control of this id can have this value.
+        accepts: whether the control with this id can have this value.
     """
     if kind == "ViewerCameraMessage":
         return is_camera(message) and _is_canvas(message)
@@ -92,7 +92,7 @@ def sensible(kind: str, message: Mapping[str, Any], accepts: Callable[[str, Any]
         return _is_click(message)
     if kind == "GuiUpdateMessage":
         updates, uuid = message["updates"], message["uuid"]
-        # Anything else in there would be set as well: what listens to the control, whether it is there at all.
+        # viser would set any other attribute too, such as callbacks or visibility.
         return isinstance(updates, dict) and updates.keys() == {"value"} and accepts(str(uuid), updates["value"])
     return False
 
@@ -105,7 +105,7 @@ def is_camera(fields: Mapping[str, Any]) -> bool:
 
 
 def are_numbers(values: Any, count: int, largest: float) -> bool:
-    """Whether these are `count` finite numbers, none beyond `largest` on either side of 0."""
+    """Whether `values` are `count` finite numbers of absolute value at most `largest`."""
     if not isinstance(values, list | tuple) or len(values) != count:
         return False
     return all(type(v) in (int, float) and -largest <= v <= largest for v in values)

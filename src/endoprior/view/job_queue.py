@@ -1,4 +1,4 @@
-"""What many threads ask for and one thread does: a queue that neither a flood nor a hurry can fill."""
+"""A bounded job queue: many threads add jobs, one thread runs them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections import deque
 from collections.abc import Callable, Hashable
 
 Job = Callable[[], None]
-MOST_WAITING = 200
-"""Presses of buttons and clicks that wait at once; a person gets nowhere near it."""
+MAX_WAITING = 200
+"""Largest number of waiting jobs; a person never reaches it."""
 
 
-class Jobs:
-    """A queue of jobs."""
+class JobQueue:
+    """A bounded queue of jobs."""
 
     def __init__(self) -> None:
         self._waiting: deque[tuple[Hashable, Job]] = deque()
@@ -20,23 +20,23 @@ class Jobs:
         self._changed = threading.Condition()
 
     def put(self, job: Job, key: Hashable = None, *, surely: bool = False) -> None:
-        """Ask for a job; too many are dropped.
+        """Add a job. Jobs beyond `MAX_WAITING` are dropped.
 
         Args:
-            key: of jobs with the same key one waits at a time: whoever reads a state when it runs, reads the last one.
-            surely: never drop it.
+            key: only one job per key waits at a time. The job reads its state when it runs, so it uses the newest.
+            surely: never drop this job.
         """
         with self._changed:
             if key is not None and key in self._keys:
                 return
-            if key is None and not surely and len(self._waiting) >= MOST_WAITING:
+            if key is None and not surely and len(self._waiting) >= MAX_WAITING:
                 return
             self._keys |= set() if key is None else {key}
             self._waiting.append((key, job))
             self._changed.notify()
 
     def take(self, seconds: float) -> list[Job]:
-        """All that wait at this moment, in order; none, if nothing comes within `seconds`."""
+        """All waiting jobs, in order; an empty list if none arrives within `seconds`."""
         with self._changed:
             if not self._waiting and seconds > 0:
                 self._changed.wait(min(seconds, threading.TIMEOUT_MAX))

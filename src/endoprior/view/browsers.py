@@ -1,0 +1,181 @@
+"""Update each connected browser: with a rendered background image, or with a point cloud or splats to render itself."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.types import Camera
+from .access_control import is_camera
+from .line_overlay import Lines, draw_lines
+from .view_settings import REST_SECONDS, ViewSettings, shrink_factor
+from .viewable import Viewable
+from .viewport import Viewport, bounded_aspect, endoscope_viewport, free_viewport
+
+if TYPE_CHECKING:
+    import viser
+
+PREVIEW_QUALITY = 80
+"""JPEG quality of images while something moves; static images are PNG (lossless)."""
+CAMERA_FIELDS = ("wxyz", "position", "look_at", "up_direction", "fov")
+SPLATS_NODE, POINTS_NODE, LINES_NODE = "/splats", "/points", "/lines"
+
+
+@dataclass
+class _Browser:
+    """State of one connected browser."""
+
+    client: viser.ClientHandle
+    pose: tuple | None = None
+    """Endoscope pose and field of view that its camera was set to."""
+    shown: tuple | None = None
+    """Content of its background image, and whether it is a preview; None for no image."""
+
+
+class Browsers:
+    """The browsers of one server. All methods run in the rendering thread."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._browsers: dict[int, _Browser] = {}
+        self._sent: tuple | None = None
+        self._full_ms = 0.0
+
+    def join(self, client: viser.ClientHandle) -> None:
+        """Add a browser that connected."""
+        self._browsers[client.client_id] = _Browser(client)
+
+    def leave(self, client: viser.ClientHandle) -> None:
+        """Remove a browser that disconnected."""
+        self._browsers.pop(client.client_id, None)
+
+    def notify(self, title: str, body: str) -> None:
+        """Show a notification in every browser for a few seconds."""
+        for browser in self._connected():
+            browser.client.add_notification(title, body, auto_close_seconds=5.0)
+
+    def _connected(self) -> list[_Browser]:
+        """Browsers that are still connected; `leave` may not have been called yet."""
+        clients = self._server.get_clients()
+        return [browser for number, browser in list(self._browsers.items()) if number in clients]
+
+    def return_to_endoscope(self) -> None:
+        """Reset the camera of every browser to the endoscope at the next update."""
+        for browser in self._browsers.values():
+            browser.pose = None
+
+    def viewport(
+        self, client: viser.ClientHandle, viewable: Viewable, settings: ViewSettings, shrink: int = 1
+    ) -> Viewport | None:
+        """The current viewport of a browser; None if its camera is invalid."""
+        camera, own = client.camera, viewable.cameras[settings.frame]
+        aspect = bounded_aspect(camera.image_width, camera.image_height)
+        if settings.endoscope:
+            return endoscope_viewport(own, aspect, shrink)
+        if not is_camera({name: np.asarray(getattr(camera, name)).tolist() for name in CAMERA_FIELDS}):
+            return None
+        return free_viewport(camera.wxyz, camera.position, camera.fov, aspect, own.height, shrink)
+
+    def draw(
+        self, viewable: Viewable, version: int, settings: ViewSettings, lines: Lines, still_seconds: float
+    ) -> None:
+        """Update every browser.
+
+        Args:
+            version: changes when the content of `viewable` changes.
+            still_seconds: time since the last motion.
+        """
+        sent = viewable.sent(settings)
+        self._send_nodes(viewable, version, settings, lines, sent)
+        for browser in self._connected():
+            if settings.endoscope:
+                self._follow_endoscope(browser, viewable, settings)
+            if not sent:
+                self._send_picture(browser, viewable, version, settings, lines, still_seconds)
+            elif browser.shown is not None:
+                browser.client.scene.set_background_image(None)
+                browser.shown = None
+
+    def _send_picture(
+        self,
+        browser: _Browser,
+        viewable: Viewable,
+        version: int,
+        settings: ViewSettings,
+        lines: Lines,
+        still_seconds: float,
+    ) -> None:
+        shrink = shrink_factor(still_seconds, self._full_ms)
+        viewport = self.viewport(browser.client, viewable, settings, shrink)
+        if viewport is None:
+            return
+        camera, preview = viewport.camera, still_seconds < REST_SECONDS
+        seen_from = camera.width, camera.height, camera.fy, camera.world_to_camera.tobytes(), viewport.width
+        wanted = version, settings, seen_from, lines.segments.tobytes()
+        # After a preview, send the full image once nothing moves.
+        if browser.shown is not None and browser.shown[0] == wanted and (preview or not browser.shown[1]):
+            return
+        began = clock.perf_counter()
+        picture = picture_with_lines(viewable, settings, camera, lines)
+        if shrink == 1:
+            self._full_ms = 1e3 * (clock.perf_counter() - began)
+        scene = browser.client.scene
+        scene.set_background_image(viewport.paste(picture), "jpeg" if preview else "png", jpeg_quality=PREVIEW_QUALITY)
+        browser.client.flush()
+        browser.shown = wanted, preview
+
+    def _send_nodes(self, viewable: Viewable, version: int, settings: ViewSettings, lines: Lines, sent: bool) -> None:
+        """Update the objects that browsers render themselves: nothing, or a cloud and the lines."""
+        wanted = (version, settings, lines.segments.tobytes()) if sent else None
+        if wanted == self._sent:
+            return
+        self._sent, scene = wanted, self._server.scene
+        with self._server.atomic():
+            cloud = viewable.cloud(settings) if sent else None
+            splats = cloud is not None and cloud.covariances is not None
+            for name, gone in (
+                (SPLATS_NODE, not splats),
+                (POINTS_NODE, cloud is None or splats),
+                (LINES_NODE, cloud is None or not len(lines)),
+            ):
+                if gone and scene.get_handle_by_name(name) is not None:
+                    scene.remove_by_name(name)
+            if cloud is None:
+                return
+            if splats:
+                colors, opacities = cloud.colors / 255.0, cloud.opacities[:, None]
+                scene.add_gaussian_splats(SPLATS_NODE, cloud.points, cloud.covariances, colors, opacities)
+            else:
+                look_of_points = {"point_size": cloud.size, "point_shape": "circle", "precision": "float32"}
+                scene.add_point_cloud(POINTS_NODE, cloud.points, cloud.colors, **look_of_points)
+            if len(lines):
+                colors = np.repeat(lines.colors[:, None], 2, 1)
+                scene.add_line_segments(LINES_NODE, lines.segments, colors, thickness=3.0, thickness_units="screen")
+
+    def _follow_endoscope(self, browser: _Browser, viewable: Viewable, settings: ViewSettings) -> None:
+        """Set the browser's camera to the endoscope camera."""
+        viewport = self.viewport(browser.client, viewable, settings)
+        pose = viewport.camera.world_to_camera.tobytes(), round(viewport.fov, 4)
+        if browser.pose == pose:
+            return
+        browser.pose = pose
+        camera = browser.client.camera
+        with browser.client.atomic():
+            camera.position, camera.look_at, camera.up_direction = camera_pose(viewport.camera, viewable)
+            camera.fov = viewport.fov
+
+
+def picture_with_lines(viewable: Viewable, settings: ViewSettings, camera: Camera, lines: Lines) -> NDArray[np.uint8]:
+    """(H, W, 3) image with the lines drawn over it."""
+    picture = viewable.picture(settings, camera)
+    return draw_lines(picture, camera, lines) if len(lines) else picture
+
+
+def camera_pose(camera: Camera, viewable: Viewable) -> tuple[NDArray, NDArray, NDArray]:
+    """Position of a camera, the point at mid depth that it looks at, and its up direction."""
+    axes = camera.world_to_camera[:3, :3]
+    return camera.center, camera.center + axes[2] * sum(viewable.span) / 2, -axes[1]

@@ -1,0 +1,53 @@
+"""Settings of the view as one frozen value, and the playback rules: which frame to show, at which resolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Layer = Literal["color", "depth", "alpha", "motion", "prior", "frame", "difference"]
+"""`color`, `depth` and `alpha` as rendered; `motion` since the first frame; `prior` the texture-prior score; `frame`
+the original; `difference` rendered minus original."""
+
+SLOW_MS = 60.0
+"""If rendering at full size takes longer, images are rendered at half size while something moves."""
+REST_SECONDS = 0.25
+"""After this time without motion, the image is rendered again at full size."""
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """All settings of the panel. The viewports of the browsers are not part of it."""
+
+    frame: int = 0
+    """0-based frame of the sequence."""
+    layer: Layer = "color"
+    endoscope: bool = True
+    """Use the camera of the sequence in this frame; False: the camera of the browser."""
+    in_browser: bool = False
+    """Send the Gaussians to the browser and render there (smooth); False: render on the server (exact)."""
+    points: bool = False
+    """Small opaque dots in place of splats."""
+    tool: bool = False
+    """Show the tool of the input frame on top, with an outline."""
+    near: float = 0.0
+    """Smallest depth to render, mm."""
+    far: float = float("inf")
+    """Largest depth to render, mm."""
+    tracks: bool = False
+    """Show tracks of material points over the previous frames."""
+
+
+def frame_due(start: int, seconds: float, frames_per_second: float, total: int) -> int:
+    """The frame to show `seconds` after `start` was shown; playback repeats."""
+    return (start + int(seconds * frames_per_second)) % total
+
+
+def shrink_factor(still_seconds: float, full_ms: float) -> int:
+    """Divisor of the image size: 2 while something moves and rendering at full size is slow, else 1.
+
+    Args:
+        still_seconds: time since the last motion.
+        full_ms: rendering time of the last image of full size.
+    """
+    return 2 if still_seconds < REST_SECONDS and full_ms > SLOW_MS else 1
