@@ -69,7 +69,6 @@ def test_what_is_masked_out_changes_no_score(made, seed):
 def test_rounding_to_8_bits_is_idempotent(made):
     first, _, _ = made
     stored = metrics.to_uint8(first * 3 - 1)
-    assert np.array_equal(metrics.to_uint8(metrics.quantize(first * 3 - 1)), stored)
     assert np.array_equal(metrics.to_uint8(stored / np.float32(255)), stored)
 
 
@@ -114,7 +113,7 @@ def test_flow_of_a_picture_compared_with_itself_has_no_error(height, width, seed
     rng = np.random.default_rng(seed)
     images = [rng.integers(0, 256, (height, width, 3)).astype(np.uint8) for _ in range(3)]
     shown = [np.ones((height, width), bool), rng.random((height, width)) < 0.5, np.zeros((height, width), bool)]
-    errors = metrics.flow_error(images, images, shown, metrics.dis_flow())
+    errors = metrics.flow_error(images, images, shown, metrics.dis_flow)
     assert errors[0] == 0 and math.isnan(errors[1])
 
 

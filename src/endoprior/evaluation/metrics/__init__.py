@@ -16,25 +16,19 @@ from .image import (
     psnr,
     psnr_behind_tool,
     psnr_tissue,
-    quantize,
     ssim,
     ssim_tissue,
     to_uint8,
 )
-from .lpips import LpipsDistance, lpips_distance
-from .raft import RaftFlow, raft_flow
+from .lpips import lpips_distance
+from .raft import raft_flow
 from .stability import depth_instability
-from .tracks import NeighborBreaks, TrackError, neighbor_breaks, track_error
-from .weights import FoundWeights, ScoreUnavailable, WeightsMissing
+from .tracks import neighbor_breaks, track_error
+from .weights import ScoreUnavailable, WeightsMissing
 
 __all__ = [
     "FlowEstimator",
-    "FoundWeights",
-    "LpipsDistance",
-    "NeighborBreaks",
-    "RaftFlow",
     "ScoreUnavailable",
-    "TrackError",
     "WeightsMissing",
     "depth_instability",
     "depth_rmse",
@@ -47,7 +41,6 @@ __all__ = [
     "psnr",
     "psnr_behind_tool",
     "psnr_tissue",
-    "quantize",
     "raft_flow",
     "ssim",
     "ssim_tissue",

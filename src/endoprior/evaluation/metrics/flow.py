@@ -6,9 +6,7 @@ of the score's name: `flow_error` (RAFT-large, as published), `flow_error_raft_s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -21,43 +19,25 @@ DIS_MIN_SIZE = 32
 """Shortest image side for DIS, px: a shorter one has no room for two levels of its 8 px patches."""
 
 
-class FlowEstimator(Protocol):
-    """Anything that estimates the motion between two images."""
-
-    @property
-    def score_name(self) -> str:
-        """The name of the flow error measured with this estimator."""
-        ...
-
-    def __call__(self, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(H, W, 2) displacement (x, y) in px from `first` to `second`, both (H, W, 3) 8-bit RGB."""
-        ...
+FlowEstimator = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[np.float32]]
+"""Gives the (H, W, 2) displacement (x, y) in px from the first to the second of two (H, W, 3) 8-bit RGB images."""
 
 
-@dataclass(frozen=True)
-class DisFlow:
-    """Dense inverse search (Kroeger et al. 2016) from OpenCV, medium preset, on gray images. No network, any CPU."""
+def dis_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Dense inverse search (Kroeger et al. 2016) by OpenCV, medium preset, on gray images; see `FlowEstimator`.
 
-    score_name: str = "flow_error_dis"
+    The result is bit-identical for any number of OpenCV threads.
 
-    def __call__(self, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """See `FlowEstimator`. The result is bit-identical for any number of OpenCV threads.
-
-        Raises:
-            ScoreUnavailable: a side is shorter than `DIS_MIN_SIZE`.
-        """
-        if min(first.shape[:2]) < DIS_MIN_SIZE:
-            height, width = first.shape[:2]
-            raise ScoreUnavailable(f"DIS flow needs images of at least {DIS_MIN_SIZE} px a side; got {width}x{height}")
-        gray_first, gray_second = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second))
-        # A new estimator for each pair: its buffers would make a pair depend on the one before.
-        estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        return estimator.calc(gray_first, gray_second, None)
-
-
-def dis_flow() -> DisFlow:
-    """The estimator behind `flow_error_dis`."""
-    return DisFlow()
+    Raises:
+        ScoreUnavailable: a side is shorter than `DIS_MIN_SIZE`.
+    """
+    if min(first.shape[:2]) < DIS_MIN_SIZE:
+        height, width = first.shape[:2]
+        raise ScoreUnavailable(f"DIS flow needs images of at least {DIS_MIN_SIZE} px a side; got {width}x{height}")
+    gray_first, gray_second = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second))
+    # A new estimator for each pair: its buffers would make a pair depend on the one before.
+    estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return estimator.calc(gray_first, gray_second, None)
 
 
 def flow_error(

@@ -1,7 +1,7 @@
 """How close one rendered frame is to its target: PSNR, SSIM and depth RMSE, as the published protocol defines them.
 
 Shared letters: `H, W` image size. Masks are positive: True = tissue, the pixel counts. Sums are in float64. The
-protocol measures 8-bit images: pass renders through `quantize` first. Sources: the evaluation of EndoGaussian and
+protocol measures 8-bit images: round rendered color with `to_uint8` first. Sources: the evaluation of EndoGaussian and
 EndoPrior-GS (docs/paper_map.md), Wang et al. 2004 for SSIM.
 """
 
@@ -31,11 +31,6 @@ def to_uint8(image: NDArray) -> NDArray[np.uint8]:
     """
     _check_finite_float("image", image)
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def quantize(image: NDArray) -> NDArray[np.float32]:
-    """(H, W, 3) color in [0, 1] after a round trip through an 8-bit file; see `to_uint8`."""
-    return to_uint8(image).astype(np.float32) / np.float32(255)
 
 
 def psnr(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:

@@ -32,11 +32,6 @@ class LpipsDistance:
     """The distance, ready to be called on one frame after another."""
 
     network: Module
-    score_name: str
-    """`lpips` with AlexNet, `lpips_squeeze` with SqueezeNet."""
-    weights: FoundWeights
-    """File of the classifier's weights."""
-    device: str
 
     def __call__(self, image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
         """LPIPS of the masked images scaled to [-1, 1], averaged over the frame.
@@ -68,30 +63,27 @@ class LpipsDistance:
             for x in (image, target)
         )
         with torch.inference_mode():
-            return float(self.network(a.to(self.device), b.to(self.device)))
+            return float(self.network(a, b))
 
 
 def lpips_distance(
     backbone: Literal["alex", "squeeze"] = "alex",
     weights_dir: Path | None = None,
     *,
-    device: str = "cpu",
     download: bool = True,
 ) -> LpipsDistance:
-    """Load LPIPS. "alex" is the published score's classifier; "squeeze" is scored under its own name.
+    """Load LPIPS. "alex" is the published score's classifier; "squeeze" has a score of its own.
 
     Args:
         backbone: which classifier.
         weights_dir: folder to look in first; see `weights.find_weights`.
-        device: torch device to run on.
         download: False never touches the network.
     Raises:
         InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
         ScoreUnavailable: lpips, torchvision or the weights are missing, with the reason.
     """
-    files, score_name = {"alex": (ALEXNET, "lpips"), "squeeze": (SQUEEZENET, "lpips_squeeze")}[backbone]
     import_torchvision()
-    found = find_weights(files, weights_dir, download=download)
+    found = find_weights(ALEXNET if backbone == "alex" else SQUEEZENET, weights_dir, download=download)
     network, heads = _untrained(backbone)
     state = network.state_dict()
     trunk = {name: _stored_name(name) for name in state if name.startswith("net.")}
@@ -100,7 +92,7 @@ def lpips_distance(
     # Only the constants of the input scaling may stay as constructed; the heads' file names each head twice.
     unset = [name for name in missing if not name.startswith("scaling_layer.") and not name.startswith("lins.")]
     assert not unset and not unexpected, (unset, unexpected)
-    return LpipsDistance(network.eval().requires_grad_(False).to(device), score_name, found, device)
+    return LpipsDistance(network.eval().requires_grad_(False))
 
 
 def _stored_name(name: str) -> str:
