@@ -1,4 +1,4 @@
-"""What tests of readers share: refusals in one line, and frames compared with what was written."""
+"""What tests of readers share: errors in one line, and frames compared with what was written."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 
 
-def assert_refused(folder: Path, named: str, words: str, cfg: DataConfig | None = None) -> None:
+def assert_rejected(folder: Path, named: str, words: str, cfg: DataConfig | None = None) -> None:
     """Loading, or decoding every frame, must fail with one line: PATH: expected X, got Y. Next step."""
     with pytest.raises(InputError) as caught:
         load_sequence(folder, cfg).validate()

@@ -142,7 +142,7 @@ def test_opengl_poses_look_along_minus_z(tiny_sequence):
     camera = load_sequence(tiny_sequence, pose_axes="opengl").camera(0)
     np.testing.assert_allclose(camera.center, [1, 2, 3], atol=1e-12)
     pixel, z = project(camera.center - 10 * rotation[:, 2] + rotation[:, 1], camera)
-    assert z == pytest.approx(10) and pixel[1] < 20  # y up in the pose, up in the picture
+    assert z == pytest.approx(10) and pixel[1] < 20  # y up in the pose, up in the image
 
 
 def test_inverted_polarity_by_description(tiny_sequence):
@@ -270,7 +270,7 @@ def test_truth_is_read_when_asked_for(tiny_sequence):
         ({"points": np.array([None])}, "a NumPy file"),
     ],
 )
-def test_wrong_tracks_are_refused(tmp_path, arrays, words):
+def test_wrong_tracks_are_rejected(tmp_path, arrays, words):
     np.savez(tmp_path / "tracks.npz", **arrays)
     with pytest.raises(InputError, match=words) as caught:
         _ = Truth(tmp_path, ["0", "1"]).tracks

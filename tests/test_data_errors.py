@@ -96,8 +96,8 @@ AT_LOAD = {
     "poses not numbers": (poses(lambda p: p.astype(str)), "poses_bounds.npy", "finite numbers"),
     "poses not an array": (lambda f: (f / "poses_bounds.npy").write_text("x"), "poses_bounds.npy", "a NumPy file"),
     "pose NaN": (pose_entry(3, 7, np.nan), "poses_bounds.npy", "finite numbers"),
-    "pose not a rotation": (pose_entry(3, 0, 1.1), "poses_bounds.npy", "something else in row 3"),
-    "pose mirrored": (pose_entry(2, 0, -1), "poses_bounds.npy", "something else in row 2"),
+    "pose not a rotation": (pose_entry(3, 0, 1.1), "poses_bounds.npy", "another matrix in row 3"),
+    "pose mirrored": (pose_entry(2, 0, -1), "poses_bounds.npy", "another matrix in row 2"),
     "focal zero": (without_fx(pose_entry(0, 14, 0)), "poses_bounds.npy", "focal length > 0"),
     "description broken": (lambda f: (f / "sequence.json").write_text("{"), "sequence.json", "a JSON object"),
     "description a list": (lambda f: (f / "sequence.json").write_text("[1]"), "sequence.json", "got list"),
@@ -167,7 +167,7 @@ def assert_one_line_about(caught, folder: Path, named: str, words: str) -> None:
 
 
 @pytest.mark.parametrize("case", AT_LOAD)
-def test_bad_folder_is_refused_at_load(tiny_sequence, case):
+def test_bad_folder_is_rejected_at_load(tiny_sequence, case):
     damage, named, words = AT_LOAD[case]
     damage(tiny_sequence)
     with pytest.raises(InputError) as caught:
@@ -176,7 +176,7 @@ def test_bad_folder_is_refused_at_load(tiny_sequence, case):
 
 
 @pytest.mark.parametrize("case", ON_VALIDATE)
-def test_bad_file_is_refused_on_validate(tiny_sequence, case, capfd):
+def test_bad_file_is_rejected_on_validate(tiny_sequence, case, capfd):
     damage, named, words = ON_VALIDATE[case]
     damage(tiny_sequence)
     seq = load_sequence(tiny_sequence)
@@ -191,7 +191,7 @@ def test_missing_gt_masks_are_named(tiny_sequence):
         load_sequence(tiny_sequence, DataConfig(use_gt_masks=True))
 
 
-def test_float_tiff_depth_under_png_name_is_refused(tiny_sequence):
+def test_float_tiff_depth_under_png_name_is_rejected(tiny_sequence):
     path = tiny_sequence / "depth/000003.png"
     write(path.with_suffix(".tiff"), np.ones(SIZE, np.float32))
     path.with_suffix(".tiff").rename(path)

@@ -110,12 +110,12 @@ def test_fusion_wants_a_camera_that_moves():
 
 def test_surface_is_freed_from_the_background():
     scene = moving_scene()
-    drawn = scene.render(0.2)
+    out = scene.render(0.2)
     seen = render_surface(scene, 0.2, scene.cameras[2], 0.5)
-    shown = drawn.alpha.numpy() >= 0.5
+    shown = out.alpha.numpy() >= 0.5
     assert shown.any() and not shown.all()
     assert (seen.depth[~shown] == 0).all() and (seen.color[~shown] == 0).all()
-    expected = drawn.depth.numpy()[shown] / drawn.alpha.numpy()[shown]
+    expected = out.depth.numpy()[shown] / out.alpha.numpy()[shown]
     assert seen.depth[shown] == pytest.approx(expected, rel=1e-6)
     assert abs(np.median(seen.depth[shown]) - 60) < 5
 

@@ -59,7 +59,7 @@ def random_scene(num: int, num_frames: int, seed: int = 0) -> Scene:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """3000 Gaussians in six frames, three of them not to be drawn."""
+    """3000 Gaussians in six frames, three of them invisible."""
     scene = random_scene(3000, NUM_FRAMES)
     with torch.no_grad():
         scene.gaussians["opacity_logits"][FAINT] = -9
@@ -120,18 +120,18 @@ def test_what_is_stored_is_the_scene_within_the_stated_bounds(scene, player):
         cosine = np.abs((quats * found).sum(1)).clip(max=1)
         assert np.rad2deg(2 * np.arccos(cosine)).max() < 0.5
         assert np.abs(stored[7:10, t].T - np.log(scales)).max() <= 0.01 + 1e-5
-        drawn = opacities >= 1 / 255
-        assert np.abs(stored[10, t] - opacities)[drawn].max() <= 0.0005 and not stored[10, t][~drawn].any()
+        visible = opacities >= 1 / 255
+        assert np.abs(stored[10, t] - opacities)[visible].max() <= 0.0005 and not stored[10, t][~visible].any()
         towards = means - camera.center
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         colors = sh.colors(splats.sh[kept], torch.from_numpy(towards).float()).numpy()
-        assert np.abs(stored[11:, t].T - colors)[drawn].max() <= 0.5 / 255 + 1e-6
+        assert np.abs(stored[11:, t].T - colors)[visible].max() <= 0.5 / 255 + 1e-6
         assert np.allclose(about["cameras"][t], [300, 310, 150, 137, *camera.world_to_camera.ravel()])
 
 
 @pytest.mark.slow
 def test_sixty_frames_of_twenty_thousand_fit_in_a_mail(tmp_path):
-    page = write_html(random_scene(20_000, 60), tmp_path / "new" / "scene.html")  # refuses more than 20 MB itself
+    page = write_html(random_scene(20_000, 60), tmp_path / "new" / "scene.html")  # an error above 20 MB
     size = page.stat().st_size
     print(f"60 frames x 20,000 Gaussians: {size / 1e6:.2f} MB")
     assert 1e6 < size < 20e6
@@ -144,7 +144,7 @@ def test_the_page_refers_to_nothing_outside(player):
     assert text.count("Bowel &lt;1&gt; &amp; more") == 2
 
 
-def test_what_cannot_be_written_is_refused_in_one_line(scene, tmp_path):
+def test_what_cannot_be_written_is_rejected_in_one_line(scene, tmp_path):
     with pytest.raises(
         InputError, match=r"scene\.html: expected at most 0\.0 MB, got 0\.\d MB for 6 time steps of 2997"
     ):
@@ -346,7 +346,7 @@ DYING = "terminate() {} postMessage() { setTimeout(() => this.onerror(new Event(
         "window.Worker = class { constructor() { throw new Error('none here'); } };",
         f"window.Worker = class {{ {DYING} }};",
     ],
-    ids=["refused", "dies"],
+    ids=["rejected", "dies"],
 )
 def test_without_workers_the_page_sorts_by_itself(scene, browser, player, kept, code):
     script = browser.send(BEFORE, source=code)["identifier"]

@@ -30,7 +30,7 @@ def test_instability_of_a_surface_that_moves_as_one():
 def test_instability_counts_pixels_that_are_tissue_and_drawn_in_both_frames():
     depth_a, depth_b = np.full((1, 5), 10.0), np.full((1, 5), 12.0)
     mask_a, mask_b = np.ones((1, 5), bool), np.ones((1, 5), bool)
-    depth_a[0, 0], depth_b[0, 1] = 0, 0  # not drawn in one of them
+    depth_a[0, 0], depth_b[0, 1] = 0, 0  # not rendered in one of them
     mask_a[0, 2] = mask_b[0, 3] = False
     depth_b[0, 2] = depth_a[0, 3] = np.nan  # outside the masks: may be anything
     depth_b[0, 4] = 17

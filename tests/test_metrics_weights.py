@@ -147,7 +147,7 @@ class Trap:
 @pytest.mark.parametrize(
     "kind", ["garbage.safetensors", "garbage.pth", "empty.pth", "trap.pth", "plain_trap.pth", "list.pth"]
 )
-def test_unreadable_and_dangerous_files_are_refused(tmp_path, kind):
+def test_unreadable_and_dangerous_files_are_rejected(tmp_path, kind):
     path, evidence = tmp_path / kind, tmp_path / "executed"
     if kind == "trap.pth":
         torch.save({"a": Trap(evidence)}, path)

@@ -1,4 +1,4 @@
-"""What is written is what is read, for generated sizes, counts, scales and polarities; and what is refused."""
+"""What is written is what is read, for generated sizes, counts, scales and polarities; and what is rejected."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_polarity_stride_and_shrink_change_what_they_say(made, stride, shrink):
 
 @examples(40)
 @given(recordings())
-def test_exactly_the_unusable_is_refused(made):
+def test_exactly_the_unusable_is_rejected(made):
     meta, frames, _ = made
     with TemporaryDirectory() as place:
         sequence = load_sequence(written(Path(place) / "sequence", *made))

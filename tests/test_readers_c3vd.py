@@ -1,4 +1,4 @@
-"""C3VD: names, 16-bit depth, pose order, and the omnidirectional pictures against their formula."""
+"""C3VD: names, 16-bit depth, pose order, and the omnidirectional images against their formula."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from reader_checks import assert_refused, remark_with
+from reader_checks import assert_rejected, remark_with
 from sequence_edits import write
 
 from endoprior.core.config import DataConfig
@@ -79,7 +79,7 @@ def test_frames_and_depths_match_by_number(video):
 
 
 def test_pinhole_picture_shows_what_the_lens_saw(video):
-    """Color is linear in (X / Z, Y / Z), so the pinhole picture must be linear in x and y."""
+    """Color is linear in (X / Z, Y / Z), so the pinhole image must be linear in x and y."""
     seq = load_sequence(video)
     camera, frame = seq.camera(0), seq.frame(0)
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -205,7 +205,7 @@ BAD = {
     "word": (pose_line(3, ",".join("x" * 16)), "pose.txt", "rows of numbers"),
     "NaN": (pose_line(3, "1,0,0,0,0,1,0,0,0,0,1,0,nan,0,0,1"), "pose.txt", "finite rigid transforms"),
     "NaN rotation": (pose_line(3, "nan,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1"), "pose.txt", "finite rigid transforms"),
-    "scaled": (pose_line(3, "2,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1"), "pose.txt", "something else in row 3"),
+    "scaled": (pose_line(3, "2,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1"), "pose.txt", "another matrix in row 3"),
     "no pose.txt row": (pose_line(3, ",".join("1" * 16)), "pose.txt", "no row 0, 0, 0, 1"),
     "other camera": (lambda f: (f / "config.ini").unlink(), "0_color.png", "1350x1080 px, the calibrated size"),
     "no a2": (lambda f: write_lens(f, LENS, a2=None), "config.ini", "a number a2, got 'none'"),
@@ -221,10 +221,10 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_videos_are_refused(video, case):
+def test_bad_videos_are_rejected(video, case):
     damage, named, words = BAD[case]
     damage(video)
-    assert_refused(video, named, words)
+    assert_rejected(video, named, words)
 
 
 def test_unit_can_be_overridden(video):

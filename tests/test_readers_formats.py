@@ -1,4 +1,4 @@
-"""The choice of a layout: the table, the option, the complaint; and EndoNeRF folders read as ever."""
+"""The choice of a layout: the registry, the option, the error; and EndoNeRF folders."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reader_checks import assert_refused, edit_json, remark_with
+from reader_checks import assert_rejected, edit_json, remark_with
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
@@ -70,14 +70,14 @@ def test_option_wins_over_what_the_folder_looks_like(tmp_path, name):
 
 def test_unknown_folder_is_described(tmp_path):
     known = "scared, c3vd, stir, stereomis, hamlyn, endonerf, plain"
-    assert_refused(tmp_path, tmp_path.name, f"the layouts {known}, got an empty folder. Fix: see docs/datasets.md.")
+    assert_rejected(tmp_path, tmp_path.name, f"the layouts {known}, got an empty folder. Fix: see docs/datasets.md.")
     touch(tmp_path, *"abcdef", "g/x", ".hidden")
-    assert_refused(tmp_path, tmp_path.name, "got a, b, c, d, e and 2 more")
+    assert_rejected(tmp_path, tmp_path.name, "got a, b, c, d, e and 2 more")
 
 
 def test_missing_folder_and_file(tmp_path):
-    assert_refused(tmp_path / "gone", "gone", "got no such folder")
-    assert_refused(touch(tmp_path, "a.mp4") / "a.mp4", "a.mp4", "got a file")
+    assert_rejected(tmp_path / "gone", "gone", "got no such folder")
+    assert_rejected(touch(tmp_path, "a.mp4") / "a.mp4", "a.mp4", "got a file")
 
 
 def test_ranges_of_the_options():
@@ -117,7 +117,7 @@ def test_origins_of_an_endonerf_folder(tiny_sequence):
     assert remark_with(tiny_sequence, "scale of its depth is unknown")
     assert remark_with(tiny_sequence, "1 frames are marked as unexplained, the first is frame 3")
     edit_json(tiny_sequence / "sequence.json", unexplained_frames=[-1])
-    assert_refused(tiny_sequence, "sequence.json", "unexplained_frames in 0..16, got -1")
+    assert_rejected(tiny_sequence, "sequence.json", "unexplained_frames in 0..16, got -1")
 
 
 def test_description_is_checked_before_pictures_are_read(tiny_sequence):

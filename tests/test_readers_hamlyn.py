@@ -7,7 +7,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from reader_checks import assert_refused, remark_with
+from reader_checks import assert_rejected, remark_with
 from sequence_edits import change_poses, write
 
 from endoprior.core.config import DataConfig
@@ -52,7 +52,7 @@ def test_forplane_is_cropped_and_its_camera_with_it(forplane):
     assert (camera.cx, camera.cy) == (WIDTH / 2 - 40, HEIGHT / 2)
     assert (frame.rgb_u8[0, :, 0] == np.arange(40, 64)).all() and (frame.rgb_u8[..., 1] == 7).all()
     assert frame.tissue_mask[:, :20].all() and not frame.tissue_mask[:, 20:].any()
-    assert frame.depth[3, 5] == 145 and remark_with(forplane, "40 columns without picture")
+    assert frame.depth[3, 5] == 145 and remark_with(forplane, "40 empty columns")
 
 
 def test_forplane_unit_is_assumed_until_given(forplane):
@@ -77,7 +77,7 @@ def test_rectified(rectified):
     camera, frame = seq.camera(4), seq.frame(4)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (70.5, 71, 30.75, 20.5)
     assert (frame.rgb_u8 == 40).all() and (frame.depth == 84).all() and frame.tissue_mask.all()
-    assert not seq.depth_is_relative and remark_with(rectified, "camera is taken to stand still")
+    assert not seq.depth_is_relative and remark_with(rectified, "camera is assumed to be static")
     assert len(load_sequence(rectified, DataConfig(stride=4))) == 3
 
 
@@ -120,14 +120,14 @@ RECTIFIED_BAD = {
 
 
 @pytest.mark.parametrize("case", FORPLANE_BAD)
-def test_bad_forplane_folders_are_refused(forplane, case):
+def test_bad_forplane_folders_are_rejected(forplane, case):
     damage, named, words = FORPLANE_BAD[case]
     damage(forplane)
-    assert_refused(forplane, named, words)
+    assert_rejected(forplane, named, words)
 
 
 @pytest.mark.parametrize("case", RECTIFIED_BAD)
-def test_bad_rectified_folders_are_refused(rectified, case):
+def test_bad_rectified_folders_are_rejected(rectified, case):
     damage, named, words = RECTIFIED_BAD[case]
     damage(rectified)
-    assert_refused(rectified, named, words)
+    assert_rejected(rectified, named, words)

@@ -1,4 +1,4 @@
-"""Plain folders: pictures alone, or with masks, depth of any kind, and sequence.json."""
+"""Plain folders: images alone, or with masks, depth of any kind, and sequence.json."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from reader_checks import assert_refused, remark_with
+from reader_checks import assert_rejected, remark_with
 from sequence_edits import write
 
 from endoprior.core.checks import InputError
@@ -18,7 +18,7 @@ WIDTH, HEIGHT, FRAMES = 30, 20, 12
 
 
 @pytest.fixture
-def pictures(tmp_path):
+def plain(tmp_path):
     (tmp_path / "images").mkdir()
     for i in range(FRAMES):
         assert cv2.imwrite(str(tmp_path / f"images/{i}.jpg"), np.full((HEIGHT, WIDTH, 3), 10 * i, np.uint8))
@@ -37,8 +37,8 @@ def add_depth(folder, suffix=".npy"):
             write(path, depth)
 
 
-def test_pictures_alone(pictures):
-    seq = load_sequence(pictures)
+def test_images_alone(plain):
+    seq = load_sequence(plain)
     camera, frame = seq.camera(3), seq.frame(10)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (27, 27, 15, 10)
     np.testing.assert_array_equal(camera.world_to_camera, np.eye(4))
@@ -48,57 +48,57 @@ def test_pictures_alone(pictures):
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".tiff"])
-def test_depth_of_another_kind(pictures, suffix):
-    add_depth(pictures, suffix)
-    seq = load_sequence(pictures)
+def test_depth_of_another_kind(plain, suffix):
+    add_depth(plain, suffix)
+    seq = load_sequence(plain)
     frame = seq.frame(11)
     assert frame.depth[5, 5] == 51 and not frame.depth_valid[0, 0] and frame.depth[0, 0] == 0
     assert seq.depth_is_relative
-    for words in ("no unit given", "every pixel counts as tissue", "0.9 image widths (27 px)", "stand still"):
-        assert remark_with(pictures, words)
+    for words in ("no unit given", "every pixel counts as tissue", "0.9 image widths (27 px)", "assumed to be static"):
+        assert remark_with(plain, words)
 
 
-def test_unit_of_the_option_and_of_the_description(pictures):
-    add_depth(pictures)
-    (pictures / "sequence.json").write_text(json.dumps({"depth_scale": 0.5}))
-    assert load_sequence(pictures).frame(0).depth[5, 5] == 20 and not load_sequence(pictures).depth_is_relative
-    assert load_sequence(pictures, DataConfig(depth_unit_mm=2)).frame(0).depth[5, 5] == 80
+def test_unit_of_the_option_and_of_the_description(plain):
+    add_depth(plain)
+    (plain / "sequence.json").write_text(json.dumps({"depth_scale": 0.5}))
+    assert load_sequence(plain).frame(0).depth[5, 5] == 20 and not load_sequence(plain).depth_is_relative
+    assert load_sequence(plain, DataConfig(depth_unit_mm=2)).frame(0).depth[5, 5] == 80
 
 
-def test_description_and_masks(pictures):
-    add_depth(pictures)
-    (pictures / "masks").mkdir()
+def test_description_and_masks(plain):
+    add_depth(plain)
+    (plain / "masks").mkdir()
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, :6] = 255
     for i in range(FRAMES):
-        write(pictures / f"masks/{i}.png", mask)
+        write(plain / f"masks/{i}.png", mask)
     described = {"fx": 33, "cx": 14.5, "frames_per_second": 30, "mask_tool_value": 0, "depth_relative": False}
     described |= {"sources": {"depth": "me"}, "unexplained_frames": [4, 2], "format_version": 1}
-    (pictures / "sequence.json").write_text(json.dumps(described))
-    seq = load_sequence(pictures, DataConfig(stride=2))
+    (plain / "sequence.json").write_text(json.dumps(described))
+    seq = load_sequence(plain, DataConfig(stride=2))
     camera = seq.camera(0)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (33, 33, 14.5, 10)
     assert len(seq) == 6 and seq.frames_per_second == 15 and seq.sources == {"depth": "me"}
     assert seq.frame(0).tissue_mask[:, :6].all() and not seq.frame(0).tissue_mask[:, 6:].any()
     assert seq.frame(1).rgb_u8[0, 0, 0] == 20 and not seq.depth_is_relative
-    assert remark_with(pictures, "2 frames are marked as unexplained, the first is frame 2")
-    assert not remark_with(pictures, "image widths")
+    assert remark_with(plain, "2 frames are marked as unexplained, the first is frame 2")
+    assert not remark_with(plain, "image widths")
 
 
 def test_endonerf_folder_without_poses_is_plain_only_on_request(tiny_sequence):
     (tiny_sequence / "poses_bounds.npy").unlink()
-    assert_refused(tiny_sequence, "poses_bounds.npy", "set data.format to plain")
+    assert_rejected(tiny_sequence, "poses_bounds.npy", "set data.format to plain")
     seq = load_sequence(tiny_sequence, DataConfig(format="plain"))
     assert len(seq) == 17 and seq.camera(0).fx == 50 and not seq.depth_is_relative
 
 
-def test_a_jpeg_that_ends_early_is_refused(pictures, capfd):
+def test_a_jpeg_that_ends_early_is_rejected(plain, capfd):
     """Decoders fill what is missing with gray and say so on stderr."""
-    add_depth(pictures)
-    path = pictures / "images/3.jpg"
+    add_depth(plain)
+    path = plain / "images/3.jpg"
     assert cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8))
     path.write_bytes(path.read_bytes()[:-100])
-    assert_refused(pictures, "images/3.jpg", "cannot be decoded")
+    assert_rejected(plain, "images/3.jpg", "cannot be decoded")
     assert capfd.readouterr().err == ""
 
 
@@ -111,7 +111,7 @@ BAD = {
     "depth cut": (lambda f: (f / "depth/3.npy").write_bytes(b"x"), "depth/3.npy", "a NumPy file"),
     "depth of other size": (lambda f: np.save(f / "depth/3.npy", np.ones((2, 3))), "depth/3.npy", "got 3x2"),
     "empty masks": (lambda f: (f / "masks").mkdir(), "masks", "PNG files, got none"),
-    "picture cut": (
+    "truncated image": (
         lambda f: (f / "images/3.jpg").write_bytes((f / "images/3.jpg").read_bytes()[:300]),
         "images/3.jpg",
         "cannot be decoded",
@@ -129,12 +129,12 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_folders_are_refused(pictures, case):
-    add_depth(pictures)
+def test_bad_folders_are_rejected(plain, case):
+    add_depth(plain)
     damage, named, words = BAD[case]
-    damage(pictures)
-    assert_refused(pictures, named, words)
+    damage(plain)
+    assert_rejected(plain, named, words)
 
 
-def test_gt_masks_that_were_asked_for_must_be_there(pictures):
-    assert_refused(pictures, "gt_masks", "no such folder", DataConfig(use_gt_masks=True))
+def test_gt_masks_must_exist_if_the_option_names_them(plain):
+    assert_rejected(plain, "gt_masks", "no such folder", DataConfig(use_gt_masks=True))

@@ -8,7 +8,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from reader_checks import assert_refused, edit_json, remark_with
+from reader_checks import assert_rejected, edit_json, remark_with
 from sequence_edits import write
 
 from endoprior.core.config import DataConfig
@@ -217,28 +217,28 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_keyframes_are_refused(keyframe, case):
+def test_bad_keyframes_are_rejected(keyframe, case):
     damage, named, words = BAD[case]
     damage(keyframe)
-    assert_refused(keyframe, named, words)
+    assert_rejected(keyframe, named, words)
 
 
-def test_mixed_versions_are_refused(keyframe, tmp_path):
+def test_mixed_versions_are_rejected(keyframe, tmp_path):
     other = write_keyframe(tmp_path / "two", version=2)
     shutil.copy(frame(other, "reprojection_data", ".json"), frame(keyframe, "reprojection_data", ".json"))
-    assert_refused(keyframe, "reprojection_data", "files of one version, got versions 1 and 2")
+    assert_rejected(keyframe, "reprojection_data", "files of one version, got versions 1 and 2")
 
 
-def test_version_2_of_another_size_is_refused(tmp_path):
+def test_version_2_of_another_size_is_rejected(tmp_path):
     keyframe = write_keyframe(tmp_path / "dataset_1/keyframe_1", version=2)
     edit_json(frame(keyframe, "reprojection_data", ".json"), image_size=[1280, 1024])
-    assert_refused(keyframe, GEOMETRY, "image_size [24, 20]")
+    assert_rejected(keyframe, GEOMETRY, "image_size [24, 20]")
 
 
-def test_raw_keyframe_is_recognized_and_refused(tmp_path):
+def test_raw_keyframe_is_recognized_and_rejected(tmp_path):
     (tmp_path / "data").mkdir()
     (tmp_path / "data/frame_data.tar.gz").write_bytes(b"")
-    assert_refused(tmp_path, "data/frame_data", "process the keyframe first, see docs/datasets.md.")
+    assert_rejected(tmp_path, "data/frame_data", "process the keyframe first, see docs/datasets.md.")
 
 
 def test_depth_survives_shrinking(keyframe):

@@ -8,7 +8,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from reader_checks import assert_refused, edit_json, remark_with
+from reader_checks import assert_rejected, edit_json, remark_with
 from sequence_edits import change_poses, write
 
 from endoprior.core.config import DataConfig
@@ -78,7 +78,7 @@ def test_fingerprint_knows_the_calibration(prepared):
 def test_raw_sequence_is_sent_to_prepare(tmp_path):
     (tmp_path / "masks").mkdir()
     (tmp_path / "StereoCalibration.ini").write_text("[StereoLeft]\n")
-    assert_refused(tmp_path, "StereoCalibration.ini", "run endoprior prepare on its video")
+    assert_rejected(tmp_path, "StereoCalibration.ini", "run endoprior prepare on its video")
 
 
 BAD = {
@@ -100,7 +100,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_sequences_are_refused(prepared, case):
+def test_bad_sequences_are_rejected(prepared, case):
     damage, named, words = BAD[case]
     damage(prepared)
-    assert_refused(prepared, named, words)
+    assert_rejected(prepared, named, words)

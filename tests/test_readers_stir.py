@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from reader_checks import assert_refused
+from reader_checks import assert_rejected
 from sequence_edits import write
 
 from endoprior.core.checks import InputError
@@ -16,11 +16,11 @@ SCALE = 2
 
 
 def spots(*boxes):
-    """96 x 80 px picture with boxes (x, y, w, h) marked."""
-    picture = np.zeros((80, 96, 3), np.uint8)
+    """96 x 80 px image with boxes (x, y, w, h) marked."""
+    image = np.zeros((80, 96, 3), np.uint8)
     for x, y, w, h in boxes:
-        picture[y : y + h, x : x + w] = 255
-    return picture
+        image[y : y + h, x : x + w] = 255
+    return image
 
 
 @pytest.fixture
@@ -37,8 +37,8 @@ def clip(tmp_path):
 def test_clip_is_sent_to_prepare(clip):
     video = clip / "frames/00000ms-01000ms-visible.mp4"
     words = f"run endoprior prepare {video} OUT --border keep --stir {clip}"
-    assert_refused(clip, "seq00", words)
-    assert_refused(clip.parents[1], "7", words)
+    assert_rejected(clip, "seq00", words)
+    assert_rejected(clip.parents[1], "7", words)
 
 
 def test_centers_are_those_of_the_bounding_boxes(clip):
@@ -80,12 +80,12 @@ def test_errors_go_to_the_nearest_end():
     np.testing.assert_allclose(nearest_end_errors(predicted, ends), [1, 2, np.sqrt(26)])
 
 
-def test_a_cropped_folder_is_refused(clip, make_tiny_sequence):
-    with pytest.raises(InputError, match=r"whole picture of .*icgstartseg\.png, got 48x30 px for 96x80\. Fix: prepare"):
+def test_a_cropped_folder_is_rejected(clip, make_tiny_sequence):
+    with pytest.raises(InputError, match=r"whole image of .*icgstartseg\.png, got 48x30 px for 96x80\. Fix: prepare"):
         write_stir_tracks(clip, make_tiny_sequence("cropped", height=30))
 
 
-def test_clips_without_points_are_refused(clip, tiny_sequence):
+def test_clips_without_points_are_rejected(clip, tiny_sequence):
     write(clip / "segmentation/icgendseg.png", spots())
     with pytest.raises(InputError, match=r"icgendseg\.png: expected spots where the frame has depth, got none of 0"):
         write_stir_tracks(clip, tiny_sequence)

@@ -46,7 +46,7 @@ def test_kinds_are_told_apart_without_opening(tmp_path):
         assert len(str(caught.value)) < 400 and "\0" not in str(caught.value)
 
 
-def test_files_too_large_are_refused_by_their_size_in_mb(tmp_path, monkeypatch):
+def test_files_too_large_are_rejected_by_their_size_in_mb(tmp_path, monkeypatch):
     with open(tmp_path / "sparse", "wb") as file:
         file.truncate((1 << 30) + 1)
     with pytest.raises(InputError, match="at most 1024 MB, got 1024 MB"):
@@ -111,7 +111,7 @@ def test_an_archive_is_measured_before_it_is_unfolded(tmp_path, monkeypatch):
         read_numpy(tmp_path / "a.npz", "numbers", HINT)
 
 
-def test_an_archive_whose_members_lie_is_refused(tmp_path):
+def test_an_archive_whose_members_lie_is_rejected(tmp_path):
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000000,), }\n"
     member = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:

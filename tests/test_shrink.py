@@ -63,5 +63,5 @@ def test_ground_truth_is_left_out_with_a_note(tiny_sequence):
 
 def test_nothing_left_is_bad_input(tiny_sequence):
     for cfg in (DataConfig(shrink=50), DataConfig(first_frames=1)):
-        with pytest.raises(InputError, match=r"expected 2 frames"):
+        with pytest.raises(InputError, match=r"expected at least 2 frames"):
             load_sequence(tiny_sequence, cfg)

@@ -14,7 +14,7 @@ from endoprior.data.writer import SequenceMeta, SequenceWriter
 META = SequenceMeta(width=6, height=4, fx=5.0, fy=5.5, cx=3.0, cy=2.0, frames_per_second=25.0, depth_source="test")
 
 
-def picture(value=7):
+def image(value=7):
     """(4, 6, 3) with a red ramp, so that swapped channels or axes would show."""
     pixels = np.full((4, 6, 3), value, np.uint8)
     pixels[..., 0] = np.arange(24).reshape(4, 6)
@@ -27,9 +27,9 @@ def test_round_trip(tmp_path):
     depth = np.full((4, 6), 51.234, np.float32)
     depth[0, 0], depth[0, 1], depth[0, 2] = np.nan, -3, 60
     with SequenceWriter(tmp_path / "out", META) as writer:
-        writer.add(picture(), mask, depth)
+        writer.add(image(), mask, depth)
         assert not (tmp_path / "out").exists()  # it appears whole
-    assert np.array_equal(cv2.imread(str(tmp_path / "out/images/000000.png"))[..., ::-1], picture())
+    assert np.array_equal(cv2.imread(str(tmp_path / "out/images/000000.png"))[..., ::-1], image())
     assert np.array_equal(cv2.imread(str(tmp_path / "out/masks/000000.png"), -1), np.where(mask, 255, 0))
     stored = cv2.imread(str(tmp_path / "out/depth/000000.png"), -1)
     assert stored.dtype == np.uint16 and stored[0, :4].tolist() == [0, 0, 6000, 5123]
@@ -44,13 +44,13 @@ def test_round_trip(tmp_path):
 def test_an_empty_folder_is_taken_over(tmp_path):
     (tmp_path / "out").mkdir()
     with SequenceWriter(tmp_path / "out", META) as writer:
-        writer.add(picture(), np.zeros((4, 6), bool))
+        writer.add(image(), np.zeros((4, 6), bool))
     assert (tmp_path / "out/images/000000.png").exists() and not (tmp_path / "out/depth").exists()
 
 
 def test_nothing_is_left_after_an_error(tmp_path):
     with pytest.raises(RuntimeError), SequenceWriter(tmp_path / "deep/out", META) as writer:
-        writer.add(picture(), np.zeros((4, 6), bool))
+        writer.add(image(), np.zeros((4, 6), bool))
         raise RuntimeError
     assert not list((tmp_path / "deep").iterdir())
     with pytest.raises(ValueError, match="at least one frame"), SequenceWriter(tmp_path / "out", META):
@@ -65,4 +65,4 @@ def test_unusable_places_and_arrays_are_named(tmp_path):
     with pytest.raises(InputError, match="under"):
         SequenceWriter(tmp_path / "file" / "under", META)
     with pytest.raises(ValueError, match="tool_mask"), SequenceWriter(tmp_path / "out", META) as writer:
-        writer.add(picture(), np.zeros((6, 4), bool))
+        writer.add(image(), np.zeros((6, 4), bool))

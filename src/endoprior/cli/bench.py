@@ -15,7 +15,7 @@ from .parsing import parse
 from .progress import say
 
 MOST_CORES = 4096
-"""Of one machine."""
+"""Largest --cores and --threads."""
 
 
 @dataclass
@@ -23,21 +23,21 @@ class Bench:
     """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
 
     spec: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="SPEC")]]
-    """What to compare: a .yaml or .toml file, or a folder of them; bench/specs/ has those of the paper's tables."""
+    """A .yaml or .toml file, or a folder of them; bench/specs/ has those of the paper's tables."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0
-    """Cores to use in all; 0 takes those of this machine."""
+    """Cores to use in total; 0 uses all of this machine."""
     threads: int = 1
-    """Cores of each cell. One is the most for the money; more finish a single cell sooner."""
+    """Cores of each cell. One is most efficient; more finish a single cell sooner."""
     ray: str | None = None
     """Address of a Ray cluster that shares this file system; `local` starts one."""
     data: tuple[str, ...] = ()
-    """NAME=FOLDER for sequences that lie elsewhere than the spec says."""
+    """NAME=FOLDER: the folder of a sequence of the spec, in place of the spec's own."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     report_only: bool = False
-    """Train nothing; write the report of what is there."""
+    """Train nothing; write the report of the finished cells."""
 
 
 def run(argv: list[str]) -> int:
@@ -81,7 +81,7 @@ def run(argv: list[str]) -> int:
                 folder = args.out / path.stem if args.spec.is_dir() else args.out
                 say(f"{path}: {spec.title}")
                 matrix = run_matrix(
-                    spec, args.out, execute, threads=args.threads, weights_dir=args.weights_dir, say=say
+                    spec, args.out, execute, threads=args.threads, weights_dir=args.weights_dir, progress=say
                 )
                 report = write_report(matrix, folder)
                 failed, reports[folder] = failed + matrix.failed, matrix
@@ -97,20 +97,20 @@ def _cores() -> int:
 
 
 def _specs(path: Path) -> list[Path]:
-    """The spec, or those of a folder in the order of their names."""
+    """The spec, or those of a folder, sorted by name."""
     if not path.is_dir():
         return [path]
-    found = sorted(file for file in path.iterdir() if file.suffix in (".yaml", ".yml", ".toml"))
-    if not found:
+    specs = sorted(file for file in path.iterdir() if file.suffix in (".yaml", ".yml", ".toml"))
+    if not specs:
         raise input_error(path, ".yaml or .toml files", "none", "pass a folder of specs.")
-    return found
+    return specs
 
 
 def _folders(data: tuple[str, ...]) -> dict[str, Path]:
-    found = {}
+    folders = {}
     for item in data:
         name, separator, folder = item.partition("=")
         if not separator or not folder:
             raise input_error("--data", "NAME=FOLDER", f"{item!r}", "name a sequence of the spec.")
-        found[name] = Path(folder).expanduser()
-    return found
+        folders[name] = Path(folder).expanduser()
+    return folders

@@ -29,7 +29,7 @@ class Demo:
 
 
 def run(argv: list[str]) -> None:
-    """Make the phantom, train on it, score, draw, and say what to look at."""
+    """Write the phantom, train, score, render, and print the results' paths."""
     args = parse(Demo, argv, "demo")
     from dataclasses import replace
 
@@ -48,9 +48,9 @@ def run(argv: list[str]) -> None:
     say(f"1/4  a phantom of {args.frames} frames: {data}")
     write_phantom(data, phantom)
     say("2/4  training")
-    # Network scores may want large downloads, which a demo should not start unasked.
+    # Network scores may start large downloads, which a demo should not do.
     train_and_evaluate(data, cfg, folder, resume=False, networks=False, weights_dir=None)
-    say("\n3/4  drawing")
+    say("\n3/4  rendering")
     scene = load_scene(folder)
     render(scene, Render(run=folder))
     say("4/4  report")

@@ -1,4 +1,4 @@
-"""The last step of every reader: which frames are kept, and a `FrameSequence` out of cameras and a decoder."""
+"""The last step of every reader: select frames, and build a `FrameSequence` from cameras and a decoder."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ LEAST_FOCAL_PX, MOST_PX = 1e-2, 1e6
 
 
 def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1) -> range:
-    """Positions, in the folder, of the frames that are read.
+    """Positions in the folder of the frames to read.
 
     Args:
         count: frames in the folder.
-        cfg: `stride` and `first_frames`, which counts frames that are left after striding.
+        cfg: `stride` and `first_frames`, which counts frames after striding.
         own_stride: the dataset's published stride, used where `cfg.stride` is 0.
     """
     kept = range(0, count, cfg.stride or own_stride)
@@ -58,17 +58,17 @@ def assemble(
         cfg: `shrink` and how depth is cleaned.
         cameras: of the kept frames at full size.
         decode: pixels of kept frame i at full size.
-        files: what the sequence is made of, for its fingerprint.
-        clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where depth was measured or
-            rendered, so that its extremes are real.
+        files: of the sequence, for its fingerprint.
+        clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where the extremes of depth are
+            reliable, because it was measured or rendered.
         frames_per_second, truth, remarks, mask_folder, depth_is_relative, sources: see `FrameSequence`.
     Raises:
-        InputError: fewer than 2 frames, or no pixel, would be left, or a camera has numbers that no lens has.
+        InputError: fewer than 2 frames or no pixel would be left, or a camera has impossible numbers.
     """
     count, width, height = len(cameras), cameras[0].width, cameras[0].height
     if count < 2 or min(width, height) // cfg.shrink < 1:
         hint = "lower data.shrink or data.stride, or raise data.first_frames."
-        raise input_error(path, "2 frames of 1x1 px to be left", f"{count} of {width}x{height} / {cfg.shrink}", hint)
+        raise input_error(path, "at least 2 frames of 1x1 px", f"{count} of {width}x{height} / {cfg.shrink}", hint)
 
     _demand_usable(path, cameras)
 
@@ -96,7 +96,7 @@ def assemble(
 
 
 def _demand_usable(path: Path, cameras: list[Camera]) -> None:
-    """Refuse lenses and places that would overflow in the renderer: finite is not enough."""
+    """Raise InputError for cameras whose finite numbers would still overflow in the renderer."""
     for index, camera in enumerate(cameras):
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
         if not (all(abs(value) <= MOST_PX for value in lens) and min(camera.fx, camera.fy) >= LEAST_FOCAL_PX):

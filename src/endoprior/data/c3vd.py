@@ -1,6 +1,6 @@
-"""Reader of C3VD's registered videos: colonoscope pictures of a phantom with depth rendered from its registered model.
+"""Reader of C3VD's registered videos: colonoscope images of a phantom, with depth rendered from its registered model.
 
-The pictures are omnidirectional; reading turns them, and their depth, into those of a pinhole camera.
+The images are omnidirectional; the reader resamples them, and their depth, to a pinhole camera.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ CF_HQ190L = Omnidirectional(
     d=0.00288273829525059,
     e=-0.00296316513429569,
 )
-"""The endoscope of the first edition, as its authors calibrated it."""
+"""The endoscope of the first edition of C3VD, as its authors calibrated it."""
 FARTHEST = 65535
-"""Stored depth of everything at or beyond 100 mm; 0 is outside of the picture or of the model."""
+"""Stored depth of everything at or beyond 100 mm; 0 is outside the image circle or the model."""
 POSES_HINT = "take pose.txt of the same video: 16 numbers per frame, camera to world."
 
 
 def is_c3vd(path: Path) -> bool:
-    """Whether a folder has `pose.txt` and pictures called `*_color.png`."""
+    """Whether a folder has `pose.txt` and images called `*_color.png`."""
     return (path / "pose.txt").exists() and any(path.glob("*_color.png"))
 
 
@@ -54,7 +54,7 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a registered video.
 
     Raises:
-        InputError: files are missing or cannot be used, or the camera of the pictures is unknown.
+        InputError: files are missing or cannot be used, or the camera is unknown.
     """
     images = list_files(path, (".png",), "C3VD", "_color")
     stored = {_number(file): file for file in list_files(path, (".tiff", ".tif"), "C3VD", "_depth")}
@@ -95,17 +95,17 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
         decode,
         files=[*images, *depths, path / "pose.txt", *([calibration] if calibration.exists() else [])],
         clip_depth=False,
-        remarks=[f"{path}: omnidirectional pictures, read as those of a pinhole camera of {focal:.1f} px focal length"],
+        remarks=[f"{path}: omnidirectional images, resampled to a pinhole camera of {focal:.1f} px focal length"],
         mask_folder=".",
         sources={"depth": "rendered from the registered model", "poses": "registration of the robot's log"},
     )
 
 
 class Undistorter:
-    """Resamples pictures of an omnidirectional lens to its pinhole camera; the maps are made once, when needed."""
+    """Resamples images of an omnidirectional lens to its pinhole camera; the maps are computed at first use."""
 
     def __init__(self, lens: Omnidirectional) -> None:
-        """Args: lens: of the pictures to come."""
+        """Args: lens: of the images."""
         self.lens = lens
 
     @cached_property
@@ -114,25 +114,25 @@ class Undistorter:
         return self.lens.pinhole_maps()
 
     def smooth(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) bilinear; the border's color goes on outside of the original, where there is no tissue anyway."""
+        """(H, W, 3) bilinear; outside the original the border's color is repeated; no tissue is there."""
         return cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def nearest(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) nearest pixel, so that depths never mix across an edge; 0 outside of the original."""
+        """(H, W) nearest pixel, so that depths do not mix across an edge; 0 outside the original."""
         return cv2.remap(image, *self.maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
 
 
 def camera_to_world(path: Path, count: int) -> NDArray[np.float64]:
     """(N, 4, 4) poses of `pose.txt`, translation in mm.
 
-    The files are column-major, although C3VD's page says row-major; the place of the row (0, 0, 0, 1) decides.
+    The files are column-major, although C3VD's page says row-major; the position of (0, 0, 0, 1) decides.
 
     Raises:
         InputError: not `count` rows of 16 numbers, or not rigid.
     """
     rows = read_table(path, POSES_HINT)
     if rows.shape != (count, 16):
-        raise input_error(path, f"{count} rows of 16 numbers, one per picture", f"shape {rows.shape}", POSES_HINT)
+        raise input_error(path, f"{count} rows of 16 numbers, one per image", f"shape {rows.shape}", POSES_HINT)
     for poses in (rows.reshape(-1, 4, 4).transpose(0, 2, 1), rows.reshape(-1, 4, 4)):
         if (poses[:, 3] == (0, 0, 0, 1)).all() and np.isfinite(poses).all():
             demand_rotations(path, poses[:, :3, :3], "each pose", POSES_HINT)
@@ -141,20 +141,20 @@ def camera_to_world(path: Path, count: int) -> NDArray[np.float64]:
 
 
 def read_lens(path: Path) -> Omnidirectional:
-    """The camera in a file of lines `name = number` (or with a colon); other lines are passed over.
+    """The camera in a file of lines `name = number` (or with a colon); other lines are ignored.
 
     Raises:
         InputError: unreadable, or a parameter is missing.
     """
     text = read_text(path, "camera parameters", "write it again.")
-    found = dict(re.findall(r"^\s*(\w+)\s*[=:]\s*([-+.\deE]+)\s*;?\s*$", text, re.MULTILINE))
+    entries = dict(re.findall(r"^\s*(\w+)\s*[=:]\s*([-+.\deE]+)\s*;?\s*$", text, re.MULTILINE))
     values = {}
     for name, field in Omnidirectional.__dataclass_fields__.items():
         try:
-            values[name] = int(found[name]) if field.type == "int" else float(found[name])
+            values[name] = int(entries[name]) if field.type == "int" else float(entries[name])
         except (KeyError, ValueError):
             hint = "add a line such as a0 = 769.2."
-            raise input_error(path, f"a number {name}", repr(found.get(name, "none")), hint) from None
+            raise input_error(path, f"a number {name}", repr(entries.get(name, "none")), hint) from None
     return Omnidirectional(**values)
 
 

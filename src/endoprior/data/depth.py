@@ -1,4 +1,4 @@
-"""Cleaning of measured depth: what counts as measured, and how its outliers are limited."""
+"""Clean measured depth: which values count as measured, and how outliers are clipped."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def clean_depth(
 
     Args:
         raw: (H, W) depth, mm; missing where 0, negative or not finite.
-        cfg: percentiles, and `lift_missing_depth` for EndoGaussian's habit of treating missing depth as near.
+        cfg: percentiles, and `lift_missing_depth`, which treats missing depth as near, as EndoGaussian does.
     Returns:
         (H, W) depth, mm, 0 where missing, and (H, W) bool, True where measured. A frame without any measured depth
         is all 0 and False, lifted or not.

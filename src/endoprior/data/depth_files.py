@@ -1,4 +1,4 @@
-"""Depth (or disparity) files of any common kind to one float image: PNG, TIFF, NumPy, EXR."""
+"""Read depth or disparity files: PNG, TIFF, NumPy, EXR."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .numpy_files import read_only_array
 from .reading import demand_file
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
-"""Files this module reads, in lower case."""
+"""Suffixes of the files this module reads, in lower case."""
 
 
 def read_depth_file(path: Path, mm_per_unit: float = 1.0, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
@@ -21,7 +21,7 @@ def read_depth_file(path: Path, mm_per_unit: float = 1.0, size: tuple[int, int] 
 
     Args:
         path: PNG or TIFF (8 or 16 bit, TIFF also float), NPY, NPZ with one array, or EXR with one channel.
-        mm_per_unit: what one stored unit is worth.
+        mm_per_unit: mm per stored unit.
         size: (width, height) it must have, px; None accepts any.
     Returns:
         (H, W) depth, mm; 0 where the file has NaN, infinity, 0 or less.
@@ -67,7 +67,7 @@ def _read_numpy(path: Path) -> NDArray:
 def _read_exr(path: Path) -> NDArray:
     """The (H, W) channel of an EXR file: its only one, `Z`, or several that are equal."""
     try:
-        import OpenEXR  # optional: OpenCV's own decoder is switched off in its packages
+        import OpenEXR  # optional: the packages of OpenCV have no EXR decoder
     except ImportError:
         raise input_error(path, "the OpenEXR package", "none", "run pip install 'endoprior[exr]'.") from None
     demand_file(path, "an EXR image", "write the file again.")
@@ -78,7 +78,7 @@ def _read_exr(path: Path) -> NDArray:
             raise ValueError(f"{right - left + 1}x{bottom - top + 1} px by its header")
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except Exception as error:  # the library raises its own kinds, RuntimeError among them
+    except Exception as error:  # the library raises many kinds, RuntimeError among them
         raise input_error(path, "an EXR image", str(error).split("\n")[0], "write the file again.") from None
     if "Z" in channels:
         return channels["Z"]

@@ -1,4 +1,4 @@
-"""`sequence.json`: what a folder says about itself, checked. Every key is optional."""
+"""`sequence.json`: the description of a sequence folder, checked. Every key is optional."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..core.checks import input_error
 from .files import read_json
 
 LEAST, MOST = 1e-6, 1e6
-"""Of every measure in the file."""
+"""Range of every number in the file."""
 FORMAT_VERSION = 1
 """Newest `format_version` this program can read; a file without one is of version 1."""
 POSITIVE = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")
@@ -19,7 +19,7 @@ def read_description(path: Path) -> dict[str, Any]:
     """The checked contents of `sequence.json`, or an empty dict when there is none. Unknown keys are kept.
 
     Raises:
-        InputError: not a JSON object, or a known key has a value it cannot have.
+        InputError: not a JSON object, or a known key has an invalid value.
     """
     if not path.exists():
         return {}
@@ -33,14 +33,14 @@ def read_description(path: Path) -> dict[str, Any]:
         hint = "give mm, and mm per stored unit as depth_scale."
         raise input_error(path, "depth_unit mm", repr(described["depth_unit"]), hint)
     if described.get("mask_tool_value", 255) not in (0, 255):
-        hint = "say which of the two marks tools."
+        hint = "give the one that marks tools."
         raise input_error(path, "mask_tool_value 255 or 0", repr(described["mask_tool_value"]), hint)
     _check_origins(path, described)
     return described
 
 
 def check_frames(path: Path, described: dict[str, Any], count: int) -> list[str]:
-    """Refuse `unexplained_frames` that the sequence does not have; a remark when there are some."""
+    """A remark if there are `unexplained_frames`; raises InputError if the sequence does not have one of them."""
     marked = described.get("unexplained_frames", [])
     outside = [index for index in marked if not 0 <= index < count]
     if outside:
@@ -53,10 +53,10 @@ def check_frames(path: Path, described: dict[str, Any], count: int) -> list[str]
 def intrinsics_of(
     path: Path, described: dict[str, Any], width: int, height: int, focal: float
 ) -> tuple[float, float, float, float]:
-    """(fx, fy, cx, cy), px: those described, else `focal` and the middle of the picture.
+    """(fx, fy, cx, cy), px: those described, else `focal` and the image center.
 
     Raises:
-        InputError: the description is of pictures of another size.
+        InputError: the description is for images of another size.
     """
     if {"width", "height"} <= described.keys() and (described["width"], described["height"]) != (width, height):
         got = f"{described['width']}x{described['height']}"
@@ -68,7 +68,7 @@ def intrinsics_of(
 
 
 def _check_origins(path: Path, described: dict[str, Any]) -> None:
-    """Refuse wrong values of the keys that say how a sequence was made."""
+    """Raise InputError for wrong values of the keys that describe how a sequence was made."""
     hint = "correct it or remove it."
     relative = described.get("depth_relative", False)
     if not isinstance(relative, bool):

@@ -25,7 +25,7 @@ from .sequence import FrameSequence
 from .truth import Truth
 
 POSES_HINT = "write one row of 17 numbers per frame: 3x5 [R | t | (H, W, focal)], near, far."
-STILL_HINT = f"{POSES_HINT[:-1]}; for a camera that stands still, set data.format to plain."
+STILL_HINT = f"{POSES_HINT[:-1]}; for a static camera, set data.format to plain."
 
 
 def is_endonerf(path: Path) -> bool:
@@ -49,10 +49,10 @@ def load_endonerf(
         cfg: which frames and masks are read and how depth is cleaned.
         pose_axes: meaning of the columns of the stored camera-to-world matrices: `opencv` (x right, y down,
             z forward; as stored by EndoNeRF) or `opengl` (x right, y up, z backward).
-        facts: entries of `sequence.json` that a dataset states elsewhere; the file itself has the last word.
-        fact_files: where they came from.
+        facts: entries of `sequence.json` that a dataset has elsewhere; the file itself overrides them.
+        fact_files: the files they come from.
     Raises:
-        InputError: the folder is not a sequence; one line with file, expectation, finding and next step.
+        InputError: the folder is not a sequence.
     """
     folders = ("images", "gt_masks" if cfg.use_gt_masks else "masks", "depth")
     images, masks, depths = (list_files(path / name, (".png",), "EndoNeRF") for name in folders)
@@ -80,7 +80,7 @@ def load_endonerf(
         truth = Truth(path / "truth", [file.stem for file in images])
         if cfg.shrink > 1 or len(kept) < len(cameras):
             truth = None
-            remarks.append(f"{path / 'truth'}: left out, because it belongs to the whole sequence at its full size")
+            remarks.append(f"{path / 'truth'}: ignored, because it belongs to the whole sequence at full size")
     rate = described.get("frames_per_second")
     description = [path / "sequence.json"] if own_description else []
     return assemble(
@@ -133,7 +133,7 @@ def _cameras(
     if "fx" not in described and (stored_width, stored_height) != (width, height):
         remarks.append(
             f"{path / 'poses_bounds.npy'}: its focal length is for {stored_width:g}x{stored_height:g} px, "
-            f"the images are {width}x{height}; it is used as it stands"
+            f"the images are {width}x{height}; it is used unchanged"
         )
     flip = np.array([1.0, 1.0, 1.0] if pose_axes == "opencv" else [1.0, -1.0, -1.0])
     return [Camera(width, height, *intrinsics, world_to_camera(pose[:, :3] * flip, pose[:, 3])) for pose in poses]

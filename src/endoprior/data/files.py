@@ -1,7 +1,4 @@
-"""Files of a dataset folder: listed in order, matched with each other, JSON and tables of numbers read.
-
-Every complaint is one line that names the file.
-"""
+"""Files of a dataset folder: list them in order, compare their names, read JSON and tables of numbers."""
 
 from __future__ import annotations
 
@@ -17,14 +14,14 @@ from ..core.checks import InputError, input_error
 from .reading import ACCESS_HINT, read_text
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-"""Pictures that color readers take."""
+"""Color images that readers accept."""
 
 
 def entries(folder: Path) -> list[Path]:
-    """What is in a folder, in no order.
+    """The entries of a folder, unordered.
 
     Raises:
-        InputError: the folder may not be read.
+        InputError: the folder is not readable.
     """
     try:
         return list(folder.iterdir())
@@ -64,7 +61,7 @@ def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str
 
 
 def demand_count(files: list[Path], folder: Path, count: int) -> None:
-    """Refuse a list of files that are not one per image."""
+    """Raise InputError unless there is one file per image."""
     if len(files) != count:
         raise input_error(folder, f"{count} files, one per image", f"{len(files)}", "add or remove files to match.")
 

@@ -1,6 +1,6 @@
 """Reader of Hamlyn sequences in two layouts: Forplane's (`images/ gt_masks/ gt_depth/`) and `rectifiedNN`.
 
-Neither has camera poses: the camera is taken to stand still.
+Neither has camera poses: the camera is assumed to be static.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from .poses import identity_poses
 from .sequence import FrameSequence
 
 CROP_LEFT_PX = 40
-"""Columns without picture at the left of Forplane's images; its own program cuts them off, too."""
+"""Empty columns at the left of Forplane's images; its own program crops them, too."""
 
 
 def is_hamlyn(path: Path) -> bool:
-    """Whether a folder is a Hamlyn sequence; Forplane's are known by `gt_depth/` or by `hamlyn` in their name."""
+    """Whether a folder is a Hamlyn sequence; Forplane's have `gt_depth/`, or `hamlyn` in their name."""
     named = any("hamlyn" in name.lower() for name in (path.name, path.parent.name))
-    # A folder that this program prepared from a Hamlyn video describes itself and has nothing to crop.
+    # A folder that this program prepared from a Hamlyn video has a sequence.json and no empty columns.
     bare = (path / "poses_bounds.npy").exists() and not (path / "sequence.json").exists()
     forplane = (path / "images").is_dir() and ((path / "gt_depth").is_dir() or (named and bare))
     return forplane or _is_rectified(path)
@@ -58,14 +58,14 @@ def _load_forplane(path: Path, cfg: DataConfig) -> FrameSequence:
     height, width = read_color(images[0]).shape[:2]
     if width <= CROP_LEFT_PX:
         raise input_error(images[0], f"more than {CROP_LEFT_PX} columns", f"{width}", "pass images of full size.")
-    # All rows must be there and finite, but only size and focal length are used: Forplane's camera stands still.
+    # All rows must be finite, but only size and focal length are used: Forplane's camera is static.
     _, _, focal = read_poses_bounds(path / "poses_bounds.npy", len(images))[0, :, 4]
     if focal <= 0:
         raise input_error(path / "poses_bounds.npy", "a focal length > 0 px", f"{focal:g}", "correct row 0, column 14.")
     remarks = unequal_names(images, masks) + unequal_names(images, depths)
-    remarks.append(f"{path}: {CROP_LEFT_PX} columns without picture are cut off at the left, as in Forplane")
+    remarks.append(f"{path}: {CROP_LEFT_PX} empty columns at the left are cropped, as in Forplane")
     if not cfg.depth_unit_mm:
-        remarks.append(f"{path / depth_folder}: its unit is not documented; taken for mm, set data.depth_unit_mm")
+        remarks.append(f"{path / depth_folder}: its unit is not documented, mm assumed; set data.depth_unit_mm")
     kept = kept_frames(len(images), cfg)
     images, masks, depths = ([files[i] for i in kept] for files in (images, masks, depths))
     size = (width, height)
@@ -75,7 +75,7 @@ def _load_forplane(path: Path, cfg: DataConfig) -> FrameSequence:
         pixels = read_color(images[index], size), ~read_tool_mask(masks[index], 255, size), depth
         return tuple(np.ascontiguousarray(image[:, CROP_LEFT_PX:]) for image in pixels)
 
-    # The principal point moves by the whole crop; Forplane moves it by half of it, which is not the same camera.
+    # The principal point moves by the whole crop; Forplane moves it by half of that, which is a different camera.
     shape = (width - CROP_LEFT_PX, height, focal, focal, width / 2 - CROP_LEFT_PX, height / 2)
     return assemble(
         path,
@@ -104,7 +104,7 @@ def _load_rectified(path: Path, cfg: DataConfig) -> FrameSequence:
         raise input_error(calibration, "a 3x3 camera matrix", f"shape {matrix.shape} or other numbers", hint)
     height, width = read_color(images[0]).shape[:2]
     remarks = [*unequal_names(images, depths), f"{path}: no tool masks, every pixel counts as tissue"]
-    remarks.append(f"{path}: no camera poses, the camera is taken to stand still")
+    remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
     kept = kept_frames(len(images), cfg)
     images, depths = ([files[i] for i in kept] for files in (images, depths))
     size = (width, height)
@@ -119,7 +119,7 @@ def _load_rectified(path: Path, cfg: DataConfig) -> FrameSequence:
         cfg,
         [Camera(*shape, pose) for pose in identity_poses(len(kept))],
         decode,
-        # A calibration beside the folder is outside of it and cannot be named below it.
+        # A calibration outside the folder has no name below it, which the fingerprint needs.
         files=[*images, *depths, *([calibration] if calibration.parent == path else [])],
         remarks=remarks,
         mask_folder="image01",

@@ -1,4 +1,4 @@
-"""How large the picture in an encoded image is, by its header alone: what is too large must not be decoded first."""
+"""The size of an encoded image from its header, so that an image that is too large is never decoded."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 """Markers of the segment that holds the size."""
 TIFF_WIDTH, TIFF_HEIGHT = 256, 257
 TIFF_INTEGERS = {1: "B", 3: "H", 4: "I", 16: "Q"}
-"""Types a size may have, and how `struct` calls them."""
+"""Types a size may have, as `struct` codes."""
 
 
 def stored_size(encoded: bytes) -> tuple[int, int] | None:
-    """(width, height), px, that the header of a PNG, JPEG, TIFF, BMP or WebP image promises.
+    """(width, height), px, in the header of a PNG, JPEG, TIFF, BMP or WebP image.
 
     Returns:
-        None if it is none of these, or damaged where the size should be.
+        None if it is none of these, or the header is damaged.
     """
     for reader in (_png, _jpeg, _tiff, _bmp, _webp):
         try:
             if size := reader(encoded):
                 return size
-        except (struct.error, IndexError):  # it ends too early
+        except (struct.error, IndexError):  # truncated
             return None
     return None
 
 
 def is_whole(encoded: bytes) -> bool:
-    """Whether an image got here complete: the checksums of a PNG hold, a JPEG has its end. True for other kinds.
+    """Whether an image is complete: the checksums of a PNG match, a JPEG has its end. True for other kinds.
 
-    Decoders would find out as well, but say so on stderr.
+    Decoders check this as well, but print to stderr.
     """
     if encoded.startswith(PNG_SIGNATURE):
         return _png_is_whole(encoded)
@@ -88,12 +88,12 @@ def _tiff(encoded: bytes) -> tuple[int, int] | None:
     at = struct.unpack_from(f"{order}{offset}", encoded, 4 if version == 42 else 8)[0]
     entries = struct.unpack_from(f"{order}{count}", encoded, at)[0]
     at += struct.calcsize(f"<{count}")
-    found = {}
+    size = {}
     for entry in range(at, min(at + entries * step, len(encoded)), step):
         tag, kind = struct.unpack_from(f"{order}HH", encoded, entry)
         if tag in (TIFF_WIDTH, TIFF_HEIGHT) and kind in TIFF_INTEGERS:
-            found[tag] = struct.unpack_from(f"{order}{TIFF_INTEGERS[kind]}", encoded, entry + step // 2 + 2)[0]
-    return (found[TIFF_WIDTH], found[TIFF_HEIGHT]) if len(found) == 2 else None
+            size[tag] = struct.unpack_from(f"{order}{TIFF_INTEGERS[kind]}", encoded, entry + step // 2 + 2)[0]
+    return (size[TIFF_WIDTH], size[TIFF_HEIGHT]) if len(size) == 2 else None
 
 
 def _bmp(encoded: bytes) -> tuple[int, int] | None:

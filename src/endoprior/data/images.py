@@ -1,4 +1,4 @@
-"""Image files to arrays, with a complaint that names the file when one is not what it should be."""
+"""Image files to arrays; error messages name the file, what is expected and what it holds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .image_header import is_whole, stored_size
 from .reading import read_bytes
 
 MOST_PIXELS = 64_000_000
-"""Of one picture; 7680x4320 has half as many."""
+"""Of one image; 7680x4320 has half as many."""
 
 
 def read_color(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
@@ -82,21 +82,21 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
     Args:
         path: the file.
         size: (width, height) it must have, px; None accepts any.
-        flags: `cv2.imdecode`'s: as stored, or turned into something else.
+        flags: of `cv2.imdecode`: as stored, or converted.
     Returns:
         The array, (H, W) or (H, W, C) with channels in OpenCV's order (blue first).
     Raises:
-        InputError: unreadable, of another kind, cut short, of more than `MOST_PIXELS`, or of another size.
+        InputError: unreadable, of another format, truncated, of more than `MOST_PIXELS`, or of another size.
     """
     encoded = read_bytes(path)
     data = encoded.tobytes()
-    promised = stored_size(data)
-    if promised and promised[0] * promised[1] > MOST_PIXELS:
-        got = f"{promised[0]}x{promised[1]} px by its header"
-        raise input_error(path, f"a picture of at most {MOST_PIXELS // 1_000_000} Mpx", got, "scale it down.")
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is said below, on one line
+    header_size = stored_size(data)
+    if header_size and header_size[0] * header_size[1] > MOST_PIXELS:
+        got = f"{header_size[0]}x{header_size[1]} px in its header"
+        raise input_error(path, f"an image of at most {MOST_PIXELS // 1_000_000} Mpx", got, "scale it down.")
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below replaces its messages
     try:
-        pixels = cv2.imdecode(encoded, flags) if promised and is_whole(data) else None
+        pixels = cv2.imdecode(encoded, flags) if header_size and is_whole(data) else None
     except cv2.error:
         pixels = None
     if pixels is None:
@@ -114,13 +114,13 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
 
 
 def save_png(path: Path, pixels: NDArray, compression: int = 1) -> None:
-    """Write a PNG; encoded in memory first, because libpng's own writer would tell of a full disk on stderr.
+    """Write a PNG. It is encoded in memory first, because libpng prints to stderr when the disk is full.
 
     Args:
         pixels: (H, W) 8- or 16-bit, or (H, W, 3) 8-bit red, green, blue.
         compression: 0 to 9.
     Raises:
-        OSError: the disk does not take it.
+        OSError: the disk is full or not writable.
     """
     stored = np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels
     encoded = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, compression])[1]
@@ -128,7 +128,7 @@ def save_png(path: Path, pixels: NDArray, compression: int = 1) -> None:
 
 
 def single_channel(path: Path, pixels: NDArray) -> NDArray:
-    """(H, W) view of a gray image, also of one stored with equal color channels."""
+    """(H, W) view of a gray image, or of one stored with equal color channels."""
     if pixels.ndim == 2:
         return pixels
     first = pixels[..., 0]
@@ -138,7 +138,7 @@ def single_channel(path: Path, pixels: NDArray) -> NDArray:
 
 
 def describe_pixels(pixels: NDArray) -> str:
-    """Type and channels of an array in words, such as '16-bit, 1 channel'."""
+    """Type and channels of an array as text, such as '16-bit, 1 channel'."""
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     kind = "float" if np.issubdtype(pixels.dtype, np.floating) else f"{8 * pixels.dtype.itemsize}-bit"
     return f"{kind}, {channels} channel{'s' if channels > 1 else ''}"

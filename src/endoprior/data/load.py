@@ -22,7 +22,7 @@ def load_sequence(
     Args:
         path: the folder.
         cfg: its layout, which frames and masks are read, and how depth is cleaned.
-        pose_axes: meaning of the stored poses of the EndoNeRF layout, see `load_endonerf`.
+        pose_axes: axes of the stored poses of the EndoNeRF layout, see `load_endonerf`.
     Raises:
         InputError: the folder is not a sequence; the message names the file, what is expected, what is there and a fix.
         ValueError: unknown `pose_axes`, or `opengl` for another layout.

@@ -1,4 +1,4 @@
-"""Arrays of .npy and .npz files; nothing in them is executed, and no header is believed before the bytes are there."""
+"""Arrays of .npy and .npz files: nothing in them is executed, and headers are checked against the size of the data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..core.checks import input_error
 from .reading import MOST_BYTES, read_bytes
 
 MOST_ARRAYS = 1000
-"""In one .npz file."""
+"""Largest number of arrays in one .npz file."""
 ZIP_START = b"PK"
 
 
@@ -24,16 +24,16 @@ def read_numpy(path: Path, expected: str, fix: str) -> NDArray | dict[str, NDArr
     """The array of an .npy file, or the named arrays of an .npz file; no pickles.
 
     Raises:
-        InputError: unreadable, not NumPy's, or larger than `MOST_BYTES`; `expected` says what should be there.
+        InputError: unreadable, not NumPy's, or larger than `MOST_BYTES`.
     """
     stored = read_bytes(path, expected, fix).tobytes()
     try:
         return _archive(stored) if stored.startswith(ZIP_START) else _array(stored)
     except (OSError, ValueError, TypeError, EOFError, BadZipFile, zlib.error, LZMAError) as error:
-        found = (str(error) or type(error).__name__).split("\n")[0][:120]
+        problem = (str(error) or type(error).__name__).split("\n")[0][:120]
     except (RuntimeError, MemoryError, OverflowError) as error:  # encrypted, unknown compression, nested header
-        found = (str(error) or type(error).__name__).split("\n")[0][:120]
-    raise input_error(path, expected, found, fix)
+        problem = (str(error) or type(error).__name__).split("\n")[0][:120]
+    raise input_error(path, expected, problem, fix)
 
 
 def read_only_array(path: Path, fix: str) -> NDArray:
@@ -49,7 +49,7 @@ def _archive(stored: bytes) -> dict[str, NDArray]:
     """The arrays of an .npz file; ValueError if they would be too large."""
     with ZipFile(io.BytesIO(stored)) as archive:
         members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
-        # Python's zipfile never unfolds a member to more than its header says.
+        # Python's zipfile never decompresses a member to more than its header says.
         size = sum(member.file_size for member in members)
         if size > MOST_BYTES or len(members) > MOST_ARRAYS:
             raise ValueError(f"{len(members)} arrays of {size >> 20} MB; at most {MOST_BYTES >> 20} MB are read")
@@ -57,7 +57,7 @@ def _archive(stored: bytes) -> dict[str, NDArray]:
 
 
 def _array(stored: bytes) -> NDArray:
-    """The array in the bytes of an .npy file; ValueError or another error if they are none."""
+    """The array in the bytes of an .npy file; ValueError or another error if they are not one."""
     file = io.BytesIO(stored)
     if not stored.startswith(np.lib.format.MAGIC_PREFIX):
         raise ValueError("pickled objects or something else" if stored else "an empty file")

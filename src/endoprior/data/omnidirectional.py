@@ -1,4 +1,4 @@
-"""Scaramuzza's omnidirectional camera, and the pinhole camera that shows the middle of its picture.
+"""Scaramuzza's omnidirectional camera, and the pinhole camera that shows the middle of its image.
 
 A pixel at (u, v) from the center looks along (x, y, p(rho)), where (x, y) = A^-1 (u, v), rho = |(x, y)| and
 p(rho) = a0 + a2 rho^2 + a3 rho^3 + a4 rho^4, with A = [[c, d], [e, 1]]. Pixel centers are integers here.
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 TABLE_STEPS_PER_PX = 16
-"""Entries of the table that inverts p, per pixel of radius: its error stays far below 1/1000 px."""
+"""Entries of the table that inverts p, per pixel of radius: the error is far below 1/1000 px."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Omnidirectional:
         return self.a0 + rho**2 * (self.a2 + rho * (self.a3 + rho * self.a4))
 
     def pinhole(self) -> tuple[float, float, float]:
-        """(focal length, cx, cy), px, of the pinhole picture of equal size; here pixel centers are halves.
+        """(focal length, cx, cy), px, of the pinhole image of equal size; here pixel centers are halves.
 
         Its axis is the camera's own, and its nearest edge shows what the nearest edge of the original shows.
         """
@@ -46,10 +46,10 @@ class Omnidirectional:
         return float(self.forward(np.float64(nearest))), cx, cy
 
     def pinhole_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """x and y, (H, W) each, of the original pixel that each pixel of the pinhole picture shows (`cv2.remap`).
+        """x and y, (H, W) each, of the original pixel that each pixel of the pinhole image shows (`cv2.remap`).
 
         Raises:
-            ValueError: p is not that of a camera: its angle does not grow with the radius.
+            ValueError: p does not describe a camera: its angle does not grow with the radius.
         """
         focal, cx, cy = self.pinhole()
         x = (np.arange(self.width) + 0.5 - cx) / focal
@@ -58,7 +58,7 @@ class Omnidirectional:
         far = math.hypot(self.width, self.height)
         radii = np.linspace(0, far, math.ceil(far) * TABLE_STEPS_PER_PX)
         angles = np.arctan2(radii, self.forward(radii))
-        # Past its last valid pixel a fitted polynomial may turn back; the picture must not reach that far.
+        # Beyond its last valid pixel a fitted polynomial may decrease again; the image must not reach that far.
         turns = np.flatnonzero(np.diff(angles) <= 0)
         valid = slice(0, turns[0] + 1 if turns.size else None)
         angle = np.arctan(slope)

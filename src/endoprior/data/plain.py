@@ -1,4 +1,4 @@
-"""Reader of plain folders: pictures, with masks and depth where there are any, from a camera that stands still."""
+"""Reader of plain folders: images of a static camera, with masks and depth if there are any."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from .poses import identity_poses
 from .sequence import FrameSequence
 
 ASSUMED_FOCAL = 0.9
-"""Focal length in image widths where none is given: a field of view of 58 degrees, between usual endoscopes."""
+"""Focal length in image widths if none is given: a field of view of 58 degrees, typical of endoscopes."""
 
 
 def is_plain(path: Path) -> bool:
-    """Whether a folder has pictures in `images/`."""
+    """Whether a folder has images in `images/`."""
     folder = path / "images"
     return folder.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in folder.iterdir())
 
 
 def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Open a folder of pictures. What is missing is assumed, and said in a remark.
+    """Open a folder of images. A remark names everything that is missing and assumed.
 
     Raises:
-        InputError: no pictures, numbers of files that differ, or files that cannot be used.
+        InputError: no images, numbers of files that differ, or files that cannot be used.
     """
     images = list_files(path / "images", IMAGE_SUFFIXES, "plain")
     mask_folder = "gt_masks" if cfg.use_gt_masks else "masks"
-    # A folder that the user asked for by name must be there.
+    # A folder that the user names must exist.
     masked = cfg.use_gt_masks or (path / mask_folder).is_dir()
     masks = list_files(path / mask_folder, (".png",), "plain") if masked else []
     depths = list_files(path / "depth", DEPTH_SUFFIXES, "plain") if (path / "depth").is_dir() else []
-    remarks = [f"{path}: no camera poses, the camera is taken to stand still"]
+    remarks = [f"{path}: no camera poses, the camera is assumed to be static"]
     for files, folder in ((masks, mask_folder), (depths, "depth")):
         if files:
             demand_count(files, path / folder, len(images))
@@ -47,12 +47,12 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
     described = read_description(path / "sequence.json")
     remarks += check_frames(path / "sequence.json", described, len(images))
     if not masks:
-        remarks.append(f"{path / 'masks'}: not there, every pixel counts as tissue")
+        remarks.append(f"{path / 'masks'}: missing, every pixel counts as tissue")
     if not depths:
-        remarks.append(f"{path / 'depth'}: not there; endoprior prepare adds it")
+        remarks.append(f"{path / 'depth'}: missing; endoprior prepare adds it")
     unit = cfg.depth_unit_mm or described.get("depth_scale")
     if depths and not unit:
-        remarks.append(f"{path / 'depth'}: no unit given, taken for mm; set data.depth_unit_mm")
+        remarks.append(f"{path / 'depth'}: no unit given, mm assumed; set data.depth_unit_mm")
     height, width = read_color(images[0]).shape[:2]
     if "fx" not in described:
         focal = ASSUMED_FOCAL * width

@@ -1,4 +1,4 @@
-"""The bytes and texts of a user's files: regular files only, and never more than a file of its kind can need."""
+"""Read bytes and text of user files: regular files only, of bounded size."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 
 MOST_BYTES = 1 << 30
-"""Of one file, and of what one compressed file may unfold to."""
+"""Largest size of one file, also after decompression."""
 MOST_TEXT_BYTES = 64 << 20
-"""Of a JSON, YAML or text file."""
-ACCESS_HINT = "check the path and the rights."
+"""Largest size of a JSON, YAML or text file."""
+ACCESS_HINT = "check the path and its permissions."
 Kind = Literal["a file", "a folder", "nothing", "a device or a pipe"]
 
 
 def kind_of(path: Path) -> Kind:
-    """What is at `path`, links followed; a link that leads nowhere, or to itself, is nothing.
+    """What is at `path`, links followed; a broken link is nothing.
 
     Raises:
-        InputError: the system does not say, because the name is too long or a folder above is closed to the user.
+        InputError: the name is too long, or a folder above is not readable.
     """
     try:
         mode = path.stat().st_mode
@@ -31,7 +31,7 @@ def kind_of(path: Path) -> Kind:
         if isinstance(error, FileNotFoundError | NotADirectoryError) or "symbolic links" in str(error):
             return "nothing"
         raise input_error(shortened(path), "a usable path", error.strerror or str(error), ACCESS_HINT) from None
-    except ValueError as error:  # a zero byte in a name that came out of a file
+    except ValueError as error:  # a zero byte in a name that comes from a file
         raise input_error(ascii(str(path)), "a usable path", str(error), ACCESS_HINT) from None
     if stat.S_ISREG(mode):
         return "a file"
@@ -39,7 +39,7 @@ def kind_of(path: Path) -> Kind:
 
 
 def shortened(path: Path, most: int = 120) -> str:
-    """The path as text, its middle left out where it is very long."""
+    """The path as text, without its middle if it is very long."""
     text = str(path)
     return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 2 :]}"
 
@@ -48,8 +48,8 @@ def read_bytes(path: Path, expected: str = "a readable file", fix: str = ACCESS_
     """(N,) bytes of a file.
 
     Raises:
-        InputError: missing, unreadable, not a regular file (reading a pipe would wait for ever), or of more than
-            `MOST_BYTES`; `expected` says what should be there.
+        InputError: missing, unreadable, not a regular file (reading a pipe could block forever), or of more than
+            `MOST_BYTES`.
     """
     demand_file(path, expected, fix, MOST_BYTES)
     try:
@@ -68,7 +68,7 @@ def read_text(path: Path, expected: str, fix: str) -> str:
 
 
 def demand_file(path: Path, expected: str, fix: str, most: int = MOST_BYTES) -> None:
-    """Refuse what is not a regular file, and more than `most` bytes."""
+    """Raise InputError unless `path` is a regular file of at most `most` bytes."""
     kind = kind_of(path)
     if kind != "a file":
         raise input_error(path, expected, "No such file" if kind == "nothing" else kind, fix)

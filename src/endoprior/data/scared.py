@@ -1,8 +1,8 @@
 """Reader of processed SCARED keyframes: rectified left images, disparity, calibration and pose of every frame.
 
-Two kinds of processing are in use. Version 1 (EndoGaussian, EndoSurf) keeps the raw camera `KL` and pose beside
+There are two versions of processed data. Version 1 (EndoGaussian, EndoSurf) keeps the raw camera `KL` and pose beside
 rectified images. Version 2 (EndoPrior-GS) stores its own rectification, which is then applied to camera and pose.
-Pixel centers of these calibrations are integers, ours are halves: principal points move by 0.5.
+Pixel centers of these calibrations are integers, ours are halves: 0.5 is added to principal points.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STRIDES = {1: 2, 2: 1, 3: 4, 6: 8, 7: 8}
 """Published frame stride of each dataset number."""
 BADLY_CALIBRATED = (4, 5)
 NEAR_MM, FAR_MM = 0.03, 300.0
-"""Depth outside is missing. The near end looks like a slip for 30, but it is the published one."""
+"""Depth outside this range counts as missing. The near end is the published one, though probably a typo for 30."""
 FOLDERS = {"left_finalpass": ".png", "disparity": ".tiff", "reprojection_data": ".json"}
 HINT = "process the keyframe first, see docs/datasets.md."
 VERSION_2 = ("left_rectification_rotation", "left_projection_matrix", "reprojection_matrix")
@@ -94,7 +94,7 @@ def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
         clip_depth=False,
         remarks=remarks,
         mask_folder="data/disparity",
-        sources={"depth": "structured light at the keyframe, carried to other frames by robot kinematics"},
+        sources={"depth": "structured light at the keyframe, transferred to other frames by robot kinematics"},
     )
 
 
@@ -117,7 +117,7 @@ def disparity_to_depth(disparity: NDArray[np.float32], reprojection: NDArray[np.
 def tissue_from_depth(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(H, W) True where depth is known, gaps closed by squares of W / 128 px; there are no tool masks.
 
-    OpenCV's closing with an even square moves the mask by one pixel; the published masks have that, too.
+    OpenCV's closing with an even square shifts the mask by one pixel, as in the published masks.
     """
     side = max(1, depth.shape[1] // 128)
     return cv2.morphologyEx((depth != 0).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)) > 0
@@ -126,9 +126,8 @@ def tissue_from_depth(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 def dataset_number(path: Path) -> int | None:
     """The k of `dataset_k` among a path's folders, or of a name like `d1k1`; None without one."""
     for part in reversed(path.resolve().parts):
-        found = re.fullmatch(r"dataset_?(\d+)|d(\d+)_?k\d+", part.lower())
-        if found:
-            return int(found[1] or found[2])
+        if match := re.fullmatch(r"dataset_?(\d+)|d(\d+)_?k\d+", part.lower()):
+            return int(match[1] or match[2])
     return None
 
 
@@ -156,7 +155,7 @@ def _geometry(
 
 
 def _version(path: Path, stored: dict[str, Any]) -> int:
-    """1 or 2, as the file says or as its keys show."""
+    """1 or 2: the file's `schema_version`, or what its keys imply."""
     version = stored.get("schema_version", 2 if VERSION_2[0] in stored else 1)
     if type(version) is not int or version not in (1, 2):
         raise input_error(path, "schema_version 1 or 2", repr(version), HINT)
@@ -164,7 +163,7 @@ def _version(path: Path, stored: dict[str, Any]) -> int:
 
 
 def _remarks(path: Path, number: int | None, cfg: DataConfig) -> list[str]:
-    """What is odd about the keyframe as a whole."""
+    """What is unusual about the keyframe as a whole."""
     remarks = []
     if number is None and not cfg.stride:
         remarks.append(f"{path}: no folder dataset_k in its path, so every frame is kept; set data.stride")

@@ -1,4 +1,4 @@
-"""A sequence of frames that are read when first asked for, and its split into training and test frames.
+"""A sequence of frames that are read when first used, and its split into training and test frames.
 
 `T` frames; every 8th frame, starting at frame 1, is a test frame.
 """
@@ -20,13 +20,13 @@ from .truth import Truth
 Split = Literal["train", "test", "video"]
 TEST_EVERY = 8
 DECODING_BYTES = 40
-"""Per pixel, while a frame is read."""
+"""Memory per pixel while a frame is read."""
 TOOL_FRACTION_WARNING = 0.6
-"""A larger share of tool pixels than this is more often an inverted mask than a picture of tools."""
+"""With a larger share of tool pixels, the mask is probably inverted."""
 
 
 class FrameSequence:
-    """Frames of one scene, decoded when they are asked for; as many are kept as memory allows, 1 MB per 110,000 px."""
+    """Frames of one scene, decoded when they are used; a cache keeps as many as memory allows, 1 MB per 110,000 px."""
 
     def __init__(
         self,
@@ -45,16 +45,16 @@ class FrameSequence:
         """Describe a sequence; nothing is decoded yet.
 
         Args:
-            path: folder the sequence came from; names it in messages.
+            path: folder of the sequence, for messages.
             cameras: the camera of each frame.
-            read_frame: decodes frame i; called again where the frame was not kept.
+            read_frame: decodes frame i; called again if the frame is no longer in the cache.
             frames_per_second: of the video, None if unknown.
             files: every file that makes up the sequence, for `fingerprint`.
             truth: ground truth of a synthetic sequence.
-            remarks: what the reader found odd but usable, one line each.
-            mask_folder: name of the folder the masks came from; names it in messages.
+            remarks: what is unusual but usable, one line each.
+            mask_folder: name of the folder of the masks, for messages.
             depth_is_relative: the scale of depth is unknown or assumed, so that lengths are not in mm.
-            sources: where each part came from, such as {"depth": "stereo"}.
+            sources: origin of each part, such as {"depth": "stereo"}.
         """
         self.path = path
         self.depth_is_relative = depth_is_relative
@@ -70,7 +70,7 @@ class FrameSequence:
 
     @property
     def remarks(self) -> list[str]:
-        """What the reader found odd but usable, one line each."""
+        """What is unusual but usable, one line each."""
         return list(self._remarks)
 
     def __len__(self) -> int:
@@ -114,25 +114,25 @@ class FrameSequence:
         return digest.hexdigest()
 
     def validate(self) -> list[str]:
-        """Decode every frame and refuse what cannot be trained on.
+        """Decode every frame and check that the sequence can be trained on.
 
         Returns:
-            Remarks about what is usable but suspicious, one line each.
+            Remarks about what is unusual but usable, one line each.
         Raises:
             InputError: a file cannot be used, or no frame has tissue, or no tissue pixel has depth.
         """
         camera = self.camera(0)
         threads = workers(DECODING_BYTES * camera.width * camera.height)
         with ThreadPoolExecutor(threads) as pool:  # decoding releases the interpreter lock
-            seen = list(pool.map(lambda index: _contents(self.frame(index)), range(len(self))))
-        tissue = [share for share, _, _ in seen]
+            contents = list(pool.map(lambda index: _contents(self.frame(index)), range(len(self))))
+        tissue = [share for share, _, _ in contents]
         if not any(tissue):
             hint = "the polarity may be inverted: masks are 255 on tools."
             raise input_error(self._masks, "tissue in at least one frame", "tool everywhere", hint)
-        if not any(has_depth for _, has_depth, _ in seen):
+        if not any(has_depth for _, has_depth, _ in contents):
             hint = "provide depth in mm, 0 where it is missing."
             raise input_error(self.path / "depth", "depth > 0 in at least one frame", "0 everywhere", hint)
-        if not any(seen[index][2] for index in self.indices("train")):
+        if not any(contents[index][2] for index in self.indices("train")):
             hint = "the mask's polarity may be inverted, or the depth may be of the tool only."
             raise input_error(self.path / "depth", "depth on tissue in a training frame", "none", hint)
         remarks = self.remarks
@@ -140,15 +140,15 @@ class FrameSequence:
         if tool > TOOL_FRACTION_WARNING:
             remarks.append(f"{self._masks}: {tool:.0%} of all pixels are tool; the polarity may be inverted")
         if self.depth_is_relative:
-            remarks.append(f"{self.path}: the scale of its depth is unknown or assumed; lengths in mm mean nothing")
-        empty = [index for index, (_, _, has_tissue_depth) in enumerate(seen) if not has_tissue_depth]
+            remarks.append(f"{self.path}: the scale of its depth is unknown or assumed; lengths are not millimeters")
+        empty = [index for index, (_, _, has_tissue_depth) in enumerate(contents) if not has_tissue_depth]
         if empty:
             remarks.append(f"{self.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")
         return remarks
 
 
 def _contents(frame: Frame) -> tuple[float, bool, bool]:
-    """Share of tissue; whether any pixel has depth; whether one of tissue has."""
+    """Share of tissue; whether any pixel has depth; whether any tissue pixel has depth."""
     measured = frame.depth_valid & frame.tissue_mask
     return float(frame.tissue_mask.mean()), bool(frame.depth_valid.any()), bool(measured.any())
 
@@ -158,10 +158,10 @@ def _frame_bytes(frame: Frame) -> int:
 
 
 class FrameList(Sequence[Frame]):
-    """A read-only list of frames that decodes each when it is used."""
+    """A read-only list of frames; each is decoded when it is used."""
 
     def __init__(self, sequence: FrameSequence, indices: list[int]) -> None:
-        """Args: sequence: where frames come from. indices: which, in order."""
+        """Args: sequence: source of the frames. indices: of the frames, in order."""
         self.sequence = sequence
         self.indices = indices
 

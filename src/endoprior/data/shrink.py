@@ -1,4 +1,4 @@
-"""Frames at a fraction of their size: colors averaged, masks and depth where the whole block agrees."""
+"""Frames at a fraction of their size: colors are averaged; masks and depth are valid where the whole block is."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from ..core.types import Camera, Frame
 
 
 def _steps(camera: Camera, factor: int) -> tuple[int, int]:
-    """Columns and rows of the blocks that become one pixel: `factor`, or what there is of a side that is shorter."""
+    """Columns and rows of the blocks that become one pixel: `factor`, or the whole side if it is shorter."""
     return min(factor, camera.width), min(factor, camera.height)
 
 
 def shrunk_camera(camera: Camera, factor: int) -> Camera:
-    """The camera of pictures that are `factor` times smaller: sizes rounded down, to 1 px at least."""
+    """The camera of images that are `factor` times smaller: sizes rounded down, at least 1 px."""
     across, down = _steps(camera, factor)
     return replace(
         camera,
@@ -39,7 +39,7 @@ def shrunk(frame: Frame, factor: int) -> Frame:
         return frame
     camera, steps = shrunk_camera(frame.camera, factor), _steps(frame.camera, factor)
     width, height = camera.width, camera.height
-    with np.errstate(over="ignore"):  # a mean that float32 cannot hold is no depth
+    with np.errstate(over="ignore"):  # a mean beyond float32 counts as missing
         depth = _blocks(frame.depth, width, height, steps).mean((1, 3), dtype=np.float32)
     valid = _blocks(frame.depth_valid, width, height, steps).all((1, 3)) & np.isfinite(depth)
     rgb_u8 = frame.rgb_u8[: steps[1] * height, : steps[0] * width]

@@ -1,6 +1,6 @@
 """Reader of prepared StereoMIS sequences: the EndoNeRF layout with `split.json`, as EndoPrior-GS writes it.
 
-Poses are in mm and masks mark tools already. Raw sequences are recognized only to say what to do with them.
+Poses are in mm and masks mark tools. Raw sequences are recognized only to explain how to prepare them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def is_stereomis(path: Path) -> bool:
 def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a prepared sequence.
 
-    8-bit depth is Omnidata's relative depth, so its scale is unknown; 16-bit depth counts as mm.
+    8-bit depth is Omnidata's relative depth of unknown scale; 16-bit depth is in mm.
 
     Raises:
         InputError: a raw sequence, another split than every 8th frame, or files that cannot be used.
@@ -62,7 +62,7 @@ def _read_intrinsics(path: Path) -> dict[str, float]:
 
 
 def _check_split(path: Path, count: int) -> None:
-    """Refuse a stored split that is not the one every sequence of this program has."""
+    """Raise InputError if the stored split is not the one that this program uses."""
     split = read_json(path)
     expected = {
         "test_indices": [i for i in range(count) if is_test_frame(i)],

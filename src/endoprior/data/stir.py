@@ -1,8 +1,8 @@
-"""STIR clips (Surgical Tattoos in Infrared): points tattooed on tissue, seen in infrared before and after a clip.
+"""STIR clips (Surgical Tattoos in Infrared): points tattooed on tissue, visible in infrared before and after a clip.
 
-A clip is a video without depth, so `endoprior prepare` comes first; `write_stir_tracks` then adds its points. STIR
-does not say which point of the end is which point of the start: its benchmark takes, for each predicted end, the
-nearest true one. No pairs are made up here, because pairing by distance would favor scenes that stand still.
+A clip is a video without depth, so `endoprior prepare` comes first; `write_stir_tracks` then adds its points. STIR does
+not pair the points of the end with those of the start: its benchmark compares each predicted end point with the nearest
+true one. We do not pair them by distance either, because that would favor static scenes.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from .sequence import FrameSequence
 from .truth import Tracks
 
 DEPTH_WINDOW_PX = 2
-"""Depth of a point is the median of what was measured up to so many pixels to each side."""
+"""Depth of a point is the median of the measured depth up to so many pixels to each side."""
 SEGMENTATIONS = ("segmentation/icgstartseg.png", "segmentation/icgendseg.png")
 ASPECT_TOLERANCE = 0.01
-"""Largest relative difference of the scales of width and height: rounding, not a crop."""
+"""Largest relative difference between the scales of width and height that rounding explains; a crop exceeds it."""
 
 
 def is_stir(path: Path) -> bool:
-    """Whether a folder is a STIR clip (`left/seqNN`), or holds some."""
+    """Whether a folder is a STIR clip (`left/seqNN`), or contains one."""
     return (path / SEGMENTATIONS[0]).exists() or any(path.glob(f"left*/seq*/{SEGMENTATIONS[0]}"))
 
 
 def load_stir(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Say how to get a sequence out of a clip.
+    """Explain how to prepare a clip.
 
     Raises:
         InputError: always.
@@ -91,14 +91,14 @@ def nearest_end_errors(predicted: NDArray[np.floating], true_ends: NDArray[np.fl
     """(P,) distance of each predicted end point to the nearest true one: the error of STIR's benchmark.
 
     Args:
-        predicted: (P, K) where a tracker says the points of the start are at the end; mm for K = 3, px for K = 2.
+        predicted: (P, K) predicted end of each start point; mm for K = 3, px for K = 2.
         true_ends: (Q, K) Q > 0.
     """
     return np.linalg.norm(predicted[:, None] - true_ends[None], axis=-1).min(1)
 
 
 def demand_stir_clip(clip: Path) -> None:
-    """Refuse a folder that is no `left/seqNN` of STIR, before work that would be lost."""
+    """Raise InputError unless a folder is a `left/seqNN` of STIR; called before long work."""
     for name in SEGMENTATIONS:
         if kind_of(clip / name) != "a file":
             raise input_error(clip / name, "a clip of STIR", "no such file", "pass its folder left/seqNN.")
@@ -107,13 +107,13 @@ def demand_stir_clip(clip: Path) -> None:
 def write_stir_tracks(clip: Path, prepared: Path) -> Path:
     """Write `truth/tracks.npz` of a prepared clip from its segmentations; returns the file.
 
-    The file also has `paired`, False: nothing says which end belongs to which start.
+    The file also has `paired`, False: STIR does not pair starts with ends.
 
     Args:
         clip: STIR's `left/seqNN` folder.
-        prepared: what `endoprior prepare` made of its video, all frames, not cropped.
+        prepared: the folder that `endoprior prepare` wrote for its video, all frames, not cropped.
     Raises:
-        InputError: no segmentations, no spot with depth, or a cropped picture.
+        InputError: no segmentations, no spot with depth, or cropped images.
     """
     sequence = load_endonerf(Path(prepared), DataConfig(lift_missing_depth=False))
     frames = sequence.frame(0), sequence.frame(len(sequence) - 1)
@@ -124,7 +124,7 @@ def write_stir_tracks(clip: Path, prepared: Path) -> Path:
         scale = np.array([frame.camera.width / width, frame.camera.height / height])
         if abs(scale[0] / scale[1] - 1) > ASPECT_TOLERANCE:
             got = f"{frame.camera.width}x{frame.camera.height} px for {width}x{height}"
-            raise input_error(prepared, f"the whole picture of {path}", got, "prepare the clip with --border keep.")
+            raise input_error(prepared, f"the whole image of {path}", got, "prepare the clip with --border keep.")
         spots.append(tattoo_centers(path) * scale)
     tracks = stir_tracks(*spots, *frames, len(sequence))
     for time, name in ((0, SEGMENTATIONS[0]), (-1, SEGMENTATIONS[1])):
@@ -139,15 +139,15 @@ def write_stir_tracks(clip: Path, prepared: Path) -> Path:
 
 
 def _lift(spots: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
-    """(P', 3) points in camera axes, mm, of the (P, 2) spots around which depth was measured."""
-    camera, found = frame.camera, []
+    """(P', 3) points in camera axes, mm, of the (P, 2) spots that have measured depth around them."""
+    camera, points = frame.camera, []
     for x, y in spots:
         rows, columns = (slice(max(0, int(v) - DEPTH_WINDOW_PX), int(v) + DEPTH_WINDOW_PX + 1) for v in (y, x))
         measured = frame.depth[rows, columns][frame.depth_valid[rows, columns]]
         if measured.size:
             z = float(np.median(measured))
-            found.append(((x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z))
-    return np.array(found).reshape(-1, 3)
+            points.append(((x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z))
+    return np.array(points).reshape(-1, 3)
 
 
 FORMAT = Format(is_stir, load_stir)

@@ -1,4 +1,4 @@
-"""Ground truth of a synthetic sequence: what the tool hid, exact depth, and tracked material points."""
+"""Ground truth of a synthetic sequence: tissue behind the tool, exact depth, and tracked material points."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Tracks:
     points: NDArray[np.float32]
     """(T, P, 3) positions in camera axes, mm."""
     visible: NDArray[np.bool_]
-    """(T, P) True where the point is in the picture and nothing hides it."""
+    """(T, P) True where the point is in the image and not occluded."""
     paired: bool = True
-    """False if nothing says which point of the last frame is which of the first, as in STIR: each is seen once."""
+    """False if points of the first and the last frame are not matched, as in STIR: each is visible once."""
 
 
 class Truth:
-    """The `truth/` folder of a sequence; files are read when asked for, parts that are absent are None."""
+    """The `truth/` folder of a sequence; files are read when used, missing parts are None."""
 
     def __init__(self, folder: Path, names: list[str]) -> None:
         """Args: folder: the `truth/` folder. names: stem of each frame's files, in the order of the sequence."""
@@ -37,7 +37,7 @@ class Truth:
         self._names = names
 
     def tissue(self, index: int) -> NDArray[np.uint8] | None:
-        """(H, W, 3) picture of frame `index` without the tool, 0..255."""
+        """(H, W, 3) image of frame `index` without the tool, 0..255."""
         path = self.folder / "tissue" / f"{self._names[index]}.png"
         return read_color(path) if path.parent.is_dir() else None
 

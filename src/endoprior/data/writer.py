@@ -1,7 +1,7 @@
 """Writes a sequence folder: the EndoNeRF layout plus `sequence.json`.
 
-`FrameFiles` writes into a folder that its owner looks after; `SequenceWriter` makes a sequence that appears whole or
-not at all: everything goes into a hidden folder beside the target, which takes the target's name when it is complete.
+`FrameFiles` writes into an existing folder. `SequenceWriter` writes a whole sequence: everything goes into a hidden
+folder beside the target, which gets the target's name when it is complete.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TOOL_VALUE = 255
 
 @dataclass(frozen=True)
 class SequenceMeta:
-    """The facts of a sequence that its pictures do not show."""
+    """The facts of a sequence that its images do not hold."""
 
     width: int
     """px."""
@@ -42,24 +42,24 @@ class SequenceMeta:
     frames_per_second: float
     """1/s."""
     baseline_mm: float | None = None
-    """Distance between the eyes, mm; None for a single eye."""
+    """Distance between the left and the right camera, mm; None for a monocular sequence."""
     depth_scale: float = 0.01
     """mm per unit of the 16-bit depth PNG."""
     depth_source: str | None = None
-    """Where the depth came from, for example `stereo`; None where there is none."""
+    """Origin of the depth, for example `stereo`; None without depth."""
     depth_relative: bool = False
-    """Whether the depth's scale is assumed, so that its mm are not mm."""
+    """Whether the depth's scale is assumed, so that lengths are not millimeters."""
     sources: dict[str, str] = field(default_factory=dict)
-    """Where each part of the sequence came from, for readers; no paths, which may hold names."""
+    """Origin of each part of the sequence; no paths, which may hold names."""
     note: str = ""
-    """What a reader should know."""
+    """A note for users of the sequence."""
 
 
 class FrameFiles:
     """Writes the files of one frame after another into a folder, then what describes all of them."""
 
     def __init__(self, folder: Path, meta: SequenceMeta, count: int = 0) -> None:
-        """Args: folder: where. meta: the facts. count: frames that are in the folder already, complete."""
+        """Args: folder: to write to. meta: the facts. count: complete frames that are already in the folder."""
         self.folder, self.meta, self.count = folder, meta, count
 
     def add(
@@ -72,10 +72,10 @@ class FrameFiles:
         """Append one frame.
 
         Args:
-            rgb: (H, W, 3) picture, 0..255.
+            rgb: (H, W, 3) image, 0..255.
             tool_mask: (H, W) True where a tool is.
             depth: (H, W) z in mm, 0 or not finite where missing; None in every frame for a sequence without depth.
-            right: (H, W, 3) what the right eye sees, 0..255; None in every frame for a single eye.
+            right: (H, W, 3) image of the right camera, 0..255; None in every frame of a monocular sequence.
         """
         size = (self.meta.height, self.meta.width)
         for name, array in (("rgb", rgb), ("tool_mask", tool_mask), ("depth", depth), ("right", right)):
@@ -99,7 +99,7 @@ class FrameFiles:
             pixels: (H, W, 3) RGB 8-bit, or (H, W) 8- or 16-bit.
         """
         path = self._file(f"{folder}/{self.count:06d}.png")
-        # Fast compression: a sequence is written once and read many times, and noise does not compress anyway.
+        # Fast compression: noise does not compress well anyway.
         save_png(path, pixels, 2)
 
     def write_array(self, name: str, array: NDArray) -> None:
@@ -120,8 +120,8 @@ class FrameFiles:
         """Write `poses_bounds.npy` and `sequence.json`.
 
         Args:
-            camera_to_world: (T, 4, 4) mm, OpenCV axes; None for a camera that stands still at the origin.
-            unexplained_frames: those that whoever made the sequence could not account for.
+            camera_to_world: (T, 4, 4) mm, OpenCV axes; None for a static camera at the origin.
+            unexplained_frames: frames with a problem that could not be resolved.
         """
         if self.count == 0:
             raise ValueError("a sequence must have at least one frame; got none")
@@ -155,11 +155,11 @@ class FrameFiles:
         self.write_json("sequence.json", described)
 
     def file(self, folder: str, index: int) -> Path:
-        """Path of the picture of frame `index` in `folder`."""
+        """Path of the image of frame `index` in `folder`."""
         return self.folder / folder / f"{index:06d}.png"
 
     def _depth_bounds(self, index: int) -> tuple[float, float]:
-        """Nearest and farthest depth of a frame that is written, mm; (0, 0) without depth."""
+        """Nearest and farthest depth of a written frame, mm; (0, 0) without depth."""
         path = self.file("depth", index)
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.exists() else np.zeros(0, np.uint16)
         measured = stored[stored > 0]
@@ -168,7 +168,7 @@ class FrameFiles:
         return float(measured.min() * self.meta.depth_scale), float(measured.max() * self.meta.depth_scale)
 
     def _file(self, name: str) -> Path:
-        """The place of a file in the folder; its parents exist afterwards."""
+        """Path of a file in the folder; creates its parents."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path

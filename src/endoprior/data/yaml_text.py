@@ -1,6 +1,6 @@
-"""YAML from a stranger: plain data only, and no more of it than was written.
+"""YAML from untrusted files: plain data only, of bounded size.
 
-A few lines of anchors that name each other can stand for billions of entries, and nesting can exhaust the stack.
+A few lines of nested anchors can stand for billions of entries, and nesting can exhaust the stack.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 MOST_NODES = 100_000
-"""Entries that a text may stand for, each alias counted as often as it is used."""
+"""Largest number of entries, each alias counted as often as it is used."""
 MOST_NESTED = 50
 
 
@@ -21,7 +21,7 @@ class BoundedLoader(yaml.SafeLoader):
     _depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """One node of the text; refuses what is nested too deeply, before the parser's own stack overflows."""
+        """One node of the text; an error if it is nested too deeply, before the parser's own stack overflows."""
         self._depth += 1
         if self._depth > MOST_NESTED:
             raise yaml.YAMLError(f"entries nested more than {MOST_NESTED} deep")
@@ -31,7 +31,7 @@ class BoundedLoader(yaml.SafeLoader):
             self._depth -= 1
 
     def get_single_node(self) -> Any:
-        """The whole text; refuses what stands for too much, and a name that is given twice."""
+        """The whole text; an error if it has too many entries, or one name twice."""
         node = super().get_single_node()
         if node is not None and (size := _unfolded(node, {}, 0)) > MOST_NODES:
             raise yaml.YAMLError(f"{size:.0e} entries, aliases counted as often as used; at most {MOST_NODES} are read")
@@ -42,7 +42,7 @@ def load_yaml(text: str, loader: type[BoundedLoader] = BoundedLoader) -> Any:
     """The data in a YAML text.
 
     Raises:
-        yaml.YAMLError, ValueError: no YAML, tags of objects, too deep, or too much.
+        yaml.YAMLError, ValueError: not YAML, tags of objects, too deep, or too many entries.
     """
     try:
         return yaml.load(text, loader)  # a safe loader, see above

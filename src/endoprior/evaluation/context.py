@@ -68,6 +68,11 @@ class RenderedFrame:
     """(H, W) sum of weight * z, mm."""
 
     @property
+    def rgb(self) -> NDArray[np.float32]:
+        """(H, W, 3) `rgb_u8` in [0, 1]."""
+        return self.rgb_u8 / np.float32(255)
+
+    @property
     def nbytes(self) -> int:
         """Memory it takes."""
         return sum(array.nbytes for array in (self.color, self.rgb_u8, self.depth) if array is not None)

@@ -1,4 +1,4 @@
-"""Runs jobs side by side: on the cores of this machine, or on a Ray cluster. One failing job does not stop the rest."""
+"""Run jobs in parallel: on the cores of this machine, or on a Ray cluster. A failing job does not stop the others."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Outcome:
     job: Job
     seconds: float
     failure: str = ""
-    """Why it failed, from the end of its log; empty if it is done."""
+    """Why it failed, from the end of its log; empty if it succeeded."""
 
 
 class Executor(Protocol):
@@ -40,10 +40,10 @@ class Executor(Protocol):
 
 
 def run_job(job: Job, started: list[subprocess.Popen] | None = None) -> Outcome:
-    """Run one job in a process of its own and wait for it; its output goes to `log.txt` beside its cell's folder.
+    """Run one job in its own process and wait for it; its output goes to `.log.txt` beside its cell's folder.
 
     Args:
-        started: takes the process, so that others can signal it.
+        started: the process is appended to it, so that others can signal it.
     """
     folder = Path(job.folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -69,7 +69,7 @@ def run_job(job: Job, started: list[subprocess.Popen] | None = None) -> Outcome:
 
 @contextmanager
 def local_executor(num_jobs: int) -> Iterator[Executor]:
-    """Processes of this machine, `num_jobs` at a time. On Ctrl-C all are told and save their state first."""
+    """Processes of this machine, `num_jobs` at a time. Ctrl-C interrupts all of them, and each saves its state."""
     started: list[subprocess.Popen] = []
 
     def execute(jobs: list[Job]) -> Iterator[Outcome]:

@@ -1,7 +1,7 @@
-"""The whole matrix: write phantoms, find what is done, run the rest, report what came out.
+"""The whole matrix: write phantoms, find finished cells, run the others.
 
-Below OUT: `sequences/` (phantoms) and `cells/KEY/` (metrics, run folder). A cell's folder is named by all that makes
-its result, so that equal cells of different specs are run once.
+Below OUT: `sequences/` (phantoms) and `cells/KEY/` (metrics, run folder). A cell's folder is named by a hash of
+everything that determines its result, so that equal cells of different specs run once.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from .worker import Job, finished
 
 KEY_DIGITS = 16
 SCORES_VERSION = 1
-"""Raise it when a score changes its meaning: finished cells are then run again."""
+"""Increase it when a score changes its meaning; finished cells then run again."""
 
 
 @dataclass
 class Matrix:
-    """Cells of a spec, what became of them, and where."""
+    """The cells of a spec, their folders, and why some have no result."""
 
     spec: Spec
     out: Path
@@ -38,9 +38,9 @@ class Matrix:
     missing: dict[Cell, str] = field(default_factory=dict)
     """Why a cell has no result."""
     failed: int = 0
-    """Cells among them that were tried."""
+    """Number of cells among them that ran and failed."""
     data: dict[str, Path] = field(default_factory=dict)
-    """Folder of each sequence that could be read."""
+    """Folder of each readable sequence."""
 
 
 def run_matrix(
@@ -50,46 +50,46 @@ def run_matrix(
     *,
     threads: int = 1,
     weights_dir: Path | None = None,
-    say: Callable[[str], None] = lambda text: None,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> Matrix:
     """Run every cell that is not finished yet.
 
     Args:
-        out: folder of the benchmark; finished cells in it are kept if nothing that made them has changed.
-        execute: runs the jobs; None runs nothing and only looks at what is there.
+        out: folder of the benchmark; its finished cells are kept if nothing that determines them has changed.
+        execute: runs the jobs; None runs nothing and only finds finished cells.
         threads: of each cell.
-        say: takes a line of progress.
+        progress: takes a line of text.
     """
     matrix = Matrix(spec, out)
     jobs = _jobs(matrix, threads, weights_dir, write=execute is not None)
     total = len(cells(spec))
-    say(f"{total} cells: {len(matrix.done)} done before, {len(jobs)} to run, {len(matrix.missing)} without data")
+    progress(f"{total} cells: {len(matrix.done)} done before, {len(jobs)} to run, {len(matrix.missing)} without data")
     for name, reason in {cell.sequence: reason for cell, reason in matrix.missing.items()}.items():
-        say(f"note: {name}: {reason}")
+        progress(f"note: {name}: {reason}")
     if execute is None:
         matrix.missing |= {cell: "not run yet" for cell in jobs}
         return matrix
-    alike: dict[str, list[Cell]] = {}  # cells of different methods can come to the same thing
+    by_folder: dict[str, list[Cell]] = {}  # different methods can have equal configs
     for cell, job in jobs.items():
-        alike.setdefault(job.folder, []).append(cell)
+        by_folder.setdefault(job.folder, []).append(cell)
     began, ended = clock.perf_counter(), 0
-    for outcome in execute([jobs[same[0]] for same in alike.values()]):
+    for outcome in execute([jobs[same[0]] for same in by_folder.values()]):
         ended += 1
-        for cell in alike[outcome.job.folder]:
+        for cell in by_folder[outcome.job.folder]:
             if outcome.failure:
                 matrix.missing[cell] = outcome.failure
                 matrix.failed += 1
             else:
                 matrix.done[cell] = Path(outcome.job.folder)
-        left = (clock.perf_counter() - began) / ended * (len(alike) - ended)
+        left = (clock.perf_counter() - began) / ended * (len(by_folder) - ended)
         result = f"failed: {outcome.failure}" if outcome.failure else f"done in {outcome.seconds:.0f} s"
-        say(f"[{ended}/{len(alike)}] {outcome.job.name}: {result}; about {left / 60:.0f} min left")
+        progress(f"[{ended}/{len(by_folder)}] {outcome.job.name}: {result}; about {left / 60:.0f} min left")
     return matrix
 
 
 def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -> dict[Cell, Job]:
     """A job for each cell that is not finished; fills `done`, `missing` and `data` of the matrix."""
-    spec, found = matrix.spec, {}
+    spec, jobs = matrix.spec, {}
     fingerprints: dict[str, str] = {}
     for name in spec.sequences:
         try:
@@ -106,7 +106,7 @@ def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -
         if finished(folder, key):
             matrix.done[cell] = folder
             continue
-        found[cell] = Job(
+        jobs[cell] = Job(
             name=cell.name,
             folder=str(folder),
             data=str(matrix.data[cell.sequence].absolute()),
@@ -116,14 +116,14 @@ def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -
             weights_dir=str(weights_dir.absolute()) if weights_dir else None,
             threads=threads,
         )
-    return found
+    return jobs
 
 
 def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]:
-    """Folder and fingerprint of a sequence; a phantom is written if it is not there.
+    """Folder and fingerprint of a sequence; a missing phantom is written.
 
     Raises:
-        InputError: it is not there or cannot be read.
+        InputError: it is missing or cannot be read.
     """
     from ..core.config import DataConfig
     from ..data import load_sequence
@@ -139,9 +139,9 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]
 
 
 def commits_of(matrix: Matrix) -> list[str]:
-    """Commits that the finished cells were trained at, sorted; "unknown" for a cell trained outside a checkout."""
-    found = {read_json(folder / "run" / "config.json").get("commit") for folder in matrix.done.values()}
-    return sorted(commit or "unknown" for commit in found)
+    """Commits at which the finished cells were trained, sorted; "unknown" outside a checkout."""
+    commits = {read_json(folder / "run" / "config.json").get("commit") for folder in matrix.done.values()}
+    return sorted(commit or "unknown" for commit in commits)
 
 
 def scores_of(folder: Path) -> dict[str, Any]:

@@ -91,7 +91,7 @@ def _some(names: list[str]) -> str:
 
 
 def _protocol(matrices: list[Matrix], level: int) -> list[str]:
-    """What the scores mean, from the first finished cell."""
+    """The protocol of the scores, from the first finished cell."""
     folders = [folder for matrix in matrices for folder in matrix.done.values()]
     if not folders:
         return []

@@ -1,4 +1,4 @@
-"""What a benchmark compares, as a small YAML or TOML file: read strictly, every mistake named before anything runs."""
+"""What a benchmark compares: a YAML or TOML file, checked completely before anything runs."""
 
 from __future__ import annotations
 
@@ -29,35 +29,35 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 MOST_EXTENDED = 8
 MOST_CELLS = 100_000
 FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
-"""A value such as `x0.75` multiplies what the preset and the settings before it say."""
+"""A value such as `x0.75` multiplies the value of the preset and of the settings before it."""
 
 
 @dataclass(frozen=True)
 class SequenceSpec:
-    """One sequence: a folder, or a phantom that is written first."""
+    """One sequence: a folder, or a phantom that the benchmark writes."""
 
     path: str = ""
     """Sequence folder; `~` and `$NAME` are expanded, a relative one starts at the spec's folder."""
     phantom: PhantomConfig | None = None
     """Fields of the phantom; in place of `path`."""
     shrink: int = 1
-    """Fraction of width and height that is read."""
+    """Divides width and height."""
     first_frames: int = 0
-    """Frames that are read; 0 reads all."""
+    """Number of frames to read; 0 reads all."""
     stride: int = 0
-    """Every n-th frame is read; 0 takes what is published for the dataset."""
+    """Read every n-th frame; 0 is the dataset's published stride."""
     format: str = "auto"
     """Layout of the folder (docs/datasets.md)."""
 
     @property
     def reading(self) -> dict[str, Any]:
-        """The fields of `DataConfig` that it decides."""
+        """The fields of `DataConfig` that it sets."""
         return {"shrink": self.shrink, "first_frames": self.first_frames, "stride": self.stride, "format": self.format}
 
 
 @dataclass(frozen=True)
 class MethodSpec:
-    """One method: a preset and what differs from it."""
+    """One method: a preset and its changes."""
 
     preset: str = "default"
     set: dict[str, Any] = field(default_factory=dict)
@@ -68,19 +68,19 @@ class MethodSpec:
 
 @dataclass(frozen=True)
 class ClaimSpec:
-    """A statement that the results are held against."""
+    """A statement that the results are checked against."""
 
     score: str
     method: str
     than: str
     expect: Expectation = "better"
     by: float = 0.0
-    """Difference that is claimed, or the largest that counts as none for `no effect` and `no worse`.
+    """The claimed difference; for `no effect` and `no worse`, the largest that is still allowed.
 
-    In dB for PSNR, as it is for SSIM, relative for all other scores.
+    In the score's unit, or relative: see `Score.compare`.
     """
     text: str = ""
-    """Where the claim comes from."""
+    """Source of the claim."""
     budget: int | None = None
     """Only cells of this budget; None takes all."""
 
@@ -93,9 +93,9 @@ class Spec:
     sequences: dict[str, SequenceSpec]
     methods: dict[str, MethodSpec]
     about: str = ""
-    """Printed above the tables: sizes, what was reduced and why."""
+    """Text above the tables: sizes, reductions and their reasons."""
     budgets: tuple[int, ...] = ()
-    """Initial Gaussians; none leaves each method's own."""
+    """Initial Gaussians; empty: each method's own."""
     seeds: tuple[int, ...] = (0,)
     set: dict[str, Any] = field(default_factory=dict)
     """Config fields by dotted name, for all methods."""
@@ -106,15 +106,15 @@ class Spec:
     claims: tuple[ClaimSpec, ...] = ()
     figures: tuple[Literal["budgets", "curves", "frames", "instability", "prior"], ...] = ("curves", "frames")
     compare_with: str = ""
-    """Method that paired differences are taken from; the first if empty."""
+    """Reference of the paired differences; the first method if empty."""
     networks: bool = False
-    """Also score with RAFT and LPIPS where their weights can be had."""
+    """Also compute the scores that need a network (RAFT, LPIPS), if their weights are found."""
     folder: str = "."
-    """Where relative paths start: the folder of the spec file."""
+    """Base of relative paths: the folder of the spec file."""
 
     @property
     def reference(self) -> str:
-        """Method that paired differences are taken from."""
+        """Reference of the paired differences."""
         return self.compare_with or next(iter(self.methods))
 
     def label(self, method: str) -> str:
@@ -161,9 +161,9 @@ def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
 
     Args:
         path: `.yaml`, `.yml` or `.toml`.
-        data: folders of sequences by name, in place of those of the file.
+        data: folders of sequences by name; they override those of the file.
     Raises:
-        InputError: naming the file and the field, what was expected and what was found.
+        InputError: naming the file, the field, what is expected and what is there.
     """
     values = _read(path)
     try:
@@ -183,7 +183,7 @@ def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
 
 
 def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Entries of a file over those of the files it `extends`: later ones win, `set` and `set_for` are merged.
+    """Entries of a file and the files it `extends`: later ones override, `set` and `set_for` are merged.
 
     Raises:
         InputError: a file cannot be read, or extends itself.
@@ -198,7 +198,7 @@ def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
         raise InputError(f"{path}: expected at most {MOST_EXTENDED} files that extend each other. Fix: merge some.")
     try:
         values = readers[path.suffix](text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a number of 5000 digits is a plain ValueError
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # such as a number of 5000 digits
         raise input_error(path, f"valid {path.suffix[1:]}", f"{error}", "correct it.") from None
     extends = values.pop("extends", []) if isinstance(values, dict) else None
     if not isinstance(extends, list) or not all(isinstance(name, str) for name in extends):
@@ -261,7 +261,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Unique in the matrix."""
+        """Unique within the matrix."""
         budget = "" if self.budget is None else f"@{self.budget}"
         return f"{self.sequence}/{self.method}{budget}/seed{self.seed}"
 
@@ -278,7 +278,7 @@ def cells(spec: Spec) -> list[Cell]:
 
 
 def sequence_folder(spec: Spec, name: str, out: Path) -> Path:
-    """Where the sequence lies: the user's folder, or the phantom's below `out`."""
+    """Folder of a sequence: the user's, or the phantom's below `out`."""
     sequence = spec.sequences[name]
     if sequence.phantom:
         fields = json.dumps(to_dict(sequence.phantom), sort_keys=True)

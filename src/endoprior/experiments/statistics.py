@@ -1,4 +1,4 @@
-"""Means, spreads, paired differences with a bootstrap interval, and what they say about a claim.
+"""Means, spreads, paired differences with a bootstrap interval, and verdicts on claims.
 
 `K` paired observations: the same sequence, budget and seed by two methods.
 """
@@ -72,7 +72,7 @@ def difference(values: ArrayLike, seed: int = 0) -> Difference:
 
 
 def verdict(measured: Difference, expect: str, by: float) -> Verdict:
-    """Whether a claim holds, by the interval alone.
+    """Whether a claim holds; the interval alone decides.
 
     Args:
         expect: `better`: at least `by` better; `no worse`: at most `by` worse; `no effect`: within `by` either way.

@@ -1,7 +1,7 @@
-"""One cell of a benchmark in a process of its own: train, score, say that it is done last of all.
+"""Train and score one cell of a benchmark in its own process; `cell.json` marks it as finished.
 
-`python -m endoprior.experiments.worker JOB.json`, where JOB.json holds the fields of `Job`. A cell that was killed goes
-on from its checkpoint.
+`python -m endoprior.experiments.worker JOB.json`, where JOB.json holds the fields of `Job`. An interrupted cell
+resumes from its checkpoint.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from ..data.files import read_json
 from ..system.atomic import write_json
 
 DONE = "cell.json"
-"""Written last: a folder that has it, with the same key, needs no work."""
+"""Written last: a folder that has it, with the same key, is finished."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """All that a worker needs to know."""
+    """The input of a worker."""
 
     name: str
     folder: str
@@ -34,13 +34,13 @@ class Job:
     data: str
     """Sequence folder, absolute."""
     config: dict[str, Any]
-    """Every field."""
+    """Every field of `Config`."""
     key: str
-    """Changes with anything that changes the result."""
+    """Hash of everything that determines the result."""
     networks: bool
     weights_dir: str | None
     threads: int
-    """Numba's and torch's threads."""
+    """Threads of Numba and torch."""
 
     def write(self, path: Path) -> None:
         """Save as JSON."""
@@ -48,7 +48,7 @@ class Job:
 
 
 def finished(folder: Path, key: str) -> bool:
-    """Whether the cell in `folder` is done, its result is the one that `key` stands for, and can be read."""
+    """Whether `folder` holds a finished cell with this `key` and readable scores."""
     try:
         scores = read_json(folder / "metrics.json").get("scores")
         return read_json(folder / DONE).get("key") == key and isinstance(scores, dict)
@@ -57,7 +57,7 @@ def finished(folder: Path, key: str) -> bool:
 
 
 def work(job: Job) -> None:
-    """Train and score one cell; its run folder is `run/`, the scores lie beside it.
+    """Train and score one cell; its run folder is `run/`, the scores are beside it.
 
     Raises:
         InputError: the sequence or the config cannot be used.
@@ -71,24 +71,24 @@ def work(job: Job) -> None:
 
     cfg, folder = from_dict(Config, job.config), Path(job.folder)
     run, key_file = folder / "run", folder / "key"
-    going_on = (run / "checkpoint.safetensors").exists() and key_file.exists() and key_file.read_text() == job.key
-    if not going_on:
+    resume = (run / "checkpoint.safetensors").exists() and key_file.exists() and key_file.read_text() == job.key
+    if not resume:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         key_file.write_text(job.key)
     began = clock.perf_counter()
-    scene = train(load_sequence(job.data, cfg.data), cfg, run, resume=going_on)
+    scene = train(load_sequence(job.data, cfg.data), cfg, run, resume=resume)
     seconds = clock.perf_counter() - began
     sequence = load_sequence(job.data, scored_data(cfg.data))
     weights_dir = Path(job.weights_dir) if job.weights_dir else None
-    scene = scene.to(device_for(cfg.render.backend))  # drawn where it was trained
+    scene = scene.to(device_for(cfg.render.backend))  # score on the training device
     result = evaluate(scene, sequence, networks=job.networks, weights_dir=weights_dir)
-    if going_on:
+    if resume:
         result.skipped["train_seconds"] = "the run was interrupted"
     else:
         result.scores["train_seconds"] = seconds
     result.save(folder)
-    (run / "checkpoint.safetensors").unlink()  # larger than all the rest, and of no more use
+    (run / "checkpoint.safetensors").unlink()  # large, and no longer needed
     write_json(folder / DONE, {"name": job.name, "key": job.key, "seconds": clock.perf_counter() - began})
 
 
@@ -107,7 +107,7 @@ def main(argv: list[str]) -> int:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when `parent` is no longer its parent: work that nobody collects must not go on."""
+    """End this process when `parent` ends, because nobody would collect its result."""
     while os.getppid() == parent:
         clock.sleep(0.5)
     os._exit(1)

@@ -1,9 +1,9 @@
 """Scores: pure functions of NumPy arrays, one frame or one pair of frames at a time.
 
-A frame on which a score has no meaning (an empty mask, no measured depth) scores NaN; `mean_over_frames` leaves such
-frames out and says NaN when none is left. A score whose network or weights are not there raises `ScoreUnavailable`; its
-text is the reason to print, and nothing else is ever measured in its place. Torch, torchvision and lpips are imported
-only when a network score is asked for.
+A frame on which a score is undefined (an empty mask, no measured depth) scores NaN. `mean_over_frames` ignores such
+frames, and returns NaN if none is left. A score whose network or weights are missing raises `ScoreUnavailable`, whose
+text is the reason to print; nothing else is measured in its place. Torch, torchvision and lpips are imported only when
+a score needs them.
 """
 
 from __future__ import annotations
@@ -16,25 +16,19 @@ from .image import (
     psnr,
     psnr_behind_tool,
     psnr_tissue,
-    quantize,
     ssim,
     ssim_tissue,
     to_uint8,
 )
-from .lpips import LpipsDistance, lpips_distance
-from .raft import RaftFlow, raft_flow
+from .lpips import lpips_distance
+from .raft import raft_flow
 from .stability import depth_instability
-from .tracks import NeighborBreaks, TrackError, neighbor_breaks, track_error
-from .weights import FoundWeights, ScoreUnavailable, WeightsMissing
+from .tracks import neighbor_breaks, track_error
+from .weights import ScoreUnavailable, WeightsMissing
 
 __all__ = [
     "FlowEstimator",
-    "FoundWeights",
-    "LpipsDistance",
-    "NeighborBreaks",
-    "RaftFlow",
     "ScoreUnavailable",
-    "TrackError",
     "WeightsMissing",
     "depth_instability",
     "depth_rmse",
@@ -47,7 +41,6 @@ __all__ = [
     "psnr",
     "psnr_behind_tool",
     "psnr_tissue",
-    "quantize",
     "raft_flow",
     "ssim",
     "ssim_tissue",

@@ -10,8 +10,8 @@ import numpy as np
 def mean_over_frames(values: Iterable[float]) -> float:
     """Mean of the finite values.
 
-    NaN marks a frame on which the score has no meaning (no tissue, no depth, no tool). Infinity is the PSNR of two
-    equal images; it is left out too, because one such frame would hide every other.
+    NaN marks a frame on which the score is undefined (no tissue, no depth, no tool). Infinity is the PSNR of two equal
+    images; it is ignored too, because one such frame would hide all others.
 
     Args:
         values: (T,) one value per frame or pair, any unit.

@@ -1,7 +1,7 @@
 """How close one rendered frame is to its target: PSNR, SSIM and depth RMSE, as the published protocol defines them.
 
 Shared letters: `H, W` image size. Masks are positive: True = tissue, the pixel counts. Sums are in float64. The
-protocol measures 8-bit images: pass renders through `quantize` first. Sources: the evaluation of EndoGaussian and
+protocol measures 8-bit images: round rendered color with `to_uint8` first. Sources: the evaluation of EndoGaussian and
 EndoPrior-GS (docs/paper_map.md), Wang et al. 2004 for SSIM.
 """
 
@@ -33,11 +33,6 @@ def to_uint8(image: NDArray) -> NDArray[np.uint8]:
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def quantize(image: NDArray) -> NDArray[np.float32]:
-    """(H, W, 3) color in [0, 1] after a round trip through an 8-bit file; see `to_uint8`."""
-    return to_uint8(image).astype(np.float32) / np.float32(255)
-
-
 def psnr(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
     """PSNR of the masked images over the whole frame, dB: the published one.
 
@@ -64,7 +59,7 @@ def psnr_tissue(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> flo
 
 
 def psnr_behind_tool(image: NDArray, tissue_truth: NDArray, mask: NDArray[np.bool_]) -> float:
-    """PSNR of what was drawn behind the tool against the tissue that is really there, dB.
+    """PSNR of the pixels rendered behind the tool against the true tissue there, dB.
 
     Args:
         image: (H, W, 3) rendered color in [0, 1].
@@ -82,7 +77,7 @@ def ssim(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
     """Structural similarity of the masked images, averaged over all pixels and channels.
 
     Gaussian window of 11 px and sigma 1.5 px, zeros outside the frame, C1 = 0.01^2, C2 = 0.03^2. Windows that lie
-    wholly outside the mask score 1, as in the published protocol.
+    entirely outside the mask score 1, as in the published protocol.
 
     Args:
         image: (H, W, 3) rendered color in [0, 1].
@@ -100,7 +95,7 @@ def ssim(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
 def ssim_tissue(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
     """Structural similarity averaged over the tissue pixels alone. Window, constants, arguments and errors as `ssim`.
 
-    What windows at the border see outside the mask is black in both images.
+    Pixels outside the mask are black in both images, also within windows at its border.
     """
     _check_images(image, target, mask)
     return float(_ssim_map(image, target, mask)[mask].mean()) if mask.any() else float("nan")
@@ -132,17 +127,17 @@ def depth_rmse(depth: NDArray, target: NDArray, valid: NDArray[np.bool_]) -> flo
         mm; NaN where no pixel is valid.
     Raises:
         ValueError: shapes differ, `valid` is not bool, or a value at a valid pixel is not finite floating point.
-            Skipping such pixels would reward broken renders.
+            Ignoring such pixels would reward broken renders.
     """
     error = _valid_differences(depth, target, valid)
     return float(np.sqrt(np.mean(error * error))) if error.size else float("nan")
 
 
 def depth_rmse_endogaussian(depth: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
-    """The depth figure EndoGaussian's evaluation prints, kept only to compare with its published tables.
+    """The depth figure that EndoGaussian's evaluation prints, only to compare with its published tables.
 
     Depths are truncated to 8 bits; differences and squares wrap modulo 256, so a 16 mm error counts as 0 and 20 mm as
-    sqrt(144); the sum is divided by the whole frame. It is no error in any unit: use `depth_rmse`.
+    sqrt(144); the sum is divided by the whole frame. It is not an error in any unit: use `depth_rmse`.
 
     Args:
         depth: (H, W) rendered z, mm, >= 0.

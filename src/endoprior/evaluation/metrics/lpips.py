@@ -1,7 +1,7 @@
 """LPIPS (Zhang et al. 2018): the distance of two images in the features of a classifier, through the lpips package.
 
-`lpips` means AlexNet, as published; the same distance with SqueezeNet is scored as `lpips_squeeze`. The package brings
-the calibrated heads; the classifier's weights are found by `weights.find_weights`.
+`lpips` means AlexNet, as published; the same distance with SqueezeNet is scored as `lpips_squeeze`. The package
+contains the calibrated heads; `weights.find_weights` finds the classifier's weights.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 HEADS_VERSION = "0.1"
 """Version of the calibrated heads: the one every published LPIPS figure uses."""
 MIN_SIZE = 32
-"""Shortest side accepted, px: much below it the deepest features have no pixel left."""
+"""Shortest side, px: much below it the deepest features have no pixel left."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,6 @@ class LpipsDistance:
     """The distance, ready to be called on one frame after another."""
 
     network: Module
-    score_name: str
-    """`lpips` with AlexNet, `lpips_squeeze` with SqueezeNet."""
-    weights: FoundWeights
-    """Where the classifier's weights came from."""
-    device: str
 
     def __call__(self, image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
         """LPIPS of the masked images scaled to [-1, 1], averaged over the frame.
@@ -68,39 +63,36 @@ class LpipsDistance:
             for x in (image, target)
         )
         with torch.inference_mode():
-            return float(self.network(a.to(self.device), b.to(self.device)))
+            return float(self.network(a, b))
 
 
 def lpips_distance(
     backbone: Literal["alex", "squeeze"] = "alex",
     weights_dir: Path | None = None,
     *,
-    device: str = "cpu",
     download: bool = True,
 ) -> LpipsDistance:
-    """Load LPIPS. "alex" is the published score's classifier; "squeeze" is scored under its own name.
+    """Load LPIPS. "alex" is the published score's classifier; "squeeze" has a score of its own.
 
     Args:
         backbone: which classifier.
         weights_dir: folder to look in first; see `weights.find_weights`.
-        device: torch device to run on.
         download: False never touches the network.
     Raises:
         InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
-        ScoreUnavailable: lpips, torchvision or the weights cannot be had, with the reason.
+        ScoreUnavailable: lpips, torchvision or the weights are missing, with the reason.
     """
-    files, score_name = {"alex": (ALEXNET, "lpips"), "squeeze": (SQUEEZENET, "lpips_squeeze")}[backbone]
     import_torchvision()
-    found = find_weights(files, weights_dir, download=download)
+    found = find_weights(ALEXNET if backbone == "alex" else SQUEEZENET, weights_dir, download=download)
     network, heads = _untrained(backbone)
     state = network.state_dict()
     trunk = {name: _stored_name(name) for name in state if name.startswith("net.")}
     weights = select_weights(found, state, trunk) | dict(load_weights(heads))
     missing, unexpected = network.load_state_dict(weights, strict=False)
-    # All that may stay as constructed are the constants of the input scaling; the heads' file calls each head twice.
+    # Only the constants of the input scaling may stay as constructed; the heads' file names each head twice.
     unset = [name for name in missing if not name.startswith("scaling_layer.") and not name.startswith("lins.")]
     assert not unset and not unexpected, (unset, unexpected)
-    return LpipsDistance(network.eval().requires_grad_(False).to(device), score_name, found, device)
+    return LpipsDistance(network.eval().requires_grad_(False))
 
 
 def _stored_name(name: str) -> str:
@@ -118,13 +110,12 @@ def _untrained(backbone: str) -> tuple[Module, FoundWeights]:
         raise ScoreUnavailable(
             f"lpips cannot be imported ({error}). Install it with: pip install endoprior[networks]"
         ) from error
-    # A new network draws random weights; those draws must not shift the caller's random numbers.
+    # A new network has random weights; creating them must not change the caller's random numbers.
     with torch.random.fork_rng(devices=[]), warnings.catch_warnings():
-        # The package names the classifier's weights in torchvision's old way, even when it wants none.
+        # The package names the classifier's weights in torchvision's old way, even when it needs none.
         warnings.filterwarnings("ignore", message="The parameter 'pretrained' is deprecated", category=UserWarning)
         warnings.filterwarnings("ignore", message="Arguments other than a weight enum", category=UserWarning)
-        # pnet_rand and pretrained=False: both of the package's own loads are left out, one needs a download, the other
-        # unpickles.
+        # pnet_rand and pretrained=False skip the package's own loading: one part downloads, the other unpickles.
         network = lpips.LPIPS(pretrained=False, net=backbone, version=HEADS_VERSION, pnet_rand=True, verbose=False)
     heads = Path(lpips.__file__).parent / "weights" / f"v{HEADS_VERSION}" / f"{backbone}.pth"
     return network, FoundWeights(heads, "lpips package")

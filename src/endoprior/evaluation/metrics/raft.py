@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...core.checks import check_shape
 from .torchvision_compat import import_torchvision
-from .weights import RAFT_LARGE, RAFT_SMALL, FoundWeights, ScoreUnavailable, find_weights, select_weights
+from .weights import RAFT_LARGE, RAFT_SMALL, ScoreUnavailable, find_weights, select_weights
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,17 +30,12 @@ class RaftFlow:
     """A flow estimator: torchvision's RAFT in evaluation mode with its default input scaling."""
 
     network: Module
-    score_name: str
-    """`flow_error` for RAFT-large, `flow_error_raft_small` for RAFT-small."""
-    weights: FoundWeights
-    """Where the weights came from."""
-    device: str
 
     def __call__(self, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(H, W, 2) displacement (x, y) in px from `first` to `second`, both (H, W, 3) 8-bit RGB.
 
-        Sides that are no multiple of 8 are continued to the right and below by repeating the last column and row, and
-        the flow is cut back to the image.
+        Sides that are not a multiple of 8 are padded at the right and bottom by the last column and row; the flow is
+        cropped to the image.
 
         Raises:
             ValueError: shapes differ.
@@ -52,14 +47,14 @@ class RaftFlow:
         height, width = size["H"], size["W"]
         if min(height, width) < MIN_SIZE:
             raise ScoreUnavailable(f"RAFT needs images of at least {MIN_SIZE} px a side; got {width}x{height}")
-        a, b = (_network_input(image).to(self.device) for image in (first, second))
+        a, b = (_network_input(image) for image in (first, second))
         with torch.inference_mode():
             flow = self.network(a, b, num_flow_updates=NUM_UPDATES)[-1][0]
-        return flow.permute(1, 2, 0)[:height, :width].cpu().numpy()
+        return flow.permute(1, 2, 0)[:height, :width].numpy()
 
 
 def _network_input(image: NDArray[np.uint8]) -> Tensor:
-    """(1, 3, H', W') image in [-1, 1] as torchvision's preset scales it, sides continued to multiples of 8."""
+    """(1, 3, H', W') image in [-1, 1] as torchvision's preset scales it, sides padded to multiples of 8."""
     import torch
 
     height, width = image.shape[:2]
@@ -71,28 +66,25 @@ def raft_flow(
     variant: Literal["large", "small"] = "large",
     weights_dir: Path | None = None,
     *,
-    device: str = "cpu",
     download: bool = True,
 ) -> RaftFlow:
-    """Load RAFT. "large" is the published score's network; "small" is scored under its own name.
+    """Load RAFT. "large" is the published score's network; "small" has a score of its own.
 
     Args:
         variant: which network.
         weights_dir: folder to look in first; see `weights.find_weights`.
-        device: torch device to run on.
         download: False never touches the network.
     Raises:
         InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
-        ScoreUnavailable: torchvision or the weights cannot be had, with the reason.
+        ScoreUnavailable: torchvision or the weights are missing, with the reason.
     """
     import torch
 
-    files, score_name = {"large": (RAFT_LARGE, "flow_error"), "small": (RAFT_SMALL, "flow_error_raft_small")}[variant]
     models = import_torchvision().models.optical_flow
-    found = find_weights(files, weights_dir, download=download)
-    # A new network draws random weights; those draws must not shift the caller's random numbers.
+    found = find_weights(RAFT_LARGE if variant == "large" else RAFT_SMALL, weights_dir, download=download)
+    # A new network has random weights; creating them must not change the caller's random numbers.
     with torch.random.fork_rng(devices=[]):
         network = (models.raft_large if variant == "large" else models.raft_small)(weights=None)
     state = network.state_dict()
     network.load_state_dict(select_weights(found, state, {name: name for name in state}))
-    return RaftFlow(network.eval().requires_grad_(False).to(device), score_name, found, device)
+    return RaftFlow(network.eval().requires_grad_(False))

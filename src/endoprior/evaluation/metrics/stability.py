@@ -1,4 +1,4 @@
-"""How steady the rendered surface is from one frame to the next. NumPy only."""
+"""Stability of the rendered depth from frame to frame. NumPy only."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ def depth_instability(
 ) -> float:
     """Mean absolute change of depth between two adjacent frames, mm: the paper's depth temporal instability.
 
-    A pixel counts where both frames show tissue and both rendered depths are positive. True motion counts too, so the
-    figure compares methods on one sequence and is no error in itself. A sequence scores the mean over adjacent pairs.
+    A pixel counts where both frames show tissue and both rendered depths are positive. True motion counts too, so
+    compare methods on one sequence only. The score of a sequence is the mean over adjacent pairs.
 
     Args:
-        depth_a: (H, W) rendered z of one frame, mm; 0 where nothing was drawn.
+        depth_a: (H, W) rendered z of one frame, mm; 0 where nothing is rendered.
         depth_b: (H, W) rendered z of the next frame, mm.
         mask_a: (H, W) True = tissue in the first frame.
         mask_b: (H, W) True = tissue in the second frame.
@@ -35,5 +35,5 @@ def depth_instability(
     a, b = depth_a[tissue].astype(np.float64), depth_b[tissue].astype(np.float64)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise ValueError("depth_a and depth_b must be finite under both masks; got NaN or infinity")
-    drawn = (a > 0) & (b > 0)
-    return float(np.abs(b - a)[drawn].mean()) if drawn.any() else float("nan")
+    rendered = (a > 0) & (b > 0)
+    return float(np.abs(b - a)[rendered].mean()) if rendered.any() else float("nan")

@@ -1,7 +1,7 @@
 """Import torchvision, also where its compiled operators do not fit the installed torch.
 
-A CUDA build of torchvision beside a CPU-only torch cannot load its operators, and its import then stops at "operator
-torchvision::nms does not exist" because it describes two of them by name. RAFT and the classifiers use no compiled
+A CUDA build of torchvision with a CPU-only torch cannot load its operators, and its import then fails with "operator
+torchvision::nms does not exist" because it registers two of them by name. RAFT and the classifiers use no compiled
 operator, so declaring those two names is enough. Only this file and the lpips package import torchvision.
 """
 
@@ -19,15 +19,15 @@ MISSING_OPERATORS = (
 )
 """Schemas of the operators torchvision describes while it is imported."""
 
-# The declarations live as long as the library object does; torch forgets them when it is collected.
+# torch drops the declarations when the library object is garbage-collected.
 _declared: list[Any] = []
 
 
 def import_torchvision() -> ModuleType:
-    """The torchvision module, after declaring its missing operators if that is what keeps it from loading.
+    """The torchvision module, after declaring its missing operators if the import fails for that reason.
 
     Raises:
-        ScoreUnavailable: torchvision is not installed, or does not work beside this torch.
+        ScoreUnavailable: torchvision is not installed, or does not work with this torch.
     """
     try:
         return _import_torchvision()
@@ -42,7 +42,7 @@ def import_torchvision() -> ModuleType:
 
 
 def _import_torchvision() -> ModuleType:
-    """The torchvision module with the parts used here; RuntimeError where it does not fit torch."""
+    """The torchvision module with the parts used here; RuntimeError if it does not match torch."""
     try:
         importlib.import_module("torchvision.models.optical_flow")
         return importlib.import_module("torchvision")
@@ -53,7 +53,7 @@ def _import_torchvision() -> ModuleType:
 
 
 def _declare_operators() -> None:
-    """Tell torch the names of the operators torchvision could not load; calling them still fails."""
+    """Declare to torch the operators torchvision could not load; calling them still fails."""
     import torch
 
     if not _declared:
@@ -64,7 +64,7 @@ def _declare_operators() -> None:
 
 
 def _broken(error: RuntimeError) -> ScoreUnavailable:
-    """The reason to report for a torchvision that does not work beside this torch."""
+    """The reason to report for a torchvision that does not work with this torch."""
     import torch
 
     cause = str(error).strip().splitlines()[0]

@@ -1,7 +1,4 @@
-"""How far followed points of the tissue end up from where they really went.
-
-Shared letters: `T` frames, `P` material points. Who carries the points through the model is the caller's affair.
-"""
+"""Errors of predicted tracks of material points. Shared letters: `T` frames, `P` points."""
 
 from __future__ import annotations
 
@@ -17,13 +14,13 @@ from ...core.geometry import project
 from ...core.types import Camera
 
 NEIGHBORS = 4
-"""Neighbors of each point that must stay beside it."""
+"""Nearest neighbors of each point whose connection is checked."""
 TEAR_STRETCH = 2.0
-"""A line between neighbors that is this many times too long is torn."""
+"""A connection between neighbors that is this many times too long is torn."""
 
 
 class TrackError(NamedTuple):
-    """Mean error of followed points; NaN where it cannot be had."""
+    """Mean error of predicted points; NaN where it is undefined."""
 
     mm: float
     """Mean 3D distance, mm."""
@@ -37,11 +34,11 @@ def track_error(predicted: NDArray, truth: NDArray, visible: NDArray[np.bool_], 
     Args:
         predicted: (T, P, 3) predicted positions in camera axes, mm.
         truth: (T, P, 3) true positions in camera axes, mm, z > 0 where visible.
-        visible: (T, P) True where the true point is seen and its error counts.
-        camera: intrinsics; its pose is not used, because the points are in camera axes already.
+        visible: (T, P) True where the true point is visible and its error counts.
+        camera: intrinsics; its pose is ignored, because the points are in camera axes.
     Returns:
         Both means. NaN when nothing is visible; `px` is NaN also when a predicted point that counts lies at z <= 0,
-        where it has no image. Leaving such points out would reward losing them.
+        where it has no image. Ignoring such points would reward losing them.
     Raises:
         ValueError: shapes differ, `visible` is not bool, a point that counts is not finite, or a true one has z <= 0.
     """
@@ -63,10 +60,10 @@ def track_error(predicted: NDArray, truth: NDArray, visible: NDArray[np.bool_], 
 
 
 class NeighborBreaks(NamedTuple):
-    """How often neighbors on the tissue lose each other; NaN where no pair can be judged."""
+    """How often neighboring points fold over or separate; NaN without any pair."""
 
     fold: float
-    """Share of (frame, pair) in which the predicted line between two neighbors points against the true one."""
+    """Share of (frame, pair) in which the predicted connection of two neighbors points against the true one."""
     tear: float
     """Share of (frame, pair) in which it is more than `TEAR_STRETCH` times as long as the true one."""
 
@@ -74,11 +71,11 @@ class NeighborBreaks(NamedTuple):
 def neighbor_breaks(
     predicted: NDArray, truth: NDArray, visible: NDArray[np.bool_], first: NDArray[np.integer]
 ) -> NeighborBreaks:
-    """Folds and tears between each point and its nearest neighbors among those that start in the same frame.
+    """Folds and tears between each point and its nearest neighbors that start in the same frame.
 
     Args:
         predicted, truth: (T, P, 3) positions, mm. visible: (T, P) True where a point counts.
-        first: (P,) frame each point starts in, where `truth` says where it is.
+        first: (P,) frame each point starts in; `truth` is known there.
     Returns:
         Both shares over all frames in which both ends of a pair count.
     """
@@ -89,7 +86,7 @@ def neighbor_breaks(
         visible=visible,
         first=first,
     )
-    folds = tears = judged = 0
+    folds = tears = total = 0
     for start in np.unique(first):
         group = np.flatnonzero(first == start)
         k = min(NEIGHBORS + 1, len(group))
@@ -100,5 +97,5 @@ def neighbor_breaks(
         wanted, got = (truth[:, a] - truth[:, b])[both], (predicted[:, a] - predicted[:, b])[both]
         folds += int(((wanted * got).sum(-1) < 0).sum())
         tears += int((np.linalg.norm(got, axis=-1) > TEAR_STRETCH * np.linalg.norm(wanted, axis=-1)).sum())
-        judged += len(wanted)
-    return NeighborBreaks(folds / judged, tears / judged) if judged else NeighborBreaks(float("nan"), float("nan"))
+        total += len(wanted)
+    return NeighborBreaks(folds / total, tears / total) if total else NeighborBreaks(float("nan"), float("nan"))

@@ -1,7 +1,7 @@
-"""Where the weights of a scoring network are, and how to read them without running anything they contain.
+"""Find the weights of a network, and read them without executing anything they contain.
 
-Looked for in this order: the folder the caller names, the folder in `ENDOPRIOR_WEIGHTS`, torch's own cache, and at last
-torchvision's published file, downloaded into that cache. Whoever asks for a network gets that network or a reason.
+Places, in this order: the caller's folder, the folder in `ENDOPRIOR_WEIGHTS`, torch's cache, torchvision's published
+file, which is downloaded into that cache. The result is the requested network or an error with the reason.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
 ENVIRONMENT_VARIABLE = "ENDOPRIOR_WEIGHTS"
 """Environment variable that names a folder of weights."""
 NETWORK_TIMEOUT_S = 4.0
-"""Longest wait for an answer of the download server, s: a machine without network must learn so at once."""
+"""Timeout of the download server, s; short, because many machines have no network."""
 
 
 class ScoreUnavailable(RuntimeError):
-    """A score cannot be had here; the text is the one-line reason to report in its place."""
+    """A score cannot be computed here; the text is the one-line reason to report instead."""
 
 
 class WeightsMissing(ScoreUnavailable):
-    """The weights of the network behind a score are nowhere to be found, or cannot be read."""
+    """The weights of a network are missing or cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class WeightFiles:
     network: str
     """The network's name in messages."""
     names: tuple[str, ...]
-    """File names to look for, the first found is taken. Keys are torchvision's."""
+    """File names to look for; the first match is used. Keys are torchvision's."""
     url: str
-    """Where torchvision publishes them; the file name ends in the start of its SHA-256."""
+    """Address at which torchvision publishes them; the file name ends in the start of its SHA-256."""
 
 
 @dataclass(frozen=True)
 class FoundWeights:
-    """A weights file and how it was found."""
+    """A weights file and the place it is in."""
 
     path: Path
     source: str
@@ -71,14 +71,14 @@ SQUEEZENET = _published("SqueezeNet 1.1", "squeezenet1_1_features.safetensors", 
 
 
 def find_weights(files: WeightFiles, weights_dir: Path | None = None, *, download: bool = True) -> FoundWeights:
-    """Find the weights of a network; see the module for the order of places.
+    """Find the weights of a network; the module lists the places.
 
     Args:
         files: what to look for.
         weights_dir: a folder to look in first.
         download: False never touches the network.
     Returns:
-        The file and where it came from.
+        The file and its place.
     Raises:
         InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
         WeightsMissing: the file is in none of the places and could not be downloaded, with the reason.
@@ -101,15 +101,15 @@ def find_weights(files: WeightFiles, weights_dir: Path | None = None, *, downloa
         tried = f"the download of {files.url} failed ({failure})"
     else:
         tried = "downloads are off"
-    looked = ", ".join(f"{source} {folder}" for source, folder in places)
+    searched = ", ".join(f"{source} {folder}" for source, folder in places)
     raise WeightsMissing(
-        f"no weights for {files.network}: expected {' or '.join(files.names)} in {looked}; {tried}. "
+        f"no weights for {files.network}: expected {' or '.join(files.names)} in {searched}; {tried}. "
         f"Fix: put the file in a folder and name it with --weights-dir or {ENVIRONMENT_VARIABLE}."
     )
 
 
 def load_weights(found: FoundWeights) -> Mapping[str, Tensor]:
-    """Read named tensors from a `.safetensors` or `.pth` file; a `.pth` that holds anything else than data is refused.
+    """Read named tensors from a `.safetensors` or `.pth` file; a `.pth` may contain data only.
 
     Raises:
         WeightsMissing: the file cannot be read or holds no named tensors, with the reason.
@@ -122,7 +122,7 @@ def load_weights(found: FoundWeights) -> Mapping[str, Tensor]:
         if found.path.suffix == ".safetensors":
             return load_file(found.path)
         with warnings.catch_warnings():
-            # Torch doubts a pickle of another protocol before it reads it; whether it can be read is all that matters.
+            # torch warns of pickles of other protocols, also of those it can read.
             warnings.filterwarnings("ignore", message="Detected pickle protocol", category=UserWarning)
             stored = torch.load(found.path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, RuntimeError, ValueError, UnpicklingError, SafetensorError) as error:
@@ -135,7 +135,7 @@ def load_weights(found: FoundWeights) -> Mapping[str, Tensor]:
 
 
 def select_weights(found: FoundWeights, keys: Mapping[str, Tensor], origin: Mapping[str, str]) -> dict[str, Tensor]:
-    """The tensors a network needs, picked from a weights file by name and checked for shape.
+    """The tensors a network needs, selected from a weights file by name and checked for shape.
 
     Args:
         found: the file.
@@ -175,7 +175,7 @@ def _torch_cache() -> Path:
 
 
 def _download(url: str, target: Path) -> str | None:
-    """Fetch a published file into torch's cache, checked against the hash in its name; None, or why it failed."""
+    """Download a published file into torch's cache and check the hash in its name; None, or why it failed."""
     import torch
 
     if failure := _unreachable(url):
@@ -201,7 +201,7 @@ def _unreachable(url: str) -> str | None:
         except (OSError, ValueError) as error:
             outcome.append(_first_line(error))
 
-    # In a thread of its own: looking up a host name obeys no timeout, and may take half a minute without a network.
+    # In a thread: looking up a host name ignores the timeout, and may take half a minute without a network.
     asking = threading.Thread(target=ask, daemon=True)
     asking.start()
     asking.join(NETWORK_TIMEOUT_S)
@@ -210,7 +210,7 @@ def _unreachable(url: str) -> str | None:
 
 @contextmanager
 def _socket_timeout(seconds: float) -> Iterator[None]:
-    """Let new sockets give up after `seconds` of silence: torch's download offers no timeout of its own."""
+    """Set the timeout of new sockets: torch's download has none of its own."""
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(seconds)
     try:
@@ -220,6 +220,6 @@ def _socket_timeout(seconds: float) -> Iterator[None]:
 
 
 def _first_line(error: BaseException) -> str:
-    """What went wrong, in one line."""
+    """The first line of an error."""
     text = str(error).strip()
     return text.splitlines()[0] if text else type(error).__name__

@@ -31,8 +31,8 @@ def compute(context: EvaluationContext) -> None:
         rendered = context.rendered[frame.index]
         true_color, true_depth = truth.tissue(frame.index), truth.depth(frame.index)
         if true_color is not None:
-            image, target = rendered.rgb_u8 / np.float32(255), true_color / np.float32(255)
-            color.append(metrics.psnr_behind_tool(image, target, frame.tissue_mask))
+            target = true_color / np.float32(255)
+            color.append(metrics.psnr_behind_tool(rendered.rgb, target, frame.tissue_mask))
         if true_depth is not None:
             hidden = ~frame.tissue_mask & (true_depth > 0)
             depth.append(metrics.depth_rmse(rendered.depth, true_depth, hidden))

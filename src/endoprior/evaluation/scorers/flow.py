@@ -33,7 +33,7 @@ SCORES = (
 def compute(context: EvaluationContext) -> None:
     """Score consecutive frames of the split; with DIS also adjacent frames of the video."""
     with context.skip_if_unavailable("flow_error_dis"):
-        _add(context, "flow_error_dis", context.frames, metrics.dis_flow())
+        _add(context, "flow_error_dis", context.frames, metrics.dis_flow)
     if context.networks:
         with context.skip_if_unavailable("flow_error"):
             _add(context, "flow_error", context.frames, metrics.raft_flow("large", context.weights_dir))
@@ -43,7 +43,7 @@ def compute(context: EvaluationContext) -> None:
     else:
         context.skip("flow_error", NETWORKS_OFF)
     with context.skip_if_unavailable("flow_error_dis_adjacent"):
-        _add(context, "flow_error_dis_adjacent", context.sequence.frames("video"), metrics.dis_flow())
+        _add(context, "flow_error_dis_adjacent", context.sequence.frames("video"), metrics.dis_flow)
 
 
 def _add(context: EvaluationContext, name: str, frames: Sequence[Frame], estimator: metrics.FlowEstimator) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from .. import metrics
 from ..context import EvaluationContext
 from ..score import Score
@@ -34,7 +32,7 @@ def compute(context: EvaluationContext) -> None:
     rows = []
     for frame in context.frames:
         rendered, target, mask = context.rendered[frame.index], frame.rgb, frame.tissue_mask
-        image = rendered.rgb_u8 / np.float32(255)
+        image = rendered.rgb
         rows.append(
             {
                 "psnr": metrics.psnr(image, target, mask),

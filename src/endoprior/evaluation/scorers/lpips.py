@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from .. import metrics
 from ..context import NETWORKS_OFF, EvaluationContext
 from ..score import Score
@@ -29,7 +27,6 @@ def compute(context: EvaluationContext) -> None:
         with context.skip_if_unavailable(name):
             distance = metrics.lpips_distance(backbone, context.weights_dir, download=backbone == "alex")
             values = [
-                distance(context.rendered[frame.index].rgb_u8 / np.float32(255), frame.rgb, frame.tissue_mask)
-                for frame in context.frames
+                distance(context.rendered[frame.index].rgb, frame.rgb, frame.tissue_mask) for frame in context.frames
             ]
             context.add_mean(name, values, "no tissue in the split")

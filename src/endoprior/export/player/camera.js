@@ -29,7 +29,7 @@ function recordedView(about, frame) {
   };
 }
 
-// A hand-held camera that starts as the recorded one and turns around a point in the middle of its picture.
+// A free camera that starts as the recorded one and turns around the point at the center of its image.
 class FreeCamera {
   constructor(focus) {
     this.focus = focus; // mm in front of the camera
@@ -57,7 +57,7 @@ class FreeCamera {
     this.zoom = Math.max(NEAREST_ZOOM, Math.min(FARTHEST_ZOOM, this.zoom * factor));
   }
 
-  // size: px of the recording that fit in the window; the recorded picture is in their middle.
+  // size: px of the recording that fit in the window, with the recorded image in the center.
   view(base, size) {
     const middle = base.size.map((length, i) => ((length / 2 - base.center[i]) / base.focal[i]) * this.focus);
     const pivot = [...middle, this.focus];

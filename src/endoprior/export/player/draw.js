@@ -11,12 +11,12 @@ function compile(gl, vertexSource, fragmentSource) {
     gl.compileShader(shader);
     gl.attachShader(program, shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
-      throw new Error(`The graphics driver refused a shader: ${gl.getShaderInfoLog(shader)}`);
+      throw new Error(`The graphics driver rejected a shader: ${gl.getShaderInfoLog(shader)}`);
     }
   }
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
-    throw new Error(`The graphics driver refused the shaders: ${gl.getProgramInfoLog(program)}`);
+    throw new Error(`The graphics driver rejected the shaders: ${gl.getProgramInfoLog(program)}`);
   }
   const places = {};
   for (let i = 0; i < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); i++) {
@@ -139,7 +139,7 @@ class Painter {
     return this.fence !== null && !this.gl.isContextLost();
   }
 
-  // ms that the last picture took, once it is done; else 0.
+  // ms that the last image took, once it is complete; else 0.
   finished() {
     const { gl } = this;
     if (!this.busy || gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED) return 0;
@@ -174,5 +174,5 @@ class Painter {
   }
 }
 
-// Where each channel goes among the 16 numbers of a Gaussian's texels, in the order of `about.channels`.
+// Position of each channel among the 16 numbers of a Gaussian's texels, in the order of `about.channels`.
 const CHANNEL_SLOTS = [0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 3, 12, 13, 14];

@@ -1,9 +1,9 @@
 // The page: what is shown (one state), and the buttons, keys and hands that change it.
 
 const NEAR_Z = 0.2; // mm
-const MOST_PIXELS_PER_PIXEL = 2; // drawn per recorded one; more shows nothing new
+const MOST_PIXELS_PER_PIXEL = 2; // rendered per recorded one; more would add no detail
 const LONGEST_STEP = 0.25; // s that playing may jump when the browser was busy
-const BUDGET = 60; // ms for a picture in motion: fewer pixels where it takes longer, all of them once it rests
+const BUDGET = 60; // ms for an image in motion: fewer pixels if it takes longer, all of them once it is static
 const COARSEST = 0.25; // of the full width
 const REST = 250; // ms after the last change
 
@@ -18,7 +18,7 @@ let painter = null;
 let sorter = null;
 let stale = true;
 let changedAt = 0; // ms, by hand
-let quality = 1; // share of the full width that can be drawn within the budget
+let quality = 1; // share of the full width that can be rendered within the budget
 let drawnQuality = 0;
 
 function changed() {
@@ -32,7 +32,7 @@ function fail(text) {
   stage.removeAttribute("aria-busy");
 }
 
-// ---- what is drawn
+// ---- rendering
 
 // Places the canvas: the recorded frame as large as it fits, or for the free view the whole stage at the same scale.
 function layOut(share) {
@@ -65,7 +65,7 @@ function requestPicture(share) {
   sorter.ask({ frame, weights: depthWeights(about, view), nearZ: NEAR_Z, view, depth, share });
 }
 
-// Called by the sorter with what it was asked.
+// Called by the sorter with the order and its request.
 function drawAnswer(order, { frame, view, depth, share }) {
   layOut(share);
   painter.draw(frame, order, view, depth);
@@ -297,9 +297,9 @@ function describe() {
     `linear-gradient(${DEPTH_COLORS.map((c) => `rgb(${c})`).join(",")})`;
 }
 
-// How fast pictures can be had decides how fine they are while things move.
+// Rendering time decides the resolution while something moves.
 function learnFrom(took) {
-  const full = took / drawnQuality ** 2; // ms, were all pixels drawn
+  const full = took / drawnQuality ** 2; // ms if all pixels were rendered
   const wanted = Math.max(COARSEST, Math.min(1, Math.sqrt(BUDGET / full)));
   quality = Math.abs(wanted - quality) < 0.1 ? quality : wanted;
 }

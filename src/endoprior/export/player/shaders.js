@@ -90,7 +90,7 @@ void main() {
   gl_Position = vec4(corner * 4.0 - 1.0, 0.0, 1.0);
 }`;
 
-// Near to far, evenly spaced; the bar beside the picture is made of the same.
+// Near to far, evenly spaced; the color bar beside the image uses the same.
 const DEPTH_COLORS = [[255, 241, 196], [246, 160, 77], [196, 64, 92], [93, 38, 120], [24, 22, 60]];
 
 const SCREEN_FRAGMENT = `#version 300 es

@@ -1,4 +1,4 @@
-// Order of drawing: far to near, by camera z of the centers, in a worker where the browser allows one.
+// Order of rendering: far to near, by camera z of the centers, in a worker where the browser allows one.
 
 // planes: integers of x, y, z, each with one frame or all of them; weights: z = weights . (x, y, z, 1) in integers.
 // Returns the indices of Gaussians beyond nearZ, the farthest first. Counting sort over 2**16 bins; stable.
@@ -37,7 +37,7 @@ function sortFarToNear(planes, numGaussians, frame, weights, nearZ) {
   return order;
 }
 
-// Sorts what is asked for, one thing at a time; of questions that come in between only the newest is answered.
+// Sorts one request at a time; of the requests that arrive meanwhile, only the newest is answered.
 class Sorter {
   constructor(planes, numGaussians, answered) {
     this.planes = planes;
