@@ -162,7 +162,7 @@ def ones(n, device): raise RuntimeError("no kernel image is available")
     (tmp_path / "torch/__init__.py").write_text(fake)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     torch, *_ = facts_module._probe_torch(30.0)
-    assert torch.available is True and torch.architectures == ("sm_90",)
+    assert torch.available is True
     assert torch.gpus[0] == Gpu("NVIDIA H200", (9, 0), 128.0, False, "no kernel image is available")
     assert torch.gpus[1] == Gpu("device 1", None, None, False, "fell off the bus")
 

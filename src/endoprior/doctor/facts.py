@@ -150,7 +150,6 @@ def _probe_torch(limit_s: float) -> TorchFacts:
         hip=str(found.get("hip", installed.hip)),
         available=found.get("available"),
         gpus=tuple(_gpu(entry) for entry in found.get("gpus", ())),
-        architectures=tuple(map(str, found.get("architectures", ()))),
         host_compilers=found.get("host_compilers", {}),
         **texts,
     )

@@ -1,4 +1,4 @@
-"""Lines about the computer itself, and about what is good to have and never needed."""
+"""Lines about the computer itself, and about optional parts."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def machine_lines(facts: Facts) -> list[Line]:
 
 
 def optional_lines(facts: Facts) -> list[Line]:
-    """What else a user may wonder about."""
+    """Optional packages, weights and environment variables."""
     lines = []
     for part, (purpose, packages) in PARTS.items():
         absent = [name for name in packages if not facts.packages.get(name)]
@@ -41,33 +41,28 @@ def optional_lines(facts: Facts) -> list[Line]:
         found = f"{purpose}: {'no ' + ', '.join(absent) if absent else there}"
         lines.append(Line("also", part, state, found, f"pip install 'endoprior[{part}]'" if absent else ""))
     lines += _weights(facts)
-    lines.append(Line("also", "browser", "ok", "any serves `endoprior view`; Chromium is for the tests only"))
-    lines += _variables(facts)
-    return lines
+    return lines + _variables(facts)
 
 
 def _weights(facts: Facts) -> list[Line]:
-    if facts.weights_error and not facts.weights:
+    if not facts.weights:
         named = "ENDOPRIOR_WEIGHTS" in facts.weights_error
         repair = "unset ENDOPRIOR_WEIGHTS, or name a folder" if named else ""
-        return [Line("also", "weights", "wrong" if named else "missing", facts.weights_error, repair)]
-    here = [f"{network} ({place})" for network, place in facts.weights.items() if place]
-    absent = [network for network, place in facts.weights.items() if not place]
-    found = ", ".join(here) or "none here"
-    if not absent:
+        return [Line("also", "weights", "wrong" if named else "missing", facts.weights_error or "not checked", repair)]
+    found = ", ".join(f"{network} ({place or 'missing'})" for network, place in facts.weights.items())
+    if all(facts.weights.values()):
         return [Line("also", "weights", "ok", found)]
-    found += f"; not here: {', '.join(absent)}"
-    repair = "name a folder with their files in ENDOPRIOR_WEIGHTS; until then their scores are skipped"
+    repair = "set ENDOPRIOR_WEIGHTS to a folder with their files; without them their scores are skipped"
     return [Line("also", "weights", "missing", found, repair)]
 
 
 def _variables(facts: Facts) -> list[Line]:
-    """Variables that are set; those of our own that nothing reads, or that are no number, are wrong."""
+    """Variables that are set; our own are wrong if nothing reads them or their value is not a number."""
     lines = []
     for name, value in facts.variables.items():
         found, repair = value or "(empty)", ""
         if name.startswith("ENDOPRIOR_") and name not in (*OURS, *TESTS):
-            found, repair = f"{found}: nothing reads it; known are {', '.join(OURS)}", f"unset {name}"
+            found, repair = f"{found}: nothing reads it; expected {', '.join(OURS)}", f"unset {name}"
         elif name == "ENDOPRIOR_CACHE_GB" and not _is_number(value):
             found, repair = f"{found}: expected a number of GB", f"unset {name}"
         lines.append(Line("also", name, "wrong" if repair else "ok", found, repair))

@@ -84,8 +84,6 @@ class Torch:
     """Its error when it was not available."""
     gpus: tuple[Gpu, ...] = ()
     """GPUs in torch's order; the first is the one that would be used."""
-    architectures: tuple[str, ...] = ()
-    """What its kernels were compiled for: sm_90, ..."""
     extensions: str = ""
     """Folder in which it keeps compiled extensions."""
     host_compilers: dict[str, list[int]] = field(default_factory=dict)

@@ -43,9 +43,8 @@ def main() -> None:
 
 def _cuda(torch: Any) -> dict[str, Any]:
     """GPUs, and whether each of them adds two numbers."""
-    found: dict[str, Any] = {"available": False, "reason": "", "gpus": [], "architectures": []}
+    found: dict[str, Any] = {"available": False, "reason": "", "gpus": []}
     try:
-        found["architectures"] = list(torch.cuda.get_arch_list())
         found["available"] = bool(torch.cuda.is_available())
         if not found["available"]:
             torch.cuda.init()  # says why
