@@ -25,11 +25,11 @@ def parse(cls: type[A], argv: list[str], command: str, default: A | None = None)
     if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in argv):
         fix = "Set the shell variable, or remove the empty argument."
         raise input_error(f"endoprior {command}", "no empty argument", "one", fix)
-    errors = io.StringIO()
+    words, errors = _current(argv), io.StringIO()
     extra = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(errors):
-            return tyro.cli(cls, args=_current(argv), prog=f"endoprior {command}", description=cls.__doc__, **extra)
+            return tyro.cli(cls, args=words, prog=f"endoprior {command}", description=cls.__doc__, **extra)
     except SystemExit as exit_:
         if exit_.code == 0:
             raise
