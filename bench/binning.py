@@ -9,8 +9,7 @@ import common
 import plain
 import scenes
 
-from endoprior.render import tiles
-from endoprior.render.cpu import Project
+from endoprior.render.numba import KERNELS
 from endoprior.render.projection import project
 
 
@@ -19,13 +18,13 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     measured = []
     for size in sizes:
         splats, camera = scenes.splats(size)
-        projected = Project.apply(splats.means, splats.quats, splats.scales, splats.sh, splats.opacities, camera)
-        means2d, row_forms, z, colors, radii = (t.numpy() for t in projected)
-        arrays = (means2d, row_forms, z, colors, splats.opacities.numpy(), radii)
-        seen, picture = project(splats, camera), (size.width, size.height)
-        ours = {"": lambda _, a=arrays, p=picture: tiles.build(*a, *p)}
-        theirs = {"": lambda _, s=seen, o=splats.opacities, p=picture: plain.bin_tiles(s, o, *p)}
-        measured += common.rows("binning + sort", common.race(ours, theirs), size.num, picture)
+        inputs = (splats.means, splats.quats, splats.scales, splats.sh)
+        *projected, radii = KERNELS.project_forward(inputs, splats.opacities, camera)
+        gaussians = (*projected, splats.opacities)
+        seen, image = project(splats, camera), (size.width, size.height)
+        ours = {"": lambda _, g=gaussians, r=radii, s=image: KERNELS.bin_tiles(g, r, s)}
+        theirs = {"": lambda _, s=seen, o=splats.opacities, p=image: plain.bin_tiles(s, o, *p)}
+        measured += common.rows("binning + sort", common.race(ours, theirs), size.num, image)
     return measured
 
 

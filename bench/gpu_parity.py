@@ -1,4 +1,4 @@
-"""Whether a GPU backend draws, and differentiates, what the CPU backend and the reference do."""
+"""Whether a GPU backend gives the images and gradients of the Numba backend and the reference."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from endoprior.render.constants import ALPHA_MAX
 from endoprior.render.projection import FIELDS
 
 SCENES, FRAMES = 20, 3
-PICTURE_LIMIT, GRADIENT_LIMIT = 1e-3, 0.01
+IMAGE_LIMIT, GRADIENT_LIMIT = 1e-3, 0.01
 """Largest difference of color, alpha and depth / largest depth; and of a gradient, relative to its norm."""
 STRAY_PIXELS = {"random": 1e-4, "trained": 5e-4}
-"""Share of pixels that may differ by more: where an edge hangs on the last bits, and, in a trained scene, where gsplat
-1.5.3 lets alpha reach 0.999 (see render/cuda.py)."""
+"""Share of pixels that may differ by more: where an edge depends on the last bits, and in a trained scene where gsplat
+1.5.3 lets alpha reach 0.999 (see render/gsplat.py)."""
 WINDOW = (112, 80)
-"""px, of a trained scene's picture, where kernels are interpreted: some minutes."""
+"""px, the part of a trained scene's image that interpreted kernels render, in some minutes."""
 LARGEST_OPACITY = 0.985
 """Of random scenes: below where the two caps on alpha differ."""
-DRAWN = ("color", "alpha", "depth")
+IMAGES = ("color", "alpha", "depth")
 
 
 @dataclass(frozen=True)
-class Contest:
-    """Who is compared with whom, and where."""
+class Target:
+    """A backend under test, and the device it runs on."""
 
     backend: render.Backend
     device: torch.device
@@ -51,8 +51,8 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Gap:
-    """How far the backend is from another on one scene."""
+class Difference:
+    """How far a backend is from another one on one scene."""
 
     backend: str
     kind: str
@@ -66,7 +66,7 @@ class Gap:
     depth: float
     """The same divided by the largest depth."""
     stray: float
-    """Share of pixels in which any of color, alpha and depth differs by more than PICTURE_LIMIT."""
+    """Share of pixels in which any of color, alpha and depth differs by more than IMAGE_LIMIT."""
     gradient: float
     """Largest relative difference of a gradient, and"""
     worst: str
@@ -79,7 +79,7 @@ class Gap:
 
 
 def random_case(seed: int) -> Case:
-    """150 Gaussians in and around a small picture, camera rotated and off-center; SH degree 0 to 3 in turn."""
+    """150 Gaussians in and around a small image, camera rotated and off-center; SH degree 0 to 3 in turn."""
     rng = np.random.default_rng(seed)
     width, height = int(rng.integers(40, 100)), int(rng.integers(40, 100))
     pose = np.eye(4)
@@ -114,14 +114,14 @@ def trained_cases(run: Path, *, window: bool) -> list[Case]:
 
 
 def cropped(view: Camera) -> Camera:
-    """The camera that sees the middle of another's picture."""
+    """The camera that sees the middle of another's image."""
     width, height = (min(size, limit) for size, limit in zip((view.width, view.height), WINDOW, strict=True))
     left, top = (view.width - width) // 2, (view.height - height) // 2
     return replace(view, width=width, height=height, cx=view.cx - left, cy=view.cy - top)
 
 
-def draw(backend: render.Backend, device: torch.device, case: Case) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Picture, and gradients under seeded random cotangents, as float64 on the CPU; the reference draws in float64."""
+def rendered(backend: render.Backend, device: torch.device, case: Case) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Images, and gradients under seeded random cotangents, as float64 on the CPU. The reference computes in it."""
     dtype = torch.float64 if backend == "reference" else torch.float32
     leaves = {n: getattr(case.splats, n).detach().to(device, dtype).clone().requires_grad_() for n in FIELDS}
     background = torch.tensor([0.1, 0.2, 0.3], dtype=dtype, device=device)
@@ -130,32 +130,32 @@ def draw(backend: render.Backend, device: torch.device, case: Case) -> tuple[dic
     out.means2d.retain_grad()
     generator = torch.Generator().manual_seed(0)
     pulled = background.new_zeros(())
-    for name in DRAWN:
+    for name in IMAGES:
         image = getattr(out, name)
         pulled = pulled + (torch.randn(image.shape, generator=generator).to(image) * image).sum()
     pulled.backward()
     grads = {name: leaf.grad for name, leaf in leaves.items()} | {"means2d": out.means2d.grad}
-    return on_cpu({name: getattr(out, name) for name in DRAWN}), on_cpu(grads)
+    return on_cpu({name: getattr(out, name) for name in IMAGES}), on_cpu(grads)
 
 
 def on_cpu(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The same in float64 on the CPU."""
+    """Copies in float64 on the CPU."""
     return {name: tensor.detach().double().cpu() for name, tensor in tensors.items()}
 
 
-def gap(contest: Contest, against: render.Backend, case: Case) -> Gap:
+def compared(target: Target, against: render.Backend, case: Case) -> Difference:
     """Compare the backend with another on one scene."""
-    picture, grads = draw(contest.backend, contest.device, case)
-    wanted, wanted_grads = draw(against, torch.device("cpu"), case)
-    off = {name: numbers((picture[name] - wanted[name]).abs()) for name in DRAWN}
+    images, grads = rendered(target.backend, target.device, case)
+    wanted, wanted_grads = rendered(against, torch.device("cpu"), case)
+    off = {name: numbers((images[name] - wanted[name]).abs()) for name in IMAGES}
     off["color"] = off["color"].amax(-1)
     largest = wanted["depth"].max().clamp(min=1e-12)
-    stray = (off["color"] > PICTURE_LIMIT) | (off["alpha"] > PICTURE_LIMIT) | (off["depth"] / largest > PICTURE_LIMIT)
+    stray = (off["color"] > IMAGE_LIMIT) | (off["alpha"] > IMAGE_LIMIT) | (off["depth"] / largest > IMAGE_LIMIT)
     wanted_norms = {name: v.norm().clamp(min=1e-12) for name, v in wanted_grads.items()}
     relative = {name: float(numbers((grads[name] - wanted_grads[name]).norm() / v)) for name, v in wanted_norms.items()}
     worst = max(relative, key=relative.__getitem__)
-    return Gap(
-        backend=contest.backend,
+    return Difference(
+        backend=target.backend,
         kind=case.kind,
         scene=case.name,
         against=against,
@@ -169,13 +169,13 @@ def gap(contest: Contest, against: render.Backend, case: Case) -> Gap:
 
 
 def numbers(values: Tensor) -> Tensor:
-    """The same with infinity for NaN, which would pass every comparison unseen."""
+    """The values with infinity in place of NaN, which would pass every comparison."""
     return values.nan_to_num(nan=math.inf)
 
 
-def agreement(contest: Contest, num_scenes: int, run: Path | None) -> list[Gap]:
-    """Random scenes against the CPU backend and the reference, frames of a trained one against the CPU backend."""
+def agreement(target: Target, num_scenes: int, run: Path | None) -> list[Difference]:
+    """Random scenes against Numba and the reference, frames of a trained scene against Numba."""
     cases = [random_case(seed) for seed in range(num_scenes)]
-    found = [gap(contest, against, case) for case in cases for against in ("cpu", "reference")]
-    window = contest.device.type == "cpu" and contest.backend != "cpu"  # interpreted
-    return found + [gap(contest, "cpu", case) for case in (trained_cases(run, window=window) if run else [])]
+    found = [compared(target, against, case) for case in cases for against in ("numba", "reference")]
+    window = target.device.type == "cpu" and target.backend == "triton"  # interpreted
+    return found + [compared(target, "numba", case) for case in (trained_cases(run, window=window) if run else [])]

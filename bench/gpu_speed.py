@@ -1,4 +1,4 @@
-"""How long a GPU backend takes to draw, measured by the device's own clock."""
+"""How long a GPU backend takes to render, measured by the device's own clock."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import common
 import rendering
 import scenes
 import torch
-from gpu_parity import Contest
+from gpu_parity import Target
 
 from endoprior import render
 from endoprior.core.presets import preset
@@ -23,40 +23,40 @@ from endoprior.model.scene import Scene
 from endoprior.render.projection import FIELDS
 
 SIZES = (common.Size(20_000, 640, 512), common.Size(40_000, 640, 512), common.Size(100_000, 640, 512))
-LAPS, WARM_UP = 50, 5
-MOMENT = 0.4
+REPEATS, WARM_UP = 50, 5
+TIME = 0.4
 AT_A_TIME = 16
-"""Pictures drawn in one call."""
+"""Images rendered in one call."""
 
 
 @dataclass(frozen=True)
-class Lap:
+class Timing:
     """One timing."""
 
     backend: str
     stage: str
     gaussians: int
     ms: float | None = None
-    """Median; None if it could not be done."""
+    """Median; None if it failed."""
     memory_mb: float | None = None
     """Peak memory of the device, MB."""
     note: str = ""
-    pictures: int = 1
-    """Drawn at a time."""
+    images: int = 1
+    """Rendered at a time."""
 
 
-def laps_ms(step: Callable[[], Any], device: torch.device, laps: int) -> float:
+def median_ms(step: Callable[[], Any], device: torch.device, repeats: int) -> float:
     """Median milliseconds of a step, measured on the device where it is a GPU."""
-    for _ in range(min(WARM_UP, laps)):
+    for _ in range(min(WARM_UP, repeats)):
         step()
     if device.type != "cuda":
         taken = []
-        for _ in range(laps):
+        for _ in range(repeats):
             began = time.perf_counter()
             step()
             taken.append(1e3 * (time.perf_counter() - began))
         return statistics.median(taken)
-    events = [[torch.cuda.Event(enable_timing=True) for _ in range(2)] for _ in range(laps)]
+    events = [[torch.cuda.Event(enable_timing=True) for _ in range(2)] for _ in range(repeats)]
     torch.cuda.synchronize(device)
     for start, end in events:
         start.record()
@@ -66,43 +66,45 @@ def laps_ms(step: Callable[[], Any], device: torch.device, laps: int) -> float:
     return statistics.median(start.elapsed_time(end) for start, end in events)
 
 
-def speed(contest: Contest, sizes: tuple[common.Size, ...], laps: int) -> list[Lap]:
-    """Drawing, drawing and its gradient, and drawing with either deformation before it."""
+def speed(target: Target, sizes: tuple[common.Size, ...], repeats: int) -> list[Timing]:
+    """Rendering, rendering with gradients, and rendering after either deformation."""
     found = []
     for size in sizes:
         splats, camera = scenes.splats(size)
-        on_device = Splats(**{name: getattr(splats, name).to(contest.device) for name in FIELDS})
-        background = torch.zeros(3, device=contest.device)
-        rasterize = partial(render.load(contest.backend), camera=camera, background=background)
+        on_device = Splats(**{name: getattr(splats, name).to(target.device) for name in FIELDS})
+        background = torch.zeros(3, device=target.device)
+        rasterize = partial(render.load(target.backend), camera=camera, background=background)
         steps = {
-            "drawn from kept splats": partial(drawn, rasterize, on_device),
-            "drawn and differentiated": both_ways(rasterize, on_device),
+            "rendered from cached splats": partial(forward, rasterize, on_device),
+            "rendered, with gradients": both_ways(rasterize, on_device),
         }
         for name in rendering.PRESETS:
-            steps[f"deformed ({name}) and drawn"] = deformed(rasterize, name, splats, camera, contest.device)
+            steps[f"deformed ({name}) and rendered"] = deformed(rasterize, name, splats, camera, target.device)
         several = [on_device] * AT_A_TIME
-        many = partial(render.load_many(contest.backend), cameras=[camera] * AT_A_TIME, background=background)
-        stage = f"drawn from kept splats, {AT_A_TIME} at a time"
-        found.append(replace(timed(contest, stage, size.num, partial(drawn, many, several), laps), pictures=AT_A_TIME))
-        found += [timed(contest, stage, size.num, step, laps) for stage, step in steps.items()]
+        many = partial(render.load_many(target.backend), cameras=[camera] * AT_A_TIME, background=background)
+        stage = f"rendered from cached splats, {AT_A_TIME} at a time"
+        found.append(
+            replace(timed(target, stage, size.num, partial(forward, many, several), repeats), images=AT_A_TIME)
+        )
+        found += [timed(target, stage, size.num, step, repeats) for stage, step in steps.items()]
     return found
 
 
-def timed(contest: Contest, stage: str, num: int, step: Callable[[], Any], laps: int) -> Lap:
-    """One row; what the device cannot do yet is said in its note."""
-    device = contest.device
+def timed(target: Target, stage: str, num: int, step: Callable[[], Any], repeats: int) -> Timing:
+    """One row; an error becomes its note."""
+    device = target.device
     on_gpu = device.type == "cuda"
     if on_gpu:
         torch.cuda.reset_peak_memory_stats(device)
     try:
-        ms = laps_ms(step, device, laps)
+        ms = median_ms(step, device, repeats)
     except (AttributeError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
-        return Lap(contest.backend, stage, num, note=f"not possible: {str(error).splitlines()[0]:.120}")
-    return Lap(contest.backend, stage, num, ms, torch.cuda.max_memory_allocated(device) / 1e6 if on_gpu else None)
+        return Timing(target.backend, stage, num, note=f"failed: {str(error).splitlines()[0]:.120}")
+    return Timing(target.backend, stage, num, ms, torch.cuda.max_memory_allocated(device) / 1e6 if on_gpu else None)
 
 
 @torch.no_grad()
-def drawn(rasterize: Callable[..., Any], splats: Splats | list[Splats]) -> None:
+def forward(rasterize: Callable[..., Any], splats: Splats | list[Splats]) -> None:
     """Forward only."""
     rasterize(splats)
 
@@ -124,7 +126,7 @@ def both_ways(rasterize: Callable[..., Any], splats: Splats) -> Callable[[], Non
 def deformed(
     rasterize: Callable[..., Any], name: str, splats: Splats, camera: Camera, device: torch.device
 ) -> Callable[[], None]:
-    """A preset's deformation at a moment, then forward, on the device; the first lap moves the scene there."""
+    """A preset's deformation at one time, then forward, on the device; the first call moves the scene there."""
     kept: list[Scene] = []
 
     def step() -> None:
@@ -134,6 +136,6 @@ def deformed(
                 field = HexPlaneField.from_points(splats.means, cfg.deformation, torch.Generator().manual_seed(0))
             scene = rendering.make_scene(splats, camera, cfg, field and field.to(device))
             kept.append(replace(scene, gaussians=scene.gaussians.to(device)))
-        drawn(rasterize, kept[0].at(MOMENT))
+        forward(rasterize, kept[0].at(TIME))
 
     return step

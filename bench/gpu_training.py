@@ -1,17 +1,14 @@
-"""Training a whole scene on a GPU and on the CPU: seconds, scores, and how often the host waits for the device."""
+"""Training a whole scene on a GPU and on the CPU: seconds, scores, and whether a repetition is bit-identical."""
 
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from unittest import mock
 
 import torch
 
@@ -23,14 +20,9 @@ from endoprior.evaluation.scoring import evaluate
 from endoprior.model.scene import Scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.system.devices import wait_for
-from endoprior.training.recorded import SWITCH
 from endoprior.training.trainer import Trainer
 
 FRAMES, WIDTH, HEIGHT = 63, 640, 512
-WATCHED = 15
-"""Iterations in which waits are counted: fewer than lie between two looks."""
-WATCHED_FROM = 0.6
-"""Of the iterations, so that every term is active."""
 SCORES = (
     "psnr_tissue", "psnr", "ssim", "depth_rmse_mm", "flow_error_dis_adjacent", "num_gaussians", "fps", "fps_cached",
 )  # fmt: skip
@@ -43,35 +35,29 @@ class Run:
     name: str
     frames: int = 0
     start_s: float = 0.0
-    """From nothing to the first iteration: frames, prior, first points and their tracks, all on the CPU."""
+    """Before the first iteration: frames, prior, initial points and their tracks, all on the CPU."""
     loop_s: float = 0.0
-    """All iterations, the device's work included."""
+    """All iterations."""
     iterations: int = 0
     bits: str = ""
-    """Digest of the trained Gaussians: equal ones are equal to the last bit."""
-    waits: float | None = None
-    """Times the host waited for the device, per iteration; None on the CPU."""
-    waited_at: list[str] = field(default_factory=list)
-    """Where."""
+    """Digest of the trained Gaussians: the same for bit-identical ones."""
     memory_mb: float | None = None
     """Peak memory of the device."""
     scores: dict[str, float] = field(default_factory=dict)
     note: str = ""
-    """Why there is nothing, if there is nothing."""
+    """The error, if there was one."""
 
 
 def runs_of(backends: list[render.Backend], folder: Path, iterations: int | None) -> Iterator[Run]:
-    """One training on each backend; of one that repeats to the bit also a second, and one that is recorded."""
+    """One training on each backend; a second one with Triton, which promises bit-identical results."""
     for backend in backends:
         yield attempt(backend, folder, backend, iterations)
         if backend == "triton":
             yield attempt("triton again", folder, backend, iterations, scored=False)
-            with mock.patch.dict(os.environ, {SWITCH: "1"}):
-                yield attempt("triton recorded", folder, backend, iterations)
 
 
 def attempt(name: str, folder: Path, backend: render.Backend, iterations: int | None, *, scored: bool = True) -> Run:
-    """A training; what goes wrong becomes its note, so that the others are still done."""
+    """A training; an error becomes its note, so that the others still run."""
     try:
         return trained(name, folder, backend, iterations, scored=scored)
     except Exception as error:
@@ -103,7 +89,7 @@ def config(backend: render.Backend, iterations: int | None) -> Config:
 
 
 def trained(name: str, folder: Path, backend: render.Backend, iterations: int | None, *, scored: bool) -> Run:
-    """Train on one backend and score the result where it lies."""
+    """Train on one backend and score the result on the same device."""
     cfg = config(backend, iterations)
     sequence = load_sequence(folder, cfg.data)
     began = time.perf_counter()
@@ -113,18 +99,14 @@ def trained(name: str, folder: Path, backend: render.Backend, iterations: int | 
         torch.cuda.reset_peak_memory_stats(trainer.device)
     trainer.start()
     started = time.perf_counter()
-    total, waits, waited_at = cfg.schedule.fine_iterations, None, []
     while not trainer.finished:
-        if on_gpu and trainer.state.iteration == int(WATCHED_FROM * total) // 100 * 100:
-            waits, waited_at = watched(trainer)
-        else:
-            trainer.step()
+        trainer.step()
     scene = trainer.scene().to(trainer.device)
     wait_for(trainer.device)
     ended = time.perf_counter()
     return Run(
-        name=name, frames=len(sequence), start_s=started - began, loop_s=ended - started, iterations=total,
-        bits=digest(scene), waits=waits, waited_at=waited_at,
+        name=name, frames=len(sequence), start_s=started - began, loop_s=ended - started,
+        iterations=cfg.schedule.fine_iterations, bits=digest(scene),
         memory_mb=torch.cuda.max_memory_allocated(trainer.device) / 1e6 if on_gpu else None,
         scores=scores(scene, sequence) if scored else {},
     )  # fmt: skip
@@ -144,30 +126,14 @@ def scores(scene: Scene, sequence: FrameSequence) -> dict[str, float]:
     return {name: found[name] for name in SCORES if name in found}
 
 
-def watched(trainer: Trainer) -> tuple[float, list[str]]:
-    """Some iterations, right after a look: how often each waited, as torch reports it, and what said so."""
-    trainer.settle()
-    torch.cuda.set_sync_debug_mode("warn")
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            for _ in range(WATCHED):
-                trainer.step()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    waited = [w for w in caught if "synchroniz" in str(w.message)]
-    return len(waited) / WATCHED, sorted({f"{Path(w.filename).name}:{w.lineno}" for w in waited})
-
-
 def table(runs: list[Run]) -> list[str]:
     """Markdown, one row per training."""
     names = [name for name in SCORES if any(name in run.scores for run in runs)]
-    facts = ("`default` on", "frames", "start, s", "iterations, s", "of them a second", "host waits each", "bits")
+    facts = ("`default` on", "frames", "start, s", "iterations, s", "iterations/s", "bits")
     lines = header(*facts, *names)
     for run in runs:
         cells = [run.name, str(run.frames), f"{run.start_s:.1f}", f"{run.loop_s:.1f}"]
-        cells += [f"{run.iterations / max(run.loop_s, 1e-9):.0f}", "" if run.waits is None else f"{run.waits:.2f}"]
-        cells.append(run.note or run.bits)
+        cells += [f"{run.iterations / max(run.loop_s, 1e-9):.0f}", run.note or run.bits]
         cells += [f"{run.scores[name]:.4g}" if name in run.scores else "" for name in names]
         lines.append(f"| {' | '.join(cells)} |")
     return lines

@@ -22,7 +22,7 @@ from endoprior.data import FrameSequence, load_sequence
 from endoprior.model import scene as scene_module
 from endoprior.model.deformation import HexPlaneField
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.render import cpu, tiles
+from endoprior.render import numba as numba_backend
 from endoprior.training import step as iteration_module
 from endoprior.training import temporal, temporal_numba
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
@@ -44,13 +44,13 @@ PARTS = {
         (HexPlaneField, "offsets"),
         (HexPlaneField, "offsets_and_displacement"),
     ],
-    "projection + SH": [(cpu, "project_forward")],
-    "binning + sort": [(tiles, "build")],
-    "compositing": [(cpu, "composite_forward")],
+    "projection + SH": [(numba_backend, "project_forward")],
+    "binning + sort": [(numba_backend.tiles, "build")],
+    "compositing": [(numba_backend, "composite_forward")],
     "losses": [(iteration_module, "supervised_terms")],
     "temporal term": [(temporal, "choose"), *((temporal_numba, n) for n in ("neighbors", "affinity", "local_motion"))],
-    "compositing backward": [(cpu, "composite_backward"), (cpu, "gather")],
-    "projection backward": [(cpu, "project_backward")],
+    "compositing backward": [(numba_backend, "composite_backward"), (numba_backend, "gather")],
+    "projection backward": [(numba_backend, "project_backward")],
     "other backward": [(torch.Tensor, "backward")],
     "density statistics": [(iteration_module.TrainingStep, "_observe")],
     "optimizer": [(Optimizer, "step")],

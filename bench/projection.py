@@ -1,4 +1,4 @@
-"""Projection and spherical harmonics of all Gaussians, forward and backward, beside `render.projection` in torch.
+"""Projection and spherical harmonics of all Gaussians, forward and backward, beside `render.projection` in PyTorch.
 
 `python bench/projection.py [--quick] [--json FILE]`
 """
@@ -9,10 +9,11 @@ import common
 import scenes
 import torch
 
-from endoprior.render.cpu import Project
+from endoprior.render.autograd import Project
+from endoprior.render.numba import KERNELS
 from endoprior.render.projection import project
 
-PICTURE = (640, 512)
+IMAGE = (640, 512)
 """It matters only for what is culled, which is next to nothing here."""
 
 
@@ -20,11 +21,11 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     """Two rows for each number of Gaussians."""
     measured = []
     for num in common.nums(sizes):
-        splats, camera = scenes.splats(common.Size(num, *PICTURE))
+        splats, camera = scenes.splats(common.Size(num, *IMAGE))
         inputs = [t.requires_grad_() for t in (splats.means, splats.quats, splats.scales, splats.sh)]
         cotangents = [torch.randn(shape) for shape in ((num, 2), (num, 3), (num,), (num, 3))]
         ours = {
-            "forward": lambda _, i=inputs, s=splats, c=camera: Project.apply(*i, s.opacities, c)[:4],
+            "forward": lambda _, i=inputs, s=splats, c=camera: Project.apply(KERNELS, c, s.opacities, *i)[:4],
             "backward": lambda out, i=inputs, v=cotangents: torch.autograd.grad(out, i, v),
         }
         theirs = ours | {"forward": lambda _, s=splats, c=camera: list(vars(project(s, c)).values())[:4]}

@@ -1,4 +1,4 @@
-"""Drawing a scene at a moment, deformation included, beside plain torch, with the share of each part.
+"""Rendering a scene at one time, deformation included, beside plain torch, with the share of each part.
 
 `python bench/rendering.py [--quick] [--json FILE]`
 """
@@ -17,17 +17,17 @@ from endoprior.model import scene as scene_module
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.playback import Playback
 from endoprior.model.scene import Scene
-from endoprior.render import cpu, tiles
+from endoprior.render import numba as numba_backend
 
 PRESETS = ("default", "paper")
-MOMENT = 0.4
+TIME = 0.4
 TORCH_MOST = 20_000
 """Gaussians; with more, torch takes many seconds."""
 PARTS = {
     "deformation": [(scene_module, "offsets_at")],
-    "projection + SH": [(cpu, "project_forward")],
-    "binning + sort": [(tiles, "build")],
-    "compositing": [(cpu, "composite_forward")],
+    "projection + SH": [(numba_backend, "project_forward")],
+    "binning + sort": [(numba_backend.tiles, "build")],
+    "compositing": [(numba_backend, "composite_forward")],
 }
 
 
@@ -41,10 +41,10 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
             if cfg.deformation.kind == "hexplane" and field is None:  # the volume is the same at all sizes
                 field = HexPlaneField.from_points(splats.means, cfg.deformation, torch.Generator().manual_seed(0))
             scene = make_scene(splats, camera, cfg, field)
-            ours = {"": lambda _, s=scene: s.render(MOMENT)}
+            ours = {"": lambda _, s=scene: s.render(TIME)}
             theirs = torch_steps(scene) if size.num <= TORCH_MOST else None
-            picture = (size.width, size.height)
-            measured += common.rows(f"rendering {name}", common.race(ours, theirs), size.num, picture)
+            image = (size.width, size.height)
+            measured += common.rows(f"rendering {name}", common.race(ours, theirs), size.num, image)
             measured += common.part_rows(f"rendering {name}", ours, PARTS, size)
     for size in sizes:
         measured += kept_rows(size)
@@ -63,10 +63,10 @@ def kept_rows(size: common.Size) -> list[common.Row]:
     playback, background = Playback(make_scene(splats, camera, preset("default").fitted(68), None)), torch.zeros(3)
 
     @torch.no_grad()
-    def draw(_: object) -> RenderOutput:
+    def step(_: object) -> RenderOutput:
         return plain.rasterize(playback.splats(0), camera, background=background)
 
-    theirs = {"": draw} if size.num <= TORCH_MOST else None
+    theirs = {"": step} if size.num <= TORCH_MOST else None
     result = common.race({"": lambda _: playback.render(0)}, theirs)
     return common.rows("rendering kept frame", result, size.num, (size.width, size.height))
 
@@ -77,15 +77,15 @@ def torch_steps(scene: Scene) -> common.Steps:
     field, background = scene.field and plain.Field(scene.field), torch.zeros(3)
 
     @torch.no_grad()
-    def draw(_: object) -> RenderOutput:
+    def step(_: object) -> RenderOutput:
         if field is not None:
-            offsets = field.offsets(gaussians["means"], MOMENT)
+            offsets = field.offsets(gaussians["means"], TIME)
         else:
-            offsets = plain.basis_offsets(gaussians["motion"], MOMENT, cfg.deformation)
+            offsets = plain.basis_offsets(gaussians["motion"], TIME, cfg.deformation)
         splats = gaussians.splats(offsets, cfg.schedule.sh_degree)
         return plain.rasterize(splats, scene.cameras[0], background=background)
 
-    return {"": draw}
+    return {"": step}
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from endoprior.core.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.view import browsers
 from endoprior.view.panel import control_id
-from endoprior.view.view_settings import REST_SECONDS, ViewSettings
+from endoprior.view.view_settings import IDLE_SECONDS, ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 
 FRAMES = 24
@@ -85,7 +85,7 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
         moves = iter(range(1, 1 << 30))
 
         def settle(_: object, client=client) -> None:
-            client.drain(REST_SECONDS + 0.2)
+            client.drain(IDLE_SECONDS + 0.2)
 
         def move(_: object, client=client, viewer=viewer, moves=moves) -> None:
             slider = {"value": 1 + next(moves) * 7 % (FRAMES - 1)}

@@ -185,7 +185,7 @@ SPECS = [
         ("spec.yaml", "frames"),
     ),
     Case("a preset nobody knows", changed("{ours: {}}", "{ours: {preset: best}}"), ("spec.yaml", "best")),
-    Case("a spec that extends itself", spec(SOUND + "extends: [spec.yaml]"), ("spec.yaml", "extends itself")),
+    Case("a spec that extends itself", spec(SOUND + "extends: [spec.yaml]"), ("spec.yaml", "extend itself")),
     Case("a spec that extends a device", spec(SOUND + "extends: [/dev/zero]"), ("/dev/zero",)),
     Case("a field nobody knows", spec(SOUND + "colour: red"), ("spec.yaml", "colour")),
     Case(

@@ -16,6 +16,13 @@ TINY_FRAMES, TINY_WIDTH, TINY_HEIGHT = 17, 48, 40
 TINY_FOCAL = 50.0
 TINY_DEPTH_SCALE = 0.01
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+FIRST = ("test_bad_inputs", "test_check", "test_phantom", "test_prepare")
+"""Files to begin with: one of two workers compiles the kernels of training, the other those of the phantom."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files of `FIRST` first; the others keep their order."""
+    items.sort(key=lambda item: FIRST.index(item.path.stem) if item.path.stem in FIRST else len(FIRST))
 
 
 @pytest.fixture

@@ -145,13 +145,13 @@ def loaded(monkeypatch, kernels):
         monkeypatch.setitem(sys.modules, name, module)
     fake._C = kernels
     forget(monkeypatch)
-    module = importlib.import_module("endoprior.render.cuda")
+    module = importlib.import_module("endoprior.render.gsplat")
     monkeypatch.setattr(module, "DEVICE", "cpu")
     return module
 
 
 def forget(monkeypatch):
     """Make the next import of the backend a real one, now and after the test."""
-    monkeypatch.delitem(sys.modules, "endoprior.render.cuda", raising=False)
-    monkeypatch.setitem(sys.modules, "endoprior.render.cuda", ModuleType("put aside"))  # undone last: nothing stays
-    del sys.modules["endoprior.render.cuda"]
+    monkeypatch.delitem(sys.modules, "endoprior.render.gsplat", raising=False)
+    monkeypatch.setitem(sys.modules, "endoprior.render.gsplat", ModuleType("put aside"))  # undone last: nothing stays
+    del sys.modules["endoprior.render.gsplat"]

@@ -20,7 +20,7 @@ import scenes
 from common import Row, Size
 
 from endoprior.data import load_sequence
-from endoprior.render import cpu
+from endoprior.render import numba as numba_backend
 
 BENCH = Path(common.__file__).parent
 TINY = Size(40, 48, 40)
@@ -126,7 +126,7 @@ def is_foreign(line):
 def test_plain_torch_draws_the_same_picture_with_the_same_gradients():
     splats, camera = scenes.splats(TINY)
     leaves = [t.requires_grad_() for t in (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)]
-    drawn = [r(splats, camera, background=torch.ones(3)) for r in (cpu.rasterize, plain.rasterize)]
+    drawn = [r(splats, camera, background=torch.ones(3)) for r in (numba_backend.rasterize, plain.rasterize)]
     torch.testing.assert_close(drawn[1].color, drawn[0].color, rtol=0, atol=1e-4)
     torch.testing.assert_close(drawn[1].depth, drawn[0].depth, rtol=0, atol=1e-2)
     torch.testing.assert_close(drawn[1].alpha, drawn[0].alpha, rtol=0, atol=1e-4)

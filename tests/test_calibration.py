@@ -80,7 +80,7 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_every_spelling_gives_the_same_numbers(tmp_path, form):
+def test_every_file_format_gives_the_same_numbers(tmp_path, form):
     found = read_calibration(FORMS[form](tmp_path))
     half = np.zeros((3, 3))
     half[:2, 2] = 0.5  # OpenCV counts pixel centers from 0, we from 0.5
@@ -91,21 +91,21 @@ def test_every_spelling_gives_the_same_numbers(tmp_path, form):
     assert check_pair(found, "c") == pytest.approx(np.linalg.norm(T))
 
 
-def test_one_eye(tmp_path):
+def test_one_camera(tmp_path):
     found = read_calibration(opencv_yaml(tmp_path / "c.yaml", camera_matrix=K1, distortion_coefficients=D1))
     assert found.right is None and np.allclose(found.left.distortion, D1) and found.size is None
     with pytest.raises(InputError, match=r"expected both cameras, R and T, got one camera.*--layout mono"):
         check_pair(found, "c.yaml")
 
 
-def test_other_pictures_of_the_same_proportions_scale_it(tmp_path):
+def test_calibration_is_scaled_to_the_image_size(tmp_path):
     found = read_calibration(FORMS["json"](tmp_path)).for_size(1280, 1024, "c")
     assert found.left.matrix[0, 0] == 1160 and found.left.matrix[0, 2] == pytest.approx(2 * 318.7)
     with pytest.raises(InputError, match="expected images of 640x512 px, or the same aspect ratio, got 720x480"):
         read_calibration(FORMS["json"](tmp_path)).for_size(720, 480, "c")
 
 
-def test_a_unit_can_be_given(tmp_path):
+def test_the_unit_option(tmp_path):
     path = as_json(tmp_path / "c.json", K1=K1, K2=K2, R=R, T=T / 10)
     assert np.allclose(read_calibration(path, "cm").translation_mm, T)
     with pytest.raises(InputError, match=r"baseline of 1 to 30 mm, got 0\.42.*--calibration-unit"):
@@ -139,7 +139,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_broken_files_are_refused_in_one_line(tmp_path, kind):
+def test_broken_files_give_one_error_line(tmp_path, kind):
     name, content, says = BROKEN[kind]
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError) as error:
@@ -151,7 +151,7 @@ def test_broken_files_are_refused_in_one_line(tmp_path, kind):
     ("shift", "says"),
     [((4.2, 0, 0), "left and right are swapped"), ((0, -4.2, 0), "T along x"), ((-90, 0, 0), "got 90 mm")],
 )
-def test_implausible_pairs_are_refused(tmp_path, shift, says):
+def test_implausible_pairs_are_errors(tmp_path, shift, says):
     path = as_json(tmp_path / "c.json", K1=K1, K2=K2, R=np.eye(3), T=shift)
     with pytest.raises(InputError, match=says):
         check_pair(read_calibration(path), "c.json")

@@ -1,4 +1,4 @@
-"""Copies, exposure jumps, cuts, blur and other places in a clip: each made on purpose, none where there is none."""
+"""Duplicates, exposure jumps, cuts, blur and other scenes: each is created on purpose and detected."""
 
 import cv2
 import numpy as np
@@ -34,13 +34,13 @@ def odd(changes) -> dict[str, tuple[int, ...]]:
 
 
 @pytest.mark.parametrize("options", [{}, {"step": 0.0}, {"step": 3.0}, {"noise": 0.5, "step": 0.2}])
-def test_nothing_is_found_in_a_clean_clip(options):
+def test_a_clean_clip_has_no_changes(options):
     changes = find_changes(clip(**options))
     assert odd(changes) == {}
     assert changes.brightness.shape == changes.sharpness.shape == (COUNT,) and changes.difference.shape == (COUNT - 1,)
 
 
-def test_copies_are_found():
+def test_duplicates_are_detected():
     images = clip()
     images[7] = images[6]
     images[15] = images[14]
@@ -48,7 +48,7 @@ def test_copies_are_found():
     assert find_changes([p for p in clip() for _ in range(2)]).duplicates == tuple(range(1, 2 * COUNT, 2))
 
 
-def test_copies_survive_video_coding_but_a_scene_at_rest_is_no_copy():
+def test_duplicates_after_video_coding_but_not_a_static_scene():
     images = clip(noise=0.5)
     residue = np.random.default_rng(2).random((HEIGHT, WIDTH, 1)) < 0.06  # what is left after coding, one level
     images[9] = images[8] + residue.astype(np.uint8)
@@ -60,7 +60,7 @@ def test_copies_survive_video_coding_but_a_scene_at_rest_is_no_copy():
 
 
 @pytest.mark.parametrize("gain", [0.75, 1.3])
-def test_an_exposure_jump_is_found_where_it_happens(gain):
+def test_an_exposure_jump_is_detected_at_its_frame(gain):
     images = [np.clip(p * (gain if i >= 10 else 1.0), 0, 255).astype(np.uint8) for i, p in enumerate(clip())]
     assert odd(find_changes(images)) == {"exposure_jumps": (10,)}
 
@@ -81,7 +81,7 @@ def test_a_cut_is_a_cut_and_not_an_exposure_jump():
     assert found.cuts == (12,) and found.exposure_jumps == ()
 
 
-def test_blur_and_other_colors_are_found():
+def test_blur_and_other_colors_are_detected():
     images = clip()
     images[6] = cv2.GaussianBlur(images[6], (0, 0), 4)
     images[18] = np.ascontiguousarray(images[18][..., [1, 0, 2]])
@@ -89,12 +89,12 @@ def test_blur_and_other_colors_are_found():
     assert found.blurred == (6,) and found.off_color == (18,)
 
 
-def test_one_picture_has_no_changes():
+def test_one_image_has_no_changes():
     changes = find_changes(clip()[:1])
     assert odd(changes) == {} and changes.difference.shape == (0,)
 
 
 @pytest.mark.slow
-def test_nothing_is_found_in_the_real_clip(real_clip):
+def test_the_real_clip_has_no_changes(real_clip):
     images = [cv2.imread(str(file))[..., ::-1] for file in sorted((real_clip / "images").iterdir())]
     assert odd(find_changes(images)) == {}

@@ -1,4 +1,4 @@
-"""`endoprior check`: a phantom broken in one way at a time is caught, with the fix to type; a whole one is not."""
+"""`endoprior check`: each defect of a phantom is reported with its fix; a good sequence gives no findings."""
 
 import json
 import shutil
@@ -68,7 +68,7 @@ def only(folder: Path, code: str) -> Finding:
     return found[code]
 
 
-def test_a_whole_sequence_gives_no_findings(facts):
+def test_a_good_sequence_gives_no_findings(facts):
     assert find(facts) == []
     assert len(facts.cloud) > 10_000 and facts.stereo.order.as_given > 0.8
 
@@ -142,7 +142,7 @@ def test_round_border(data):
     assert only(data, "round-border").what == "the image is round (radius 120 px) and its outside counts as tissue"
 
 
-def test_burned_in_writing(data):
+def test_burned_in_text(data):
     def paint(image: np.ndarray, position: int) -> np.ndarray:
         image[5:27, 150:240] = 0
         cv2.putText(image, "SMITH J", (154, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 2)
@@ -161,7 +161,7 @@ def test_swapped_eyes(stereo):
     assert found["swapped-eyes"].fix == f"swap the folders {stereo}/images and {stereo}/right, and measure depth again"
 
 
-def test_eyes_on_unequal_heights(stereo):
+def test_vertical_offset(stereo):
     edit(stereo / "right", lambda image, _: np.roll(image, 4, 0))
     assert only(stereo, "vertical-offset").what == "the rows of left and right images are 4.0 px apart"
 
@@ -176,7 +176,7 @@ def test_duplicated_frames(data):
     assert finding.fix == f"remove them from {data}"
 
 
-def test_a_clip_at_twice_its_rate_names_the_stride(data):
+def test_doubled_frame_rate_suggests_a_stride(data):
     files = sorted((data / "images").iterdir())
     for copy in range(1, FRAMES, 2):
         shutil.copy(files[copy - 1], files[copy])
@@ -192,7 +192,7 @@ def test_exposure_jump(data):
     )
 
 
-def test_moving_camera_with_resting_poses(data):
+def test_moving_camera_with_static_poses(data):
     def pan(image: np.ndarray, position: int) -> np.ndarray:
         shift = np.array([[1.15, 0, -16 - 3 * position], [0, 1.15, -14]], np.float32)
         return cv2.warpAffine(image, shift, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
@@ -218,7 +218,7 @@ def test_frames_without_depth(data):
     assert finding.severity == "error" and finding.what == "no frame has depth"
 
 
-def test_sparse_depth_and_depth_that_jumps(data):
+def test_sparse_depth_and_depth_jumps(data):
     keep = np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 4 == 0
     edit(data / "depth", lambda depth, i: depth * keep * np.uint16(2 if i == 9 else 1))
     found = findings(data)
@@ -227,7 +227,7 @@ def test_sparse_depth_and_depth_that_jumps(data):
     assert found["depth-sparse"].what == "depth on 24% of the tissue of a usual frame"
 
 
-def test_masks_that_mark_everything_or_nothing(data):
+def test_masks_that_are_full_or_empty(data):
     edit(data / "masks", lambda mask, _: np.zeros_like(mask))
     finding = only(data, "tool-fraction")
     assert finding.severity == "note" and finding.what == "no mask marks a tool"
@@ -251,7 +251,7 @@ def test_intrinsics_of_another_size(facts):
     assert finding.fix == f'set "fx", "fy", "cx", "cy" in {facts.path}/sequence.json, px'
 
 
-def test_what_only_facts_say(facts):
+def test_findings_from_edited_facts(facts):
     relative = find(replace(facts, depth=replace(facts.depth, relative=True)))
     assert [(f.code, f.severity) for f in relative] == [("relative-depth", "note")]
     assert [f.code for f in find(replace(facts, notes=("odd",), cloud=None))] == ["no-points", "reader"]
@@ -261,7 +261,7 @@ def test_what_only_facts_say(facts):
     assert [f.fix for f in cut] == [f"remove frames 0-2 from {facts.path}"]
 
 
-def test_command_prints_draws_and_writes(data, capsys):
+def test_command_prints_and_writes_figure_and_json(data, capsys):
     describe(data, depth_scale=1e-5)
     out, facts = data.parent / "new" / "check.png", data.parent / "check.json"
     assert main(["check", str(data), "--out", str(out), "--json", str(facts)]) == 0

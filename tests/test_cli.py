@@ -1,4 +1,4 @@
-"""The command line: exit statuses, one-line complaints, and the main path from a folder to scores and a film."""
+"""The command line: exit statuses, one-line error messages, and the main path from a folder to scores and a video."""
 
 import json
 import shutil
@@ -59,7 +59,7 @@ def test_every_command_explains_itself(command, capsys):
         (["train", "nowhere", "out", "--density.min-densify-weight", "2"], "min_densify_weight"),
         pytest.param(["train", "nowhere", "out", "--device", "cuda"], "--device", marks=pytest.mark.slow),
         (["train", "nowhere", "out", "--render.backend", "triton"], "--device cuda"),
-        (["train", "nowhere", "out", "--render.backend", "cuda", "--device", "cpu"], "--render.backend cuda"),
+        (["train", "nowhere", "out", "--render.backend", "gsplat", "--device", "cpu"], "--render.backend gsplat"),
         (["eval", "nowhere", "--device", "gpu"], "gpu"),
         (["train", "nowhere", "out", "--weights-dir", "no-weights"], "no-weights"),
         (["eval", "nowhere"], "nowhere"),
@@ -75,7 +75,7 @@ def test_bad_usage_is_one_line_and_status_2(arguments, says, capsys, tmp_path, m
     assert list(tmp_path.iterdir()) == [], "something was left behind"
 
 
-def test_train_scores_and_says_what_was_skipped(run):
+def test_train_scores_and_reports_skipped_scores(run):
     _, folder = run
     metrics = json.loads((folder / "metrics.json").read_text())
     assert set(metrics) == {"protocol", "scores", "skipped"}
@@ -98,13 +98,13 @@ def test_eval_repeats_the_scores_of_train(run, tmp_path):
     assert {k: v for k, v in first.items() if k not in timed} == {k: v for k, v in second.items() if k not in timed}
 
 
-def test_eval_of_other_data_is_refused(run, make_tiny_sequence, capsys):
+def test_eval_of_other_data_is_an_error(run, make_tiny_sequence, capsys):
     _, folder = run
     assert main(["eval", str(folder), "--data", str(make_tiny_sequence("short", num_frames=9))]) == 2
     assert "17 frames" in complaint(capsys)
 
 
-def test_eval_without_its_sequence_says_so(run, tmp_path, capsys):
+def test_eval_without_its_sequence_is_an_error(run, tmp_path, capsys):
     _, folder = run
     shutil.copytree(folder, tmp_path / "moved")
     facts = json.loads((tmp_path / "moved" / "config.json").read_text())
@@ -114,7 +114,7 @@ def test_eval_without_its_sequence_says_so(run, tmp_path, capsys):
     assert "--data" in complaint(capsys)
 
 
-def test_render_writes_frames_depth_and_a_film(run, tmp_path):
+def test_render_writes_frames_depth_and_a_video(run, tmp_path):
     _, folder = run
     assert main(["render", str(folder), str(tmp_path / "out"), "--split", "test"]) == 0
     assert sorted(p.name for p in (tmp_path / "out" / "rgb").iterdir()) == ["000001.png", "000009.png"]
@@ -144,7 +144,7 @@ def test_render_of_chosen_times_and_a_camera_path(run, tmp_path, capsys):
     assert "path.json" in complaint(capsys)
 
 
-def test_prior_draws_maps_and_a_sheet(run, tmp_path, capsys):
+def test_prior_writes_maps_and_a_contact_sheet(run, tmp_path, capsys):
     data, _ = run
     assert main(["prior", str(data), str(tmp_path / "out"), "--split", "test"]) == 0
     for name in ("specular", "salience", "prior"):

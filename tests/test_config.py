@@ -6,11 +6,17 @@ from pathlib import Path
 
 import pytest
 
+from endoprior.cli.parsing import parse
+from endoprior.cli.train import Train
+from endoprior.core import config_io
 from endoprior.core.checks import InputError
-from endoprior.core.config import BasisConfig, Config, DensityConfig, HexPlaneConfig
+from endoprior.core.config import BasisConfig, Config, DensityConfig, HexPlaneConfig, RenderConfig
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.core.presets import preset
+from endoprior.experiments.spec import MethodSpec, SequenceSpec, Spec
 from endoprior.model.basis import identity_motion
+from endoprior.model.scene import SceneFacts
+from endoprior.runs.identity import refuse_other_run
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
 PRESETS = ("default", "paper", "released", "endogaussian")
@@ -86,3 +92,30 @@ def test_bumps_follow_the_length_of_the_sequence():
     assert fitted.deformation.basis.num_bases == 22 and fitted.fitted(99) == fitted
     with pytest.raises(ValueError, match=r"Config\.fitted"):
         identity_motion(3, preset("default").deformation)
+
+
+@pytest.mark.parametrize(("former", "current"), [("cpu", "numba"), ("cuda", "gsplat"), ("triton", "triton")])
+def test_files_with_former_names_of_backends_are_read(former, current, capsys):
+    stored, now = {"render": {"backend": former}}, Config(render=RenderConfig(current))
+    assert from_dict(Config, stored) == now
+    about = {"config": stored, "width": 9, "height": 9, "frames_per_second": 25.0}
+    assert from_dict(SceneFacts, about, "about").config == now
+    config = to_dict(now)
+    refuse_other_run(Path("f"), config | {"render": config["render"] | stored["render"]}, "data", now, "data", Path())
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--render.backend", "cpu"], ["--render.backend=cpu"]])
+def test_a_former_name_that_is_typed_gets_a_hint(words, capsys):
+    config_io._print_renamed.cache_clear()
+    assert parse(Train, [*words, "data", "out"], "train").config.render.backend == "numba"
+    assert capsys.readouterr().err == "endoprior: render.backend: `cpu` is now called `numba`\n"
+    assert parse(Train, ["--device", "cpu", "cpu", "cpu"], "train").data == Path("cpu")
+    assert not capsys.readouterr().err
+
+
+def test_a_former_name_in_a_benchmark_gets_a_hint(capsys):
+    config_io._print_renamed.cache_clear()
+    spec = Spec("t", {"s": SequenceSpec("f")}, {"m": MethodSpec(set={"render.backend": "cuda"})})
+    assert [spec.config("m", "s", None, seed).render.backend for seed in (0, 1)] == ["gsplat", "gsplat"]
+    assert capsys.readouterr().err == "endoprior: render.backend: `cuda` is now called `gsplat`\n"

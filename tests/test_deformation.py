@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from reference import basis as reference_basis
+from reference.hexplane import displacement
 from safetensors.torch import load_file, save_file
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import BasisConfig, DeformationConfig, HexPlaneConfig
@@ -19,7 +20,6 @@ from endoprior.model.attributes import motion_layout
 from endoprior.model.basis import basis_offsets, basis_weights, identity_motion
 from endoprior.model.deformation import HexPlaneField, Offsets, box_of_points
 from endoprior.model.heads import OffsetHeads
-from endoprior.model.hexplane import PLANE_NAMES
 from endoprior.model.ops import NUMBA
 
 SMALL = DeformationConfig(hexplane=HexPlaneConfig((6, 5, 4), 8, 12, (1, 2)))
@@ -47,27 +47,6 @@ def test_box_is_max_then_min_and_never_flat() -> None:
         box_of_points(torch.full((2, 3), float("nan")))
 
 
-def literal_offsets(model: HexPlaneField, means: Tensor, box: Tensor, time: float) -> Tensor:
-    """Displacement by the formulas of the published code, float64: u = (x - max) * 2 / (min - max) - 1."""
-    where = (means - box[0]) * 2 / (box[1] - box[0]) - 1
-    where = torch.cat([where, torch.full_like(where[:, :1], time)], -1)
-    features = []
-    for s in range(model.grid.num_scales):
-        product = 1.0
-        for name in PLANE_NAMES:
-            axes = where[:, ["xyzt".index(axis) for axis in name]][None, None]
-            image = model.grid.plane(s, name).double().permute(2, 0, 1)[None]
-            product = product * grid_sample(image, axes, padding_mode="border", align_corners=True)[0, :, 0].T
-        features.append(product)
-    layers = {name: value.detach().double() for name, value in model.heads.parameters.items()}
-    hidden = torch.cat(features, -1)
-    for layer in ("trunk", "means.hidden", "means.output"):
-        if layer != "trunk":
-            hidden = hidden.clamp(min=0)
-        hidden = hidden @ layers[f"{layer}.weight"].T + layers[f"{layer}.bias"]
-    return hidden
-
-
 def test_field_agrees_with_the_literal_formulas() -> None:
     """Offsets, and gradients of centers and box, where some Gaussians have left the box."""
     model = field()
@@ -78,7 +57,7 @@ def test_field_agrees_with_the_literal_formulas() -> None:
     (got * cotangent).sum().backward()
     double_means = means.detach().double().requires_grad_(True)
     double_box = model.box.detach().double().requires_grad_(True)
-    want = literal_offsets(model, double_means, double_box, 0.6)
+    want = displacement(model, double_means, double_box, 0.6)
     (want * cotangent).sum().backward()
     # float32 sums of 24 and 32 terms around 1.
     torch.testing.assert_close(got, want.float(), rtol=1e-4, atol=1e-5)
@@ -242,21 +221,11 @@ def test_motion_layout_follows_the_configuration() -> None:
     assert identity_motion(5, plain).shape == (5, 9, 3)
 
 
-def literal_weights(time: float, cfg: BasisConfig) -> list[float]:
-    weights = []
-    sigma, end = cfg.relative_width / cfg.num_bases, math.exp(-4.5)
-    for b in range(cfg.num_bases):
-        center = b / (cfg.num_bases - 1)
-        inside = abs(time - center) <= 3 * sigma
-        weights.append((math.exp(-((time - center) ** 2) / (2 * sigma**2)) - end) / (1 - end) if inside else 0.0)
-    return weights
-
-
 @pytest.mark.parametrize("time", [0.0, 0.31, 0.5, 0.999, 1.0])
 def test_basis_by_its_definition(time: float) -> None:
     cfg = replace(BASIS, deform_opacity=True)
     motion = torch.randn(300, 9, 14, generator=torch.Generator().manual_seed(1))
-    weights = literal_weights(time, cfg.basis)
+    weights = reference_basis.weights(time, cfg.basis)
     np.testing.assert_allclose(basis_weights(time, cfg.basis), weights, rtol=1e-12)
     assert 0 in weights  # the cut is being tested
     total = sum(w * motion[:, b].double() for b, w in enumerate(weights)).float()

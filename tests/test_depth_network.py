@@ -56,7 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @needs_transformers
-def test_a_folder_is_loaded_and_looks_at_a_picture_of_any_size(folder, monkeypatch):
+def test_a_model_folder_runs_on_any_image_size(folder, monkeypatch):
     monkeypatch.setattr(depth_network, "SHORT_SIDE_PX", 56)
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
     network = DepthNetwork(folder)
@@ -74,7 +74,7 @@ def test_a_folder_is_loaded_and_looks_at_a_picture_of_any_size(folder, monkeypat
 
 @needs_transformers
 @pytest.mark.parametrize("missing", FILES)
-def test_a_folder_without_a_file_is_refused(missing, tmp_path):
+def test_a_folder_without_a_file_is_an_error(missing, tmp_path):
     for file in set(FILES) - {missing}:
         (tmp_path / file).write_bytes(b"{}")
     with pytest.raises(InputError, match=f"{tmp_path}: expected .*no {missing}"):
@@ -82,7 +82,7 @@ def test_a_folder_without_a_file_is_refused(missing, tmp_path):
 
 
 @needs_transformers
-def test_files_of_something_else_are_refused(folder, tmp_path):
+def test_other_files_are_an_error(folder, tmp_path):
     for config, weights in ((b"{}", b"broken"), ((folder / "config.json").read_bytes(), b"broken")):
         (tmp_path / "config.json").write_bytes(config)
         (tmp_path / "model.safetensors").write_bytes(weights)
@@ -92,7 +92,7 @@ def test_files_of_something_else_are_refused(folder, tmp_path):
 
 
 @needs_transformers
-def test_weights_of_another_network_are_refused(folder, tmp_path):
+def test_weights_of_another_network_are_an_error(folder, tmp_path):
     from safetensors.numpy import save_file
 
     (tmp_path / "config.json").write_bytes((folder / "config.json").read_bytes())
@@ -103,7 +103,7 @@ def test_weights_of_another_network_are_refused(folder, tmp_path):
 
 @needs_transformers
 @pytest.mark.parametrize("name", ["/nowhere/at-all", "some_folder", "./a/b"])
-def test_what_is_neither_folder_nor_hub_name_asks_nobody(name, monkeypatch):
+def test_a_wrong_name_makes_no_network_request(name, monkeypatch):
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
     with pytest.raises(InputError, match="model folder") as caught:
         DepthNetwork(name)
@@ -111,7 +111,7 @@ def test_what_is_neither_folder_nor_hub_name_asks_nobody(name, monkeypatch):
 
 
 @needs_transformers
-def test_a_hub_name_is_looked_for_in_the_cache_first(folder, monkeypatch):
+def test_a_hub_name_is_searched_in_the_cache_first(folder, monkeypatch):
     asked = []
 
     def fetch(name, allow_patterns, local_files_only=False):

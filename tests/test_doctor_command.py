@@ -17,7 +17,7 @@ FOR_IMAGES = {"TORCH_CUDA_ARCH_LIST": "9.0"}
 
 def doctor(monkeypatch, facts, compiled=None, *options):
     """Run the command on a machine; `compiled` is gsplat after it compiled, None where it must not be asked to."""
-    monkeypatch.setattr("endoprior.doctor.look", lambda: facts)
+    monkeypatch.setattr("endoprior.doctor.read_facts", lambda: facts)
 
     def compiles(facts):
         assert compiled is not None, "nothing to compile"
@@ -40,14 +40,14 @@ def test_json_says_the_same(monkeypatch, capsys):
     assert doctor(monkeypatch, ONLY_TRITON, None, "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["device"], found["backend"], found["cuda_works"]) == ("cuda", "triton", True)
-    assert found["ways"] == {"triton": True, "gsplat": False} and found["next_step"].endswith("by Triton")
+    assert found["backends"] == {"triton": True, "gsplat": False} and found["next_step"].endswith("with Triton")
     assert doctor(monkeypatch, TO_COMPILE, None, "--json", "--compile") == 1
     assert "IndexError" in json.loads(capsys.readouterr().out)["compiling"]
 
 
-def test_what_hinders_compiling_is_named_and_the_status_says_so(monkeypatch, capsys):
+def test_what_compile_problem_is_named_and_the_status_says_so(monkeypatch, capsys):
     assert doctor(monkeypatch, replace(WORKING, gsplat=Gsplat()), None, "--compile") == 1
-    assert "gsplat was not compiled: first mend gsplat: not installed; pip install" in capsys.readouterr().out
+    assert "gsplat was not compiled: first fix gsplat: not installed; pip install" in capsys.readouterr().out
 
 
 def test_the_command_compiles_when_asked(monkeypatch, capsys):
@@ -66,31 +66,31 @@ def test_an_image_is_built_where_no_gpu_is(monkeypatch, capsys):
     assert "IndexError" in refused and "TORCH_CUDA_ARCH_LIST=9.0 endoprior doctor --compile" in refused
     machine = replace(TO_COMPILE, variables=FOR_IMAGES)
     assert doctor(monkeypatch, machine, replace(WORKING.gsplat, compile_seconds=365.0), "--compile") == 0
-    assert "gsplat is compiled, ready in 365 s; here is no GPU to draw on" in capsys.readouterr().out
+    assert "gsplat is compiled, ready in 365 s; there is no GPU to test it on" in capsys.readouterr().out
     assert doctor(monkeypatch, machine, Gsplat("1.5.3", loads=False, error="nvcc died"), "--compile") == 1
 
 
 @pytest.mark.parametrize(
-    ("change", "hinder"),
+    ("change", "problem"),
     [
         ({}, ""),
         ({"variables": {}}, "IndexError"),
         ({"variables": {"TORCH_CUDA_ARCH_LIST": "native"}}, "IndexError"),
         ({"variables": {"TORCH_CUDA_ARCH_LIST": ""}}, "IndexError"),
-        ({"toolkit": Toolkit(pip="/p")}, "first mend nvcc: no CUDA toolkit; pip install 'cuda-toolkit[nvcc,cccl]"),
-        ({"torch": Torch("2.13.0+cpu")}, "first mend torch: 2.13.0+cpu, built without CUDA; pip uninstall"),
-        ({"builders": replace(WORKING.builders, ninja="")}, "first mend ninja"),
+        ({"toolkit": Toolkit(pip="/p")}, "first fix nvcc: no CUDA toolkit; pip install 'cuda-toolkit[nvcc,cccl]"),
+        ({"torch": Torch("2.13.0+cpu")}, "first fix torch: 2.13.0+cpu, built without CUDA; pip uninstall"),
+        ({"builders": replace(WORKING.builders, ninja="")}, "first fix ninja"),
         ({"builders": replace(WORKING.builders, c_version="")}, ""),
         ({"torch": WORKING.torch, "driver": WORKING.driver, "variables": {}}, ""),
     ],
 )
-def test_what_hinders_compiling(change, hinder):
-    found = examine(replace(TO_COMPILE, **{"variables": FOR_IMAGES, **change})).hinders_compiling
-    assert hinder in found and bool(hinder) == bool(found) and "\n" not in found
+def test_what_prevents_compiling(change, problem):
+    found = examine(replace(TO_COMPILE, **{"variables": FOR_IMAGES, **change})).compile_problem
+    assert problem in found and bool(problem) == bool(found) and "\n" not in found
 
 
-def test_a_gpu_that_is_here_and_sick_is_mended_first():
+def test_a_broken_gpu_is_fixed_first():
     sick = replace(WORKING.torch, gpus=(replace(WORKING.torch.gpus[0], computes=False, error="sick"),))
     machine = replace(WORKING, torch=sick, gsplat=Gsplat("1.5.3"))
-    assert examine(machine).hinders_compiling.startswith("first mend GPU computes: ")
-    assert not examine(replace(machine, variables=FOR_IMAGES)).hinders_compiling
+    assert examine(machine).compile_problem.startswith("first fix GPU computes: ")
+    assert not examine(replace(machine, variables=FOR_IMAGES)).compile_problem

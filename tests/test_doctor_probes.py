@@ -1,4 +1,4 @@
-"""The doctor's probes: programs that answer, hang, die or print garbage, and what is seen of this machine."""
+"""The doctor's probes: programs that answer, hang, die or print garbage, and the facts of this machine."""
 
 import os
 import subprocess
@@ -11,12 +11,12 @@ from doctor_machines import NO_TRITON, WORKING, bare_machine, program
 from hypothesis import given
 from hypothesis import strategies as st
 
-from endoprior.doctor import Facts, examine, glance, look, mend
+from endoprior.doctor import Facts, examine, fixes, read_facts, read_facts_quickly
 from endoprior.doctor import facts as facts_module
-from endoprior.doctor.ask import MOST_BYTES, ask, clean
+from endoprior.doctor.choice import choose, choose_here
 from endoprior.doctor.driver import driver_answers, driver_files, read_banner, read_gpus
+from endoprior.doctor.probe_process import MOST_BYTES, clean, run_program
 from endoprior.doctor.records import Driver, Gpu, System, Torch, number
-from endoprior.system import devices as device
 
 
 @pytest.fixture
@@ -80,15 +80,15 @@ def test_nvidia_smi_that_hangs_fails_or_raves(path, body, says):
 
 def test_a_program_that_prints_without_end_is_stopped():
     began = time.monotonic()
-    said = ask(["sh", "-c", "while :; do echo garbage garbage garbage; done"], 20)
+    said = run_program(["sh", "-c", "while :; do echo garbage garbage garbage; done"], 20)
     assert "without end" in said.problem and len(said.text) == MOST_BYTES and time.monotonic() - began < 15
-    assert "cannot be run" in ask(["no-such-program-here"], 1).problem
-    assert ask(["sh", "-c", "echo out; echo err >&2; exit 3"], 5).problem == "sh ended with status 3"
+    assert "cannot be run" in run_program(["no-such-program-here"], 1).problem
+    assert run_program(["sh", "-c", "echo out; echo err >&2; exit 3"], 5).problem == "sh ended with status 3"
 
 
 def test_nothing_that_was_started_is_left():
     mark = f"98{os.getpid()}"
-    ask(["sh", "-c", f"sleep {mark} & sleep {mark}"], 0.3)
+    run_program(["sh", "-c", f"sleep {mark} & sleep {mark}"], 0.3)
     running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True).stdout
     assert f"sleep {mark}" not in running
 
@@ -140,7 +140,7 @@ def test_a_torch_that_breaks_hangs_or_dies(tmp_path, monkeypatch, body, says):
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, "torch")
     limit = 2.0 if "sleep" in body else 30.0
-    torch, *_ = facts_module._ask_torch(limit)
+    torch, *_ = facts_module._probe_torch(limit)
     assert (torch.version, torch.cuda, torch.available) == ("2.13.0+cu130", "13.0", None) and says in torch.error
     assert examine(replace(WORKING, torch=torch)).blocking.name == "torch"
 
@@ -161,7 +161,7 @@ def ones(n, device): raise RuntimeError("no kernel image is available")
     (tmp_path / "torch").mkdir()
     (tmp_path / "torch/__init__.py").write_text(fake)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    torch, *_ = facts_module._ask_torch(30.0)
+    torch, *_ = facts_module._probe_torch(30.0)
     assert torch.available is True and torch.architectures == ("sm_90",)
     assert torch.gpus[0] == Gpu("NVIDIA H200", (9, 0), 128.0, False, "no kernel image is available")
     assert torch.gpus[1] == Gpu("device 1", None, None, False, "fell off the bus")
@@ -214,19 +214,19 @@ def test_compiled_files_are_found_and_tried_without_importing_gsplat(tmp_path, m
     (tmp_path / "cache/gsplat_cuda/gsplat_cuda.so").write_bytes(b"no library")
     found = facts_module._gsplat(torch)
     assert (found.prebuilt, found.loads) == ("", False) and "gsplat_cuda.so" in found.error
-    assert mend.compile_again(replace(WORKING, gsplat=found)).startswith(f"rm -r {tmp_path}/cache/gsplat_cuda && ")
+    assert fixes.compile_again(replace(WORKING, gsplat=found)).startswith(f"rm -r {tmp_path}/cache/gsplat_cuda && ")
 
 
-def test_a_glance_costs_nothing_and_agrees_with_a_look():
+def test_quick_facts_take_no_time_and_agree_with_all_facts():
     began = time.monotonic()
-    seen = glance()
+    quick = read_facts_quickly()
     assert time.monotonic() - began < 1
-    assert seen.torch.version.startswith("2.") and seen.system.cores >= 1
-    looked = look()
-    assert (looked.torch.version, looked.torch.cuda) == (seen.torch.version, seen.torch.cuda)
-    assert looked.torch.error == "" and looked.packages.keys() == set(facts_module.PACKAGES)
-    assert device.choose_here("auto").device == device.choose("auto", looked).device
-    assert device.choose_here("cpu").why == "CPU: as asked"
+    assert quick.torch.version.startswith("2.") and quick.system.cores >= 1
+    facts = read_facts()
+    assert (facts.torch.version, facts.torch.cuda) == (quick.torch.version, quick.torch.cuda)
+    assert facts.torch.error == "" and facts.packages.keys() == set(facts_module.PACKAGES)
+    assert choose_here("auto").device == choose("auto", facts).device
+    assert choose_here("cpu").why == "CPU: as requested"
 
 
 def test_probes_that_raise_leave_the_others(monkeypatch):
@@ -237,11 +237,11 @@ def test_probes_that_raise_leave_the_others(monkeypatch):
         "_system",
         "driver_files",
         "_torch_files",
-        "_ask_torch",
+        "_probe_torch",
         "driver_answers",
-        "look_for_toolkit",
+        "find_toolkit",
         "_gsplat",
     ):
         monkeypatch.setattr(facts_module, name, fails)
-    facts = look()
+    facts = read_facts()
     assert facts.builders.compiler and examine(facts).next_step

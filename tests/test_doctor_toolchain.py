@@ -10,7 +10,7 @@ from doctor_machines import NO_TRITON, ONLY_TRITON, WORKING, bare_machine, progr
 from endoprior.doctor import examine, toolchain
 from endoprior.doctor import facts as facts_module
 from endoprior.doctor.records import Gsplat, System, Toolkit, Torch
-from endoprior.doctor.toolchain import look_for_builders, look_for_toolkit
+from endoprior.doctor.toolchain import find_builders, find_toolkit
 
 
 @pytest.fixture
@@ -23,33 +23,33 @@ NVCC = "echo 'Cuda compilation tools, release 13.0, V13.0.88'"
 
 def test_toolkit_is_found_where_torch_looks(tmp_path, path, monkeypatch):
     default = tmp_path / "local/cuda"
-    assert look_for_toolkit(default) == Toolkit()
+    assert find_toolkit(default) == Toolkit()
     program(tmp_path / "local/cuda-12.6/bin", "nvcc", NVCC.replace("13.0", "12.6"))
-    assert look_for_toolkit(default) == Toolkit(), "without headers it is of no use"
+    assert find_toolkit(default) == Toolkit(), "without headers it is of no use"
     (tmp_path / "local/cuda-12.6/include").mkdir()
     (tmp_path / "local/cuda-12.6/include/cuda_runtime.h").touch()
     others = ((str(tmp_path / "local/cuda-12.6"), "12.6"),)
-    assert look_for_toolkit(default) == Toolkit(others=others)
+    assert find_toolkit(default) == Toolkit(others=others)
     program(default / "bin", "nvcc", "echo garbage")
-    found = look_for_toolkit(default)
+    found = find_toolkit(default)
     assert (found.home, found.home_from, found.nvcc) == (str(default), "default", "") and "no version" in found.error
     program(path, "nvcc", NVCC)  # a wrapper far from its headers, as package managers leave it
-    found = look_for_toolkit(default)
+    found = find_toolkit(default)
     assert found == Toolkit(str(tmp_path), "PATH", "13.0", "", False, "", others, str(tmp_path / "lib64"))
     header = tmp_path / "targets/x86_64-linux/include/cuda_runtime.h"
     header.parent.mkdir(parents=True)
     header.touch()
-    assert look_for_toolkit(default).headers_elsewhere == str(header.parent)
+    assert find_toolkit(default).headers_elsewhere == str(header.parent)
     monkeypatch.setenv("CUDA_INC_PATH", str(header.parent))
-    assert look_for_toolkit(default).headers
+    assert find_toolkit(default).headers
     monkeypatch.setenv("CUDA_HOME", str(tmp_path / "gone"))
-    found = look_for_toolkit(default)
+    found = find_toolkit(default)
     assert found.home_from == "CUDA_HOME" and "gone" in found.error
 
 
 def test_nvcc_that_hangs(tmp_path, path):
     program(path, "nvcc", "sleep 30")
-    assert "no answer" in look_for_toolkit(tmp_path / "none", limit_s=0.3).error
+    assert "no answer" in find_toolkit(tmp_path / "none", limit_s=0.3).error
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_nvcc_that_hangs(tmp_path, path):
 )
 def test_compilers(path, body, version, is_gcc):
     program(path, "c++", body)
-    found = look_for_builders(limit_s=0.5)
+    found = find_builders(limit_s=0.5)
     assert (found.compiler_version, found.compiler_is_gcc) == (version, is_gcc)
     assert bool(found.compiler_error) == (not version)
 
@@ -76,7 +76,7 @@ def test_ninja_beside_python_but_not_on_path(tmp_path, monkeypatch, path):
     monkeypatch.setenv("PATH", str(path))
     monkeypatch.setattr(sys, "executable", str(tmp_path / "venv/bin/python"))
     program(tmp_path / "venv/bin", "ninja", "echo 1.13")
-    found = look_for_builders()
+    found = find_builders()
     assert found.ninja == "" and found.ninja_beside_python == str(tmp_path / "venv/bin")
     builders = replace(WORKING.builders, ninja="", ninja_beside_python=found.ninja_beside_python)
     assert examine(replace(NO_TRITON, builders=builders)).next_step == f'export PATH={tmp_path}/venv/bin:"$PATH"'
@@ -113,7 +113,7 @@ def test_a_toolkit_from_pip_step_by_step(tmp_path, path, monkeypatch):
     machine = replace(NO_TRITON, gsplat=Gsplat("1.5.3"))
 
     def step():
-        toolkit = look_for_toolkit(tmp_path / "none")
+        toolkit = find_toolkit(tmp_path / "none")
         return examine(replace(machine, toolkit=toolkit)).next_step
 
     assert step() == f"{PIP} && export CUDA_HOME='{folder}'"
@@ -147,15 +147,15 @@ def test_libcudart_is_looked_for_where_the_linker_looks(tmp_path, path, monkeypa
     monkeypatch.setenv("CUDA_HOME", str(tmp_path))
     (tmp_path / "lib").mkdir()
     (tmp_path / "lib/libcudart.so").touch()
-    found = look_for_toolkit()
+    found = find_toolkit()
     assert (found.libraries, found.cudart) == (str(tmp_path / "lib"), True)
     (tmp_path / "lib64").mkdir()  # torch takes it where it is there, whatever is in it
-    found = look_for_toolkit()
+    found = find_toolkit()
     assert (found.libraries, found.cudart, found.cudart_name) == (str(tmp_path / "lib64"), False, "")
     program(path, "c++", f'case "$1" in -print-file-name=libcudart.so) echo {tmp_path}/lib/libcudart.so;; esac')
-    assert look_for_toolkit().cudart, "the linker's own folders, as Debian has it"
+    assert find_toolkit().cudart, "the linker's own folders, as Debian has it"
     program(path, "c++", "echo libcudart.so")
-    assert not look_for_toolkit().cudart, "what a compiler says that did not find it"
+    assert not find_toolkit().cudart, "what a compiler says that did not find it"
 
 
 def test_a_library_that_is_nowhere():
@@ -170,11 +170,11 @@ def test_a_library_that_is_nowhere():
     [
         ("16.0.1", "13.0", "export CC=gcc-14 CXX=g++-14"),
         ("9.4.0", "13.0", "export CC=gcc-14 CXX=g++-14"),
-        ("9.4.0", "12.6", "nothing: CUDA works, by gsplat"),
-        ("10.2.1", "13.0", "nothing: CUDA works, by gsplat"),
+        ("9.4.0", "12.6", "nothing: CUDA works, with gsplat"),
+        ("10.2.1", "13.0", "nothing: CUDA works, with gsplat"),
     ],
 )
-def test_a_gcc_that_nvcc_or_cpp20_refuses_is_replaced_by_one_that_is_here(version, cuda, step):
+def test_a_gcc_that_nvcc_or_cpp20_refuses_is_replaced_by_one_that_is_installed(version, cuda, step):
     builders = replace(WORKING.builders, compiler_version=version, other_gcc=(9, 12, 14, 17))
     torch = replace(WORKING.torch, cuda=cuda)
     toolkit = replace(WORKING.toolkit, nvcc=cuda)
@@ -191,18 +191,18 @@ def test_a_gcc_that_nvcc_or_cpp20_refuses_is_replaced_by_one_that_is_here(versio
 def test_the_c_compiler_is_the_one_triton_takes(path, monkeypatch, cc, found):
     """CC as one word, else gcc, else clang."""
     monkeypatch.setenv("PATH", str(path))
-    assert look_for_builders().c_error == "no gcc, no clang on PATH"
+    assert find_builders().c_error == "no gcc, no clang on PATH"
     program(path, "clang", "echo 'clang version 17.0.0'")
-    assert look_for_builders().c_compiler == "clang"
+    assert find_builders().c_compiler == "clang"
     program(path, "gcc", "echo 'gcc (Debian 12.2.0-14) 12.2.0'")
     program(path, "ccache", "echo 'ccache version 4.8'")
     if cc is not None:
         monkeypatch.setenv("CC", cc)
-    builders = look_for_builders()
+    builders = find_builders()
     assert (builders.c_compiler, builders.c_version) == found
     machine = replace(ONLY_TRITON, builders=replace(WORKING.builders, c_version=found[1], c_error=builders.c_error))
     named = replace(machine, variables={} if cc is None else {"CC": cc})
-    assert examine(named).next_step == ("nothing: CUDA works, by Triton" if found[1] else "unset CC")
+    assert examine(named).next_step == ("nothing: CUDA works, with Triton" if found[1] else "unset CC")
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_the_c_compiler_is_the_one_triton_takes(path, monkeypatch, cc, found):
     [
         ({}, ""),
         ({"compiled_by": "/usr/local/cuda/bin/nvcc"}, ""),
-        ({"compiled_by": "/usr/local/cuda-13.0/bin/nvcc"}, "now that CUDA_HOME is /usr/local/cuda"),
+        ({"compiled_by": "/usr/local/cuda-13.0/bin/nvcc"}, "CUDA_HOME is now /usr/local/cuda"),
         ({"current": True}, ""),
         ({"current": False}, "another ninja"),
     ],

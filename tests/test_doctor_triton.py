@@ -1,4 +1,4 @@
-"""The doctor and Triton: the shorter of two ways to the GPU, and whether Triton was seen to compute."""
+"""The doctor and Triton: the backend that needs fewer fixes, and whether Triton computes."""
 
 import sys
 from dataclasses import replace
@@ -9,10 +9,10 @@ from doctor_machines import H200, NO_GPU, NO_TRITON, ONLY_TRITON, WORKING
 from endoprior.core.checks import InputError
 from endoprior.doctor import examine
 from endoprior.doctor import facts as facts_module
-from endoprior.doctor.ask import Answer, ask
+from endoprior.doctor.choice import Choice, choose
+from endoprior.doctor.probe_process import Answer, run_program
 from endoprior.doctor.records import Gsplat, System, Toolkit, Torch, Triton
 from endoprior.doctor.report import table
-from endoprior.system import devices as device
 
 INSTALL = ["pip install 'endoprior[cuda]'"]
 
@@ -20,26 +20,26 @@ INSTALL = ["pip install 'endoprior[cuda]'"]
 def test_triton_alone_is_enough():
     report = examine(ONLY_TRITON)
     assert (report.works, report.triton, report.gsplat) == (True, True, False)
-    assert report.next_step == "nothing: CUDA works, by Triton"
+    assert report.next_step == "nothing: CUDA works, with Triton"
     text = "\n".join(table(report))
-    assert "then Triton: works" in text and "or gsplat: not needed" in text
-    assert [line.mend for line in report.lines if line.part == "gsplat" and line.mend] == INSTALL, "and no more"
-    choice = device.choose("auto", ONLY_TRITON)
-    assert choice == device.Choice("cuda", "triton", "CUDA: NVIDIA H200, torch 2.13.0+cu130, Triton 3.7.1")
-    assert device.choose("cuda", ONLY_TRITON) == choice
+    assert "Triton: works" in text and "gsplat: not needed" in text
+    assert [line.fix for line in report.lines if line.part == "gsplat" and line.fix] == INSTALL, "and no more"
+    choice = choose("auto", ONLY_TRITON)
+    assert choice == Choice("cuda", "triton", "CUDA: NVIDIA H200, torch 2.13.0+cu130, Triton 3.7.1")
+    assert choose("cuda", ONLY_TRITON) == choice
 
 
 def test_gsplat_is_taken_where_both_work_and_never_compiled_where_triton_works():
-    assert device.choose("auto", WORKING).backend == device.choose("cuda", WORKING).backend == "cuda"
-    assert examine(WORKING).next_step == "nothing: CUDA works, by Triton and by gsplat"
+    assert choose("auto", WORKING).backend == choose("cuda", WORKING).backend == "gsplat"
+    assert examine(WORKING).next_step == "nothing: CUDA works, with Triton and gsplat"
     to_compile = replace(WORKING, gsplat=Gsplat("1.5.3"))
     for wanted in ("auto", "cuda"):
-        choice = device.choose(wanted, to_compile)
+        choice = choose(wanted, to_compile)
         assert (choice.device, choice.backend) == ("cuda", "triton")
         assert choice.why.endswith("Triton 3.7.1; gsplat is not compiled")
-    assert device.choose("auto", NO_TRITON).backend == "cuda"
-    with pytest.raises(InputError, match=r"got Triton: not installed\. Mend it: pip install triton==3\.7\.1"):
-        device.choose("cuda", replace(ONLY_TRITON, triton=Triton(wanted="triton==3.7.1")))
+    assert choose("auto", NO_TRITON).backend == "gsplat"
+    with pytest.raises(InputError, match=r"got Triton: not installed\. Fix: pip install triton==3\.7\.1"):
+        choose("cuda", replace(ONLY_TRITON, triton=Triton(wanted="triton==3.7.1")))
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_gsplat_is_taken_where_both_work_and_never_compiled_where_triton_works()
         ({}, "pip install triton==3.7.1"),
         ({"triton": Triton()}, "pip install triton"),
         ({"triton": Triton("3.0", "triton==3.7.1", False, "KeyError: 'sm_120'")}, "pip install triton==3.7.1"),
-        # Nothing is known to mend Triton: the way leads through gsplat.
+        # No fix of Triton is known: gsplat is next.
         ({"triton": Triton("3.7.1", "triton==3.7.1", False, "KeyError: 'sm_120'")}, "endoprior doctor --compile"),
         ({"system": System("Windows")}, "endoprior doctor --compile"),
         # One step each: Triton, which compiles in seconds. Two against one: gsplat.
@@ -59,7 +59,7 @@ def test_gsplat_is_taken_where_both_work_and_never_compiled_where_triton_works()
         ({"builders": replace(WORKING.builders, python_headers=False)}, "install the headers of Python 3.11"),
     ],
 )
-def test_the_shorter_way_is_named(changes, step):
+def test_the_backend_with_fewer_fixes_is_named(changes, step):
     machine = replace(WORKING, triton=Triton(wanted="triton==3.7.1"), gsplat=Gsplat("1.5.3"))
     report = examine(replace(machine, **changes))
     assert not report.works and step in report.next_step
@@ -74,14 +74,14 @@ def test_the_shorter_way_is_named(changes, step):
         ("[Errno 28] No space left on device", "export TRITON_CACHE_DIR="),
     ],
 )
-def test_what_triton_says_is_mended(error, step):
+def test_errors_of_triton_have_fixes(error, step):
     machine = replace(ONLY_TRITON, triton=Triton("3.7.1", "triton==3.7.1", False, error))
     report = examine(machine)
     assert report.next_step.startswith(step) and report.blocking.found == f"3.7.1: {error}"
-    assert device.choose("auto", machine).device == "cpu"
+    assert choose("auto", machine).device == "cpu"
 
 
-def test_interpreted_kernels_are_no_way_to_the_gpu():
+def test_interpreted_kernels_do_not_use_the_gpu():
     machine = replace(ONLY_TRITON, variables={"TRITON_INTERPRET": "1"})
     assert examine(machine).next_step == "unset TRITON_INTERPRET"
     assert examine(replace(machine, variables={"TRITON_INTERPRET": "0"})).works
@@ -89,10 +89,14 @@ def test_interpreted_kernels_are_no_way_to_the_gpu():
 
 def test_without_a_gpu_nothing_is_recommended():
     report = examine(NO_GPU)
-    assert not report.works and report.next_step.startswith("nothing to install: no NVIDIA GPU is seen")
-    rows = table(report)
-    assert not any("nvcc" in row or "C compiler" in row for row in rows)
-    assert any(row.split() == ["ok", "Triton", "3.7.1", "adds", "two", "numbers", "on", "the", "GPU"] for row in rows)
+    assert not report.works and report.next_step == "nothing to install. Everything runs on the CPU."
+    text = "\n".join(table(report))
+    assert "\nGPU: none found. Everything runs on the CPU.\n(In a container, start it with `--gpus all` to use" in text
+    assert not any(name in text for name in ("nvcc", "C compiler", "Triton"))
+    no_cuda = examine(replace(WORKING, system=System("Darwin")))
+    assert "\nsystem: Darwin x86_64: CUDA does not support it. Everything runs on the CPU.\n\n" in "\n".join(
+        table(no_cuda)
+    )
 
 
 FAKE_TORCH = """
@@ -139,7 +143,7 @@ def test_triton_is_tried_and_may_crash_or_hang(tmp_path, monkeypatch, launch, co
         (tmp_path / name / "__init__.py").write_text(text)
     (tmp_path / "triton/language.py").write_text("constexpr = int")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    torch, triton, *_ = facts_module._ask_torch(3.0 if "sleep" in launch else 30.0)
+    torch, triton, *_ = facts_module._probe_torch(3.0 if "sleep" in launch else 30.0)
     seen = (torch.version, torch.available, torch.gpus[0].computes, torch.error)
     assert seen == ("2.13.0+cu130", True, True, ""), "torch is judged alone"
     assert (triton.version, triton.computes) == ("3.7.1", computes) and says in triton.error
@@ -157,7 +161,7 @@ def test_triton_that_cannot_be_imported(tmp_path, monkeypatch, package, version,
     else:
         (tmp_path / "triton.py").write_text("raise ModuleNotFoundError(name='triton')")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    _, triton, *_ = facts_module._ask_torch(30.0)
+    _, triton, *_ = facts_module._probe_torch(30.0)
     assert (triton.version, triton.computes, triton.error) == (version, None, says)
 
 
@@ -189,4 +193,4 @@ def test_the_kernel_adds(monkeypatch):
     pytest.importorskip("triton")
     monkeypatch.setenv("TRITON_INTERPRET", "1")
     code = "from endoprior.doctor.triton_probe import adds; print(adds('cpu'))"
-    assert ask([sys.executable, "-c", code], 60).text.strip().endswith("True")
+    assert run_program([sys.executable, "-c", code], 60).text.strip().endswith("True")

@@ -68,7 +68,7 @@ def test_a_turned_scene_draws_the_same_picture(name):
     matrix = np.eye(4)
     matrix[:3, :3] = ROTATIONS[name]
     moved = replace(camera, world_to_camera=camera.world_to_camera @ matrix.T)
-    rasterize = render.load("cpu")
+    rasterize = render.load("numba")
     want = rasterize(splats, camera, background=torch.zeros(3))
     got = rasterize(splats_in_axes(splats, name), moved, background=torch.zeros(3))
     torch.testing.assert_close(

@@ -16,7 +16,7 @@ def tissue(count=6, height=120, width=160, seed=0):
     return [large[i : i + height, 2 * i : 2 * i + width].astype(np.uint8) for i in range(count)]
 
 
-def test_no_border_is_found_on_plain_tissue():
+def test_plain_tissue_has_no_border():
     assert not find_strips(tissue()) and find_circle(tissue()) is None
     assert not find_strips(tissue(1))
 
@@ -31,13 +31,13 @@ def test_strips_are_measured_to_the_pixel(side, level):
     assert find_strips(images) == Strips(**{name: 12 * (name == side) for name in ("top", "bottom", "left", "right")})
 
 
-def test_a_strip_with_still_text_counts_and_a_still_red_one_does_not():
+def test_a_strip_with_static_text_counts_and_a_static_red_one_does_not():
     images = tissue()
     for image in images:
         image[-12:], image[-9:-4, 20:60] = 60, 220
     assert find_strips(images).bottom == 12
     for image in images:
-        image[-12:] = (150, 40, 40)  # a still piece of tissue is still tissue
+        image[-12:] = (150, 40, 40)  # a static piece of tissue is tissue
     assert not find_strips(images)
 
 
@@ -63,7 +63,7 @@ def moved(image, shift=0.0, degrees=0.0, zoom=1.0):
     return cv2.warpAffine(image, matrix, (width, height), borderMode=cv2.BORDER_REFLECT)
 
 
-def test_shift_is_measured_in_pixels_of_the_pictures():
+def test_shift_is_measured_in_pixels_of_the_images():
     base = tissue(1, 400, 640)[0]
     found = camera_motion([moved(base, 3.0 * i) for i in range(20)])
     assert np.allclose(found.pixels_per_frame, 3, atol=0.15) and np.allclose(found.path_px, 3 * np.arange(20), atol=1)
@@ -84,12 +84,12 @@ def test_breathing_and_noise_are_no_camera_motion():
     assert not camera_motion(noisy).moving
 
 
-def test_what_nothing_explains_is_nan():
+def test_unexplained_steps_are_nan():
     found = camera_motion([tissue(1, seed=1)[0], tissue(1, seed=2)[0], np.zeros((120, 160, 3), np.uint8)])
     assert np.isnan(found.pixels_per_frame).all() and not found.moving and "0% of steps" in found.reason
 
 
-def test_masked_tools_do_not_count():
+def test_masked_tools_are_ignored():
     base = tissue(1, 240, 320)[0]
     images = [base.copy() for _ in range(8)]
     patch = tissue(1, 200, 200, seed=5)[0]

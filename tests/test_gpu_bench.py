@@ -1,4 +1,4 @@
-"""The GPU benchmark without a GPU: its dry run, and what it makes of a backend that is wrong or cannot run."""
+"""The GPU benchmark without a GPU: its dry run, and backends that are wrong or fail."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ def gpu_bench(monkeypatch):
     return importlib.import_module("gpu")
 
 
-def gpu_contest(monkeypatch):
-    """The CPU in the GPU's place."""
-    return gpu_bench(monkeypatch).Contest("cpu", torch.device("cpu"))
+def cpu_target(monkeypatch):
+    """The CPU in place of a GPU."""
+    return gpu_bench(monkeypatch).Target("numba", torch.device("cpu"))
 
 
 @pytest.mark.slow
 def test_gpu_bench_dry_run_agrees_times_and_writes(tmp_path, monkeypatch, capsys):
     out = tmp_path / "gpu.json"
-    options = ["--dry-run", "--scenes", "1", "--gaussians", "50", "--laps", "1", "--out", str(out)]
+    options = ["--dry-run", "--scenes", "1", "--gaussians", "50", "--repeats", "1", "--out", str(out)]
     assert gpu_bench(monkeypatch).main(options) == 0
     found, printed = json.loads(out.read_text()), capsys.readouterr().out
-    assert [g["agrees"] for g in found["gaps"]] == [True, True] and found["facts"]["GPU"].startswith("none")
-    assert len(found["laps"]) == 5 and all(lap["ms"] > 0 for lap in found["laps"])
+    assert [d["agrees"] for d in found["differences"]] == [True, True] and found["facts"]["GPU"].startswith("none")
+    assert len(found["timings"]) == 5 and all(timing["ms"] > 0 for timing in found["timings"])
     columns = {len(block.splitlines()[0].split("|")) for block in printed.split("\n\n")}
     assert len(found["runs"]) == 1 and found["runs"][0]["scores"]["psnr_tissue"] > 5
     assert len(columns) == 4 and all(
@@ -40,20 +40,20 @@ def test_gpu_bench_dry_run_agrees_times_and_writes(tmp_path, monkeypatch, capsys
     )
 
 
-def test_gpu_bench_can_have_the_kernels_interpreted(monkeypatch):
+def test_gpu_bench_can_interpret_the_kernels(monkeypatch):
     """That they agree, test_render_triton.py says on smaller scenes."""
     gpu = gpu_bench(monkeypatch)
-    (contest,) = gpu.contests(gpu.arguments().parse_args(["--interpreted"]))
-    assert (contest.backend, contest.device.type) == ("triton", "cpu")
+    (target,) = gpu.targets(gpu.arguments().parse_args(["--interpreted"]))
+    assert (target.backend, target.device.type) == ("triton", "cpu")
 
 
-def test_gpu_bench_sees_a_backend_that_draws_something_else(monkeypatch):
-    gpu, cuda = gpu_bench(monkeypatch), loaded(monkeypatch, kernels=object())
-    contest, case = gpu.Contest("cuda", torch.device("cpu")), gpu.random_case(1)
-    assert gpu.gap(contest, "cpu", case).agrees
+def test_gpu_bench_notices_a_wrong_backend(monkeypatch):
+    gpu, gsplat = gpu_bench(monkeypatch), loaded(monkeypatch, kernels=object())
+    target, case = gpu.Target("gsplat", torch.device("cpu")), gpu.random_case(1)
+    assert gpu.compared(target, "numba", case).agrees
     for factor in (1.002, NAN):
-        monkeypatch.setattr(cuda.gsplat, "rasterize_to_pixels", scaled_color(factor))
-        found = gpu.gap(contest, "cpu", case)
+        monkeypatch.setattr(gsplat.gsplat, "rasterize_to_pixels", scaled_color(factor))
+        found = gpu.compared(target, "numba", case)
         assert not found.agrees and found.stray > 0.01
 
 
@@ -61,18 +61,18 @@ def scaled_color(factor):
     """A rasterizer that is wrong by a factor."""
 
     def wrong(*args, **options):
-        drawn, alpha = rasterize_to_pixels(*args, **options)
-        return drawn * factor, alpha
+        blended, alpha = rasterize_to_pixels(*args, **options)
+        return blended * factor, alpha
 
     return wrong
 
 
-def test_gpu_bench_says_what_the_device_cannot_do_yet(monkeypatch):
+def test_gpu_bench_reports_what_fails(monkeypatch):
     def broken():
         raise TypeError("can't convert cuda:0 device type tensor to numpy.\nUse Tensor.cpu()")
 
-    lap = gpu_bench(monkeypatch).timed(gpu_contest(monkeypatch), "deformed", 7, broken, 1)
-    assert lap.ms is None and lap.note == "not possible: can't convert cuda:0 device type tensor to numpy."
+    timing = gpu_bench(monkeypatch).timed(cpu_target(monkeypatch), "deformed", 7, broken, 1)
+    assert timing.ms is None and timing.note == "failed: can't convert cuda:0 device type tensor to numpy."
 
 
 def test_gpu_bench_unpacks_a_wheel_beside_itself(tmp_path, monkeypatch):

@@ -9,29 +9,14 @@ import numpy as np
 import pytest
 import torch
 from hexplane_grids import SMALL, random_grid, random_layer, random_unit, sample
+from reference.hexplane import features
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from endoprior.core.config import HexPlaneConfig
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, TOUCHED, PlaneGrid, mapped_zeros
 from endoprior.model.hexplane_numba import CHUNK, hexplane_linear
 from endoprior.training.plane_adam import PlaneAdam
 from endoprior.training.plane_adam_numba import adam_planes_step, step_cells
-
-
-def reference(planes: list[list[Tensor]], unit: Tensor, coordinate: float) -> Tensor:
-    """The published definition in plain torch; `coordinate` is time as `grid_sample` takes it, planes (R, C, ch)."""
-    where = torch.cat([unit * 2 - 1, torch.full_like(unit[:, :1], coordinate)], -1)
-    features = []
-    for scale in planes:
-        product = 1.0
-        for name, plane in zip(PLANE_NAMES, scale, strict=True):
-            axes = where[:, ["xyzt".index(axis) for axis in name]][None, None]
-            image = plane.permute(2, 0, 1)[None]
-            sample = grid_sample(image, axes, mode="bilinear", padding_mode="border", align_corners=True)
-            product = product * sample[0, :, 0].T
-        features.append(product)
-    return torch.cat(features, -1)
 
 
 def planes_of(grid: PlaneGrid, source: Tensor | None = None) -> list[list[Tensor]]:
@@ -96,7 +81,7 @@ def test_agrees_with_grid_sample(channels: int, time_map: str) -> None:
 
         values = grid.values.double().requires_grad_(True)
         double_unit = unit.detach().double().requires_grad_(True)
-        want = reference(planes_of(grid, values), double_unit, time if time_map == "raw" else 2 * time - 1)
+        want = features(planes_of(grid, values), double_unit, time if time_map == "raw" else 2 * time - 1)
         (want * cotangent).sum().backward()
         # float32: six samples of four products each, around 1; a position rounds to 1e-7 of at most 17 cells.
         torch.testing.assert_close(got, want.float(), rtol=2e-5, atol=1e-6)
@@ -120,8 +105,8 @@ def test_linear_layer_agrees_with_grid_sample(channels: int) -> None:
 
     exact = [tensor.detach().double().requires_grad_(True) for tensor in (grid.values, unit, weight, bias)]
     values, double_unit, double_weight, double_bias = exact
-    features = [reference(planes_of(grid, values), double_unit, time) for time in times]
-    want = torch.stack([f @ double_weight.T + double_bias for f in features])
+    found = [features(planes_of(grid, values), double_unit, time) for time in times]
+    want = torch.stack([f @ double_weight.T + double_bias for f in found])
     (want * cotangents).sum().backward()
     torch.testing.assert_close(got, want.float(), rtol=2e-5, atol=2e-6)  # float32 means over up to 128 products
     for found, expected in zip((grid.grads, unit.grad, weight.grad, bias.grad), exact, strict=True):
@@ -176,7 +161,7 @@ def test_planes_begin_on_a_cache_line() -> None:
 def test_many_chunks_agree_with_grid_sample() -> None:
     """More Gaussians than one task holds, and a count that is no multiple of it."""
     grid, unit = random_grid(), random_unit(1003)
-    want = reference(planes_of(grid), unit, 0.5)
+    want = features(planes_of(grid), unit, 0.5)
     torch.testing.assert_close(sample(grid, unit, 0.5), want, rtol=5e-5, atol=1e-6)  # both float32
 
 

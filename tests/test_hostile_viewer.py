@@ -1,4 +1,4 @@
-"""What strangers can do to a viewer that is listening: nothing. One server takes it all, then serves a picture."""
+"""A viewer under attack: malformed requests and messages, floods, foreign pages. It keeps serving images."""
 
 import base64
 import os
@@ -86,7 +86,7 @@ def resident_mb() -> float:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def test_requests_that_are_none(viewer, good):
+def test_malformed_requests(viewer, good):
     rng = np.random.default_rng(0)
     requests = [b"", b"\0" * 10_000, rng.bytes(5000), b"GET", b"GET / HTTP/1.1\r\nHost: x\r\n", b"\x16\x03\x01" * 50]
     requests += [b"GET / HTTP/1.1\r\n" + b"X: " + b"a" * 10**6, b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 100_000]
@@ -109,7 +109,7 @@ def test_no_path_leads_out_of_the_page(viewer, good, secret):
         assert b"root:" not in answer and b"PATH=" not in answer and b"200 OK" not in answer.split(b"\r\n")[0], path
 
 
-def test_frames_that_are_none(viewer, good):
+def test_malformed_frames(viewer, good):
     before = resident_mb()
     bombs = [b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\x91" * 60_000]
     frames = [
@@ -188,7 +188,7 @@ class Stranger(Client):
         self.again()
 
     def camera(self, **changes) -> dict:
-        """The message that says where the camera is."""
+        """The message with the position of the camera."""
         place = {"wxyz": [1, 0, 0, 0], "position": [0, 0, 0], "look_at": [0, 0, 60], "up_direction": [0, -1, 0]}
         size = {"fov": 0.9, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 600}
         return {"type": "ViewerCameraMessage", **place, **size, **changes}
@@ -230,10 +230,10 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
     if orbit:
         good.set(viewer.panel.camera, panels.ENDOSCOPE)
         good.picture(quiet=0.2)
-    assert "view/" not in capfd.readouterr().err  # what viser says about broken messages is its own matter
+    assert "view/" not in capfd.readouterr().err  # messages of viser itself are allowed
 
 
-def test_only_the_folder_for_pictures_is_written_to(viewer, good):
+def test_only_the_output_folder_is_written_to(viewer, good):
     files = {path for path in viewer.out.parent.rglob("*") if viewer.out not in path.parents}
     assert files <= {viewer.out} and not list(viewer.out.parent.parent.rglob("*pwned*"))
 
@@ -241,7 +241,7 @@ def test_only_the_folder_for_pictures_is_written_to(viewer, good):
 ORIGINS = ("http://evil.example", "null", "http://127.0.0.1:1", "http://localhost.evil:{port}", "http://[", "x" * 999)
 
 
-def test_a_foreign_page_neither_sees_nor_commands(viewer, good):
+def test_a_foreign_page_can_neither_read_nor_control(viewer, good):
     """Browsers let any page open a WebSocket to this machine; what it sends at once must not be carried out."""
     at, own = viewer.settings.frame, f"Origin: http://127.0.0.1:{viewer.port}\r\n"
     orders = [Stranger.camera(good), gui(control_id(viewer.panel.frame), value=(at + 3) % 9)] * 2
@@ -260,7 +260,7 @@ def test_a_foreign_page_neither_sees_nor_commands(viewer, good):
     assert viewer.settings.frame == (at + 3) % 9  # and our own page's is
 
 
-def test_no_more_browsers_than_there_can_be(viewer, good):
+def test_the_number_of_browsers_is_limited(viewer, good):
     crowd = []
     for _ in range(MAX_BROWSERS + 8):
         with suppress(ConnectionClosed):
@@ -279,7 +279,7 @@ def test_no_more_browsers_than_there_can_be(viewer, good):
     assert free
 
 
-def test_a_flood_neither_stops_the_work_nor_fills_the_memory(viewer, good):
+def test_a_flood_of_messages_is_limited(viewer, good):
     """Training calls `work` between two iterations: it must come back however much is asked for."""
     before, stop, ended = resident_mb(), threading.Event(), []
 
@@ -321,7 +321,7 @@ def test_jobs_are_bounded_and_state_is_not_lost():
     assert len(jobs.take(0)) == 1 and jobs.take(0) == []
 
 
-def test_views_for_a_film_are_bounded(viewer, good):
+def test_saved_views_are_limited(viewer, good):
     for _ in range(MAX_KEPT + 5):
         good.set(viewer.panel.keep, True)
         time.sleep(0.002)
@@ -329,11 +329,11 @@ def test_views_for_a_film_are_bounded(viewer, good):
     while f"{MAX_KEPT} views" not in viewer.panel.status.content and time.monotonic() < end:
         time.sleep(0.05)
     time.sleep(0.2)
-    assert f"{MAX_KEPT} views kept" in viewer.panel.status.content
+    assert f"{MAX_KEPT} saved views" in viewer.panel.status.content
     good.set(viewer.panel.forget, True)
 
 
-def test_messages_are_judged():
+def test_messages_are_validated():
     camera = {k: v for k, v in Stranger.camera(None).items() if k != "type"}
 
     def sane(**changes):
@@ -353,7 +353,7 @@ def test_names_of_folders_are_text(viewer):
     assert "\n" not in panels.plain("a\nb") and panels.plain("größe 2") == "größe 2"
 
 
-def test_a_link_in_a_run_from_a_stranger_is_not_followed(tmp_path):
+def test_a_link_in_an_untrusted_run_is_not_followed(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "view").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(InputError, match="got a link"):

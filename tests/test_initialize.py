@@ -1,4 +1,4 @@
-"""Where points are drawn and how they are lifted."""
+"""Sampling of initial points and their back-projection."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_distribution_sums_to_one_inside_the_eroded_mask(rho, mask, eta):
 
 
 @pytest.mark.parametrize("eta", [0.0, 0.45])
-def test_no_texture_gives_even_draws(mask, eta):
+def test_no_texture_gives_uniform_sampling(mask, eta):
     probability = sampling_distribution(np.zeros((HEIGHT, WIDTH)), mask, InitConfig(uniform_fraction=eta))
     inside = probability[eroded_mask(mask, 9)]
     np.testing.assert_allclose(inside, 1 / len(inside), rtol=1e-12)
@@ -133,7 +133,7 @@ def test_no_tissue_gives_nothing(rho, mask):
     assert not sampling_distribution(rho, np.zeros_like(mask)).any()
 
 
-def test_poisoned_prior_is_named(rho, mask):
+def test_invalid_prior_is_named(rho, mask):
     for value in (np.nan, -0.1, np.inf):
         rho[2, 2] = value
         with pytest.raises(ValueError, match="rho must be finite and >= 0"):
@@ -145,7 +145,7 @@ def test_poisoned_prior_is_named(rho, mask):
 # --- drawing
 
 
-def test_single_draws_follow_the_distribution(rho, mask):
+def test_single_samples_follow_the_distribution(rho, mask):
     probability = sampling_distribution(rho[:12, :16], mask[:12, :16], InitConfig(erosion_px=5))
     rng = np.random.default_rng(7)
     draws = 50_000
@@ -158,7 +158,7 @@ def test_single_draws_follow_the_distribution(rho, mask):
     assert chisquare(drawn[possible], draws * probability[possible]).pvalue > 1e-4
 
 
-def test_a_million_draws_without_replacement_follow_the_distribution(rho, mask):
+def test_a_million_samples_without_replacement_follow_the_distribution(rho, mask):
     # Tiled 1,250 times, each pixel is so rare that drawing 2 % of the field leaves the odds as they were.
     probability = sampling_distribution(rho[:12, :16], mask[:12, :16], InitConfig(erosion_px=5))
     tiles = 1250
@@ -174,7 +174,7 @@ def test_a_million_draws_without_replacement_follow_the_distribution(rho, mask):
     np.testing.assert_allclose(drawn, expected, rtol=0.1, atol=0)
 
 
-def test_pairs_are_drawn_in_turn():
+def test_pairs_are_sampled_sequentially():
     weights = np.array([[1.0, 2.0, 3.0]])
     rng = np.random.default_rng(9)
     draws = 20_000
@@ -184,7 +184,7 @@ def test_pairs_are_drawn_in_turn():
     assert share == pytest.approx(2 / 6 * 3 / 4 + 3 / 6 * 2 / 3, abs=4 * 0.5 / math.sqrt(draws))  # 4 standard errors
 
 
-def test_draws_take_what_there_is():
+def test_sampling_returns_all_pixels_if_there_are_too_few():
     weights = np.array([[0, 0.5, 0, 1e-300]])
     rng = np.random.default_rng(0)
     np.testing.assert_array_equal(sample_pixels(weights, 10, rng), [1, 3])
@@ -245,7 +245,7 @@ def test_seed_decides(mask):
     assert not np.array_equal(first.points, other.points)
 
 
-def test_every_frame_gives_its_share(mask):
+def test_every_frame_contributes_its_share(mask):
     frames = [make_frame(mask, i) for i in range(3)]
     cloud = initial_points(frames, InitConfig(budget=101, sampler="uniform"))
     colors = [{tuple(c) for c in frame.rgb.reshape(-1, 3)} for frame in frames]
@@ -266,7 +266,7 @@ def test_pool_of_a_tiny_share_still_has_a_point_of_each_frame(mask):
     assert len(np.unique(cloud.points, axis=0)) == 4
 
 
-def test_frame_that_is_too_small_gives_what_it_has_and_says_so(mask, caplog):
+def test_a_frame_with_too_few_pixels_logs_a_warning(mask, caplog):
     small = np.zeros_like(mask)
     small[10, 3:8] = True
     frames = [make_frame(mask, 0), make_frame(small, 1), make_frame(np.zeros_like(mask), 2)]
@@ -292,7 +292,7 @@ def test_nothing_to_sample_is_bad_input(mask, sampler, frames, caplog):
     assert "\n" not in str(caught.value) and caplog.text.count("\n") <= 1
 
 
-def test_released_options_change_the_weights_as_told(mask):
+def test_released_options_change_the_weights(mask):
     frame = make_frame(mask)
     frame = replace(frame, rgb_u8=(frame.rgb_u8 // 2 + 120))  # bright: the 97th percentile exceeds 0.85
     eroded = eroded_mask(mask, 9)

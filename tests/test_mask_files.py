@@ -1,4 +1,4 @@
-"""Masks of users in all their forms, their polarity, complaints that name file, expectation, finding and fix."""
+"""Mask files in all formats, their polarity, and error messages that name file, problem and fix."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ EXACT = {
 
 
 @pytest.mark.parametrize("name", EXACT)
-def test_every_form_gives_the_same_mask(tmp_path, name):
+def test_every_format_gives_the_same_mask(tmp_path, name):
     assert (read_user_mask(save(tmp_path / name, EXACT[name]), SIZE) == TRUE).all()
 
 
@@ -103,7 +103,7 @@ def unusable(folder):
         "cannot be decoded": folder / "broken.png",
         "a NumPy file": folder / "broken.npy",
         "pickled objects": folder / "objects.npy",
-        "one array, got 2": folder / "two.npz",
+        "one array": folder / "two.npz",
         "many colors": save(folder / "photo.png", photo),
         "No such file": folder / "absent.png",
         "numbers of shape": save(folder / "flat.npy", np.zeros(5)),
@@ -111,7 +111,7 @@ def unusable(folder):
     }
 
 
-def test_complaints_name_the_file_on_one_line(tmp_path):
+def test_error_messages_name_the_file_on_one_line(tmp_path):
     for finding, path in unusable(tmp_path).items():
         with pytest.raises(InputError) as error:
             read_user_mask(path, SIZE)
@@ -119,7 +119,7 @@ def test_complaints_name_the_file_on_one_line(tmp_path):
         assert str(path) in text and finding in text and "expected" in text and "\n" not in text
 
 
-def test_polarity_as_told_detected_or_by_convention():
+def test_polarity_by_option_detection_or_convention():
     image = np.where(TRUE[..., None], (120, 120, 120), (190, 90, 85)).astype(np.uint8)
     assert tool_polarity("low", [TRUE], [image]).tool_is_high is False
     assert "--mask-tool-value" in tool_polarity("high", [~TRUE], [image]).reason

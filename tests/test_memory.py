@@ -15,7 +15,7 @@ from endoprior.runs.training_run import train
 from endoprior.system.memory import LEAST_CACHE, BoundedCache, available_bytes, cache_bytes
 
 
-def test_what_is_free_is_between_nothing_and_all():
+def test_free_memory_is_between_zero_and_total():
     assert 0 < available_bytes() <= os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -39,7 +39,7 @@ def test_the_size_of_caches_can_be_set(monkeypatch, value, wanted):
 
 
 @pytest.mark.parametrize(("kind", "option"), [(resource.RLIMIT_DATA, "-d"), (resource.RLIMIT_AS, "-v")])
-def test_a_limit_under_which_nothing_loads_is_refused_at_once(kind, option):
+def test_a_limit_too_small_for_the_libraries_is_an_error(kind, option):
     def limited():
         resource.setrlimit(kind, (400 * 2**20, 400 * 2**20))
 
@@ -49,7 +49,7 @@ def test_a_limit_under_which_nothing_loads_is_refused_at_once(kind, option):
     assert f"ulimit {option}: expected at least" in done.stderr and "400 MB" in done.stderr
 
 
-def test_the_least_recently_used_goes_first():
+def test_the_least_recently_used_is_evicted_first():
     made = []
     cache = BoundedCache(30, len)
 

@@ -1,4 +1,4 @@
-"""Burned-in writing: found where it stands still before a moving image, and nowhere else."""
+"""Detection of burned-in text: static text in a changing image, and nothing else."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def ink(frames, marked):
 
 
 @pytest.mark.parametrize("box", [False, True])
-def test_writing_is_found_where_it_is(box):
+def test_text_is_detected_at_its_position(box):
     frames = moving()
     marked = written(frames, box=box)
     left, top, right, bottom = ink(frames, written(frames))
@@ -52,23 +52,23 @@ def test_writing_is_found_where_it_is(box):
     assert width * height < 4 * (right - left) * (bottom - top)
 
 
-def test_two_labels_come_from_top_to_bottom():
+def test_two_labels_are_sorted_from_top_to_bottom():
     first, second = find_static_overlays(written(written(moving()), "CAM2", (140, 30)))
     assert first[1] < second[1] and first[0] > second[0]
 
 
-def test_nothing_without_writing():
+def test_no_text_gives_nothing():
     assert find_static_overlays(moving()) == []
 
 
-def test_a_still_scene_says_nothing():
+def test_a_static_scene_gives_nothing():
     marked = written(moving())[0]
     noise = np.random.default_rng(3)
     still = [np.clip(marked + noise.normal(0, 2, marked.shape), 0, 255).astype(np.uint8) for _ in range(COUNT)]
     assert find_static_overlays(still) == []
 
 
-def test_borders_and_round_borders_are_no_writing():
+def test_borders_are_not_text():
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     round_border = (x - 120) ** 2 + (y - 80) ** 2 < 75**2
     bars = (x >= 20) & (x < 220) & (y >= 12) & (y < 150)
@@ -78,7 +78,7 @@ def test_borders_and_round_borders_are_no_writing():
     assert find_static_overlays([np.where(divider[..., None], 255, p).astype(np.uint8) for p in moving()]) == []
 
 
-def test_too_few_pictures_say_nothing():
+def test_too_few_images_give_nothing():
     marked = written(moving())
     assert find_static_overlays(marked[:4]) == [] and find_static_overlays([]) == []
     with pytest.raises(ValueError, match="image must have shape"):

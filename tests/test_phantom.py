@@ -86,7 +86,7 @@ def test_description_and_poses(folder):
     assert (poses[:, 15] > 15).all() and (poses[:, 16] < 120).all() and (poses[:, 15] < poses[:, 16]).all()
 
 
-def test_mask_marks_a_tool_of_sensible_size(folder):
+def test_mask_marks_a_tool_of_plausible_size(folder):
     for index in range(SMALL.frames):
         image, mask, _, truth, _ = frame(folder, index)
         assert 0.02 < mask.mean() < 0.40
@@ -95,7 +95,7 @@ def test_mask_marks_a_tool_of_sensible_size(folder):
         assert np.median(gap[mask]) > 20 > np.percentile(gap[~mask], 99)
 
 
-def test_picture_is_the_truth_plus_noise_outside_the_mask(folder):
+def test_image_is_the_truth_plus_noise_outside_the_mask(folder):
     for index in range(SMALL.frames):
         image, mask, _, truth, _ = frame(folder, index)
         gap = image.astype(float)[~mask] - truth[~mask]
@@ -134,19 +134,19 @@ def test_tracks_lie_on_the_true_surface_where_visible(folder):
         assert np.median(error) < 0.1 and np.percentile(error, 95) < 1.2
 
 
-def test_something_moves_far_and_something_hardly(folder):
+def test_some_tracks_move_far_and_some_hardly(folder):
     points = np.load(folder / "truth/tracks.npz")["points"]
     moved = np.linalg.norm(points - points[:1], axis=-1).max(0)
     assert moved.max() > 8 and np.percentile(moved, 20) < 4.5  # the pull is local, breathing is a few mm
 
 
-def test_occlusion_wanders_and_ends(folder):
+def test_occlusion_moves_and_ends(folder):
     masks = np.stack([frame(folder, i)[1] for i in range(SMALL.frames)])
     ever = masks.any(0)
     assert (ever & ~masks.all(0)).sum() > 0.3 * ever.sum()
 
 
-def test_right_eye_sees_the_left_picture_shifted_by_disparity(folder):
+def test_right_image_is_the_left_one_shifted_by_disparity(folder):
     described = json.loads((folder / "calibration.json").read_text())
     assert described["T_mm"] == [-4.2, 0, 0] and described["K_left"] == described["K_right"]
     assert np.array_equal(described["R"], np.eye(3)) and described["K_left"][0][2] == 48
@@ -163,7 +163,7 @@ def test_right_eye_sees_the_left_picture_shifted_by_disparity(folder):
     assert gap[1.0] < 0.85 * min(gap[0.7], gap[1.3]) and gap[1.0] < 0.5 * gap[0.0]
 
 
-def test_same_seed_same_bytes_whatever_the_threads(folder, tmp_path):
+def test_same_seed_gives_the_same_bytes_for_any_threads(folder, tmp_path):
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
@@ -176,7 +176,7 @@ def test_same_seed_same_bytes_whatever_the_threads(folder, tmp_path):
         assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
-def test_seeds_differ_and_mono_has_no_right_eye(folder, tmp_path):
+def test_seeds_differ_and_mono_has_no_right_image(folder, tmp_path):
     out = tmp_path / "other"
     done = []
     cfg = dataclasses.replace(SMALL, seed=4, frames=2, stereo=False)
@@ -188,7 +188,7 @@ def test_seeds_differ_and_mono_has_no_right_eye(folder, tmp_path):
     assert np.abs(np.load(out / "truth/depth/000000.npy") - np.load(folder / "truth/depth/000000.npy")).mean() > 2
 
 
-def test_principal_point_moves_the_picture(tmp_path):
+def test_principal_point_moves_the_image(tmp_path):
     # The same ray is seen at another pixel: an off-center principal point shifts the true depth map by whole pixels.
     out, count = {}, 2
     for x in (48.0, 52.0):
@@ -200,7 +200,7 @@ def test_principal_point_moves_the_picture(tmp_path):
     assert np.median(np.abs(out[48.0][:, :-4] - out[52.0][:, 4:])) < 0.05
 
 
-def test_occupied_output_is_refused(tmp_path):
+def test_occupied_output_is_an_error(tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "note.txt").write_text("mine")
     with pytest.raises(InputError, match=r"full.*new or empty"):
@@ -243,7 +243,7 @@ def test_motion_never_folds_the_tissue(seed):
         assert (aa * bb - ab * ba).min() > 0.02  # area ratio of the map (a, b) -> moved (a, b); 1 is undeformed
 
 
-def test_motion_and_tools_have_no_jerks():
+def test_motion_and_tools_are_smooth():
     cfg = PhantomConfig(frames=96)  # two cycles, so that the hand-over between them is covered
     motion = build_motion(cfg, build_plane(cfg), build_anatomy(0))
     steps = 2000

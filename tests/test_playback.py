@@ -88,9 +88,9 @@ def test_another_camera_and_no_such_frame(scene):
 
 @pytest.mark.parametrize(
     "trained, asked, on_gpu, want",
-    [("cpu", None, False, "cpu"), ("cpu", None, True, "cuda"), ("cpu", "triton", True, "triton"),
-     ("triton", None, True, "triton"), ("triton", None, False, "cpu"), ("reference", None, False, "reference"),
-     ("cuda", "triton", True, "triton"), ("cuda", "triton", False, "cpu")],
+    [("numba", None, False, "numba"), ("numba", None, True, "gsplat"), ("numba", "triton", True, "triton"),
+     ("triton", None, True, "triton"), ("triton", None, False, "numba"), ("reference", None, False, "reference"),
+     ("gsplat", "triton", True, "triton"), ("gsplat", "triton", False, "numba")],
 )  # fmt: skip
 def test_what_draws_a_scene_fits_its_device(scene, trained, asked, on_gpu, want):
     config = replace(scene.config, render=replace(scene.config.render, backend=trained))

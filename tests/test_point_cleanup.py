@@ -96,7 +96,7 @@ def test_scale_of_a_grid_is_its_spacing():
     np.testing.assert_allclose(np.exp(initial_log_scales(grid)), 2.5, rtol=1e-6)
 
 
-def test_coinciding_points_get_the_floor():
+def test_coinciding_points_get_the_minimum_scale():
     points = np.zeros((9, 3), np.float32)
     points[8] = 7
     scales = np.exp(initial_log_scales(points, 0.4))
@@ -105,15 +105,15 @@ def test_coinciding_points_get_the_floor():
 
 
 @pytest.mark.parametrize("points", [np.zeros((3, 3)), np.full((9, 3), np.nan), np.zeros((9, 2)), np.zeros((0, 3))])
-def test_poisoned_points_are_named(points):
+def test_invalid_points_are_named(points):
     with pytest.raises(ValueError, match="points must"):
         initial_log_scales(points)
 
 
-def test_joined_keeps_order_and_origins():
+def test_concatenated_keeps_order_and_origins():
     rng = np.random.default_rng(5)
     cloud = cloud_of(rng.random((10, 3), np.float32), rng.random((10, 3), np.float32))
-    again = concatenated([cloud.taken(np.arange(4)), cloud.taken(np.arange(10) >= 4)])
+    again = concatenated([cloud.subset(np.arange(4)), cloud.subset(np.arange(10) >= 4)])
     for name in ("points", "colors", "origins"):
         np.testing.assert_array_equal(getattr(again, name), getattr(cloud, name))
     assert len(concatenated([])) == 0

@@ -20,7 +20,7 @@ def scene(tool_color=(120, 120, 125), tissue_color=(190, 90, 85), columns=20, se
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_gray_side_is_the_tool(inverted):
+def test_the_gray_region_is_the_tool(inverted):
     tool, image = scene()
     found = mask_polarity([tool ^ inverted] * 3, [image] * 3)
     assert found.tool_is_high != inverted
@@ -38,14 +38,14 @@ def test_color_outweighs_area(inverted):
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_area_decides_where_color_says_nothing(inverted):
+def test_area_decides_without_color(inverted):
     tool, image = scene(tool_color=(150, 100, 100), tissue_color=(150, 100, 100))
     found = mask_polarity([tool ^ inverted], [image])
     assert found.tool_is_high != inverted
     assert 0.3 < found.certainty < 0.95
 
 
-def test_unsure_where_nothing_speaks():
+def test_ambiguous_masks_have_low_certainty():
     _, image = scene(columns=0)
     left = np.zeros((HEIGHT, WIDTH), bool)
     left[:, : WIDTH // 2] = True
@@ -58,7 +58,7 @@ def test_unsure_where_nothing_speaks():
         assert found.tool_is_high != high.all()  # no tools rather than nothing but tools
 
 
-def test_what_lies_outside_a_round_border_does_not_count():
+def test_pixels_outside_a_round_border_are_ignored():
     tool, image = scene()
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     outside = (x - 40) ** 2 + (y - 30) ** 2 > 22**2  # two thirds of all pixels, black and so as gray as the tool

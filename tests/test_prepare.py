@@ -84,7 +84,7 @@ def test_a_stereo_video_becomes_a_sequence(tmp_path, phantom, layout):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "v.mp4"]
 
 
-def test_two_folders_of_pictures_and_a_part_of_them(tmp_path, phantom):
+def test_two_image_folders_and_a_time_range(tmp_path, phantom):
     cfg = options(phantom, right=phantom / "right", start=1 / 25, end=4 / 25, border="keep")
     done = prepare(phantom / "images", tmp_path / "out", cfg)
     assert done.num_frames == 3
@@ -135,7 +135,7 @@ def test_a_distorted_pair_is_rectified(tmp_path, phantom):
     assert np.median(np.abs(points[inside, 2] - true[at_y[inside], at_x[inside]])) < 1.2
 
 
-def test_one_eye_and_nothing_else(tmp_path, phantom):
+def test_monocular_video_without_options(tmp_path, phantom):
     done = prepare(write_video(tmp_path / "v.mp4", cameras(phantom)[0]), tmp_path / "out")
     sequence = load_sequence(done.out)
     assert sequence.depth_is_relative and sequence.frame(0).depth_valid.mean() > 0.9
@@ -147,7 +147,7 @@ def test_one_eye_and_nothing_else(tmp_path, phantom):
 
 
 @pytest.mark.parametrize("kind", ["npy", "png", "tiff"])
-def test_depth_of_the_user_with_a_unit(tmp_path, phantom, kind):
+def test_depth_files_with_a_unit(tmp_path, phantom, kind):
     (tmp_path / "depth").mkdir()
     for index, frame in enumerate(load_sequence(phantom).frames("video")):
         meters = (frame.depth / 1000).astype(np.float32)
@@ -193,7 +193,7 @@ def test_relative_disparity_of_a_network(tmp_path, phantom):
     assert np.corrcoef(1 / frame.depth[frame.tissue_mask], 1 / true[frame.tissue_mask])[0, 1] > 0.99
 
 
-def test_a_folder_is_known_by_more_than_its_name(tmp_path, phantom, monkeypatch):
+def test_source_identity_includes_the_files_of_a_folder(tmp_path, phantom, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "depth-anything-maps"
     folder.mkdir()
@@ -205,7 +205,7 @@ def test_a_folder_is_known_by_more_than_its_name(tmp_path, phantom, monkeypatch)
     assert np.median(np.abs(load_sequence(done.out).frame(1).depth - np.load(folder / "1.npy"))) < 0.01
 
 
-def test_inverted_masks_are_turned(tmp_path, phantom):
+def test_inverted_masks_are_corrected(tmp_path, phantom):
     (tmp_path / "masks").mkdir()
     for file in (phantom / "masks").glob("*.png"):
         cv2.imwrite(str(tmp_path / "masks" / file.name), 255 - cv2.imread(str(file), 0))
@@ -216,7 +216,7 @@ def test_inverted_masks_are_turned(tmp_path, phantom):
         assert np.array_equal(mine.tissue_mask, true.tissue_mask)
 
 
-def test_names_are_painted_over_and_nothing_of_the_file_is_copied(tmp_path, phantom):
+def test_labels_are_blanked_and_no_metadata_is_copied(tmp_path, phantom):
     cfg = options(phantom, layout="mono", blank=("10,20,50,15",))
     done = prepare(write_video(tmp_path / "SMITH_John.mkv", cameras(phantom)[0]), tmp_path / "out", cfg)
     frame = load_sequence(done.out).frame(1)
@@ -226,7 +226,7 @@ def test_names_are_painted_over_and_nothing_of_the_file_is_copied(tmp_path, phan
 
 
 @pytest.mark.slow
-def test_frames_out_of_the_body_can_be_dropped(tmp_path, phantom):
+def test_frames_outside_the_body_can_be_dropped(tmp_path, phantom):
     images = cameras(phantom)[0]
     images.insert(2, np.full_like(images[0], (90, 140, 160)))
     video = write_video(tmp_path / "v.mkv", images)
@@ -237,7 +237,7 @@ def test_frames_out_of_the_body_can_be_dropped(tmp_path, phantom):
     assert dropped.num_frames == FRAMES
 
 
-def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, phantom):
+def test_an_interrupted_run_resumes_with_identical_files(tmp_path, phantom):
     cfg = options(phantom, right=phantom / "right")
     want = prepare(phantom / "images", tmp_path / "want", cfg).out
 
@@ -331,7 +331,7 @@ def test_the_command(tmp_path, phantom, capsys):
     assert main(["prepare", str(video), str(tmp_path / "new"), "--end", "-1"]) == 2
 
 
-def test_the_hidden_folder_is_the_only_thing_an_interruption_leaves(tmp_path, phantom):
+def test_an_interruption_leaves_only_the_hidden_folder(tmp_path, phantom):
     def stop(what, done, total):
         raise KeyboardInterrupt
 
@@ -343,7 +343,7 @@ def test_the_hidden_folder_is_the_only_thing_an_interruption_leaves(tmp_path, ph
 
 
 @pytest.mark.slow
-def test_a_moving_camera_with_one_eye(tmp_path):
+def test_moving_monocular_camera(tmp_path):
     rng = np.random.default_rng(0)
     noise = cv2.GaussianBlur(rng.random((500, 700, 3), np.float32), (0, 0), 2)
     wall = (60 + 150 * (noise - noise.min()) / np.ptp(noise) * np.array([1, 0.5, 0.45])).astype(np.uint8)

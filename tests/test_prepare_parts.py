@@ -27,7 +27,7 @@ def pair(shift=6):
     return wide[:, :96], wide[:, shift : shift + 96]
 
 
-def test_eyes_come_apart_as_they_were_put_together():
+def test_split_cameras_inverts_every_layout():
     left, right = pair()
     for layout, frame in (("side-by-side", np.hstack([left, right])), ("top-bottom", np.vstack([left, right]))):
         assert all(np.array_equal(a, b) for a, b in zip(split_cameras(frame, layout), (left, right), strict=True))
@@ -46,7 +46,7 @@ def stereo(size=None, layout=None):
     return Calibration(camera, camera, np.eye(3), np.array([-4.0, 0, 0]), size, layout)
 
 
-def test_the_layout_is_found():
+def test_the_layout_is_detected():
     left, right = pair()
     rows = np.empty((128, 96, 3), np.uint8)
     rows[::2], rows[1::2] = left, right
@@ -59,7 +59,7 @@ def test_the_layout_is_found():
     assert find_layout(left, None, False, "v") == "mono" and find_layout(left, None, True, "v") == "two-files"
 
 
-def test_a_layout_that_cannot_be_told_is_asked_for():
+def test_an_unknown_layout_is_an_error():
     left, right = pair()
     with pytest.raises(InputError, match=r"v: expected two cameras in each frame, got 96x64 px.*--layout"):
         find_layout(smooth(64, 96), stereo((50, 60)), False, "v")
@@ -74,18 +74,18 @@ def geometry_of(size, calibration=None, **options):
     return make_geometry(size, calibration, **(base | options))
 
 
-def test_a_plain_view_changes_nothing():
+def test_default_geometry_is_the_identity():
     geometry, image = geometry_of((96, 64)), smooth(64, 96)
     assert np.array_equal(geometry.image(image), image) and geometry.inside.all()
     assert np.allclose(geometry.matrix, [[48, 0, 48], [0, 48, 32], [0, 0, 1]])  # 90 degrees across 96 px
 
 
-def test_odd_sizes_stay(tmp_path):
+def test_odd_sizes_are_unchanged(tmp_path):
     geometry = geometry_of((97, 63))
     assert geometry.size == (97, 63) and np.array_equal(geometry.image(smooth(63, 97)), smooth(63, 97))
 
 
-def test_cutting_and_shrinking_move_the_principal_point():
+def test_crop_and_resize_move_the_principal_point():
     geometry = geometry_of((200, 100), crop=(20, 10, 120, 80), max_width=60)
     assert geometry.size == (60, 40)
     assert np.allclose(geometry.matrix, [[50, 0, (100 - 20) / 2], [0, 50, (50 - 10) / 2], [0, 0, 1]])
@@ -94,7 +94,7 @@ def test_cutting_and_shrinking_move_the_principal_point():
     assert np.array_equal(geometry.image(image), want)
 
 
-def test_strips_circle_and_blank_rectangles_are_left_out():
+def test_strips_circle_and_blank_rectangles_are_excluded():
     circle = Circle(50, 40, 35)
     geometry = geometry_of((100, 80), strips=Strips(0, 10, 0, 0), circle=circle, blank=[(40, 30, 10, 5)])
     kept = circle.mask(100, 80, 0.025 * 35)
@@ -108,7 +108,7 @@ def test_strips_circle_and_blank_rectangles_are_left_out():
     assert not geometry.image(np.full((80, 100, 3), 9, np.uint8))[painted[box]].any()
 
 
-def test_values_are_never_mixed_and_may_have_either_size():
+def test_masks_use_nearest_neighbor_at_either_size():
     geometry = geometry_of((200, 100), max_width=50)
     mask = np.random.default_rng(0).random((100, 200)) > 0.5
     assert geometry.size == (50, 25) and geometry.values(mask).shape == (25, 50) and geometry.values(mask).dtype == bool
@@ -121,7 +121,7 @@ def project(points, matrix, distortion, rotation, translation):
     return pixels[:, 0]
 
 
-def test_rectified_eyes_see_a_point_in_one_row_at_the_disparity_of_its_depth():
+def test_rectified_pair_has_equal_rows_and_the_true_disparity():
     left = Intrinsics(np.array([[300.0, 0, 160.5], [0, 301, 120.5], [0, 0, 1]]), np.array([-0.2, 0.05, 0.001, 0, 0]))
     right = Intrinsics(np.array([[295.0, 0, 165.5], [0, 296, 118.5], [0, 0, 1]]), np.array([-0.15, 0.02, 0, 0.001, 0]))
     rotation = cv2.Rodrigues(np.array([0.01, -0.02, 0.015]))[0]
@@ -154,7 +154,7 @@ def test_rectified_eyes_see_a_point_in_one_row_at_the_disparity_of_its_depth():
     assert np.abs(depth / points[both, 2] - 1).max() < 0.03  # the rectified camera is turned by half a degree
 
 
-def test_a_rectangle_must_lie_in_the_picture():
+def test_a_rectangle_must_be_inside_the_image():
     with pytest.raises(InputError, match="--crop: expected a rectangle within 100x80 px, got 50,50,60,10"):
         geometry_of((100, 80), crop=(50, 50, 60, 10))
     with pytest.raises(InputError, match="--blank: expected x,y,width,height in px, got '1,2,3'"):
@@ -170,7 +170,7 @@ def test_a_rectangle_must_lie_in_the_picture():
         ([f"m{i}" for i in range(1, 9)], [3, 5], {3: "m4", 5: "m6"}),
     ],
 )
-def test_files_find_their_pictures(tmp_path, names, indices, want):
+def test_files_are_matched_to_frames(tmp_path, names, indices, want):
     for name in names:
         (tmp_path / f"{name}.png").touch()
     (tmp_path / "notes.txt").touch()
@@ -218,7 +218,7 @@ def plane_frames(count=12):
     return seen, np.array(poses), matrix
 
 
-def test_the_path_of_a_camera_is_found():
+def test_camera_poses_are_estimated():
     seen, poses, matrix = plane_frames()
     found = estimate_poses(seen.__getitem__, len(seen), matrix, relative_depth=False)
     assert found.explained.all()
@@ -231,14 +231,14 @@ def test_the_path_of_a_camera_is_found():
         assert np.abs(a[:2] / a[2] - b[:2] / b[2]).max() < 1.0
 
 
-def test_relative_depth_is_scaled_to_the_points_that_are_followed():
+def test_relative_depth_is_scaled_to_the_tracked_points():
     seen, _, matrix = plane_frames()
     wrong = [PoseInput(s.rgb_u8, s.tissue_mask, s.depth * np.float32(1 + 0.02 * i)) for i, s in enumerate(seen)]
     found = estimate_poses(wrong.__getitem__, len(wrong), matrix, relative_depth=True)
     assert np.allclose(found.depth_scale, 1 / (1 + 0.02 * np.arange(len(seen))), atol=0.01)
 
 
-def test_a_frame_of_something_else_is_not_explained():
+def test_a_frame_of_another_scene_is_unexplained():
     seen, _, matrix = plane_frames(6)
     seen[3] = PoseInput(smooth(120, 160, seed=9), seen[3].tissue_mask, seen[3].depth)
     found = estimate_poses(seen.__getitem__, 6, matrix, relative_depth=False)
@@ -246,7 +246,7 @@ def test_a_frame_of_something_else_is_not_explained():
     assert np.array_equal(found.camera_to_world[3], found.camera_to_world[2])
 
 
-def test_poses_of_the_user(tmp_path):
+def test_poses_from_a_file(tmp_path):
     _, poses, _ = plane_frames(3)
     np.save(tmp_path / "p.npy", poses)
     assert np.allclose(read_poses(tmp_path / "p.npy", 3).camera_to_world, poses)
@@ -258,7 +258,7 @@ def test_poses_of_the_user(tmp_path):
         read_poses(tmp_path / "p.npy", 3)
 
 
-def test_a_work_folder_survives_what_is_not_its_users_fault(tmp_path):
+def test_a_work_folder_survives_crashes(tmp_path):
     out, plan = tmp_path / "out", {"a": 1}
     with pytest.raises(KeyboardInterrupt), work_folder(out, plan) as folder:
         (folder / "images").mkdir()
@@ -285,7 +285,7 @@ def test_two_processes_do_not_write_one_folder(tmp_path):
         assert folder.exists()
 
 
-def test_the_last_frame_of_an_interrupted_run_is_not_trusted(tmp_path):
+def test_the_last_frame_of_an_interrupted_run_is_written_again(tmp_path):
     for part, count in (("images", 4), ("masks", 3), ("depth", 3)):
         (tmp_path / part).mkdir()
         for i in range(count):
@@ -296,13 +296,13 @@ def test_the_last_frame_of_an_interrupted_run_is_not_trusted(tmp_path):
 @pytest.mark.parametrize(
     "options", [{"end": 1.0, "start": 2.0}, {"max_frames": 1}, {"field_of_view_degrees": float("nan")}]
 )
-def test_impossible_options_are_refused(options):
+def test_impossible_options_are_errors(options):
     with pytest.raises(ValueError, match=next(iter(options)).split("_")[0]):
         PrepareConfig(**options)
 
 
 @pytest.mark.parametrize("count", range(9))
-def test_frames_stand_in_the_middle_of_their_neighbors(count):
+def test_windows_are_centered_on_their_frame(count):
     frames = [MeasuredFrame(i, i, np.zeros((1, 1, 3), np.uint8), None, None) for i in range(count)]
     windows = [[frame.position for frame in window] for window in with_neighbors(frames)]
     reach = [min(REACH, i, count - 1 - i) for i in range(count)]

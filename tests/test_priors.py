@@ -139,7 +139,7 @@ def test_salience_matches_loop(rgb, mask, percent):
     np.testing.assert_allclose(salience(rgb, mask, SalienceConfig(percentile=percent)), want, atol=1e-4)
 
 
-def test_percentile_sees_tissue_only(rgb, mask):
+def test_percentile_uses_tissue_only(rgb, mask):
     changed = rgb.copy()
     changed[:8, :8] *= 0.1  # a dim corner, all of it off the tissue
     mask[:10, :10] = False
@@ -215,7 +215,7 @@ def test_smallest_images_give_finite_priors(shape):
         (lambda rgb, mask: (rgb[:0], mask[:0]), "rgb must have at least one pixel"),
     ],
 )
-def test_poison_is_named(rgb, mask, change, message):
+def test_invalid_values_are_named(rgb, mask, change, message):
     with pytest.raises(ValueError, match=message):
         joint_texture_prior(*change(rgb, mask))
 

@@ -1,4 +1,4 @@
-"""The texture prior on generated pictures: range, masks, symmetries; and the sampling distribution of Eq. (6)."""
+"""The texture prior on generated images: range, masks, symmetries; and the sampling distribution of Eq. (6)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_prior_and_cues_lie_in_0_to_1_and_are_0_on_tools(made):
 
 @examples(50)
 @given(inputs(), st.sampled_from(["left-right", "up-down", "transpose"]))
-def test_prior_of_a_mirrored_picture_is_the_mirrored_prior(made, how):
+def test_prior_of_a_mirrored_image_is_the_mirrored_prior(made, how):
     rgb, mask, cfg = made
 
     def mirrored(image):
@@ -57,7 +57,7 @@ def test_prior_of_a_mirrored_picture_is_the_mirrored_prior(made, how):
 
 
 @given(SIDES, SIDES, SEEDS, st.floats(0, 1))
-def test_constant_and_clipped_pictures_have_no_prior(height, width, seed, gray):
+def test_constant_and_clipped_images_have_no_prior(height, width, seed, gray):
     mask = np.random.default_rng(seed).random((height, width)) < 0.8
     constant = np.full((height, width, 3), gray, np.float32)
     assert joint_texture_prior(constant, mask).max() == 0  # reflected borders are no edges
@@ -67,7 +67,7 @@ def test_constant_and_clipped_pictures_have_no_prior(height, width, seed, gray):
 
 
 @given(inputs())
-def test_what_is_masked_out_sets_no_scale(made):
+def test_masked_pixels_do_not_change_the_scale(made):
     """E divides by a percentile over the tissue alone: the prior there is the same whatever tools far away show."""
     rgb, mask, cfg = made
     near = np.pad(mask, 1)
@@ -80,7 +80,7 @@ def test_what_is_masked_out_sets_no_scale(made):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e-6, 1.001, 255.0])
-def test_what_is_no_color_is_refused(value):
+def test_invalid_colors_are_errors(value):
     rgb = np.full((3, 4, 3), 0.5, np.float32)
     rgb[1, 2, 0] = value
     with pytest.raises(ValueError, match="rgb must be finite and in"):
@@ -102,7 +102,7 @@ def test_sampling_probabilities_sum_to_1_inside_the_eroded_mask(made, uniform, e
 
 
 @given(frames(), st.sampled_from(["prior", "uniform", "pool"]), st.booleans(), st.booleans())
-def test_pixels_without_tissue_or_usable_depth_are_never_drawn(frame, sampler, adaptive, on_eroded):
+def test_pixels_without_tissue_or_usable_depth_are_never_sampled(frame, sampler, adaptive, on_eroded):
     cfg = InitConfig(sampler=sampler, adaptive_specular=adaptive, salience_on_eroded_mask=on_eroded)
     weights = pixel_probability(frame, cfg, PriorConfig())
     assert np.isfinite(weights).all() and (weights >= 0).all()

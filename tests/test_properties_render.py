@@ -16,7 +16,7 @@ from render_scenes import NAMES, camera, draw, pick, splats
 from endoprior.core.types import Camera, Splats
 from endoprior.render.constants import ALPHA_MIN, MIN_QUAT, NEAR_Z
 
-BACKENDS = ("cpu", "reference")
+BACKENDS = ("numba", "reference")
 WEIRD = (math.nan, math.inf, -math.inf)
 SEEDS = st.integers(0, 2**31 - 1)
 
@@ -141,7 +141,7 @@ def test_fast_renderer_agrees_with_the_reference(made):
     """Up to rounding, which may decide otherwise where alpha is at ALPHA_MIN or a pixel about to be full."""
     view, scene = made
     want, want_grads = draw("reference", scene, view)
-    got, grads = draw("cpu", scene, view)
+    got, grads = draw("numba", scene, view)
     gap = (got.alpha - want.alpha).abs()
     assert gap.max() <= 0.011, "more than one decision differs"
     assert (gap > 1e-5).float().mean() <= 0.01 + 1 / gap.numel()
@@ -157,7 +157,7 @@ def test_fast_renderer_agrees_with_the_reference(made):
 def test_fast_renderer_culls_and_draws_what_the_reference_does(made):
     view, scene = made
     want, _ = draw("reference", scene, view)
-    got, _ = draw("cpu", scene, view)
+    got, _ = draw("numba", scene, view)
     # Where a footprint ends within rounding of a pixel, either may see it; then it adds nothing to the picture.
     differs = (got.radii > 0) != (want.radii > 0)
     assert differs.float().mean() <= 0.2 if len(scene) else True
@@ -171,7 +171,7 @@ def test_order_of_the_gaussians_never_matters(backend, made, seed):
     order = torch.randperm(len(scene), generator=torch.Generator().manual_seed(seed))
     want, want_grads = draw(backend, scene, view, dtype=torch.float32)
     got, grads = draw(backend, pick(scene, order), view, dtype=torch.float32)
-    exact = backend == "cpu"
+    exact = backend == "numba"
     for name in ("color", "alpha", "depth"):
         a, b = getattr(got, name), getattr(want, name)
         assert torch.equal(a, b) if exact else torch.allclose(a, b, rtol=1e-5, atol=1e-5)
@@ -204,7 +204,7 @@ def test_a_hundred_thousand_gaussians_on_one_pixel(opacity):
         torch.full((num,), opacity),
         torch.zeros(num, 1, 3),
     )
-    out, grads = draw("cpu", scene, view)
+    out, grads = draw("numba", scene, view)
     assert_sound(out, grads, scene, view)
     assert out.alpha.item() > 0.99 and out.depth.item() < (100 if opacity < 0.1 else 2)
 
@@ -216,6 +216,6 @@ def test_what_is_not_beyond_the_near_plane_is_culled(x, y, sign):
     for z in (-1e30, -1.0, 0.0, 0.5 * NEAR_Z, NEAR_Z, np.nextafter(np.float32(NEAR_Z), np.float32(1)), 0.21, 5.0):
         means = torch.tensor([[x * abs(z) * 0.3, y * abs(z) * 0.3, z]], dtype=torch.float32)
         scene = replace(base, means=means, opacities=torch.tensor([0.9]))
-        out, grads = draw("cpu", scene, view)
+        out, grads = draw("numba", scene, view)
         assert (out.radii[0] > 0) == (float(means[0, 2]) > NEAR_Z)
         assert all(torch.isfinite(grad).all() for grad in grads.values())

@@ -92,13 +92,13 @@ def test_points_lie_on_usable_pixels_of_their_own_frame(clip, cfg, seed):
 
 @pytest.mark.parametrize("depth", [0.06, 0.2, 1e-30, 1e9, 1e30])
 @pytest.mark.parametrize("sampler", ["prior", "uniform", "pool"])
-def test_depth_that_no_gaussian_can_be_drawn_at_is_refused_in_one_line(depth, sampler, caplog):
+def test_depth_outside_the_renderable_range_is_one_error_line(depth, sampler, caplog):
     """Meters that pass for millimeters lie in front of the near plane: training would never show anything."""
     camera, z = Camera(30, 20, 50.0, 50.0, 15.0, 10.0, np.eye(4)), np.full((20, 30), depth, np.float32)
     frame = Frame(0, 0.0, camera, np.full((20, 30, 3), 90, np.uint8), np.ones((20, 30), bool), z, z > 0)
     with pytest.raises(InputError, match=r"between 0\.2 and 1e\+06 mm .*, got 0\. Fix: Check masks, depth"):
         initial_points([frame] * 3, InitConfig(sampler=sampler, budget=100))
-    assert not caplog.records  # a refusal is one line, without a warning before it
+    assert not caplog.records  # the error is one line, without a warning before it
 
 
 @given(st.integers(0, 500), st.integers(0, 30))
@@ -109,7 +109,7 @@ def test_quotas_are_equal_shares_of_the_whole_budget(budget, num_frames):
 
 
 @given(SEEDS, st.integers(1, 30), st.integers(1, 30), st.integers(0, 1000), st.sampled_from([0.0, -300.0, 300.0]))
-def test_drawn_pixels_are_distinct_and_have_weight(seed, height, width, count, exponent):
+def test_sampled_pixels_are_distinct_and_have_weight(seed, height, width, count, exponent):
     rng = np.random.default_rng(seed)
     weights = np.where(rng.random((height, width)) < 0.6, rng.random((height, width)) * 10.0**exponent, 0)
     drawn = sample_pixels(weights, count, rng)
@@ -152,7 +152,7 @@ def test_shrunk_frames_keep_their_meaning(clip, factor):
 
 @examples(15)
 @given(st.integers(1, 3), st.integers(20, 70), st.integers(20, 70), SEEDS, st.sampled_from(["still", "noise", "black"]))
-def test_initial_motion_is_finite_for_any_pictures(count, height, width, seed, kind):
+def test_initial_motion_is_finite_for_any_images(count, height, width, seed, kind):
     rng = np.random.default_rng(seed)
     camera = Camera(width, height, 60.0, 60.0, width / 2, height / 2, np.eye(4))
     still = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
@@ -172,7 +172,7 @@ def test_initial_motion_is_finite_for_any_pictures(count, height, width, seed, k
 
 
 @pytest.mark.parametrize("count", [2, 3, 9, 10, 18])
-def test_a_start_reads_no_test_frame(count):
+def test_initialization_reads_no_test_frame(count):
     rng = np.random.default_rng(0)
     camera = Camera(40, 36, 50.0, 50.0, 20.0, 18.0, np.eye(4))
 

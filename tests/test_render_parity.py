@@ -1,4 +1,4 @@
-"""Every fast backend against the reference: picture and gradients, with the same cotangents."""
+"""Every fast backend against the reference: image and gradients, with the same cotangents."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from render_scenes import agree, camera, compare, draw, splats
 
 from endoprior import render
 
-FAST = [name for name in get_args(render.Backend) if name not in ("reference", "cuda", "triton")]  # they have their own
+FAST = [name for name in get_args(render.Backend) if name not in ("reference", *render.ON_GPU)]
+"""Those on a GPU have files of their own."""
 
 
 def test_a_fast_backend_is_under_test():
@@ -42,12 +43,12 @@ def test_agrees_at_any_size(backend, width, height):
 def test_agrees_on_needles_and_sheets(backend):
     """Axes from 1/50 px to 30 px: the blur alone keeps them drawable.
 
-    The moments that make the gradient of a needle's shape cancel down from length^2 to width^2, here by up to
+    The sums that make the gradient of a needle's shape cancel down from length^2 to width^2, here by up to
     30^2 / 0.3 = 3000 float32 roundings.
     """
     view = camera(80, 60, seed=5)
     scene = splats(view, 40, degree=0, seed=3, widths=(0.02, 30.0))
-    compare(backend, scene, view, picture=2e-5, gradient=5e-4)
+    compare(backend, scene, view, image=2e-5, gradient=5e-4)
 
 
 @pytest.mark.parametrize("backend", FAST)

@@ -145,7 +145,7 @@ def test_order_of_the_list_does_not_matter():
 
 
 def test_unknown_backend_is_named():
-    with pytest.raises(InputError, match="expected one of cpu, cuda, triton, reference; got 'gpu'"):
+    with pytest.raises(InputError, match="expected one of reference, numba, triton, gsplat; got 'gpu'"):
         render.load("gpu")
 
 

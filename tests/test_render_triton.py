@@ -27,19 +27,13 @@ pytest.importorskip("triton")
 if os.environ.get("TRITON_INTERPRET") != "1":
     pytest.skip("needs TRITON_INTERPRET=1; test_triton_compile.py runs it so", allow_module_level=True)
 
-backend, bins, triton_project = (
-    importlib.import_module(f"endoprior.render.{name}") for name in ("triton", "triton_bins", "triton_project")
+backend, tiles, projection = (
+    importlib.import_module(f"endoprior.render.triton{name}") for name in ("", ".tiles", ".projection")
 )
 # The interpreter is NumPy, which also computes what the masks throw away.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 CPU = torch.device("cpu")
 NAN, INF = float("nan"), float("inf")
-
-
-@pytest.fixture(autouse=True)
-def nothing_remembered(monkeypatch):
-    """From other tests."""
-    monkeypatch.setattr(bins, "_rooms", {})
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -55,7 +49,7 @@ def test_agrees_with_reference(degree, depth_grad_to_means):
 
 @pytest.mark.parametrize("width, height", [(1, 1), (16, 8), (17, 9), (7, 30)])
 def test_agrees_at_any_size(width, height):
-    """The sums of one pixel average no rounding away: there `cpu` differs by as much."""
+    """The sums of one pixel average no rounding away: there `numba` differs by as much."""
     view = camera(width, height, seed=1)
     compare("triton", splats(view, 20, degree=1, seed=2, widths=(0.5, 6.0)), view, gradient=1e-4)
 
@@ -63,7 +57,7 @@ def test_agrees_at_any_size(width, height):
 def test_agrees_on_needles_and_sheets():
     """Axes from 1/50 px to 30 px; tolerances as in `test_render_parity`."""
     view = camera(48, 30, seed=5)
-    compare("triton", splats(view, 30, degree=0, seed=3, widths=(0.02, 30.0)), view, picture=2e-5, gradient=5e-4)
+    compare("triton", splats(view, 30, degree=0, seed=3, widths=(0.02, 30.0)), view, image=2e-5, gradient=5e-4)
 
 
 def test_agrees_where_pixels_fill_up():
@@ -143,7 +137,7 @@ def test_near_plane():
 
 
 @pytest.mark.parametrize("num", [0, 3])
-def test_nothing_to_draw_is_the_background(num):
+def test_without_visible_gaussians_the_image_is_the_background(num):
     view = camera(33, 21)
     scene = pick(splats(view), torch.arange(num))
     scene = replace(scene, means=scene.means - 1e4 * torch.tensor(view.world_to_camera[2, :3]).float())
@@ -155,13 +149,12 @@ def test_nothing_to_draw_is_the_background(num):
 
 def tiles_of(scene, view):
     """(L, N) how often each tile lists each Gaussian."""
-    means2d, forms, z, colors, radii, keys = backend.Project.apply(
-        scene.means, scene.quats, scene.scales, scene.sh, scene.opacities, view
-    )
-    work = bins.build(means2d, forms, z, colors, scene.opacities, radii, keys, view.width, view.height)
-    listed = torch.zeros(len(work.tile_starts) - 1, len(scene), dtype=torch.int64)
-    ranks = work.order[work.ranks.long()]
-    for tile, (start, end) in enumerate(zip(work.tile_starts[:-1], work.tile_starts[1:], strict=True)):
+    inputs = (scene.means, scene.quats, scene.scales, scene.sh)
+    *projected, radii = backend.KERNELS.project_forward(inputs, scene.opacities, view)
+    lists = backend.KERNELS.bin_tiles((*projected, scene.opacities), radii, (view.width, view.height))
+    listed = torch.zeros(len(lists.tile_starts) - 1, len(scene), dtype=torch.int64)
+    ranks = lists.order[lists.ranks.long()]
+    for tile, (start, end) in enumerate(zip(lists.tile_starts[:-1], lists.tile_starts[1:], strict=True)):
         listed[tile] += torch.bincount(ranks[start:end], minlength=len(scene))
     return listed
 
@@ -175,43 +168,14 @@ def test_tiles_are_those_the_footprint_touches(monkeypatch):
     for n in range(len(scene)):
         alpha = render.load("reference")(pick(scene, torch.tensor([n])), view, background=torch.zeros(3)).alpha
         rows, columns = torch.nonzero(alpha > 0).T
-        touched[(rows // bins.TILE_HEIGHT * -(-view.width // bins.TILE_WIDTH) + columns // bins.TILE_WIDTH), n] = 1
+        touched[(rows // tiles.TILE_HEIGHT * tiles.columns(view.width) + columns // tiles.TILE_WIDTH), n] = 1
     assert listed.max() == 1 and (listed >= touched).all()
     assert touched.sum() > 200 and (listed - touched).sum() <= 0.02 * touched.sum()
-    monkeypatch.setattr(bins, "FEW_TILES", 0)
+    monkeypatch.setattr(tiles, "FEW_TILES", 0)
     assert torch.equal(tiles_of(scene, view), listed)
 
 
-def test_without_waiting_the_farthest_go_first_and_somebody_is_told():
-    view = camera(33, 21)
-    scene = splats(view, 40, degree=0, seed=2)
-    rasterize, black = render.load("triton"), torch.zeros(3)
-    whole = rasterize(scene, view, background=black)
-    pairs = bins._rooms[CPU].pairs
-    assert pairs > 40 and not backend.overflowed(CPU)
-    bins._rooms[CPU].pairs = 20
-    queued = render.load_queued("triton")
-    assert not queued.incomplete(CPU)
-    with backend.without_waiting():
-        lacking, grads = draw("triton", scene, view)
-    assert (lacking.alpha <= whole.alpha + 1e-6).all() and (lacking.alpha < whole.alpha - 0.1).any()
-    assert all(value.isfinite().all() for value in grads.values())
-    assert torch.equal(queued.rasterize(scene, view, background=black).alpha, lacking.alpha)
-    assert queued.incomplete(CPU) and queued.incomplete(CPU) and queued.make_room(CPU)
-    assert not queued.incomplete(CPU) and not backend.overflowed("cpu") and bins._rooms[CPU].pairs == pairs
-    again = queued.rasterize(scene, view, background=black)
-    assert not queued.incomplete(CPU)
-    assert all(torch.equal(getattr(again, n), getattr(whole, n)) for n in ("color", "alpha", "depth"))
-
-
-def test_without_waiting_a_first_picture_has_room():
-    view = camera(16, 9)
-    with backend.without_waiting():
-        render.load("triton")(splats(view, 5, degree=0), view, background=torch.zeros(3))
-    assert not backend.overflowed(CPU) and bins._rooms[CPU].pairs == 0
-
-
-def test_equal_input_gives_equal_bits():
+def test_equal_input_gives_bit_identical_results():
     view = camera(33, 21)
     scene = splats(view, 40, degree=1)
     (first, first_grads), (second, second_grads) = (draw("triton", scene, view) for _ in range(2))
@@ -237,13 +201,13 @@ def test_gradients_reach_only_what_is_asked():
 
 def test_cameras_are_kept_by_value():
     view = camera()
-    before = triton_project.lens_of(view, CPU)
-    assert triton_project.lens_of(camera(), CPU) is before and len(before) == triton_project.LENS_SIZE.value
+    before = projection.lens_of(view, CPU)
+    assert projection.lens_of(camera(), CPU) is before and len(before) == projection.LENS_SIZE.value
     view.world_to_camera[0, 3] += 1
-    assert not torch.equal(triton_project.lens_of(view, CPU), before)
+    assert not torch.equal(projection.lens_of(view, CPU), before)
 
 
-def test_other_types_and_devices_are_refused(monkeypatch):
+def test_other_types_and_devices_are_rejected(monkeypatch):
     view = camera(16, 9)
     scene = splats(view, 3)
     doubled = Splats(*(getattr(scene, name).double() for name in NAMES))

@@ -23,7 +23,7 @@ def lit(depth: np.ndarray, exposure: float = 1.0, corners: float = 0.0) -> np.nd
     return np.rint(gray[..., None] * [1.0, 0.5, 0.5]).astype(np.uint8)
 
 
-def test_the_nearer_surface_is_nearer_by_the_stated_share():
+def test_relief_is_scaled_by_the_constant():
     model = fit_shading([lit(BUMP)] * 3, [EVERYWHERE] * 3, working_distance_mm=60)
     depth = model.depth(lit(BUMP), EVERYWHERE)
     assert depth.shape == (HEIGHT, WIDTH) and depth.dtype == np.float32
@@ -35,7 +35,7 @@ def test_the_nearer_surface_is_nearer_by_the_stated_share():
     assert 0.6 * want < got < 1.1 * want
 
 
-def test_exposure_moves_nothing():
+def test_exposure_does_not_change_depth():
     model = fit_shading([lit(BUMP, e) for e in (0.8, 1.0, 1.3)], [EVERYWHERE] * 3)
     usual = model.depth(lit(BUMP), EVERYWHERE)
     for exposure in (0.6, 1.6):
@@ -43,7 +43,7 @@ def test_exposure_moves_nothing():
         np.testing.assert_allclose(model.depth(lit(BUMP, exposure), EVERYWHERE), usual, rtol=5e-3)
 
 
-def test_what_comes_near_does_not_push_the_rest_away():
+def test_a_near_object_does_not_change_the_rest():
     model = fit_shading([lit(BUMP)] * 3, [EVERYWHERE] * 3)
     lifted = np.where((COLUMN < -0.3) & (abs(ROW) < 0.8), 45.0, BUMP)
     before, after = model.depth(lit(BUMP), EVERYWHERE), model.depth(lit(lifted), EVERYWHERE)
@@ -51,7 +51,7 @@ def test_what_comes_near_does_not_push_the_rest_away():
     assert (after[60:90, 20:50] < 0.9 * before[60:90, 20:50]).all()
 
 
-def test_half_of_dark_corners_is_put_down_to_the_lens():
+def test_half_of_the_corner_darkening_is_vignetting():
     wall = np.full((HEIGHT, WIDTH), 70.0)
     model = fit_shading([lit(wall, corners=1.2)], [EVERYWHERE])
     assert abs(model.vignetting - 0.6) < 0.03
@@ -60,11 +60,11 @@ def test_half_of_dark_corners_is_put_down_to_the_lens():
     assert 1.03 < depth[0, 0] / depth[75, 100] < 1.1
 
 
-def test_brighter_corners_are_not_taken_for_a_lens():
+def test_brighter_corners_are_not_vignetting():
     assert fit_shading([lit(np.full((HEIGHT, WIDTH), 70.0), corners=-0.8)], [EVERYWHERE]).vignetting == 0
 
 
-def test_tools_highlights_and_the_outside_are_filled_from_around():
+def test_tools_highlights_and_the_outside_are_filled_in():
     image = lit(BUMP)
     model = fit_shading([image], [EVERYWHERE])
     clean = model.depth(image, EVERYWHERE)
@@ -78,7 +78,7 @@ def test_tools_highlights_and_the_outside_are_filled_from_around():
     assert np.isfinite(model.depth(np.where(round_border[..., None], image, 0).astype(np.uint8), round_border)).all()
 
 
-def test_depth_is_finite_and_bounded_whatever_comes(monkeypatch):
+def test_depth_is_finite_and_bounded_for_any_image(monkeypatch):
     monkeypatch.setattr(shading, "RELIEF", 4.0)
     model = fit_shading([lit(BUMP)], [EVERYWHERE], 50)
     harsh = np.where(COLUMN[..., None] < 0, 1, 200).astype(np.uint8) * np.ones(3, np.uint8)
@@ -88,7 +88,7 @@ def test_depth_is_finite_and_bounded_whatever_comes(monkeypatch):
     assert np.isfinite(model.depth(np.zeros((HEIGHT, WIDTH, 3), np.uint8), EVERYWHERE)).all()
 
 
-def test_pixels_the_samples_never_showed_are_judged_by_the_picture_alone():
+def test_pixels_missing_in_all_samples_use_the_image_alone():
     left, right = COLUMN < -0.1, COLUMN > 0.1
     model = fit_shading([lit(BUMP)], [left])
     depth = model.depth(lit(BUMP), right)
@@ -120,7 +120,7 @@ def test_relative_disparity_is_linear_in_inverse_depth():
     assert np.percentile(depth, 2) == pytest.approx(60 / NEAR_RATIO, rel=1e-2)
     slope, shift = np.polyfit(disparity.ravel().astype(np.float64), 1 / depth.ravel().astype(np.float64), 1)
     np.testing.assert_allclose(slope * disparity + shift, 1 / depth, rtol=1e-4)
-    # Scale and shift of the network do not matter, and another frame is judged by the same reference.
+    # Scale and shift of the network do not matter, and another frame uses the same reference.
     again = relative_to_mm(
         7 * disparity + 2, "disparity", fit_reference([7 * disparity + 2], [usable], "disparity", 60)
     )
@@ -135,7 +135,7 @@ def test_relative_depth_keeps_its_proportions():
     np.testing.assert_allclose(depth / relative, 70 / np.median(relative), rtol=1e-5)
 
 
-def test_values_that_say_nothing_become_missing():
+def test_invalid_values_become_missing():
     relative = np.array([[np.nan, np.inf, 0.0, -1.0, 1.0, 1e9, 1e-9]])
     reference = fit_reference([np.array([[0.5, 1.0, 1.5, np.nan, -3.0]])], [np.ones((1, 5), bool)], "depth", 70)
     depth = relative_to_mm(relative, "depth", reference)

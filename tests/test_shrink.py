@@ -53,7 +53,7 @@ def test_first_frames_are_a_shorter_sequence(tiny_sequence, tmp_path):
     assert len(load_sequence(tiny_sequence, DataConfig(first_frames=99))) == 17
 
 
-def test_truth_of_the_whole_is_left_out_with_a_remark(tiny_sequence):
+def test_ground_truth_is_left_out_with_a_note(tiny_sequence):
     (tiny_sequence / "truth").mkdir()
     assert load_sequence(tiny_sequence).truth is not None
     for cfg in (DataConfig(shrink=2), DataConfig(first_frames=9)):

@@ -1,4 +1,4 @@
-"""Images from files: every one, in order, at its moment; damaged files named in one line."""
+"""Video files and image folders: all images, in order, with their times; errors for damaged files."""
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ def pictures_of(count, height=24, width=32):
     return [rng.integers(0, 256, (height, width, 3), np.uint8) for _ in range(count)]
 
 
-def test_video_gives_back_every_pixel(tmp_path):
+def test_video_is_decoded_losslessly(tmp_path):
     written = pictures_of(7)
     source = open_source(write_video(tmp_path / "a.mkv", written, rate=10))
     assert (source.width, source.height, source.frames_per_second) == (32, 24, 10)
@@ -56,7 +56,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_broken_sources_are_refused_in_one_line(tmp_path, kind):
+def test_broken_sources_give_one_error_line(tmp_path, kind):
     make, says = BROKEN[kind]
     path = make(tmp_path)
     with pytest.raises(InputError) as error:
@@ -64,7 +64,7 @@ def test_broken_sources_are_refused_in_one_line(tmp_path, kind):
     assert str(path) in str(error.value) and says in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_truncated_video_says_how_to_use_what_is_there(tmp_path):
+def test_a_truncated_video_suggests_end(tmp_path):
     path = cut(write_video(tmp_path / "cut.mp4", pictures_of(40)), 0.6)
     seen = []
     with pytest.raises(InputError, match=r"cut\.mp4: expected 40 images, got .*--end"):
@@ -73,7 +73,7 @@ def test_a_truncated_video_says_how_to_use_what_is_there(tmp_path):
     assert 0 < len(seen) < 40
 
 
-def test_a_picture_of_another_size_is_named(tmp_path):
+def test_an_image_of_another_size_is_named(tmp_path):
     for number, size in enumerate((32, 32, 30)):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((24, size, 3), np.uint8))
     with pytest.raises(InputError, match=r"2\.png: expected 32x24 px like the first image, got 30x24"):
@@ -86,7 +86,7 @@ def taken(times, **options):
     return [stereo_frame.index for stereo_frame in stereo_frames], selection
 
 
-def test_an_even_clip_is_taken_whole():
+def test_an_even_clip_is_used_completely():
     found, selection = taken(np.arange(50) / 30, frames_per_second=30, source_rate=30)
     assert found == list(range(50)) and selection.gaps == selection.uneven_steps == 0
 
@@ -97,13 +97,13 @@ def test_range_and_rate():
     )
 
 
-def test_a_rate_that_does_not_divide_takes_the_nearest():
+def test_a_rate_that_does_not_divide_uses_the_nearest_frames():
     found, selection = taken(np.arange(300) / 30, frames_per_second=25, source_rate=30)
     wanted = np.arange(len(found)) / 25
     assert np.abs(np.array(found) / 30 - wanted).max() <= 0.5 / 30 + 1e-9 and selection.gaps == 0
 
 
-def test_variable_rate_is_counted_and_no_picture_is_taken_twice():
+def test_variable_rate_is_counted_and_no_image_is_used_twice():
     times = np.r_[np.arange(10) / 25, 0.4 + 0.2 + np.arange(10) / 25]  # five images dropped in the middle
     found, selection = taken(times, frames_per_second=25, source_rate=25)
     assert found == list(range(20))

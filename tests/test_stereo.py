@@ -35,7 +35,7 @@ def measure(pair: tuple[np.ndarray, np.ndarray], shift: float = 0.0, **options: 
 
 
 @pytest.mark.parametrize("disparity", [6.0, 9.3, 12.5])
-def test_a_wall_is_found_at_its_depth(disparity):
+def test_depth_of_a_wall(disparity):
     found = measure(cameras(flat(disparity), tissue()))
     inside = np.s_[8:-8, 16:-8]
     assert (found.depth[inside] > 0).mean() > 0.99
@@ -54,7 +54,7 @@ def test_a_slanted_plane_is_smooth_in_disparity():
     assert np.median(error) < 0.05 and np.quantile(error, 0.95) < 0.3
 
 
-def test_the_refinement_finds_the_shift_that_is_left():
+def test_refinement_estimates_the_remaining_shift():
     truth = 6 + 0.04 * COLUMN
     left, right = (cv2.cvtColor(camera, cv2.COLOR_RGB2GRAY) for camera in cameras(truth, tissue()))
     inside = np.s_[8:-8, 20:-8]
@@ -69,7 +69,7 @@ def test_the_refinement_finds_the_shift_that_is_left():
     assert np.abs(far_off - truth - 3).max() < 0.51  # never far from the matcher
 
 
-def test_smoothing_takes_out_steps_and_keeps_jumps():
+def test_smoothing_removes_steps_and_keeps_edges():
     truth = 6 + 0.04 * COLUMN
     stepped = (np.rint(8 * truth) / 8).astype(np.float32)
     inside = np.s_[8:-8, 8:-8]
@@ -80,13 +80,13 @@ def test_smoothing_takes_out_steps_and_keeps_jumps():
     assert np.isnan(smooth_disparity(flat(np.nan))).all()
 
 
-def test_what_lies_outside_the_other_picture_is_missing():
+def test_pixels_outside_the_other_image_are_missing():
     depth = measure(cameras(flat(12.0), tissue())).depth
     assert not depth[:, :10].any()
     assert (depth[8:-8, 14:20] > 0).all()
 
 
-def test_half_occluded_pixels_are_missing_and_the_jump_is_kept():
+def test_half_occluded_pixels_are_missing_and_the_edge_is_kept():
     near = (COLUMN > 80) & (COLUMN < 130)
     left, right = cameras(np.where(near, 14.0, 5.0).astype(np.float32), tissue())
     hidden = np.s_[:, 72:81]  # 14 - 5 px of the wall behind, which the right camera cannot see
@@ -101,7 +101,7 @@ def test_half_occluded_pixels_are_missing_and_the_jump_is_kept():
     assert abs(np.median(depth[rows, 30:60]) - PRODUCT / 5) < 2
 
 
-def test_a_pale_wall_without_texture_is_not_trusted():
+def test_a_wall_without_texture_has_no_confidence():
     pair = tuple(np.full((HEIGHT, WIDTH, 3), 120, np.uint8) for _ in range(2))
     assert not measure(pair).depth.any()
 
@@ -114,7 +114,7 @@ def test_highlights_halve_the_confidence():
     assert shiny[58:62, 90:98].max() <= 0.5 < plain[58:62, 90:98].min()
 
 
-def test_the_shift_of_the_principal_points_is_subtracted():
+def test_center_shift_is_subtracted():
     depth = measure(cameras(flat(9.0 - 4.0), tissue()), shift=-4.0).depth
     assert abs(np.median(depth[8:-8, 20:-8]) - PRODUCT / 9) < 0.5
     # Rectified to converge: near tissue has negative disparity.
@@ -128,12 +128,12 @@ def test_depth_stays_in_range():
     assert ((depth == 0) | ((depth >= 60) & (depth <= 200))).all()
 
 
-def test_exchanged_eyes_give_little():
+def test_swapped_images_give_little_depth():
     left, right = cameras(flat(9.0), tissue())
     assert (measure((right, left)).depth > 0).mean() < 0.4
 
 
-def test_no_confidence_asked_for_still_asks_both_eyes():
+def test_zero_min_confidence_still_checks_consistency():
     left, right = cameras(flat(9.0), tissue())
     right[30:90, 60:110] = tissue(seed=7)[30:90, 60:110].astype(np.uint8)
     depth = measure((left, right), min_confidence=0, fill_px=0, speckle_px=0).depth
@@ -142,7 +142,7 @@ def test_no_confidence_asked_for_still_asks_both_eyes():
     assert (np.abs(PRODUCT / kept[kept > 0] - 9) < 1).mean() > 0.8
 
 
-def test_wide_pictures_are_matched_small_and_refined_at_full_size(monkeypatch):
+def test_wide_images_are_matched_small_and_refined_at_full_size(monkeypatch):
     monkeypatch.setattr("endoprior.prepare.stereo.MATCHING_WIDTH", 60)
     depth = measure(cameras(flat(9.3), tissue(sigma=4.0))).depth
     inside = depth[12:-12, 24:-12]
@@ -150,7 +150,7 @@ def test_wide_pictures_are_matched_small_and_refined_at_full_size(monkeypatch):
     assert abs(np.median(PRODUCT / inside[inside > 0]) - 9.3) < 0.1
 
 
-def test_the_same_pictures_give_the_same_bits():
+def test_results_are_deterministic():
     pair = cameras(6 + 0.04 * COLUMN, tissue())
     assert (measure(pair).depth == measure(pair).depth).all()
 
@@ -178,7 +178,7 @@ def test_small_holes_are_filled_on_planes_only():
         (lambda camera: camera.astype(np.float32), "8-bit"),
     ],
 )
-def test_other_pictures_are_refused(change, message):
+def test_wrong_images_are_errors(change, message):
     left, right = cameras(flat(9.0), tissue())
     with pytest.raises(ValueError, match=message):
         measure((change(left), right))
@@ -192,7 +192,7 @@ def test_config_is_checked(options):
         StereoConfig(**options)
 
 
-def test_impossible_geometry_is_refused():
+def test_impossible_geometry_is_an_error():
     pair = cameras(flat(9.0), tissue())
     with pytest.raises(ValueError, match="far_mm"):
         stereo_depth(*pair, 1e5, BASELINE)
@@ -201,7 +201,7 @@ def test_impossible_geometry_is_refused():
             stereo_depth(*pair, focal, baseline, None, shift)
 
 
-def test_temporal_median_calms_noise_and_leaves_motion():
+def test_temporal_median_reduces_noise_and_keeps_motion():
     rng = np.random.default_rng(0)
     still = [np.float32(80) + rng.normal(0, 0.4, (40, 50)).astype(np.float32) for _ in range(5)]
     calm = temporal_median(still)

@@ -21,7 +21,7 @@ def pair() -> tuple[np.ndarray, np.ndarray]:
     return left, right
 
 
-def test_the_order_of_the_eyes_is_recognized(pair):
+def test_swapped_cameras_are_detected(pair):
     left, right = pair
     given, exchanged = stereo_order(left, right), stereo_order(right, left)
     assert given.as_given > 0.8 and given.exchanged < 0.5 and not given.swapped
@@ -30,7 +30,7 @@ def test_the_order_of_the_eyes_is_recognized(pair):
     assert abs(given.as_given - exchanged.exchanged) < 0.05
 
 
-def test_converging_eyes_need_their_shift(pair):
+def test_converging_cameras_need_center_shift(pair):
     left, right = pair
     moved = np.roll(right, 20, 1)  # disparity is 20 px less now, all of it negative
     assert stereo_order(left, moved).swapped
@@ -38,14 +38,14 @@ def test_converging_eyes_need_their_shift(pair):
     assert stereo_order(moved, left, center_shift_px=20.0).swapped
 
 
-def test_one_picture_twice_says_nothing(pair):
+def test_identical_images_give_no_order(pair):
     assert not stereo_order(pair[0], pair[0]).swapped
     blank = np.zeros_like(pair[0])
     assert not stereo_order(blank, blank).swapped
 
 
 @pytest.mark.parametrize("rows", [0, 1, 5])
-def test_rows_that_do_not_match_are_measured(pair, rows):
+def test_vertical_offset_is_measured(pair, rows):
     left, right = pair
     # Features are placed to about a fifth of a pixel.
     assert abs(vertical_offset_px(left, np.roll(right, rows, 0)) - rows) < 0.25

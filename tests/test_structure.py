@@ -29,8 +29,6 @@ CHECKED_PAGES = ("docs/development.md",)
 """Pages whose lines are short. Add a page when it complies."""
 PRIVATE_WORDS = ("house", "storey")
 """Words of this project's past that the source no longer uses. Add a word when its last use is gone."""
-MAY_IMPORT_TESTS = ("test_definitions.py", "test_device_loop.py", "test_hexplane_definition.py", "test_recorded.py")
-"""Test files that are about to go or to be rewritten."""
 NO_TORCH = ("priors", "data", "evaluation/metrics/stability.py", "phantom", "core", "footage", "check")
 
 
@@ -145,7 +143,7 @@ def test_no_test_file_imports_another():
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [module or ""]
             for name in names:
                 message = f"{path} imports {name}: move what both need into a helper module"
-                assert path.name in MAY_IMPORT_TESTS or not name.startswith("test_"), message
+                assert not name.startswith("test_"), message
 
 
 def test_lines_of_pages_are_at_most_100_characters_long():

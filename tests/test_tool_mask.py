@@ -35,7 +35,7 @@ def scores(found, true):
 
 
 @pytest.mark.parametrize("with_depth", [False, True])
-def test_finds_the_phantoms_tools(phantom, with_depth):
+def test_tools_of_the_phantom_are_detected(phantom, with_depth):
     images, true, depths, _ = phantom
     known = depths if with_depth else [None] * FRAMES
     model = fit_tools(images, [VIEW] * FRAMES, depths if with_depth else None)
@@ -46,7 +46,7 @@ def test_finds_the_phantoms_tools(phantom, with_depth):
     assert (model.relief_odds is not None) == with_depth
 
 
-def test_masks_are_whole_regions_without_holes(phantom):
+def test_masks_are_filled_regions(phantom):
     images = phantom[0]
     mask = fit_tools(images, [VIEW] * FRAMES).mask(images[0], VIEW)
     regions = cv2.connectedComponents(mask.astype(np.uint8))[0] - 1
@@ -55,7 +55,7 @@ def test_masks_are_whole_regions_without_holes(phantom):
     assert background == 1
 
 
-def test_tissue_alone_is_left_alone(phantom):
+def test_tissue_alone_gives_empty_masks(phantom):
     tissue = phantom[3]
     model = fit_tools(tissue, [VIEW] * FRAMES)
     assert model.detected_share == 0
@@ -71,7 +71,7 @@ def test_exposure_does_not_matter(phantom):
     assert scores(*masks)[0] > 0.95  # measured 0.996; rounding to a third of the levels
 
 
-def test_nothing_outside_the_view_and_tools_enter_at_its_border(phantom):
+def test_masks_stay_inside_the_view(phantom):
     images, true = phantom[:2]
     y, x = np.mgrid[:128, :160]
     view = (x - 80) ** 2 + (y - 64) ** 2 < 60**2
@@ -100,7 +100,7 @@ def test_gray_clips_and_empty_views_give_empty_masks():
         assert model.detected_share == 0 and not model.mask(gray, view).any()
 
 
-def test_depth_that_is_missing_is_no_relief():
+def test_missing_depth_has_no_relief():
     depth = np.full((96, 96), 50, np.float32)
     depth[40:56, :] = 30  # a bar 20 mm nearer
     depth[:8] = 0

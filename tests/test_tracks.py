@@ -1,4 +1,4 @@
-"""Initial motion: points followed through synthetic frames whose motion is known."""
+"""Initial motion: points tracked through synthetic frames with known motion."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WIDTH, HEIGHT, NUM_FRAMES, DEPTH = 160, 128, 7, 50.0
 def moving_frames(
     step_px: tuple[float, float], *, tool: slice | None = None, moving: slice = slice(None)
 ) -> list[Frame]:
-    """A textured plane at 50 mm that shifts by `step_px` a frame in the columns `moving` and rests elsewhere."""
+    """A textured plane at 50 mm that shifts by `step_px` a frame in the columns `moving` and is static elsewhere."""
     noise = np.random.default_rng(0).random((HEIGHT + 160, WIDTH + 160, 3)).astype(np.float32)
     texture = cv2.GaussianBlur(noise, (0, 0), 3)
     texture = (texture - texture.min()) / (texture.max() - texture.min())
@@ -59,7 +59,7 @@ def followed(frames: list[Frame], cloud: PointCloud) -> np.ndarray:
 
 
 @pytest.mark.parametrize("origin", [0, 3, 6])
-def test_a_shifting_plane_is_followed_both_ways(origin):
+def test_a_shifting_plane_is_tracked_both_ways(origin):
     frames = moving_frames((2.0, -1.0))
     cloud = cloud_at([(80.5, 60.5), (70.25, 70.0)], origin, frames[0].camera)
     pixels = followed(frames, cloud)
@@ -80,7 +80,7 @@ def test_coefficients_move_the_points_with_the_plane():
         np.testing.assert_allclose(moved, expected, atol=0.2)  # mm; half a pixel is 0.125 mm
 
 
-def test_what_rests_gets_no_motion_and_what_moves_does():
+def test_static_points_get_no_motion_and_moving_points_do():
     frames = moving_frames((1.5, 0.0), moving=slice(80, None))
     cloud = cloud_at([(20.5, 60.5), (40.5, 30.5), (120.5, 64.5)], 0, frames[0].camera)
     motion = tracks.initial_motion(frames, cloud, BasisConfig(num_bases=7))
@@ -88,7 +88,7 @@ def test_what_rests_gets_no_motion_and_what_moves_does():
     assert np.abs(motion[2]).max() > 0.5
 
 
-def test_a_point_is_lost_behind_the_tool_and_stays_lost():
+def test_a_track_ends_behind_the_tool():
     frames = moving_frames((4.0, 0.0), tool=slice(90, None))
     pixels = followed(frames, cloud_at([(80.5, 64.5)], 0, frames[0].camera))
     assert np.isfinite(pixels[:3]).all()
@@ -103,7 +103,7 @@ def advanced(start: np.ndarray, there: np.ndarray, back: np.ndarray, tissue_mask
     return out
 
 
-def test_flow_that_does_not_return_loses_the_point():
+def test_inconsistent_flow_ends_the_track():
     there = np.full((HEIGHT, WIDTH, 2), 3.0, np.float32)
     tissue_mask = np.ones((HEIGHT, WIDTH), bool)
     start = np.array([[50.0, 50.0], [np.nan, np.nan]])
@@ -145,7 +145,7 @@ def test_mismatch_is_summed_over_known_points():
         np.testing.assert_allclose(total, expected)
 
 
-def test_gaps_are_filled_linearly_and_held_at_the_ends():
+def test_gaps_are_filled_linearly_and_constant_at_the_ends():
     offsets = np.full((6, 3, 3), np.nan)
     offsets[1, 0], offsets[4, 0] = 3.0, 9.0
     offsets[2, 1] = 5.0
@@ -156,7 +156,7 @@ def test_gaps_are_filled_linearly_and_held_at_the_ends():
     np.testing.assert_array_equal(filled[:, 2], 0)
 
 
-def test_fit_follows_what_the_basis_can_say():
+def test_fit_reproduces_offsets_in_the_span_of_the_basis():
     cfg, rng = BasisConfig(num_bases=5), np.random.default_rng(1)
     times = [i / 40 for i in range(40)]
     coefficients = rng.normal(size=(4, 5, 3))
@@ -176,7 +176,7 @@ def test_unmeasured_depth_leaves_a_gap():
     np.testing.assert_allclose(lifted[[0, 1, 3, 4, 5, 6], 0], np.broadcast_to(cloud.points, (6, 3)), atol=0.13)
 
 
-def test_frames_too_small_for_flow_start_at_rest(caplog):
+def test_frames_too_small_for_flow_get_no_motion(caplog):
     frames = moving_frames((1.0, 0.0))
     small = [
         Frame(f.index, f.time, f.camera, f.rgb_u8[:16], f.tissue_mask[:16], f.depth[:16], f.depth_valid[:16])
@@ -197,7 +197,7 @@ def test_training_starts_along_the_tracks(tmp_path):
     motion = trainer.state.gaussians["motion"].detach()
     assert motion[..., :3].abs().amax() > 0.3  # mm; the plane slides by 3 mm
     assert not motion[..., 3:].any()
-    # The points drift with the plane: most of the track's way is theirs at every moment.
+    # The points drift with the plane: most of the track's motion is theirs at every time.
     moved = torch.einsum("b,nbc->nc", torch.from_numpy(basis_weights(0.25, cfg.deformation.basis)).float(), motion)
     still = torch.einsum("b,nbc->nc", torch.from_numpy(basis_weights(0.75, cfg.deformation.basis)).float(), motion)
     assert (moved - still)[:, 0].median() == pytest.approx(3.0, abs=1.0)

@@ -211,7 +211,7 @@ def test_a_scene_knows_that_its_lengths_are_relative(tiny_sequence, tmp_path):
     assert json.loads((tmp_path / "ply/index.json").read_text())["lengths_are_relative"]
 
 
-@pytest.mark.parametrize("backend", ["cuda", "triton"])
+@pytest.mark.parametrize("backend", ["gsplat", "triton"])
 def test_a_backend_of_a_gpu_without_one_is_refused_in_words(tiny_sequence, backend, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     cfg = tiny_config("basis")
@@ -222,4 +222,4 @@ def test_a_backend_of_a_gpu_without_one_is_refused_in_words(tiny_sequence, backe
 def test_the_run_says_what_computed_it(tiny_sequence, tmp_path):
     train(load_sequence(tiny_sequence), tiny_config("basis", coarse=0, fine=2), tmp_path / "run")
     about = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert about["backend"] == "cpu" and about["device"].startswith("CPU, ") and "triton" not in about["versions"]
+    assert about["backend"] == "numba" and about["device"].startswith("CPU, ") and "triton" not in about["versions"]

@@ -1,4 +1,4 @@
-"""The unit of a depth map, guessed: every usual unit, disparity, and what cannot be told."""
+"""The guessed unit of depth maps: every usual unit, disparity, and ambiguous cases."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_usual_units(factor, unit, mm):
 @pytest.mark.parametrize(
     ("median", "unit"), [(19.9, "cm"), (20, "mm"), (249, "mm"), (250, "0.1 mm"), (1.0, "ambiguous")]
 )
-def test_where_one_unit_ends_and_the_next_begins(median, unit):
+def test_limits_between_units(median, unit):
     flat = np.full((HEIGHT, WIDTH), median), np.ones((HEIGHT, WIDTH), bool)
     image = np.full((HEIGHT, WIDTH, 3), 100, np.uint8)
     assert guess_unit([(*flat, image, flat[1])]).unit == unit
@@ -52,7 +52,7 @@ def test_disparity_is_not_depth(tool):
     assert np.isnan(guess.tool_ratio) != tool
 
 
-def test_a_near_tool_tells_disparity_where_shading_does_not():
+def test_a_near_tool_reveals_disparity_without_shading():
     assert guess_unit([view("disparity", shading=0)]).unit == "disparity"
     assert guess_unit([view("depth", shading=0)]).unit == "mm"
 
@@ -69,7 +69,7 @@ def test_no_depth_and_constant_depth():
     assert guess_unit([(np.full_like(values, 70), tissue | True, image, tissue)]).shading == 0
 
 
-def test_frames_without_tissue_use_what_there_is():
+def test_frames_without_tissue_use_all_pixels():
     values, valid, image, tissue = view()
     assert guess_unit([(values, valid, image, np.zeros_like(tissue))]).unit == "mm"
 

@@ -27,7 +27,7 @@ PICTURES = pictures_folder("view")
 WIDTH, HEIGHT = 1100, 760
 FRAME = 3
 KNOWN = ("THREE.Clock", "GPU stall due to ReadPixels", "GL Driver Message", "Automatic fallback to software WebGL")
-"""What viser's own page says in any software-drawn browser: notes on speed and on an old name."""
+"""Messages of viser's own page in a browser without a GPU: notes on speed and on an old name."""
 SPLAT_NOTE = "computeBoundingSphere"
 """viser 1.1.1 gives its splats corners of two coordinates; three.js complains when it is asked for their extent."""
 
@@ -58,7 +58,7 @@ def viewer(scene, phantom, tmp_path):
 
 @pytest.fixture
 def page(viewer):
-    """The page, once it shows a picture. Afterwards its console must hold no complaint."""
+    """The page, once it shows an image. Afterwards its console must hold no error."""
     with open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
         page.wait_for("document.querySelector('[role=slider]') !== null")
         end = time.monotonic() + 30
@@ -93,7 +93,7 @@ def settled(page, name: str = "") -> np.ndarray:
 
 
 def press_button(page, text: str) -> None:
-    """Press the button that says so."""
+    """Press the button with this label."""
     found = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {text!r})"
     page.wait_for(f"{found} !== undefined")
     page.evaluate(f"{found}.click()")
@@ -115,7 +115,7 @@ def choose(viewer, handle, value) -> None:
     client.flush()
 
 
-def test_the_slider_changes_the_picture_and_play_advances(viewer, page, scene):
+def test_the_slider_changes_the_image_and_play_advances(viewer, page, scene):
     first = settled(page, "first_frame")
     page.evaluate("document.querySelector('[role=slider]').focus()")
     for _ in range(FRAME):
@@ -180,7 +180,7 @@ def test_layers_tracks_tool_and_orbit(viewer, page):
     assert np.abs(settled(page, "orbit") - before).mean() > 2
 
 
-def test_the_browser_draws_what_the_server_draws(viewer):
+def test_the_browser_renders_like_the_server(viewer):
     with open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
         page.wait_for("document.querySelector('[role=slider]') !== null")
         wait_until(lambda: canvas(page).std() > 20, 30)
@@ -189,7 +189,7 @@ def test_the_browser_draws_what_the_server_draws(viewer):
         wait_until(lambda: viewer.settings.in_browser)
         time.sleep(2)
         theirs = settled(page, "browser_splats")
-    margin = round(0.2 * ours.shape[1])  # the server's picture ends where the endoscope's does
+    margin = round(0.2 * ours.shape[1])  # the server's image ends at the border of the endoscope image
     assert np.abs(ours - theirs)[:, margin:-margin].mean() < 12
     assert not unexpected(page.problems, SPLAT_NOTE)
 

@@ -1,4 +1,4 @@
-"""The viewer's pure parts: clock, canvas, marks, measuring, paths, dots, who may connect, files."""
+"""Pure functions of the viewer: playback, canvas, lines, measuring, video paths, points, access control, files."""
 
 import socket
 from dataclasses import replace
@@ -22,18 +22,18 @@ CAMERA = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
 OFF_CENTER = Camera(64, 48, 80.0, 80.0, 30.0, 27.0, np.eye(4))
 
 
-def test_the_film_repeats_at_its_rate():
+def test_playback_repeats_at_its_rate():
     assert [frame_due(8, seconds, 10.0, 12) for seconds in (0, 0.09, 0.1, 0.35, 0.4, 1.25)] == [8, 8, 9, 11, 0, 8]
 
 
-def test_only_a_slow_picture_that_moves_is_halved():
+def test_only_slow_moving_images_are_halved():
     assert [shrink_factor(0.0, 30.0), shrink_factor(0.0, 90.0), shrink_factor(1.0, 90.0)] == [1, 2, 1]
 
 
 @pytest.mark.parametrize("camera", (CAMERA, OFF_CENTER))
 @pytest.mark.parametrize("aspect", (0.5, 4 / 3, 2.5))
 @pytest.mark.parametrize("shrink", (1, 2))
-def test_the_canvas_holds_the_picture_and_has_its_principal_point_in_the_middle(camera, aspect, shrink):
+def test_the_canvas_contains_the_image_with_a_centered_principal_point(camera, aspect, shrink):
     viewport = endoscope_viewport(camera, aspect, shrink)
     assert viewport.pixel((0.5, 0.5)) == pytest.approx((viewport.camera.cx, viewport.camera.cy), abs=0.51)
     assert viewport.width / viewport.height == pytest.approx(aspect, rel=0.06)  # sizes are whole even numbers
@@ -54,7 +54,7 @@ def test_pixels_that_are_not_square_become_square():
     assert (viewport.camera.width, viewport.camera.fx, viewport.camera.cx) == (128, 80.0, 64.0)
 
 
-def test_a_browsers_camera_sees_what_it_looks_at():
+def test_a_browser_camera_becomes_a_viewport():
     half = np.sqrt(0.5)
     viewport = free_viewport(np.array([half, 0, half, 0]), np.array([1.0, 2, 3]), 0.8, 1.5, 100)
     pixels, z = project(np.array([[11.0, 2, 3]]), viewport.camera)  # turned by 90 degrees about y: looks along +x
@@ -66,12 +66,12 @@ def test_a_browsers_camera_sees_what_it_looks_at():
     "wxyz, position, fov",
     (([np.nan, 0, 0, 0], [0, 0, 0], 1.0), ([0, 0, 0, 0], [0, 0, 0], 1.0), ([1, 0, 0, 0], [0, np.inf, 0], 1.0)),
 )
-def test_a_camera_that_is_none_draws_nothing(wxyz, position, fov):
+def test_an_invalid_camera_gives_no_viewport(wxyz, position, fov):
     assert free_viewport(np.array(wxyz), np.array(position), fov, 1.0, 100) is None
     assert free_viewport(np.array([1.0, 0, 0, 0]), np.zeros(3), -2.0, 1.0, 100) is None
 
 
-def test_canvases_of_no_size_have_an_aspect():
+def test_empty_canvases_have_an_aspect():
     assert [bounded_aspect(0, 10), bounded_aspect(10, 0), bounded_aspect(1000, 1), bounded_aspect(3, 2)] == [
         1,
         1,
@@ -80,7 +80,7 @@ def test_canvases_of_no_size_have_an_aspect():
     ]
 
 
-def test_trails_end_at_the_frame_and_leave_out_what_is_unknown():
+def test_track_lines_end_at_the_frame_and_skip_unknown_points():
     paths = np.zeros((12, 2, 3))
     paths[:, 0, 0] = np.arange(12)
     paths[5, 1] = np.nan
@@ -91,7 +91,7 @@ def test_trails_end_at_the_frame_and_leave_out_what_is_unknown():
     assert marks.dots.sum() == 2 and len(track_lines(paths, 0)) == 2
 
 
-def test_marks_are_drawn_where_they_project():
+def test_lines_are_drawn_at_their_projection():
     ends = np.array([[-5.0, 0, 50], [5, 0, 50]])
     marks = concatenated(no_lines(), ruler(ends))
     picture = draw_lines(np.zeros((48, 64, 3), np.uint8), CAMERA, marks)
@@ -103,7 +103,7 @@ def test_marks_are_drawn_where_they_project():
     assert len(ruler(ends[:0])) == 0 and len(ruler(ends[:1])) == 1
 
 
-def test_a_click_finds_the_point_behind_it():
+def test_a_click_picks_the_surface_point():
     depth = np.zeros((48, 64), np.float32)
     depth[10, 20] = 40
     assert pick(depth, CAMERA, (20.5, 10.5)) == pytest.approx([(20.5 - 32) / 80 * 40, (10.5 - 24) / 80 * 40, 40])
@@ -111,7 +111,7 @@ def test_a_click_finds_the_point_behind_it():
         assert pick(depth, CAMERA, nowhere) is None
 
 
-def test_a_measurement_says_distance_and_change():
+def test_a_measurement_reports_distance_and_change():
     paths = np.zeros((3, 2, 3))
     paths[:, 1, 0] = 4, 5, 7
     measured = Measurement(1, paths)
@@ -126,7 +126,7 @@ def test_a_measurement_says_distance_and_change():
     assert "second" in measurement_text(Measurement(0, paths[:, :1]), 0, relative=False)
 
 
-def test_a_film_follows_the_frames_or_the_places_kept():
+def test_a_video_follows_the_frames_or_the_saved_views():
     cameras = (CAMERA, OFF_CENTER)
     assert [place.camera for place in follow_frames(cameras, None)] == list(cameras)
     assert {place.camera.cx for place in follow_frames(cameras, OFF_CENTER)} == {30.0}
@@ -139,7 +139,7 @@ def test_a_film_follows_the_frames_or_the_places_kept():
     assert len({(place.camera.width, place.camera.height) for place in path}) == 1
 
 
-def test_the_nearest_dot_is_on_top():
+def test_the_nearest_point_is_on_top():
     points = np.array([[0.0, 0, 60], [0, 0, 50], [0, 0, -5]], np.float32)
     colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
     for order in ([0, 1, 2], [2, 1, 0]):
@@ -162,11 +162,11 @@ def test_the_nearest_dot_is_on_top():
         ("null", "127.0.0.1:80", "127.0.0.1", False),
     ),
 )
-def test_pages_of_other_sites_are_not_served(origin, asked, bound, admitted):
+def test_pages_of_other_sites_are_rejected(origin, asked, bound, admitted):
     assert is_trusted(origin, asked, bound) is admitted
 
 
-def test_an_address_that_cannot_be_had_is_refused():
+def test_an_occupied_address_is_an_error():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -178,7 +178,7 @@ def test_an_address_that_cannot_be_had_is_refused():
     check_address("127.0.0.1", 0)
 
 
-def test_files_are_kept_beside_each_other_and_nowhere_else(tmp_path):
+def test_files_are_never_overwritten_and_stay_in_the_folder(tmp_path):
     picture = np.zeros((8, 8, 3), np.uint8)
     first, second = (keep(tmp_path / "view", "a.png", png_bytes(picture)) for _ in range(2))
     assert first != second and first.read_bytes() == second.read_bytes()

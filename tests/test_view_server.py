@@ -1,4 +1,4 @@
-"""The viewer spoken to over its own protocol: pictures, clicks, garbage, foreign pages; scenes, sequences, training."""
+"""The viewer over its own protocol: images, clicks, malformed data, foreign pages; scenes, sequences, training."""
 
 import hashlib
 import json
@@ -58,7 +58,7 @@ def viewer(scene, tmp_path):
 
 @pytest.fixture
 def client(viewer):
-    """A connected stand-in for a browser, past its first picture."""
+    """A connected stand-in for a browser, after its first image."""
     client = Client(viewer.port)
     client.send_camera()
     client.picture()
@@ -67,17 +67,17 @@ def client(viewer):
 
 
 def close(a, b, levels: float = 3.0) -> bool:
-    """Whether two pictures agree but for JPEG."""
+    """Whether two images agree up to JPEG errors."""
     return a.shape == b.shape and np.abs(a.astype(float) - b).mean() < levels
 
 
-def test_the_picture_is_the_scenes_own(scene):
+def test_the_image_equals_the_rendering_of_the_scene(scene):
     settings, viewable = ViewSettings(frame=3), ViewableScene(scene, "wall")
     assert np.array_equal(viewable.picture(settings, CAMERA), to_u8(scene.render(3 / NUM_FRAMES).color.numpy()))
     assert viewable.surface(settings, CAMERA)[24, 32] == pytest.approx(50, abs=1e-3)
 
 
-def test_the_slider_changes_the_picture(viewer, client, scene):
+def test_the_slider_changes_the_image(viewer, client, scene):
     client.set(viewer.panel.frame, 5)
     expected = to_u8(scene.render(5 / NUM_FRAMES).color.numpy())
     canvas = client.picture()
@@ -85,7 +85,7 @@ def test_the_slider_changes_the_picture(viewer, client, scene):
     assert np.array_equal(canvas[2:50], expected) and not canvas[0].any()
 
 
-def test_every_layer_is_a_different_picture(viewer, client):
+def test_every_layer_is_a_different_image(viewer, client):
     client.set(viewer.panel.frame, 4)
     pictures = {"color": client.picture()}
     for layer in ("depth", "alpha", "motion", "prior"):
@@ -143,7 +143,7 @@ def test_play_advances_and_pauses(viewer, client):
     assert viewer.settings.frame == at == viewer.panel.frame.value
 
 
-def test_a_browser_can_draw_the_gaussians_itself(viewer, client):
+def test_a_browser_can_render_the_gaussians_itself(viewer, client):
     def nodes(handle, value):
         client.set(handle, value)
         kinds, end = set(), time.monotonic() + 2
@@ -160,7 +160,7 @@ def test_a_browser_can_draw_the_gaussians_itself(viewer, client):
     assert "BackgroundImageMessage" in nodes(viewer.panel.layer, LAYER_NAMES["depth"])  # no color of a Gaussian
 
 
-def test_screenshot_and_film_are_kept_in_the_run(viewer, client):
+def test_screenshot_and_video_are_stored_in_the_run(viewer, client):
     client.set(viewer.panel.screenshot, True)
     client.set(viewer.panel.camera, ORBIT)
     client.set(viewer.panel.keep, True)
@@ -175,7 +175,7 @@ def test_screenshot_and_film_are_kept_in_the_run(viewer, client):
     assert sorted(path.name for path in viewer.out.iterdir()) == ["color_000000_1.png", "color_1.mp4"]
 
 
-def test_garbage_ends_its_own_connection_only(viewer, client, capfd):
+def test_malformed_data_closes_only_its_own_connection(viewer, client, capfd):
     for raw in (b"", b"\xff" * 100, b"\x81\xa4type\xa3foo", "text"):
         stranger = Client(viewer.port)
         stranger.socket.send(raw)
@@ -211,7 +211,7 @@ def test_a_page_of_another_site_sees_nothing(viewer):
     own.socket.close()
 
 
-def test_only_this_machine_is_listened_to(viewer):
+def test_the_server_binds_to_this_machine_only(viewer):
     assert viewer.server.get_host() == "127.0.0.1" and viewer.server.request_share_url() is None
 
 
@@ -240,7 +240,7 @@ def test_a_raw_sequence_is_shown_before_training(tiny_sequence):
         for x in (0.45, 0.55):
             client.click(x, 0.7)
         time.sleep(0.5)
-        assert np.isfinite(viewer.measured.distances).sum() == 1  # nothing says where the points go
+        assert np.isfinite(viewer.measured.distances).sum() == 1  # the motion of the points is unknown
         client.socket.close()
 
 
@@ -261,7 +261,7 @@ def short_config() -> Config:
     return replace(cfg, init=replace(cfg.init, budget=300), schedule=schedule)
 
 
-def test_watching_does_not_change_the_training(tiny_sequence, tmp_path):
+def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path):
     digests, shown = [], []
     for watched in (False, True):
         out, client = tmp_path / f"run{watched}", None

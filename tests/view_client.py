@@ -29,7 +29,7 @@ class Client:
         )
 
     def send_camera(self, **changes: Any) -> None:
-        """Say where its camera is."""
+        """Send the position of its camera."""
         camera = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "look_at": (0, 0, 60), "up_direction": (0, -1, 0)}
         camera |= {"fov": 0.9, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 600}
         self.send("ViewerCameraMessage", **camera | changes)
@@ -53,7 +53,7 @@ class Client:
         self.send("ScenePointerMessage", event_type="click", screen_pos=((x, y),), modifier=None, **ray)
 
     def read(self, timeout: float) -> list[dict]:
-        """The next messages; of a picture the pixels, (H, W, 3) RGB, under `picture`."""
+        """The next messages; of an image the pixels, (H, W, 3) RGB, under `picture`."""
         raw = self.socket.recv(timeout=timeout)
         length = int.from_bytes(raw[8:16], "little")
         messages = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(raw[16 : 16 + length]))["messages"]
@@ -63,7 +63,7 @@ class Client:
         return messages
 
     def picture(self, timeout: float = 20, quiet: float = 0.8) -> NDArray[np.uint8]:
-        """The last picture, once nothing comes for `quiet` seconds."""
+        """The last image, once nothing arrives for `quiet` seconds."""
         found, wait = None, timeout
         while True:
             try:

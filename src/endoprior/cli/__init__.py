@@ -78,7 +78,7 @@ def main(argv: list[str] | None = None) -> int:
 def system_failure(error: Exception) -> str | None:
     """The error message for failures of memory and the file system; None for a bug."""
     whole = " ".join(str(error).split())
-    if type(error).__name__ == "OutOfMemoryError":  # torch's, of a GPU: its words begin with the numbers
+    if type(error).__name__ == "OutOfMemoryError":  # raised by torch for a GPU; its message starts with the numbers
         return (
             f"expected enough GPU memory, got {whole[:160]!r}. Fix: use smaller frames, a smaller --init-budget or "
             "--device cpu. The last checkpoint of a run is complete; continue it with --resume."

@@ -30,7 +30,7 @@ class Check:
 
 
 def run(argv: list[str]) -> None:
-    """Measure, print, draw."""
+    """Measure the sequence, print the report, write the figure."""
     args = parse(Check, argv, "check")
     if args.out.suffix.lower() != ".png":
         raise input_error("--out", "a .png file", str(args.out), f"`--out {args.out.with_suffix('.png')}`.")

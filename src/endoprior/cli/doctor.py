@@ -27,11 +27,11 @@ class Doctor:
 def run(argv: list[str]) -> int:
     """Print the report. Exit status 0 even if something is missing; 1 if --compile fails."""
     args = parse(Doctor, argv, "doctor")
-    from ..doctor import examine, look
+    from ..doctor import examine, read_facts
     from ..doctor.choice import choose
     from ..doctor.report import as_json, table
 
-    facts, compiling = look(), ""
+    facts, compiling = read_facts(), ""
     if args.compile:
         facts, compiling = _compile(facts, quiet=args.json)
     report = examine(facts)
@@ -56,8 +56,8 @@ def _compile(facts: Facts, quiet: bool) -> tuple[Facts, str]:
     from ..doctor import examine
     from ..doctor.facts import compile_gsplat
 
-    if hinders := examine(facts).hinders_compiling:
-        return facts, f"gsplat was not compiled: {hinders}"
+    if problem := examine(facts).compile_problem:
+        return facts, f"gsplat was not compiled: {problem}"
     if not quiet:
         say("compiling gsplat; this takes minutes")
     facts = compile_gsplat(facts)

@@ -10,6 +10,7 @@ from typing import TypeVar
 import tyro
 
 from ..core.checks import InputError, input_error
+from ..core.config_io import current_value
 
 A = TypeVar("A")
 BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
@@ -28,7 +29,7 @@ def parse(cls: type[A], argv: list[str], command: str, default: A | None = None)
     extra = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(errors):
-            return tyro.cli(cls, args=argv, prog=f"endoprior {command}", description=cls.__doc__, **extra)
+            return tyro.cli(cls, args=_current(argv), prog=f"endoprior {command}", description=cls.__doc__, **extra)
     except SystemExit as exit_:
         if exit_.code == 0:
             raise
@@ -37,6 +38,18 @@ def parse(cls: type[A], argv: list[str], command: str, default: A | None = None)
         raise
     except ValueError as error:  # a range check of the config
         raise InputError(f"{str(error).removesuffix('.')}. Fix: `endoprior {command} --help`.") from None
+
+
+def _current(argv: list[str]) -> list[str]:
+    """The words with values of earlier versions replaced: `--render.backend cpu` is `--render.backend numba`."""
+    words = []
+    for word, before in zip(argv, ["", *argv], strict=False):
+        option, equals, value = word.partition("=")
+        if equals:
+            words.append(f"{option}={current_value(option.removeprefix('--'), value, hint=True)}")
+        else:
+            words.append(current_value(before.removeprefix("--"), word, hint=True))
+    return words
 
 
 def _one_line(page: str) -> str:

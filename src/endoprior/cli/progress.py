@@ -23,7 +23,7 @@ def say(text: str) -> None:
 
 @contextmanager
 def training_progress() -> Iterator:
-    """Yield the `on_step` callback of `train.train`."""
+    """Yield the `on_step` callback of `runs.training_run.train`."""
     if sys.stderr.isatty():
         with _bar() as callback:
             yield callback

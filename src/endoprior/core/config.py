@@ -15,6 +15,9 @@ from typing import Annotated, Literal
 from .checks import InputError, check_range
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
+Backend = Literal["reference", "numba", "triton", "gsplat"]
+"""What renders: see `render`."""
+
 
 @dataclass(frozen=True)
 class DataConfig(Checked):
@@ -186,8 +189,8 @@ class DeformationConfig:
 class RenderConfig:
     """How splats are rendered."""
 
-    backend: Literal["cpu", "cuda", "triton", "reference"] = "cpu"
-    """`cpu`: Numba kernels; `cuda`, `triton`: an NVIDIA GPU, by gsplat or our own kernels; `reference`: plain torch."""
+    backend: Backend = "numba"
+    """`numba`: the CPU; `triton`, `gsplat`: an NVIDIA GPU, by our own kernels or gsplat's; `reference`: PyTorch."""
     depth_grad_to_means: bool = False
     """Let the gradient of rendered depth reach the composited z; EndoGaussian's rasterizer drops it."""
 

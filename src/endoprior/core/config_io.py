@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import sys
 import types
 import typing
 from typing import Any, TypeVar
@@ -13,6 +14,28 @@ from .checks import InputError, input_error
 
 C = TypeVar("C")
 _hints = functools.cache(typing.get_type_hints)
+FORMER_VALUES = {"render.backend": {"cpu": "numba", "cuda": "gsplat"}}
+"""Config field -> value of earlier versions -> what it is called now."""
+
+
+def current_value(field: str, value: Any, *, hint: bool = False) -> Any:
+    """What a value of a config field is called now; any other value is returned as it is.
+
+    Args:
+        field: dotted name; only its last two parts count.
+        hint: print the new name on stderr, once: for values that a user typed.
+    """
+    renamed = FORMER_VALUES.get(".".join(field.split(".")[-2:]), {})
+    if not isinstance(value, str) or value not in renamed:
+        return value
+    if hint:
+        _print_renamed(field, value, renamed[value])
+    return renamed[value]
+
+
+@functools.cache
+def _print_renamed(field: str, former: str, current: str) -> None:
+    print(f"endoprior: {field}: `{former}` is now called `{current}`", file=sys.stderr)
 
 
 def to_dict(cfg: Any) -> Any:
@@ -53,6 +76,7 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return value
+    value = current_value(where, value)
     if origin is typing.Literal:
         ok, want = value in args, f"one of {', '.join(map(repr, args))}"
     elif origin is tuple:

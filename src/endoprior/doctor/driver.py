@@ -1,4 +1,4 @@
-"""NVIDIA's driver: its files, which cost nothing to look at, and nvidia-smi, which may hang."""
+"""NVIDIA's driver: its files, which are quick to read, and nvidia-smi, which may hang."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-from .ask import ask, clean
+from .probe_process import clean, run_program
 from .records import Driver, Gpu, number
 
 LIMIT_S = 10.0
-"""Longest wait for nvidia-smi, s: it wakes sleeping cards first, which takes seconds each."""
+"""Longest wait for nvidia-smi, s: it wakes sleeping GPUs first, which takes seconds each."""
 DRIVER_CUDA = {
     450: "11.0", 455: "11.1", 460: "11.2", 465: "11.3", 470: "11.4", 495: "11.5", 510: "11.6", 515: "11.7",
     520: "11.8", 525: "12.0", 530: "12.1", 535: "12.2", 545: "12.3", 550: "12.4", 555: "12.5", 560: "12.6",
@@ -20,15 +20,15 @@ DRIVER_CUDA = {
 }  # fmt: skip
 """First driver branch that serves each CUDA: NVIDIA's release notes of the toolkit."""
 DEVICE_FILES = ("/dev/nvidia0", "/dev/nvidiactl", "/dev/nvhost-gpu")
-"""How a program reaches a card: on Linux, in a container that has some of the cards, on a Jetson."""
-WSL_DOOR = "/dev/dxg"
-"""The same in WSL, for cards of any make: only with NVIDIA's tool, which Windows brings in, is one of them NVIDIA's."""
+"""How a program reaches a GPU: on Linux, in a container that has some of the GPUs, on a Jetson."""
+WSL_DEVICE = "/dev/dxg"
+"""In WSL, for GPUs of any maker: one is NVIDIA's only if NVIDIA's tool is there too."""
 TOOL_PLACES = ("/usr/lib/wsl/lib/nvidia-smi", "/opt/bin/nvidia-smi")
 """Where nvidia-smi is when it is not on PATH."""
 
 
 def driver_files(root: Path = Path("/")) -> Driver:
-    """What can be seen of the driver without running anything.
+    """What its files tell, without running anything.
 
     Args:
         root: where the file system starts; tests put another one here.
@@ -37,25 +37,25 @@ def driver_files(root: Path = Path("/")) -> Driver:
     return Driver(
         on_bus=_on_bus(root / "sys/bus/pci/devices"),
         module=_module(root / "proc/driver/nvidia/version"),
-        device_files=any((root / name[1:]).exists() for name in (*DEVICE_FILES, *[WSL_DOOR] * bool(tool))),
+        device_files=any((root / name[1:]).exists() for name in (*DEVICE_FILES, *[WSL_DEVICE] * bool(tool))),
         tool=tool,
     )
 
 
 def driver_answers(driver: Driver, limit_s: float = LIMIT_S) -> Driver:
-    """The same with what nvidia-smi says, if there is one."""
+    """The driver with what nvidia-smi prints, if there is one."""
     if not driver.tool:
         return replace(driver, version=driver.module, cuda=_served(driver.module))
-    said = ask([driver.tool], limit_s)
-    if said.problem:
-        error = f"{said.problem}: {clean(said.text)}" if said.text.strip() else said.problem
+    answer = run_program([driver.tool], limit_s)
+    if answer.problem:
+        error = f"{answer.problem}: {clean(answer.text)}" if answer.text.strip() else answer.problem
         return replace(driver, version=driver.module, cuda=_served(driver.module), error=error)
-    version, cuda = read_banner(said.text)
+    version, cuda = read_banner(answer.text)
     if not version:
-        error = f"{Path(driver.tool).name} printed no version: {clean(said.text, 80)}"
+        error = f"{Path(driver.tool).name} printed no version: {clean(answer.text, 80)}"
         return replace(driver, version=driver.module, cuda=_served(driver.module), error=error)
     query = "--query-gpu=name,compute_cap,memory.total"
-    listed = ask([driver.tool, query, "--format=csv,noheader,nounits"], limit_s)
+    listed = run_program([driver.tool, query, "--format=csv,noheader,nounits"], limit_s)
     gpus = () if listed.problem else read_gpus(listed.text)
     return replace(driver, version=version, cuda=cuda or _served(version), gpus=gpus)
 
@@ -71,7 +71,7 @@ def read_banner(text: str) -> tuple[str, str]:
 
 
 def read_gpus(text: str) -> tuple[Gpu, ...]:
-    """Cards out of nvidia-smi's table of name, compute capability and memory in MiB; lines that do not fit are skipped.
+    """GPUs out of nvidia-smi's table of name, compute capability and memory in MiB; lines that do not fit are skipped.
 
     A name may hold a comma.
     """
@@ -106,7 +106,7 @@ def _module(file: Path) -> str:
 
 
 def _on_bus(folder: Path) -> int | None:
-    """How many display controllers of NVIDIA's (PCI vendor 10de, class 03) are on the bus; None if that is not seen."""
+    """Number of NVIDIA's display controllers (PCI vendor 10de, class 03) on the bus; None if it cannot be read."""
     try:
         devices = list(folder.iterdir())
     except OSError:

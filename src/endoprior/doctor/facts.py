@@ -1,4 +1,4 @@
-"""Look at this machine. Every look is on its own: one that fails, hangs or finds garbage leaves the others alone."""
+"""Reading the facts of this machine. Each is read on its own: one that fails or hangs does not affect the others."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..system.memory import available_bytes
-from .ask import MARK, Answer, ask, clean
 from .driver import driver_answers, driver_files
+from .probe_process import MARK, Answer, clean, run_program
 from .records import Builders, Driver, Facts, Gpu, Gsplat, System, Toolkit, Torch, Triton
-from .toolchain import look_for_builders, look_for_toolkit
+from .toolchain import find_builders, find_toolkit
 
 TORCH_LIMIT_S = 90.0
-"""Longest wait for torch, s: a first import from a slow disk, and a context on each of many cards, take time."""
+"""Longest wait for torch, s: a first import from a slow disk, and a context on each of many GPUs, take time."""
 LOAD_LIMIT_S = 60.0
 COMPILE_LIMIT_S = 3600.0
 PACKAGES = ("OpenEXR", "transformers", "torchvision", "lpips", "ray")
-"""What the optional parts import."""
+"""What optional parts import."""
 VARIABLES = (
     "CUDA_HOME", "CUDA_PATH", "CUDA_VISIBLE_DEVICES", "CUDA_INC_PATH", "TORCH_CUDA_ARCH_LIST", "TORCH_EXTENSIONS_DIR",
     "MAX_JOBS", "CC", "CXX", "TRITON_INTERPRET", "TRITON_CACHE_DIR", "TRITON_LIBCUDA_PATH", "OMP_NUM_THREADS",
@@ -37,31 +37,31 @@ VARIABLES = (
 PACKAGE_MANAGERS = ("apt-get", "dnf", "zypper", "pacman")
 
 T = TypeVar("T")
-Asked = tuple[Torch, Triton, dict[str, str], str]
-"""Torch, Triton, the weights that were found, and why they could not be looked for."""
+TorchFacts = tuple[Torch, Triton, dict[str, str], str]
+"""Torch, Triton, the weights that were found, and the error if there was one."""
 
 
-def glance() -> Facts:
-    """What can be seen without running anything, in milliseconds; enough to know that there is no CUDA here."""
+def read_facts_quickly() -> Facts:
+    """What needs no other program, in milliseconds: enough to know that there is no CUDA here."""
     return Facts(system=_or(System(), _system), driver=_or(Driver(), driver_files), torch=_or(Torch(), _torch_files))
 
 
-def look(torch_limit_s: float = TORCH_LIMIT_S) -> Facts:
+def read_facts(torch_limit_s: float = TORCH_LIMIT_S) -> Facts:
     """Everything, in the time of one import of torch; never raises.
 
     Args:
         torch_limit_s: longest wait for torch.
     """
-    seen = glance()
+    known = read_facts_quickly()
     with ThreadPoolExecutor(3) as pool:
-        driver = pool.submit(_or, seen.driver, driver_answers, seen.driver)
-        toolkit = pool.submit(_or, Toolkit(), look_for_toolkit)
-        builders = pool.submit(_or, Builders(), look_for_builders)
-        # Torch takes longest, and is asked from this thread: Ctrl-C then ends it at once.
-        silent: Asked = (seen.torch, Triton(), {}, "torch was not asked")
-        torch, triton, weights, weights_error = _or(silent, _ask_torch, torch_limit_s)
+        driver = pool.submit(_or, known.driver, driver_answers, known.driver)
+        toolkit = pool.submit(_or, Toolkit(), find_toolkit)
+        builders = pool.submit(_or, Builders(), find_builders)
+        # Torch takes longest and runs in this thread, so that Ctrl-C ends it at once.
+        without: TorchFacts = (known.torch, Triton(), {}, "the probe of torch failed")
+        torch, triton, weights, weights_error = _or(without, _probe_torch, torch_limit_s)
         return replace(
-            seen,
+            known,
             torch=torch,
             triton=triton,
             driver=driver.result(),
@@ -76,22 +76,23 @@ def look(torch_limit_s: float = TORCH_LIMIT_S) -> Facts:
 
 
 def compile_gsplat(facts: Facts, limit_s: float = COMPILE_LIMIT_S) -> Facts:
-    """Have gsplat compile itself, which takes minutes, and draw with it; the facts with what came of it."""
-    said = _run("gsplat_probe", ["compile"], limit_s)
-    found = _after(said)
+    """Compile gsplat, which takes minutes, and render with it; the facts with the result."""
+    answer = _run("gsplat_probe", ["compile"], limit_s)
+    found = _after(answer)
     gsplat = _or(facts.gsplat, _gsplat_files, facts.torch)
     if found is None:
-        return replace(facts, gsplat=replace(gsplat, loads=False, error=f"{said.problem} {clean(said.text[-300:])}"))
+        error = f"{answer.problem} {clean(answer.text[-300:])}"
+        return replace(facts, gsplat=replace(gsplat, loads=False, error=error))
     seconds = found.get("seconds")
     loads, error = found.get("loads") is True, clean(str(found.get("error", "")), 600)
     kept = seconds if isinstance(seconds, int | float) else None
     return replace(facts, gsplat=replace(gsplat, loads=loads, error=error, compile_seconds=kept))
 
 
-def _or(otherwise: T, look_: Callable[..., T], *arguments: Any) -> T:
-    """What the look returns; what is known without it if it fails in a way nobody thought of."""
+def _or(otherwise: T, read: Callable[..., T], *arguments: Any) -> T:
+    """What `read` returns, or `otherwise` if it raises anything."""
     try:
-        return look_(*arguments)
+        return read(*arguments)
     except Exception:
         return otherwise
 
@@ -131,39 +132,40 @@ def _torch_files() -> Torch:
     return Torch(version=value("__version__"), cuda=value("cuda"), hip=value("hip"))
 
 
-def _ask_torch(limit_s: float) -> Asked:
-    """What a process that imports torch says."""
-    seen = _or(Torch(), _torch_files)
-    said = _run("torch_probe", [], limit_s)
-    found = _after(said)
+def _probe_torch(limit_s: float) -> TorchFacts:
+    """What a process that imports torch finds."""
+    installed = _or(Torch(), _torch_files)
+    answer = _run("torch_probe", [], limit_s)
+    found = _after(answer)
     if found is None:
-        reason = f"{said.problem or 'no answer'} {clean(said.text[-160:])}".strip()
-        return (replace(seen, error=reason) if seen.version else seen), Triton(), {}, "torch gave no answer"
-    if not seen.version and "version" not in found:
-        return seen, Triton(), {}, "torch is not installed"
+        reason = f"{answer.problem or 'no answer'} {clean(answer.text[-160:])}".strip()
+        torch = replace(installed, error=reason) if installed.version else installed
+        return torch, Triton(), {}, "torch gave no answer"
+    if not installed.version and "version" not in found:
+        return installed, Triton(), {}, "torch is not installed"
     texts = {name: clean(str(found.get(name, ""))) for name in ("error", "reason", "extensions")}
     torch = Torch(
-        version=str(found.get("version", seen.version)),
-        cuda=str(found.get("cuda", seen.cuda)),
-        hip=str(found.get("hip", seen.hip)),
+        version=str(found.get("version", installed.version)),
+        cuda=str(found.get("cuda", installed.cuda)),
+        hip=str(found.get("hip", installed.hip)),
         available=found.get("available"),
         gpus=tuple(_gpu(entry) for entry in found.get("gpus", ())),
         architectures=tuple(map(str, found.get("architectures", ()))),
         host_compilers=found.get("host_compilers", {}),
         **texts,
     )
-    triton = _or(Triton(), _triton, torch, found.get("triton", {}), said)
+    triton = _or(Triton(), _triton, torch, found.get("triton", {}), answer)
     return torch, triton, found.get("weights", {}), clean(str(found.get("weights_error", "")))
 
 
-def _triton(torch: Torch, found: Mapping[str, Any], said: Answer) -> Triton:
-    """Triton, out of what the process of torch said: if it ended while Triton was tried, that is Triton's answer."""
+def _triton(torch: Torch, found: Mapping[str, Any], answer: Answer) -> Triton:
+    """Triton, from the probe of torch: if that ended while it tried Triton, Triton is what failed."""
     version, computes = clean(str(found.get("version", "")), 40), found.get("computes")
     error = clean(str(found.get("error", "")))
     if version and computes is None and torch.gpus and torch.gpus[0].computes:
-        computes, error = False, said.problem or "no answer"
-    elif computes is False:  # Triton tells no more than the status of the C compiler, which has printed its reason
-        printed = [line for line in said.text.splitlines() if "error: " in line and not line.startswith(MARK)]
+        computes, error = False, answer.problem or "no answer"
+    elif computes is False:  # Triton only tells the status of the C compiler, which printed its reason
+        printed = [line for line in answer.text.splitlines() if "error: " in line and not line.startswith(MARK)]
         error = clean(printed[0]) if printed else error
     return Triton(version, _or("", _triton_wanted), computes, error)
 
@@ -191,14 +193,14 @@ def _gsplat(torch: Torch, limit_s: float = LOAD_LIMIT_S) -> Gsplat:
     if not file or not torch.cuda or torch.error:
         return gsplat
     gsplat = _tried(gsplat, name, file, limit_s)
-    if not gsplat.loads and gsplat.prebuilt and gsplat.cached:  # as gsplat itself goes on to its own compiled code
+    if not gsplat.loads and gsplat.prebuilt and gsplat.cached:  # gsplat, too, then takes its own compiled code
         gsplat = _tried(replace(gsplat, prebuilt=""), "gsplat_cuda", gsplat.cached, limit_s)
     return gsplat
 
 
 def _tried(gsplat: Gsplat, name: str, file: str, limit_s: float) -> Gsplat:
-    said = _run("gsplat_probe", ["load", name, file], limit_s)
-    found = _after(said) or {"error": said.problem}
+    answer = _run("gsplat_probe", ["load", name, file], limit_s)
+    found = _after(answer) or {"error": answer.problem}
     return replace(gsplat, loads=found.get("loads") is True, error=clean(str(found.get("error", ""))))
 
 
@@ -220,7 +222,7 @@ def _gsplat_files(torch: Torch) -> Gsplat:
 
 
 def _compiled_by(folder: Path) -> str:
-    """The nvcc that torch wrote down for ninja, "" if it did not."""
+    """The nvcc in the file that torch wrote for ninja, "" if there is none."""
     text = (folder / "build.ninja").read_text(encoding="utf-8", errors="replace")
     found = re.search(r"^nvcc = (\S+)$", text, re.MULTILINE)
     return found[1] if found else ""
@@ -230,8 +232,8 @@ def _current(folder: Path) -> bool | None:
     """Whether ninja would compile nothing there: another ninja, or sources that changed, have it compile all."""
     if not (folder / "build.ninja").is_file():
         return None
-    said = ask(["ninja", "-C", str(folder), "-n"], LOAD_LIMIT_S)  # -n: only says what it would do
-    return None if said.problem else "no work to do" in said.text
+    answer = run_program(["ninja", "-C", str(folder), "-n"], LOAD_LIMIT_S)  # -n: a dry run
+    return None if answer.problem else "no work to do" in answer.text
 
 
 def _package(name: str) -> str:
@@ -252,13 +254,13 @@ def _variables() -> dict[str, str]:
 
 
 def _run(module: str, arguments: list[str], limit_s: float) -> Answer:
-    # -P: the folder one happens to be in must not stand in for packages, as it does not for `endoprior` itself.
-    return ask([sys.executable, "-P", "-m", f"{__package__}.{module}", *arguments], limit_s)
+    # -P: a file in the current folder must not be imported in place of a package.
+    return run_program([sys.executable, "-P", "-m", f"{__package__}.{module}", *arguments], limit_s)
 
 
-def _after(said: Answer) -> dict[str, Any] | None:
-    """The JSON object behind the last `MARK` in what a probe printed, whatever else was printed around it."""
-    for line in reversed(said.text.splitlines()):
+def _after(answer: Answer) -> dict[str, Any] | None:
+    """The JSON object after the last `MARK` in what a probe printed, whatever else was printed around it."""
+    for line in reversed(answer.text.splitlines()):
         if line.startswith(MARK):
             try:
                 found = json.loads(line.removeprefix(MARK))

@@ -1,82 +1,82 @@
-"""The lines about the GPU itself, its driver, and torch, which every way to draw on it needs. Pure."""
+"""The lines about the GPU itself, its driver and torch, which both GPU backends need."""
 
 from __future__ import annotations
 
-from . import mend
+from . import fixes
 from .lines import Line, State
 from .records import Facts, Gpu, number
 
 
 def gpu_lines(facts: Facts) -> tuple[Line, ...]:
-    """In the order in which things must be right."""
+    """In the order in which they must be ok."""
     return tuple(link(facts) for link in (_system, _gpu, _driver, _torch, _available, _computes))
 
 
-def _line(name: str, state: State, found: str, mend_: str = "") -> Line:
-    return Line("cuda", name, state, found, mend_)
+def _line(name: str, state: State, found: str, fix: str = "") -> Line:
+    return Line("cuda", name, state, found, fix)
 
 
 def _system(facts: Facts) -> Line:
     words = f"{facts.system.name} {facts.system.machine}"
     if facts.system.name in ("Linux", "Windows"):
         return _line("system", "ok", words)
-    return _line("system", "wrong", f"{words}: there is no CUDA for it; the CPU does everything")
+    return _line("system", "wrong", f"{words}: CUDA does not support it")
 
 
 def _gpu(facts: Facts) -> Line:
     driver, gpus = facts.driver, facts.torch.gpus or facts.driver.gpus
-    blind = driver.on_bus is None and driver.tool  # the bus cannot be seen, but somebody installed NVIDIA's tool
+    blind = driver.on_bus is None and driver.tool  # the bus cannot be read, but NVIDIA's tool is installed
     if not (gpus or driver.on_bus or driver.module or driver.device_files or driver.version or blind):
-        inside = " in this container (--gpus all shows it those of the host)" * facts.system.container
-        return _line("GPU", "missing", f"no NVIDIA GPU is seen{inside}; the CPU does everything")
+        return _line("GPU", "missing", "none found")
     if not gpus:
         return _line("GPU", "ok", f"{driver.on_bus} on the bus" if driver.on_bus else "one, by its driver")
     words = ", ".join(map(_gpu_words, gpus))
-    if gpus[0].capability and gpus[0].capability < mend.LEAST_CAPABILITY:
+    if gpus[0].capability and gpus[0].capability < fixes.LEAST_CAPABILITY:
         return _line("GPU", "wrong", f"{words}: compute capability 7.0 is needed", _other_gpu(facts))
     return _line("GPU", "ok", words)
 
 
 def _driver(facts: Facts) -> Line:
     driver, system = facts.driver, facts.system
-    words = f"{driver.version or driver.module or 'version unknown'}, serves CUDA {driver.cuda or 'of unknown version'}"
+    version = driver.version or driver.module or "version unknown"
+    words = f"{version}, supports CUDA {driver.cuda or 'of unknown version'}"
     if facts.torch.available:
         return _line("driver", "ok", words)
     if driver.error and not (driver.module or driver.device_files) and driver.on_bus is not None:
-        return _line("driver", "missing", f"not loaded; {driver.error}", mend.install_driver(facts))
+        return _line("driver", "missing", f"not loaded; {driver.error}", fixes.install_driver(facts))
     if driver.error:
         return _line("driver", "wrong", driver.error, _restart(facts))
     if not (driver.module or driver.device_files or driver.version or driver.tool):
-        return _line("driver", "missing", "no sign of it", mend.install_driver(facts))
+        return _line("driver", "missing", "not found", fixes.install_driver(facts))
     if driver.module and not driver.device_files:
         found = f"{driver.module} is loaded, but /dev/nvidia* is not there"
         if system.container:
             return _line("driver", "wrong", found, "start the container with --gpus all")
         return _line("driver", "wrong", found, "sudo nvidia-modprobe -u -c=0")
-    card = mend.capability(facts)
-    if driver.cuda and not mend.torch_builds(facts) and (card is None or card >= mend.LEAST_CAPABILITY):
-        return _line("driver", "wrong", f"{words}: too old for this GPU and Python", mend.install_driver(facts))
+    arch = fixes.capability(facts)
+    if driver.cuda and not fixes.torch_builds(facts) and (arch is None or arch >= fixes.LEAST_CAPABILITY):
+        return _line("driver", "wrong", f"{words}: too old for this GPU and Python", fixes.install_driver(facts))
     return _line("driver", "ok", words)
 
 
 def _torch(facts: Facts) -> Line:
     torch = facts.torch
-    install = mend.install_torch(facts) or mend.install_driver(facts)
-    repair = mend.install_torch(facts, again=True) or mend.install_driver(facts)
+    install = fixes.install_torch(facts) or fixes.install_driver(facts)
+    repair = fixes.install_torch(facts, again=True) or fixes.install_driver(facts)
     if not torch.version:
         return _line("torch", "missing", "not installed", install)
     if torch.error:
         hangs = "no answer" in torch.error  # most likely in the driver
         return _line("torch", "wrong", f"{torch.version}: {torch.error}", _restart(facts) if hangs else repair)
     if torch.hip:
-        return _line("torch", "wrong", f"{torch.version}, built for ROCm; only NVIDIA's GPUs are served", install)
+        return _line("torch", "wrong", f"{torch.version}, built for ROCm; only NVIDIA GPUs are supported", install)
     if not torch.cuda:
         return _line("torch", "wrong", f"{torch.version}, built without CUDA", install)
     words = f"{torch.version}, built for CUDA {torch.cuda}"
-    if number(torch.version) < mend.LEAST_TORCH:
+    if number(torch.version) < fixes.LEAST_TORCH:
         return _line("torch", "wrong", f"{words}; 2.4 or newer is needed", repair)
     if not torch.available and facts.driver.cuda and number(torch.cuda)[:1] > number(facts.driver.cuda)[:1]:
-        return _line("torch", "wrong", f"{words}; the driver serves only {facts.driver.cuda}", install)
+        return _line("torch", "wrong", f"{words}; the driver supports only {facts.driver.cuda}", install)
     return _line("torch", "ok", words)
 
 
@@ -86,10 +86,10 @@ def _available(facts: Facts) -> Line:
         return _line(name, "ok", f"available, {len(torch.gpus)} GPU{'s' * (len(torch.gpus) != 1)}")
     if torch.available is None:
         return _line(name, "missing", "not tried", "endoprior doctor" if torch.cuda and not torch.error else "")
-    found = torch.reason.split(". ")[0] or "not available"  # what torch advises after it is said better here
+    found = torch.reason.split(". ")[0] or "not available"  # without the advice that torch adds
     if "CUDA_VISIBLE_DEVICES" in facts.variables:
         masked = f"{found}; CUDA_VISIBLE_DEVICES is {facts.variables['CUDA_VISIBLE_DEVICES']!r}"
-        return _line(name, "wrong", masked, mend.unset_variable(facts, "CUDA_VISIBLE_DEVICES"))
+        return _line(name, "wrong", masked, fixes.unset_variable(facts, "CUDA_VISIBLE_DEVICES"))
     return _line(name, "wrong", found, _restart(facts))
 
 
@@ -104,14 +104,14 @@ def _computes(facts: Facts) -> Line:
     if other := _other_gpu(facts):
         return _line(name, "wrong", found, other)
     if "out of memory" in gpu.error:
-        return _line(name, "wrong", found, "end what fills the GPU: nvidia-smi shows it")
+        return _line(name, "wrong", found, "free its memory: nvidia-smi shows which programs use it")
     if "kernel image" in gpu.error:
-        return _line(name, "wrong", found, mend.install_torch(facts) or mend.install_driver(facts))
+        return _line(name, "wrong", found, fixes.install_torch(facts) or fixes.install_driver(facts))
     return _line(name, "wrong", found, _restart(facts))
 
 
 def _gpu_words(gpu: Gpu) -> str:
-    """A card in words."""
+    """A GPU in words."""
     words = [gpu.name]
     words += [f"compute capability {gpu.capability[0]}.{gpu.capability[1]}"] if gpu.capability else []
     words += [f"{gpu.memory_gb:.0f} GB"] if gpu.memory_gb else []
@@ -119,12 +119,12 @@ def _gpu_words(gpu: Gpu) -> str:
 
 
 def _other_gpu(facts: Facts) -> str:
-    """The command that makes another card, one that computes and is new enough, the first; "" if there is none."""
+    """The command that selects another GPU, one that computes and is new enough; "" if there is none."""
     for index, gpu in enumerate(facts.torch.gpus):
-        if index and gpu.computes and (gpu.capability or (0, 0)) >= mend.LEAST_CAPABILITY:
+        if index and gpu.computes and (gpu.capability or (0, 0)) >= fixes.LEAST_CAPABILITY:
             names = facts.variables.get("CUDA_VISIBLE_DEVICES", "").split(",")
             name = names[index].strip() if index < len(names) else str(index)
-            return mend.set_variable(facts, "CUDA_VISIBLE_DEVICES", name)
+            return fixes.set_variable(facts, "CUDA_VISIBLE_DEVICES", name)
     return ""
 
 

@@ -1,7 +1,7 @@
 """Runs in a process of its own: loads gsplat's compiled code, or has gsplat compile it; prints JSON after `MARK`.
 
 Arguments: `load NAME FILE` loads a file that is there and compiles nothing; `compile` does what gsplat does at its
-first use, then draws one Gaussian.
+first use, then renders one Gaussian.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sys
 import time as clock
 from typing import Any
 
-from .ask import MARK
+from .probe_process import MARK
 
 NEEDED = "intersect_tile"
 """A function that the extension of every version we accept has."""
@@ -33,7 +33,7 @@ def main(arguments: list[str]) -> None:
             found["error"] = "gsplat has no compiled code" if extension is None else f"it has no {NEEDED}"
         else:
             if arguments[0] == "compile":
-                _draw()
+                _render()
             found["loads"] = True
     except BaseException as error:
         found["error"] = " ".join(str(error).split())[-600:] or type(error).__name__
@@ -49,10 +49,10 @@ def _load(name: str, file: str) -> Any:
     return module
 
 
-def _draw() -> None:
-    """One Gaussian of half opacity in the middle of 16 x 16 pixels; raises if it cannot be seen."""
+def _render() -> None:
+    """One Gaussian of half opacity in the middle of 16 x 16 pixels; raises if it is not visible."""
     torch = importlib.import_module("torch")
-    if not torch.cuda.is_available():  # compiled for another machine; nothing to draw on
+    if not torch.cuda.is_available():  # compiled for another machine
         return
     to = {"device": "cuda", "dtype": torch.float32}
     camera = torch.tensor([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]], **to)
@@ -70,7 +70,7 @@ def _draw() -> None:
     )
     brightest = color.max().item()
     if not 0.3 < brightest <= 0.5:
-        raise RuntimeError(f"it draws a Gaussian of opacity 0.5 with brightness {brightest:.3g}")
+        raise RuntimeError(f"it renders a Gaussian of opacity 0.5 with brightness {brightest:.3g}")
 
 
 if __name__ == "__main__":

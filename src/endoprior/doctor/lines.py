@@ -1,4 +1,4 @@
-"""One line of the report, and a way to draw on the GPU: the lines that must be right for it."""
+"""One line of the report, and a GPU backend: the lines that must be ok for it."""
 
 from __future__ import annotations
 
@@ -11,31 +11,30 @@ Part = Literal["machine", "cuda", "triton", "gsplat", "also"]
 
 @dataclass(frozen=True)
 class Line:
-    """One thing, whether it is right, and what makes it so."""
+    """One thing, whether it is ok, and how to fix it."""
 
     part: Part
     name: str
     state: State
     found: str
-    mend: str = ""
+    fix: str = ""
     """A command, or a sentence where no command will do; empty if there is nothing to do, or it would not help."""
 
 
 @dataclass(frozen=True)
-class Way:
-    """A rasterizer for the GPU, and what it needs besides the GPU itself and torch."""
+class GpuBackend:
+    """What a backend needs besides the GPU itself and torch."""
 
-    name: Literal["Triton", "gsplat"]
     needs: tuple[Line, ...]
-    """In the order in which things must be right."""
+    """In the order in which they must be ok."""
 
     @property
     def blocking(self) -> Line | None:
-        """The first that is not right; None if all are."""
+        """The first line that is not ok; None if all are."""
         return next((line for line in self.needs if line.state != "ok"), None)
 
     @property
     def effort(self) -> tuple[bool, int]:
-        """Less is shorter: whether something cannot be mended at all, and how many things are to be mended."""
+        """For comparing: whether something has no fix, then how many fixes are needed."""
         wrong = [line for line in self.needs if line.state != "ok"]
-        return any(not line.mend for line in wrong), len(wrong)
+        return any(not line.fix for line in wrong), len(wrong)

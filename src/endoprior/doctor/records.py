@@ -1,7 +1,7 @@
-"""What was seen of a machine: plain values, as found, without any judgment.
+"""The facts of a machine: plain values, as they were found.
 
 Versions are text as the program prints them ("13.0"), empty where there is none; `number` makes them comparable. None
-means that nobody looked, or that no answer came.
+means: not tried, or no answer.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class System:
 
 @dataclass(frozen=True)
 class Gpu:
-    """One graphics card."""
+    """One GPU."""
 
     name: str
     capability: tuple[int, int] | None = None
@@ -52,11 +52,11 @@ class Driver:
     """NVIDIA's driver."""
 
     on_bus: int | None = None
-    """NVIDIA display controllers on the PCI bus; None where the bus cannot be seen."""
+    """NVIDIA display controllers on the PCI bus; None where the bus cannot be read."""
     module: str = ""
     """Version of the loaded kernel module."""
     device_files: bool = False
-    """Whether this process can reach a card: /dev/nvidia0, or the door of WSL."""
+    """Whether this process can reach a GPU: /dev/nvidia0, or the device file of WSL."""
     tool: str = ""
     """Path of nvidia-smi."""
     version: str = ""
@@ -64,7 +64,7 @@ class Driver:
     """The newest CUDA it serves."""
     gpus: tuple[Gpu, ...] = ()
     error: str = ""
-    """What nvidia-smi said instead of an answer."""
+    """The error of nvidia-smi."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,11 @@ class Torch:
     error: str = ""
     """Why it cannot be imported."""
     available: bool | None = None
-    """`torch.cuda.is_available()`; None if that was not asked or no answer came."""
+    """`torch.cuda.is_available()`; None: not tried, or no answer."""
     reason: str = ""
-    """What it said when it was not available."""
+    """Its error when it was not available."""
     gpus: tuple[Gpu, ...] = ()
-    """Cards in torch's order; the first is the one that would be used."""
+    """GPUs in torch's order; the first is the one that would be used."""
     architectures: tuple[str, ...] = ()
     """What its kernels were compiled for: sm_90, ..."""
     extensions: str = ""
@@ -94,7 +94,7 @@ class Torch:
 
 @dataclass(frozen=True)
 class Triton:
-    """What compiles our own kernels for the GPU."""
+    """The compiler of our own GPU kernels."""
 
     version: str = ""
     """Empty if it cannot be imported where torch is."""
@@ -108,7 +108,7 @@ class Triton:
 
 @dataclass(frozen=True)
 class Gsplat:
-    """The rasterizer for CUDA."""
+    """The gsplat library."""
 
     version: str = ""
     prebuilt: str = ""
@@ -116,7 +116,7 @@ class Gsplat:
     cached: str = ""
     """Extension that torch compiled on this machine."""
     loads: bool | None = None
-    """Whether the extension can be loaded; None if there is none, or nobody tried."""
+    """Whether the extension can be loaded; None if there is none, or it was not tried."""
     error: str = ""
     """Why it cannot."""
     compile_seconds: float | None = None
@@ -124,12 +124,12 @@ class Gsplat:
     compiled_by: str = ""
     """The nvcc that compiled `cached`, as it was spelled then."""
     current: bool | None = None
-    """Whether ninja finds nothing to do in the folder of `cached`; None if it was not asked or gave no answer."""
+    """Whether ninja finds nothing to do in the folder of `cached`; None: not tried, or no answer."""
 
 
 @dataclass(frozen=True)
 class Toolkit:
-    """What compiles CUDA."""
+    """The CUDA toolkit."""
 
     home: str = ""
     """Folder in which torch looks for it: CUDA_HOME, CUDA_PATH, the one of the nvcc on PATH, or /usr/local/cuda."""
@@ -138,7 +138,7 @@ class Toolkit:
     nvcc: str = ""
     """Version of `home`/bin/nvcc."""
     error: str = ""
-    """What nvcc said instead of a version."""
+    """The error of nvcc."""
     headers: bool = False
     """Whether cuda_runtime.h is where a C++ compiler will look."""
     headers_elsewhere: str = ""
@@ -157,7 +157,7 @@ class Toolkit:
 
 @dataclass(frozen=True)
 class Builders:
-    """What compiles C++ and C."""
+    """Compilers for C++ and C, and what they need."""
 
     compiler: str = ""
     """The command: CXX, c++, or cl."""
@@ -178,7 +178,7 @@ class Builders:
 
 @dataclass(frozen=True)
 class Facts:
-    """Everything that was seen. The default is a Linux machine with nothing on it."""
+    """All facts. The default is a Linux machine with nothing on it."""
 
     system: System = field(default_factory=System)
     driver: Driver = field(default_factory=Driver)

@@ -10,7 +10,7 @@ import sys
 import sysconfig
 from pathlib import Path
 
-from .ask import ask, clean
+from .probe_process import clean, run_program
 from .records import Builders, Toolkit
 
 LIMIT_S = 10.0
@@ -20,7 +20,7 @@ CUDART = "cudart.lib" if WINDOWS else "libcudart.so"
 """What gsplat is linked against; wheels have it only under its full name, with a version behind."""
 
 
-def look_for_toolkit(default: Path = Path("/usr/local/cuda"), limit_s: float = LIMIT_S) -> Toolkit:
+def find_toolkit(default: Path = Path("/usr/local/cuda"), limit_s: float = LIMIT_S) -> Toolkit:
     """The CUDA toolkit that torch's extension compiler would take, and others beside it.
 
     Args:
@@ -55,14 +55,14 @@ def look_for_toolkit(default: Path = Path("/usr/local/cuda"), limit_s: float = L
     )
 
 
-def look_for_builders(limit_s: float = LIMIT_S) -> Builders:
+def find_builders(limit_s: float = LIMIT_S) -> Builders:
     """The compilers that torch and Triton would take, ninja, and Python's headers."""
     compiler = _cxx()
     version, is_gcc, error = _compiler(compiler.split(), limit_s)  # CXX may be "ccache g++"
     c_compiler = _cc()
     c_version, _, c_error = _compiler([c_compiler], limit_s) if c_compiler else ("", False, "no gcc, no clang on PATH")
     beside = Path(sys.executable).parent
-    ninja = ask(["ninja", "--version"], limit_s)
+    ninja = run_program(["ninja", "--version"], limit_s)
     headers = sysconfig.get_path("include", "nt" if WINDOWS else "posix_prefix")  # Debian's own scheme names others
     return Builders(
         compiler=clean(compiler, 80),
@@ -108,8 +108,8 @@ def _libraries(home: Path) -> Path:
 
 def _linker_finds(name: str, limit_s: float) -> bool:
     """Whether a library is where the linker looks by itself, as Debian's packages put it, or LIBRARY_PATH does."""
-    said = ask([*_cxx().split(), f"-print-file-name={name}"], limit_s)
-    return not said.problem and os.path.isabs(said.text.strip()) and Path(said.text.strip()).exists()
+    answer = run_program([*_cxx().split(), f"-print-file-name={name}"], limit_s)
+    return not answer.problem and os.path.isabs(answer.text.strip()) and Path(answer.text.strip()).exists()
 
 
 def _home(default: Path) -> tuple[str, str]:
@@ -127,10 +127,10 @@ def _nvcc(home: Path, limit_s: float) -> tuple[str, str]:
     program = home / "bin" / f"nvcc{SUFFIX}"
     if not program.is_file():
         return "", f"no {program}"
-    said = ask([str(program), "--version"], limit_s)
-    found = re.search(r"release (\d+\.\d+)", said.text)
-    if said.problem or not found:
-        return "", said.problem or f"{program} printed no version: {clean(said.text, 80)}"
+    answer = run_program([str(program), "--version"], limit_s)
+    found = re.search(r"release (\d+\.\d+)", answer.text)
+    if answer.problem or not found:
+        return "", answer.problem or f"{program} printed no version: {clean(answer.text, 80)}"
     return found[1], ""
 
 
@@ -147,17 +147,17 @@ def _compiler(words: list[str], limit_s: float) -> tuple[str, bool, str]:
     """Version, whether it is gcc, and why there is none."""
     if not words or not shutil.which(words[0]):
         return "", False, f"no {clean(' '.join(words), 80) or 'compiler'} on PATH"
-    if Path(words[0]).stem.lower() == "cl":  # prints its version and complains; there is nothing else to ask
-        said = ask(words, limit_s)
-        return _version(said.text) or "?", False, ""
-    said = ask([*words, "--version"], limit_s)
-    if said.problem:
-        return "", False, said.problem
-    version = _version(said.text.splitlines()[0] if said.text.strip() else "")
+    if Path(words[0]).stem.lower() == "cl":  # prints its version and an error; it has no option for it
+        answer = run_program(words, limit_s)
+        return _version(answer.text) or "?", False, ""
+    answer = run_program([*words, "--version"], limit_s)
+    if answer.problem:
+        return "", False, answer.problem
+    version = _version(answer.text.splitlines()[0] if answer.text.strip() else "")
     if not version:
-        return "", False, f"{words[0]} printed no version: {clean(said.text, 80)}"
+        return "", False, f"{words[0]} printed no version: {clean(answer.text, 80)}"
     # Clang says so; "Free Software Foundation" is in gcc's own page, whatever the command is called.
-    return version, "Free Software Foundation" in said.text and "clang" not in said.text, ""
+    return version, "Free Software Foundation" in answer.text and "clang" not in answer.text, ""
 
 
 def _version(text: str) -> str:

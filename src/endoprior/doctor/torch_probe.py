@@ -1,4 +1,4 @@
-"""Runs in a process of its own: imports torch, asks it about CUDA, prints one line of JSON after `MARK`.
+"""Runs in a process of its own: imports torch, queries CUDA, prints one line of JSON after `MARK`.
 
 A broken torch or driver may crash or hang here, and the CUDA context it makes ends with the process. Triton is tried
 last, and the line printed again with what came of it: the first one is left if that crashes or hangs.
@@ -11,11 +11,11 @@ import os
 import sys
 from typing import Any
 
-from .ask import MARK
+from .probe_process import MARK
 
 
 def main() -> None:
-    """Print what torch says; what fails leaves a reason in its place."""
+    """Print what torch tells, and an error for what fails."""
     found: dict[str, Any] = {}
     try:
         import torch
@@ -25,9 +25,9 @@ def main() -> None:
     found["version"] = str(torch.__version__)
     found["cuda"] = getattr(torch.version, "cuda", None) or ""
     found["hip"] = getattr(torch.version, "hip", None) or ""
-    for name, look in (("extensions", _extensions), ("host_compilers", _host_compilers)):
+    for name, read in (("extensions", _extensions), ("host_compilers", _host_compilers)):
         try:
-            found[name] = look()
+            found[name] = read()
         except Exception:
             continue
     found.update(_weights())
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def _cuda(torch: Any) -> dict[str, Any]:
-    """Cards, and whether each of them adds two numbers."""
+    """GPUs, and whether each of them adds two numbers."""
     found: dict[str, Any] = {"available": False, "reason": "", "gpus": [], "architectures": []}
     try:
         found["architectures"] = list(torch.cuda.get_arch_list())

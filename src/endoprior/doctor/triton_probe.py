@@ -1,6 +1,6 @@
 """A kernel that adds two numbers: where it runs, Triton finds its compilers and the driver. For `torch_probe` only.
 
-Triton keeps what it compiled in its own cache, as it will when it draws: a cache that cannot be written shows here.
+Triton keeps what it compiled in its own cache, as it does when it renders: a cache that cannot be written fails here.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ import yaml
 
 from ..core.checks import InputError, input_error
 from ..core.config import Config
-from ..core.config_io import from_dict, to_dict
+from ..core.config_io import current_value, from_dict, to_dict
 from ..core.presets import PresetName, preset
 from ..data.formats import FORMATS
 from ..data.reading import read_text
@@ -153,7 +153,7 @@ def _override(values: dict[str, Any], name: str, value: Any, where: str) -> None
         raise input_error(where, "the dotted name of a config field", f"{name}", "see `endoprior train -h`.")
     if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(values[last]) in (int, float):
         value = type(values[last])(values[last] * float(factor[1]))
-    values[last] = value
+    values[last] = current_value(name, value, hint=True)
 
 
 def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:

@@ -23,7 +23,7 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points)
 
-    def taken(self, rows: NDArray) -> PointCloud:
+    def subset(self, rows: NDArray) -> PointCloud:
         """The points selected by `rows`, indices or a mask."""
         return PointCloud(self.points[rows], self.colors[rows], self.origins[rows])
 
@@ -78,4 +78,4 @@ def remove_outliers(cloud: PointCloud, num_neighbors: int, num_std: float) -> Po
     distance, _ = cKDTree(cloud.points).query(cloud.points, k=num_neighbors)
     average = distance.reshape(len(cloud), -1).mean(1)
     keep = average <= average.mean() + num_std * average.std(ddof=1)
-    return cloud.taken(keep)
+    return cloud.subset(keep)

@@ -69,7 +69,7 @@ def initial_points(
         samples = list(pool.map(sample, range(len(frames))))
     cloud, missing = concatenated([points for points, _ in samples]), sum(missed for _, missed in samples)
     if cfg.sampler == "pool" and len(cloud):
-        cloud = cloud.taken(np.random.default_rng(seed).integers(len(cloud), size=cfg.budget))
+        cloud = cloud.subset(np.random.default_rng(seed).integers(len(cloud), size=cfg.budget))
     if cfg.cleanup:
         num_sampled = len(cloud)
         cloud = remove_outliers(merge_voxels(cloud, cfg.voxel_divisions), cfg.outlier_neighbors, cfg.outlier_std)

@@ -134,7 +134,7 @@ class Scene:
         for backend in (self.rendered_by, self.config.render.backend):
             if backend is not None and (backend in render.ON_GPU) == on_gpu:
                 return backend
-        return "cuda" if on_gpu else "cpu"
+        return "gsplat" if on_gpu else "numba"
 
     def to(
         self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False

@@ -137,7 +137,7 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
     Beside the sequence (images, masks, depth, poses, `sequence.json`) it writes `truth/tissue/*.png` (the image
     without tools and without sensor noise), `truth/depth/*.npy` ((H, W) float32 z of the tool-free tissue, mm) and
     `truth/tracks.npz` (`points` (T, P, 3) float32 mm in camera axes, `visible` (T, P) bool); with `cfg.stereo` also
-    `right/*.png` and `calibration.json`. Tools cast no shadow, so outside them a image is the truth plus noise.
+    `right/*.png` and `calibration.json`. Tools cast no shadow, so outside them an image is the truth plus noise.
 
     Args:
         out: a new or empty folder; it appears when complete.

@@ -51,7 +51,7 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     """
     table = _read_table(path)
     table = {_plain(name): value for name, value in table.items()}
-    size = _size(table, path)
+    size, layout = _size(table, path), table.get("layout") if isinstance(table.get("layout"), str) else None
     # Files of this package count pixel centers from 0.5; OpenCV and all others count them from 0.
     offset = 0.5 - _number(table, "pixelcenter", path, 0.0)
     if "fcxleft" in table:
@@ -59,12 +59,12 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     else:
         left, right = _cameras(table, offset, path)
     if left is None:
-        raise input_error(path, "the left camera matrix", f"only {_some(table)}", HINT)
+        raise input_error(path, "the left camera matrix", f"only {', '.join(list(table)[:6])}", HINT)
     if right is None and table.get("baselinemm") is not None:
         shift = np.array([-_number(table, "baselinemm", path), 0.0, 0.0])
-        return Calibration(left, left, np.eye(3), shift, size, _text(table, "layout"))
+        return Calibration(left, left, np.eye(3), shift, size, layout)
     if right is None:
-        return Calibration(left, size=size, layout=_text(table, "layout"))
+        return Calibration(left, size=size, layout=layout)
     rotation = _find(table, ROTATION, path, (3, 3))
     in_mm = any(name + "mm" in table for name in TRANSLATION)
     translation = _find(table, (*(name + "mm" for name in TRANSLATION), *TRANSLATION), path, (3,))
@@ -76,7 +76,7 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     if unit == "auto":
         unit = "m" if not in_mm and 0 < np.linalg.norm(translation) < METERS_BELOW else "mm"
     scale = 1.0 if in_mm else MM_PER_UNIT[unit]
-    return Calibration(left, right, rotation, translation * scale, size, _text(table, "layout"))
+    return Calibration(left, right, rotation, translation * scale, size, layout)
 
 
 def _read_table(path: Path) -> Table:
@@ -146,14 +146,6 @@ def _flat(content: dict[Any, Any], prefix: str = "") -> Table:
 
 def _plain(name: str) -> str:
     return "".join(c for c in name.lower() if c.isalnum())
-
-
-def _text(table: Table, name: str) -> str | None:
-    return table[name] if isinstance(table.get(name), str) else None
-
-
-def _some(table: Table) -> str:
-    return ", ".join(list(table)[:6]) + (" and more" if len(table) > 6 else "")
 
 
 def _find(table: Table, names: tuple[str, ...], path: Path, shape: tuple[int, ...]) -> NDArray[np.float64] | None:

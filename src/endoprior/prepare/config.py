@@ -33,7 +33,7 @@ def parse_rectangle(text: str, option: str) -> Rectangle:
 
 @dataclass(frozen=True)
 class PrepareConfig:
-    """How a video becomes a sequence folder."""
+    """Options of `prepare`."""
 
     right: Path | None = None
     """Video or image folder of the second camera, if each camera has its own file."""

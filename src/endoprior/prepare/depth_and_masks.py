@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -177,12 +178,8 @@ def _of_either_size(read: Callable[[Path, tuple[int, int]], NDArray], path: Path
     try:
         return read(path, geometry.source_size)
     except InputError:
-        if geometry.size == geometry.source_size:
-            raise
-        try:
+        with suppress(InputError):
             return read(path, geometry.size)
-        except InputError:
-            pass
         raise
 
 

@@ -19,7 +19,7 @@ MAX_CHANGE_PX = 0.5
 SMOOTHING_PX, SMOOTHING_SIGMA_PX = 15, 5.0
 """Size and standard deviation of the smoothing window ..."""
 SMOOTHING_STEP_PX = 0.5
-"""... and the difference of disparity at which a neighbor begins to belong to another surface, px."""
+"""... and the difference of disparity between neighbors on different surfaces, px."""
 SPECKLE_STEP_PX = 1.0
 """Neighbors whose disparities differ by more belong to different regions."""
 PLANE_RESIDUAL_PX = 0.35
@@ -68,7 +68,7 @@ def smooth_disparity(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
     known = np.isfinite(disparity)
     if not known.any():
         return disparity
-    apart = disparity[known].min() - 40 * np.float32(SMOOTHING_STEP_PX)  # too far to weigh anything
+    apart = disparity[known].min() - 40 * np.float32(SMOOTHING_STEP_PX)  # so far that the weight is 0
     smooth = cv2.bilateralFilter(np.where(known, disparity, apart), SMOOTHING_PX, SMOOTHING_STEP_PX, SMOOTHING_SIGMA_PX)
     return np.where(known, smooth, np.float32(np.nan))
 

@@ -26,7 +26,7 @@ LEAST_CERTAINTY = 0.5
 
 
 def read_user_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Read a mask of any usual form.
+    """Read a mask in any usual format.
 
     Images: 0 and 255, 0 and 1, smoothed or compressed gray (above half is high), label images (above 0 is high), colors
     on black (not black is high), an alpha channel that is not the same everywhere (more than half opaque is high).

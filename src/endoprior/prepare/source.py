@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import av
 import cv2
@@ -41,30 +40,18 @@ class SourceFrame:
     """(H, W, 3)."""
 
 
-class Source(Protocol):
-    """A clip that can be iterated any number of times."""
-
-    path: Path
-    width: int
-    height: int
-    frames_per_second: float
-    """Nominal frame rate."""
-    num_frames: int
-    """Announced number of images; 0 if unknown."""
-
-    def __iter__(self) -> Iterator[SourceFrame]: ...
-
-
-def open_source(path: Path, frames_per_second: float | None = None) -> Source:
+def open_source(path: Path, frames_per_second: float = 25.0) -> Source:
     """Open a video file or a folder of images.
 
     Args:
-        frames_per_second: rate of a folder of images; 25 if None.
+        frames_per_second: rate of a folder of images.
+    Returns:
+        The source. `num_frames` is the announced number of images, 0 if unknown.
     Raises:
         InputError: the file does not exist or cannot be read.
     """
     if kind_of(path) == "a folder":
-        return ImageFolder(path, frames_per_second or 25.0)
+        return ImageFolder(path, frames_per_second)
     return Video(path)
 
 
@@ -171,3 +158,6 @@ class Video:
         context = container.streams.video[0].codec_context
         context.options = {"max_pixels": str(MOST_PIXELS)}
         return container
+
+
+Source = ImageFolder | Video

@@ -20,6 +20,10 @@ from .disparity import drop_speckles, fill_small_holes, refine_disparity, smooth
 
 MATCHING_WIDTH = 960
 """Wider images are matched at a whole fraction of their size, px. The refinement uses the full size."""
+TOLERANCE = 0.02
+"""Relative difference up to which depths agree: about half a pixel of disparity at the usual distance."""
+SURROUNDINGS_PX = 15
+"""Side of the square around a pixel that counts as its surroundings."""
 
 
 @dataclass(frozen=True)
@@ -126,9 +130,7 @@ def stereo_depth(
     return StereoDepth(depth, np.where(valid, confidence, np.float32(0)))
 
 
-def temporal_median(
-    window: Sequence[NDArray[np.float32]], tolerance: float = 0.02, surroundings_px: int = 15
-) -> NDArray[np.float32]:
+def temporal_median(window: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     """Temporal median filter of depth for the middle frame of a window.
 
     Frames enter in pairs, one before and one after at equal distance, and only at pixels where both agree with the
@@ -137,9 +139,7 @@ def temporal_median(
 
     Args:
         window: an odd number of (H, W) depth maps, mm, 0 where missing; the middle one is filtered.
-        tolerance: largest relative difference that counts as agreement; 0.02 is about half a pixel of disparity at the
-            usual distance of a stereo endoscope.
-        surroundings_px: side of the square around a hole whose mean the filling must agree with.
+
     Returns:
         (H, W) depth, mm; 0 where missing.
     Raises:
@@ -155,7 +155,7 @@ def temporal_median(
     votes = [middle]
     for away in range(1, half + 1):
         before, after = window[half - away], window[half + away]
-        agree = np.maximum(np.abs(before - middle), np.abs(after - middle)) <= np.float32(tolerance) * middle
+        agree = np.maximum(np.abs(before - middle), np.abs(after - middle)) <= np.float32(TOLERANCE) * middle
         # A pair of opposite infinities does not change the median.
         votes += [np.where(agree, before, -np.inf), np.where(agree, after, np.inf)]
     median = np.partition(np.stack(votes), half, axis=0)[half] if half else middle
@@ -163,9 +163,9 @@ def temporal_median(
     if half and not measured.all():
         before, after = window[half - 1], window[half + 1]
         between = (before + after) / 2
-        around = _mean_around(middle, measured, surroundings_px)
-        static = np.abs(before - after) <= np.float32(tolerance) * between
-        fits = np.abs(between - around) <= np.float32(2 * tolerance) * around
+        around = _mean_around(middle, measured)
+        static = np.abs(before - after) <= np.float32(TOLERANCE) * between
+        fits = np.abs(between - around) <= np.float32(2 * TOLERANCE) * around
         fill = ~measured & (before > 0) & (after > 0) & static & fits
         result[fill] = between[fill]
     return result
@@ -193,9 +193,9 @@ def _match_consistently(
     return from_left, apart
 
 
-def _mean_around(values: NDArray[np.float32], measured: NDArray[np.bool_], side_px: int = 15) -> NDArray[np.float32]:
+def _mean_around(values: NDArray[np.float32], measured: NDArray[np.bool_]) -> NDArray[np.float32]:
     """(H, W) mean of the measured values in a square around each pixel; 0 if there are none."""
     weight = measured.astype(np.float32)
-    total = cv2.blur(values * weight, (side_px, side_px))
-    share = cv2.blur(weight, (side_px, side_px))
+    total = cv2.blur(values * weight, (SURROUNDINGS_PX, SURROUNDINGS_PX))
+    share = cv2.blur(weight, (SURROUNDINGS_PX, SURROUNDINGS_PX))
     return np.divide(total, share, out=np.zeros_like(total), where=share > 1e-6)

@@ -73,7 +73,7 @@ class ToolModel:
     def mask(
         self, rgb_u8: NDArray[np.uint8], view: NDArray[np.bool_], depth: NDArray[np.float32] | None = None
     ) -> NDArray[np.bool_]:
-        """Mark the tools of one frame; about 25 ms at 640x512.
+        """Tool mask of one frame; about 25 ms at 640x512.
 
         Args:
             rgb_u8: (H, W, 3) color, 0..255.
@@ -128,7 +128,7 @@ def fit_tools(
 
 @dataclass(frozen=True)
 class _Sample:
-    """One frame at working size."""
+    """One resized frame."""
 
     view: NDArray[np.bool_]
     """(h, w) True inside the endoscope's image."""
@@ -214,12 +214,12 @@ def _learn(
 
 
 def _find(model: ToolModel, sample: _Sample) -> NDArray[np.bool_]:
-    """(h, w) True on the tools of one frame, without a rim."""
+    """(h, w) True on the tools of one frame, before dilation."""
     return _clean(_probability(model, sample), sample.view)
 
 
 def _probability(model: ToolModel, sample: _Sample) -> NDArray[np.float32]:
-    """(h, w) that a pixel shows a tool, 0..1. Highlights take the mean of what surrounds them."""
+    """(h, w) tool probability, 0..1. Highlights get the mean of their surroundings."""
     probability = model.color_probability[sample.cell]
     if model.relief_odds is not None and sample.depth is not None:
         relief = relief_cells(sample.depth, sample.view & (probability < SURE))

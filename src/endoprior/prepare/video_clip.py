@@ -25,8 +25,6 @@ class StereoFrame:
 
     index: int
     """Position of the frame in the source, from 0."""
-    seconds: float
-    """Time since the first frame."""
     left: NDArray[np.uint8]
     """(h, w, 3)."""
     right: NDArray[np.uint8] | None
@@ -98,7 +96,7 @@ class Clip:
     ) -> StereoFrame:
         if self.swap and second is not None:
             first, second = second, first
-        return StereoFrame(image.index, image.seconds, first, second)
+        return StereoFrame(image.index, first, second)
 
 
 class EvenSample:

@@ -1,7 +1,7 @@
-"""The numbers every backend shares: what is culled, what is drawn, when a pixel is full.
+"""The numbers every backend shares: what is culled, what is visible, when a pixel is full.
 
 They are those of 3D Gaussian splatting (Kerbl et al. 2023) and of EndoGaussian's rasterizer. Numba does not notice a
-change here: delete `render/__pycache__` after one.
+change here: delete `render/numba/__pycache__` after one.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ JACOBIAN_MARGIN = 0.3
 ALPHA_MAX = 0.99
 """Largest alpha of one Gaussian at one pixel; no gradient flows where it binds."""
 ALPHA_MIN = 1.0 / 255.0
-"""A Gaussian is not drawn at a pixel where its alpha would be below this: the exact edge of its footprint."""
+"""Smaller alphas count as 0: this is the exact edge of a Gaussian's footprint."""
 STOP_TRANSMITTANCE = 1e-4
-"""The Gaussian that would bring a pixel's transmittance below this is not drawn there, nor any behind it."""
+"""The Gaussian that would bring a pixel's transmittance below this is left out there, and all behind it."""
 MIN_QUAT = 1e-12
 """A Gaussian whose quaternion is shorter is culled: its gradient, which grows with 1 / length, would overflow."""
 OVERFLOW = 3.4e38

@@ -1,4 +1,4 @@
-"""EWA projection in torch (Zwicker et al. 2001): 3D Gaussians to 2D ones. The definition the CPU kernels must meet.
+"""EWA projection in PyTorch (Zwicker et al. 2001): 3D Gaussians to 2D ones. The kernels compute the same.
 
 The camera maps p = (x, y, z) to (fx x/z + cx, fy y/z + cy). Its Jacobian J is taken at the center, with x/z and y/z
 limited to a little outside the image (`JACOBIAN_MARGIN`) because the linearization fails there. Then
@@ -55,7 +55,7 @@ def check(splats: Splats, background: Tensor) -> int:
 
 
 def check_device(splats: Splats, background: Tensor, device_type: str) -> None:
-    """Check what a backend of one type of device requires besides.
+    """Check what a backend of one type of device requires besides `check`.
 
     Raises:
         ValueError: something is not float32, or not on one device of that type.
@@ -92,7 +92,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def project(splats: Splats, camera: Camera) -> Projected:
-    """Project every Gaussian, and find out which of them can be drawn.
+    """Project every Gaussian, and find out which of them are visible.
 
     Culled are: center at or behind `NEAR_Z`; any number not finite, or a result that overflows; a quaternion shorter
     than `MIN_QUAT`; a footprint (where alpha >= `ALPHA_MIN`) that misses every pixel center's bounding box.

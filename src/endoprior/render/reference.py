@@ -1,5 +1,4 @@
-"""The definition of what a rasterizer returns: every Gaussian at every pixel, in plain torch, differentiated by
-autograd.
+"""The reference implementation: every Gaussian at every pixel, in plain PyTorch, differentiated by autograd.
 
 Memory is H x W x N numbers several times over: for small scenes, tests and reading. float32 or float64.
 """
@@ -16,14 +15,16 @@ from .projection import check, project
 
 
 def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_to_means: bool = True) -> RenderOutput:
-    """Draw the Gaussians near to far (Kerbl et al. 2023, Eq. 3); ties in z keep their order. See
-    `render.Rasterizer`."""
+    """Render the Gaussians near to far (Kerbl et al. 2023, Eq. 3); ties in z keep their order.
+
+    See `render.Rasterizer`.
+    """
     check(splats, background)
     seen = project(splats, camera)
     order = seen.z.argsort(stable=True)
     order = order[seen.radii[order] > 0]
     alpha = _alpha(seen.means2d[order], seen.cov2d[order], seen.det[order], splats.opacities[order], camera)
-    alpha = alpha * _drawn(alpha)
+    alpha = alpha * _counts(alpha)
     behind = torch.cumprod(torch.cat([alpha.new_ones((*alpha.shape[:2], 1)), 1 - alpha], -1), -1)
     weights, transmittance = alpha * behind[..., :-1], behind[..., -1]
     z = seen.z if depth_grad_to_means else seen.z.detach()
@@ -48,6 +49,6 @@ def _alpha(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, camer
 
 
 @torch.no_grad()
-def _drawn(alpha: Tensor) -> Tensor:
+def _counts(alpha: Tensor) -> Tensor:
     """(H, W, N) 1 until a Gaussian would bring the transmittance below STOP_TRANSMITTANCE, 0 from that one on."""
     return (torch.cumprod(1 - alpha, -1) >= STOP_TRANSMITTANCE).to(alpha.dtype)

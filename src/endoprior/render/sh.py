@@ -1,4 +1,4 @@
-"""Color that depends on the direction of view: real spherical harmonics of degree 0 to 3, in torch.
+"""Color that depends on the viewing direction: real spherical harmonics of degree 0 to 3, in PyTorch.
 
 Order and signs are those of 3DGS PLY files: coefficients (l, m) with m = -l..l, Condon-Shortley phase kept. With the
 Legendre functions written out, each is a constant times a polynomial of the unit direction (x, y, z).

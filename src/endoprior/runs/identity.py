@@ -8,7 +8,7 @@ from typing import Any
 
 from ..core.checks import InputError
 from ..core.config import Config
-from ..core.config_io import to_dict
+from ..core.config_io import current_value, to_dict
 
 
 def reject_other_run(
@@ -25,8 +25,7 @@ def reject_other_run(
         InputError: the config differs, or the data do.
     """
     current = json.loads(json.dumps(to_dict(cfg)))
-    if stored_config != current:
-        changed = _first_difference(stored_config if isinstance(stored_config, dict) else {}, current)
+    if changed := _first_difference(stored_config if isinstance(stored_config, dict) else {}, current):
         raise InputError(f"{file}: config differs at {changed}. Resume with the options the run was started with.")
     if stored_fingerprint != fingerprint:
         raise InputError(f"{file}: was trained on other data than {data}. Pass the same sequence.")
@@ -38,6 +37,6 @@ def _first_difference(old: dict, new: dict, where: str = "") -> str:
         if isinstance(value, dict) and isinstance(old.get(name), dict):
             if found := _first_difference(old[name], value, f"{where}{name}."):
                 return found
-        elif name not in old or value != old[name]:
+        elif name not in old or value != current_value(f"{where}{name}", old[name]):
             return f"{where}{name} ({old.get(name)!s:.80} in the folder, {value!s:.80} now)"
     return next((f"{where}{name:.80} (unknown to this version)" for name in old if name not in new), "")

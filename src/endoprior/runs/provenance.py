@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.config_io import to_dict
+from ..render import ON_GPU
 from ..system.devices import name_of
 from ..training.trainer import Trainer
 
@@ -16,8 +17,8 @@ from ..training.trainer import Trainer
 def run_facts(trainer: Trainer, fingerprint: str) -> dict[str, Any]:
     """Contents of `config.json`: every config field, versions, commit, backend, device, and the data."""
     backend = trainer.cfg.render.backend
-    libraries = {"cuda": ("gsplat",), "triton": ("triton",)}.get(backend, ())
-    names = ("endoprior", "torch", "numpy", "numba", "scipy", "opencv-python-headless", *libraries)
+    names = ["endoprior", "torch", "numpy", "numba", "scipy", "opencv-python-headless"]
+    names += [backend] if backend in ON_GPU else []
     return {
         "config": to_dict(trainer.cfg),
         "seed": trainer.cfg.seed,

@@ -1,1 +1,1 @@
-"""The machine: memory limits, files that appear whole or not at all, arrays on disk, devices."""
+"""System interface: memory limits, atomic files, arrays on disk, devices."""

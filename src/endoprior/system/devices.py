@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def name_of(device: torch.device) -> str:
-    """What computes there, in words: the GPU's name, or how many threads of the CPU."""
+    """The name of the GPU, or "CPU, N threads"."""
     if device.type == "cuda":
         import torch
 
@@ -20,7 +20,7 @@ def name_of(device: torch.device) -> str:
 
 
 def wait_for(device: torch.device) -> None:
-    """Return when all that was queued there is done; on the CPU it is."""
+    """Wait until a device has finished its work; the CPU always has."""
     if device.type == "cuda":
         import torch
 

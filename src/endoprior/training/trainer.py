@@ -75,7 +75,7 @@ class Trainer:
         """Sample the initial points and build the state before the first iteration."""
         cfg = self.cfg
         cloud = initial_points(self.sequence.frames("train"), cfg.init, cfg.prior, cfg.seed)
-        cloud = cloud.taken(morton_order(cloud.points))
+        cloud = cloud.subset(morton_order(cloud.points))
         log_scales = initial_log_scales(cloud.points, cfg.init.variance_factor)
         gaussians = create_gaussians(cloud.points, cloud.colors, log_scales, cfg)
         if cfg.init.motion == "flow" and cfg.deformation.kind == "basis":

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.types import Camera
 from .access_control import is_camera
 from .line_overlay import Lines, draw_lines
-from .view_settings import REST_SECONDS, ViewSettings, shrink_factor
+from .view_settings import IDLE_SECONDS, ViewSettings, shrink_factor
 from .viewable import Viewable
 from .viewport import Viewport, bounded_aspect, endoscope_viewport, free_viewport
 
@@ -80,22 +80,20 @@ class Browsers:
             return None
         return free_viewport(camera.wxyz, camera.position, camera.fov, aspect, own.height, shrink)
 
-    def draw(
-        self, viewable: Viewable, version: int, settings: ViewSettings, lines: Lines, still_seconds: float
-    ) -> None:
+    def draw(self, viewable: Viewable, version: int, settings: ViewSettings, lines: Lines, idle_seconds: float) -> None:
         """Update every browser.
 
         Args:
             version: changes when the content of `viewable` changes.
-            still_seconds: time since the last motion.
+            idle_seconds: time since the last motion.
         """
-        sent = viewable.sent(settings)
+        sent = viewable.renders_in_browser(settings)
         self._send_nodes(viewable, version, settings, lines, sent)
         for browser in self._connected():
             if settings.endoscope:
                 self._follow_endoscope(browser, viewable, settings)
             if not sent:
-                self._send_picture(browser, viewable, version, settings, lines, still_seconds)
+                self._send_picture(browser, viewable, version, settings, lines, idle_seconds)
             elif browser.shown is not None:
                 browser.client.scene.set_background_image(None)
                 browser.shown = None
@@ -107,13 +105,13 @@ class Browsers:
         version: int,
         settings: ViewSettings,
         lines: Lines,
-        still_seconds: float,
+        idle_seconds: float,
     ) -> None:
-        shrink = shrink_factor(still_seconds, self._full_ms)
+        shrink = shrink_factor(idle_seconds, self._full_ms)
         viewport = self.viewport(browser.client, viewable, settings, shrink)
         if viewport is None:
             return
-        camera, preview = viewport.camera, still_seconds < REST_SECONDS
+        camera, preview = viewport.camera, idle_seconds < IDLE_SECONDS
         seen_from = camera.width, camera.height, camera.fy, camera.world_to_camera.tobytes(), viewport.width
         wanted = version, settings, seen_from, lines.segments.tobytes()
         # After a preview, send the full image once nothing moves.

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Camera
-from ..visualization.image_tools import colorize, to_u8
+from ..visualization.image_tools import colorize
 
 LARGEST_DIFFERENCE = 0.25
 """Mean absolute color difference that is shown in red."""
@@ -35,11 +35,6 @@ def depth_picture(depth: NDArray, span: tuple[float, float]) -> NDArray[np.uint8
 def value_picture(value: NDArray, alpha: NDArray) -> NDArray[np.uint8]:
     """Turbo colors of composited values in [0, 1]; black where there is no surface."""
     return colorize(value / np.maximum(alpha, 1e-6), 0, 1, alpha > SOLID_ALPHA)
-
-
-def gray_picture(value: NDArray) -> NDArray[np.uint8]:
-    """Values in [0, 1] as gray."""
-    return np.repeat(to_u8(value)[..., None], 3, -1)
 
 
 def difference_picture(rendered: NDArray[np.uint8], original: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -85,17 +85,13 @@ class Panel:
         def allow(rule: Callable[[Any], bool], *handles: Any) -> None:
             found.update({control_id(handle): rule for handle in handles})
 
-        def choice(handle: Any) -> None:
-            allow(lambda value: isinstance(value, str) and value in handle.options, handle)
-
         last, end = self.frame.max, self.clip_end
         allow(lambda value: are_numbers([value], 1, last) and value >= 0, self.frame)
         allow(lambda value: are_numbers(value, 2, end) and min(value) >= 0, self.clip)
-        allow(lambda value: isinstance(value, bool), self.tool, self.tracks, self.measure)
-        allow(lambda value: isinstance(value, bool), self.play, self.clear, self.screenshot, self.keep, self.forget)
-        allow(lambda value: isinstance(value, bool), self.video)
+        buttons = self.play, self.clear, self.screenshot, self.keep, self.forget, self.video
+        allow(lambda value: isinstance(value, bool), self.tool, self.tracks, self.measure, *buttons)
         for handle in (self.speed, self.layer, self.camera, self.rendered_by, self.rendered_as):
-            choice(handle)
+            allow(lambda value, names=handle.options: isinstance(value, str) and value in names, handle)
         return found
 
     def accepts(self, uuid: str, value: Any) -> bool:
@@ -136,7 +132,7 @@ def status(viewable: Viewable, settings: ViewSettings, num_kept: int) -> str:
     lines = [f"**{plain(viewable.title)}**", f"frame {settings.frame} of {len(viewable.cameras)}"]
     if legend := viewable.legend(settings):
         lines.append(legend)
-    if settings.in_browser and not viewable.sent(settings):
+    if settings.in_browser and not viewable.renders_in_browser(settings):
         lines.append("This layer is rendered by the server.")
     if not settings.endoscope and settings.layer in ORIGINALS and "color" in viewable.layers:
         lines.append("Input frames are available in the endoscope view only; showing color.")

@@ -32,7 +32,7 @@ from .job_queue import JobQueue
 from .line_overlay import Lines, concatenated, no_lines, ruler, track_lines
 from .measure import Measurement, measurement_text, pick
 from .video_path import PathPoint, follow_frames, interpolate
-from .view_settings import REST_SECONDS, ViewSettings, frame_due
+from .view_settings import IDLE_SECONDS, ViewSettings, frame_due
 from .viewable import Viewable
 from .viewport import endoscope_viewport
 
@@ -73,7 +73,7 @@ class Viewer:
         """Picked points and their frames."""
         self._tracks: NDArray | None = None
         self.kept_views: list[PathPoint] = []
-        self._version, self._moved_at = 0, clock.monotonic() - REST_SECONDS
+        self._version, self._moved_at = 0, clock.monotonic() - IDLE_SECONDS
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
             self.server = _LocalServer(host=host, port=port, label="EndoPrior-GS", verbose=False)
         self._install_filter()
@@ -144,8 +144,8 @@ class Viewer:
         """Time until the next frame of the playback, or until the full-size image after a motion."""
         if self._playing:
             return 0.01
-        rest = self._moved_at + REST_SECONDS - clock.monotonic()
-        return max(rest, 0.0) + 0.01 if rest > -REST_SECONDS else float("inf")
+        rest = self._moved_at + IDLE_SECONDS - clock.monotonic()
+        return max(rest, 0.0) + 0.01 if rest > -IDLE_SECONDS else float("inf")
 
     def _attempt(self, job: Callable[[], None]) -> None:
         """Run a job. Report a failure on stderr and in the browsers; it stops neither the viewer nor a training."""
@@ -360,7 +360,7 @@ class Viewer:
         if len(self.kept_views) > 1:
             settings, places = replace(settings, endoscope=False), interpolate(self.kept_views)
         if len(places) > MAX_PICTURES:
-            self._browsers.notify("No video", f"Expected at most {MAX_PICTURES} pictures; got {len(places)}.")
+            self._browsers.notify("No video", f"Expected at most {MAX_PICTURES} images, got {len(places)}.")
             return
         self._browsers.notify("Rendering the video", f"{len(places)} images")
         steps = [replace(settings, frame=place.frame) for place in places]

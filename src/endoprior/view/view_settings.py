@@ -11,7 +11,7 @@ the original; `difference` rendered minus original."""
 
 SLOW_MS = 60.0
 """If rendering at full size takes longer, images are rendered at half size while something moves."""
-REST_SECONDS = 0.25
+IDLE_SECONDS = 0.25
 """After this time without motion, the image is rendered again at full size."""
 
 
@@ -43,11 +43,11 @@ def frame_due(start: int, seconds: float, frames_per_second: float, total: int) 
     return (start + int(seconds * frames_per_second)) % total
 
 
-def shrink_factor(still_seconds: float, full_ms: float) -> int:
+def shrink_factor(idle_seconds: float, full_ms: float) -> int:
     """Divisor of the image size: 2 while something moves and rendering at full size is slow, else 1.
 
     Args:
-        still_seconds: time since the last motion.
+        idle_seconds: time since the last motion.
         full_ms: rendering time of the last image of full size.
     """
-    return 2 if still_seconds < REST_SECONDS and full_ms > SLOW_MS else 1
+    return 2 if idle_seconds < IDLE_SECONDS and full_ms > SLOW_MS else 1

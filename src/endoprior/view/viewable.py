@@ -52,7 +52,7 @@ class Viewable(Protocol):
         """(H, W) z of the visible surface, mm; 0 where there is none."""
         ...
 
-    def sent(self, settings: ViewSettings) -> bool:
+    def renders_in_browser(self, settings: ViewSettings) -> bool:
         """Whether the browser renders this view itself, from a `cloud`."""
         ...
 

@@ -18,7 +18,7 @@ from ..model.carry import carry_points
 from ..model.gaussians import SH_C0
 from ..model.playback import Playback
 from ..model.scene import Scene
-from ..visualization.image_tools import to_u8
+from ..visualization.image_tools import gray, to_u8
 from ..visualization.rendered_views import depth_span
 from . import layers
 from .view_settings import Layer, ViewSettings
@@ -78,7 +78,7 @@ class ViewableScene:
         if kind == "depth":
             return layers.depth_picture(expected_depth(out.depth.cpu().numpy(), alpha), self.span)
         if kind == "alpha":
-            return layers.gray_picture(alpha)
+            return gray(alpha)
         if kind in ("motion", "prior"):
             return layers.value_picture(out.color[..., 0].cpu().numpy(), alpha)
         color = to_u8(out.color.cpu().numpy())
@@ -128,8 +128,8 @@ class ViewableScene:
         frames = np.linspace(0, len(self.cameras) - 1, min(MOTION_SAMPLES, len(self.cameras))).astype(int)
         return max(*(float(np.percentile(self._moved(int(i)).cpu().numpy(), 98)) for i in frames), 1e-3)
 
-    def sent(self, settings: ViewSettings) -> bool:
-        """See `Viewable.sent`: layers that are not a color per Gaussian are rendered on the server."""
+    def renders_in_browser(self, settings: ViewSettings) -> bool:
+        """See `Viewable.renders_in_browser`: layers that are not a color per Gaussian are rendered on the server."""
         return settings.in_browser and settings.layer in BROWSER_LAYERS
 
     @torch.no_grad()

@@ -79,8 +79,8 @@ class ViewableSequence:
         depth = frame.depth * (frame.depth_valid & (frame.depth >= settings.near) & (frame.depth <= settings.far))
         return layers.fitted(depth.astype(np.float32), camera)
 
-    def sent(self, settings: ViewSettings) -> bool:
-        """See `Viewable.sent`: from another camera there are only the points."""
+    def renders_in_browser(self, settings: ViewSettings) -> bool:
+        """See `Viewable.renders_in_browser`: from another camera there are only the points."""
         return not settings.endoscope
 
     def cloud(self, settings: ViewSettings) -> Cloud:

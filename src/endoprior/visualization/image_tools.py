@@ -23,6 +23,11 @@ def to_u8(unit: NDArray) -> NDArray[np.uint8]:
     return (np.clip(unit, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
+def gray(unit: NDArray) -> NDArray[np.uint8]:
+    """(H, W, 3) gray image of (H, W) values in [0, 1]."""
+    return np.repeat(to_u8(unit)[..., None], 3, -1)
+
+
 def colorize(values: NDArray, low: float, high: float, valid: NDArray | None = None) -> NDArray[np.uint8]:
     """Turbo color map of (H, W) values: blue at `low`, red at `high`; black where `valid` is False."""
     span = max(high - low, 1e-9)

@@ -12,7 +12,7 @@ from ..core.config import PriorConfig
 from ..data import FrameSequence, Split
 from ..priors import joint_texture_prior, salience, specular_likelihood
 from ..system.atomic import reject_occupied, whole_folder
-from .image_tools import colorize, label, tile, to_u8, write_png
+from .image_tools import colorize, gray, label, tile, to_u8, write_png
 
 SHEET_FRAMES = 6
 SHEET_WIDTH_PX = 320
@@ -40,15 +40,11 @@ def write_prior_maps(sequence: FrameSequence, split: Split, cfg: PriorConfig, ou
             for name, values in maps.items():
                 write_png(folder / name / f"{frame.index:06d}.png", to_u8(values))
             if position in shown:
-                images = {f"frame {frame.index}": frame.rgb_u8, "tissue mask": _gray(frame.tissue_mask)}
+                images = {f"frame {frame.index}": frame.rgb_u8, "tissue mask": gray(frame.tissue_mask)}
                 images |= {name: colorize(values, 0, 1) for name, values in maps.items()}
                 rows += [label(_small(image), name) for name, image in images.items()]
         write_png(folder / "contact_sheet.png", tile(rows, 5))
     return out / "contact_sheet.png"
-
-
-def _gray(mask: NDArray) -> NDArray[np.uint8]:
-    return np.repeat(to_u8(mask)[..., None], 3, -1)
 
 
 def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

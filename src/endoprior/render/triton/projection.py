@@ -1,12 +1,11 @@
 """EWA projection and color of all Gaussians as Triton kernels, forward and backward, one Gaussian per lane.
 
-Meets `projection.project`. What compositing needs of a 2D Gaussian is its *column form* (a, k, m):
-`power = -(a (dy + k dx)^2 + m dx^2) / 2`: every column of pixels is a 1D Gaussian of precision a, centered k dx above,
-and its peak falls off with precision m. With covariance (xx, xy, yy): `a = xx / det`, `k = -xy / xx`, `m = 1 / xx`.
-Unlike the inverse covariance it has no cancellation, and neither has `det` (see `project_kernels`).
+The PyTorch implementation is `render.projection.project`. Compositing takes the LDL^T factors (a, k, m) of the conic,
+y first: `power = -(a (dy + k dx)^2 + m dx^2) / 2`. With covariance (xx, xy, yy): `a = xx / det`, `k = -xy / xx`,
+`m = 1 / xx`. Nothing cancels, in `det` neither (see `numba.projection`).
 
-Geometry is float64 inside, as on the CPU: a few hundred operations per Gaussian, some microseconds per picture even
-where float64 runs at 1/64 of the speed, for centers and gradients that agree with the definition to float32 rounding.
+Geometry is float64 inside, as on the CPU: a few hundred operations per Gaussian, some microseconds per image even where
+float64 runs at 1/64 of the speed, for centers and gradients that agree with the reference to float32 rounding.
 Colors are float32. In this file `v_x` is dL/dx; `lens` is what `lens_of` returns.
 """
 
@@ -20,10 +19,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..core.types import Camera
-from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
-from .projection import jacobian_limits
-from .triton_sh import expand, pull_back
+from ...core.types import Camera
+from ..constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
+from ..projection import jacobian_limits
+from .sh import expand, pull_back
 
 BLOCK = 128
 """Gaussians per program."""
@@ -143,11 +142,11 @@ def _direction(world, lens):
 @triton.jit(do_not_specialize=["num", "width", "height"])
 def project_forward(
     means, quats, scales, opacities, sh, lens, num, width, height,
-    means2d, forms, z_out, colors, radii, keys,
+    means2d, conic_ldl, z_out, colors, radii,
     DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One program per BLOCK Gaussians. Writes one row each of means2d (N, 2), forms (N, 3), z_out (N,), colors (N, 3),
-    radii (N,), and keys (N,): z where the Gaussian is drawn, else infinity. Culled: all zeros."""
+    """One program per BLOCK Gaussians. Writes one row each of means2d (N, 2), conic_ldl (N, 3), z_out (N,),
+    colors (N, 3) and radii (N,). Culled: all zeros."""
     g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = g < num
     world, center, _, length, _, _, _, _, cov = _project(means, quats, scales, lens, g, mask)
@@ -171,22 +170,21 @@ def project_forward(
     level = 2.0 * tl.log(tl.maximum(opacity / _ALPHA_MIN, 1.0)).to(tl.float64)  # squared reach, in sigmas
     reach_x, reach_y = tl.sqrt(level * xx), tl.sqrt(level * yy)
     touches = (px + reach_x >= 0.5) & (px - reach_x <= width - 0.5) & (py + reach_y >= 0.5)
-    drawn = usable & touches & (py - reach_y <= height - 0.5) & (opacity >= _ALPHA_MIN)
+    visible = usable & touches & (py - reach_y <= height - 0.5) & (opacity >= _ALPHA_MIN)
     half = 0.5 * (xx - yy)
     long_axis = 0.5 * (xx + yy) + tl.sqrt(half * half + xy * xy)
-    radius = tl.where(drawn, tl.minimum(tl.ceil(3.0 * tl.sqrt(long_axis)), 1073741824.0), 0.0)
+    radius = tl.where(visible, tl.minimum(tl.ceil(3.0 * tl.sqrt(long_axis)), 1073741824.0), 0.0)
 
     tl.store(means2d + 2 * g, tl.where(usable, px, 0.0).to(tl.float32), mask)
     tl.store(means2d + 2 * g + 1, tl.where(usable, py, 0.0).to(tl.float32), mask)
-    tl.store(forms + 3 * g, tl.where(usable, xx / det, 0.0).to(tl.float32), mask)
-    tl.store(forms + 3 * g + 1, tl.where(usable, -xy / xx, 0.0).to(tl.float32), mask)
-    tl.store(forms + 3 * g + 2, tl.where(usable, 1.0 / xx, 0.0).to(tl.float32), mask)
+    tl.store(conic_ldl + 3 * g, tl.where(usable, xx / det, 0.0).to(tl.float32), mask)
+    tl.store(conic_ldl + 3 * g + 1, tl.where(usable, -xy / xx, 0.0).to(tl.float32), mask)
+    tl.store(conic_ldl + 3 * g + 2, tl.where(usable, 1.0 / xx, 0.0).to(tl.float32), mask)
     tl.store(z_out + g, tl.where(usable, z, 0.0).to(tl.float32), mask)
     tl.store(colors + 3 * g, tl.where(usable, tl.maximum(red, 0.0), 0.0), mask)
     tl.store(colors + 3 * g + 1, tl.where(usable, tl.maximum(green, 0.0), 0.0), mask)
     tl.store(colors + 3 * g + 2, tl.where(usable, tl.maximum(blue, 0.0), 0.0), mask)
     tl.store(radii + g, radius.to(tl.int32), mask)
-    tl.store(keys + g, tl.where(drawn, z.to(tl.float32), float("inf")), mask)
 
 
 @triton.jit
@@ -202,7 +200,7 @@ def _store_axis(row, v_row, lens, j: tl.constexpr, r0, r1, r2, vb, vc, vz, gx, g
 
 @triton.jit(do_not_specialize=["num"])
 def project_backward(
-    means, quats, scales, sh, lens, num, radii, v_means2d, v_forms, v_z, v_colors, v_means, v_quats, v_scales, v_sh,
+    means, quats, scales, sh, lens, num, radii, v_means2d, v_conic_ldl, v_z, v_colors, v_means, v_quats, v_scales, v_sh,
     DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """One program per BLOCK Gaussians. Writes one row each of v_means, v_quats, v_scales, v_sh; zeros where radii is
@@ -219,10 +217,10 @@ def project_backward(
     z0, z1, z2 = axes_z
     xx, xy, _, det = cov
 
-    # Column form -> covariance -> rows of J times the axes.
-    v_a = tl.load(v_forms + 3 * g, mask, 0.0).to(tl.float64)
-    v_k = tl.load(v_forms + 3 * g + 1, mask, 0.0).to(tl.float64)
-    v_m = tl.load(v_forms + 3 * g + 2, mask, 0.0).to(tl.float64)
+    # LDL^T factors -> covariance -> rows of J times the axes.
+    v_a = tl.load(v_conic_ldl + 3 * g, mask, 0.0).to(tl.float64)
+    v_k = tl.load(v_conic_ldl + 3 * g + 1, mask, 0.0).to(tl.float64)
+    v_m = tl.load(v_conic_ldl + 3 * g + 2, mask, 0.0).to(tl.float64)
     v_det = -v_a * xx / (det * det)
     v_yy = v_det * xx
     v_xy = -2.0 * v_det * xy - v_k / xx

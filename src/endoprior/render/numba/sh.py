@@ -1,4 +1,4 @@
-"""The harmonics of `sh` and their gradients, one Gaussian at a time, for the CPU kernels.
+"""The harmonics of `render.sh` and their gradients, one Gaussian at a time.
 
 `values` and `v_values` are rows that the caller owns, so that nothing is allocated per Gaussian.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from . import sh
+from .. import sh
 
 f4 = np.float32
 C0, C1 = f4(sh.C0), f4(sh.C1)

@@ -1,4 +1,4 @@
-"""The command that mends each thing: which build of torch, which toolkit, which package."""
+"""The command that fixes each thing: which build of torch, which toolkit, which package."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .records import Facts, number
 
 WHEELS = "https://download.pytorch.org/whl"
 LEAST_CAPABILITY = (7, 0)
-"""gsplat uses cooperative groups by label, which older cards lack."""
+"""gsplat uses cooperative groups by label, which older GPUs lack."""
 LEAST_TORCH = (2, 4)
 LEAST_GSPLAT = (1, 5, 3)
 LEAST_GCC_FOR_13 = 10
@@ -22,38 +22,38 @@ NVCC_FOR = {
 
 
 def torch_builds(facts: Facts) -> list[tuple[str, str]]:
-    """Builds of torch that serve this driver and this card, best first: (CUDA, requirement for pip).
+    """Builds of torch that work with this driver and this GPU, best first: (CUDA, requirement for pip).
 
     A driver serves every minor version of its major one and all older ones (NVIDIA, "CUDA compatibility"). CUDA 13 has
-    no kernels for cards before 7.5; the wheels for 12.6 and 11.8 have none for cards after 9.0; those for 12.8 end with
+    no kernels for GPUs before 7.5; the wheels for 12.6 and 11.8 have none for GPUs after 9.0; those for 12.8 end with
     torch 2.11, those for 11.8 with 2.7, which knows no Python after 3.13.
     """
-    card = capability(facts) or (8, 0)
-    serves = number(facts.driver.cuda) or ((12, 6) if card < (10,) else (13, 0))
+    arch = capability(facts) or (8, 0)
+    serves = number(facts.driver.cuda) or ((12, 6) if arch < (10,) else (13, 0))
     builds = []
-    if card < LEAST_CAPABILITY:
+    if arch < LEAST_CAPABILITY:
         return builds
-    if serves >= (13,) and card >= (7, 5):
+    if serves >= (13,) and arch >= (7, 5):
         builds.append(("13.0", "torch"))
-    if serves >= (12, 8) and card >= (10,):
+    if serves >= (12, 8) and arch >= (10,):
         builds.append(("12.8", "torch<2.12"))
-    if serves >= (12,) and card < (10,):
+    if serves >= (12,) and arch < (10,):
         builds.append(("12.6", "torch"))
-    if serves >= (11,) and card < (10,) and number(facts.system.python) < (3, 14):
+    if serves >= (11,) and arch < (10,) and number(facts.system.python) < (3, 14):
         builds.append(("11.8", "torch<2.8"))
     nvcc = number(facts.toolkit.nvcc)
-    if nvcc >= (12,) and knows_card(facts, facts.toolkit.nvcc):  # one that fits the toolkit that is here
+    if nvcc >= (12,) and supports_gpu(facts, facts.toolkit.nvcc):  # first those that fit the installed toolkit
         builds.sort(key=lambda build: number(build[0])[0] != nvcc[0])
     return builds
 
 
 def capability(facts: Facts) -> tuple[int, int] | None:
-    """Compute capability of the card that would be used."""
+    """compute capability of the GPU that would be used."""
     return next((gpu.capability for gpu in (*facts.torch.gpus, *facts.driver.gpus) if gpu.capability), None)
 
 
 def install_torch(facts: Facts, major: int | None = None, again: bool = False) -> str:
-    """The command that installs a torch for this driver and card, "" if there is none.
+    """The command that installs a torch for this driver and GPU, "" if there is none.
 
     Args:
         major: only builds for this CUDA.
@@ -82,13 +82,13 @@ def install_driver(facts: Facts) -> str:
 
 
 def planned_cuda(facts: Facts) -> str:
-    """The CUDA of torch: of the one that is here, or of the one that `install_torch` would install; "" if neither."""
+    """The CUDA of the installed torch, or of the one that `install_torch` would install; "" if neither."""
     served = facts.driver.cuda or capability(facts)
     return facts.torch.cuda or (next((cuda for cuda, _ in torch_builds(facts)), "") if served else "")
 
 
 def install_toolkit(facts: Facts) -> str:
-    """How to get an nvcc that fits torch and knows the card."""
+    """How to get an nvcc that fits torch and the GPU."""
     wanted = number(planned_cuda(facts))[:2]
     least = nvcc_needed(facts)
     version = ".".join(map(str, max(wanted, least if least[:1] == wanted[:1] else ())))
@@ -120,31 +120,31 @@ def pip_toolkit(facts: Facts, version: str) -> str:
 
 
 def link_cudart(facts: Facts) -> str:
-    """How to give the linker the name it looks for, which wheels leave out."""
+    """How to make the link that the linker needs, which wheels leave out."""
     folder = PurePosixPath(facts.toolkit.libraries)
     return f"ln -sf {shlex.quote(facts.toolkit.cudart_name)} {shlex.quote(str(folder / 'libcudart.so'))}"
 
 
 def fitting_toolkit(facts: Facts) -> str:
-    """A toolkit that is here already, of torch's CUDA, which torch does not look at; "" if there is none."""
+    """An installed toolkit of torch's CUDA in a place that torch does not search; "" if there is none."""
     wanted = number(planned_cuda(facts))
     fitting = [
-        entry for entry in facts.toolkit.others if number(entry[1])[:1] == wanted[:1] and knows_card(facts, entry[1])
+        entry for entry in facts.toolkit.others if number(entry[1])[:1] == wanted[:1] and supports_gpu(facts, entry[1])
     ]
     same = [folder for folder, version in fitting if number(version) == wanted]
     return (same or [folder for folder, _ in fitting] or [""])[0]
 
 
 def nvcc_needed(facts: Facts) -> tuple[int, ...]:
-    """First nvcc that compiles for the card, () if any does."""
-    card = capability(facts) or (0, 0)
-    return max((need for least, need in NVCC_FOR.items() if card[0] == least[0] and card >= least), default=())
+    """First nvcc that compiles for the GPU, () if any does."""
+    arch = capability(facts) or (0, 0)
+    return max((need for least, need in NVCC_FOR.items() if arch[0] == least[0] and arch >= least), default=())
 
 
-def knows_card(facts: Facts, nvcc: str) -> bool:
-    """Whether an nvcc of this version compiles for the card."""
-    card = capability(facts)
-    return card is None or (number(nvcc) >= nvcc_needed(facts) and not (number(nvcc) >= (13,) and card < (7, 5)))
+def supports_gpu(facts: Facts, nvcc: str) -> bool:
+    """Whether an nvcc of this version compiles for the GPU."""
+    arch = capability(facts)
+    return arch is None or (number(nvcc) >= nvcc_needed(facts) and not (number(nvcc) >= (13,) and arch < (7, 5)))
 
 
 def install_compiler(facts: Facts) -> str:
@@ -157,7 +157,7 @@ def install_compiler(facts: Facts) -> str:
 
 
 def other_compiler(facts: Facts, least: int, too_new: int) -> str:
-    """How to use a gcc of at least `least` and below `too_new`: one that is here, or one to install."""
+    """How to use a gcc of at least `least` and below `too_new`: an installed one, or one to install."""
     here = [major for major in facts.builders.other_gcc if least <= major < too_new]
     major = max(here, default=too_new - 1)
     use = f"export CC=gcc-{major} CXX=g++-{major}"
@@ -188,16 +188,16 @@ def install_triton(facts: Facts) -> str:
 
 
 def interprets(facts: Facts) -> bool:
-    """Whether Triton was told to interpret kernels on the CPU."""
+    """Whether Triton is set to interpret kernels on the CPU."""
     return facts.variables.get("TRITON_INTERPRET", "").lower() in ("1", "true", "yes", "on", "y")
 
 
-def mend_triton(facts: Facts) -> str:
-    """What to do about a Triton that is there and did not compute, by what it said; "" if that tells nothing."""
+def fix_triton(facts: Facts) -> str:
+    """How to fix a Triton that is installed and did not compute, by its error; "" if that is not known."""
     error, wanted = facts.triton.error, facts.triton.wanted
     if "libcuda" in error:
         return "sudo ldconfig; if that is not enough, export TRITON_LIBCUDA_PATH=(the folder of libcuda.so.1)"
-    if "fatal error" in error:  # the compiler's words: it lacks the headers of C
+    if "fatal error" in error:  # of the compiler: it lacks the headers of C
         return install_compiler(facts)
     if any(words in error for words in ("Permission denied", "Read-only", "No space")):
         return 'export TRITON_CACHE_DIR="$(mktemp -d)"'

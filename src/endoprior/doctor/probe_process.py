@@ -1,4 +1,4 @@
-"""Run another program and get its answer, or the reason why there is none: it may hang, crash or print without end."""
+"""Run another program and get its output, or the reason why there is none: it may hang, crash or print without end."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 MARK = "endoprior-probe "
-"""What our own probes print before their answer, one line of JSON: libraries print whatever they like around it."""
+"""Our probes print it before their answer, one line of JSON: libraries may print anything around that."""
 MOST_BYTES = 2**20
 """A program that prints more than this is stopped."""
 GRACE_S = 1.0
-"""How long a program that was killed may take to go; a driver that hangs keeps its caller for ever."""
+"""How long to wait for a killed program: if a driver hangs, its caller cannot end."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What came back."""
+    """The output of a program."""
 
     text: str
     """What it printed, on both streams."""
@@ -29,12 +29,12 @@ class Answer:
 
 
 def clean(text: str, most: int = 200) -> str:
-    """One printable line of at most `most` characters: what programs print may hold anything."""
+    """One printable line of at most `most` characters."""
     words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return words if len(words) <= most else words[: most - 3] + "..."
 
 
-def ask(command: Sequence[str], limit_s: float) -> Answer:
+def run_program(command: Sequence[str], limit_s: float) -> Answer:
     """Run a program without input; never raises and never takes much longer than `limit_s`.
 
     Args:
@@ -95,7 +95,7 @@ def _wait(process: subprocess.Popen, seconds: float) -> None:
 
 
 def _kill(process: subprocess.Popen) -> None:
-    """End the program and all it started; those of its session that outlive it, too."""
+    """End the program and everything it started."""
     try:
         if os.name == "posix":
             os.killpg(process.pid, signal.SIGKILL)

@@ -1,13 +1,12 @@
 """EWA projection and color of all Gaussians, forward and backward, one Gaussian per iteration.
 
-Meets `projection.project`. What compositing needs of a 2D Gaussian is its *row form* (a, k, m):
-`power = -(a (dx + k dy)^2 + m dy^2) / 2`: every row is a 1D Gaussian of precision a, centered k dy to the left, and its
-peak falls off with precision m. With covariance (xx, xy, yy): `a = yy / det`, `k = -xy / yy`, `m = 1 / yy`. Unlike the
-inverse covariance it has no cancellation, and `det` has none either: for the blurred product B B^T + b I of a 2x3
-matrix with rows r1, r2, `det = |r1 x r2|^2 + b (|r1|^2 + |r2|^2) + b^2`.
+The PyTorch implementation is `render.projection.project`. Compositing takes the LDL^T factors (a, k, m) of the conic,
+x first: `power = -(a (dx + k dy)^2 + m dy^2) / 2`. With covariance (xx, xy, yy): `a = yy / det`, `k = -xy / yy`,
+`m = 1 / yy`. Nothing cancels, in `det` neither: for the blurred product B B^T + b I of a 2x3 matrix with rows r1, r2,
+`det = |r1 x r2|^2 + b (|r1|^2 + |r2|^2) + b^2`.
 
 Geometry is float64 inside (the time goes to memory and square roots), colors are float32. In this file `v_x` is dL/dx.
-`lens` is (fx, fy, cx, cy, left, right, top, bottom), the last four from `projection.jacobian_limits`.
+`lens` is (fx, fy, cx, cy, left, right, top, bottom), the last four from `render.projection.jacobian_limits`.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
-from .sh_kernels import direction_gradient, write_basis
+from ..constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
+from .sh import direction_gradient, write_basis
 
 f4 = np.float32
 HALF = f4(0.5)
@@ -64,14 +63,14 @@ def _covariance(b0, b1, b2, c0, c1, c2):
 @njit(parallel=True, cache=True, error_model="numpy")
 def project_forward(
     means, quats, scales, opacities, sh, view, center, lens, width, height,
-    means2d, row_forms, z_out, colors, radii,
+    means2d, conic_ldl, z_out, colors, radii,
 ):  # fmt: skip
-    # One task per BLOCK Gaussians. Writes one row each of means2d, row_forms, z_out, colors, radii; culled: all zeros.
+    # One task per BLOCK Gaussians. Writes one row each of means2d, conic_ldl, z_out, colors, radii; culled: all zeros.
     num, num_sh = len(means), sh.shape[1]
     for block in prange((num + BLOCK - 1) // BLOCK):
         axes, values = np.empty((3, 3)), np.empty(16, f4)
         for g in range(block * BLOCK, min(num, (block + 1) * BLOCK)):
-            means2d[g] = row_forms[g] = colors[g] = f4(0)
+            means2d[g] = conic_ldl[g] = colors[g] = f4(0)
             z_out[g] = f4(0)
             radii[g] = 0
             wx, wy, wz = np.float64(means[g, 0]), np.float64(means[g, 1]), np.float64(means[g, 2])
@@ -98,7 +97,7 @@ def project_forward(
             if not (size < OVERFLOW and length >= MIN_QUAT):
                 continue
             means2d[g, 0], means2d[g, 1], z_out[g] = px, py, z
-            row_forms[g, 0], row_forms[g, 1], row_forms[g, 2] = yy / det, -xy / yy, 1.0 / yy
+            conic_ldl[g, 0], conic_ldl[g, 1], conic_ldl[g, 2] = yy / det, -xy / yy, 1.0 / yy
             colors[g, 0], colors[g, 1], colors[g, 2] = max(red, f4(0)), max(green, f4(0)), max(blue, f4(0))
             if opacities[g] >= f4(ALPHA_MIN):
                 level = 2.0 * np.log(opacities[g] / ALPHA_MIN)  # squared reach of the footprint, in sigmas
@@ -115,7 +114,7 @@ def project_forward(
 @njit(parallel=True, cache=True, error_model="numpy")
 def project_backward(
     means, quats, scales, sh, view, center, lens, radii,
-    v_means2d, v_row_forms, v_z, v_colors, v_means, v_quats, v_scales, v_sh,
+    v_means2d, v_conic_ldl, v_z, v_colors, v_means, v_quats, v_scales, v_sh,
 ):  # fmt: skip
     # One task per BLOCK Gaussians. Writes one row each of v_means, v_quats, v_scales, v_sh; zeros where radii is 0.
     num, num_sh = len(means), sh.shape[1]
@@ -135,12 +134,12 @@ def project_backward(
             slope_x, slope_y, b0, b1, b2, c0, c1, c2 = _spread(lens, x, y, z, axes)
             _, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
 
-            # Row form -> covariance -> rows of J times the axes.
-            v_a, v_k = np.float64(v_row_forms[g, 0]), np.float64(v_row_forms[g, 1])
+            # LDL^T factors -> covariance -> rows of J times the axes.
+            v_a, v_k = np.float64(v_conic_ldl[g, 0]), np.float64(v_conic_ldl[g, 1])
             v_det = -v_a * yy / (det * det)
             v_xx = v_det * yy
             v_xy = -2.0 * v_det * xy - v_k / yy
-            v_yy = -v_a * (xy / det) ** 2 + (v_k * xy - v_row_forms[g, 2]) / (yy * yy)
+            v_yy = -v_a * (xy / det) ** 2 + (v_k * xy - v_conic_ldl[g, 2]) / (yy * yy)
             vb0, vb1, vb2 = 2 * v_xx * b0 + v_xy * c0, 2 * v_xx * b1 + v_xy * c1, 2 * v_xx * b2 + v_xy * c2
             vc0, vc1, vc2 = 2 * v_yy * c0 + v_xy * b0, 2 * v_yy * c1 + v_xy * b1, 2 * v_yy * c2 + v_xy * b2
 

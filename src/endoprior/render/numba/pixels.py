@@ -1,6 +1,6 @@
-"""What one Gaussian does to LANES pixels of a row: inlined by both compositing passes, so that both decide alike.
+"""What one Gaussian does to LANES pixels of a row. Both compositing passes inline it, so their decisions agree.
 
-A Gaussian is drawn from its row form (see `project_kernels`): with (dx, dy) measured from its center,
+A Gaussian comes as the LDL^T factors of its conic (see `projection`): with (dx, dy) measured from its center,
 `alpha = opacity exp(-(a (dx + k dy)^2 + m dy^2) / 2) = 2^(log2(opacity) - (root dx + root k dy)^2 - m_log2 dy^2)`,
 where `root = sqrt(a log2(e) / 2)` and `m_log2 = m log2(e) / 2`.
 """
@@ -12,8 +12,8 @@ from math import log2
 import numpy as np
 from numba import njit
 
-from ..compute.simd import floor, fma, magnitude, scale_by_power_of_two, smaller, splat, where_ge
-from .constants import ALPHA_MAX, ALPHA_MIN, STOP_TRANSMITTANCE
+from ...compute.simd import floor, fma, magnitude, scale_by_power_of_two, smaller, splat, where_ge
+from ..constants import ALPHA_MAX, ALPHA_MIN, STOP_TRANSMITTANCE
 
 f4 = np.float32
 LOG2_ALPHA_MIN = f4(log2(ALPHA_MIN))
@@ -31,11 +31,11 @@ def log2_alpha(base, root_k, m_log2, log2_opacity, dy):
 
 
 @njit(forceinline=True)
-def draw(exponent, transmittance):
-    """Alpha of the Gaussian at the pixels, its weight, which is 0 where it is not drawn, and the transmittance behind
+def blend(exponent, transmittance):
+    """Alpha of the Gaussian at the pixels, its weight, which is 0 where it does not count, and the transmittance behind
     it.
 
-    A transmittance below STOP marks a pixel that is full: its magnitude stays what it was and nothing more is drawn.
+    A transmittance below STOP marks a pixel that is full: its magnitude stays what it was and nothing more is added.
     All are vectors.
     """
     zero = splat(f4(0.0))

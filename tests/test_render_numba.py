@@ -1,4 +1,4 @@
-"""The CPU backend on its own: central differences, determinism, invariance, poison, and what its tiles may skip."""
+"""The Numba backend on its own: central differences, determinism, invariance, poison, and what its tiles may skip."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from scipy.spatial.transform import Rotation
 
 from endoprior.compute import simd
 from endoprior.core.types import Splats
-from endoprior.render import constants, tiles
-from endoprior.render.cpu import rasterize
-from endoprior.render.pixel_kernels import draw as draw_lanes
+from endoprior.render import constants
+from endoprior.render.numba import rasterize, tiles
+from endoprior.render.numba.pixels import blend
 
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 
 
-def same_bits(first, second):
-    """Whether two draws are identical, gradients included."""
+def identical(first, second):
+    """Whether two renderings are bit-identical, gradients included."""
     images = all(torch.equal(getattr(first[0], n), getattr(second[0], n)) for n in ("color", "alpha", "depth", "radii"))
     return images and all(torch.equal(first[1][n], second[1][n]) for n in first[1])
 
 
-def test_same_bits_for_any_number_of_threads():
+def test_bit_identical_for_any_number_of_threads():
     view = camera(100, 90)
     scene = splats(view, 400, widths=(0.5, 20.0))
     threads = numba.get_num_threads()
@@ -35,10 +35,10 @@ def test_same_bits_for_any_number_of_threads():
     try:
         for count in (1, threads, 1, threads):
             numba.set_num_threads(count)
-            drawn.append(draw("cpu", scene, view))
+            drawn.append(draw("numba", scene, view))
     finally:
         numba.set_num_threads(threads)
-    assert all(same_bits(drawn[0], other) for other in drawn[1:])
+    assert all(identical(drawn[0], other) for other in drawn[1:])
 
 
 def test_order_of_the_list_does_not_matter():
@@ -46,8 +46,8 @@ def test_order_of_the_list_does_not_matter():
     view = camera()
     scene = splats(view)
     order = torch.randperm(60, generator=torch.Generator().manual_seed(1))
-    want, want_grads = draw("cpu", scene, view)
-    got, grads = draw("cpu", pick(scene, order), view)
+    want, want_grads = draw("numba", scene, view)
+    got, grads = draw("numba", pick(scene, order), view)
     assert torch.equal(got.color, want.color) and torch.equal(got.depth, want.depth)
     assert all(torch.equal(grads[name], want_grads[name][order]) for name in NAMES)
 
@@ -88,7 +88,7 @@ def test_central_differences():
     view = camera(20, 16)
     scene = splats(view, 5, widths=(12.0, 20.0))  # weak colors stay above the cutoff at 0
     scene = replace(scene, opacities=torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5]), sh=0.2 * scene.sh)
-    _, grads = draw("cpu", scene, view)
+    _, grads = draw("numba", scene, view)
     generator = torch.Generator().manual_seed(0)
     weights = [torch.randn(s, generator=generator).double() for s in ((16, 20, 3), (16, 20), (16, 20))]
     steps = {"means": 0.05, "quats": 0.02, "scales": 0.02, "opacities": 0.01, "sh": 0.05}
@@ -112,7 +112,7 @@ POISON += [(name, 1e38) for name in ("means", "quats", "scales")]  # finite, but
 
 
 @pytest.mark.parametrize("name, value", POISON)
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", ["numba", "reference"])
 def test_poison_is_culled(backend, name, value):
     """The poisoned Gaussian is as if it were not there, and gets finite gradients: zeros where it is culled."""
     view = camera(24, 20)
@@ -129,7 +129,7 @@ def test_poison_is_culled(backend, name, value):
         assert all((grads[field][5] == 0).all() for field in NAMES)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", ["numba", "reference"])
 def test_zero_quaternion_behind_and_tiny_are_culled_or_finite(backend):
     view = camera(24, 20, seed=None)
     scene = splats(view, 6)
@@ -151,7 +151,7 @@ def test_huge_gaussians_cover_everything():
     assert torch.allclose(out.alpha, torch.tensor(0.6), atol=1e-4)  # 50 px are 0.005 sigma
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", ["numba", "reference"])
 def test_empty_scene_is_background(backend):
     view = camera(9, 7)
     nothing = Splats(*(torch.zeros(shape) for shape in [(0, 3), (0, 4), (0, 3), (0,), (0, 4, 3)]))
@@ -161,11 +161,11 @@ def test_empty_scene_is_background(backend):
     assert grads["means"].shape == (0, 3)
 
 
-def test_other_types_are_refused():
+def test_other_types_are_rejected():
     view = camera()
     scene = splats(view, 2)
     doubled = Splats(*(getattr(scene, name).double() for name in NAMES))
-    with pytest.raises(ValueError, match=r"float32 on the cpu; got torch\.float64"):
+    with pytest.raises(ValueError, match=r"float32 on one cpu device; got torch\.float64"):
         rasterize(doubled, view, background=BACKGROUND.double())
 
 
@@ -175,10 +175,10 @@ def test_inputs_may_be_strided():
     strided = Splats(*(getattr(scene, name).mT.contiguous().mT if name in ("means", "quats", "scales", "sh")
                        else getattr(scene, name) for name in NAMES))  # fmt: skip
     assert not strided.means.is_contiguous()
-    assert same_bits(draw("cpu", scene, view), draw("cpu", strided, view))
+    assert identical(draw("numba", scene, view), draw("numba", strided, view))
 
 
-def test_a_picture_needs_no_gradient():
+def test_an_image_needs_no_gradient():
     view = camera()
     with torch.no_grad():
         out = rasterize(splats(view), view, background=BACKGROUND)
@@ -195,15 +195,15 @@ def test_tiles_skip_only_what_is_not_drawn():
     centers = rng.uniform(-20, 95, (num, 2)).astype(np.float32)
     a = np.exp(rng.uniform(-5, 1, num))
     k, m = rng.normal(size=num) * 2, np.exp(rng.uniform(-7, 1, num))
-    row_forms = np.stack([a, k, m], -1).astype(np.float32)
+    conic_ldl = np.stack([a, k, m], -1).astype(np.float32)
     opacities = rng.uniform(0.005, 0.99, num).astype(np.float32)
     z, colors = rng.uniform(1, 2, num).astype(np.float32), np.zeros((num, 3), np.float32)
-    work = tiles.build(centers, row_forms, z, colors, opacities, np.ones(num, np.int32), width, height)
+    lists = tiles.build(centers, conic_ldl, z, colors, opacities, np.ones(num, np.int32), width, height)
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     tiles_x = -(-width // tiles.TILE_WIDTH)
     listed = np.zeros((num, height, width), bool)
-    for tile in range(len(work.tile_starts) - 1):
-        pairs = work.pairs[work.tile_starts[tile] : work.tile_starts[tile + 1]]
+    for tile in range(len(lists.tile_starts) - 1):
+        pairs = lists.pairs[lists.tile_starts[tile] : lists.tile_starts[tile + 1]]
         assert (np.diff(z[pairs[:, tiles.ID]]) > 0).all()
         for pair in pairs:
             for strip in range(tiles.STRIPS):
@@ -221,14 +221,14 @@ def test_tiles_skip_only_what_is_not_drawn():
         extra += sum(int((listed[g][:, s].any(1) & ~drawn[:, s].any(1)).sum()) for s in strips)
     num_strips = sum((listed[:, :, s : s + simd.LANES].any((1, 2))).sum() for s in range(0, width, simd.LANES))
     assert extra <= 2 * num_strips
-    slots = np.sort(work.pairs[:, tiles.SLOT])
-    assert np.array_equal(slots, np.arange(len(slots))) and work.slot_starts[-1] == len(slots)
+    slots = np.sort(lists.pairs[:, tiles.SLOT])
+    assert np.array_equal(slots, np.arange(len(slots))) and lists.slot_starts[-1] == len(slots)
 
 
 @njit
 def _alphas(exponents, out):
     for i in range(0, exponents.size, simd.LANES):
-        alpha, _, _ = draw_lanes(simd.load(exponents, i), simd.splat(np.float32(1.0)))
+        alpha, _, _ = blend(simd.load(exponents, i), simd.splat(np.float32(1.0)))
         simd.store(out, i, alpha)
 
 

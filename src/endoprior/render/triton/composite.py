@@ -1,17 +1,17 @@
 """Front-to-back compositing as Triton kernels, forward and backward.
 
-One program of one warp per tile: nothing has to wait for other warps, and a look at all pixels is five shuffles.
+One program of one warp per tile: nothing has to wait for other warps, and checking all pixels takes five shuffles.
 Pixels are (ROWS, 32) blocks whose first axis lies within a lane, so that a Gaussian's numbers are loaded, and its
 offset from the lane's column is computed, once for ROWS pixels, and ROWS values are added up before the lanes are.
 With (dx, dy) from the Gaussian's center and `u = root dy + root_k dx`, `alpha = 2^(log2(opacity) - m_log2 dx^2 - u^2)`:
-see `triton_bins` for the records, and `triton_project` for the column form.
+see `tiles` for the records, and `projection` for the factors.
 
 The backward pass is the same walk again. With weights w_j, colors c_j (z among them), cotangents v and final
 transmittance T_end, Gaussian i at one pixel gets `dL/dalpha_i = T_i (c_i . v) - rest_i / (1 - alpha_i)`, where
 `rest_i = sum_{j > i} w_j (c_j . v) + T_end (background . v - v_alpha)`. `rest` starts as the whole sum, known from the
-forward pass, and loses one term per Gaussian: no list is walked backwards, and both passes decide alike. Every pair
-belongs to one tile, so its program writes that pair's sums, and `gather` adds up each Gaussian's pairs in a fixed
-order: no atomics, and equal input gives equal bits. In this file `v_x` is dL/dx, and dp is dL / d log alpha, 0 where
+forward pass, and loses one term per Gaussian: no list is walked backwards, and both passes take the same decisions.
+Every pair belongs to one tile, so its program writes that pair's sums, and `gather` adds up each Gaussian's pairs in a
+fixed order: no atomics, and results are bit-identical. In this file `v_x` is dL/dx, and dp is dL / d log alpha, 0 where
 ALPHA_MAX binds.
 """
 
@@ -20,16 +20,16 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from .constants import ALPHA_MAX, STOP_TRANSMITTANCE
-from .triton_bins import BLUE, HALF_LOG2_E, LOG2_ALPHA_MIN, M_LOG2, RECORD, RED, ROOT, TILE_WIDTH, X
+from ..constants import ALPHA_MAX, STOP_TRANSMITTANCE
+from .tiles import BLUE, HALF_LOG2_E, LOG2_ALPHA_MIN, M_LOG2, RECORD, RED, ROOT, TILE_WIDTH, X
 
-MOMENTS = tl.constexpr(10)
+NUM_SUMS = tl.constexpr(10)
 """Sums over a pair's pixels of dp times 1, dx, dx^2, u, u^2, u dx, and of the weight times the four cotangents."""
 SIZES = ["width", "height", "tiles_x"]
 """Arguments that may be any number without another version being compiled."""
 _ALPHA_MAX, _STOP = tl.constexpr(ALPHA_MAX), tl.constexpr(STOP_TRANSMITTANCE)
 _WIDTH = tl.constexpr(TILE_WIDTH)
-_CHECK_EVERY = tl.constexpr(16)  # pairs between two looks at whether the whole tile is full
+_CHECK_EVERY = tl.constexpr(16)  # pairs between two checks whether the whole tile is full
 
 
 @triton.jit
@@ -69,7 +69,7 @@ def _row(records, rank, known):
 
 
 @triton.jit
-def _draw(gx, gy, root, root_k, m_log2, log2_opacity, x, y, step, transmittance):
+def _blend(gx, gy, root, root_k, m_log2, log2_opacity, x, y, step, transmittance):
     # Alpha of a Gaussian, the transmittance behind it, and dx and u, which the gradients need. Fused operations are
     # named, so that no compiler chooses them and both passes come to the same bits. Times -1 costs nothing; a minus is
     # a subtraction from 0 in Triton 3.7.
@@ -84,10 +84,10 @@ def _draw(gx, gy, root, root_k, m_log2, log2_opacity, x, y, step, transmittance)
 @triton.jit(do_not_specialize=SIZES)
 def composite_forward(
     records, ranks, tile_starts, background, width, height, tiles_x,
-    color, alpha_out, depth, transmittance_out, tile_ends, ROWS: tl.constexpr,
+    color, depth, transmittance, tile_ends, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """One program per tile. Writes color (H, W, 3), alpha_out, depth, transmittance_out (H, W), and tile_ends (L,):
-    where each tile's list was left."""
+    """One program per tile. Writes color (H, W, 3), depth and transmittance (H, W), and tile_ends (L,): where each
+    tile's list was left."""
     tile = tl.program_id(0)
     x, y, step, place, inside = _pixels(tile, tiles_x, width, height, ROWS)
     pair, end = tl.load(tile_starts + tile), tl.load(tile_starts + tile + 1)
@@ -101,7 +101,7 @@ def composite_forward(
         for p in tl.range(pair, chunk_end, loop_unroll_factor=2):
             n0, n1, n2, n3, n4, n5, n6, n7, n8, n9 = _row(records, rank, True)
             rank = tl.load(ranks + p + 2, p + 2 < end, 0)
-            alpha, behind, _, _ = _draw(gx, gy, root, root_k, m, opacity, x, y, step, t)
+            alpha, behind, _, _ = _blend(gx, gy, root, root_k, m, opacity, x, y, step, t)
             weight = tl.where(behind >= _STOP, t * alpha, 0.0)
             t = tl.where(behind >= _STOP, behind, tl.abs(t) * -1.0)
             red += weight * r
@@ -115,9 +115,8 @@ def composite_forward(
     tl.store(color + 3 * place, red + t * tl.load(background), inside)
     tl.store(color + 3 * place + 1, green + t * tl.load(background + 1), inside)
     tl.store(color + 3 * place + 2, blue + t * tl.load(background + 2), inside)
-    tl.store(alpha_out + place, 1.0 - t, inside)
     tl.store(depth + place, z, inside)
-    tl.store(transmittance_out + place, t, inside)
+    tl.store(transmittance + place, t, inside)
 
 
 @triton.jit
@@ -149,9 +148,9 @@ def _number(lane):
 @triton.jit(do_not_specialize=SIZES)
 def composite_backward(
     records, ranks, slots, tile_starts, tile_ends, width, height, tiles_x,
-    color, depth, transmittance, v_color, v_depth, v_alpha, moments, ROWS: tl.constexpr,
+    color, depth, transmittance, v_color, v_depth, v_alpha, sums, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """One program per tile. Writes moments (P, MOMENTS) by slot; zeros for pairs the forward pass did not need."""
+    """One program per tile. Writes sums (P, NUM_SUMS) by slot; zeros for pairs the forward pass did not need."""
     tile = tl.program_id(0)
     x, y, step, place, inside = _pixels(tile, tiles_x, width, height, ROWS)
     v_red = tl.load(v_color + 3 * place, inside, 0.0)
@@ -174,7 +173,7 @@ def composite_backward(
         n0, n1, n2, n3, n4, n5, n6, n7, n8, n9 = _row(records, rank, True)
         rank = tl.load(ranks + p + 2, p + 2 < needed, 0)
         next_slot = tl.load(slots + p + 1, p + 1 < needed, 0)
-        alpha, behind, dx, u = _draw(gx, gy, root, root_k, m, opacity, x, y, step, t)
+        alpha, behind, dx, u = _blend(gx, gy, root, root_k, m, opacity, x, y, step, t)
         weight = tl.where(behind >= _STOP, t * alpha, 0.0)
         gain = weight * (r * v_red + g * v_green + b * v_blue + gz * v_z)
         rest -= gain
@@ -191,18 +190,18 @@ def composite_backward(
         s_red, s_green = tl.sum(weight * v_red, 0), tl.sum(weight * v_green, 0)
         s_blue, s_z = tl.sum(weight * v_blue, 0), tl.sum(weight * v_z, 0)
         s_x = s_1 * dx
-        sums = _totals(s_1, s_x, s_x * dx, s_u, s_uu, s_u * dx, s_red, s_green, s_blue, s_z, lane)
-        tl.store(moments + slot * MOMENTS + number, sums, writes)
+        totals = _totals(s_1, s_x, s_x * dx, s_u, s_uu, s_u * dx, s_red, s_green, s_blue, s_z, lane)
+        tl.store(sums + slot * NUM_SUMS + number, totals, writes)
         slot = next_slot
         gx, gy, root, root_k, m, opacity, r, g, b, gz = n0, n1, n2, n3, n4, n5, n6, n7, n8, n9
     for p in range(needed, end):
-        tl.store(moments + tl.load(slots + p) * MOMENTS + number, tl.zeros_like(number), writes)
+        tl.store(sums + tl.load(slots + p) * NUM_SUMS + number, tl.zeros_like(number), writes)
 
 
-@triton.jit(do_not_specialize=["num", "capacity"])
+@triton.jit(do_not_specialize=["num"])
 def gather(
-    moments, slot_ends, order, forms, opacities, num, capacity,
-    v_means2d, v_forms, v_opacities, v_colors, v_z, BLOCK: tl.constexpr, SIDE_BY_SIDE: tl.constexpr,
+    sums, slot_ends, order, conic_ldl, opacities, num,
+    v_means2d, v_conic_ldl, v_z, v_colors, v_opacities, BLOCK: tl.constexpr, SIDE_BY_SIDE: tl.constexpr,
 ):  # fmt: skip
     """One program per BLOCK ranks. Adds up the slots of each, SIDE_BY_SIDE at a time, and writes one row of each v_*.
 
@@ -213,13 +212,13 @@ def gather(
     known = rank < num
     g = tl.load(order + rank, known, 0)
     start = tl.load(slot_ends + rank - 1, known & (rank > 0), 0)
-    end = tl.minimum(tl.load(slot_ends + rank, known, 0), capacity)
+    end = tl.load(slot_ends + rank, known, 0)
     s_1 = tl.zeros((BLOCK, SIDE_BY_SIDE), tl.float32)
     s_x, s_xx, s_u, s_uu, s_ux, s_red, s_green, s_blue, s_z = s_1, s_1, s_1, s_1, s_1, s_1, s_1, s_1, s_1
     for i in range(0, tl.max(end - start, 0).to(tl.int32), SIDE_BY_SIDE):
         slot = start[:, None] + i + tl.arange(0, SIDE_BY_SIDE)[None, :]
         taken = slot < end[:, None]
-        row = moments + slot * MOMENTS
+        row = sums + slot * NUM_SUMS
         s_1 += tl.load(row, taken, 0.0)
         s_x += tl.load(row + 1, taken, 0.0)
         s_xx += tl.load(row + 2, taken, 0.0)
@@ -231,15 +230,15 @@ def gather(
         s_blue += tl.load(row + 8, taken, 0.0)
         s_z += tl.load(row + 9, taken, 0.0)
     some = known & (end > start)
-    a, k = tl.load(forms + 3 * g, some, 1.0), tl.load(forms + 3 * g + 1, some, 0.0)
+    a, k = tl.load(conic_ldl + 3 * g, some, 1.0), tl.load(conic_ldl + 3 * g + 1, some, 0.0)
     inverse_root = 1.0 / tl.sqrt(a * HALF_LOG2_E)
     u_1, u_x = tl.sum(s_u, 1) * inverse_root, tl.sum(s_ux, 1) * inverse_root
     v_y = a * u_1
-    tl.store(v_means2d + 2 * g, k * v_y + tl.load(forms + 3 * g + 2, some, 0.0) * tl.sum(s_x, 1), known)
+    tl.store(v_means2d + 2 * g, k * v_y + tl.load(conic_ldl + 3 * g + 2, some, 0.0) * tl.sum(s_x, 1), known)
     tl.store(v_means2d + 2 * g + 1, v_y, known)
-    tl.store(v_forms + 3 * g, -0.5 * tl.sum(s_uu, 1) * inverse_root * inverse_root, known)
-    tl.store(v_forms + 3 * g + 1, -a * u_x, known)
-    tl.store(v_forms + 3 * g + 2, -0.5 * tl.sum(s_xx, 1), known)
+    tl.store(v_conic_ldl + 3 * g, -0.5 * tl.sum(s_uu, 1) * inverse_root * inverse_root, known)
+    tl.store(v_conic_ldl + 3 * g + 1, -a * u_x, known)
+    tl.store(v_conic_ldl + 3 * g + 2, -0.5 * tl.sum(s_xx, 1), known)
     tl.store(v_opacities + g, tl.sum(s_1, 1) / tl.load(opacities + g, some, 1.0), known)
     tl.store(v_colors + 3 * g, tl.sum(s_red, 1), known)
     tl.store(v_colors + 3 * g + 1, tl.sum(s_green, 1), known)

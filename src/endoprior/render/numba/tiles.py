@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ..compute.simd import LANES
-from .constants import ALPHA_MIN
+from ...compute.simd import LANES
+from ..constants import ALPHA_MIN
 
 STRIPS = 2
 """Strips of LANES px side by side in a tile; the rows that a Gaussian touches are known per strip."""
@@ -30,7 +30,7 @@ RECORD_SIZE = 12
 HALF_LOG2_E = np.float32(0.5 * log2(np.e))
 LOG2_ALPHA_MIN = log2(ALPHA_MIN)
 LAST = np.iinfo(np.int64).max
-"""Sort key of what is not drawn."""
+"""Sort key of Gaussians that are not visible."""
 
 # Columns of a pair.
 ID, SLOT, FIRST_ROWS = range(3)
@@ -41,10 +41,10 @@ PAIR_SIZE = FIRST_ROWS + 2 * STRIPS
 
 @dataclass(frozen=True)
 class Tiles:
-    """The work list of one picture."""
+    """The lists of one image."""
 
     records: NDArray[np.float32]
-    """(N, RECORD_SIZE) see the columns above; only rows of drawn Gaussians are set."""
+    """(N, RECORD_SIZE) see the columns above; only rows of visible Gaussians are set."""
     pairs: NDArray[np.int32]
     """(P, PAIR_SIZE) Gaussian, slot, and first and last + 1 row of each strip; sorted by tile, then near to far."""
     tile_starts: NDArray[np.int64]
@@ -57,7 +57,7 @@ class Tiles:
 
 def build(
     means2d: NDArray[np.float32],
-    row_forms: NDArray[np.float32],
+    conic_ldl: NDArray[np.float32],
     z: NDArray[np.float32],
     colors: NDArray[np.float32],
     opacities: NDArray[np.float32],
@@ -69,7 +69,7 @@ def build(
     num, num_visible = len(z), np.count_nonzero(radii)
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     records, keys = np.empty((num, RECORD_SIZE), np.float32), np.empty(num, np.int64)
-    gaussians = (means2d, row_forms, z, z.view(np.int32), colors, opacities, radii)
+    gaussians = (means2d, conic_ldl, z, z.view(np.int32), colors, opacities, radii)
     box_starts = np.zeros(num + 1, np.int64)
     _write_records(*gaussians, width, height, records, keys, box_starts)
     near_to_far = np.sort(keys)[:num_visible] & 0xFFFFFFFF
@@ -94,7 +94,7 @@ def build(
 def _footprint(record):
     # The footprint is  square (dx + k dy)^2 + m dy^2 <= level.  Returns square, k, m, level in float64, the largest dy
     # (tip, found at dx = -k tip) and the largest dx (reach).
-    # The level is widened a little, so that float32 rounding in the pixel kernels cannot draw outside of it.
+    # The level is widened a little, so that float32 rounding in the pixel kernels cannot reach outside of it.
     square, k, m = np.float64(record[ROOT]) ** 2, np.float64(record[K]), np.float64(record[M_LOG2])
     level = np.float64(record[LOG2_OPACITY]) - LOG2_ALPHA_MIN + 0.01
     tip = np.sqrt(level / m)
@@ -111,16 +111,16 @@ def _pixels(center, before, after, size):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _write_records(means2d, row_forms, z, z_bits, colors, opacities, radii, width, height, records, keys, box_starts):
+def _write_records(means2d, conic_ldl, z, z_bits, colors, opacities, radii, width, height, records, keys, box_starts):
     # One iteration per Gaussian. Writes its sort key: the bits of z (monotone, as z is > 0), then its index; and if it
     # is visible its record and, at g + 1, how many tiles the box around it touches: room enough for its pairs.
     for g in prange(z.size):
         keys[g] = LAST
         if radii[g] > 0:
             records[g, X], records[g, Y] = means2d[g, 0], means2d[g, 1]
-            records[g, ROOT] = np.sqrt(row_forms[g, 0] * HALF_LOG2_E)
-            records[g, K] = row_forms[g, 1]
-            records[g, M_LOG2] = row_forms[g, 2] * HALF_LOG2_E
+            records[g, ROOT] = np.sqrt(conic_ldl[g, 0] * HALF_LOG2_E)
+            records[g, K] = conic_ldl[g, 1]
+            records[g, M_LOG2] = conic_ldl[g, 2] * HALF_LOG2_E
             records[g, LOG2_OPACITY] = np.log2(opacities[g])
             records[g, RED], records[g, GREEN], records[g, BLUE] = colors[g, 0], colors[g, 1], colors[g, 2]
             records[g, Z] = z[g]

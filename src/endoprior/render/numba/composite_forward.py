@@ -10,18 +10,18 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from ..compute.simd import LANES, fma, lane_numbers, larger, load, splat, store
+from ...compute.simd import LANES, fma, lane_numbers, larger, load, splat, store
 from . import tiles
-from .pixel_kernels import STOP, draw, log2_alpha
+from .pixels import STOP, blend, log2_alpha
 from .tiles import FIRST_ROWS, ID, STRIPS, TILE_HEIGHT, TILE_WIDTH
 
 PLANES = 5
-"""Transmittance; red, green, blue, depth drawn so far."""
+"""Transmittance; red, green, blue, depth so far."""
 ROW = PLANES * LANES
 """Numbers per row of a strip."""
 STRIP_SIZE = TILE_HEIGHT * ROW
 CHECK_EVERY = 32
-"""Pairs between two looks at whether the whole tile is full."""
+"""Pairs between two checks whether the whole tile is full."""
 f4 = np.float32
 
 
@@ -37,8 +37,8 @@ def _is_full(state):
 
 
 @njit(inline="always")
-def _draw_pair(record, pair, left, top, state):
-    # Draws one Gaussian on the rows of one tile that it touches. (left, top): center of the tile's first pixel.
+def _blend_pair(record, pair, left, top, state):
+    # Blends one Gaussian into the rows of one tile that it touches. (left, top): center of the tile's first pixel.
     root, m_log2 = record[tiles.ROOT], splat(record[tiles.M_LOG2])
     root_k, log2_opacity = splat(root * record[tiles.K]), splat(record[tiles.LOG2_OPACITY])
     red, green, blue = splat(record[tiles.RED]), splat(record[tiles.GREEN]), splat(record[tiles.BLUE])
@@ -50,7 +50,7 @@ def _draw_pair(record, pair, left, top, state):
         place = strip * STRIP_SIZE + first * ROW
         for _ in range(first, end):
             exponent = log2_alpha(base, root_k, m_log2, log2_opacity, y - center_y)
-            _, weight, behind = draw(exponent, load(state, place))
+            _, weight, behind = blend(exponent, load(state, place))
             store(state, place, behind)
             store(state, place + LANES, fma(weight, red, load(state, place + LANES)))
             store(state, place + 2 * LANES, fma(weight, green, load(state, place + 2 * LANES)))
@@ -61,14 +61,14 @@ def _draw_pair(record, pair, left, top, state):
 
 
 @njit(cache=True, error_model="numpy")
-def _draw_tile(records, pairs, left, top, columns, rows, state):
-    # Draws the pairs of one tile, near to far, and returns how many it needed before all pixels were full.
+def _blend_tile(records, pairs, left, top, columns, rows, state):
+    # Blends the pairs of one tile, near to far, and returns how many it needed before all pixels were full.
     state[:] = f4(0.0)  # pixels outside the image are full
     for r in range(rows):
         for c in range(columns):
             state[c // LANES * STRIP_SIZE + r * ROW + c % LANES] = f4(1.0)
     for p in range(len(pairs)):
-        _draw_pair(records[pairs[p, ID]], pairs[p], f4(left + 0.5), f4(top + 0.5), state)
+        _blend_pair(records[pairs[p, ID]], pairs[p], f4(left + 0.5), f4(top + 0.5), state)
         if p % CHECK_EVERY == CHECK_EVERY - 1 and _is_full(state):
             return p + 1
     return len(pairs)
@@ -88,7 +88,7 @@ def composite_forward(
             top, left = tile // tiles_x * TILE_HEIGHT, tile % tiles_x * TILE_WIDTH
             rows, columns = min(TILE_HEIGHT, height - top), min(TILE_WIDTH, width - left)
             start, end = tile_starts[tile], tile_starts[tile + 1]
-            tile_ends[tile] = start + _draw_tile(records, pairs[start:end], left, top, columns, rows, state)
+            tile_ends[tile] = start + _blend_tile(records, pairs[start:end], left, top, columns, rows, state)
             for r in range(rows):
                 for c in range(columns):
                     place = c // LANES * STRIP_SIZE + r * ROW + c % LANES

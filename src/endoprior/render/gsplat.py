@@ -1,27 +1,27 @@
-"""The GPU backend: gsplat (Apache-2.0, an extra) behind the same seam, float32 on one CUDA device.
+"""The backend that calls gsplat (Apache-2.0, an extra), float32 on one CUDA device.
 
 gsplat's separate steps are used and not its `rasterization`: color and z are composited in one pass of four channels,
-the gradient of z can be stopped, and `means2d` is the tensor whose gradient is kept. Its tiles are counted on the
-host, once per call; nothing here waits for the device besides.
+the gradient of z can be stopped, and `means2d` is the tensor whose gradient is kept. Once per call the host waits for
+the device, to count the tiles.
 
 Where gsplat 1.5.3 differs from `reference`, read from its sources, and what that means for "agrees within 1e-3":
 
 - One Gaussian's alpha ends at 0.999, not at ALPHA_MAX = 0.99 (its later sources have 0.99). In the core of a Gaussian
   of opacity above 0.99, within 0.14 standard deviations, alpha differs by up to 0.009, and a gradient passes. Capping
-  the opacity instead would be off by as much, over the whole footprint. Drawn by `cpu` with 0.999, no more than 5 of
-  327,680 pixels of two trained scenes changed by more than 1e-3. Everything else agrees.
+  the opacity instead would be off by as much, over the whole footprint. Rendered by `numba` with 0.999, no more than 5
+  of 327,680 pixels of two trained scenes changed by more than 1e-3. Everything else agrees.
 - alpha < ALPHA_MIN is left out pixel by pixel, as here: its tiles hold the bounding box of the ellipse cut at 3.33
   standard deviations, where alpha is below ALPHA_MIN for every opacity up to 1. The footprint is the same. `radii` is
-  computed here all the same, as gsplat's count what touches no pixel center.
+  computed here, as gsplat's counts Gaussians that touch no pixel center.
 - A pixel stops where its transmittance would become <= STOP_TRANSMITTANCE, here where it would become less.
-- It computes with fast math. Where an edge, an order or a stop hangs on the last bits, one Gaussian more or less is
-  drawn at a pixel, at an edge 1/255 of its contrast: a handful of pixels of a full picture, none of most.
+- It computes with fast math. Where an edge, an order or a stop depends on the last bits, one Gaussian more or less
+  counts at a pixel, at an edge 1/255 of its contrast: a handful of pixels of a full image, none of most.
 - The determinant of a footprint is xx yy - xy^2, which cancels: a needle 300 px long is off by a few percent, and one
-  whose determinant comes out <= 0 is not drawn. The Jacobian, its margin and its gradient are the same.
-- It keeps z == near_plane and what is not a number. So the plane given is the number next to NEAR_Z, and what
-  `reference` culls is moved behind the camera before gsplat sees it, together with what might overflow there: a
-  standard deviation above LARGEST_SIGMA px, a number above LARGEST, a coefficient above LARGEST_SH.
-- Gradients are summed with atomics: equal input gives equal bits in the picture, not in gradients. The backward pass
+  whose determinant comes out <= 0 is culled. The Jacobian, its margin and its gradient are the same.
+- It keeps z == near_plane and NaN. So the plane given is the number next to NEAR_Z, and what `reference` culls is moved
+  behind the camera before gsplat sees it, together with what might overflow there: a standard deviation above
+  LARGEST_SIGMA px, a number above LARGEST, a coefficient above LARGEST_SH.
+- Gradients are summed with atomics: images are bit-identical for equal input, gradients are not. The backward pass
   starts from 1 - alpha, of which a full pixel keeps 3 digits: up to 0.1 % there.
 - Order is by the bits of z, ties by index. Blur (no compensation), pixel centers, background, spherical harmonics and
   the cut-off of color at 0 are the same.
@@ -46,7 +46,7 @@ NEXT_STEP = "Install `endoprior[cuda]`; `endoprior doctor` tells what is missing
 try:
     import gsplat
 except ImportError as error:
-    raise InputError(f"backend: cuda needs gsplat, which cannot be imported ({error}). {NEXT_STEP}") from error
+    raise InputError(f"backend: gsplat cannot be imported ({error}). {NEXT_STEP}") from error
 
 DEVICE = "cuda"
 """Type of device the tensors must be on."""
@@ -65,7 +65,7 @@ KEPT_CAMERAS = 1024
 
 
 class Lens(NamedTuple):
-    """The numbers of one camera of each of `B` moments on the device, float32."""
+    """The numbers of one camera of each of `B` time steps on the device, float32."""
 
     viewmats: Tensor
     """(B, 1, 4, 4) world to camera."""
@@ -86,7 +86,7 @@ class Lens(NamedTuple):
 
 
 def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_to_means: bool = True) -> RenderOutput:
-    """Draw the Gaussians near to far. See `render.Rasterizer`.
+    """Render the Gaussians near to far. See `render.Rasterizer`.
 
     Raises:
         ValueError: the input is not float32 on one CUDA device, or its shapes disagree.
@@ -99,30 +99,30 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
 def rasterize_many(
     splats: list[Splats], cameras: list[Camera], *, background: Tensor, depth_grad_to_means: bool = True
 ) -> list[RenderOutput]:
-    """Draw several moments in one call, for which the host waits once. See `render.load_many`.
+    """Render several time steps in one call, for which the host waits once. See `render.load_many`.
 
-    For pictures: gsplat 1.5.3 mixes up the gradients of several moments of fewer than 32 Gaussians.
+    Without gradients: gsplat 1.5.3 mixes up those of several time steps of fewer than 32 Gaussians.
 
     Raises:
-        ValueError: as `rasterize`, or the moments differ in their number of Gaussians, or cameras in size.
+        ValueError: as `rasterize`, or the time steps differ in their number of Gaussians, or cameras in size.
     """
     degrees = {check(each, background) for each in splats}
     alike = degrees, {len(each) for each in splats}, {(camera.width, camera.height) for camera in cameras}
     if any(len(found) != 1 for found in alike) or len(splats) != len(cameras):
-        raise ValueError("moments drawn in one call must agree in Gaussians, degree of color and size of picture")
+        raise ValueError("time steps of one call must agree in number of Gaussians, SH degree and image size")
     for each in splats:
         check_device(each, background, DEVICE)
     if not len(splats[0]):
         return [_nothing(*each, background) for each in zip(splats, cameras, strict=True)]
     _build_kernels()
-    return _draw(splats, cameras, background, degrees.pop(), depth_grad_to_means)
+    return _render(splats, cameras, background, degrees.pop(), depth_grad_to_means)
 
 
-def _draw(
+def _render(
     splats: list[Splats], cameras: list[Camera], background: Tensor, degree: int, depth_grad_to_means: bool
 ) -> list[RenderOutput]:
-    """`B` moments of `N` Gaussians, seen by one camera each."""
-    moments, width, height = len(splats), cameras[0].width, cameras[0].height
+    """`B` time steps of `N` Gaussians, seen by one camera each."""
+    steps, width, height = len(splats), cameras[0].width, cameras[0].height
     all_means, quats, scales, opacities, coefficients = (torch.stack([getattr(s, n) for s in splats]) for n in FIELDS)
     together = Splats(all_means, quats, scales, opacities, coefficients)
     lens = _together([lens_of(camera, background.device) for camera in cameras])
@@ -141,9 +141,9 @@ def _draw(
         far_plane=OVERFLOW,
         opacities=opacities.detach(),
     )
-    boxes, centers, depths, conics = (each.squeeze(1) for each in found[:4])  # of the one camera of each moment
+    boxes, centers, depths, conics = (each.squeeze(1) for each in found[:4])  # of the one camera of each time step
     kept = (boxes > 0).all(-1)  # rows of the others were never written
-    # Of each picture a tensor of its own, whose gradient can be kept.
+    # Each image gets a tensor of its own, whose gradient can be kept.
     means2d = [torch.where(k[:, None], c, 0) for k, c in zip(kept, centers, strict=True)]
     centers = torch.stack(means2d)
     sh = gsplat.spherical_harmonics(degree, means - lens.center, coefficients, masks=kept)
@@ -151,7 +151,7 @@ def _draw(
     channels = torch.cat([(sh + 0.5).clamp(min=0), z[..., None]], -1)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     _, pairs, pair_ids = gsplat.isect_tiles(centers, boxes, depths, TILE, tiles_x, tiles_y)
-    drawn, alpha = gsplat.rasterize_to_pixels(
+    blended, alpha = gsplat.rasterize_to_pixels(
         centers,
         conics,
         channels,
@@ -159,14 +159,13 @@ def _draw(
         width,
         height,
         TILE,
-        gsplat.isect_offset_encode(pairs, moments, tiles_x, tiles_y),
+        gsplat.isect_offset_encode(pairs, steps, tiles_x, tiles_y),
         pair_ids,
     )
-    color, depth = drawn.split([3, 1], -1)
+    color, depth = blended.split([3, 1], -1)
     color = color + (1 - alpha) * background  # given to gsplat, its backward pass reads it at every Gaussian of a pixel
     radii = _radii(centers, conics, opacities, kept, lens)
-    pictures = zip(color, alpha[..., 0], depth[..., 0], means2d, radii, strict=True)
-    return [RenderOutput(*picture) for picture in pictures]
+    return [RenderOutput(*image) for image in zip(color, alpha[..., 0], depth[..., 0], means2d, radii, strict=True)]
 
 
 def lens_of(camera: Camera, device: torch.device) -> Lens:
@@ -203,7 +202,7 @@ def _lens(
 
 
 def _together(lenses: list[Lens]) -> Lens:
-    """The lenses of several moments as one."""
+    """The lenses of several time steps as one."""
     return lenses[0] if len(lenses) == 1 else Lens(*map(torch.cat, zip(*lenses, strict=True)))
 
 
@@ -214,13 +213,13 @@ def _build_kernels() -> None:
         from gsplat.cuda._backend import _C as kernels
     except (ImportError, IndexError, OSError, RuntimeError) as error:  # IndexError: no GPU to compile for
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise InputError(f"backend: gsplat could not build its CUDA kernels ({reason}). {NEXT_STEP}") from error
+        raise InputError(f"backend: gsplat cannot build its CUDA kernels ({reason}). {NEXT_STEP}") from error
     if kernels is None:
         raise InputError(f"backend: gsplat found no CUDA toolkit to build its kernels with. {NEXT_STEP}")
 
 
 def _nothing(splats: Splats, camera: Camera, background: Tensor) -> RenderOutput:
-    """The picture without Gaussians, by whose number gsplat divides; tied to its inputs as any other is."""
+    """The image without Gaussians, by whose number gsplat divides; tied to its inputs as any other is."""
     means2d = splats.means[:, :2]
     zero = means2d.sum() + sum(getattr(splats, name).sum() for name in FIELDS)
     color = background.expand(camera.height, camera.width, 3) + zero

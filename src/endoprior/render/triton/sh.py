@@ -1,4 +1,4 @@
-"""The harmonics of `sh` and their gradients inside Triton kernels: one Gaussian per lane, float32.
+"""The harmonics of `render.sh` and their gradients inside Triton kernels: one Gaussian per lane, float32.
 
 Coefficients are read where they are needed, so that no kernel holds 48 of them at once. The rows of two lanes are far
 apart in memory, where a load or a store costs the same for one number as for four: so four harmonics at a time, three
@@ -10,7 +10,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from . import sh
+from .. import sh
 
 C0, C1 = tl.constexpr(sh.C0), tl.constexpr(sh.C1)
 C2_XY, C2_ZZ, C2_XX = tl.constexpr(sh.C2_XY), tl.constexpr(sh.C2_ZZ), tl.constexpr(sh.C2_XX)
