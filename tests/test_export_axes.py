@@ -71,7 +71,5 @@ def test_a_turned_scene_draws_the_same_picture(name):
     rasterize = render.load("numba")
     want = rasterize(splats, camera, background=torch.zeros(3))
     got = rasterize(splats_in_axes(splats, name), moved, background=torch.zeros(3))
-    torch.testing.assert_close(
-        got.color, want.color, rtol=0, atol=1e-4
-    )  # equal depths may change order
+    torch.testing.assert_close(got.color, want.color, rtol=0, atol=1e-4)  # equal depths may change order
     torch.testing.assert_close(got.depth, want.depth, rtol=0, atol=1e-2)
