@@ -16,7 +16,7 @@ from endoprior.core.presets import preset
 from endoprior.experiments.spec import MethodSpec, SequenceSpec, Spec
 from endoprior.model.basis import identity_motion
 from endoprior.model.scene import SceneFacts
-from endoprior.runs.identity import refuse_other_run
+from endoprior.runs.identity import reject_other_run
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
 PRESETS = ("default", "paper", "released", "endogaussian")
@@ -101,7 +101,7 @@ def test_files_with_former_names_of_backends_are_read(former, current, capsys):
     about = {"config": stored, "width": 9, "height": 9, "frames_per_second": 25.0}
     assert from_dict(SceneFacts, about, "about").config == now
     config = to_dict(now)
-    refuse_other_run(Path("f"), config | {"render": config["render"] | stored["render"]}, "data", now, "data", Path())
+    reject_other_run(Path("f"), config | {"render": config["render"] | stored["render"]}, "data", now, "data", Path())
     assert not capsys.readouterr().err
 
 

@@ -25,10 +25,13 @@ FLOORS = [
 """Packages, lowest first. A package imports from floors below its own, never from its own or from above."""
 FLOOR_OF = {name: level for level, names in enumerate(FLOORS) for name in names}
 ROOT_FILES = {"__init__.py", "__main__.py", "py.typed"}
-CHECKED_PAGES = ("docs/development.md",)
-"""Pages whose lines are short. Add a page when it complies."""
-PRIVATE_WORDS = ("house", "storey")
-"""Words of this project's past that the source no longer uses. Add a word when its last use is gone."""
+CHECKED_PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")} - {ROOT / "docs" / "results.md"})
+"""Every page but the generated one."""
+PRIVATE_WORDS = (
+    "house", "storey", "desk", "mend", "crowd", "nobody", "dear", "bump", "refuse", "refusal", "judge", "half planes",
+    "row form", "lacking",
+)  # fmt: skip
+"""Words that this project once used in place of the field's."""
 NO_TORCH = ("priors", "data", "evaluation/metrics/stability.py", "phantom", "core", "footage", "check")
 
 
@@ -150,11 +153,11 @@ def test_lines_of_pages_are_at_most_100_characters_long():
     """Tables, code and the targets of links do not count."""
     for page in CHECKED_PAGES:
         is_code = False
-        for number, line in enumerate((ROOT / page).read_text().splitlines(), 1):
+        for number, line in enumerate(page.read_text().splitlines(), 1):
             is_code ^= line.startswith("```")
             if not is_code and not line.startswith(("|", "    ", "```")):
                 length = len(re.sub(r"\]\([^)]*\)|https?://\S+", "", line))
-                assert length <= 100, f"{page}:{number}: expected at most 100 characters, got {length}"
+                assert length <= 100, f"{page.name}:{number}: expected at most 100 characters, got {length}"
 
 
 def test_the_source_has_no_private_vocabulary():

@@ -107,7 +107,7 @@ def main(argv: list[str]) -> int:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when `parent` ends, because nobody would collect its result."""
+    """End this process when `parent` ends, because its result would be lost."""
     while os.getppid() == parent:
         clock.sleep(0.5)
     os._exit(1)

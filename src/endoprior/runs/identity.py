@@ -14,7 +14,7 @@ from ..core.config_io import current_value, to_dict
 def reject_other_run(
     file: Path, stored_config: Any, stored_fingerprint: Any, cfg: Config, fingerprint: str, data: Path
 ) -> None:
-    """Refuse to resume with another config or on other data.
+    """Reject resuming with another config or on other data.
 
     Args:
         file: where the stored ones come from; named in the message.

@@ -40,7 +40,7 @@ def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
     if key in _filled:
         return
     _filled.add(key)
-    with suppress(OSError, subprocess.SubprocessError):  # a folder nobody may write to: Numba caches nothing either
+    with suppress(OSError, subprocess.SubprocessError):  # a read-only folder: Numba caches nothing either
         marker = _cache_folder() / f"endoprior_{key}.ready"
         if marker.exists():
             return

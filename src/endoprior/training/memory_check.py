@@ -47,7 +47,7 @@ def least_bytes(cfg: Config, num_train: int, width: int, height: int) -> int:
 
 
 def reject_too_large(sequence: FrameSequence, cfg: Config) -> None:
-    """Refuse a training that the free memory cannot hold.
+    """Reject a training that the free memory cannot hold.
 
     Raises:
         InputError: it needs more than there is; with both numbers.
