@@ -108,7 +108,7 @@ def test_report_only_trains_nothing(tmp_path, monkeypatch):
     spec = write_spec(tmp_path, sequences={"tiny": {"path": "tiny"}, "unset": {"path": "$NOWHERE/clip"}})
     assert main(["bench", str(spec), str(tmp_path / "out"), "--report-only"]) == 0
     text = (tmp_path / "out" / "results.md").read_text()
-    assert "expected NOWHERE to be set" in text
+    assert "expected the variable NOWHERE, got none" in text
     assert "not run yet" in text and not list((tmp_path / "out").glob("cells/**/cell.json"))
 
 
@@ -210,7 +210,7 @@ def test_two_benchmarks_do_not_share_a_folder(tmp_path, capsys):
     (tmp_path / "out").mkdir()
     with FileLock(tmp_path / "out" / ".lock"):
         assert main(["bench", str(write_spec(tmp_path)), str(tmp_path / "out")]) == 2
-    assert "another benchmark is running there" in capsys.readouterr().err
+    assert "got one in which another runs" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -218,8 +218,8 @@ def test_two_benchmarks_do_not_share_a_folder(tmp_path, capsys):
     [
         (["--threads", "0"], "--threads: expected 1 to 4096"),
         (["--data", "tiny"], "NAME=FOLDER"),
-        (["--data", "x=y"], "no such sequence"),
-        (["--weights-dir", "nowhere"], "expected a folder with weights"),
+        (["--data", "x=y"], "expected one of absent, tiny"),
+        (["--weights-dir", "nowhere"], "expected a folder of network weights"),
     ],
 )
 def test_bad_options_are_named(tmp_path, capsys, options, said):
@@ -256,7 +256,7 @@ def test_a_folder_of_specs_shares_equal_cells(tmp_path, capsys):
     text = (tmp_path / "out" / "results.md").read_text()
     assert text.startswith("# Results\n\n## Tiny") and text.count("## Tiny") == 2 and text.count("## Protocol") == 1
     assert main(["bench", str(tmp_path / "tiny"), str(tmp_path / "out")]) == 2
-    assert "got none. Pass a folder of specs" in capsys.readouterr().err
+    assert "got none. Fix: pass a folder of specs" in capsys.readouterr().err
 
 
 @pytest.mark.slow

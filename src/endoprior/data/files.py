@@ -48,9 +48,8 @@ def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str
     """
     kind = "/".join(sorted({suffix.removeprefix(".").upper() for suffix in suffixes} - {"JPEG", "TIF"}, reverse=True))
     if not folder.is_dir():
-        raise input_error(
-            folder, f"a folder of {kind} files", "no such folder", f"pass a folder in the {layout} layout."
-        )
+        fix = f"pass a folder in the {layout} layout."
+        raise input_error(folder, f"a folder of {kind} files", "no such folder", fix)
     everything = [file for file in entries(folder) if not file.name.startswith(".")]
     files = [file for file in everything if file.suffix.lower() in suffixes and file.stem.endswith(ending)]
     if not files:

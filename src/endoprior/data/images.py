@@ -104,12 +104,8 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
         raise input_error(path, "an image (PNG, JPEG, TIFF, BMP, WebP)", got, "write the file again.")
     got = (pixels.shape[1], pixels.shape[0])
     if size is not None and got != size:
-        raise input_error(
-            path,
-            f"{size[0]}x{size[1]} px like the first image",
-            f"{got[0]}x{got[1]}",
-            "bring all images, masks and depth to one size.",
-        )
+        want, fix = f"{size[0]}x{size[1]} px like the first image", "bring all images, masks and depth to one size."
+        raise input_error(path, want, f"{got[0]}x{got[1]}", fix)
     return pixels
 
 

@@ -18,6 +18,8 @@ from .reading import MOST_BYTES, read_bytes
 MOST_ARRAYS = 1000
 """Largest number of arrays in one .npz file."""
 ZIP_START = b"PK"
+_BROKEN = (OSError, ValueError, TypeError, EOFError, BadZipFile, zlib.error, LZMAError)
+_UNUSUAL = (RuntimeError, MemoryError, OverflowError)  # encrypted, unknown compression, nested header
 
 
 def read_numpy(path: Path, expected: str, fix: str) -> NDArray | dict[str, NDArray]:
@@ -29,9 +31,7 @@ def read_numpy(path: Path, expected: str, fix: str) -> NDArray | dict[str, NDArr
     stored = read_bytes(path, expected, fix).tobytes()
     try:
         return _archive(stored) if stored.startswith(ZIP_START) else _array(stored)
-    except (OSError, ValueError, TypeError, EOFError, BadZipFile, zlib.error, LZMAError) as error:
-        problem = (str(error) or type(error).__name__).split("\n")[0][:120]
-    except (RuntimeError, MemoryError, OverflowError) as error:  # encrypted, unknown compression, nested header
+    except (*_BROKEN, *_UNUSUAL) as error:
         problem = (str(error) or type(error).__name__).split("\n")[0][:120]
     raise input_error(path, expected, problem, fix)
 

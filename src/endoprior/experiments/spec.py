@@ -221,12 +221,8 @@ def _check(spec: Spec) -> None:
         if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
             raise InputError(f"sequences.{name}: a phantom has its own size. Fix: remove shrink and first_frames.")
         if sequence.format not in ("auto", *FORMATS):
-            raise input_error(
-                f"sequences.{name}.format",
-                f"auto, {', '.join(FORMATS)}",
-                f"{sequence.format!r}",
-                "see docs/datasets.md.",
-            )
+            want = f"auto, {', '.join(FORMATS)}"
+            raise input_error(f"sequences.{name}.format", want, repr(sequence.format), "see docs/datasets.md.")
     for name in spec.set_for:
         if name not in PresetName.__args__:
             raise input_error("set_for", f"one of {', '.join(PresetName.__args__)}", f"{name!r}", "choose one.")

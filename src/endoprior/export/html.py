@@ -72,13 +72,9 @@ def write_html(
     data, channels = pack(quantized.values, DEFLATE_LEVEL)
     page = _page(title or DEFAULT_TITLE, _about(scene, times, quantized, channels), data).encode()
     if len(page) > max_bytes:
-        what = f"{len(times)} time steps of {quantized.values.shape[2]} Gaussians"
-        raise input_error(
-            out,
-            f"at most {max_bytes / 1e6:.1f} MB",
-            f"{len(page) / 1e6:.1f} MB for {what}",
-            "choose fewer with --times (the size grows with their number), or raise --max-mb.",
-        )
+        got = f"{len(page) / 1e6:.1f} MB for {len(times)} time steps of {quantized.values.shape[2]} Gaussians"
+        fix = "choose fewer with --times (the size grows with their number), or raise --max-mb."
+        raise input_error(out, f"at most {max_bytes / 1e6:.1f} MB", got, fix)
     with whole_file(out) as temporary:
         temporary.write_bytes(page)
     return out

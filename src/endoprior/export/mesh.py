@@ -47,12 +47,8 @@ def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, byt
         surface = render_surface(scene, step.time, step.camera(scene), options.min_alpha)
         mesh = depth_grid(surface, options.mesh_step, options.max_slope)
     if not len(mesh.triangles):
-        raise input_error(
-            "--min-alpha",
-            f"a value that leaves a surface at time {step.time:.3f}",
-            f"{options.min_alpha}",
-            "lower it, or raise --max-slope.",
-        )
+        want = f"a value that leaves a surface at time {step.time:.3f}"
+        raise input_error("--min-alpha", want, f"{options.min_alpha}", "lower it, or raise --max-slope.")
     return {
         f".{options.mesh_format}": encode_mesh(
             points_in_axes(mesh.vertices, options.frame),
@@ -101,14 +97,6 @@ def _is_continuous(
 
 FORMAT = Format(
     suffixes=(".ply", ".obj", ".stl"),
-    options=(
-        *TIME_STEP_OPTIONS,
-        "mesh_format",
-        "mesh_method",
-        "mesh_step",
-        "max_slope",
-        "voxel_mm",
-        "min_alpha",
-    ),
+    options=(*TIME_STEP_OPTIONS, *("mesh_format", "mesh_method", "mesh_step", "max_slope", "voxel_mm", "min_alpha")),
     files=files,
 )

@@ -25,9 +25,8 @@ def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, byt
     opaque = splats.opacities >= options.min_opacity
     if not opaque.any():
         most = float(splats.opacities.max())
-        raise input_error(
-            "--min-opacity", f"at most {most:.3f}, the largest opacity", f"{options.min_opacity}", "lower it."
-        )
+        want = f"at most {most:.3f}, the largest opacity"
+        raise input_error("--min-opacity", want, f"{options.min_opacity}", "lower it.")
     means = splats.means[opaque]
     towards = torch.nn.functional.normalize(means - torch.from_numpy(step.camera(scene).center).to(means.dtype))
     colors = sh.colors(splats.sh[opaque], towards).numpy()

@@ -126,12 +126,8 @@ def _back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDA
         if not np.isfinite(depth).all():
             point = np.flatnonzero(own)[np.flatnonzero(~np.isfinite(depth))[0]]
             x, y = queries.pixels[point]
-            raise input_error(
-                "--points",
-                "pixels that show tissue",
-                f"({x:g}, {y:g}) in frame {frame} for point {point}, where no surface is rendered",
-                "move it.",
-            )
+            got = f"({x:g}, {y:g}) in frame {frame} for point {point}, where no surface is rendered"
+            raise input_error("--points", "pixels that show tissue", got, "move it.")
         positions[own] = back_project(queries.pixels[own], depth, camera)
     return positions
 
