@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ..compute.fastmath import REORDERED
 from .motion import ToolPose
-from .noise import FAST
 from .raster import FAR
 from .shading import HIGHLIGHT_LIMIT, LIGHTS_MM, REFERENCE_MM, ggx
 
@@ -53,7 +53,7 @@ def pack_tool(
     return np.concatenate([np.asarray(part, float) for part in parts]).astype(np.float32)
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=REORDERED)
 def _cylinder(along, radial, start, stop, radius, rounding):
     # Signed distance to a cylinder between `start` and `stop` on its axis, with rounded rims.
     dx = radial - radius + rounding
@@ -62,7 +62,7 @@ def _cylinder(along, radial, start, stop, radius, rounding):
     return np.sqrt(ox * ox + oy * oy) + min(max(dx, dy), np.float32(0)) - rounding
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=REORDERED)
 def _jaw(x, y, z):
     # Signed distance to one jaw: a tapered rounded bar along x with an oval window; z is away from the other jaw.
     zero, half = np.float32(0), np.float32(0.5)
@@ -80,7 +80,7 @@ def _jaw(x, y, z):
     return max(bar, window)
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=REORDERED)
 def _distance(px, py, pz, g):
     # Signed distance, mm, from a point to the instrument `g` (26,), and its part: 0 shaft, 1 collar, 2 wrist and jaws.
     dx, dy, dz = px - g[3], py - g[4], pz - g[5]
@@ -114,7 +114,7 @@ def _distance(px, py, pz, g):
     return nearest, part
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=REORDERED)
 def _light(n, v, p, part, g, lights, grain, out):
     # Radiance of a tool point: position p, unit normal n, unit direction v to the camera; writes out (3,).
     zero, one = np.float32(0), np.float32(1)
@@ -152,7 +152,7 @@ def _light(n, v, p, part, g, lights, grain, out):
         out[c] = min(out[c], np.float32(HIGHLIGHT_LIMIT))
 
 
-@njit(parallel=True, cache=True, fastmath=FAST)
+@njit(parallel=True, cache=True, fastmath=REORDERED)
 def _draw(tools, tissue_z, camera, lights, focal, cx, cy, far, color, depth):
     # A task takes every 64th row, since tools fill only some rows. Sphere-traces each tool in front of the tissue
     # tissue_z (SH, SW), mm; writes color (SH, SW, 3) and depth (SH, SW), only where a tool is nearest.

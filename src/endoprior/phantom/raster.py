@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from .noise import FAST
+from ..compute.fastmath import REORDERED
 
 _BANDS = 16
 _RIM = np.float32(1e-4)  # triangles are widened by this, so that samples on a shared edge belong to one of the two
@@ -17,7 +17,7 @@ FAR = np.float32(1e9)
 """Depth of samples without a surface."""
 
 
-@njit(parallel=True, cache=True, fastmath=FAST)
+@njit(parallel=True, cache=True, fastmath=REORDERED)
 def _rasterize(x, y, inverse_z, row_low, row_high, out):
     # One task per band of image rows; it walks the mesh in a fixed order and keeps the nearest triangle of each sample.
     # x, y, inverse_z (MH, MW) projected vertices, px and 1/mm; row_low/high (MH - 1,) y range of each mesh row.

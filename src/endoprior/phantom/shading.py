@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from .noise import FAST
+from ..compute.fastmath import REORDERED
 from .surface import Plane
 
 LIGHTS_MM = np.array([[-3.6, -2.2, 0.0], [3.9, -1.8, 0.0]], np.float32)
@@ -21,7 +21,7 @@ HIGHLIGHT_LIMIT = 3.0
 """Radiance of a sample is clamped to this, so that one highlight does not dominate a whole pixel."""
 
 
-@njit(cache=True, fastmath=FAST, inline="always")
+@njit(cache=True, fastmath=REORDERED, inline="always")
 def ggx(cosine, alpha):
     # Microfacet distribution of roughness alpha at the cosine between normal and half vector.
     square = alpha * alpha
@@ -29,7 +29,7 @@ def ggx(cosine, alpha):
     return square / (np.float32(np.pi) * d * d)
 
 
-@njit(parallel=True, cache=True, fastmath=FAST)
+@njit(parallel=True, cache=True, fastmath=REORDERED)
 def _shade(hits, normals, texture, e_a, e_b, camera, lights, focal, cx, cy, far, out):
     # One task per row of samples. hits (SH, SW, 3) from `rasterize`; normals (MH, MW, 3); texture (TH, TW, 7); writes
     # out (SH, SW, 3) linear radiance. Both look-ups are bilinear; black where nothing was hit.

@@ -14,8 +14,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ..compute.fastmath import REORDERED
 from .config import PhantomConfig
-from .noise import FAST, fractal
+from .noise import fractal
 
 MARGIN = 0.27
 """Margin of the material around the image, in image sizes, so that no motion uncovers its border."""
@@ -144,7 +145,7 @@ def _spline(knots: NDArray, count: int) -> NDArray:
     return np.stack([np.interp(even, arc, curve[:, i]) for i in range(2)], -1)
 
 
-@njit(parallel=True, cache=True, fastmath=FAST)
+@njit(parallel=True, cache=True, fastmath=REORDERED)
 def _loops(a, b, paths, radii, bases, boxes, height, owner, along, across):
     # One task per row of a, b (H, W). Highest loop at each point; ties go to the lower index. boxes (K, 4) are a0, a1,
     # b0, b1 outside which a loop lies under the floor. Writes the last four arrays.

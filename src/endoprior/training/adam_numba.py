@@ -11,11 +11,11 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..compute.fastmath import REORDERED
 from ..compute.simd import LANES, prefetch
 from ..model.basis import RankOneGradient
 from .adam import BETA1, BETA2, AdamState
 
-FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
 CHUNK = 128  # rows per task
 _AHEAD = 4  # rows between asking for the basis functions of one and updating them
 
@@ -65,7 +65,7 @@ def _constants(epsilon: float) -> tuple[np.float32, np.float32, np.float32]:
     return np.float32(BETA1), np.float32(BETA2), np.float32(epsilon)
 
 
-@njit(parallel=True, cache=True, fastmath=FLAGS)
+@njit(parallel=True, cache=True, fastmath=REORDERED)
 def _adam_flat(param, grad, first, second, rate, root_scale, beta1, beta2, epsilon):
     # Update every element; param, grad, first, second (n,) float32, all scalars float32. Inputs are trusted.
     # rate = lr / (1 - beta1**step), root_scale = 1 / sqrt(1 - beta2**step).
@@ -79,7 +79,7 @@ def _adam_flat(param, grad, first, second, rate, root_scale, beta1, beta2, epsil
         param[i] -= rate * m / (np.sqrt(v) * root_scale + epsilon)
 
 
-@njit(parallel=True, cache=True, fastmath=FLAGS)
+@njit(parallel=True, cache=True, fastmath=REORDERED)
 def _adam_outer(param, weights, v, first, second, begin, rate, root_scale, beta1, beta2, epsilon):
     # Like `_adam_flat` for a gradient that is a sum of outer products: grad[r, b, c] = sum_k weights[k, b] v[k, r, c].
     # param, first, second (R, B, C); weights (K, B), v (K, R, C) float32. Updates basis functions begin .. begin +

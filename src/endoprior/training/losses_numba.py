@@ -15,7 +15,7 @@ from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
+from ..compute.fastmath import REORDERED
 
 
 def supervised_losses(
@@ -62,7 +62,7 @@ class _SupervisedLosses(torch.autograd.Function):
         return *ctx.grads, None, None, None, None, None
 
 
-@njit(parallel=True, cache=True, fastmath=FLAGS)
+@njit(parallel=True, cache=True, fastmath=REORDERED)
 def _invert(depth, inverse):
     for y in prange(depth.shape[0]):
         for x in range(depth.shape[1]):
@@ -75,7 +75,7 @@ def _sign(x):
     return np.float32(x > 0) - np.float32(x < 0)
 
 
-@njit(parallel=True, cache=True, fastmath=FLAGS)
+@njit(parallel=True, cache=True, fastmath=REORDERED)
 def _rows(color, depth, target_u8, target_inverse, tissue_mask, measured, inverse, factors, v_color, v_depth, sums):
     # One task per row y: writes v_color[y], v_depth[y] and sums[y], the unweighted (color, depth, two variations).
     # The variation's gradient is the signs of the differences to the four neighbors: no task writes another's row.

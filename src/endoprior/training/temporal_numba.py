@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..compute.fastmath import REORDERED
 from ..compute.neighbors import MAX_COORDINATE, nearest
 from ..core.checks import check_shape
 from ..core.config import TemporalConfig
 from .temporal_torch import SQRT_EPS, SUM_EPS
 
-FLAGS = {"reassoc", "contract", "nsz", "arcp", "afn"}
 _POINTS_PER_TASK = 256
 _SAMPLE_ROWS, _SAMPLE_MARGIN = 512, 0.08
 
@@ -154,7 +154,7 @@ def _list_incoming(indices, weights, starts, sources, incoming):
             sources[place], incoming[place] = i, weights[i, s]
 
 
-@njit(cache=True, forceinline=True, fastmath=FLAGS)
+@njit(cache=True, forceinline=True, fastmath=REORDERED)
 def _pair(now, before, i, j, w, constants):
     # Of pair (i, j), times w: displacement and penalty of Eq. (11), then its gradients for point i: the displacement to
     # now_i (to before_i the opposite), the penalty to now_i, and the penalty to before_i.
@@ -172,7 +172,7 @@ def _pair(now, before, i, j, w, constants):
     return w * displacement, w * penalty, p * dx, p * dy, p * dz, q * ax, q * ay, q * az, r * bx, r * by, r * bz
 
 
-@njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(parallel=True, cache=True, fastmath=REORDERED, error_model="numpy")
 def _pull(now, before, indices, weights, starts, sources, incoming, constants, grads, sums):
     # One task per run of points. Writes grads[:, i] (displacement, penalty now, penalty before), of the sums that are
     # not yet divided by the sum of weights, and sums[task]: weights, displacement, penalty.
