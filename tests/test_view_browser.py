@@ -126,7 +126,7 @@ def test_the_slider_changes_the_image_and_play_advances(viewer, page, scene):
     seen = set()
     wait_until(lambda: seen.add(viewer.settings.frame) or len(seen) > 5)
     press_button(page, "Pause")
-    wait_until(lambda: viewer._playing is None)
+    wait_until(lambda: viewer.panel.play.label == "Play")
     settled(page, "played")
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import socket
 import threading
 import time
@@ -23,6 +24,7 @@ from endoprior.data import load_sequence
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
 from endoprior.runs.training_run import train
+from endoprior.view import live
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT, POINTS
 from endoprior.view.server import Viewer
 from endoprior.view.view_settings import ViewSettings
@@ -261,7 +263,9 @@ def short_config() -> Config:
     return replace(cfg, init=replace(cfg.init, budget=300), schedule=schedule)
 
 
-def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path):
+def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "REFRESH_SECONDS", 0.0)
+    monkeypatch.setattr(live, "LARGEST_SHARE", math.inf)
     digests, shown = [], []
     for watched in (False, True):
         out, client = tmp_path / f"run{watched}", None
@@ -275,7 +279,6 @@ def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path):
                         client = Client(on_step.viewer.port)
                         client.send_camera()
                         threading.Event().wait(0.3)
-                    on_step._due = 0.0
                     client.set(on_step.viewer.panel.layer, LAYER_NAMES["motion" if report.iteration % 2 else "prior"])
                     threading.Event().wait(0.05)
                     shown.append(on_step.viewer.panel.status.content)
