@@ -51,7 +51,7 @@ KEY_CODES = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, 
 
 
 def pictures_folder(name: str) -> Path:
-    """Where pictures that tests make are kept to be looked at: below `build/`, or ENDOPRIOR_TEST_PICTURES."""
+    """Where images that tests make are kept to be looked at: below `build/`, or ENDOPRIOR_TEST_PICTURES."""
     folder = Path(os.environ.get("ENDOPRIOR_TEST_PICTURES", Path(__file__).parents[1] / "build")) / name
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -198,7 +198,7 @@ class Page:
         self.send("Input.dispatchKeyEvent", type="keyUp", key=key, code=name, windowsVirtualKeyCode=code)
 
     def screenshot(self, path: Path | None = None, selector: str | None = None) -> NDArray[np.uint8]:
-        """(H, W, 3) RGB picture of the window or of one element, written to `path` as PNG too."""
+        """(H, W, 3) RGB image of the window or of one element, written to `path` as PNG too."""
         clip = {}
         if selector:
             left, top, width, height = self.box(selector)

@@ -23,14 +23,14 @@ SEEDS = st.integers(0, 2**31 - 1)
 
 @st.composite
 def views(draw_from):
-    """A camera of any small picture, 1x1 included, at the origin or anywhere."""
+    """A camera of any small image, 1x1 included, at the origin or anywhere."""
     width, height = (draw_from(st.one_of(st.integers(1, 4), st.integers(5, 70))) for _ in range(2))
     return camera(width, height, seed=draw_from(st.one_of(st.none(), st.integers(0, 99))))
 
 
 @st.composite
 def scenes(draw_from, most=12):
-    """A camera, and Gaussians of ordinary size around its picture."""
+    """A camera, and Gaussians of ordinary size around its image."""
     view = draw_from(views())
     num, degree = draw_from(st.integers(0, most)), draw_from(st.integers(0, 3))
     return view, splats(
@@ -92,7 +92,7 @@ def assert_sound(out, grads, scene, view):
 @pytest.mark.parametrize("backend", BACKENDS)
 @examples(80)
 @given(wild_scenes())
-def test_extreme_numbers_give_finite_pictures_and_gradients(backend, made):
+def test_extreme_numbers_give_finite_images_and_gradients(backend, made):
     view, scene = made
     out, grads = render_with_grads(backend, scene, view, dtype=torch.float32)
     assert_sound(out, grads, scene, view)
@@ -154,11 +154,11 @@ def test_fast_renderer_agrees_with_the_reference(made):
 
 @examples(40)
 @given(wild_scenes())
-def test_fast_renderer_culls_and_draws_what_the_reference_does(made):
+def test_fast_renderer_culls_and_renders_what_the_reference_does(made):
     view, scene = made
     want, _ = render_with_grads("reference", scene, view)
     got, _ = render_with_grads("numba", scene, view)
-    # Where a footprint ends within rounding of a pixel, either may see it; then it adds nothing to the picture.
+    # Where a footprint ends within rounding of a pixel, either may see it; then it adds nothing to the image.
     differs = (got.radii > 0) != (want.radii > 0)
     assert differs.float().mean() <= 0.2 if len(scene) else True
     assert ((got.alpha - want.alpha).abs() <= 0.011).all()

@@ -119,7 +119,7 @@ def test_gradcheck(depth_grad_to_means):
         assert torch.autograd.gradcheck(lambda *values: outputs(*values)[:2], (background, *inputs))
 
 
-def test_detached_depth_is_the_same_picture_with_constant_z():
+def test_detached_depth_is_the_same_image_with_constant_z():
     """method_facts 9.5: composited z carries no gradient, but z still gets one through the projected covariance."""
     view, names = camera(), ("means", "opacities", "scales", "sh")
     scene = splats(view)
