@@ -46,12 +46,12 @@ LAUNCH = (
     "import fcntl, os, sys; ends = [fcntl.fcntl(int(fd), fcntl.F_DUPFD, 10) for fd in sys.argv[1:3]];"
     "os.dup2(ends[0], 3); os.dup2(ends[1], 4); os.execv(sys.argv[3], sys.argv[3:])"
 )
-HARMLESS = ("GPU stall due to ReadPixels",)  # Chromium's own remark when it draws without a graphics card
+HARMLESS = ("GPU stall due to ReadPixels",)  # Chromium's own remark when it renders without a graphics card
 KEY_CODES = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Home": 36, "End": 35, " ": 32}
 
 
 def pictures_folder(name: str) -> Path:
-    """Where pictures that tests make are kept to be looked at: below `build/`, or ENDOPRIOR_TEST_PICTURES."""
+    """Where images that tests make are kept to be looked at: below `build/`, or ENDOPRIOR_TEST_PICTURES."""
     folder = Path(os.environ.get("ENDOPRIOR_TEST_PICTURES", Path(__file__).parents[1] / "build")) / name
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -88,14 +88,14 @@ class Page:
         self._replies: queue.Queue[dict] = queue.Queue()
         self._session: str | None = None
         self._count = 0
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        self.reader = threading.Thread(target=self._read, daemon=True)
+        self.reader.start()
 
     def send(self, method: str, timeout: float = 60, **params: Any) -> dict:
         """Run one command of the DevTools protocol and return its result.
 
         Raises:
-            RuntimeError: Chromium refused it, ended, or gave no answer in `timeout` seconds.
+            RuntimeError: Chromium rejected it, ended, or gave no answer in `timeout` seconds.
         """
         self._count += 1
         message: dict[str, Any] = {"id": self._count, "method": method, "params": params}
@@ -198,7 +198,7 @@ class Page:
         self.send("Input.dispatchKeyEvent", type="keyUp", key=key, code=name, windowsVirtualKeyCode=code)
 
     def screenshot(self, path: Path | None = None, selector: str | None = None) -> NDArray[np.uint8]:
-        """(H, W, 3) RGB picture of the window or of one element, written to `path` as PNG too."""
+        """(H, W, 3) RGB image of the window or of one element, written to `path` as PNG too."""
         clip = {}
         if selector:
             left, top, width, height = self.box(selector)
@@ -270,6 +270,6 @@ def open_page(address: str, *, width: int = 1000, height: int = 800) -> Iterator
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)  # its own session: the helpers that it started
         process.wait()
-        page._reader.join(timeout=10)
+        page.reader.join(timeout=10)
         os.close(answers)
         shutil.rmtree(profile, ignore_errors=True)

@@ -75,7 +75,7 @@ def poison(scene: Splats, name: str, row: int, value: float) -> Splats:
     return replace(scene, **{name: changed})
 
 
-def draw(
+def render_with_grads(
     backend: str,
     scene: Splats,
     view: Camera,
@@ -85,10 +85,10 @@ def draw(
     dtype: torch.dtype | None = None,
     seed: int = 0,
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
-    """Draw, and pull seeded random cotangents of color, depth and alpha back to every input.
+    """Render, and pull seeded random cotangents of color, depth and alpha back to every input.
 
     Returns:
-        the picture, and the gradients by name, those of `means2d` and `background` among them. float64 for the
+        the image, and the gradients by name, those of `means2d` and `background` among them. float64 for the
         reference unless `dtype` says otherwise.
     """
     dtype = dtype or (torch.float64 if backend == "reference" else torch.float32)
@@ -111,15 +111,15 @@ def agree(got, want, relative, name):
     assert gap <= relative, f"{name} differs by {gap:.1e} of its largest value"
 
 
-def compare(backend, scene, view, picture=2e-6, gradient=1e-5, **options):
-    """Picture, alpha and depth within a few float32 roundings per layer; gradients sum more of them."""
-    want, want_grads = draw("reference", scene, view, **options)
-    got, grads = draw(backend, scene, view, **options)
+def compare(backend, scene, view, image=2e-6, gradient=1e-5, **options):
+    """Color, alpha and depth within a few float32 roundings per layer; gradients sum more of them."""
+    want, want_grads = render_with_grads("reference", scene, view, **options)
+    got, grads = render_with_grads(backend, scene, view, **options)
     for name in ("color", "alpha", "depth"):
-        agree(getattr(got, name), getattr(want, name), picture, name)
-    drawn = want.radii > 0
-    agree(got.means2d[drawn], want.means2d[drawn], 1e-6, "means2d")
-    assert torch.equal(got.radii > 0, drawn)
+        agree(getattr(got, name), getattr(want, name), image, name)
+    rendered = want.radii > 0
+    agree(got.means2d[rendered], want.means2d[rendered], 1e-6, "means2d")
+    assert torch.equal(got.radii > 0, rendered)
     assert (got.radii - want.radii).abs().max() <= 1  # ceil may fall on either side
     for name, value in want_grads.items():
         agree(grads[name], value, gradient, f"gradient of {name}")

@@ -107,7 +107,7 @@ def test_files_with_former_names_of_backends_are_read(former, current, capsys):
 
 @pytest.mark.parametrize("words", [["--render.backend", "cpu"], ["--render.backend=cpu"]])
 def test_a_former_name_that_is_typed_gets_a_hint(words, capsys):
-    config_io._print_renamed.cache_clear()
+    config_io.print_renamed.cache_clear()
     assert parse(Train, [*words, "data", "out"], "train").config.render.backend == "numba"
     assert capsys.readouterr().err == "endoprior: render.backend: `cpu` is now called `numba`\n"
     assert parse(Train, ["--device", "cpu", "cpu", "cpu"], "train").data == Path("cpu")
@@ -115,7 +115,7 @@ def test_a_former_name_that_is_typed_gets_a_hint(words, capsys):
 
 
 def test_a_former_name_in_a_benchmark_gets_a_hint(capsys):
-    config_io._print_renamed.cache_clear()
+    config_io.print_renamed.cache_clear()
     spec = Spec("t", {"s": SequenceSpec("f")}, {"m": MethodSpec(set={"render.backend": "cuda"})})
     assert [spec.config("m", "s", None, seed).render.backend for seed in (0, 1)] == ["gsplat", "gsplat"]
     assert capsys.readouterr().err == "endoprior: render.backend: `cuda` is now called `gsplat`\n"

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import ModuleType
 
 import pytest
 from doctor_machines import NO_TRITON, WORKING, bare_machine, program
@@ -16,7 +17,7 @@ from endoprior.doctor import facts as facts_module
 from endoprior.doctor.choice import choose, choose_here
 from endoprior.doctor.driver import driver_answers, driver_files, read_banner, read_gpus
 from endoprior.doctor.probe_process import MOST_BYTES, clean, run_program
-from endoprior.doctor.records import Driver, Gpu, System, Torch, number
+from endoprior.doctor.records import Driver, Gpu, Gsplat, System, Torch, number
 
 
 @pytest.fixture
@@ -140,7 +141,7 @@ def test_a_torch_that_breaks_hangs_or_dies(tmp_path, monkeypatch, body, says):
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, "torch")
     limit = 2.0 if "sleep" in body else 30.0
-    torch, *_ = facts_module._probe_torch(limit)
+    torch = read_facts(limit).torch
     assert (torch.version, torch.cuda, torch.available) == ("2.13.0+cu130", "13.0", None) and says in torch.error
     assert examine(replace(WORKING, torch=torch)).blocking.name == "torch"
 
@@ -161,7 +162,7 @@ def ones(n, device): raise RuntimeError("no kernel image is available")
     (tmp_path / "torch").mkdir()
     (tmp_path / "torch/__init__.py").write_text(fake)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    torch, *_ = facts_module._probe_torch(30.0)
+    torch = read_facts(30.0).torch
     assert torch.available is True
     assert torch.gpus[0] == Gpu("NVIDIA H200", (9, 0), 128.0, False, "no kernel image is available")
     assert torch.gpus[1] == Gpu("device 1", None, None, False, "fell off the bus")
@@ -207,12 +208,12 @@ def test_compiled_files_are_found_and_tried_without_importing_gsplat(tmp_path, m
     (tmp_path / "gsplat/__init__.py").write_text("raise SystemExit('imported')")
     (tmp_path / "gsplat/csrc.so").write_bytes(b"no library")
     torch = replace(WORKING.torch, extensions=str(tmp_path / "cache"))
-    found = facts_module._gsplat(torch)
+    found = facts_module.read_gsplat(torch)
     assert (found.version, found.prebuilt, found.cached) == ("?", str(tmp_path / "gsplat/csrc.so"), "")
     assert found.loads is False and "csrc.so" in found.error
     (tmp_path / "cache/gsplat_cuda").mkdir(parents=True)
     (tmp_path / "cache/gsplat_cuda/gsplat_cuda.so").write_bytes(b"no library")
-    found = facts_module._gsplat(torch)
+    found = facts_module.read_gsplat(torch)
     assert (found.prebuilt, found.loads) == ("", False) and "gsplat_cuda.so" in found.error
     assert fixes.compile_again(replace(WORKING, gsplat=found)).startswith(f"rm -r {tmp_path}/cache/gsplat_cuda && ")
 
@@ -233,15 +234,10 @@ def test_probes_that_raise_leave_the_others(monkeypatch):
     def fails(*_):
         raise ZeroDivisionError
 
-    for name in (
-        "_system",
-        "driver_files",
-        "_torch_files",
-        "_probe_torch",
-        "driver_answers",
-        "find_toolkit",
-        "_gsplat",
-    ):
+    for name in ("available_bytes", "driver_files", "driver_answers", "find_toolkit", "run_program"):
         monkeypatch.setattr(facts_module, name, fails)
+    for name in ("torch", "gsplat"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))  # without a spec: looking for it raises ValueError
     facts = read_facts()
+    assert facts.torch == Torch() and facts.gsplat == Gsplat() and facts.weights_error == "the probe of torch failed"
     assert facts.builders.compiler and examine(facts).next_step

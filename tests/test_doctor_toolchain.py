@@ -8,7 +8,7 @@ import pytest
 from doctor_machines import NO_TRITON, ONLY_TRITON, WORKING, bare_machine, program
 
 from endoprior.doctor import examine, toolchain
-from endoprior.doctor import facts as facts_module
+from endoprior.doctor.facts import read_gsplat
 from endoprior.doctor.records import Gsplat, System, Toolkit, Torch
 from endoprior.doctor.toolchain import find_builders, find_toolkit
 
@@ -174,7 +174,7 @@ def test_a_library_that_is_nowhere():
         ("10.2.1", "13.0", "nothing: CUDA works, with gsplat"),
     ],
 )
-def test_a_gcc_that_nvcc_or_cpp20_refuses_is_replaced_by_one_that_is_installed(version, cuda, step):
+def test_a_gcc_that_nvcc_or_cpp20_rejects_is_replaced_by_one_that_is_installed(version, cuda, step):
     builders = replace(WORKING.builders, compiler_version=version, other_gcc=(9, 12, 14, 17))
     torch = replace(WORKING.torch, cuda=cuda)
     toolkit = replace(WORKING.toolkit, nvcc=cuda)
@@ -223,11 +223,14 @@ def test_what_would_be_compiled_again_is_not_called_ready(change, says):
 
 
 @pytest.mark.parametrize(("ninja", "current"), [("ninja: no work to do.", True), ("[1/30] nvcc", False)])
-def test_ninja_is_asked_what_it_would_do(tmp_path, path, ninja, current):
-    program(path, "ninja", f'test "$*" = "-C {tmp_path} -n" && echo "{ninja}"')
-    assert facts_module._current(tmp_path) is None, "nothing was compiled there by torch"
-    (tmp_path / "build.ninja").write_text("cxx = c++\nnvcc = /usr/local/cuda/bin/nvcc\n\ncflags = x\n")
-    assert facts_module._current(tmp_path) is current
-    assert facts_module._compiled_by(tmp_path) == "/usr/local/cuda/bin/nvcc"
+def test_ninja_is_asked_what_it_would_do(tmp_path, path, monkeypatch, ninja, current):
+    for folder in ("gsplat", "gsplat_cuda"):
+        (tmp_path / folder).mkdir()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    torch, build = Torch(extensions=str(tmp_path)), tmp_path / "gsplat_cuda"
+    program(path, "ninja", f'test "$*" = "-C {build} -n" && echo "{ninja}"')
+    assert read_gsplat(torch) == Gsplat("?"), "nothing was compiled there by torch"
+    (build / "build.ninja").write_text("cxx = c++\nnvcc = /usr/local/cuda/bin/nvcc\n\ncflags = x\n")
+    assert read_gsplat(torch) == Gsplat("?", compiled_by="/usr/local/cuda/bin/nvcc", current=current)
     program(path, "ninja", "exit 1")
-    assert facts_module._current(tmp_path) is None
+    assert read_gsplat(torch).current is None

@@ -1,16 +1,17 @@
 """The doctor and Triton: the backend that needs fewer fixes, and whether Triton computes."""
 
+import json
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 from doctor_machines import H200, NO_GPU, NO_TRITON, ONLY_TRITON, WORKING
 
 from endoprior.core.checks import InputError
-from endoprior.doctor import examine
+from endoprior.doctor import examine, read_facts
 from endoprior.doctor import facts as facts_module
 from endoprior.doctor.choice import Choice, choose
-from endoprior.doctor.probe_process import Answer, run_program
+from endoprior.doctor.probe_process import MARK, Answer, run_program
 from endoprior.doctor.records import Gsplat, System, Toolkit, Torch, Triton
 from endoprior.doctor.report import table
 
@@ -143,9 +144,10 @@ def test_triton_is_tried_and_may_crash_or_hang(tmp_path, monkeypatch, launch, co
         (tmp_path / name / "__init__.py").write_text(text)
     (tmp_path / "triton/language.py").write_text("constexpr = int")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    torch, triton, *_ = facts_module._probe_torch(3.0 if "sleep" in launch else 30.0)
+    facts = read_facts(3.0 if "sleep" in launch else 30.0)
+    torch, triton = facts.torch, facts.triton
     seen = (torch.version, torch.available, torch.gpus[0].computes, torch.error)
-    assert seen == ("2.13.0+cu130", True, True, ""), "torch is judged alone"
+    assert seen == ("2.13.0+cu130", True, True, ""), "torch is checked alone"
     assert (triton.version, triton.computes) == ("3.7.1", computes) and says in triton.error
 
 
@@ -161,8 +163,15 @@ def test_triton_that_cannot_be_imported(tmp_path, monkeypatch, package, version,
     else:
         (tmp_path / "triton.py").write_text("raise ModuleNotFoundError(name='triton')")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    _, triton, *_ = facts_module._probe_torch(30.0)
+    triton = read_facts(30.0).triton
     assert (triton.version, triton.computes, triton.error) == (version, None, says)
+
+
+def triton_after(found: dict, monkeypatch) -> Triton:
+    """What is read of Triton when the probe of torch prints `found` and then hangs."""
+    answer = Answer(MARK + json.dumps(found), "python gave no answer in 90 s")
+    monkeypatch.setattr(facts_module, "run_program", lambda *_: answer)
+    return read_facts().triton
 
 
 @pytest.mark.parametrize(
@@ -176,16 +185,15 @@ def test_triton_that_cannot_be_imported(tmp_path, monkeypatch, package, version,
 )
 def test_the_triton_that_torch_names(monkeypatch, requires, wanted):
     monkeypatch.setattr(facts_module.metadata, "requires", lambda _: requires)
-    assert facts_module._triton_wanted() == wanted
+    assert triton_after({}, monkeypatch).wanted == wanted
 
 
-def test_a_probe_that_answers_nothing_about_triton():
-    torch = Torch("2.13.0", "13.0", available=True, gpus=(H200,))
-    said = Answer("", "python gave no answer in 90 s")
-    assert facts_module._triton(torch, {"version": "3.7.1"}, said).error == said.problem
-    assert facts_module._triton(torch, {}, said).computes is None, "without Triton there is nothing to try"
-    no_gpu = replace(torch, gpus=())
-    assert facts_module._triton(no_gpu, {"version": "3.7.1"}, said).computes is None
+def test_a_probe_that_answers_nothing_about_triton(monkeypatch):
+    found = {"gpus": [asdict(H200)], "triton": {"version": "3.7.1"}}
+    assert triton_after(found, monkeypatch).error == "python gave no answer in 90 s"
+    without = triton_after(found | {"triton": {}}, monkeypatch)
+    assert without.computes is None, "without Triton there is nothing to try"
+    assert triton_after(found | {"gpus": []}, monkeypatch).computes is None
 
 
 def test_the_kernel_adds(monkeypatch):

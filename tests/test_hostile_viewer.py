@@ -46,14 +46,14 @@ def good(viewer):
     """A proper browser: it was there before, and is served afterwards."""
     client = Client(viewer.port)
     client.send_camera()
-    client.picture(quiet=0.1)
+    client.image(quiet=0.1)
     yield client
     client.set(viewer.panel.frame, 1 + (viewer.settings.frame % 8))
-    assert client.picture(quiet=0.1).any()
+    assert client.image(quiet=0.1).any()
     client.socket.close()
     late = Client(viewer.port)  # what is replayed to newcomers must have stayed whole, too
     late.send_camera()
-    assert late.picture(quiet=0.1).any()
+    assert late.image(quiet=0.1).any()
     late.socket.close()
 
 
@@ -210,7 +210,7 @@ class Stranger(Client):
 def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
     if orbit:
         good.set(viewer.panel.camera, ORBIT)
-        good.picture(quiet=0.2)
+        good.image(quiet=0.2)
     state = {name: handle.value for name, handle in vars(viewer.panel).items() if hasattr(handle, "value")}
     before, stranger = resident_mb(), Stranger(viewer.port, max_queue=None)
     stranger.send_camera()
@@ -229,7 +229,7 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
         good.set(getattr(viewer.panel, name), False)
     if orbit:
         good.set(viewer.panel.camera, panels.ENDOSCOPE)
-        good.picture(quiet=0.2)
+        good.image(quiet=0.2)
     assert "view/" not in capfd.readouterr().err  # messages of viser itself are allowed
 
 
@@ -274,7 +274,7 @@ def test_the_number_of_browsers_is_limited(viewer, good):
         with suppress(ConnectionClosed):
             late = Client(viewer.port, close_timeout=0.2)
             late.send_camera()
-            free = late.picture(quiet=0.1).any()
+            free = late.image(quiet=0.1).any()
             late.socket.close()
     assert free
 

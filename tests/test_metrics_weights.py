@@ -40,10 +40,10 @@ def places(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "_hub_dir", None)
     monkeypatch.setenv(weights.ENVIRONMENT_VARIABLE, str(named))
 
-    def refuse(*args, **kwargs):
+    def reject(*args, **kwargs):
         raise OSError("the network is down")
 
-    monkeypatch.setattr(urllib.request, "urlopen", refuse)
+    monkeypatch.setattr(urllib.request, "urlopen", reject)
     return {"weights folder": folder, weights.ENVIRONMENT_VARIABLE: named, "torch cache": cache / "checkpoints"}
 
 

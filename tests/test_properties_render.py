@@ -11,7 +11,7 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
-from render_scenes import NAMES, camera, draw, pick, splats
+from render_scenes import NAMES, camera, pick, render_with_grads, splats
 
 from endoprior.core.types import Camera, Splats
 from endoprior.render.constants import ALPHA_MIN, MIN_QUAT, NEAR_Z
@@ -23,14 +23,14 @@ SEEDS = st.integers(0, 2**31 - 1)
 
 @st.composite
 def views(draw_from):
-    """A camera of any small picture, 1x1 included, at the origin or anywhere."""
+    """A camera of any small image, 1x1 included, at the origin or anywhere."""
     width, height = (draw_from(st.one_of(st.integers(1, 4), st.integers(5, 70))) for _ in range(2))
     return camera(width, height, seed=draw_from(st.one_of(st.none(), st.integers(0, 99))))
 
 
 @st.composite
 def scenes(draw_from, most=12):
-    """A camera, and Gaussians of ordinary size around its picture."""
+    """A camera, and Gaussians of ordinary size around its image."""
     view = draw_from(views())
     num, degree = draw_from(st.integers(0, most)), draw_from(st.integers(0, 3))
     return view, splats(
@@ -67,24 +67,24 @@ def wild_scenes(draw_from):
 
 
 def assert_sound(out, grads, scene, view):
-    """All finite; alpha, color and depth mix what was drawn; what was culled gets no gradient."""
+    """All finite; alpha, color and depth mix what was rendered; what was culled gets no gradient."""
     assert all(torch.isfinite(image).all() for image in (out.color, out.alpha, out.depth, out.means2d))
     bad = [name for name, grad in grads.items() if not torch.isfinite(grad).all()]
     assert not bad, bad
     assert out.alpha.shape == (view.height, view.width)
     assert (out.alpha >= 0).all() and (out.alpha <= 1).all()
-    drawn = out.radii > 0
-    if not drawn.any():
+    rendered = out.radii > 0
+    if not rendered.any():
         assert (out.alpha == 0).all() and (out.depth == 0).all()
         assert torch.equal(out.color, torch.tensor([0.1, 0.2, 0.3]).expand_as(out.color))
         return
-    means = scene.means[drawn].double()
+    means = scene.means[rendered].double()
     z = means @ torch.tensor(view.world_to_camera[2, :3]) + view.world_to_camera[2, 3]
     slack = 1e-4 * out.alpha.double() + 1e-6  # float32 sums
     assert (out.depth <= out.alpha * z.max() * (1 + 1e-4) + slack * z.max()).all()
     assert (out.depth >= out.alpha * z.min() * (1 - 1e-4) - slack * z.max()).all()
     assert (out.color >= 0).all()
-    culled = ~drawn
+    culled = ~rendered
     for name in NAMES:
         assert (grads[name][culled] == 0).all(), name
 
@@ -92,9 +92,9 @@ def assert_sound(out, grads, scene, view):
 @pytest.mark.parametrize("backend", BACKENDS)
 @examples(80)
 @given(wild_scenes())
-def test_extreme_numbers_give_finite_pictures_and_gradients(backend, made):
+def test_extreme_numbers_give_finite_images_and_gradients(backend, made):
     view, scene = made
-    out, grads = draw(backend, scene, view, dtype=torch.float32)
+    out, grads = render_with_grads(backend, scene, view, dtype=torch.float32)
     assert_sound(out, grads, scene, view)
 
 
@@ -110,9 +110,9 @@ def test_one_number_that_is_none_poisons_nothing(backend, made, name, value, pla
         field[row] = value
     else:
         field[row].view(-1)[place // len(scene) % field[row].numel()] = value
-    out, grads = draw(backend, replace(scene, **{name: field}), view, dtype=torch.float32)
+    out, grads = render_with_grads(backend, replace(scene, **{name: field}), view, dtype=torch.float32)
     others = torch.tensor([i for i in range(len(scene)) if i != row], dtype=torch.int64)
-    want, want_grads = draw(backend, pick(scene, others), view, dtype=torch.float32)
+    want, want_grads = render_with_grads(backend, pick(scene, others), view, dtype=torch.float32)
     assert out.radii[row] == 0
     assert all(torch.equal(getattr(out, image), getattr(want, image)) for image in ("color", "alpha", "depth"))
     for field_name in NAMES:
@@ -127,8 +127,8 @@ def test_length_of_a_quaternion_never_matters_above_the_limit(backend, exponent,
     scene = splats(view, 6, 1, seed, widths=(1.0, 6.0))
     unit = scene.quats / scene.quats.norm(dim=-1, keepdim=True)
     factor = 10.0**exponent
-    out, grads = draw(backend, replace(scene, quats=unit * factor), view, dtype=torch.float32)
-    want, _ = draw(backend, replace(scene, quats=unit), view, dtype=torch.float32)
+    out, grads = render_with_grads(backend, replace(scene, quats=unit * factor), view, dtype=torch.float32)
+    want, _ = render_with_grads(backend, replace(scene, quats=unit), view, dtype=torch.float32)
     assert all(torch.isfinite(grad).all() for grad in grads.values())
     if factor >= 1.001 * MIN_QUAT:
         assert (out.color - want.color).abs().max() < 1e-4  # rounding of the scaled quaternion
@@ -140,8 +140,8 @@ def test_length_of_a_quaternion_never_matters_above_the_limit(backend, exponent,
 def test_fast_renderer_agrees_with_the_reference(made):
     """Up to rounding, which may decide otherwise where alpha is at ALPHA_MIN or a pixel about to be full."""
     view, scene = made
-    want, want_grads = draw("reference", scene, view)
-    got, grads = draw("numba", scene, view)
+    want, want_grads = render_with_grads("reference", scene, view)
+    got, grads = render_with_grads("numba", scene, view)
     gap = (got.alpha - want.alpha).abs()
     assert gap.max() <= 0.011, "more than one decision differs"
     assert (gap > 1e-5).float().mean() <= 0.01 + 1 / gap.numel()
@@ -154,11 +154,11 @@ def test_fast_renderer_agrees_with_the_reference(made):
 
 @examples(40)
 @given(wild_scenes())
-def test_fast_renderer_culls_and_draws_what_the_reference_does(made):
+def test_fast_renderer_culls_and_renders_what_the_reference_does(made):
     view, scene = made
-    want, _ = draw("reference", scene, view)
-    got, _ = draw("numba", scene, view)
-    # Where a footprint ends within rounding of a pixel, either may see it; then it adds nothing to the picture.
+    want, _ = render_with_grads("reference", scene, view)
+    got, _ = render_with_grads("numba", scene, view)
+    # Where a footprint ends within rounding of a pixel, either may see it; then it adds nothing to the image.
     differs = (got.radii > 0) != (want.radii > 0)
     assert differs.float().mean() <= 0.2 if len(scene) else True
     assert ((got.alpha - want.alpha).abs() <= 0.011).all()
@@ -169,8 +169,8 @@ def test_fast_renderer_culls_and_draws_what_the_reference_does(made):
 def test_order_of_the_gaussians_never_matters(backend, made, seed):
     view, scene = made
     order = torch.randperm(len(scene), generator=torch.Generator().manual_seed(seed))
-    want, want_grads = draw(backend, scene, view, dtype=torch.float32)
-    got, grads = draw(backend, pick(scene, order), view, dtype=torch.float32)
+    want, want_grads = render_with_grads(backend, scene, view, dtype=torch.float32)
+    got, grads = render_with_grads(backend, pick(scene, order), view, dtype=torch.float32)
     exact = backend == "numba"
     for name in ("color", "alpha", "depth"):
         a, b = getattr(got, name), getattr(want, name)
@@ -183,8 +183,8 @@ def test_order_of_the_gaussians_never_matters(backend, made, seed):
 @given(wild_scenes())
 def test_background_shows_by_what_alpha_leaves(backend, made):
     view, scene = made
-    dark, _ = draw(backend, scene, view, background=(0.0, 0.0, 0.0), dtype=torch.float32)
-    light, _ = draw(backend, scene, view, background=(1.0, 0.5, 0.25), dtype=torch.float32)
+    dark, _ = render_with_grads(backend, scene, view, background=(0.0, 0.0, 0.0), dtype=torch.float32)
+    light, _ = render_with_grads(backend, scene, view, background=(1.0, 0.5, 0.25), dtype=torch.float32)
     want = (1 - dark.alpha)[..., None] * torch.tensor([1.0, 0.5, 0.25])
     assert torch.equal(dark.alpha, light.alpha)
     assert ((light.color - dark.color) - want).abs().max() <= 1e-6 * (1 + dark.color.abs().max())
@@ -204,7 +204,7 @@ def test_a_hundred_thousand_gaussians_on_one_pixel(opacity):
         torch.full((num,), opacity),
         torch.zeros(num, 1, 3),
     )
-    out, grads = draw("numba", scene, view)
+    out, grads = render_with_grads("numba", scene, view)
     assert_sound(out, grads, scene, view)
     assert out.alpha.item() > 0.99 and out.depth.item() < (100 if opacity < 0.1 else 2)
 
@@ -216,6 +216,6 @@ def test_what_is_not_beyond_the_near_plane_is_culled(x, y, sign):
     for z in (-1e30, -1.0, 0.0, 0.5 * NEAR_Z, NEAR_Z, np.nextafter(np.float32(NEAR_Z), np.float32(1)), 0.21, 5.0):
         means = torch.tensor([[x * abs(z) * 0.3, y * abs(z) * 0.3, z]], dtype=torch.float32)
         scene = replace(base, means=means, opacities=torch.tensor([0.9]))
-        out, grads = draw("numba", scene, view)
+        out, grads = render_with_grads("numba", scene, view)
         assert (out.radii[0] > 0) == (float(means[0, 2]) > NEAR_Z)
         assert all(torch.isfinite(grad).all() for grad in grads.values())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gsplat_stand_in import NAN, forget, fully_fused_projection, loaded
-from render_scenes import NAMES, camera, draw, one, pick, poison, splats
+from render_scenes import NAMES, camera, one, pick, poison, render_with_grads, splats
 
 from endoprior import render
 from endoprior.core.checks import InputError
@@ -25,15 +25,15 @@ def gsplat(monkeypatch):
 
 def compare(scene, view, **options):
     """Picture within 1e-4 of the reference (depth: of its largest), gradients within 1 %."""
-    want, want_grads = draw("reference", scene, view, **options)
-    got, grads = draw("gsplat", scene, view, **options)
+    want, want_grads = render_with_grads("reference", scene, view, **options)
+    got, grads = render_with_grads("gsplat", scene, view, **options)
     assert (got.color - want.color).abs().max() < 1e-4
     assert (got.alpha - want.alpha).abs().max() < 1e-4
     assert (got.depth - want.depth).abs().max() < 1e-4 * want.depth.abs().max().clamp(min=1)
     assert torch.equal(got.radii > 0, want.radii > 0) and got.radii.dtype == torch.int32
     assert (got.radii - want.radii).abs().max() <= 1  # ceil may fall on either side
-    drawn = want.radii > 0
-    assert torch.allclose(got.means2d[drawn].double(), want.means2d[drawn], atol=1e-3)
+    rendered = want.radii > 0
+    assert torch.allclose(got.means2d[rendered].double(), want.means2d[rendered], atol=1e-3)
     assert got.means2d.isfinite().all()
     for name, value in want_grads.items():
         assert grads[name].shape == value.shape and grads[name].isfinite().all(), name
@@ -75,7 +75,7 @@ def test_stopped_depth_reaches_z_no_more(gsplat):
     assert torch.isclose(pulled[False] - pulled[True], out.alpha.detach().sum(), rtol=1e-4)
 
 
-def test_only_what_reaches_a_pixel_center_counts_as_drawn(gsplat, monkeypatch):
+def test_only_what_reaches_a_pixel_center_counts_as_rendered(gsplat, monkeypatch):
     """gsplat's box is rounded up to whole pixels, and so reaches the image from where the footprint does not."""
     boxes = []
 
@@ -96,10 +96,10 @@ def test_only_what_reaches_a_pixel_center_counts_as_drawn(gsplat, monkeypatch):
 def test_poison_is_culled_and_carries_no_gradient(gsplat, name, value):
     view = camera()
     scene = below_the_cap(splats(view, degree=1))
-    row = int(torch.nonzero(draw("reference", scene, view)[0].radii)[0])
-    got, grads = draw("gsplat", poison(scene, name, row, value), view)
+    row = int(torch.nonzero(render_with_grads("reference", scene, view)[0].radii)[0])
+    got, grads = render_with_grads("gsplat", poison(scene, name, row, value), view)
     others = torch.arange(len(scene)) != row
-    want, _ = draw("gsplat", pick(scene, others), view)
+    want, _ = render_with_grads("gsplat", pick(scene, others), view)
     assert got.radii[row] == 0 and torch.equal(got.color, want.color) and torch.equal(got.depth, want.depth)
     assert all(grads[field].isfinite().all() and not grads[field][row].any() for field in (*NAMES, "means2d"))
 
@@ -152,7 +152,7 @@ def test_without_visible_gaussians_the_image_is_the_background(gsplat, num):
     view = camera()
     scene = pick(splats(view), torch.arange(num))
     scene = replace(scene, means=scene.means - 1e4 * torch.tensor(view.world_to_camera[2, :3]).float())
-    got, grads = draw("gsplat", scene, view)
+    got, grads = render_with_grads("gsplat", scene, view)
     assert (got.color == torch.tensor([0.1, 0.2, 0.3])).all() and not got.alpha.any() and not got.depth.any()
     assert got.means2d.shape == (num, 2) and not got.radii.any()
     assert all(not grads[name].any() for name in (*NAMES, "means2d")) and grads["background"].any()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from numba import njit
-from render_scenes import NAMES, camera, draw, one, pick, poison, splats
+from render_scenes import NAMES, camera, one, pick, poison, render_with_grads, splats
 from scipy.spatial.transform import Rotation
 
 from endoprior.compute import simd
@@ -31,14 +31,14 @@ def test_bit_identical_for_any_number_of_threads():
     view = camera(100, 90)
     scene = splats(view, 400, widths=(0.5, 20.0))
     threads = numba.get_num_threads()
-    drawn = []
+    rendered = []
     try:
         for count in (1, threads, 1, threads):
             numba.set_num_threads(count)
-            drawn.append(draw("numba", scene, view))
+            rendered.append(render_with_grads("numba", scene, view))
     finally:
         numba.set_num_threads(threads)
-    assert all(identical(drawn[0], other) for other in drawn[1:])
+    assert all(identical(rendered[0], other) for other in rendered[1:])
 
 
 def test_order_of_the_list_does_not_matter():
@@ -46,8 +46,8 @@ def test_order_of_the_list_does_not_matter():
     view = camera()
     scene = splats(view)
     order = torch.randperm(60, generator=torch.Generator().manual_seed(1))
-    want, want_grads = draw("numba", scene, view)
-    got, grads = draw("numba", pick(scene, order), view)
+    want, want_grads = render_with_grads("numba", scene, view)
+    got, grads = render_with_grads("numba", pick(scene, order), view)
     assert torch.equal(got.color, want.color) and torch.equal(got.depth, want.depth)
     assert all(torch.equal(grads[name], want_grads[name][order]) for name in NAMES)
 
@@ -88,7 +88,7 @@ def test_central_differences():
     view = camera(20, 16)
     scene = splats(view, 5, widths=(12.0, 20.0))  # weak colors stay above the cutoff at 0
     scene = replace(scene, opacities=torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5]), sh=0.2 * scene.sh)
-    _, grads = draw("numba", scene, view)
+    _, grads = render_with_grads("numba", scene, view)
     generator = torch.Generator().manual_seed(0)
     weights = [torch.randn(s, generator=generator).double() for s in ((16, 20, 3), (16, 20), (16, 20))]
     steps = {"means": 0.05, "quats": 0.02, "scales": 0.02, "opacities": 0.01, "sh": 0.05}
@@ -117,11 +117,11 @@ def test_poison_is_culled(backend, name, value):
     """The poisoned Gaussian is as if it were not there, and gets finite gradients: zeros where it is culled."""
     view = camera(24, 20)
     scene = splats(view, 12)
-    out, grads = draw(backend, poison(scene, name, 5, value), view, dtype=torch.float32)
+    out, grads = render_with_grads(backend, poison(scene, name, 5, value), view, dtype=torch.float32)
     assert all(torch.isfinite(image).all() for image in (out.color, out.alpha, out.depth, out.means2d))
     assert all(torch.isfinite(grad).all() for grad in grads.values())
     if not np.isfinite(value):
-        without, _ = draw(
+        without, _ = render_with_grads(
             backend, pick(scene, torch.tensor([i for i in range(12) if i != 5])), view, dtype=torch.float32
         )
         assert out.radii[5] == 0
@@ -138,7 +138,7 @@ def test_zero_quaternion_behind_and_tiny_are_culled_or_finite(backend):
     scene.means[2, 2] = 0.99 * constants.NEAR_Z
     scene.scales[3] = 1e-30
     scene.opacities[4] = 1e-3
-    out, grads = draw(backend, scene, view, dtype=torch.float32)
+    out, grads = render_with_grads(backend, scene, view, dtype=torch.float32)
     assert (out.radii[[0, 1, 2, 4]] == 0).all()
     assert torch.isfinite(out.color).all() and all(torch.isfinite(grad).all() for grad in grads.values())
 
@@ -155,7 +155,7 @@ def test_huge_gaussians_cover_everything():
 def test_empty_scene_is_background(backend):
     view = camera(9, 7)
     nothing = Splats(*(torch.zeros(shape) for shape in [(0, 3), (0, 4), (0, 3), (0,), (0, 4, 3)]))
-    out, grads = draw(backend, nothing, view, dtype=torch.float32)
+    out, grads = render_with_grads(backend, nothing, view, dtype=torch.float32)
     assert torch.equal(out.color, BACKGROUND.expand(7, 9, 3))
     assert out.alpha.sum() == 0 and out.depth.sum() == 0 and len(out.radii) == 0
     assert grads["means"].shape == (0, 3)
@@ -175,7 +175,7 @@ def test_inputs_may_be_strided():
     strided = Splats(*(getattr(scene, name).mT.contiguous().mT if name in ("means", "quats", "scales", "sh")
                        else getattr(scene, name) for name in NAMES))  # fmt: skip
     assert not strided.means.is_contiguous()
-    assert identical(draw("numba", scene, view), draw("numba", strided, view))
+    assert identical(render_with_grads("numba", scene, view), render_with_grads("numba", strided, view))
 
 
 def test_an_image_needs_no_gradient():
@@ -185,10 +185,10 @@ def test_an_image_needs_no_gradient():
     assert not out.color.requires_grad
 
 
-def test_tiles_skip_only_what_is_not_drawn():
+def test_tiles_skip_only_what_is_not_rendered():
     """Slow loop: every pixel whose alpha reaches ALPHA_MIN lies in the listed rows of its strip, for every Gaussian.
 
-    And not much more is listed: on average at most two rows per strip beyond the drawn ones.
+    And not much more is listed: on average at most two rows per strip beyond the rendered ones.
     """
     rng = np.random.default_rng(0)
     width, height, num = 75, 70, 120
@@ -215,10 +215,10 @@ def test_tiles_skip_only_what_is_not_drawn():
     for g in range(num):
         u = x - centers[g, 0] + k[g] * (y - centers[g, 1])
         alpha = opacities[g] * np.exp(-0.5 * (a[g] * u**2 + m[g] * (y - centers[g, 1]) ** 2))
-        drawn = alpha >= constants.ALPHA_MIN
-        assert not (drawn & ~listed[g]).any()
+        rendered = alpha >= constants.ALPHA_MIN
+        assert not (rendered & ~listed[g]).any()
         strips = [slice(s, s + simd.LANES) for s in range(0, width, simd.LANES)]
-        extra += sum(int((listed[g][:, s].any(1) & ~drawn[:, s].any(1)).sum()) for s in strips)
+        extra += sum(int((listed[g][:, s].any(1) & ~rendered[:, s].any(1)).sum()) for s in strips)
     num_strips = sum((listed[:, :, s : s + simd.LANES].any((1, 2))).sum() for s in range(0, width, simd.LANES))
     assert extra <= 2 * num_strips
     slots = np.sort(lists.pairs[:, tiles.SLOT])

@@ -6,7 +6,7 @@ from typing import get_args
 
 import pytest
 import torch
-from render_scenes import agree, camera, compare, draw, splats
+from render_scenes import agree, camera, compare, render_with_grads, splats
 
 from endoprior import render
 
@@ -59,8 +59,8 @@ def test_agrees_where_pixels_fill_up(backend):
     """
     view = camera(40, 40, seed=2)
     scene = splats(view, 1500, degree=0, seed=4, widths=(1.0, 8.0))
-    want, want_grads = draw("reference", scene, view)
-    got, grads = draw(backend, scene, view)
+    want, want_grads = render_with_grads("reference", scene, view)
+    got, grads = render_with_grads(backend, scene, view)
     assert (want.alpha > 0.9).all() and want.alpha.max() > 0.9995
     off = ((got.color - want.color).abs().max(-1).values > 1e-5).float().mean()
     assert off < 0.005, f"{off:.2%} of pixels differ"
@@ -73,7 +73,7 @@ def test_agrees_where_pixels_fill_up(backend):
 def test_gradient_is_orthogonal_to_the_length_of_a_quaternion(backend):
     view = camera()
     scene = splats(view)
-    _, grads = draw(backend, scene, view)
+    _, grads = render_with_grads(backend, scene, view)
     along = (grads["quats"] * scene.quats).sum(-1) / scene.quats.norm(dim=-1)
     assert along.abs().max() <= 1e-5 * grads["quats"].norm(dim=-1).max()  # float32 rounding of a dot product
 
@@ -87,9 +87,9 @@ def test_gradients_reach_only_what_is_asked(backend):
     for name, dtype in (("reference", torch.float64), (backend, torch.float32)):
         opacities = scene.opacities.to(dtype).requires_grad_()
         values = [value.to(dtype) for value in (scene.means, scene.quats, scene.scales)]
-        drawn = render.load(name)(
+        rendered = render.load(name)(
             type(scene)(*values, opacities, scene.sh.to(dtype)), view, background=torch.zeros(3, dtype=dtype)
         )
-        drawn.alpha.sum().backward()
+        rendered.alpha.sum().backward()
         results[name] = opacities.grad
     agree(results[backend], results["reference"], 1e-5, "gradient of opacities")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from render_scenes import NAMES, camera, draw, one, pick, splats
+from render_scenes import NAMES, camera, one, pick, render_with_grads, splats
 from scipy.special import sph_harm_y
 
 from endoprior import render
@@ -74,7 +74,7 @@ def test_full_pixel_stops_before_the_gaussian_that_fills_it():
     layers = [one(view, 20.5, 10.5, z, opacities=torch.tensor([0.97])) for z in (30.0, 31.0, 32.0, 33.0)]
     scene = Splats(*(torch.cat([getattr(layer, name) for layer in layers]) for name in NAMES))
     out = rasterize(scene, view, background=BLACK)
-    # 0.03^2 = 9e-4 is above 1e-4, 0.03^3 = 2.7e-5 is not: two layers are drawn, the third and fourth are not
+    # 0.03^2 = 9e-4 is above 1e-4, 0.03^3 = 2.7e-5 is not: two layers are rendered, the third and fourth are not
     assert torch.isclose(out.alpha[10, 20], torch.tensor(1 - 0.03**2), atol=1e-6)
 
 
@@ -119,12 +119,12 @@ def test_gradcheck(depth_grad_to_means):
         assert torch.autograd.gradcheck(lambda *values: outputs(*values)[:2], (background, *inputs))
 
 
-def test_detached_depth_is_the_same_picture_with_constant_z():
+def test_detached_depth_is_the_same_image_with_constant_z():
     """method_facts 9.5: composited z carries no gradient, but z still gets one through the projected covariance."""
     view, names = camera(), ("means", "opacities", "scales", "sh")
     scene = splats(view)
-    with_z, grads = draw("reference", scene, view)
-    without, less = draw("reference", scene, view, depth_grad_to_means=False)
+    with_z, grads = render_with_grads("reference", scene, view)
+    without, less = render_with_grads("reference", scene, view, depth_grad_to_means=False)
     assert torch.equal(with_z.depth, without.depth)
     assert all(torch.allclose(grads[name], less[name]) for name in names[1:])
     # the difference is what z alone gets: weights times the cotangent, along the camera's axis
@@ -138,8 +138,8 @@ def test_order_of_the_list_does_not_matter():
     view = camera()
     scene = splats(view)
     order = torch.randperm(60, generator=torch.Generator().manual_seed(1))
-    want, want_grads = draw("reference", scene, view)
-    got, grads = draw("reference", pick(scene, order), view)
+    want, want_grads = render_with_grads("reference", scene, view)
+    got, grads = render_with_grads("reference", pick(scene, order), view)
     assert torch.allclose(got.color, want.color, atol=1e-12)
     assert torch.allclose(grads["means"], want_grads["means"][order], atol=1e-10)
 

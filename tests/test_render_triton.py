@@ -15,7 +15,7 @@ from subprocess import CalledProcessError
 import numpy as np
 import pytest
 import torch
-from render_scenes import NAMES, camera, compare, draw, one, pick, poison, splats
+from render_scenes import NAMES, camera, compare, one, pick, poison, render_with_grads, splats
 
 from endoprior import render
 from endoprior.core.checks import InputError
@@ -65,7 +65,10 @@ def test_agrees_where_pixels_fill_up():
     view = camera(16, 16, seed=2)
     scene = splats(view, 300, degree=0, seed=4, widths=(2.0, 8.0))
     scene = replace(scene, opacities=scene.opacities.clamp(min=0.6))
-    (want, want_grads), (got, grads) = draw("reference", scene, view), draw("triton", scene, view)
+    (want, want_grads), (got, grads) = (
+        render_with_grads("reference", scene, view),
+        render_with_grads("triton", scene, view),
+    )
     assert want.alpha.min() > 0.999
     off = ((got.color - want.color).abs().max(-1).values > 1e-5).float().mean()
     assert off < 0.005, f"{off:.2%} of pixels differ"  # a stop may fall on the other side of a rounding
@@ -86,7 +89,7 @@ def stack(view, opacities, z_step=1.0):
 
 
 def test_a_pixel_stops_before_it_would_be_full():
-    """0.9 four times leaves 1e-4 (less a rounding), five times 1e-5: the last ones are not drawn at the center."""
+    """0.9 four times leaves 1e-4 (less a rounding), five times 1e-5: the last ones are not rendered at the center."""
     view = camera(16, 9, seed=None)
     want, _ = compare("triton", stack(view, [0.9, 0.9, 0.89, 0.9, 0.9, 0.9]), view)
     assert want.alpha[4, 8].item() == pytest.approx(1 - 0.1**3 * 0.11, abs=1e-9)
@@ -105,22 +108,22 @@ def test_equal_depths_keep_their_order():
 
 
 def test_poison_is_culled_and_carries_no_gradient():
-    """Every field of a Gaussian of its own, with every value; what is left draws the same bits as without them."""
+    """Every field of a Gaussian of its own, with every value; what is left renders bit-identically without them."""
     view = camera(33, 21)
     scene = splats(view, 40, degree=1, seed=3)
-    drawn = torch.nonzero(draw("reference", scene, view)[0].radii)[:, 0].tolist()
+    rendered = torch.nonzero(render_with_grads("reference", scene, view)[0].radii)[:, 0].tolist()
     cases = [(name, value) for name in NAMES for value in (NAN, INF, -INF, 3e38)]
     cases += [("scales", 1e30), ("quats", 0.1 * MIN_QUAT), ("means", -3e38)]
-    bad, poisoned = drawn[-len(cases) :], scene
-    assert len(bad) == len(cases) < len(drawn)
+    bad, poisoned = rendered[-len(cases) :], scene
+    assert len(bad) == len(cases) < len(rendered)
     for row, (name, value) in zip(bad, cases, strict=True):
         poisoned = poison(poisoned, name, row, value)
-    want = draw("reference", poisoned, view)[0].radii == 0
-    got, grads = draw("triton", poisoned, view)
+    want = render_with_grads("reference", poisoned, view)[0].radii == 0
+    got, grads = render_with_grads("triton", poisoned, view)
     assert torch.equal(got.radii == 0, want)
     assert want[bad].sum() >= len(cases) - 2  # a quaternion may be as long as that, and a mean as far
     others = torch.nonzero(~want)[:, 0]
-    alone, alone_grads = draw("triton", pick(poisoned, others), view)
+    alone, alone_grads = render_with_grads("triton", pick(poisoned, others), view)
     assert torch.equal(got.color, alone.color) and torch.equal(got.depth, alone.depth)
     for name in (*NAMES, "means2d"):
         assert grads[name].isfinite().all() and not grads[name][want].any(), name
@@ -141,7 +144,7 @@ def test_without_visible_gaussians_the_image_is_the_background(num):
     view = camera(33, 21)
     scene = pick(splats(view), torch.arange(num))
     scene = replace(scene, means=scene.means - 1e4 * torch.tensor(view.world_to_camera[2, :3]).float())
-    got, grads = draw("triton", scene, view)
+    got, grads = render_with_grads("triton", scene, view)
     assert (got.color == torch.tensor([0.1, 0.2, 0.3])).all() and not got.alpha.any() and not got.depth.any()
     assert got.means2d.shape == (num, 2) and not got.radii.any()
     assert all(not grads[name].any() for name in (*NAMES, "means2d")) and grads["background"].any()
@@ -160,7 +163,7 @@ def tiles_of(scene, view):
 
 
 def test_tiles_are_those_the_footprint_touches(monkeypatch):
-    """Each once: all where the reference draws something, and few others (the ellipse may pass between pixels)."""
+    """Each once: all where the reference renders something, and few others (the ellipse may pass between pixels)."""
     view = camera(70, 45, seed=3)
     scene = splats(view, 60, degree=0, seed=1, widths=(0.3, 12.0))
     listed = tiles_of(scene, view)
@@ -178,7 +181,7 @@ def test_tiles_are_those_the_footprint_touches(monkeypatch):
 def test_equal_input_gives_bit_identical_results():
     view = camera(33, 21)
     scene = splats(view, 40, degree=1)
-    (first, first_grads), (second, second_grads) = (draw("triton", scene, view) for _ in range(2))
+    (first, first_grads), (second, second_grads) = (render_with_grads("triton", scene, view) for _ in range(2))
     assert all(torch.equal(getattr(first, n), getattr(second, n)) for n in ("color", "alpha", "depth", "means2d"))
     assert all(torch.equal(value, second_grads[name]) for name, value in first_grads.items())
 
@@ -237,8 +240,11 @@ def test_a_driver_that_does_not_start_is_told_in_one_line(monkeypatch, error):
             raise error
 
     monkeypatch.setattr(backend.triton.runtime, "driver", Failing())
+    monkeypatch.setattr(backend, "DEVICE", "cuda")
+    monkeypatch.setattr(backend, "check_device", lambda *_: None)
+    view = camera(16, 9)
     with pytest.raises(InputError, match=r"^backend: triton could not start \([^\n]+\).*endoprior doctor[^\n]*$"):
-        backend._start_driver()
+        backend.rasterize(splats(view, 3), view, background=torch.zeros(3))
 
 
 def test_edge_of_a_footprint_is_alpha_min():
@@ -246,9 +252,9 @@ def test_edge_of_a_footprint_is_alpha_min():
     view = camera(16, 9, seed=None)
     scene = one(view, 8.5, 4.5, 40.0)
     xx, xy, yy = project(scene, view).cov2d[0].double().tolist()
-    for factor, drawn in ((1.001, True), (0.999, False)):
+    for factor, rendered in ((1.001, True), (0.999, False)):
         opacity = ALPHA_MIN * float(np.exp(0.5 * 9 * yy / (xx * yy - xy * xy))) * factor
         scene = replace(scene, opacities=torch.tensor([opacity]))
         out = render.load("triton")(scene, view, background=torch.zeros(3))
         want = render.load("reference")(scene, view, background=torch.zeros(3))
-        assert (out.alpha[4, 11] > 0) == drawn and torch.equal(out.alpha > 0, want.alpha > 0)
+        assert (out.alpha[4, 11] > 0) == rendered and torch.equal(out.alpha > 0, want.alpha > 0)

@@ -32,6 +32,8 @@ PRIVATE_WORDS = (
     "row form", "lacking",
 )  # fmt: skip
 """Words that this project once used in place of the field's."""
+PRIVATE_NAMES_ALLOWED = {"_C", "_hub_dir", "_asdict", "_fields", "_replace"}
+"""What tests may use of gsplat, of torch.hub and of named tuples."""
 NO_TORCH = ("priors", "data", "evaluation/metrics/stability.py", "phantom", "core", "footage", "check")
 
 
@@ -133,7 +135,7 @@ def test_no_pickle_and_no_eval_anywhere():
             if isinstance(node, ast.Import | ast.ImportFrom):
                 names = {alias.name for alias in node.names}
                 if getattr(node, "module", None) in ("pickle", "dill", "joblib"):
-                    assert names == {"UnpicklingError"}, path  # what torch raises on a file it refuses
+                    assert names == {"UnpicklingError"}, path  # what torch raises on a file it rejects
                 assert not names & {"pickle", "dill", "joblib"}, path
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 assert node.func.id not in ("eval", "exec"), path
@@ -147,6 +149,27 @@ def test_no_test_file_imports_another():
             for name in names:
                 message = f"{path} imports {name}: move what both need into a helper module"
                 assert not name.startswith("test_"), message
+
+
+def taken_names(node: ast.AST) -> Iterator[str]:
+    """Names that a node takes from modules and objects other than `self`, those in `setattr(x, "name")` too."""
+    if isinstance(node, ast.Attribute) and ast.unparse(node.value) != "self":
+        yield node.attr
+    elif isinstance(node, ast.Import | ast.ImportFrom):
+        for name in (getattr(node, "module", None) or "", *(alias.name for alias in node.names)):
+            yield from name.split(".")
+    elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("getattr", "setattr", "delattr")):
+        for argument in node.args:
+            if isinstance(argument, ast.Constant) and isinstance(argument.value, str):
+                yield from argument.value.split(".")
+
+
+def test_tests_use_public_names_only():
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        for node in nodes(path):
+            for name in set(taken_names(node)) - PRIVATE_NAMES_ALLOWED:
+                is_private = name.startswith("_") and not name.startswith("__")
+                assert not is_private, f"{path}:{node.lineno}: {name} is private: test what is public"
 
 
 def test_lines_of_pages_are_at_most_100_characters_long():

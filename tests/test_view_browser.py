@@ -126,7 +126,7 @@ def test_the_slider_changes_the_image_and_play_advances(viewer, page, scene):
     seen = set()
     wait_until(lambda: seen.add(viewer.settings.frame) or len(seen) > 5)
     press_button(page, "Pause")
-    wait_until(lambda: viewer._playing is None)
+    wait_until(lambda: viewer.panel.play.label == "Play")
     settled(page, "played")
 
 
@@ -160,18 +160,18 @@ def test_layers_tracks_tool_and_orbit(viewer, page):
     for _ in range(FRAME):
         page.press("ArrowRight")
     wait_until(lambda: viewer.settings.frame == FRAME)
-    pictures = {}
+    images = {}
     for layer, name in LAYER_NAMES.items():
         choose(viewer, viewer.panel.layer, name)
         wait_until(lambda layer=layer: viewer.settings.layer == layer)
-        pictures[layer] = settled(page, f"layer_{layer}")
-    for a in pictures:
-        assert all(a == b or np.abs(pictures[a] - pictures[b]).mean() > 1 for b in pictures), a
+        images[layer] = settled(page, f"layer_{layer}")
+    for a in images:
+        assert all(a == b or np.abs(images[a] - images[b]).mean() > 1 for b in images), a
     choose(viewer, viewer.panel.layer, LAYER_NAMES["color"])
     choose(viewer, viewer.panel.tool, True)
     choose(viewer, viewer.panel.tracks, True)
     marked = settled(page, "tool_and_tracks")
-    assert np.abs(marked - pictures["color"]).mean() > 1
+    assert np.abs(marked - images["color"]).mean() > 1
     choose(viewer, viewer.panel.camera, ORBIT)
     before = settled(page)
     left, top, width, height = page.box("canvas")

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import socket
 import threading
 import time
@@ -23,6 +24,7 @@ from endoprior.data import load_sequence
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
 from endoprior.runs.training_run import train
+from endoprior.view import live
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT, POINTS
 from endoprior.view.server import Viewer
 from endoprior.view.view_settings import ViewSettings
@@ -61,7 +63,7 @@ def client(viewer):
     """A connected stand-in for a browser, after its first image."""
     client = Client(viewer.port)
     client.send_camera()
-    client.picture()
+    client.image()
     yield client
     client.socket.close()
 
@@ -80,34 +82,34 @@ def test_the_image_equals_the_rendering_of_the_scene(scene):
 def test_the_slider_changes_the_image(viewer, client, scene):
     client.set(viewer.panel.frame, 5)
     expected = to_u8(scene.render(5 / NUM_FRAMES).color.numpy())
-    canvas = client.picture()
+    canvas = client.image()
     assert viewer.settings.frame == 5 and canvas.shape[:2] == (52, 64)  # 600 x 480 is narrower than 64 x 48
     assert np.array_equal(canvas[2:50], expected) and not canvas[0].any()
 
 
 def test_every_layer_is_a_different_image(viewer, client):
     client.set(viewer.panel.frame, 4)
-    pictures = {"color": client.picture()}
+    images = {"color": client.image()}
     for layer in ("depth", "alpha", "motion", "prior"):
         client.set(viewer.panel.layer, LAYER_NAMES[layer])
-        pictures[layer] = client.picture()
-    for a in pictures:
-        assert all(a == b or not close(pictures[a], pictures[b]) for b in pictures)
+        images[layer] = client.image()
+    for a in images:
+        assert all(a == b or not close(images[a], images[b]) for b in images)
 
 
 def test_the_free_camera_and_clipping(viewer, client):
     client.set(viewer.panel.camera, ORBIT)
-    client.picture()
+    client.image()
     client.send_camera()
-    facing = client.picture()
+    facing = client.image()
     client.send_camera(position=(0, 0, -50))
-    assert not close(client.picture(), facing)
+    assert not close(client.image(), facing)
     client.set(viewer.panel.clip, (0.0, 40.0))
-    assert client.picture().max() < 10  # the wall is behind the far end
+    assert client.image().max() < 10  # the wall is behind the far end
     client.send_camera()
     client.send_camera(position=(np.nan, 0, 0))  # nothing can be seen from nowhere: it stays where it was
     client.set(viewer.panel.clip, (0.0, viewer.panel.clip_end))
-    assert np.array_equal(client.picture(), facing)
+    assert np.array_equal(client.image(), facing)
 
 
 def test_two_clicks_measure_and_the_distance_follows_the_tissue(viewer, client, scene):
@@ -116,7 +118,7 @@ def test_two_clicks_measure_and_the_distance_follows_the_tissue(viewer, client, 
     time.sleep(0.3)
     for x in (0.25, 0.75):
         client.click(x, 0.5)
-    client.picture()
+    client.image()
     assert viewer.measured.distances == pytest.approx(np.full(NUM_FRAMES, 32 / 80 * 50), abs=0.05)
     assert "mm" in viewer.panel.distance.content
     shift = viewer.measured.paths[-1, 0, 0] - viewer.measured.paths[0, 0, 0]
@@ -137,7 +139,7 @@ def test_play_advances_and_pauses(viewer, client):
         time.sleep(0.01)
     assert len(seen) >= 4
     client.set(viewer.panel.play, True)
-    client.picture()
+    client.image()
     at = viewer.settings.frame
     time.sleep(0.4)
     assert viewer.settings.frame == at == viewer.panel.frame.value
@@ -164,7 +166,7 @@ def test_screenshot_and_video_are_stored_in_the_run(viewer, client):
     client.set(viewer.panel.screenshot, True)
     client.set(viewer.panel.camera, ORBIT)
     client.set(viewer.panel.keep, True)
-    client.picture()
+    client.image()
     client.send_camera(position=(2, 0, 0))
     client.set(viewer.panel.frame, 3)
     client.set(viewer.panel.keep, True)
@@ -196,7 +198,7 @@ def test_malformed_data_closes_only_its_own_connection(viewer, client, capfd):
     viewer.panel.clip.value = (0.0, viewer.panel.clip_end)
     time.sleep(0.5)
     client.set(viewer.panel.frame, 2)
-    client.picture()
+    client.image()
     assert viewer.settings.frame == 2
     capfd.readouterr()  # what the server said about it
 
@@ -207,7 +209,7 @@ def test_a_page_of_another_site_sees_nothing(viewer):
         stranger.socket.recv(timeout=5)
     own = Client(viewer.port, origin=f"http://127.0.0.1:{viewer.port}")
     own.send_camera()
-    assert own.picture().any()
+    assert own.image().any()
     own.socket.close()
 
 
@@ -231,9 +233,9 @@ def test_a_raw_sequence_is_shown_before_training(tiny_sequence):
     with at_work(Viewer(viewable)) as viewer:
         client = Client(viewer.port)
         client.send_camera()
-        first = client.picture()
+        first = client.image()
         client.set(viewer.panel.layer, LAYER_NAMES["depth"])
-        assert not close(client.picture(), first)
+        assert not close(client.image(), first)
         client.set(viewer.panel.camera, ORBIT)
         client.set(viewer.panel.measure, True)
         time.sleep(0.5)
@@ -261,7 +263,9 @@ def short_config() -> Config:
     return replace(cfg, init=replace(cfg.init, budget=300), schedule=schedule)
 
 
-def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path):
+def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "REFRESH_SECONDS", 0.0)
+    monkeypatch.setattr(live, "LARGEST_SHARE", math.inf)
     digests, shown = [], []
     for watched in (False, True):
         out, client = tmp_path / f"run{watched}", None
@@ -275,14 +279,13 @@ def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path):
                         client = Client(on_step.viewer.port)
                         client.send_camera()
                         threading.Event().wait(0.3)
-                    on_step._due = 0.0
                     client.set(on_step.viewer.panel.layer, LAYER_NAMES["motion" if report.iteration % 2 else "prior"])
                     threading.Event().wait(0.05)
                     shown.append(on_step.viewer.panel.status.content)
 
             train(load_sequence(tiny_sequence), short_config(), out, on_step=step)
             if client:
-                assert client.picture(timeout=5, quiet=0.2).any()
+                assert client.image(timeout=5, quiet=0.2).any()
                 client.socket.close()
         digests.append(hashlib.sha256((out / "scene.safetensors").read_bytes()).hexdigest())
     assert digests[0] == digests[1]

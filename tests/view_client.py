@@ -53,24 +53,24 @@ class Client:
         self.send("ScenePointerMessage", event_type="click", screen_pos=((x, y),), modifier=None, **ray)
 
     def read(self, timeout: float) -> list[dict]:
-        """The next messages; of an image the pixels, (H, W, 3) RGB, under `picture`."""
+        """The next messages; of an image the pixels, (H, W, 3) RGB, under `image`."""
         raw = self.socket.recv(timeout=timeout)
         length = int.from_bytes(raw[8:16], "little")
         messages = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(raw[16 : 16 + length]))["messages"]
         for message in messages:
             if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
-                message["picture"] = _decoded(message["rgb_data"])
+                message["image"] = _decoded(message["rgb_data"])
         return messages
 
-    def picture(self, timeout: float = 20, quiet: float = 0.8) -> NDArray[np.uint8]:
+    def image(self, timeout: float = 20, quiet: float = 0.8) -> NDArray[np.uint8]:
         """The last image, once nothing arrives for `quiet` seconds."""
         found, wait = None, timeout
         while True:
             try:
                 for message in self.read(wait):
-                    found = message.get("picture", found)
+                    found = message.get("image", found)
             except TimeoutError:
-                assert found is not None, "no picture came"
+                assert found is not None, "no image came"
                 return found
             wait = timeout if found is None else quiet
 

@@ -29,12 +29,13 @@ def current_value(field: str, value: Any, *, hint: bool = False) -> Any:
     if not isinstance(value, str) or value not in renamed:
         return value
     if hint:
-        _print_renamed(field, value, renamed[value])
+        print_renamed(field, value, renamed[value])
     return renamed[value]
 
 
 @functools.cache
-def _print_renamed(field: str, former: str, current: str) -> None:
+def print_renamed(field: str, former: str, current: str) -> None:
+    """Print on stderr what a value is called now; once per process for the same arguments."""
     print(f"endoprior: {field}: `{former}` is now called `{current}`", file=sys.stderr)
 
 

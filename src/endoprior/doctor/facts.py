@@ -67,7 +67,7 @@ def read_facts(torch_limit_s: float = TORCH_LIMIT_S) -> Facts:
             driver=driver.result(),
             toolkit=toolkit.result(),
             builders=builders.result(),
-            gsplat=_or(Gsplat(), _gsplat, torch),
+            gsplat=_or(Gsplat(), read_gsplat, torch),
             packages={name: _package(name) for name in PACKAGES},
             weights=weights,
             weights_error=weights_error,
@@ -185,8 +185,13 @@ def _gpu(entry: Mapping[str, Any]) -> Gpu:
     return Gpu(**values | {"error": clean(str(values.get("error", "")))})
 
 
-def _gsplat(torch: Torch, limit_s: float = LOAD_LIMIT_S) -> Gsplat:
-    """Version, compiled files, and whether they load; nothing is compiled."""
+def read_gsplat(torch: Torch, limit_s: float = LOAD_LIMIT_S) -> Gsplat:
+    """Version, compiled files, and whether they load; gsplat is not imported and nothing is compiled.
+
+    Args:
+        torch: its `extensions` is the folder of what torch compiled; without CUDA nothing is loaded.
+        limit_s: longest wait for each file to load.
+    """
     gsplat = _gsplat_files(torch)
     name, file = ("csrc", gsplat.prebuilt) if gsplat.prebuilt else ("gsplat_cuda", gsplat.cached)
     if not file or not torch.cuda or torch.error:

@@ -204,7 +204,7 @@ def build(gaussians: tuple[Tensor, ...], radii: Tensor, size: tuple[int, int]) -
     options = {"BLOCK": BLOCK, "num_warps": 1, "enable_fp_fusion": False}
     launch(count_pairs, programs, *gaussians, radii, order, num, width, height, records, counts, **options)
     slot_ends = counts.cumsum(0)
-    num_pairs = _last(slot_ends)
+    num_pairs = read_num_pairs(slot_ends)
     dtype = torch.int16 if num_tiles < FEW_TILES else torch.int32
     tiles = torch.empty(num_pairs, dtype=dtype, device=device)
     owners = torch.empty(num_pairs, dtype=torch.int32, device=device)
@@ -217,6 +217,6 @@ def build(gaussians: tuple[Tensor, ...], radii: Tensor, size: tuple[int, int]) -
     return Tiles(records, order, slot_ends, slots, ranks, tile_starts)
 
 
-def _last(slot_ends: Tensor) -> int:
-    """The number of pairs, for which the host waits."""
+def read_num_pairs(slot_ends: Tensor) -> int:
+    """The number of pairs of a Gaussian and a tile, the last of the (N,) `slot_ends`; the host waits for the device."""
     return int(slot_ends[-1]) if len(slot_ends) else 0
