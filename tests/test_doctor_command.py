@@ -66,7 +66,7 @@ def test_an_image_is_built_where_no_gpu_is(monkeypatch, capsys):
     assert "IndexError" in refused and "TORCH_CUDA_ARCH_LIST=9.0 endoprior doctor --compile" in refused
     machine = replace(TO_COMPILE, variables=FOR_IMAGES)
     assert doctor(monkeypatch, machine, replace(WORKING.gsplat, compile_seconds=365.0), "--compile") == 0
-    assert "gsplat is compiled, ready in 365 s; there is no GPU to test it on" in capsys.readouterr().out
+    assert "gsplat is compiled, ready in 365 s; no GPU to render with" in capsys.readouterr().out
     assert doctor(monkeypatch, machine, Gsplat("1.5.3", loads=False, error="nvcc died"), "--compile") == 1
 
 
