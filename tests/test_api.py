@@ -42,7 +42,7 @@ def test_no_import_replaces_a_public_name():
     homes = sorted(set(endoprior.HOMES.values()))
     imports = [f"import endoprior.{home}" for home in homes]
     check = "import endoprior; assert all(callable(getattr(endoprior, n)) for n in endoprior.__all__)"
-    orders = [imports, imports[::-1], [check, *imports], list(itertools.chain(*((check, line) for line in imports)))]
+    orders = [imports[::-1], list(itertools.chain(*((check, line) for line in imports)))]
     processes = [subprocess.Popen([sys.executable, "-c", "\n".join([*order, check])]) for order in orders]
     assert [process.wait() for process in processes] == [0] * len(orders)
 

@@ -168,6 +168,7 @@ def test_killed_half_way_it_loses_no_finished_cell(tmp_path, how):
     assert {name: t for name, t in done_times(out).items() if name in before} == before
 
 
+@pytest.mark.slow
 def test_an_interrupted_cell_goes_on_to_the_same_scene(tmp_path):
     from endoprior.data import load_sequence
     from endoprior.experiments.matrix import run_matrix

@@ -152,6 +152,7 @@ def test_burned_in_text(data):
     assert only(data, "burned-in-text").what.startswith("burned-in text counts as tissue: ")
 
 
+@pytest.mark.slow
 def test_swapped_eyes(stereo):
     (stereo / "images").rename(stereo / "left")
     (stereo / "right").rename(stereo / "images")
@@ -161,6 +162,7 @@ def test_swapped_eyes(stereo):
     assert found["swapped-eyes"].fix == f"swap the folders {stereo}/images and {stereo}/right, and measure depth again"
 
 
+@pytest.mark.slow
 def test_vertical_offset(stereo):
     edit(stereo / "right", lambda image, _: np.roll(image, 4, 0))
     assert only(stereo, "vertical-offset").what == "the rows of left and right images are 4.0 px apart"
@@ -183,6 +185,7 @@ def test_doubled_frame_rate_suggests_a_stride(data):
     assert only(data, "duplicate-frames").fix == f"endoprior train {data} RUN --data.stride 2"
 
 
+@pytest.mark.slow
 def test_exposure_jump(data):
     edit(data / "images", lambda p, i: np.clip(p * (1.4 if i >= 11 else 1.0), 0, 255).astype(np.uint8))
     finding = only(data, "exposure-jump")
@@ -192,6 +195,7 @@ def test_exposure_jump(data):
     )
 
 
+@pytest.mark.slow
 def test_moving_camera_with_static_poses(data):
     def pan(image: np.ndarray, position: int) -> np.ndarray:
         shift = np.array([[1.15, 0, -16 - 3 * position], [0, 1.15, -14]], np.float32)
@@ -209,6 +213,7 @@ def test_moving_camera_with_static_poses(data):
     assert "camera-moves" not in findings(data), "the poses account for it"
 
 
+@pytest.mark.slow
 def test_frames_without_depth(data):
     edit(data / "depth", lambda depth, i: depth * np.uint16(i not in (3, 4)))
     finding = only(data, "no-depth-frames")

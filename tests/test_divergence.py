@@ -129,6 +129,7 @@ def rates(cfg, factor):
     return replace(cfg, optim=replace(optim, **{name: min(factor * getattr(optim, name), 1e3) for name in names}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_learning_rates_a_million_times_too_high_end_in_words(tiny_sequence, tmp_path, kind):
     cfg = rates(tiny_config(kind, coarse=50, fine=2000), 1e6)

@@ -176,6 +176,7 @@ def test_same_seed_gives_the_same_bytes_for_any_threads(folder, tmp_path):
         assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_seeds_differ_and_mono_has_no_right_image(folder, tmp_path):
     out = tmp_path / "other"
     done = []
@@ -188,6 +189,7 @@ def test_seeds_differ_and_mono_has_no_right_image(folder, tmp_path):
     assert np.abs(np.load(out / "truth/depth/000000.npy") - np.load(folder / "truth/depth/000000.npy")).mean() > 2
 
 
+@pytest.mark.slow
 def test_principal_point_moves_the_image(tmp_path):
     # The same ray is seen at another pixel: an off-center principal point shifts the true depth map by whole pixels.
     out, count = {}, 2
@@ -375,6 +377,7 @@ def test_fractal_slow_loop_and_continuity():
     assert cells(*grid, 1).min() >= 0 and 0.1 < cells(*grid, 1).mean() < 0.6
 
 
+@pytest.mark.slow
 def test_no_sample_falls_between_triangles():
     cfg = PhantomConfig(frames=16, width=320, height=256)
     scene, size = build_scene(cfg), (2 * cfg.width, 2 * cfg.height)

@@ -93,6 +93,7 @@ def test_two_image_folders_and_a_time_range(tmp_path, phantom):
         assert np.array_equal(mine.rgb_u8, true.rgb_u8) and np.array_equal(mine.tissue_mask, true.tissue_mask)
 
 
+@pytest.mark.slow
 def test_a_distorted_pair_is_rectified(tmp_path, phantom):
     """Both cameras seen through lenses with distortion, the right one turned: depth is the same as before."""
     focal, center = 0.9 * WIDTH, (120.0 - 0.5, HEIGHT / 2 - 0.5)
@@ -318,6 +319,7 @@ def test_bad_input_gives_one_line_and_leaves_nothing(tmp_path, phantom, kind):
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path, phantom, capsys):
     frames = [np.vstack(pair) for pair in zip(*cameras(phantom), strict=True)]
     video = write_video(tmp_path / "v.mp4", frames, rate=15)

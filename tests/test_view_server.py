@@ -97,6 +97,7 @@ def test_every_layer_is_a_different_image(viewer, client):
         assert all(a == b or not close(images[a], images[b]) for b in images)
 
 
+@pytest.mark.slow
 def test_the_free_camera_and_clipping(viewer, client):
     client.set(viewer.panel.camera, ORBIT)
     client.image()
