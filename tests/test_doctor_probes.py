@@ -195,6 +195,7 @@ def test_compiling_that_fails_says_why(tmp_path, monkeypatch, backend, says):
     assert examine(facts).blocking.name == "gsplat compiled" and not examine(facts).only_to_compile
 
 
+@pytest.mark.slow
 def test_compiling_that_works_is_timed(tmp_path, monkeypatch):
     fake_gsplat(tmp_path, "class _C: intersect_tile = None", monkeypatch)
     facts = facts_module.compile_gsplat(NO_TRITON)

@@ -127,6 +127,7 @@ def jit(_): return Kernel()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("launch", "computes", "says"),
     [
@@ -196,6 +197,7 @@ def test_a_probe_that_answers_nothing_about_triton(monkeypatch):
     assert triton_after(found | {"gpus": []}, monkeypatch).computes is None
 
 
+@pytest.mark.slow
 def test_the_kernel_adds(monkeypatch):
     """Interpreted: here is no GPU."""
     pytest.importorskip("triton")

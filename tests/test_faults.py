@@ -112,6 +112,7 @@ def test_training_goes_on_after_kills_to_the_same_bytes(tiny_sequence, tmp_path)
     assert differences(parts, tmp_path / "whole") + leftovers(parts) == []
 
 
+@pytest.mark.slow
 def test_a_run_killed_before_its_first_checkpoint_starts_again(tiny_sequence, tmp_path):
     cfg, out = tiny_config("basis"), tmp_path / "run"
     whole = train(load_sequence(tiny_sequence), cfg, tmp_path / "whole")

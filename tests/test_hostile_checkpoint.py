@@ -12,7 +12,7 @@ from endoprior.runs.training_run import train
 from endoprior.training.trainer import Trainer
 
 
-@pytest.fixture(scope="module", params=["basis", "hexplane"])
+@pytest.fixture(scope="module", params=["basis", pytest.param("hexplane", marks=pytest.mark.slow)])
 def run(request, tmp_path_factory):
     """A short training: what made it, and its checkpoint taken apart."""
     from conftest import write_tiny_sequence

@@ -206,6 +206,7 @@ class Stranger(Client):
             self.socket.send(raw)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orbit", [False, True])
 def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
     if orbit:
@@ -279,6 +280,7 @@ def test_the_number_of_browsers_is_limited(viewer, good):
     assert free
 
 
+@pytest.mark.slow
 def test_a_flood_of_messages_is_limited(viewer, good):
     """Training calls `work` between two iterations: it must come back however much is asked for."""
     before, stop, ended = resident_mb(), threading.Event(), []
@@ -321,6 +323,7 @@ def test_jobs_are_bounded_and_state_is_not_lost():
     assert len(jobs.take(0)) == 1 and jobs.take(0) == []
 
 
+@pytest.mark.slow
 def test_saved_views_are_limited(viewer, good):
     for _ in range(MAX_KEPT + 5):
         good.set(viewer.panel.keep, True)

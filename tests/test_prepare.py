@@ -238,6 +238,7 @@ def test_frames_outside_the_body_can_be_dropped(tmp_path, phantom):
     assert dropped.num_frames == FRAMES
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_resumes_with_identical_files(tmp_path, phantom):
     cfg = options(phantom, right=phantom / "right")
     want = prepare(phantom / "images", tmp_path / "want", cfg).out

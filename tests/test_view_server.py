@@ -264,6 +264,7 @@ def short_config() -> Config:
     return replace(cfg, init=replace(cfg.init, budget=300), schedule=schedule)
 
 
+@pytest.mark.slow
 def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path, monkeypatch):
     monkeypatch.setattr(live, "REFRESH_SECONDS", 0.0)
     monkeypatch.setattr(live, "LARGEST_SHARE", math.inf)
