@@ -12,7 +12,8 @@ import torch
 
 from endoprior.core.config import DeformationConfig
 from endoprior.core.presets import preset
-from endoprior.model.basis import RankOneGradient, basis_offsets, identity_motion
+from endoprior.model.attributes import attribute_shapes
+from endoprior.model.basis import RankOneGradient, basis_offsets
 from endoprior.model.deformation import HexPlaneField
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
@@ -66,7 +67,7 @@ def hexplane(num: int, ops: TrainingOps) -> common.Steps:
 def basis(num: int, ops: TrainingOps) -> common.Steps:
     """Offsets from temporal coefficients, their gradient and their Adam step."""
     cfg = preset("default").fitted(68)
-    motion = identity_motion(num, cfg.deformation).requires_grad_()
+    motion = torch.zeros(num, *attribute_shapes(cfg)["motion"], requires_grad=True)
     state, rates = AdamState(motion, cfg.deformation.basis.num_bases), motion_rates(cfg, 1)
     sink: list[RankOneGradient] = []
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from endoprior.compute.morton import morton_order
 from endoprior.core.config import Config
 from endoprior.core.types import Camera, Splats
-from endoprior.model.basis import identity_motion
+from endoprior.model.attributes import attribute_shapes
 from endoprior.model.gaussians import Gaussians
 
 FOCAL_PER_WIDTH = 0.9
@@ -56,7 +56,7 @@ def gaussians(drawn: Splats, cfg: Config) -> Gaussians:
         "sh_rest": drawn.sh[:, 1 : 1 + num_rest],
     }
     if cfg.deformation.kind == "basis":
-        tensors["motion"] = identity_motion(len(drawn), cfg.deformation)
+        tensors["motion"] = torch.zeros(len(drawn), *attribute_shapes(cfg)["motion"])
     return Gaussians({name: value.clone() for name, value in tensors.items()})
 
 

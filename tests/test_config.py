@@ -14,7 +14,7 @@ from endoprior.core.config import BasisConfig, Config, DensityConfig, HexPlaneCo
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.core.presets import preset
 from endoprior.experiments.spec import MethodSpec, SequenceSpec, Spec
-from endoprior.model.basis import identity_motion
+from endoprior.model.attributes import attribute_shapes
 from endoprior.model.scene import SceneFacts
 from endoprior.runs.identity import reject_other_run
 
@@ -83,15 +83,15 @@ def test_only_tuples_lists_and_plain_values_are_configured():
     assert to_dict(DensityConfig())["prior_prune"] is True
 
 
-def test_bumps_follow_the_length_of_the_sequence():
+def test_basis_functions_follow_the_length_of_the_sequence():
     basis = BasisConfig(num_bases=0)
     assert [basis.fitted(n).num_bases for n in (5, 24, 48, 63, 156)] == [4, 11, 22, 29, 71]
     assert BasisConfig(num_bases=31).fitted(24).num_bases == 31
     assert BasisConfig(num_bases=0, frames_per_basis=2.0).fitted(63).num_bases == 32
     fitted = preset("default").fitted(48)
     assert fitted.deformation.basis.num_bases == 22 and fitted.fitted(99) == fitted
-    with pytest.raises(ValueError, match=r"Config\.fitted"):
-        identity_motion(3, preset("default").deformation)
+    with pytest.raises(ValueError, match="num_bases: expected at least 2"):
+        attribute_shapes(preset("default"))
 
 
 @pytest.mark.parametrize(("former", "current"), [("cpu", "numba"), ("cuda", "gsplat"), ("triton", "triton")])

@@ -15,9 +15,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import BasisConfig, DeformationConfig, HexPlaneConfig
-from endoprior.model.attributes import motion_layout
-from endoprior.model.basis import basis_offsets, basis_weights, identity_motion
+from endoprior.core.config import BasisConfig, Config, DeformationConfig, HexPlaneConfig
+from endoprior.model.attributes import attribute_shapes, motion_layout
+from endoprior.model.basis import basis_offsets, basis_weights
 from endoprior.model.deformation import HexPlaneField, Offsets, box_of_points
 from endoprior.model.heads import OffsetHeads
 from endoprior.model.ops import NUMBA
@@ -218,7 +218,7 @@ def test_motion_layout_follows_the_configuration() -> None:
     rigid = replace(BASIS, deform_scales=False, deform_quats=False, deform_opacity=True)
     assert motion_layout(rigid) == {"means": slice(0, 3), "opacity_logits": slice(3, 4), "sh_dc": slice(4, 7)}
     plain = replace(rigid, deform_opacity=False, basis=replace(BASIS.basis, deform_color=False))
-    assert identity_motion(5, plain).shape == (5, 9, 3)
+    assert attribute_shapes(Config(deformation=plain))["motion"] == (9, 3)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.31, 0.5, 0.999, 1.0])
@@ -254,7 +254,7 @@ def test_basis_gradient() -> None:
 
 
 def test_basis_starts_as_the_identity() -> None:
-    motion = identity_motion(4, BASIS).requires_grad_(True)
+    motion = torch.zeros(4, 9, 13, requires_grad=True)
     found = basis_offsets(motion, 0.25, BASIS, NUMBA)
     assert isinstance(found, Offsets) and found.opacity_logits is None
     assert not any(value.any() for value in (found.means, found.quats, found.log_scales, found.sh_dc))
@@ -263,10 +263,10 @@ def test_basis_starts_as_the_identity() -> None:
 
 
 def test_basis_of_no_gaussians_far_times_and_wrong_shapes() -> None:
-    motion = identity_motion(0, BASIS).requires_grad_(True)
+    motion = torch.zeros(0, 9, 13, requires_grad=True)
     basis_offsets(motion, 0.5, BASIS, NUMBA).means.sum().backward()
     assert motion.grad.shape == motion.shape
-    ones = identity_motion(2, BASIS) + 1
+    ones = torch.ones(2, 9, 13)
     assert not basis_offsets(ones, 5.0, BASIS, NUMBA).means.any()
     with pytest.raises(ValueError, match="motion"):
         basis_offsets(ones[..., :-1], 0.5, BASIS, NUMBA)

@@ -186,13 +186,16 @@ def test_a_late_check_finds_the_state_before_a_bad_gradient(tiny_sequence, kind,
         trainer.step()
     trainer.synchronize()
     before = state_of(trainer)
-    poison(trainer, name, float("nan"))
+    handle = poison(trainer, name, float("nan"))
     with pytest.raises(Diverged, match=f"gradient of {name}"):
         for _ in range(CHECK_EVERY):
             trainer.step()
     after = state_of(trainer)
     assert trainer.state.iteration == 8
     assert all(torch.equal(before[key], after[key]) for key in before)
+    handle.remove()
+    trainer.step()  # and it could go on
+    assert not torch.equal(state_of(trainer)["sh_dc"], before["sh_dc"])
 
 
 def test_the_last_iteration_and_a_checkpoint_wait_for_the_check(tiny_sequence):

@@ -19,23 +19,12 @@ from torch.autograd.function import once_differentiable
 
 from ..core.checks import check_shape
 from ..core.config import BasisConfig, DeformationConfig
-from .attributes import motion_layout
+from .attributes import motion_layout, offset_widths
 from .deformation import Offsets
 from .ops import ModelOps
 
 SUPPORT = 3.0
 """Half of the support of a basis function, in standard deviations."""
-
-
-def identity_motion(num: int, cfg: DeformationConfig) -> Tensor:
-    """Zero coefficients (num, B, channels) float32: Gaussians that do not move.
-
-    Raises:
-        ValueError: the config leaves B to the length of a sequence.
-    """
-    if cfg.basis.num_bases == 0:
-        raise ValueError("num_bases must be known; got 0. Use `Config.fitted(num_frames)` first.")
-    return torch.zeros(num, cfg.basis.num_bases, max(part.stop for part in motion_layout(cfg).values()))
 
 
 def basis_weights(time: float, cfg: BasisConfig) -> NDArray[np.float64]:
@@ -70,7 +59,7 @@ def basis_offsets(
         ValueError: a wrong shape.
     """
     layout = motion_layout(cfg)
-    check_shape(f"motion:N,{cfg.basis.num_bases},{max(part.stop for part in layout.values())}", motion=motion)
+    check_shape(f"motion:N,{cfg.basis.num_bases},{sum(offset_widths(cfg).values())}", motion=motion)
     total = _WeightedSum.apply(motion, basis_weights(time, cfg.basis), sink, ops)
     return Offsets.from_channels({name: total[:, part] for name, part in layout.items()})
 

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from ..core.config import Config
 from ..core.types import Splats
-from .basis import RankOneGradient, identity_motion
+from .attributes import attribute_shapes
+from .basis import RankOneGradient
 from .deformation import Offsets
 
 SH_C0 = 0.28209479177387814
@@ -82,17 +83,17 @@ def create_gaussians(points: NDArray, colors: NDArray, log_scales: NDArray, cfg:
 
     Args:
         points: (N, 3) mm. colors: (N, 3) in [0, 1]. log_scales: (N,) log of mm.
+    Raises:
+        InputError: the config leaves the number of temporal basis functions open.
     """
-    num = len(points)
-    opacity = cfg.init.opacity
+    num, opacity = len(points), cfg.init.opacity
     tensors = {
         "means": torch.from_numpy(np.ascontiguousarray(points, np.float32)),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1),
         "log_scales": torch.from_numpy(np.asarray(log_scales, np.float32))[:, None].repeat(1, 3),
         "opacity_logits": torch.full((num,), float(np.log(opacity / (1 - opacity)))),
         "sh_dc": (torch.from_numpy(np.asarray(colors, np.float32))[:, None, :] - 0.5) / SH_C0,
-        "sh_rest": torch.zeros(num, (cfg.schedule.sh_degree + 1) ** 2 - 1, 3),
     }
-    if cfg.deformation.kind == "basis":
-        tensors["motion"] = identity_motion(num, cfg.deformation)
-    return Gaussians(tensors)
+    # Everything else starts at zero: color that does not depend on the view, and no motion.
+    zeros = {name: torch.zeros(num, *shape) for name, shape in attribute_shapes(cfg).items() if name not in tensors}
+    return Gaussians(tensors | zeros)

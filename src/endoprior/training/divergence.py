@@ -121,12 +121,14 @@ class DivergenceCheck:
         values = iter(torch.cat([each.values for each in pending]).tolist() if pending else [])
         for each in pending:
             terms = {name: next(values) for name in each.terms}
-            reason = unusable_numbers(terms, {name: int(next(values)) for name in each.gradients})
+            unusable = {name: int(next(values)) for name in each.gradients}
+            reason, last_good = unusable_numbers(terms, unusable), each.iteration - 1
+            if reason is None:
+                reason, last_good = self._watch.see(terms["color"], each.brightness), applied
             if reason is not None:
-                return Divergence(reason, each.iteration - 1)
-            reason = self._watch.see(terms["color"], each.brightness)
-            if reason is not None:
-                return Divergence(reason, applied)
+                if self.skip is not None:
+                    self.skip.zero_()  # who continues does so from the last good state
+                return Divergence(reason, last_good)
         return None
 
 
