@@ -36,7 +36,7 @@ def clip(tmp_path):
 
 def test_clip_is_sent_to_prepare(clip):
     video = clip / "frames/00000ms-01000ms-visible.mp4"
-    words = f"run endoprior prepare {video} OUT --border keep --stir {clip}"
+    words = f"`endoprior prepare {video} OUT --border keep --stir {clip}`"
     assert_rejected(clip, "seq00", words)
     assert_rejected(clip.parents[1], "7", words)
 

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from ..core.checks import number_ranges
+from ..core.shell import command
 from ..footage.camera_motion import MOVING_FRACTION
 from .facts import Facts
 
@@ -147,7 +148,7 @@ def _set_scale(facts: Facts, factor: float | None) -> str:
     scale = "MM_PER_UNIT" if factor is None else f"{facts.depth.scale * factor:.6g}"
     return (
         f'set "depth_scale": {scale} in {facts.path}/sequence.json, '
-        f"or endoprior train {facts.path} RUN --data.depth-unit-mm {scale}"
+        f"or {command('train', facts.path, 'RUN', '--data.depth-unit-mm', scale)}"
     )
 
 
@@ -188,7 +189,7 @@ def _changes(facts: Facts) -> Iterator[Finding]:
         originals = sorted(set(range(facts.frames)) - set(copies))
         stride = originals[1] if len(originals) > 1 else 0
         regular = stride > 1 and originals == list(range(0, facts.frames, stride))
-        fix = f"endoprior train {path} RUN --data.stride {stride}" if regular else f"remove them from {path}"
+        fix = command("train", path, "RUN", "--data.stride", str(stride)) if regular else f"remove them from {path}"
         yield Finding("duplicate-frames", "warning", what, fix, copies)
     for code, frames, what in (
         ("exposure-jump", changes.exposure_jumps, "the brightness of the whole image jumps at"),
@@ -249,5 +250,5 @@ def _frames(frames: tuple[int, ...]) -> str:
 def _until(facts: Facts, first: int) -> str:
     """The command that leaves out the frames from `first` on, or those before it, whichever are fewer."""
     if first >= facts.frames / 2:
-        return f"endoprior train {facts.path} RUN --data.first-frames {first}"
+        return command("train", facts.path, "RUN", "--data.first-frames", str(first))
     return f"remove frames 0-{first - 1} from {facts.path}"

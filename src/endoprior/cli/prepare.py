@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from ..core.shell import command
 from ..prepare.config import PrepareConfig
 from .parsing import parse
 from .progress import Counting, say
@@ -38,4 +39,5 @@ def run(argv: list[str]) -> None:
     for note in done.notes:
         say(f"note: {note}")
     say(f"{done.out}: {done.num_frames} frames of {done.size[0]}x{done.size[1]}")
-    say(f"next: endoprior check {done.out}; endoprior train {done.out} RUN")
+    say(f"next: {command('check', done.out)}")
+    say(f"then: {command('train', done.out, 'RUN')}")

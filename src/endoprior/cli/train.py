@@ -14,6 +14,7 @@ import tyro
 from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.presets import PresetName, preset
+from ..core.shell import command
 from ..doctor.choice import Wanted
 from .parsing import parse
 from .progress import say, training_progress
@@ -125,7 +126,7 @@ def train_and_evaluate(
     try:
         evaluate_run(scene, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
     except KeyboardInterrupt:
-        say(f"Stopped; the trained scene is saved. Score it with `endoprior eval {out}`.")
+        say(f"Stopped; the trained scene is saved. Score it with `{command('eval', out)}`.")
         raise
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
+from ..core.shell import command
 from ..core.types import Frame
 from ..system.atomic import whole_file
 from .endonerf import load_endonerf
@@ -44,8 +45,9 @@ def load_stir(path: Path, cfg: DataConfig) -> FrameSequence:
     """
     clips = [path] if (path / SEGMENTATIONS[0]).exists() else sorted(path.glob("left*/seq*"))
     videos = sorted((clips[0] / "frames").glob("*.mp4")) if clips else []
-    video = videos[0] if videos else clips[0] / "frames" / "*.mp4" if clips else path
-    hint = f"run endoprior prepare {video} OUT --border keep --stir {clips[0] if clips else path} (docs/datasets.md)."
+    video = videos[0] if videos else clips[0] / "frames" / "VIDEO.mp4" if clips else path
+    clip = clips[0] if clips else path
+    hint = f"`{command('prepare', video, 'OUT', '--border', 'keep', '--stir', clip)}` (docs/datasets.md)."
     raise input_error(path, "a prepared sequence", "a STIR clip, which has no depth", hint)
 
 

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
-from ..core.checks import InputError, check_range
+from ..core.checks import InputError, check_range, input_error
 from ..core.config import Config
 from ..core.config_io import from_dict, to_dict
 from ..core.geometry import FARTHEST_MM
 from ..core.ranges import Checked, Range
+from ..core.shell import command
 from ..core.types import Camera, RenderOutput, Splats
 from ..system.arrays_file import ArraySpec, load_arrays, part, rejecting, save_arrays
 from .basis import basis_offsets
@@ -192,7 +193,7 @@ def load_scene(path: str | Path) -> Scene:
     path = Path(path)
     file = path / "scene.safetensors" if os.path.isdir(path) else path
     if not os.path.isfile(file):  # of a name too long for the system pathlib would raise
-        raise InputError(f"{file}: expected a trained scene; found none. Train one with `endoprior train DATA {path}`.")
+        raise input_error(file, "a trained scene", "none", f"`{command('train', 'DATA', path)}`.")
     next_step = "Train the scene again."
     arrays, about = load_arrays(file, FORMAT, scene_schema, next_step)
     with rejecting(file, "a scene", next_step):
