@@ -18,7 +18,7 @@ from typing import Any
 
 from ..core.checks import InputError
 from ..data.files import read_json
-from ..system.atomic import write_json
+from ..system.atomic import write_json, write_text
 
 DONE = "cell.json"
 """Written last: a folder that has it, with the same key, is finished."""
@@ -71,11 +71,12 @@ def work(job: Job) -> None:
 
     cfg, folder = from_dict(Config, job.config), Path(job.folder)
     run, key_file = folder / "run", folder / "key"
-    resume = (run / "checkpoint.safetensors").exists() and key_file.exists() and key_file.read_text() == job.key
+    same = key_file.exists() and key_file.read_text(encoding="utf-8") == job.key
+    resume = (run / "checkpoint.safetensors").exists() and same
     if not resume:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        key_file.write_text(job.key)
+        write_text(key_file, job.key)
     began = clock.perf_counter()
     scene = train(load_sequence(job.data, cfg.data), cfg, run, resume=resume)
     seconds = clock.perf_counter() - began
@@ -94,7 +95,7 @@ def work(job: Job) -> None:
 
 def main(argv: list[str]) -> int:
     """Work on the job file `argv[0]`; exit status as for the command line."""
-    job = Job(**json.loads(Path(argv[0]).read_text()))
+    job = Job(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     try:
         work(job)
