@@ -160,7 +160,8 @@ def _border(facts: Facts) -> Iterator[Finding]:
         what = f"a bar or console strip of {sides} counts as tissue"
         width = camera.width - strips.left - strips.right
         height = camera.height - strips.top - strips.bottom
-        fix = f"endoprior prepare CLIP NEW --crop {strips.left},{strips.top},{width},{height}, or mark it in the masks"
+        crop = command("prepare", "CLIP", "NEW", "--crop", f"{strips.left},{strips.top},{width},{height}")
+        fix = f"{crop}, or mark it in the masks"
         yield Finding("console-strip", "warning", what, fix)
     if border.circle and border.outside_as_tissue > SEEN_AS_TISSUE:
         what = f"the image is round (radius {border.circle.radius:.0f} px) and its outside counts as tissue"

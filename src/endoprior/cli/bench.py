@@ -43,12 +43,11 @@ class Bench:
 def run(argv: list[str]) -> int:
     """Run the matrix and write its report; 1 if a cell failed."""
     args = parse(Bench, argv, "bench")
-    from filelock import FileLock, Timeout
-
     from ..experiments.execute import local_executor, ray_executor
     from ..experiments.matrix import run_matrix
     from ..experiments.report import write_overview, write_report
     from ..experiments.spec import load_spec
+    from ..system.file_lock import locked
     from .output_paths import require_writable_folder
 
     for option, value, least in (("--threads", args.threads, 1), ("--cores", args.cores, 0)):
@@ -63,13 +62,8 @@ def run(argv: list[str]) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise input_error(args.out, "a place for a folder", f"{error.strerror}", "choose another.") from None
-    lock = FileLock(args.out / ".lock", timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise input_error(args.out, "a folder for this benchmark alone", "one in which another runs", "wait.") from None
     failed, reports = 0, {}
-    with lock:
+    with locked(args.out, args.out / ".lock"):
         if args.report_only:
             executor = nullcontext(None)
         elif args.ray:

@@ -10,6 +10,7 @@ import tyro
 
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
+from ..core.shell import quoted
 from .parsing import parse
 from .progress import say
 
@@ -33,7 +34,8 @@ def run(argv: list[str]) -> None:
     """Measure the sequence, print the report, write the figure."""
     args = parse(Check, argv, "check")
     if args.out.suffix.lower() != ".png":
-        raise input_error("--out", "a .png file", str(args.out), f"`--out {args.out.with_suffix('.png')}`.")
+        fix = f"`--out {quoted(args.out.with_suffix('.png'))}`."
+        raise input_error("--out", "a .png file", str(args.out), fix)
     from .output_paths import require_writable_file
 
     for option, file in (("--out", args.out), ("--json", args.json)):

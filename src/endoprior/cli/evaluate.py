@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ..core.checks import input_error
+from ..core.shell import command
 from ..doctor.choice import Wanted
 from .devices import on_device
 from .parsing import parse
@@ -52,11 +53,13 @@ def run(argv: list[str]) -> None:
     )
     data = args.data or sequence_of_run(args.run)
     scene = on_device(scene, args.device)
-    evaluate_run(scene, data, args.out or args.run, args.split, args.networks, args.weights_dir, extra={})
+    out = args.out or args.run
+    evaluate_run(scene, args.run, data, out, args.split, args.networks, args.weights_dir, extra={})
 
 
 def evaluate_run(
     scene: Scene,
+    run: Path,
     data: Path,
     out: Path,
     split: Literal["test", "train", "video"],
@@ -64,7 +67,7 @@ def evaluate_run(
     weights_dir: Path | None,
     extra: dict[str, float],
 ) -> None:
-    """Score `scene` on the sequence folder `data`, write the two files into `out`, print a table.
+    """Score the `scene` of a `run` on the sequence folder `data`, write the two files into `out`, print a table.
 
     Depth is scored against measured depth, even where the run's preset trained on filled-in depth.
     """
@@ -83,9 +86,8 @@ def evaluate_run(
         say(f"  {name:<28}skipped: {reason}")
     if outliers := result.outlier_frames():
         frames = ", ".join(map(str, outliers))
-        say(
-            f"note: tissue PSNR of frames {frames} is more than 3 dB below the median; see them with `endoprior render`"
-        )
+        see = f"see them with `{command('render', run)}`"
+        say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median; {see}")
     if sequence.depth_is_relative:
         say("note: the sequence's depth is relative: scores in mm compare runs on it, but are not millimeters")
     say(f"{out / 'metrics.json'}")

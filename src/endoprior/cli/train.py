@@ -124,7 +124,7 @@ def train_and_evaluate(
     speed = {"train_seconds": seconds, "iterations_per_second": done}
     scene = scene.to(device_for(cfg.render.backend))  # score on the training device
     try:
-        evaluate_run(scene, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
+        evaluate_run(scene, out, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
     except KeyboardInterrupt:
         say(f"Stopped; the trained scene is saved. Score it with `{command('eval', out)}`.")
         raise

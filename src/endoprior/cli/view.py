@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from ..core.checks import InputError, input_error
+from ..core.shell import command
 from ..doctor.choice import Wanted
 from .devices import on_device
 from .parsing import parse
@@ -106,7 +107,8 @@ def open_viewable(path: Path, data: Path | None, device: Wanted = "cpu") -> tupl
     folder = path.parent if path.name == "scene.safetensors" else path
     if not os.path.isfile(folder / "scene.safetensors"):  # pathlib raises for a name that is too long
         if (folder / "config.json").is_file() and (folder / "log.jsonl").is_file():
-            fix = "Wait until training is done; `endoprior train --view` shows a scene during training."
+            again = command("train", "DATA", folder, "--resume", "--view")
+            fix = f"Wait until training is done. To see it before, stop it and run `{again}`."
             raise input_error(folder / "scene.safetensors", "a trained scene", "none yet", fix)
         return ViewableSequence(load_sequence(path)), None
     from ..model.scene import load_scene

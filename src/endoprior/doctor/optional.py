@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ..core.shell import install
 from .lines import Line, State
 from .records import Facts
 
@@ -39,7 +40,7 @@ def optional_lines(facts: Facts) -> list[Line]:
         there = ", ".join(f"{name} {facts.packages[name]}" for name in packages if name not in absent)
         state: State = "missing" if absent else "ok"
         found = f"{purpose}: {'no ' + ', '.join(absent) if absent else there}"
-        lines.append(Line("also", part, state, found, f"pip install 'endoprior[{part}]'" if absent else ""))
+        lines.append(Line("also", part, state, found, install(part) if absent else ""))
     lines += _weights(facts)
     return lines + _variables(facts)
 
