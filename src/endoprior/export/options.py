@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Literal
 
 from ..core.checks import check_range
-from .formats import FORMATS, Axes
+from .formats import FORMATS, REGISTRY, Axes
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
     """Options of an export. Each format takes some of them and rejects the others."""
 
-    format: Literal[FORMATS]
+    format: Literal[REGISTRY.names()]
     """What to write."""
     times: tuple[float, ...] = ()
     """Times in [0, 1] to export, instead of the frames of a split; frame i of T is at i / T."""
