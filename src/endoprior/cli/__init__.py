@@ -19,12 +19,13 @@ COMMANDS = {
     "check": "check a sequence before training: properties, problems with their fix, a figure",
     "prior": "write the cue maps and the joint texture prior of each frame",
     "train": "train one scene and score it",
-    "eval": "score a trained scene on a split",
+    "eval": "score a trained scene on a split, or the images of another program",
     "render": "render a trained scene: color, depth, side-by-side, video",
     "export": "write open formats: PLY, splat, SPZ, glTF, mesh, points, tracks, depth, video",
     "view": "show a trained scene, or a sequence before training, in a web browser",
     "doctor": "report whether this machine can use CUDA, and what to install for it",
     "bench": "compare methods on sequences over seeds, under one protocol",
+    "plugins": "list datasets, methods, scores and exporters: built in, and of other packages",
 }
 """Name and one-line description. Each command is a module of this package with the same name (`eval`: `evaluate`)."""
 
