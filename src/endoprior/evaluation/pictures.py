@@ -51,6 +51,8 @@ class Pictures:
         self._color, rule = _matched(folder, (".png",), sequence, split)
         facts: dict[str, Any] = {"name": name or folder.resolve().name, "folder": str(folder.resolve())}
         facts |= {"files": len(self._color), "matched_by": rule, "fingerprint": fingerprint(folder)}
+        first = next(iter(self._color.values()))
+        facts["bits"] = 8 * decode_image(first, None).dtype.itemsize
         self._depth: dict[int, Path] = {}
         if depth_folder:
             self._depth, rule = _matched(depth_folder, (".npy", ".png"), sequence, split)
