@@ -34,7 +34,7 @@ METHODS = {
 }
 VALUES = {
     "title": "Others",
-    "sequences": {"ph": {"phantom": PHANTOM}, "other": {"phantom": PHANTOM | {"seed": 5}}},
+    "sequences": {"ph": {"phantom": PHANTOM}, "other": {"path": "same"}},
     "methods": METHODS,
     "seeds": [0, 1],
     "set": {"schedule.fine_iterations": 5},
@@ -95,7 +95,7 @@ def test_plugins_and_images_stand_in_the_tables(tmp_path):
     assert found["ph", "theirs", 0]["skipped"]["train_seconds"] == "the images come from another program"
     assert "methods.theirs.pictures: expected other, got no entry" in facts["missing"]["other/theirs/seed0"]
     stored = json.loads((out / "cells" / found["ph", "mean", 1]["folder"] / "metrics.json").read_text())
-    assert stored["method"] == {
+    assert stored["plugin"] == {
         "name": "nearest-frame", "package": "endoprior-example 1.0", "options": {"num_frames": 1000}, "seed": 1,
     }  # fmt: skip
     write_images(tmp_path / "images" / "other", tmp_path / "same", 9)
@@ -150,7 +150,7 @@ def test_a_method_may_return_a_scene(tmp_path, make_tiny_sequence, monkeypatch):
     work(job)
     stored = json.loads((Path(job.folder) / "metrics.json").read_text())
     assert stored["scores"]["num_gaussians"] > 50 and "fps" in stored["scores"]
-    assert stored["method"]["options"] == to_dict(job.options)
+    assert stored["plugin"]["options"] == to_dict(job.options)
     assert (Path(job.folder) / "run" / "scene.safetensors").exists()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -167,6 +168,16 @@ def test_nothing_is_imported_before_it_is_used(install, tiny_sequence):
     install({"datasets": {"mine": "bad_module"}, "scores": {"mine": "bad_module"}}, bad_module="raise RuntimeError")
     assert len(load_sequence(tiny_sequence, DataConfig())) == 17  # recognized before any plugin is asked
     assert "bad_module" not in sys.modules and "mine" in SCORES.names()
+
+
+def test_the_page_shows_the_example_as_it_is():
+    page = (EXAMPLE.parents[1] / "docs" / "plugins.md").read_text()
+    files = [file.read_text() for file in [*EXAMPLE.glob("*/*.py"), EXAMPLE / "pyproject.toml"]]
+    blocks = re.findall(r"```(?:python|toml)\n(.*?)```", page, re.DOTALL)
+    blocks = [re.sub(r" +#.*", "", block).strip() for block in blocks]
+    assert len(blocks) >= 6
+    for block in blocks:
+        assert any(block in text for text in files), block
 
 
 @pytest.mark.slow

@@ -96,7 +96,7 @@ def work(job: Job) -> None:
         result.scores["train_seconds"] = seconds
     if origin := REGISTRY.origin(job.method):
         about = {"name": job.method, "package": origin, "options": job.options, "seed": job.seed}
-        result.provenance["method"] = about
+        result.provenance["plugin"] = about
     if isinstance(found, Scene) and not (run / "scene.safetensors").exists():
         found.save(run / "scene.safetensors")
     result.save(folder)
