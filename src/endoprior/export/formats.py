@@ -28,6 +28,7 @@ FORMATS = (
     "gltf",
     "points",
     "mesh",
+    "animation",
     "depth",
     "tracks",
     "video",
