@@ -29,6 +29,7 @@ FORMATS = (
     "points",
     "mesh",
     "animation",
+    "slicer",
     "depth",
     "tracks",
     "video",
