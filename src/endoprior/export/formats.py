@@ -30,6 +30,8 @@ FORMATS = (
     "gltf",
     "points",
     "mesh",
+    "animation",
+    "slicer",
     "depth",
     "tracks",
     "video",
