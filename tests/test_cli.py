@@ -51,7 +51,7 @@ def test_every_command_explains_itself(command, capsys):
     ("arguments", "says"),
     [
         (["trian"], "trian: expected one of"),
-        (["train"], "required"),
+        (["train"], "expected DATA OUT, got no DATA"),
         (["train", "nowhere", "out"], "nowhere"),
         (["train", "nowhere", "out", "--sed", "1"], "--sed"),
         (["train", "nowhere", "out", "--preset", "best"], "--preset"),

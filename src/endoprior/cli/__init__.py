@@ -80,7 +80,7 @@ def system_failure(error: Exception) -> str | None:
     whole = " ".join(str(error).split())
     if type(error).__name__ == "OutOfMemoryError":  # raised by torch for a GPU; its message starts with the numbers
         return (
-            f"expected enough GPU memory, got {whole[:160]!r}. Fix: use smaller frames, a smaller --init-budget or "
+            f"expected enough GPU memory, got {whole[:160]!r}. Fix: use smaller frames, fewer --gaussians or "
             "--device cpu. The last checkpoint of a run is complete; continue it with --resume."
         )
     text = whole[-160:]
@@ -106,6 +106,6 @@ def overview() -> str:
             "",
             *lines,
             "",
-            "`endoprior COMMAND --help` explains every option.",
+            "`endoprior COMMAND --help` shows what most users need, `--help-all` every option.",
         ]
     )

@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from ..core.checks import input_error
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -40,9 +41,14 @@ class Bench:
     """Train nothing; write the report of the finished cells."""
 
 
+HELP = Help(
+    examples=(("bench/specs/small.yaml", "OUT"), ("bench/specs/small.yaml", "OUT", "--report-only")),
+)
+
+
 def run(argv: list[str]) -> int:
     """Run the matrix and write its report; 1 if a cell failed."""
-    args = parse(Bench, argv, "bench")
+    args = parse(Bench, argv, "bench", HELP)
     from filelock import FileLock, Timeout
 
     from ..experiments.execute import local_executor, ray_executor

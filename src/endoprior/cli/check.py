@@ -10,6 +10,7 @@ import tyro
 
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -29,9 +30,18 @@ class Check:
     data: DataConfig = field(default_factory=DataConfig)
 
 
+HELP = Help(
+    examples=(("DATA",), ("DATA", "--out", "DATA.png", "--strict")),
+    basics={
+        "results": ("--out", "--json", "--strict"),
+        "which frames": ("--data.first-frames", "--data.stride", "--data.shrink", "--data.format"),
+    },
+)
+
+
 def run(argv: list[str]) -> None:
     """Measure the sequence, print the report, write the figure."""
-    args = parse(Check, argv, "check")
+    args = parse(Check, argv, "check", HELP)
     if args.out.suffix.lower() != ".png":
         raise input_error("--out", "a .png file", str(args.out), f"`--out {args.out.with_suffix('.png')}`.")
     from .output_paths import require_writable_file

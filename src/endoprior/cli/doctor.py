@@ -6,6 +6,7 @@ import json as json_text
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -24,9 +25,12 @@ class Doctor:
     """Print JSON instead of a table."""
 
 
+HELP = Help(examples=((), ("--json",)))
+
+
 def run(argv: list[str]) -> int:
     """Print the report. Exit status 0 even if something is missing; 1 if --compile fails."""
-    args = parse(Doctor, argv, "doctor")
+    args = parse(Doctor, argv, "doctor", HELP)
     from ..doctor import examine, read_facts
     from ..doctor.choice import choose
     from ..doctor.report import as_json, table

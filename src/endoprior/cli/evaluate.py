@@ -11,6 +11,7 @@ import tyro
 from ..core.checks import input_error
 from ..doctor.choice import Wanted
 from .devices import on_device
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -38,9 +39,12 @@ class Eval:
     """Where to render; `auto` uses CUDA only if everything it needs works (see `endoprior doctor`)."""
 
 
+HELP = Help(examples=(("RUN",), ("RUN", "--split", "train", "--out", "OTHER")))
+
+
 def run(argv: list[str]) -> None:
     """Score and print."""
-    args = parse(Eval, argv, "eval")
+    args = parse(Eval, argv, "eval", HELP)
     from ..model.scene import load_scene
     from .output_paths import require_writable_folder
 

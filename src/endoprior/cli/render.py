@@ -11,6 +11,7 @@ import tyro
 from ..core.checks import input_error
 from ..doctor.choice import Wanted
 from .devices import on_device
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -40,9 +41,14 @@ class Render:
     """Device; auto uses CUDA only if all of it works (`endoprior doctor`)."""
 
 
+HELP = Help(
+    examples=(("RUN",), ("RUN", "OUT", "--split", "test"), ("RUN", "OUT", "--camera", "sway")),
+)
+
+
 def run(argv: list[str]) -> None:
     """Load the scene and render it."""
-    args = parse(Render, argv, "render")
+    args = parse(Render, argv, "render", HELP)
     from ..model.scene import load_scene
 
     scene = load_scene(args.run)

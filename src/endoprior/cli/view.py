@@ -14,6 +14,7 @@ import tyro
 from ..core.checks import InputError, input_error
 from ..doctor.choice import Wanted
 from .devices import on_device
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -44,9 +45,12 @@ class View:
     """Device that renders a run; auto uses CUDA only if all of it works (`endoprior doctor`)."""
 
 
+HELP = Help(examples=(("RUN",), ("DATA", "--port", "9000")))
+
+
 def run(argv: list[str]) -> None:
     """Serve until interrupted."""
-    args = parse(View, argv, "view")
+    args = parse(View, argv, "view", HELP)
     from ..view.access_control import check_address
 
     check_address(args.host, args.port)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.checks import input_error
 from ..system.atomic import whole_file, whole_folder, write_json
-from .formats import FORMATS, Format, Progress, load_format
+from .formats import FORMATS, Format, Progress, format_of, load_format
 from .options import DEFAULTS, ExportOptions
 
 if TYPE_CHECKING:
@@ -26,17 +26,38 @@ def export(
     Returns:
         What was written: one file, or one folder.
     Raises:
-        InputError: an option has no meaning for the format, `out` does not suit it, or there is nothing to write.
+        InputError: no format is named, neither by the options nor by `out`; an option has no meaning for the format;
+            `out` does not suit it; or there is nothing to write.
     """
-    chosen = load_format(options.format)
+    name = options.format or format_of(out)
+    if name is None:
+        got = f"the suffix {out.suffix}" if out.suffix else "a name without a suffix"
+        fix = f"Add --format with one of {', '.join(FORMATS)}."
+        raise input_error(out, "a file whose suffix says the format, or --format", got, fix)
+    options, chosen = replace(options, format=name), load_format(name)
     _reject_unused_options(options, chosen)
     options = replace(options, frame=options.frame or chosen.default_axes)
+    if chosen.suffix_option:
+        options = replace(options, **{chosen.suffix_option: _by_suffix(out, options, chosen)})
     if chosen.write:
-        _check_file(out, chosen.suffixes, options.format)
+        _check_file(out, chosen.suffixes, name)
         chosen.write(scene, out, options, progress)
     else:
         _export_time_steps(scene, out, options, chosen, progress)
     return [out]
+
+
+def _by_suffix(out: Path, options: ExportOptions, chosen: Format) -> str:
+    """The value of the option that chooses between the format's suffixes: as given, else as the file is named.
+
+    Raises:
+        InputError: both are given, and differ.
+    """
+    given, option = getattr(options, chosen.suffix_option), chosen.suffix_option.replace("_", "-")
+    named = out.suffix.removeprefix(".") if out.suffix in chosen.suffixes else None
+    if given and named and given != named:
+        raise input_error(f"--{option} {given}", f"a file that ends in .{given}", str(out), f"Remove --{option}.")
+    return given or named or chosen.suffixes[0].removeprefix(".")
 
 
 def _reject_unused_options(options: ExportOptions, chosen: Format) -> None:

@@ -51,10 +51,17 @@ class Format:
     """The contents of the files of one time step, by suffix."""
     write: Callable[[Scene, Path, ExportOptions, Progress], None] | None = None
     """Writes one output for the whole sequence."""
+    suffix_option: str = ""
+    """Field of `ExportOptions` that chooses between the suffixes, as `mesh_format`; by default the file's name does."""
     default_axes: Axes = "opencv"
     """What --frame stands for where it is not given."""
     index_facts: Mapping[str, Any] | None = None
     """What `index.json` says of the files' units, for a format without axes in mm."""
+
+
+def format_of(out: Path) -> str | None:
+    """The format that a file name stands for: of those that write its suffix the first in `FORMATS`; None if none."""
+    return next((name for name in FORMATS if out.suffix in load_format(name).suffixes), None)
 
 
 def load_format(name: str) -> Format:

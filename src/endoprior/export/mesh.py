@@ -99,4 +99,5 @@ FORMAT = Format(
     suffixes=(".ply", ".obj", ".stl"),
     options=(*TIME_STEP_OPTIONS, *("mesh_format", "mesh_method", "mesh_step", "max_slope", "voxel_mm", "min_alpha")),
     files=files,
+    suffix_option="mesh_format",
 )
