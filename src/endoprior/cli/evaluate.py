@@ -14,6 +14,7 @@ from .devices import on_device
 from .help_page import Help
 from .parsing import parse
 from .progress import say
+from .score_table import score_table
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
@@ -73,18 +74,16 @@ def evaluate_run(
     Depth is scored against measured depth, even where the run's preset trained on filled-in depth.
     """
     from ..data import load_sequence
-    from ..evaluation.registry import all_scores
     from ..evaluation.scoring import evaluate, scored_data
 
     sequence = load_sequence(data, scored_data(scene.config.data))
     result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir)
     result.scores |= extra
     result.save(out)
-    say(f"\nscores on the {split} split ({len(sequence.indices(split))} frames)")
-    for name, value in result.scores.items():
-        say(f"  {name:<28}{all_scores()[name].text(value)}")
-    for name, reason in result.skipped.items():
-        say(f"  {name:<28}skipped: {reason}")
+    better = "\u2191 higher is better, \u2193 lower is better"
+    say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({better})")
+    for line in score_table(result.scores, result.skipped):
+        say(line)
     if outliers := result.outlier_frames():
         frames = ", ".join(map(str, outliers))
         say(
@@ -92,7 +91,7 @@ def evaluate_run(
         )
     if sequence.depth_is_relative:
         say("note: the sequence's depth is relative: scores in mm compare runs on it, but are not millimeters")
-    say(f"{out / 'metrics.json'}")
+    say(f"all scores: {out / 'metrics.json'}; what they mean: docs/scores.md")
 
 
 def sequence_of_run(run_folder: Path) -> Path:
