@@ -23,7 +23,7 @@ COMMANDS = {
     "render": "render a trained scene: color, depth, side-by-side, video",
     "export": "write open formats: PLY, splat, SPZ, glTF, mesh, points, tracks, depth, video",
     "view": "show a trained scene, or a sequence before training, in a web browser",
-    "doctor": "report whether this machine can use CUDA, and what to install for it",
+    "doctor": "report whether this computer can train and use a GPU, and what to install for it",
     "bench": "compare methods on sequences over seeds, under one protocol",
 }
 """Name and one-line description. Each command is a module of this package with the same name (`eval`: `evaluate`)."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Doctor:
-    """Report whether this machine can use CUDA, and what to install for it."""
+    """Report whether this computer can train, whether its GPU can be used, and what to install for it."""
 
     compile: bool = False
     """Compile gsplat now, which takes minutes, and render with it. Without a GPU, as in a container build, it compiles
