@@ -257,7 +257,7 @@ def test_a_folder_of_specs_shares_equal_cells(tmp_path, capsys):
     text = (tmp_path / "out" / "results.md").read_text()
     assert text.startswith("# Results\n\n## Tiny") and text.count("## Tiny") == 2 and text.count("## Protocol") == 1
     assert main(["bench", str(tmp_path / "tiny"), str(tmp_path / "out")]) == 2
-    assert "got none. Fix: pass a folder of specs" in capsys.readouterr().err
+    assert "got none. Fix: Pass a folder of specs" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -125,8 +125,10 @@ def test_short_names_stand_for_config_fields(parsed):
         (["c"], "endoprior train: expected DATA OUT, got c."),
         (["--iterations", "x"], "--iterations: expected an integer, got 'x'."),
         (["--device=gpu"], "--device: expected one of auto, cpu, cuda, got 'gpu'."),
+        (["--data.shrink", "2", "--data.stride", "x"], "--data.stride: expected an integer, got 'x'."),
+        (["--min-valid", "3"], "got --min-valid. Fix: Did you mean --temporal.min-valid? "),
         (["--seed"], "--seed: expected an integer, got nothing."),
-        (["--gaussians", "0"], "budget must be in"),
+        (["--gaussians", "0"], "endoprior: --gaussians must be in [1, 1e+07], got 0. Fix: "),
     ],
 )
 def test_a_wrong_option_is_named_with_what_was_meant(words, said, capsys):

@@ -67,7 +67,7 @@ def run(argv: list[str]) -> None:
     if args.json:
         write_json(args.json, as_json(facts, findings))
     draw_check(sequence, facts, findings, args.out)
-    say(f"{args.out}")
+    say(f"figure: {args.out}")
     errors = [finding for finding in findings if finding.severity == "error"]
     if args.strict and errors:
         raise InputError(f"{args.folder}: expected no errors with --strict, got {len(errors)}: {errors[0]}")

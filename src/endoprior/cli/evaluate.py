@@ -27,17 +27,17 @@ class Eval:
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder."""
     data: Path | None = None
-    """Sequence folder; default: the one the run was trained on."""
+    """Sequence folder. Default: the one the run was trained on."""
     split: Literal["test", "train", "video"] = "test"
     """Frames to score."""
     out: Path | None = None
-    """Folder for the two files."""
+    """Folder for the two files. Default: RUN."""
     networks: bool = True
-    """Also compute the scores that need a network (RAFT, LPIPS), where their weights are found."""
+    """Scores by networks (RAFT, LPIPS). They need their weights."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     device: Wanted = "auto"
-    """Where to render; `auto` uses CUDA only if everything it needs works (see `endoprior doctor`)."""
+    """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
 
 HELP = Help(examples=(("RUN",), ("RUN", "--split", "train", "--out", "OTHER")))
@@ -50,7 +50,7 @@ def run(argv: list[str]) -> None:
     from .output_paths import require_writable_folder
 
     if args.weights_dir and not args.weights_dir.is_dir():
-        raise input_error(args.weights_dir, "a folder of network weights", "none", "correct --weights-dir.")
+        raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
     scene = load_scene(args.run)
     require_writable_folder(
         "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
@@ -86,11 +86,10 @@ def evaluate_run(
         say(line)
     if outliers := result.outlier_frames():
         frames = ", ".join(map(str, outliers))
-        say(
-            f"note: tissue PSNR of frames {frames} is more than 3 dB below the median; see them with `endoprior render`"
-        )
+        look = f"endoprior render RUN --split {split}"
+        say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median. To see them: `{look}`")
     if sequence.depth_is_relative:
-        say("note: the sequence's depth is relative: scores in mm compare runs on it, but are not millimeters")
+        say("note: the depth of the sequence is relative. Scores in mm compare runs on it, but are not millimeters.")
     say(f"all scores: {out / 'metrics.json'}; what they mean: docs/scores.md")
 
 
@@ -103,7 +102,7 @@ def sequence_of_run(run_folder: Path) -> Path:
     from ..data.files import read_json
     from ..data.reading import kind_of
 
-    file, hint = run_folder / "config.json", "pass --data FOLDER."
+    file, hint = run_folder / "config.json", "Pass --data FOLDER."
     facts = read_json(file, hint).get("data")
     path = facts.get("path") if isinstance(facts, dict) else None
     if not isinstance(path, str) or not path:

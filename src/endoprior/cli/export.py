@@ -53,4 +53,4 @@ def run(argv: list[str]) -> None:
     for path in written:
         say(f"{path}")
     if scene.lengths_are_relative:
-        say("note: the scale of this scene is assumed: its lengths are not millimeters")
+        say("note: the scale of this scene is assumed. Its lengths are not millimeters.")

@@ -56,6 +56,11 @@ class Option:
         return (self.name, self.off) if self.is_flag else (self.name,)
 
 
+def option_name(word: str) -> str:
+    """The name of an option as it is typed, without a value behind `=`; underscores are hyphens, as tyro has it."""
+    return word.partition("=")[0].replace("_", "-")
+
+
 def options(cls: type, default: Any = None) -> list[Option]:
     """Every argument of the command `cls`, in the order of its fields.
 

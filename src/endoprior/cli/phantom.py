@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from ..core.shell import command
 from ..phantom import PhantomConfig
 from .help_page import Help
 from .parsing import parse
@@ -39,3 +40,4 @@ def run(argv: list[str]) -> None:
 
     write_phantom(args.out, args.config)
     say(f"{args.out}: {args.config.frames} frames of {args.config.width}x{args.config.height}")
+    say(f"next: {command('train', args.out, 'RUN')}")

@@ -41,4 +41,4 @@ def run(argv: list[str]) -> None:
 
     sequence = load_sequence(args.data)
     sheet = write_prior_maps(sequence, args.split, args.config, args.out)
-    say(f"{len(sequence.indices(args.split))} frames\n{sheet}")
+    say(f"{len(sequence.indices(args.split))} frames: {args.out}\ncontact sheet: {sheet}")

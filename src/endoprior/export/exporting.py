@@ -65,7 +65,7 @@ def _reject_unused_options(options: ExportOptions, chosen: Format) -> None:
         given = getattr(options, field.name) != getattr(DEFAULTS, field.name)
         if given and field.name not in ("format", *chosen.options):
             known = ", ".join(f"--{name.replace('_', '-')}" for name in chosen.options) or "no options"
-            want, fix = f"an option of --format {options.format}", f"leave it out. The format takes {known}."
+            want, fix = f"an option of --format {options.format}", f"Leave it out. The format takes {known}."
             raise input_error(f"--{field.name.replace('_', '-')}", want, "one that it does not use", fix)
 
 
@@ -76,7 +76,7 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
     if out.suffix in {suffix for name in FORMATS for suffix in load_format(name).suffixes}:
         _check_file(out, chosen.suffixes, options.format)
         if len(steps) != 1:
-            fix = "pass --times T, or a folder instead of a file."
+            fix = "Pass --times T with T in [0, 1], or a folder instead of a file."
             raise input_error(out, "one time step for one file", f"{len(steps)}", fix)
         contents = chosen.files(scene, steps[0], options)
         _check_file(out, tuple(contents), options.format)
@@ -100,10 +100,12 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
 def _check_file(out: Path, suffixes: tuple[str, ...], name: str) -> None:
     if suffixes and out.suffix not in suffixes:
         want = f"a file name that ends in {' or '.join(suffixes)} for --format {name}"
-        raise input_error(out, want, out.suffix or "no suffix", "choose another name.")
+        raise input_error(out, want, out.suffix or "no suffix", "Choose another name.")
     if suffixes and out.is_dir():
-        raise input_error(out, "the name of a file", "a folder", "choose another name.")
+        raise input_error(out, "the name of a file", "a folder", "Choose another name.")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise input_error(out, "a place where a file can be written", f"{error.strerror}", "choose another.") from error
+        raise input_error(
+            out, "a place where a file can be written", f"{error.strerror}", "Choose another place."
+        ) from error
