@@ -220,7 +220,7 @@ def test_two_benchmarks_do_not_share_a_folder(tmp_path, capsys):
         (["--threads", "0"], "--threads: expected 1 to 4096"),
         (["--data", "tiny"], "NAME=FOLDER"),
         (["--data", "x=y"], "expected one of absent, tiny"),
-        (["--weights-dir", "nowhere"], "expected a folder of network weights"),
+        (["--weights-dir", "nowhere"], "expected a folder with weights"),
     ],
 )
 def test_bad_options_are_named(tmp_path, capsys, options, said):
