@@ -56,7 +56,10 @@ def test_every_command_explains_itself(command, capsys):
         (["train", "nowhere", "out", "--sed", "1"], "--sed"),
         (["train", "nowhere", "out", "--preset", "best"], "--preset"),
         (["train", "nowhere", "out", "--seed", "one"], "one"),
-        (["train", "nowhere", "out", "--density.min-densify-weight", "2"], "--density.min-densify-weight must be in"),
+        (
+            ["train", "nowhere", "out", "--density.min-densify-weight", "2"],
+            "--density.min-densify-weight: min_densify_weight must be in",
+        ),
         pytest.param(["train", "nowhere", "out", "--device", "cuda"], "--device", marks=pytest.mark.slow),
         (["train", "nowhere", "out", "--render.backend", "triton"], "--device cuda"),
         (["train", "nowhere", "out", "--render.backend", "gsplat", "--device", "cpu"], "--render.backend gsplat"),

@@ -272,6 +272,7 @@ def test_scene_is_the_file_of_the_run(run, tmp_path):
     ("out", "options", "said"),
     [
         ("a.ply", ("ply",), "--times"),
+        ("a.glb", ("gltf",), "or --format animation for all of them."),
         ("a.ply", ("ply", "--times", "2"), "times must be in"),
         ("a.splat", ("ply", "--times", "0"), ".ply"),
         ("a.stl", ("mesh", "--times", "0", "--mesh-format", "obj"), "Remove --mesh-format"),

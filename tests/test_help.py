@@ -128,7 +128,7 @@ def test_short_names_stand_for_config_fields(parsed):
         (["--data.shrink", "2", "--data.stride", "x"], "--data.stride: expected an integer, got 'x'."),
         (["--min-valid", "3"], "got --min-valid. Fix: Did you mean --temporal.min-valid? "),
         (["--seed"], "--seed: expected an integer, got nothing."),
-        (["--gaussians", "0"], "endoprior: --gaussians must be in [1, 1e+07], got 0. Fix: "),
+        (["--gaussians", "0"], "endoprior: --gaussians: budget must be in [1, 1e+07], got 0. Fix: "),
     ],
 )
 def test_a_wrong_option_is_named_with_what_was_meant(words, said, capsys):

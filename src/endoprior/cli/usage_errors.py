@@ -59,8 +59,8 @@ def usage_error(
     by_name = {name: option for option in arguments for name in option.names}
     for word, value in zip(argv, [*argv[1:], ""], strict=True):
         option = by_name.get(short.get(option_name(word), option_name(word)))
-        if option and (beyond := re.match(rf"\S+: {_last_part(option.name).replace('-', '_')} (must .*)", text)):
-            return InputError(f"{option_name(word)} {beyond[1]}. Fix: {fix}")
+        if option and (beyond := re.match(rf"\S+: ({_last_part(option.name).replace('-', '_')} must .*)", text)):
+            return InputError(f"{option_name(word)}: {beyond[1]}. Fix: {fix}")
         if option and re.search(rf"{re.escape(option.name)}(?![\w-]|\.\w)", text):
             got = word.partition("=")[2] or value
             return input_error(option_name(word), _in_words(option.metavar), repr(got) if got else "nothing", fix)

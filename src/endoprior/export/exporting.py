@@ -76,7 +76,9 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
     if out.suffix in {suffix for name in FORMATS for suffix in load_format(name).suffixes}:
         _check_file(out, chosen.suffixes, options.format)
         if len(steps) != 1:
-            fix = "Pass --times T with T in [0, 1], or a folder instead of a file."
+            moving = [n for n in FORMATS if load_format(n).write and out.suffix in load_format(n).suffixes]
+            instead = "".join(f", or --format {each} for all of them" for each in moving)
+            fix = f"Pass --times T with T in [0, 1], or a folder instead of a file{instead}."
             raise input_error(out, "one time step for one file", f"{len(steps)}", fix)
         contents = chosen.files(scene, steps[0], options)
         _check_file(out, tuple(contents), options.format)
