@@ -191,7 +191,7 @@ def test_exposure_jump(data):
     finding = only(data, "exposure-jump")
     assert str(finding) == (
         "warning: exposure-jump: the brightness of the whole image jumps at frame 11. "
-        f"Fix: endoprior train {data} RUN --data.first-frames 11."
+        f"Fix: endoprior train {data} RUN --data.first-frames 11"
     )
 
 
