@@ -11,19 +11,23 @@ from typing import Annotated
 import tyro
 
 from ..core.checks import input_error
+from ..experiments.ready_specs import find_spec, spec_names, specs_of
 from .parsing import parse
 from .progress import say
 
 MOST_CORES = 4096
 """Largest --cores and --threads."""
+SPEC_HELP = (
+    "A .yaml or .toml file, a folder of them, or a name. `quick` takes minutes, `sized` has the paper's tables, sized "
+    f"for two cores, `full` at full size. All names: {', '.join(spec_names())}."
+)
 
 
 @dataclass
 class Bench:
     """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
 
-    spec: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="SPEC")]]
-    """A .yaml or .toml file, or a folder of them; bench/specs/ has those of the paper's tables."""
+    spec: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="SPEC", help=SPEC_HELP)]]
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0
@@ -56,8 +60,8 @@ def run(argv: list[str]) -> int:
             raise input_error(option, f"{least} to {MOST_CORES}", f"{value}", "correct it.")
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder of network weights", "none", "correct --weights-dir.")
-    specs = _specs(args.spec)
-    loaded = {path: load_spec(path, _folders(args.data)) for path in specs}
+    source = find_spec(args.spec)
+    loaded = {path: load_spec(path, _folders(args.data)) for path in specs_of(source)}
     require_writable_folder("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
@@ -78,7 +82,7 @@ def run(argv: list[str]) -> int:
             executor = local_executor(max(1, (args.cores or _cores()) // args.threads))
         with executor as execute:
             for path, spec in loaded.items():
-                folder = args.out / path.stem if args.spec.is_dir() else args.out
+                folder = args.out / path.stem if source.is_dir() else args.out
                 say(f"{path}: {spec.title}")
                 matrix = run_matrix(
                     spec, args.out, execute, threads=args.threads, weights_dir=args.weights_dir, progress=say
@@ -86,7 +90,7 @@ def run(argv: list[str]) -> int:
                 report = write_report(matrix, folder)
                 failed, reports[folder] = failed + matrix.failed, matrix
                 say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\n{report}")
-    if args.spec.is_dir():
+    if source.is_dir():
         say(str(write_overview(reports, args.out)))
     return 1 if failed else 0
 
@@ -94,16 +98,6 @@ def run(argv: list[str]) -> int:
 def _cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _specs(path: Path) -> list[Path]:
-    """The spec, or those of a folder, sorted by name."""
-    if not path.is_dir():
-        return [path]
-    specs = sorted(file for file in path.iterdir() if file.suffix in (".yaml", ".yml", ".toml"))
-    if not specs:
-        raise input_error(path, ".yaml or .toml files", "none", "pass a folder of specs.")
-    return specs
 
 
 def _folders(data: tuple[str, ...]) -> dict[str, Path]:
