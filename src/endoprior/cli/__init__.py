@@ -10,6 +10,7 @@ import sys
 from importlib import import_module
 
 from ..core.checks import InputError, input_error
+from ..system.installation import docs_folder
 from ..system.memory import reject_small_limits
 
 COMMANDS = {
@@ -107,5 +108,6 @@ def overview() -> str:
             *lines,
             "",
             "`endoprior COMMAND --help` explains every option.",
+            f"Pages that messages name are in {docs_folder()}",
         ]
     )
