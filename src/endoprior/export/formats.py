@@ -28,6 +28,8 @@ FORMATS = (
     "gltf",
     "points",
     "mesh",
+    "animation",
+    "slicer",
     "depth",
     "tracks",
     "video",
