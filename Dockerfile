@@ -1,6 +1,6 @@
 # The program for the CPU. Build and use: docs/install.md.
 FROM python:3.12-slim
-# Numba's thread pool.
+# OpenMP, for Numba's threads.
 RUN apt-get update && apt-get install -y --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/*
 WORKDIR /source
 COPY pyproject.toml setup.py constraints.txt README.md LICENSE ./
