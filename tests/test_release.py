@@ -103,7 +103,7 @@ def test_the_source_package_holds_what_the_repository_holds(checkout, built):
     with tarfile.open(next(built.glob("*.tar.gz"))) as file:
         found = {name.partition("/")[2] for name in file.getnames()}
     tracked = output("git", "ls-files", cwd=checkout).split()
-    assert {*tracked} - found <= {".gitignore"}
+    assert {*tracked} <= found
     assert {"Makefile", "constraints.txt", "docs/prepare.md", "tests/test_release.py"} <= found
 
 
