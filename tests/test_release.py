@@ -7,6 +7,7 @@ import subprocess
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -111,8 +112,8 @@ def test_the_wheel_works_outside_of_the_repository(endoprior, commit, tmp_path):
     def run(*words: str) -> str:
         return output(endoprior, *words, cwd=tmp_path)
 
-    # A command that a user would start with belongs into this test.
-    assert run("--version").strip() == "0.1.0"
+    # Every command that a new user starts with belongs here.
+    assert run("--version").strip() == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     help_text, doctor = run("--help"), run("doctor")
     assert f"commit {commit};" in doctor
     (docs,) = {Path(text.split("in ")[-1].strip()) for text in help_text.splitlines() if text.endswith("docs")}
