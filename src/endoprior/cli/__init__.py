@@ -11,6 +11,7 @@ import sys
 from importlib import import_module
 
 from ..core.checks import InputError, input_error
+from ..system.installation import docs_folder
 from ..system.memory import reject_small_limits
 
 COMMANDS = {
@@ -111,5 +112,6 @@ def overview() -> str:
             *lines,
             "",
             "`endoprior COMMAND --help` shows what most users need, `--help-all` every option.",
+            f"Pages that messages name are in {docs_folder()}",
         ]
     )
