@@ -21,7 +21,6 @@ DIFFERENT = {
     "os.fork": "not on Windows",
     "cv2.imread": "no names beyond ASCII on Windows: data.images.decode_image",
     "cv2.imwrite": "no names beyond ASCII on Windows: data.images.save_png",
-    "tempfile.TemporaryFile": "tries names without end in a read-only folder on Windows",
 }
 """Calls that must not be in the source."""
 

@@ -24,11 +24,6 @@ def command(name: str, *words: str | Path) -> str:
     return " ".join(["endoprior", name, *(quoted(_not_an_option(word)) for word in words)])
 
 
-def install(extra: str) -> str:
-    """The command that installs an extra of this package, in double quotes, which every shell takes."""
-    return f'pip install "endoprior[{extra}]"'
-
-
 def quoted(word: str | Path) -> str:
     """One word of a command, in quotes if the shell would change it."""
     text = os.fspath(word)

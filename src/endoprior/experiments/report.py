@@ -86,12 +86,13 @@ def _some(names: list[str]) -> str:
 
 
 def _protocol(matrices: list[Matrix], level: int) -> list[str]:
-    """The protocol of the scores, from the first finished cell."""
+    """The protocol of the scores, from the first finished cell that has all of it: images have no backend."""
     folders = [folder for matrix in matrices for folder in matrix.done.values()]
     if not folders:
         return []
     hidden = ("frames", "data_fingerprint", "shrink")
-    shown = {name: text for name, text in scores_of(folders[0])["protocol"].items() if name not in hidden}
+    whole = max((scores_of(folder)["protocol"] for folder in folders), key=len)
+    shown = {name: text for name, text in whole.items() if name not in hidden}
     return [f"{'#' * level} Protocol", "\n".join(f"- `{name}`: {text}" for name, text in shown.items())]
 
 
