@@ -11,8 +11,8 @@ from typing import Annotated
 import tyro
 
 from ..core.checks import input_error
+from ..system.console import say
 from .parsing import parse
-from .progress import say
 
 MOST_CORES = 4096
 """Largest --cores and --threads."""

@@ -10,8 +10,8 @@ import tyro
 
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
+from ..system.console import say
 from .parsing import parse
-from .progress import say
 
 
 @dataclass

@@ -10,8 +10,8 @@ from typing import Annotated
 import tyro
 
 from ..core.presets import PresetName, preset
+from ..system.console import say
 from .parsing import parse
-from .progress import say
 
 
 @dataclass

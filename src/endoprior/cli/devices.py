@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..doctor.choice import Wanted, choose_here
-from .progress import say
+from ..system.console import say
 
 if TYPE_CHECKING:
     from ..model.scene import Scene

@@ -6,8 +6,8 @@ import json as json_text
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ..system.console import say
 from .parsing import parse
-from .progress import say
 
 if TYPE_CHECKING:
     from ..doctor import Facts

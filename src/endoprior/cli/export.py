@@ -10,8 +10,9 @@ from typing import Annotated
 import tyro
 
 from ..export.options import ExportOptions
+from ..system.console import say
 from .parsing import parse
-from .progress import Counting, say
+from .progress import Counting
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ from typing import Annotated
 import tyro
 
 from ..phantom import PhantomConfig
+from ..system.console import say
 from .parsing import parse
-from .progress import say
 
 
 @dataclass

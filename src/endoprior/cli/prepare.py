@@ -10,8 +10,9 @@ import tyro
 
 from ..core.shell import command
 from ..prepare.config import PrepareConfig
+from ..system.console import say
 from .parsing import parse
-from .progress import Counting, say
+from .progress import Counting
 
 
 @dataclass

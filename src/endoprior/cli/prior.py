@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 import tyro
 
 from ..core.config import PriorConfig
+from ..system.console import say
 from .parsing import parse
-from .progress import say
 
 
 @dataclass

@@ -94,8 +94,7 @@ class RenderedFrames:
         frame = self._sequence.frame(index)
         out = self._scene.render(frame.time, frame.camera)
         color = out.color.cpu().numpy()
-        exact = np.clip(color, 0, 1) if index in self._scored else None
-        return RenderedFrame(exact, to_uint8(color), out.depth.cpu().numpy())
+        return RenderedFrame(color if index in self._scored else None, to_uint8(color), out.depth.cpu().numpy())
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import yaml
 
 from ..core.checks import InputError, input_error
 from ..core.config import Config
-from ..core.config_io import current_value, from_dict, to_dict
+from ..core.config_io import from_dict, override, to_dict
 from ..core.presets import PresetName, preset
 from ..data.formats import FORMATS
 from ..data.reading import read_text
@@ -28,8 +28,6 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 """Names of methods and sequences become folders."""
 MOST_EXTENDED = 8
 MOST_CELLS = 100_000
-FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
-"""A value such as `x0.75` multiplies the value of the preset and of the settings before it."""
 
 
 @dataclass(frozen=True)
@@ -134,26 +132,12 @@ class Spec:
             (f"set_for.{chosen.preset}", self.set_for.get(chosen.preset, {})),
             (f"methods.{method}.set", chosen.set),
         ):
-            for name, value in overrides.items():
-                _override(values, name, value, where)
+            override(values, overrides, where)
         values["data"] |= data.reading
         if budget is not None:
             values["init"]["budget"] = budget
         values["seed"] = seed
         return from_dict(Config, values, f"methods.{method}")
-
-
-def _override(values: dict[str, Any], name: str, value: Any, where: str) -> None:
-    *path, last = name.split(".")
-    for part in path:
-        values = values.get(part)
-        if not isinstance(values, dict):
-            break
-    if not isinstance(values, dict) or last not in values or isinstance(values[last], dict):
-        raise input_error(where, "the dotted name of a config field", f"{name}", "see `endoprior train -h`.")
-    if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(values[last]) in (int, float):
-        value = type(values[last])(values[last] * float(factor[1]))
-    values[last] = current_value(name, value, hint=True)
 
 
 def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
