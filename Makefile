@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-all test-faults lint browser bench figures clean
+.PHONY: demo test test-all test-faults lint browser bench figures docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
@@ -25,8 +25,8 @@ test-faults: $(VENV)/.test-installed
 	$(BIN)/python faults/run.py $(FAULTS)
 
 lint: $(VENV)/.test-installed
-	$(BIN)/ruff check src tests bench faults
-	$(BIN)/ruff format --check src tests bench faults
+	$(BIN)/ruff check src tests bench faults docs
+	$(BIN)/ruff format --check src tests bench faults docs
 
 # The viewer and the player are tested in headless Chromium. Where there is none, Debian's package is installed if that is
 # possible without asking; otherwise those tests are skipped, and say so.
@@ -42,6 +42,12 @@ bench: $(VENV)/.installed
 # The documentation's pictures; ENDOPRIOR_DATA holds the two clips.
 figures: $(VENV)/.test-installed browser
 	$(BIN)/python bench/figures.py figures
+	$(BIN)/python bench/method_figures.py figures
+
+# The site, in build/docs/html; it needs no network. Warnings, such as a link that leads nowhere, are errors.
+docs: $(VENV)/.docs-installed
+	$(BIN)/python -m sphinx -W --keep-going -q -c docs . build/docs/html
+	@echo "build/docs/html/index.html"
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
@@ -54,6 +60,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 $(VENV)/.test-installed: $(VENV)/.installed
 	$(PIP) -c constraints.txt -e '.[test]'
+	touch $@
+
+$(VENV)/.docs-installed: $(VENV)/.installed
+	$(PIP) -c constraints.txt -e '.[docs]'
 	touch $@
 
 clean:

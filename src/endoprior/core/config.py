@@ -375,7 +375,7 @@ class Config(Checked):
         """This config with other values: `preset("default").replace({"seed": 1, "optim.means_lr": 2e-3})`.
 
         Args:
-            changes: new value by the field's dotted name, as `endoprior train --help` lists them without the dashes.
+            changes: new value by the field's dotted name; docs/config.md lists all fields.
         Raises:
             InputError: no field has this name, or the value has the wrong type or range.
         """

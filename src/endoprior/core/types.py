@@ -98,7 +98,7 @@ class RenderedView:
 
     @property
     def color(self) -> Tensor:
-        """(H, W, 3) color in [0, 1]: an image to show or save."""
+        """(H, W, 3) color in [0, 1], to show or save as an image."""
         return self.unclamped_color.clamp(0, 1)
 
 
