@@ -22,7 +22,7 @@ endoprior.preset = lambda name: full(name).replace({"init.budget": 200, "schedul
 
 
 def test_readmes_python_block_runs_as_it_stands(tiny_sequence, tmp_path):
-    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     assert '"DATA"' in block and '"RUN"' in block
     checks = 'assert view.color.shape == (40, 48, 3) and "psnr" in scores and len(splats.means)\n'
     checks += "assert len(losses) == 3 and scene.config.optim.means_lr == 2e-3 and scene.config.seed == 1\n"
@@ -49,7 +49,7 @@ def test_no_module_below_the_package_has_a_public_name():
 
 def test_public_names_are_typed_and_listed_once():
     assert (PACKAGE / "py.typed").is_file()
-    tree = ast.parse((PACKAGE / "__init__.py").read_text())
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
     (guarded,) = (node for node in tree.body if isinstance(node, ast.If))
     typed = {alias.name: node.module for node in guarded.body for alias in node.names}
     assert typed == endoprior.HOMES and sorted(typed) == endoprior.__all__ == dir(endoprior)

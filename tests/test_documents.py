@@ -24,7 +24,7 @@ COMMANDS_OF_THE_LOG = ROOT / "docs" / "log.md"
 """What it tells of belongs to earlier versions."""
 CURRENT = [page for page in PAGES if page not in (COMMANDS_OF_THE_LOG, ROOT / "CHANGELOG.md")]
 ELSEWHERE = ("http://", "https://", "mailto:")
-TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
 OWN_PATH = re.compile(r"(?<![\w/])(?:bench|docs|faults|src|tests)/[\w./*-]+")
 PLACEHOLDERS = {"COMMAND", "...", "NAME"}
 """Words that stand for a command, a choice or the rest of a line."""

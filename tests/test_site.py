@@ -34,7 +34,7 @@ def field_names(values: dict, prefix: str = "") -> list[str]:
 
 
 def test_every_page_is_in_the_table_of_contents():
-    index = (ROOT / "docs" / "index.md").read_text()
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     listed = set(PAGES_LISTED.findall(index))
     pages = {page.stem for page in ROOT.glob("docs/*.md")} - {"index"}
     pages |= {f"../{page.stem}" for page in ROOT.glob("*.md")}
@@ -43,7 +43,7 @@ def test_every_page_is_in_the_table_of_contents():
 
 
 def test_every_public_name_is_in_the_reference():
-    page = (ROOT / "docs" / "api.md").read_text()
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     for name in endoprior.__all__:
         assert f":: endoprior.{name}" in page, name
 
@@ -71,10 +71,10 @@ def test_the_site_builds_and_is_complete_without_the_network(tmp_path):
     for file in tmp_path.rglob("*"):
         if file.suffix in (".html", ".css"):
             assert not (found := FETCHED.search(file.read_text(encoding="utf-8"))), f"{file}: {found[0]}"
-    commands, config = ((tmp_path / "docs" / f"{name}.html").read_text() for name in ("cli", "config"))
+    commands, config = ((tmp_path / "docs" / f"{name}.html").read_text(encoding="utf-8") for name in ("cli", "config"))
     for name in COMMANDS:
         assert f"usage: endoprior {name}" in unescape(commands), name
     for name in field_names(to_dict(Config())):
         assert f">{name}<" in config, name
-    method = (tmp_path / "docs" / "method.html").read_text()
+    method = (tmp_path / "docs" / "method.html").read_text(encoding="utf-8")
     assert method.count("<math") > 20 and "$" not in re.sub(r"<(script|math).*?</\1>", "", method, flags=re.DOTALL)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.checks import input_error
 from ..system.atomic import whole_file, whole_folder, write_json
-from .formats import FORMATS, Format, Progress, load_format
+from .formats import Format, Progress, all_suffixes, load_format
 from .options import DEFAULTS, ExportOptions
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
     from .time_steps import selected_time_steps
 
     steps = selected_time_steps(scene, options)
-    if out.suffix in {suffix for name in FORMATS for suffix in load_format(name).suffixes}:
+    if out.suffix in all_suffixes():
         _check_file(out, chosen.suffixes, options.format)
         if len(steps) != 1:
             fix = "pass --times T, or a folder instead of a file."

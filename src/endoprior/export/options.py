@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Literal
 
 from ..core.checks import check_range
-from .formats import FORMATS, Axes
+from .formats import FORMATS, REGISTRY, Axes
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
     """Options of an export. Each format takes some of them and rejects the others."""
 
-    format: Literal[FORMATS]
+    format: Literal[REGISTRY.names()]
     """What to write."""
     times: tuple[float, ...] = ()
     """Times in [0, 1] to export, instead of the frames of a split; frame i of T is at i / T."""
@@ -24,9 +24,9 @@ class ExportOptions:
     """Export the Gaussians as they are stored, before any motion, instead of time steps."""
     frame: Axes | None = None
     """Axes of the coordinates: opencv (x right, y down, z forward), opengl (y up, z back), ras or lps (for 3D Slicer).
-    Default: opengl for spz and gltf, whose specifications require it; else opencv."""
+    Default: opengl for spz, gltf and animation, whose specifications require it; else opencv."""
     min_alpha: float = 0.5
-    """A pixel shows a surface if its accumulated opacity is at least this (depth, mesh, tracks)."""
+    """A pixel shows a surface if its accumulated opacity is at least this (depth, meshes, tracks)."""
     min_opacity: float = 0.5
     """Least opacity of a Gaussian that becomes a point (points)."""
     mesh_format: Literal["ply", "obj", "stl"] = "ply"
