@@ -11,7 +11,7 @@ root_doc = "docs/index"
 include_patterns = ["*.md", "docs/*.md", "docs/notebooks/*.ipynb"]
 exclude_patterns = [path.name for path in ROOT.iterdir() if path.is_dir() and path.name != "docs"]
 
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb", "mathml", "generated"]
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb", "folders", "generated", "mathml"]
 default_role = "code"  # docstrings write `names` in single backticks
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"

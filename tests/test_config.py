@@ -64,7 +64,7 @@ def test_bad_configs_are_named(values, names):
 
 
 def test_unknown_preset():
-    with pytest.raises(InputError, match="preset: expected one of default, paper"):
+    with pytest.raises(InputError, match="preset: expected one of default, preview, paper"):
         preset("best")
 
 
@@ -107,7 +107,7 @@ def test_replaced_fields_are_set_and_the_others_stay():
         ({"optim.mean_lr": 1.0}, r"got optim\.mean_lr\. Fix: use `optim\.means_lr`\."),
         ({"budget": 3}, r"got budget\. Fix: use `init\.budget`\."),
         ({"init": 3}, "got init"),
-        ({"zzz": 3}, r"got zzz\. Fix: see `endoprior train --help`\."),
+        ({"zzz": 3}, r"got zzz\. Fix: see `endoprior train --help-all`\."),
         ({"init.budget": 0}, r"budget must be in \[1, 1e\+07\], got 0"),
         ({"init.budget": "many"}, r"config\.init\.budget: expected an integer"),
     ],

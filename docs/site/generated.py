@@ -18,16 +18,16 @@ from endoprior.core.config import Config
 from endoprior.core.presets import PresetName, preset
 
 COLUMNS = 88
-CONFIG_GROUP = re.compile(r"^ \S+ options *$", re.MULTILINE)
+CONFIG_GROUP = re.compile(r"^\S+ options:$", re.MULTILINE)
 """Heading of a group of config fields in the help of `train`."""
 
 
 def help_text(command: str) -> str:
-    """What `endoprior COMMAND --help` prints, without the fields of the config, which have a page of their own."""
+    """What `endoprior COMMAND --help-all` prints, without the fields of the config, which have a page of their own."""
     os.environ["COLUMNS"] = str(COLUMNS)
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-        main([command, "--help"])
+        main([command, "--help-all"])
     text = printed.getvalue()
     if command == "train":
         text = text[: CONFIG_GROUP.search(text).start()]

@@ -68,7 +68,7 @@ def override(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> 
             group = group.get(part) if isinstance(group, dict) else None
         if not isinstance(group, dict) or last not in group or isinstance(group[last], dict):
             nearest = difflib.get_close_matches(str(name), _dotted_names(values), 1)
-            fix = f"use `{nearest[0]}`." if nearest else "see `endoprior train --help`."
+            fix = f"use `{nearest[0]}`." if nearest else "see `endoprior train --help-all`."
             raise input_error(where, "the dotted name of a config field", str(name), fix)
         if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(group[last]) in (int, float):
             value = type(group[last])(group[last] * float(factor[1]))
