@@ -10,7 +10,7 @@ BETTER = {True: "higher", False: "lower", None: "-"}
 
 
 def test_every_score_has_one_scorer():
-    names = [score.name for scorer in scorers() for score in scorer.SCORES]
+    names = [score.name for scorer in scorers().values() for score in scorer.SCORES]
     assert len(names) == len(set(names)) == len(all_scores())
 
 

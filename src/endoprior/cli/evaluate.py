@@ -1,4 +1,4 @@
-"""`endoprior eval RUN`."""
+"""`endoprior eval RUN`, and `endoprior eval --pictures FOLDER DATA`."""
 
 from __future__ import annotations
 
@@ -17,21 +17,35 @@ from .progress import say
 from .score_table import score_table
 
 if TYPE_CHECKING:
+    from ..data import FrameSequence
+    from ..evaluation.context import Evaluation
     from ..model.scene import Scene
+
+
+MOST_MM_PER_UNIT = 1e6
+"""Largest --depth-scale."""
 
 
 @dataclass
 class Eval:
-    """Score a trained scene; writes metrics.json and per_frame.json into the run folder (or --out)."""
+    """Score a trained scene, or another program's images; writes metrics.json and per_frame.json."""
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
-    """Run folder."""
+    """Run folder; with --pictures the sequence folder."""
     data: Path | None = None
     """Sequence folder. Default: the one the run was trained on."""
     split: Literal["test", "train", "video"] = "test"
     """Frames to score."""
     out: Path | None = None
-    """Folder for the two files. Default: RUN."""
+    """Folder for the two files. Default: RUN, or the folder of --pictures."""
+    pictures: Path | None = None
+    """Score the frames in this folder, PNG of 8 or 16 bits, in place of a run (docs/benchmarks.md)."""
+    depth_pictures: Path | None = None
+    """Depth of these frames: NPY in mm, or 16-bit PNG with --depth-scale."""
+    depth_scale: float | None = None
+    """mm per unit of the depth files."""
+    name: str = ""
+    """Name of the method in metrics.json; Default: that of the folder."""
     networks: bool = True
     """Scores by networks (RAFT, LPIPS). They need their weights."""
     weights_dir: Path | None = None
@@ -51,6 +65,12 @@ def run(argv: list[str]) -> None:
 
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
+    if args.pictures:
+        evaluate_pictures(args, args.pictures)
+        return
+    if given := [o for o in ("depth_pictures", "depth_scale", "name") if getattr(args, o) not in (None, "")]:
+        option = f"--{given[0].replace('_', '-')}"
+        raise input_error(option, "--pictures beside it", "a run", f"remove {option} or add --pictures FOLDER.")
     scene = load_scene(args.run)
     require_writable_folder(
         "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
@@ -79,6 +99,37 @@ def evaluate_run(
     sequence = load_sequence(data, scored_data(scene.config.data))
     result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir)
     result.scores |= extra
+    save_and_print(result, sequence, out, split)
+
+
+def evaluate_pictures(args: Eval, folder: Path) -> None:
+    """Score the rendered frames in `folder` on the sequence that takes the place of the run."""
+    from ..data import load_sequence
+    from ..evaluation.pictures import Pictures
+    from ..evaluation.scoring import evaluate
+    from .output_paths import require_writable_folder
+
+    if args.data:
+        raise input_error("--data", "--pictures FOLDER DATA", "--data as well", "remove --data.")
+    if args.depth_scale is not None and not 0 < args.depth_scale <= MOST_MM_PER_UNIT:
+        want = f"a number above 0, up to {MOST_MM_PER_UNIT:g}"
+        raise input_error("--depth-scale", want, f"{args.depth_scale}", "correct it.")
+    out = args.out or folder
+    require_writable_folder("--out" if args.out else "--pictures", out)
+    sequence = load_sequence(args.run)
+    depth = {"depth_folder": args.depth_pictures, "depth_scale": args.depth_scale}
+    pictures = Pictures(folder, sequence, args.split, name=args.name, **depth)
+    for line in pictures.remarks:
+        say(line)
+    result = evaluate(pictures, sequence, args.split, networks=args.networks, weights_dir=args.weights_dir)
+    save_and_print(result, sequence, out, args.split)
+
+
+def save_and_print(
+    result: Evaluation, sequence: FrameSequence, out: Path, split: Literal["test", "train", "video"]
+) -> None:
+    """Write the two files into `out`, and print a table."""
+
     result.save(out)
     better = "\u2191 higher is better, \u2193 lower is better"
     say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({better})")

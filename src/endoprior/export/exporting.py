@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.checks import input_error
 from ..system.atomic import whole_file, whole_folder, write_json
-from .formats import FORMATS, Format, Progress, format_of, load_format
+from .formats import REGISTRY, Format, Progress, formats_of, load_format
 from .options import DEFAULTS, ExportOptions
 
 if TYPE_CHECKING:
@@ -29,10 +29,10 @@ def export(
         InputError: no format is named, neither by the options nor by `out`; an option has no meaning for the format;
             `out` does not suit it; or there is nothing to write.
     """
-    name = options.format or format_of(out)
+    name = options.format or next(iter(formats_of(out.suffix)), None)
     if name is None:
         got = f"the suffix {out.suffix}" if out.suffix else "a name without a suffix"
-        fix = f"Add --format with one of {', '.join(FORMATS)}."
+        fix = f"Add --format with one of {', '.join(REGISTRY.names())}."
         raise input_error(out, "a file whose suffix says the format, or --format", got, fix)
     options, chosen = replace(options, format=name), load_format(name)
     _reject_unused_options(options, chosen)
@@ -73,10 +73,10 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
     from .time_steps import selected_time_steps
 
     steps = selected_time_steps(scene, options)
-    if out.suffix in {suffix for name in FORMATS for suffix in load_format(name).suffixes}:
+    if same_suffix := formats_of(out.suffix):
         _check_file(out, chosen.suffixes, options.format)
         if len(steps) != 1:
-            moving = [n for n in FORMATS if load_format(n).write and out.suffix in load_format(n).suffixes]
+            moving = [name for name in same_suffix if load_format(name).write]
             instead = "".join(f", or --format {each} for all of them" for each in moving)
             fix = f"Pass --times T with T in [0, 1], or a folder instead of a file{instead}."
             raise input_error(out, "one time step for one file", f"{len(steps)}", fix)

@@ -11,6 +11,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ..system.plugins import Registry
+
 if TYPE_CHECKING:
     from ..model.scene import Scene
     from .options import ExportOptions
@@ -61,17 +63,36 @@ class Format:
     """What `index.json` says of the files' units, for a format without axes in mm."""
 
 
-def format_of(out: Path) -> str | None:
-    """The format that a file name stands for: of those that write its suffix the first in `FORMATS`; None if none."""
-    return next((name for name in FORMATS if out.suffix in load_format(name).suffixes), None)
+def _problem(found: Any) -> str:
+    if not isinstance(found, Format):
+        return f"an object of type {type(found).__name__}"
+    has_one = (found.files is None) != (found.write is None)
+    return "" if has_one else "a Format with both or none of files and write"
+
+
+REGISTRY: Registry[Format] = Registry(
+    "exporters",
+    FORMATS,
+    lambda name: import_module(f".{name}", __package__).FORMAT,
+    "a Format of endoprior.export.formats",
+    _problem,
+)
+"""The formats above, and those of plugins."""
 
 
 def load_format(name: str) -> Format:
     """The format of that name; imports its module.
 
     Raises:
+        InputError: it is a plugin that cannot be used.
         ValueError: there is none.
     """
-    if name not in FORMATS:
-        raise ValueError(f"format must be one of {', '.join(FORMATS)}; got {name!r}")
-    return import_module(f".{name}", __package__).FORMAT
+    if name not in REGISTRY.names():
+        raise ValueError(f"format must be one of {', '.join(REGISTRY.names())}; got {name!r}")
+    return REGISTRY.load(name)
+
+
+def formats_of(suffix: str) -> list[str]:
+    """Names of the formats that write files of this suffix: the one that it stands for first, plugins last."""
+    known = [*((name, REGISTRY.load(name)) for name in FORMATS), *REGISTRY.usable()]
+    return [name for name, format_ in known if suffix in format_.suffixes]

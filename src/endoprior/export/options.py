@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Literal
 
 from ..core.checks import check_range
-from .formats import FORMATS, Axes
+from .formats import REGISTRY, Axes
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
     """Options of an export. Each format takes some of them and rejects the others."""
 
-    format: Literal[FORMATS] | None = None
+    format: Literal[REGISTRY.names()] | None = None
     """Format; by default the one of OUT's suffix. A .ply is `ply`; a folder has no default."""
     times: tuple[float, ...] = ()
     """Times in [0, 1] to export instead of frames. Frame i of T is at i / T."""

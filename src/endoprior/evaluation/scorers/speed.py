@@ -38,8 +38,9 @@ SCORES = (
 
 def compute(context: EvaluationContext) -> None:
     """Time the rendering; no frame is needed."""
-    context.add("fps", frames_per_second(context.scene))
-    context.add("fps_cached", frames_per_second(context.scene, cached=True))
+    with context.skip_if_unavailable("fps", "fps_cached"):
+        context.add("fps", frames_per_second(context.scene))
+        context.add("fps_cached", frames_per_second(context.scene, cached=True))
 
 
 def frames_per_second(scene: Scene, *, cached: bool = False) -> float:

@@ -51,9 +51,10 @@ SCORES = (
 
 def compute(context: EvaluationContext) -> None:
     """Score paired tracks, or the end points of unpaired ones; nothing without ground truth."""
-    scene, sequence = context.scene, context.sequence
+    sequence = context.sequence
     if sequence.truth is None:
         return
+    scene = context.scene
     if sequence.truth.tracks and not sequence.truth.tracks.paired:
         context.add("track_end_error_mm", track_end_error_mm(scene, sequence), "no point has depth at start and end")
     for name, value in track_scores(scene, sequence).items():
