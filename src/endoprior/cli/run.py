@@ -42,7 +42,7 @@ class Run:
     seed: int = 0
     """Seed of the training."""
     device: Wanted = "auto"
-    """Device that trains; auto uses CUDA only if all of it works (`endoprior doctor`)."""
+    """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
     config: Annotated[PrepareConfig, tyro.conf.arg(name="")] = field(default_factory=PrepareConfig)
 
 
@@ -54,8 +54,7 @@ HELP = Help(
     ),
     basics={
         "how much": ("--preview", "--start", "--end", "--frames-per-second"),
-        "cameras": ("--calibration", "--right"),
-        "depth, tools and camera path": ("--depth", "--masks", "--poses"),
+        "cameras, depth and tools": ("--calibration", "--depth", "--masks"),
         "training": ("--preset", "--seed", "--device"),
     },
 )
