@@ -36,13 +36,13 @@ class Run:
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for the results; must be new or empty."""
     preview: bool = False
-    """A first look in about a minute: at most 60 frames, 320 px wide, few Gaussians. Not for scores."""
+    """A first look in about a minute: at most 60 frames, 320 px wide. Not for scores."""
     preset: PresetName = "default"
     """Preset of the training; --preview has its own."""
     seed: int = 0
     """Seed of the training."""
     device: Wanted = "auto"
-    """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
+    """Device that trains; auto uses CUDA only if all of it works (`endoprior doctor`)."""
     config: Annotated[PrepareConfig, tyro.conf.arg(name="")] = field(default_factory=PrepareConfig)
 
 
@@ -53,9 +53,10 @@ HELP = Help(
         ("stereo.mp4", "OUT", "--calibration", "calib.yaml"),
     ),
     basics={
-        "how much": ("--preview", "--start", "--end", "--frames-per-second"),
-        "cameras, depth and tools": ("--calibration", "--depth", "--masks"),
-        "training": ("--preset", "--seed", "--device"),
+        "how much": ("--preview", "--start", "--end"),
+        "cameras": ("--calibration", "--right"),
+        "depth and tools": ("--depth", "--masks"),
+        "training": ("--preset", "--device"),
     },
 )
 
