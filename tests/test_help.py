@@ -125,7 +125,7 @@ def test_short_names_stand_for_config_fields(parsed):
         (["c"], "endoprior train: expected DATA OUT, got c."),
         (["--iterations", "x"], "--iterations: expected an integer, got 'x'."),
         (["--device=gpu"], "--device: expected one of auto, cpu, cuda, got 'gpu'."),
-        (["--data.shrink", "2", "--data.stride", "x"], "--data.stride: expected an integer, got 'x'."),
+        (["--view", "--view-port", "x"], "--view-port: expected an integer, got 'x'."),
         (["--min-valid", "3"], "got --min-valid. Fix: Did you mean --temporal.min-valid? "),
         (["--seed"], "--seed: expected an integer, got nothing."),
         (["--gaussians", "0"], "endoprior: --gaussians: budget must be in [1, 1e+07], got 0. Fix: "),
