@@ -20,6 +20,7 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"  # notebooks are run by a test and hold their output
 nb_ipywidgets_js = {}  # it would come from the network
+nb_render_markdown_format = "myst"  # for tables
 html_math_renderer = "mathml"
 
 html_theme = "furo"

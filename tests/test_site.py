@@ -78,3 +78,5 @@ def test_the_site_builds_and_is_complete_without_the_network(tmp_path):
         assert f">{name}<" in config, name
     method = (tmp_path / "docs" / "method.html").read_text(encoding="utf-8")
     assert method.count("<math") > 20 and "$" not in re.sub(r"<(script|math).*?</\1>", "", method, flags=re.DOTALL)
+    compared = (tmp_path / "docs" / "notebooks" / "compare_methods.html").read_text(encoding="utf-8")
+    assert "<table" in compared and "<img" in compared
