@@ -5,6 +5,7 @@ Exit status: 0 done; 2 bad input or usage, one line on stderr; 1 a bug, with tra
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from importlib import import_module
@@ -45,6 +46,8 @@ def main(argv: list[str] | None = None) -> int:
     # Idle torch threads spin on the cores that Numba needs, which makes rendering three times slower (docs/log.md).
     # Torch reads this variable at its first import. A value set by the user stays.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if isinstance(sys.stdout, io.TextIOWrapper):  # write characters that its encoding lacks as \xNN
+        sys.stdout.reconfigure(errors="backslashreplace")
     argv = sys.argv[1:] if argv is None else argv
     if not argv or argv[0] in ("-h", "--help"):
         print(overview())

@@ -132,7 +132,7 @@ def train_and_evaluate(
 
 def _logged_seconds(log: Path) -> float:
     """Iterations per second: the reciprocal of the mean time of the logged iterations."""
-    seconds = [json.loads(line)["seconds"] for line in log.read_text().splitlines()]
+    seconds = [json.loads(line)["seconds"] for line in log.read_text(encoding="utf-8").splitlines()]
     return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0
 
 

@@ -253,6 +253,8 @@ def _check(spec: Spec) -> None:
         for name in names:
             if not NAME.fullmatch(name):
                 raise input_error(kind, "a name of letters, digits and . _ + -", f"{name!r}", "rename it.")
+        if len({name.lower() for name in names}) < len(names):  # figures have these names
+            raise input_error(kind, "names that differ in more than case", ", ".join(names), "rename one.")
     for name, sequence in spec.sequences.items():
         if bool(sequence.path) == (sequence.phantom is not None):
             raise input_error(f"sequences.{name}", "either path or phantom", "both or none", "keep one.")

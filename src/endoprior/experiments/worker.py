@@ -18,7 +18,7 @@ from typing import Any
 
 from ..core.checks import InputError
 from ..data.files import read_json
-from ..system.atomic import write_json
+from ..system.atomic import write_json, write_text
 
 DONE = "cell.json"
 """Written last: a folder that has it, with the same key, is finished."""
@@ -77,11 +77,11 @@ def work(job: Job) -> None:
     method, folder = REGISTRY.load(job.method), Path(job.folder)
     options, reading = from_dict(type(method.options), job.options), from_dict(DataConfig, job.reading)
     run, key_file = folder / "run", folder / "key"
-    resume = run.is_dir() and key_file.exists() and key_file.read_text() == job.key
+    resume = run.is_dir() and key_file.exists() and key_file.read_text(encoding="utf-8") == job.key
     if not resume:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        key_file.write_text(job.key)
+        write_text(key_file, job.key)
     began = clock.perf_counter()
     found = method.train(load_sequence(job.data, reading).training_view(), options, seed=job.seed, out=run)
     seconds = clock.perf_counter() - began
@@ -106,7 +106,7 @@ def work(job: Job) -> None:
 
 def main(argv: list[str]) -> int:
     """Work on the job file `argv[0]`; exit status as for the command line."""
-    job = Job(**json.loads(Path(argv[0]).read_text()))
+    job = Job(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     try:
         work(job)

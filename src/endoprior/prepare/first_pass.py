@@ -55,7 +55,8 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         hint = "Check --start, --end and --frames-per-second."
         raise input_error(path, "at least 2 frames in the selection", str(len(indices)), hint)
     lefts = [stereo_frame.left for stereo_frame in sample.kept]
-    notes = _timing_notes(selection.gaps, selection.uneven_steps, len(indices))
+    notes = [source.note for source in (clip.source, clip.second) if source and source.note]
+    notes += _timing_notes(selection.gaps, selection.uneven_steps, len(indices))
     strips = circle = None
     labels: list[Rectangle] = []
     if cfg.border == "auto":
