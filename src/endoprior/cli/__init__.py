@@ -11,6 +11,7 @@ import sys
 from importlib import import_module
 
 from ..core.checks import InputError, input_error
+from ..system.installation import docs_folder
 from ..system.memory import reject_small_limits
 
 COMMANDS = {
@@ -24,7 +25,7 @@ COMMANDS = {
     "render": "render a trained scene: color, depth, side-by-side, video",
     "export": "write open formats: PLY, splat, SPZ, glTF, mesh, points, tracks, depth, video",
     "view": "show a trained scene, or a sequence before training, in a web browser",
-    "doctor": "report whether this machine can use CUDA, and what to install for it",
+    "doctor": "report whether this computer can train and use a GPU, and what to install for it",
     "bench": "compare methods on sequences over seeds, under one protocol",
     "plugins": "list datasets, methods, scores and exporters: built in, and of other packages",
 }
@@ -84,7 +85,7 @@ def system_failure(error: Exception) -> str | None:
     whole = " ".join(str(error).split())
     if type(error).__name__ == "OutOfMemoryError":  # raised by torch for a GPU; its message starts with the numbers
         return (
-            f"expected enough GPU memory, got {whole[:160]!r}. Fix: use smaller frames, a smaller --init-budget or "
+            f"expected enough GPU memory, got {whole[:160]!r}. Fix: use smaller frames, fewer --gaussians or "
             "--device cpu. The last checkpoint of a run is complete; continue it with --resume."
         )
     text = whole[-160:]
@@ -110,6 +111,7 @@ def overview() -> str:
             "",
             *lines,
             "",
-            "`endoprior COMMAND --help` explains every option.",
+            "`endoprior COMMAND --help` shows what most users need, `--help-all` every option.",
+            f"Pages that messages name are in {docs_folder()}",
         ]
     )

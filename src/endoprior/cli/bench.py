@@ -11,19 +11,24 @@ from typing import Annotated
 import tyro
 
 from ..core.checks import input_error
+from ..experiments.ready_specs import find_spec, spec_names, specs_of
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
 MOST_CORES = 4096
 """Largest --cores and --threads."""
+SPEC_HELP = (
+    "A .yaml or .toml file, a folder of them, or a name. `quick` takes minutes, `sized` has the paper's tables, sized "
+    f"for two cores, `full` at full size. All names: {', '.join(spec_names())}."
+)
 
 
 @dataclass
 class Bench:
     """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
 
-    spec: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="SPEC")]]
-    """A .yaml or .toml file, or a folder of them; bench/specs/ has those of the paper's tables."""
+    spec: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="SPEC", help=SPEC_HELP)]]
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0
@@ -40,9 +45,14 @@ class Bench:
     """Train nothing; write the report of the finished cells."""
 
 
+HELP = Help(
+    examples=(("quick", "OUT"), ("sized", "OUT", "--report-only")),
+)
+
+
 def run(argv: list[str]) -> int:
     """Run the matrix and write its report; 1 if a cell failed."""
-    args = parse(Bench, argv, "bench")
+    args = parse(Bench, argv, "bench", HELP)
     from filelock import FileLock, Timeout
 
     from ..experiments.execute import local_executor, ray_executor
@@ -53,21 +63,25 @@ def run(argv: list[str]) -> int:
 
     for option, value, least in (("--threads", args.threads, 1), ("--cores", args.cores, 0)):
         if not least <= value <= MOST_CORES:
-            raise input_error(option, f"{least} to {MOST_CORES}", f"{value}", "correct it.")
+            raise input_error(
+                option, f"{least} to {MOST_CORES}", f"{value}", f"Choose a value from {least} to {MOST_CORES}."
+            )
     if args.weights_dir and not args.weights_dir.is_dir():
-        raise input_error(args.weights_dir, "a folder of network weights", "none", "correct --weights-dir.")
-    specs = _specs(args.spec)
-    loaded = {path: load_spec(path, _folders(args.data)) for path in specs}
+        raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
+    source = find_spec(args.spec)
+    loaded = {path: load_spec(path, _folders(args.data)) for path in specs_of(source)}
     require_writable_folder("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise input_error(args.out, "a place for a folder", f"{error.strerror}", "choose another.") from None
+        raise input_error(args.out, "a place for a folder", f"{error.strerror}", "Choose another folder.") from None
     lock = FileLock(args.out / ".lock", timeout=0)
     try:
         lock.acquire()
     except Timeout:
-        raise input_error(args.out, "a folder for this benchmark alone", "one in which another runs", "wait.") from None
+        raise input_error(
+            args.out, "a folder for this benchmark alone", "one in which another runs", "Wait until it is done."
+        ) from None
     failed, reports = 0, {}
     with lock:
         if args.report_only:
@@ -78,16 +92,16 @@ def run(argv: list[str]) -> int:
             executor = local_executor(max(1, (args.cores or _cores()) // args.threads))
         with executor as execute:
             for path, spec in loaded.items():
-                folder = args.out / path.stem if args.spec.is_dir() else args.out
+                folder = args.out / path.stem if source.is_dir() else args.out
                 say(f"{path}: {spec.title}")
                 matrix = run_matrix(
                     spec, args.out, execute, threads=args.threads, weights_dir=args.weights_dir, progress=say
                 )
                 report = write_report(matrix, folder)
                 failed, reports[folder] = failed + matrix.failed, matrix
-                say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\n{report}")
-    if args.spec.is_dir():
-        say(str(write_overview(reports, args.out)))
+                say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\nreport: {report}")
+    if source.is_dir():
+        say(f"overview: {write_overview(reports, args.out)}")
     return 1 if failed else 0
 
 
@@ -96,21 +110,11 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _specs(path: Path) -> list[Path]:
-    """The spec, or those of a folder, sorted by name."""
-    if not path.is_dir():
-        return [path]
-    specs = sorted(file for file in path.iterdir() if file.suffix in (".yaml", ".yml", ".toml"))
-    if not specs:
-        raise input_error(path, ".yaml or .toml files", "none", "pass a folder of specs.")
-    return specs
-
-
 def _folders(data: tuple[str, ...]) -> dict[str, Path]:
     folders = {}
     for item in data:
         name, separator, folder = item.partition("=")
         if not separator or not folder:
-            raise input_error("--data", "NAME=FOLDER", f"{item!r}", "name a sequence of the spec.")
+            raise input_error("--data", "NAME=FOLDER", f"{item!r}", "Name a sequence of the spec.")
         folders[name] = Path(folder).expanduser()
     return folders

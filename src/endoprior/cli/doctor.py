@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json as json_text
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import TYPE_CHECKING
 
+from ..system.installation import docs_folder, source_commit
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -15,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Doctor:
-    """Report whether this machine can use CUDA, and what to install for it."""
+    """Report whether this computer can train, whether its GPU can be used, and what to install for it."""
 
     compile: bool = False
     """Compile gsplat now, which takes minutes, and render with it. Without a GPU, as in a container build, it compiles
@@ -24,9 +27,12 @@ class Doctor:
     """Print JSON instead of a table."""
 
 
+HELP = Help(examples=((), ("--json",)))
+
+
 def run(argv: list[str]) -> int:
     """Print the report. Exit status 0 even if something is missing; 1 if --compile fails."""
-    args = parse(Doctor, argv, "doctor")
+    args = parse(Doctor, argv, "doctor", HELP)
     from ..doctor import examine, read_facts
     from ..doctor.choice import choose
     from ..doctor.report import as_json, table
@@ -41,6 +47,7 @@ def run(argv: list[str]) -> int:
         found = as_json(facts, report, choice.device, choice.backend, choice.why, compiling)
         say(json_text.dumps(found, indent=1))
         return status
+    say(f"endoprior {version('endoprior')}, commit {source_commit() or 'unknown'}; documentation: {docs_folder()}\n")
     for row in table(report):
         say(row)
     say("")

@@ -11,8 +11,10 @@ import tyro
 from ..core.checks import input_error
 from ..doctor.choice import Wanted
 from .devices import on_device
+from .help_page import Help
 from .parsing import parse
 from .progress import say
+from .score_table import score_table
 
 if TYPE_CHECKING:
     from ..data import FrameSequence
@@ -31,11 +33,11 @@ class Eval:
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder; with --pictures the sequence folder."""
     data: Path | None = None
-    """Sequence folder; default: the one the run was trained on."""
+    """Sequence folder. Default: the one the run was trained on."""
     split: Literal["test", "train", "video"] = "test"
     """Frames to score."""
     out: Path | None = None
-    """Folder for the two files; default: the run folder, or that of --pictures."""
+    """Folder for the two files. Default: RUN, or the folder of --pictures."""
     pictures: Path | None = None
     """Score the frames in this folder, PNG of 8 or 16 bits, in place of a run (docs/benchmarks.md)."""
     depth_pictures: Path | None = None
@@ -43,23 +45,26 @@ class Eval:
     depth_scale: float | None = None
     """mm per unit of the depth files."""
     name: str = ""
-    """Name of the method in metrics.json; default: that of the folder."""
+    """Name of the method in metrics.json; Default: that of the folder."""
     networks: bool = True
-    """Also compute the scores that need a network (RAFT, LPIPS), where their weights are found."""
+    """Scores by networks (RAFT, LPIPS). They need their weights."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     device: Wanted = "auto"
-    """Where to render; `auto` uses CUDA only if everything it needs works (see `endoprior doctor`)."""
+    """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
+
+
+HELP = Help(examples=(("RUN",), ("RUN", "--split", "train", "--out", "OTHER")))
 
 
 def run(argv: list[str]) -> None:
     """Score and print."""
-    args = parse(Eval, argv, "eval")
+    args = parse(Eval, argv, "eval", HELP)
     from ..model.scene import load_scene
     from .output_paths import require_writable_folder
 
     if args.weights_dir and not args.weights_dir.is_dir():
-        raise input_error(args.weights_dir, "a folder of network weights", "none", "correct --weights-dir.")
+        raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
     if args.pictures:
         evaluate_pictures(args, args.pictures)
         return
@@ -124,22 +129,19 @@ def save_and_print(
     result: Evaluation, sequence: FrameSequence, out: Path, split: Literal["test", "train", "video"]
 ) -> None:
     """Write the two files into `out`, and print a table."""
-    from ..evaluation.registry import all_scores
 
     result.save(out)
-    say(f"\nscores on the {split} split ({len(sequence.indices(split))} frames)")
-    for name, value in result.scores.items():
-        say(f"  {name:<28}{all_scores()[name].text(value)}")
-    for name, reason in result.skipped.items():
-        say(f"  {name:<28}skipped: {reason}")
+    better = "\u2191 higher is better, \u2193 lower is better"
+    say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({better})")
+    for line in score_table(result.scores, result.skipped):
+        say(line)
     if outliers := result.outlier_frames():
         frames = ", ".join(map(str, outliers))
-        say(
-            f"note: tissue PSNR of frames {frames} is more than 3 dB below the median; see them with `endoprior render`"
-        )
+        look = f"endoprior render RUN --split {split}"
+        say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median. To see them: `{look}`")
     if sequence.depth_is_relative:
-        say("note: the sequence's depth is relative: scores in mm compare runs on it, but are not millimeters")
-    say(f"{out / 'metrics.json'}")
+        say("note: the depth of the sequence is relative. Scores in mm compare runs on it, but are not millimeters.")
+    say(f"all scores: {out / 'metrics.json'}; what they mean: docs/scores.md")
 
 
 def sequence_of_run(run_folder: Path) -> Path:
@@ -151,7 +153,7 @@ def sequence_of_run(run_folder: Path) -> Path:
     from ..data.files import read_json
     from ..data.reading import kind_of
 
-    file, hint = run_folder / "config.json", "pass --data FOLDER."
+    file, hint = run_folder / "config.json", "Pass --data FOLDER."
     facts = read_json(file, hint).get("data")
     path = facts.get("path") if isinstance(facts, dict) else None
     if not isinstance(path, str) or not path:

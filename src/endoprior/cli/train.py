@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
-from ..core.checks import InputError, input_error
+from ..core.checks import input_error
 from ..core.config import Config
 from ..core.presets import PresetName, preset
 from ..core.shell import command
 from ..doctor.choice import Wanted
+from .help_page import Help
 from .parsing import parse
 from .progress import say, training_progress
 from .view import live_view
@@ -27,31 +28,51 @@ if TYPE_CHECKING:
 
 @dataclass
 class Train:
-    """Train one scene and score it. The options below --view-port are fields of the config; the preset sets them."""
+    """Train one scene and score it. The preset sets every number of the method; options change single ones."""
 
     data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
-    """Sequence folder: images/, masks/, depth/, poses_bounds.npy."""
+    """Sequence folder: of `endoprior prepare` or a dataset."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Run folder to write."""
     preset: PresetName = "default"
-    """Preset of the config."""
-    init_budget: int | None = None
-    """Short for --init.budget."""
+    """Method: a preset of the config."""
     device: Wanted = "auto"
-    """Device; auto uses CUDA only if all of it works (`endoprior doctor`)."""
+    """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     networks: bool = True
-    """Also score with RAFT and LPIPS if their weights are available."""
+    """Scores by networks (RAFT, LPIPS). They need their weights."""
     resume: bool = False
-    """Resume the run in OUT after Ctrl-C or a crash. The result is bit-identical to an uninterrupted run."""
+    """Continue the run in OUT after a stop. The result is bit-identical to an uninterrupted run."""
     checkpoint_seconds: float = 60.0
     """Time between two checkpoints, and the most time that a crash can cost."""
     view: bool = False
-    """Show the scene in a web browser during training, at 127.0.0.1 and --view-port. This slows down training."""
+    """Show the scene in a web browser during training. At 127.0.0.1 and --view-port; it slows down training."""
     view_port: int = 8080
     """Port of --view; 0 uses any free port."""
     config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+
+
+HELP = Help(
+    examples=(
+        ("DATA", "RUN"),
+        ("DATA", "RUN", "--iterations", "3000", "--gaussians", "50000"),
+        ("DATA", "RUN", "--resume"),
+    ),
+    basics={
+        "method": ("--preset", "--seed"),
+        "what to train on": ("--data.first-frames", "--data.shrink"),
+        "how long": ("--iterations", "--resume"),
+        "how large": ("--gaussians",),
+        "where it runs": ("--device",),
+        "during and after training": ("--view", "--no-networks", "--weights-dir"),
+    },
+    short={
+        "--iterations": "--schedule.fine-iterations",
+        "--gaussians": "--init.budget",
+        "--init-budget": "--init.budget",
+    },
+)
 
 
 def run(argv: list[str]) -> None:
@@ -59,7 +80,7 @@ def run(argv: list[str]) -> None:
     from ..doctor.choice import choose_here
     from ..render import ON_GPU
 
-    args = parse(Train, argv, "train", default=_preset_defaults(argv))
+    args = parse(Train, argv, "train", HELP, default=_preset_defaults(argv))
     cfg = args.config
     named = cfg.render.backend if cfg.render.backend in ON_GPU else None
     if named and args.device == "cpu":
@@ -71,11 +92,6 @@ def run(argv: list[str]) -> None:
         cfg = dataclasses.replace(cfg, render=dataclasses.replace(cfg.render, backend=choice.backend))
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
-    if args.init_budget is not None:
-        try:
-            cfg = dataclasses.replace(cfg, init=dataclasses.replace(cfg.init, budget=args.init_budget))
-        except ValueError as error:
-            raise InputError(f"--init-budget: {error}. Fix: correct the value.") from None
     port = args.view_port if args.view else None
     if not args.checkpoint_seconds >= 0:
         raise input_error("--checkpoint-seconds", "at least 0", str(args.checkpoint_seconds), "Remove it for 60.")

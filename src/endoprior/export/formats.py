@@ -55,6 +55,8 @@ class Format:
     """The contents of the files of one time step, by suffix."""
     write: Callable[[Scene, Path, ExportOptions, Progress], None] | None = None
     """Writes one output for the whole sequence."""
+    suffix_option: str = ""
+    """Field of `ExportOptions` that chooses between the suffixes, as `mesh_format`; by default the file's name does."""
     default_axes: Axes = "opencv"
     """What --frame stands for where it is not given."""
     index_facts: Mapping[str, Any] | None = None
@@ -90,7 +92,7 @@ def load_format(name: str) -> Format:
     return REGISTRY.load(name)
 
 
-def all_suffixes() -> set[str]:
-    """The suffixes of the files of all formats."""
-    known = [*map(REGISTRY.load, FORMATS), *(format_ for _, format_ in REGISTRY.usable())]
-    return {suffix for format_ in known for suffix in format_.suffixes}
+def formats_of(suffix: str) -> list[str]:
+    """Names of the formats that write files of this suffix: the one that it stands for first, plugins last."""
+    known = [*((name, REGISTRY.load(name)) for name in FORMATS), *REGISTRY.usable()]
+    return [name for name, format_ in known if suffix in format_.suffixes]

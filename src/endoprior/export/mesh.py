@@ -99,5 +99,8 @@ def _is_continuous(
 
 
 FORMAT = Format(
-    suffixes=(".ply", ".obj", ".stl"), options=(*TIME_STEP_OPTIONS, "mesh_format", *SURFACE_OPTIONS), files=files
+    suffixes=(".ply", ".obj", ".stl"),
+    options=(*TIME_STEP_OPTIONS, "mesh_format", *SURFACE_OPTIONS),
+    files=files,
+    suffix_option="mesh_format",
 )

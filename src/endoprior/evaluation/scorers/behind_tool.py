@@ -12,11 +12,12 @@ SCORES = (
     Score(
         "psnr_behind_tool", "PSNR behind tool", "dB", True, 2,
         "PSNR of the pixels that the tool hides, against the true tissue; with ground truth only.",
-        "absolute",
+        "absolute", group="image", hint="tissue that the tool hides",
     ),
     Score(
         "depth_rmse_behind_tool_mm", "depth behind tool", "mm", False, 3,
         "Root mean square depth error of the pixels that the tool hides; with ground truth only.",
+        group="depth", hint="tissue that the tool hides",
     ),
 )  # fmt: skip
 
