@@ -15,6 +15,7 @@ from ..system.installation import docs_folder
 from ..system.memory import reject_small_limits
 
 COMMANDS = {
+    "run": "from a video to a model to look at: prepare, check, train, score, video, player",
     "demo": "phantom sequence -> train -> eval -> render, with a summary and pictures",
     "phantom": "write a synthetic surgical sequence with full ground truth",
     "prepare": "write a sequence folder from a video: rectified frames, depth, tool masks, poses",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time as clock
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from ..core.config import Config
 from ..core.presets import PresetName, preset
 from ..core.shell import command
 from ..doctor.choice import Wanted
+from .devices import with_device
 from .help_page import Help
 from .parsing import parse
 from .progress import say, training_progress
@@ -77,19 +77,8 @@ HELP = Help(
 
 def run(argv: list[str]) -> None:
     """Train, score, and print the results."""
-    from ..doctor.choice import choose_here
-    from ..render import ON_GPU
-
     args = parse(Train, argv, "train", HELP, default=_preset_defaults(argv))
-    cfg = args.config
-    named = cfg.render.backend if cfg.render.backend in ON_GPU else None
-    if named and args.device == "cpu":
-        fix = f"Remove --device cpu or --render.backend {named}."
-        raise input_error(f"--render.backend {named}", "--device cuda or auto", "cpu", fix)
-    choice = choose_here("cuda" if named else args.device)
-    say(choice.why)
-    if choice.device == "cuda" and not named:
-        cfg = dataclasses.replace(cfg, render=dataclasses.replace(cfg.render, backend=choice.backend))
+    cfg = with_device(args.config, args.device)
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
     port = args.view_port if args.view else None
