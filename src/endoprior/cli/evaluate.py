@@ -54,7 +54,7 @@ class Eval:
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
 
-HELP = Help(examples=(("RUN",), ("RUN", "--split", "train", "--out", "OTHER")))
+HELP = Help(examples=(("RUN",), ("RUN", "--split", "train", "--out", "OTHER"), ("--pictures", "FOLDER", "DATA")))
 
 
 def run(argv: list[str]) -> None:
@@ -136,8 +136,8 @@ def save_and_print(
         say(line)
     if outliers := result.outlier_frames():
         frames = ", ".join(map(str, outliers))
-        look = f"endoprior render RUN --split {split}"
-        say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median. To see them: `{look}`")
+        look = "" if "pictures" in result.provenance else f" To see them: `endoprior render RUN --split {split}`"
+        say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median.{look}")
     if sequence.depth_is_relative:
         say("note: the depth of the sequence is relative. Scores in mm compare runs on it, but are not millimeters.")
     say(f"all scores: {out / 'metrics.json'}; what they mean: docs/scores.md")
