@@ -64,7 +64,7 @@ def test_bad_configs_are_named(values, names):
 
 
 def test_unknown_preset():
-    with pytest.raises(InputError, match="preset: expected one of default, preview, paper"):
+    with pytest.raises(InputError, match="preset: expected one of default, paper"):
         preset("best")
 
 
