@@ -11,9 +11,9 @@ import tyro
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
 from ..core.shell import quoted
+from ..system.console import say
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 
 
 @dataclass

@@ -10,9 +10,10 @@ from typing import Annotated
 import tyro
 
 from ..export.options import ExportOptions
+from ..system.console import say
 from .help_page import Help
 from .parsing import parse
-from .progress import Counting, say
+from .progress import Counting
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ import json
 import time as clock
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import Annotated, get_args
 
 import tyro
 
@@ -15,15 +15,12 @@ from ..core.config import Config
 from ..core.presets import PresetName, preset
 from ..core.shell import command
 from ..doctor.choice import Wanted
+from ..runs.progress import training_progress
+from ..system.console import say
 from .devices import with_device
 from .help_page import Help
 from .parsing import parse
-from .progress import say, training_progress
 from .view import live_view
-
-if TYPE_CHECKING:
-    from ..training.state import StepReport
-    from ..training.trainer import Trainer
 
 
 @dataclass
@@ -114,12 +111,7 @@ def train_and_evaluate(
     began = clock.perf_counter()
     try:
         with training_progress() as show_progress, live_view(view_port) as show_scene:
-
-            def on_step(report: StepReport, trainer: Trainer) -> None:
-                show_progress(report, trainer)
-                show_scene(report, trainer)
-
-            scene = training.complete(on_step, checkpoint_seconds=checkpoint_seconds)
+            scene = training.complete(show_progress, show_scene, checkpoint_seconds=checkpoint_seconds)
     except KeyboardInterrupt:
         say(f"Stopped; the state is saved in {out}. To resume, run the same command with --resume.")
         raise
