@@ -44,7 +44,7 @@ def specs_of(path: Path) -> list[Path]:
         return [path]
     if specs := _specs(path, "*"):
         return specs
-    raise input_error(path, ".yaml or .toml files", "none", "pass a folder of specs.")
+    raise input_error(path, ".yaml or .toml files", "none", "Pass a folder of specs.")
 
 
 def _specs(folder: Path, pattern: str) -> list[Path]:
