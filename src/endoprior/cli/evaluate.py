@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass
 class Eval:
-    """Score a trained scene; writes metrics.json and per_frame.json into the run folder (or --out)."""
+    """Score a trained scene; writes metrics.json and per_frame.json into the run folder (or --out).
+
+    Splits other than test have files of their own: metrics_train.json, per_frame_train.json.
+    """
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder."""
@@ -75,7 +78,7 @@ def evaluate_run(
     sequence = load_sequence(data, scored_data(scene.config.data))
     result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir)
     result.scores |= extra
-    result.save(out)
+    file = result.save(out)
     say(f"\nscores on the {split} split ({len(sequence.indices(split))} frames)")
     for name, value in result.scores.items():
         say(f"  {name:<28}{all_scores()[name].text(value)}")
@@ -88,7 +91,7 @@ def evaluate_run(
         )
     if sequence.depth_is_relative:
         say("note: the sequence's depth is relative: scores in mm compare runs on it, but are not millimeters")
-    say(f"{out / 'metrics.json'}")
+    say(f"{file}")
 
 
 def sequence_of_run(run_folder: Path) -> Path:
