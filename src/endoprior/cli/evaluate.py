@@ -45,6 +45,7 @@ def run(argv: list[str]) -> None:
     """Score and print."""
     args = parse(Eval, argv, "eval")
     from ..model.scene import load_scene
+    from ..runs.stored_run import sequence_of_run
     from .output_paths import require_writable_folder
 
     if args.weights_dir and not args.weights_dir.is_dir():
@@ -92,23 +93,3 @@ def evaluate_run(
     if sequence.depth_is_relative:
         say("note: the sequence's depth is relative: scores in mm compare runs on it, but are not millimeters")
     say(f"{file}")
-
-
-def sequence_of_run(run_folder: Path) -> Path:
-    """The sequence folder a run was trained on, from its config.json.
-
-    Raises:
-        InputError: config.json is missing or does not name the folder, or the folder is gone.
-    """
-    from ..data.files import read_json
-    from ..data.reading import kind_of
-
-    file, hint = run_folder / "config.json", "pass --data FOLDER."
-    facts = read_json(file, hint).get("data")
-    path = facts.get("path") if isinstance(facts, dict) else None
-    if not isinstance(path, str) or not path:
-        raise input_error(file, "the path of the sequence", repr(path), hint)
-    data = Path(path)
-    if kind_of(data) != "a folder":
-        raise input_error(data, "the sequence this run was trained on", "no such folder", hint)
-    return data

@@ -57,9 +57,9 @@ def render(scene: Scene, args: Render) -> None:
     scene = on_device(scene, args.device, fp16_planes=True)
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
+    from ..runs.stored_run import sequence_of_run
     from ..visualization.camera_paths import read_path, sway_path, times_path
     from ..visualization.rendered_views import depth_span, write_views
-    from .evaluate import sequence_of_run
 
     frames, total = None, len(scene.cameras)
     if bad := [t for t in args.times if not 0 <= t <= 1]:

@@ -7,17 +7,18 @@ import json
 import time as clock
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from ..core.checks import InputError, input_error
 from ..core.config import Config
-from ..core.presets import PresetName, preset
+from ..core.presets import PresetName
 from ..core.shell import command
 from ..doctor.choice import Wanted
 from .parsing import parse
 from .progress import say, training_progress
+from .start_config import resume_command, run_to_resume, start_config
 from .view import live_view
 
 if TYPE_CHECKING:
@@ -30,11 +31,13 @@ class Train:
     """Train one scene and score it. The options below --view-port are fields of the config; the preset sets them."""
 
     data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
-    """Sequence folder: images/, masks/, depth/, poses_bounds.npy."""
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    """Sequence folder: images/, masks/, depth/, poses_bounds.npy. Resume a run with `--resume RUN` alone."""
+    out: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="OUT")]] = None
     """Run folder to write."""
     preset: PresetName = "default"
     """Preset of the config."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
+    """config.json of another run, or YAML with some fields of the config: overrides the preset; options override it."""
     init_budget: int | None = None
     """Short for --init.budget."""
     device: Wanted = "auto"
@@ -44,7 +47,8 @@ class Train:
     networks: bool = True
     """Also score with RAFT and LPIPS if their weights are available."""
     resume: bool = False
-    """Resume the run in OUT after Ctrl-C or a crash. The result is bit-identical to an uninterrupted run."""
+    """Resume a run after Ctrl-C or a crash, with its data and config: `endoprior train --resume RUN`. The result is
+    bit-identical to an uninterrupted run."""
     checkpoint_seconds: float = 60.0
     """Time between two checkpoints, and the most time that a crash can cost."""
     view: bool = False
@@ -59,13 +63,14 @@ def run(argv: list[str]) -> None:
     from ..doctor.choice import choose_here
     from ..render import ON_GPU
 
-    args = parse(Train, argv, "train", default=_preset_defaults(argv))
+    args = _arguments(argv)
     cfg = args.config
     named = cfg.render.backend if cfg.render.backend in ON_GPU else None
     if named and args.device == "cpu":
         fix = f"Remove --device cpu or --render.backend {named}."
         raise input_error(f"--render.backend {named}", "--device cuda or auto", "cpu", fix)
-    choice = choose_here("cuda" if named else args.device)
+    resumed_on_cpu = args.resume and not named and args.device == "auto"
+    choice = choose_here("cuda" if named else "cpu" if resumed_on_cpu else args.device)
     say(choice.why)
     if choice.device == "cuda" and not named:
         cfg = dataclasses.replace(cfg, render=dataclasses.replace(cfg.render, backend=choice.backend))
@@ -116,7 +121,8 @@ def train_and_evaluate(
 
             scene = training.complete(on_step, checkpoint_seconds=checkpoint_seconds)
     except KeyboardInterrupt:
-        say(f"Stopped; the state is saved in {out}. To resume, run the same command with --resume.")
+        resume_with = resume_command(out, networks, weights_dir, checkpoint_seconds)
+        say(f"Stopped; the state is saved in {out}. To resume, run `{resume_with}`.")
         raise
     seconds = clock.perf_counter() - began
     del training  # frees its cached frames; scoring loads its own
@@ -136,14 +142,21 @@ def _logged_seconds(log: Path) -> float:
     return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0
 
 
-def _preset_defaults(argv: list[str]) -> Train:
-    """Defaults from the preset named in `argv`, so that --help shows its values and options override them."""
-    name = "default"
-    for i, word in enumerate(argv):
-        if word == "--preset" and i + 1 < len(argv):
-            name = argv[i + 1]
-        elif word.startswith("--preset="):
-            name = word.removeprefix("--preset=")
-    if name not in get_args(PresetName):
-        raise input_error("--preset", f"one of {', '.join(get_args(PresetName))}", repr(name), "`--preset default`.")
-    return Train(data=tyro.MISSING, out=tyro.MISSING, preset=name, config=preset(name))
+def _arguments(argv: list[str]) -> Train:
+    """The parsed arguments. A resumed run takes its config from its folder, and its data too if only RUN is given.
+
+    Raises:
+        InputError: as `parse`; OUT is missing; or the run to resume cannot be read.
+    """
+    name, cfg = start_config(argv)
+    start = Train(data=tyro.MISSING, preset=name, config=cfg)
+    args = parse(Train, argv, "train", default=start)
+    if not args.resume:
+        if args.out is None:
+            fix = f"`{command('train', args.data, 'RUN')}`."
+            raise input_error("endoprior train", "the run folder to write after DATA", "nothing", fix)
+        return args
+    data, out, stored = run_to_resume(args.data, args.out, argv)
+    if stored is not None:
+        args = parse(Train, argv, "train", default=dataclasses.replace(start, config=stored))
+    return dataclasses.replace(args, data=data, out=out)
