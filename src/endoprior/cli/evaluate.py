@@ -13,6 +13,7 @@ from ..doctor.choice import Wanted
 from .devices import on_device
 from .parsing import parse
 from .progress import say
+from .trained_scene import open_scene
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
@@ -44,13 +45,12 @@ class Eval:
 def run(argv: list[str]) -> None:
     """Score and print."""
     args = parse(Eval, argv, "eval")
-    from ..model.scene import load_scene
     from ..runs.stored_run import sequence_of_run
     from .output_paths import require_writable_folder
 
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder of network weights", "none", "correct --weights-dir.")
-    scene = load_scene(args.run)
+    scene = open_scene(args.run)
     require_writable_folder(
         "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
     )

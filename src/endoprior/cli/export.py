@@ -12,6 +12,7 @@ import tyro
 from ..export.options import ExportOptions
 from .parsing import parse
 from .progress import Counting, say
+from .trained_scene import open_scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,10 +29,9 @@ def run(argv: list[str]) -> None:
     """Export."""
     args = parse(Export, argv, "export")
     from ..export import export
-    from ..model.scene import load_scene
 
     options = ExportOptions(**{field.name: getattr(args, field.name) for field in fields(ExportOptions)})
-    scene = load_scene(args.run)
+    scene = open_scene(args.run)
     with Counting() as progress:
         written = export(scene, args.out, options, partial(progress, "exporting"))
     for path in written:

@@ -13,6 +13,7 @@ from ..doctor.choice import Wanted
 from .devices import on_device
 from .parsing import parse
 from .progress import say
+from .trained_scene import open_scene
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
@@ -43,9 +44,8 @@ class Render:
 def run(argv: list[str]) -> None:
     """Load the scene and render it."""
     args = parse(Render, argv, "render")
-    from ..model.scene import load_scene
 
-    scene = load_scene(args.run)
+    scene = open_scene(args.run)
     render(scene, args)
 
 
