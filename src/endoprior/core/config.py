@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
-from .checks import InputError, check_range
+from .checks import InputError, check_range, read_ranges
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
 Backend = Literal["reference", "numba", "triton", "gsplat"]
@@ -35,6 +35,8 @@ class DataConfig(Checked):
     """Read frames at this fraction of their width and height: 2 averages blocks of 2 x 2 pixels."""
     first_frames: Count = 0
     """Read only so many frames from the start of the sequence; 0 reads all."""
+    skip_frames: str = ""
+    """Frames to leave out, such as `0-9,15`: numbers of `endoprior check`, after `stride` and `first_frames`."""
     format: str = "auto"
     """Layout of the folder: a name in docs/datasets.md, such as `endonerf`; `auto` recognizes it."""
     stride: Annotated[int, Range(0, 10_000)] = 0
@@ -44,6 +46,7 @@ class DataConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        read_ranges("skip_frames", self.skip_frames)
         check_range("depth_clip_high_percentile", self.depth_clip_high_percentile, self.depth_clip_low_percentile, 100)
 
 
