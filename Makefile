@@ -25,8 +25,8 @@ test-faults: $(VENV)/.test-installed
 	$(BIN)/python faults/run.py $(FAULTS)
 
 lint: $(VENV)/.test-installed
-	$(BIN)/ruff check src tests bench faults
-	$(BIN)/ruff format --check src tests bench faults
+	$(BIN)/ruff check src tests bench faults examples
+	$(BIN)/ruff format --check src tests bench faults examples
 
 # The viewer and the player are tested in headless Chromium. Where there is none, Debian's package is installed if that is
 # possible without asking; otherwise those tests are skipped, and say so.

@@ -82,7 +82,7 @@ def pages(work: Path) -> None:
         time.sleep(PAGE_SECONDS)
         page.screenshot(work / "player.png")
     command = [sys.executable, "-m", "endoprior", "view", "demo/run", "--port", str(PORT)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=work) as viewer:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, encoding="utf-8", cwd=work) as viewer:
         try:
             print(viewer.stdout.readline().strip())
             with open_page(f"http://127.0.0.1:{PORT}", width=1100, height=760) as page:

@@ -33,7 +33,7 @@ CLOCK = ("fps", "fps_cached", "train_seconds", "iterations_per_second")
 
 def endoprior(*words: str | Path) -> None:
     """Run a command; its output is shown only if it fails."""
-    done = subprocess.run([sys.executable, "-m", "endoprior", *map(str, words)], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-m", "endoprior", *map(str, words)], capture_output=True, encoding="utf-8")
     if done.returncode:
         sys.exit(f"endoprior {' '.join(map(str, words))}:\n{done.stdout[-2000:]}{done.stderr[-4000:]}")
 
@@ -62,16 +62,16 @@ def main() -> None:
         for preset in args.presets:
             run = Path(temporary) / preset
             endoprior("train", data, run, "--preset", preset, "--no-networks", *SHORT)
-            scores = json.loads((run / "metrics.json").read_text())["scores"]
+            scores = json.loads((run / "metrics.json").read_text(encoding="utf-8"))["scores"]
             found[preset] = {
                 "scene": arrays_hash(run / "scene.safetensors"),
                 "checkpoint": arrays_hash(run / "checkpoint.safetensors"),
                 "scores": {name: value for name, value in scores.items() if name not in CLOCK},
             }
             print(preset, found[preset]["scene"][:16], found[preset]["scores"]["num_gaussians"], flush=True)
-    args.out.write_text(json.dumps(found, indent=1) + "\n")
+    args.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     if args.against:
-        before = json.loads(args.against.read_text())
+        before = json.loads(args.against.read_text(encoding="utf-8"))
         different = [f"{preset}: {part}" for preset in args.presets for part in found[preset]
                      if found[preset][part] != before[preset][part]]  # fmt: skip
         sys.exit(f"different: {', '.join(different)}" if different else 0)

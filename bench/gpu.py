@@ -57,7 +57,7 @@ def driver() -> str:
     """Version of the GPU driver, as nvidia-smi says."""
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
-        answer = subprocess.run(query, capture_output=True, text=True, check=True, timeout=30).stdout
+        answer = subprocess.run(query, capture_output=True, encoding="utf-8", check=True, timeout=30).stdout
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return answer.splitlines()[0].strip() if answer.strip() else "unknown"

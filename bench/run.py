@@ -46,7 +46,8 @@ MIN_MS = 0.5
 
 def load_ratios(file: Path) -> Ratios:
     """Ratios of a JSON file by `key`."""
-    rows = [Row(**{k: v for k, v in row.items() if k != "ratio"}) for row in json.loads(file.read_text())["rows"]]
+    stored = json.loads(file.read_text(encoding="utf-8"))["rows"]
+    rows = [Row(**{k: v for k, v in row.items() if k != "ratio"}) for row in stored]
     return {key(row): row.ratio for row in rows if row.ratio is not None}
 
 

@@ -72,8 +72,8 @@ def described(**changes: object) -> Step:
 
     def damage(data: Path) -> None:
         path = data / "sequence.json"
-        stored = json.loads(path.read_text()) | changes
-        path.write_text(json.dumps({k: v for k, v in stored.items() if v is not None}))
+        stored = json.loads(path.read_text(encoding="utf-8")) | changes
+        path.write_text(json.dumps({k: v for k, v in stored.items() if v is not None}), encoding="utf-8")
 
     return damage
 
@@ -111,7 +111,7 @@ def instead(name: str) -> Step:
         path = data / name
         if path.is_dir():
             shutil.rmtree(path)
-            path.write_text("a file")
+            path.write_text("a file", encoding="utf-8")
         else:
             path.unlink(missing_ok=True)
             path.mkdir()

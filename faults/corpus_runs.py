@@ -54,9 +54,9 @@ def config(name: str, content: bytes | str | Callable[[dict], object], *says: st
     """A run's config.json of these bytes, or changed."""
 
     def damage(folder: Path) -> None:
-        facts = json.loads((folder / CONFIG).read_text())
+        facts = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
         content(facts)
-        (folder / CONFIG).write_text(json.dumps(facts))
+        (folder / CONFIG).write_text(json.dumps(facts), encoding="utf-8")
 
     return Case(name, damaged(EVAL, damage if callable(content) else put(CONFIG, content)), says or ("config.json",))
 

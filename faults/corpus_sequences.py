@@ -86,7 +86,7 @@ def everywhere_npy(value: float) -> Step:
 
 def changed(name: str, old: str, new: str) -> Step:
     """Replaces text in a file."""
-    return lambda data: (data / name).write_text((data / name).read_text().replace(old, new))
+    return lambda data: (data / name).write_bytes((data / name).read_bytes().replace(old.encode(), new.encode()))
 
 
 def narrow(data: Path) -> None:

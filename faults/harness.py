@@ -76,7 +76,7 @@ class Program:
                 resource.setrlimit(kind, (value, value))
 
         # Files, not pipes: those fill up while nobody reads them.
-        self._outputs = [tempfile.TemporaryFile("w+") for _ in range(2)]
+        self._outputs = [tempfile.TemporaryFile("w+", encoding="utf-8") for _ in range(2)]
         self._began = time.monotonic()
         out, err = self._outputs
         environment = ENVIRONMENT | variables
@@ -136,7 +136,7 @@ def digest(file: Path) -> str:
 
 def log_without_clock(run_folder: Path) -> list[dict]:
     """The lines of `log.jsonl` without the times they took."""
-    lines = [json.loads(line) for line in (run_folder / "log.jsonl").read_text().splitlines()]
+    lines = [json.loads(line) for line in (run_folder / "log.jsonl").read_text(encoding="utf-8").splitlines()]
     return [{name: value for name, value in line.items() if name != "seconds"} for line in lines]
 
 

@@ -29,14 +29,14 @@ def long_sequence(source: Path, out: Path, frames: int) -> Path:
             os.link(there_and_back[i % len(there_and_back)], out / name / f"{i:06d}.png")
     poses = np.load(source / "poses_bounds.npy")
     np.save(out / "poses_bounds.npy", np.tile(poses[:1], (frames, 1)))
-    about = json.loads((source / "sequence.json").read_text())
-    (out / "sequence.json").write_text(json.dumps(about))
+    about = json.loads((source / "sequence.json").read_text(encoding="utf-8"))
+    (out / "sequence.json").write_text(json.dumps(about), encoding="utf-8")
     return out
 
 
 def enlarged(source: Path, out: Path, frames: int, width: int, height: int) -> Path:
     """The first frames of `source` at another size."""
-    about = json.loads((source / "sequence.json").read_text())
+    about = json.loads((source / "sequence.json").read_text(encoding="utf-8"))
     across, down = width / about["width"], height / about["height"]
     for name in ("images", "masks", "depth"):
         (out / name).mkdir(parents=True)
@@ -47,7 +47,7 @@ def enlarged(source: Path, out: Path, frames: int, width: int, height: int) -> P
     about |= {"width": width, "fx": about["fx"] * across, "cx": about["cx"] * across}
     about |= {"height": height, "fy": about["fy"] * down, "cy": about["cy"] * down}
     np.save(out / "poses_bounds.npy", np.load(source / "poses_bounds.npy")[:frames])
-    (out / "sequence.json").write_text(json.dumps(about))
+    (out / "sequence.json").write_text(json.dumps(about), encoding="utf-8")
     return out
 
 

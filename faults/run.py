@@ -31,7 +31,7 @@ def properties(work: Path) -> list[Row]:
     files = sorted((ROOT / "tests").glob("test_properties_*.py"))
     words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *map(str, files)]
     environment = ENVIRONMENT | {"ENDOPRIOR_HYPOTHESIS": "thorough"}
-    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, encoding="utf-8", check=False)
     if done.returncode:
         print(done.stdout[-6000:], done.stderr[-3000:], sep="\n", file=sys.stderr)
     last = (done.stdout.strip() or "no output").splitlines()[-1]  # `n passed in ...`
@@ -51,7 +51,7 @@ PARTS: dict[str, Callable[[Path], list[Row]]] = {
 def table(rows: list[Row], minutes: float) -> str:
     """The rows as Markdown, with what they were measured on."""
     commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty=+"], cwd=ROOT, capture_output=True, text=True, check=False
+        ["git", "describe", "--always", "--dirty=+"], cwd=ROOT, capture_output=True, encoding="utf-8", check=False
     ).stdout.strip()
     lines = ["| part | what | found | |", "|---|---|---|---|"]
     lines += [f"| {row.part} | {row.what} | {row.figure} | {'ok' if row.passed else '**failed**'} |" for row in rows]
@@ -79,9 +79,9 @@ def main() -> int:
             rows += found
     text = table(rows, (time.monotonic() - began) / 60)
     if chosen.write:
-        page = chosen.write.read_text()
+        page = chosen.write.read_text(encoding="utf-8")
         before, after = page.split(BEGIN)[0], page.split(END)[1]
-        chosen.write.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}")
+        chosen.write.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
     print(f"\n{text}")
     return 0 if all(row.passed for row in rows) else 1
 

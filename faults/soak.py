@@ -19,7 +19,7 @@ GROWTH_MB = 30.0
 
 def resident_mb() -> float:
     """Memory of this process that is in use, MB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
@@ -50,7 +50,7 @@ def main(work: Path) -> list[Row]:
     if not data.exists():
         small_sequence(data)
     words = [sys.executable, __file__, str(data), str(work / "soak")]
-    told = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, check=True).stdout
+    told = subprocess.run(words, env=ENVIRONMENT, capture_output=True, encoding="utf-8", check=True).stdout
     sizes = [float(line) for line in told.split()[-TRAININGS:]]
     figure = ", ".join(f"{size:.0f}" for size in sizes) + " MB"
     passed = len(sizes) == TRAININGS and sizes[-1] - sizes[0] < GROWTH_MB

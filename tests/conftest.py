@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does,
 TINY_FRAMES, TINY_WIDTH, TINY_HEIGHT = 17, 48, 40
 TINY_FOCAL = 50.0
 TINY_DEPTH_SCALE = 0.01
+LINUX_ONLY = (
+    "test_bad_inputs.py", "test_doctor_probes.py", "test_doctor_toolchain.py", "test_doctor_triton.py",
+    "test_faults.py", "test_hostile_viewer.py", "test_memory.py",
+)  # fmt: skip
+"""Files that need limits of processes, /proc, signals or shell scripts."""
+collect_ignore = [] if sys.platform == "linux" else [*LINUX_ONLY]
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 FIRST = ("test_bad_inputs", "test_check", "test_phantom", "test_prepare")
 """Files to begin with: one of two workers compiles the kernels of training, the other those of the phantom."""

@@ -220,7 +220,7 @@ def test_two_benchmarks_do_not_share_a_folder(tmp_path, capsys):
         (["--threads", "0"], "--threads: expected 1 to 4096"),
         (["--data", "tiny"], "NAME=FOLDER"),
         (["--data", "x=y"], "expected one of absent, tiny"),
-        (["--weights-dir", "nowhere"], "expected a folder of network weights"),
+        (["--weights-dir", "nowhere"], "expected a folder with weights"),
     ],
 )
 def test_bad_options_are_named(tmp_path, capsys, options, said):
@@ -257,7 +257,7 @@ def test_a_folder_of_specs_shares_equal_cells(tmp_path, capsys):
     text = (tmp_path / "out" / "results.md").read_text()
     assert text.startswith("# Results\n\n## Tiny") and text.count("## Tiny") == 2 and text.count("## Protocol") == 1
     assert main(["bench", str(tmp_path / "tiny"), str(tmp_path / "out")]) == 2
-    assert "got none. Fix: pass a folder of specs" in capsys.readouterr().err
+    assert "got none. Fix: Pass a folder of specs" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -188,8 +188,8 @@ def test_exposure_jump(data):
     edit(data / "images", lambda p, i: np.clip(p * (1.4 if i >= 11 else 1.0), 0, 255).astype(np.uint8))
     finding = only(data, "exposure-jump")
     assert str(finding) == (
-        "warning: exposure-jump: the brightness of the whole image jumps at frame 11; "
-        f"fix: `endoprior train {data} RUN --data.first-frames 11`"
+        "warning: exposure-jump: the brightness of the whole image jumps at frame 11. "
+        f"Fix: `endoprior train {data} RUN --data.first-frames 11`"
     )
 
 
@@ -269,7 +269,7 @@ def test_command_prints_and_writes_figure_and_json(data, capsys):
     out, facts = data.parent / "new" / "check.png", data.parent / "check.json"
     assert main(["check", str(data), "--out", str(out), "--json", str(facts)]) == 0
     text = capsys.readouterr().out.splitlines()
-    assert text[0] == str(data) and text[-1] == str(out)
+    assert text[0] == str(data) and text[-1] == f"figure: {out}"
     assert sum(line.startswith("error: depth-metres: ") for line in text) == 1
     assert any(line.split()[:2] == ["frames", "16:"] for line in text)
     assert cv2.imread(str(out)).shape == (1400, 1500, 3)
@@ -283,7 +283,7 @@ def test_command_prints_and_writes_figure_and_json(data, capsys):
 def test_exit_statuses(data, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["check", str(data), "--strict"]) == 0
-    assert capsys.readouterr().out.splitlines()[-2:] == ["no problems found", "check.png"]
+    assert capsys.readouterr().out.splitlines()[-2:] == ["no problems found", "figure: check.png"]
     assert (tmp_path / "check.png").exists()
     assert main(["check", str(data), "--data.depth-unit-mm", "0.00001", "--strict"]) == 2
     assert "error: depth-metres" in capsys.readouterr().out

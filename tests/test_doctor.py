@@ -30,7 +30,7 @@ def check_advice(facts: Facts) -> None:
         assert [line.name for line in (*chain, *backends["gsplat"]) if line.state != "ok"] == ["gsplat compiled"]
     assert report.next_step and "\n" not in report.next_step + report.compile_problem
     for line in report.lines:
-        assert line.found and line.state in ("ok", "missing", "wrong")
+        assert line.found and line.state in ("ok", "missing", "wrong", "optional")
         assert not line.fix or line.state != "ok", "what is ok needs no fix"
     check_backends(report.works, backends)
     if report.works:
@@ -180,8 +180,8 @@ def test_json_of_this_machine(capsys):
     assert main(["doctor", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert set(found) == {
-        "version", "device", "backend", "why", "cuda_works", "backends", "only_to_compile", "compiling", "blocking",
-        "next_step", "lines", "facts",
+        "version", "verdict", "device", "backend", "why", "cuda_works", "backends", "only_to_compile", "compiling",
+        "blocking", "next_step", "lines", "facts",
     }  # fmt: skip
     assert all(set(line) == {"part", "name", "state", "found", "fix"} for line in found["lines"])
     names = [line["name"] for line in found["lines"] if line["part"] in ("cuda", "triton", "gsplat")]

@@ -7,9 +7,10 @@ import pytest
 from doctor_machines import NO_GPU, NO_TRITON, ONLY_TRITON, WORKING
 
 from endoprior.cli import main
-from endoprior.doctor import examine
+from endoprior.doctor import Facts, examine
 from endoprior.doctor import facts as facts_module
-from endoprior.doctor.records import Gsplat, Toolkit, Torch
+from endoprior.doctor.records import Gsplat, Toolkit, Torch, Triton
+from endoprior.doctor.report import as_json
 
 TO_COMPILE = replace(NO_GPU, gsplat=Gsplat("1.5.3"))
 FOR_IMAGES = {"TORCH_CUDA_ARCH_LIST": "9.0"}
@@ -94,3 +95,23 @@ def test_a_broken_gpu_is_fixed_first():
     machine = replace(WORKING, torch=sick, gsplat=Gsplat("1.5.3"))
     assert examine(machine).compile_problem.startswith("first fix GPU computes: ")
     assert not examine(replace(machine, variables=FOR_IMAGES)).compile_problem
+
+
+@pytest.mark.parametrize(
+    ("torch", "says", "step"),
+    [
+        (Torch(), "cannot train yet. PyTorch: not installed.", "pip install torch"),
+        (Torch("2.13.0+cpu", error="no libgomp"), "PyTorch: 2.13.0+cpu: no libgomp.", "pip install --force-reinstall"),
+        (Torch("2.13.0+cpu"), "can train and render.", "nothing to install"),
+    ],
+)
+def test_without_pytorch_the_cpu_is_not_enough(torch, says, step):
+    report = examine(replace(NO_GPU, torch=torch))
+    assert says in report.verdict and report.next_step.startswith(step)
+    assert json.loads(json.dumps(as_json(Facts(), report, "cpu", "numba", "")))["verdict"] == report.verdict
+
+
+def test_a_gpu_that_could_work_is_named_in_the_verdict():
+    report = examine(replace(WORKING, gsplat=Gsplat(), triton=Triton()))
+    assert report.verdict == "This computer can train and render. GPU: not used yet; Triton: not installed."
+    assert examine(WORKING).verdict == "This computer can train and render. It uses its GPU."

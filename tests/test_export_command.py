@@ -20,6 +20,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.geometry import project
 from endoprior.export.axes import points_in_axes
 from endoprior.export.depth import depth_png
+from endoprior.export.formats import FORMATS, formats_of, load_format
 from endoprior.export.surface import Surface, render_surface
 from endoprior.export.tracks import grid_query_points, project_visible
 from endoprior.model.carry import carry_points
@@ -213,6 +214,41 @@ def test_mesh_of_a_scene_is_its_wall(run, tmp_path):
     assert inner.sum() > 100 and np.abs(fused[inner, 2] - (60 + 0.2 * fused[inner, 0])).mean() < 1.0
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "start"),
+    [
+        ("a.ply", ("--times", "0.5"), b"ply"),
+        ("a.splat", ("--times", "0.5"), None),
+        ("a.spz", ("--times", "0.5"), b"\x1f\x8b"),
+        ("a.glb", ("--times", "0.5"), b"glTF"),
+        ("a.obj", ("--times", "0.5"), b"# endoprior"),
+        ("a.stl", ("--times", "0.5"), b"endoprior"),
+        ("a.obj", ("--times", "0.5", "--format", "mesh"), b"# endoprior"),
+        ("a.safetensors", (), None),
+        ("a.npy", ("--times", "0.5"), b"\x93NUMPY"),
+    ],
+)
+def test_the_suffix_says_the_format(run, tmp_path, name, options, start):
+    assert main(["export", str(run), str(tmp_path / name), *options]) == 0
+    assert (tmp_path / name).read_bytes().startswith(start or b"")
+
+
+def test_every_suffix_has_a_format_and_ambiguous_ones_the_first():
+    formats = {name: load_format(name) for name in FORMATS}
+    for suffix in {suffix for each in formats.values() for suffix in each.suffixes}:
+        assert suffix in formats[formats_of(suffix)[0]].suffixes
+    table = {".ply": "ply", ".obj": "mesh", ".stl": "mesh", ".mp4": "video", ".html": "html", ".png": "depth"}
+    assert {suffix: formats_of(suffix)[0] for suffix in table} == table
+    assert formats_of("") == []
+
+
+@pytest.mark.parametrize("name", ["folder", "a.fbx"])
+def test_a_name_without_a_known_suffix_lists_the_formats(run, tmp_path, capsys, name):
+    assert main(["export", str(run), str(tmp_path / name)]) == 2
+    error = capsys.readouterr().err
+    assert ", ".join(FORMATS) in error and error.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
 def test_video_has_the_frames_of_the_split(run, tmp_path):
     assert export(run, tmp_path / "v.mp4", "video", "--split", "train") == 0
     video, frames = cv2.VideoCapture(str(tmp_path / "v.mp4")), []
@@ -235,9 +271,10 @@ def test_scene_is_the_file_of_the_run(run, tmp_path):
     ("out", "options", "said"),
     [
         ("a.ply", ("ply",), "--times"),
+        ("a.glb", ("gltf",), "or --format animation for all of them."),
         ("a.ply", ("ply", "--times", "2"), "times must be in"),
         ("a.splat", ("ply", "--times", "0"), ".ply"),
-        ("a.stl", ("mesh", "--times", "0"), ".ply"),
+        ("a.stl", ("mesh", "--times", "0", "--mesh-format", "obj"), "Remove --mesh-format"),
         ("a", ("ply", "--canonical", "--times", "0"), "several"),
         ("a", ("mesh", "--canonical"), "--canonical"),
         ("a", ("ply", "--mesh-format", "obj"), "--mesh-format"),

@@ -103,6 +103,6 @@ def test_document_names_every_tensor_of_the_file(reader, tmp_path):
 
 def test_documents_know_every_format_and_frame():
     for name in FORMATS:
-        assert f"--format {name}" in (DOCS / "export.md").read_text(encoding="utf-8")
+        assert f"`{name}`" in (DOCS / "export.md").read_text(encoding="utf-8")
     for name in ROTATIONS:
         assert f"| `{name}`" in (DOCS / "format.md").read_text(encoding="utf-8")

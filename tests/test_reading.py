@@ -30,6 +30,7 @@ from endoprior.prepare.stereo import StereoConfig
 HINT = "Write it again."
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no named pipes in folders")
 def test_kinds_are_told_apart_without_opening(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "loop").symlink_to("loop")

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from endoprior.cli.score_table import score_table
 from endoprior.evaluation.registry import all_scores, scorers
 
 PAGE = Path(__file__).parents[1] / "docs" / "scores.md"
@@ -9,16 +10,42 @@ BETTER = {True: "higher", False: "lower", None: "-"}
 
 
 def test_every_score_has_one_scorer():
-    names = [score.name for scorer in scorers() for score in scorer.SCORES]
+    names = [score.name for scorer in scorers().values() for score in scorer.SCORES]
     assert len(names) == len(set(names)) == len(all_scores())
 
 
 def test_the_page_lists_every_score():
     rows = [
-        f"| `{s.name}` | {s.label} | {s.unit or '-'} | {BETTER[s.higher_is_better]} | {s.description} |"
+        f"| `{s.name}` | {s.label} | {s.unit or '-'} | {BETTER[s.higher_is_better]} | {s.description} "
+        f"| {s.hint or '-' if s.in_summary else 'not printed'} |"
         for s in all_scores().values()
     ]
     assert "\n".join(rows) + "\n\n" in PAGE.read_text(encoding="utf-8"), "expected this table:\n" + "\n".join(rows)
+
+
+def test_every_score_has_a_group_and_a_meaning():
+    for score in all_scores().values():
+        assert score.group != "other" and score.description.endswith(".") and len(score.hint) <= 40
+
+
+def test_the_printed_table_fits_a_page_and_says_which_way_is_better():
+    table = score_table(dict.fromkeys(all_scores(), 1.0), {})
+    assert len(table) <= 25 and all(len(line) <= 90 for line in table)
+    by_label = {line[10:29].strip(): line for line in table}
+    assert "1.00 dB \u2191  above 35 dB" in by_label["tissue PSNR"] and "0 is identical" in by_label["LPIPS"]
+    assert by_label["depth RMSE"].startswith("  depth") and "1.000 mm \u2193" in by_label["depth RMSE"]
+    assert "strict PSNR" not in by_label and "\u2191" not in by_label["Gaussians"]
+    groups = [line[2:9].strip() for line in table if line[2:9].strip()]
+    assert groups == ["image", "depth", "motion", "model", "speed"]
+
+
+def test_scores_that_lack_the_same_package_are_one_line():
+    reason = "torchvision is not installed."
+    skipped = {"flow_error": reason, "lpips": reason, "lpips_squeeze": reason, "psnr_behind_tool": "no truth"}
+    assert score_table({}, skipped) == [
+        f"  not computed: flow error, LPIPS: {reason}",
+        "  not computed: PSNR behind tool: no truth",
+    ]
 
 
 def test_values_are_shown_with_their_unit():

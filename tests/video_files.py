@@ -1,12 +1,14 @@
-"""Small video files for tests, lossless so that pixels can be compared."""
+"""Small video files for tests: lossless ones, so that pixels can be compared, and those of the ffmpeg program."""
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
 import av
+import imageio_ffmpeg
 import numpy as np
 
 
@@ -27,3 +29,15 @@ def write_video(path: Path, pictures: Sequence[np.ndarray], rate: int = 25, time
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return path
+
+
+def ffmpeg(*words: str | Path) -> Path:
+    """Run the ffmpeg program of imageio; the last word is the file it writes, which is returned."""
+    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-loglevel", "error", "-y"]
+    subprocess.run([*program, *map(str, words)], check=True)
+    return Path(words[-1])
+
+
+def moving_pattern(seconds: float) -> list[str]:
+    """Input of ffmpeg: a moving pattern of 96x80 px at 25 frames per second."""
+    return ["-f", "lavfi", "-i", f"testsrc2=size=96x80:rate=25:duration={seconds:g}"]

@@ -54,7 +54,7 @@ class Finding:
     """Affected frames; empty for all."""
 
     def __str__(self) -> str:
-        return f"{self.severity}: {self.code}: {self.what}; fix: {self.fix}"
+        return f"{self.severity}: {self.code}: {self.what}. Fix: {self.fix}"
 
 
 def find(facts: Facts) -> list[Finding]:

@@ -5,6 +5,7 @@ Exit status: 0 done; 2 bad input or usage, one line on stderr; 1 a bug, with tra
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from importlib import import_module
@@ -19,12 +20,13 @@ COMMANDS = {
     "check": "check a sequence before training: properties, problems with their fix, a figure",
     "prior": "write the cue maps and the joint texture prior of each frame",
     "train": "train one scene and score it",
-    "eval": "score a trained scene on a split",
+    "eval": "score a trained scene on a split, or the images of another program",
     "render": "render a trained scene: color, depth, side-by-side, video",
     "export": "write open formats: PLY, splat, SPZ, glTF, mesh, points, tracks, depth, video",
     "view": "show a trained scene, or a sequence before training, in a web browser",
-    "doctor": "report whether this machine can use CUDA, and what to install for it",
+    "doctor": "report whether this computer can train and use a GPU, and what to install for it",
     "bench": "compare methods on sequences over seeds, under one protocol",
+    "plugins": "list datasets, methods, scores and exporters: built in, and of other packages",
 }
 """Name and one-line description. Each command is a module of this package with the same name (`eval`: `evaluate`)."""
 
@@ -44,6 +46,8 @@ def main(argv: list[str] | None = None) -> int:
     # Idle torch threads spin on the cores that Numba needs, which makes rendering three times slower (docs/log.md).
     # Torch reads this variable at its first import. A value set by the user stays.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if isinstance(sys.stdout, io.TextIOWrapper):  # write characters that its encoding lacks as \xNN
+        sys.stdout.reconfigure(errors="backslashreplace")
     argv = sys.argv[1:] if argv is None else argv
     if not argv or argv[0] in ("-h", "--help"):
         print(overview())
@@ -80,7 +84,7 @@ def system_failure(error: Exception) -> str | None:
     whole = " ".join(str(error).split())
     if type(error).__name__ == "OutOfMemoryError":  # raised by torch for a GPU; its message starts with the numbers
         return (
-            f"expected enough GPU memory, got {whole[:160]!r}. Fix: use smaller frames, a smaller --init-budget or "
+            f"expected enough GPU memory, got {whole[:160]!r}. Fix: use smaller frames, fewer --gaussians or "
             "--device cpu. The last checkpoint of a run is complete; resume with `endoprior train --resume RUN`."
         )
     text = whole[-160:]
@@ -106,6 +110,6 @@ def overview() -> str:
             "",
             *lines,
             "",
-            "`endoprior COMMAND --help` explains every option.",
+            "`endoprior COMMAND --help` shows what most users need, `--help-all` every option.",
         ]
     )

@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from ..core.checks import input_error
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -40,9 +41,14 @@ class Bench:
     """Train nothing; write the report of the finished cells."""
 
 
+HELP = Help(
+    examples=(("bench/specs/small.yaml", "OUT"), ("bench/specs/small.yaml", "OUT", "--report-only")),
+)
+
+
 def run(argv: list[str]) -> int:
     """Run the matrix and write its report; 1 if a cell failed."""
-    args = parse(Bench, argv, "bench")
+    args = parse(Bench, argv, "bench", HELP)
     from filelock import FileLock, Timeout
 
     from ..experiments.execute import local_executor, ray_executor
@@ -53,21 +59,25 @@ def run(argv: list[str]) -> int:
 
     for option, value, least in (("--threads", args.threads, 1), ("--cores", args.cores, 0)):
         if not least <= value <= MOST_CORES:
-            raise input_error(option, f"{least} to {MOST_CORES}", f"{value}", "correct it.")
+            raise input_error(
+                option, f"{least} to {MOST_CORES}", f"{value}", f"Choose a value from {least} to {MOST_CORES}."
+            )
     if args.weights_dir and not args.weights_dir.is_dir():
-        raise input_error(args.weights_dir, "a folder of network weights", "none", "correct --weights-dir.")
+        raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
     specs = _specs(args.spec)
     loaded = {path: load_spec(path, _folders(args.data)) for path in specs}
     require_writable_folder("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise input_error(args.out, "a place for a folder", f"{error.strerror}", "choose another.") from None
+        raise input_error(args.out, "a place for a folder", f"{error.strerror}", "Choose another folder.") from None
     lock = FileLock(args.out / ".lock", timeout=0)
     try:
         lock.acquire()
     except Timeout:
-        raise input_error(args.out, "a folder for this benchmark alone", "one in which another runs", "wait.") from None
+        raise input_error(
+            args.out, "a folder for this benchmark alone", "one in which another runs", "Wait until it is done."
+        ) from None
     failed, reports = 0, {}
     with lock:
         if args.report_only:
@@ -85,9 +95,9 @@ def run(argv: list[str]) -> int:
                 )
                 report = write_report(matrix, folder)
                 failed, reports[folder] = failed + matrix.failed, matrix
-                say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\n{report}")
+                say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\nreport: {report}")
     if args.spec.is_dir():
-        say(str(write_overview(reports, args.out)))
+        say(f"overview: {write_overview(reports, args.out)}")
     return 1 if failed else 0
 
 
@@ -102,7 +112,7 @@ def _specs(path: Path) -> list[Path]:
         return [path]
     specs = sorted(file for file in path.iterdir() if file.suffix in (".yaml", ".yml", ".toml"))
     if not specs:
-        raise input_error(path, ".yaml or .toml files", "none", "pass a folder of specs.")
+        raise input_error(path, ".yaml or .toml files", "none", "Pass a folder of specs.")
     return specs
 
 
@@ -111,6 +121,6 @@ def _folders(data: tuple[str, ...]) -> dict[str, Path]:
     for item in data:
         name, separator, folder = item.partition("=")
         if not separator or not folder:
-            raise input_error("--data", "NAME=FOLDER", f"{item!r}", "name a sequence of the spec.")
+            raise input_error("--data", "NAME=FOLDER", f"{item!r}", "Name a sequence of the spec.")
         folders[name] = Path(folder).expanduser()
     return folders

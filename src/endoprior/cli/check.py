@@ -10,6 +10,7 @@ import tyro
 
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -29,9 +30,18 @@ class Check:
     data: DataConfig = field(default_factory=DataConfig)
 
 
+HELP = Help(
+    examples=(("DATA",), ("DATA", "--out", "DATA.png", "--strict")),
+    basics={
+        "results": ("--out", "--json", "--strict"),
+        "which frames": ("--data.first-frames", "--data.stride", "--data.shrink", "--data.format"),
+    },
+)
+
+
 def run(argv: list[str]) -> None:
     """Measure the sequence, print the report, write the figure."""
-    args = parse(Check, argv, "check")
+    args = parse(Check, argv, "check", HELP)
     if args.out.suffix.lower() != ".png":
         raise input_error("--out", "a .png file", str(args.out), f"`--out {args.out.with_suffix('.png')}`.")
     from .output_paths import require_writable_file
@@ -57,7 +67,7 @@ def run(argv: list[str]) -> None:
     if args.json:
         write_json(args.json, as_json(facts, findings))
     draw_check(sequence, facts, findings, args.out)
-    say(f"{args.out}")
+    say(f"figure: {args.out}")
     errors = [finding for finding in findings if finding.severity == "error"]
     if args.strict and errors:
         raise InputError(f"{args.folder}: expected no errors with --strict, got {len(errors)}: {errors[0]}")

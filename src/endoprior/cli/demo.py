@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from ..core.presets import PresetName, preset
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -28,9 +29,12 @@ class Demo:
     """Seed of the phantom and of the training."""
 
 
+HELP = Help(examples=((), ("OUT", "--frames", "16")))
+
+
 def run(argv: list[str]) -> None:
     """Write the phantom, train, score, render, and print the results' paths."""
-    args = parse(Demo, argv, "demo")
+    args = parse(Demo, argv, "demo", HELP)
     from dataclasses import replace
 
     from ..data import load_sequence

@@ -6,6 +6,7 @@ import json as json_text
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Doctor:
-    """Report whether this machine can use CUDA, and what to install for it."""
+    """Report whether this computer can train, whether its GPU can be used, and what to install for it."""
 
     compile: bool = False
     """Compile gsplat now, which takes minutes, and render with it. Without a GPU, as in a container build, it compiles
@@ -24,9 +25,12 @@ class Doctor:
     """Print JSON instead of a table."""
 
 
+HELP = Help(examples=((), ("--json",)))
+
+
 def run(argv: list[str]) -> int:
     """Print the report. Exit status 0 even if something is missing; 1 if --compile fails."""
-    args = parse(Doctor, argv, "doctor")
+    args = parse(Doctor, argv, "doctor", HELP)
     from ..doctor import examine, read_facts
     from ..doctor.choice import choose
     from ..doctor.report import as_json, table

@@ -1,4 +1,4 @@
-"""`endoprior eval RUN`."""
+"""`endoprior eval RUN`, and `endoprior eval --pictures FOLDER DATA`."""
 
 from __future__ import annotations
 
@@ -11,45 +11,70 @@ import tyro
 from ..core.checks import input_error
 from ..doctor.choice import Wanted
 from .devices import on_device
+from .help_page import Help
 from .parsing import parse
 from .progress import say
+from .score_table import score_table
 from .trained_scene import open_scene
 
 if TYPE_CHECKING:
+    from ..data import FrameSequence
+    from ..evaluation.context import Evaluation
     from ..model.scene import Scene
+
+
+MOST_MM_PER_UNIT = 1e6
+"""Largest --depth-scale."""
 
 
 @dataclass
 class Eval:
-    """Score a trained scene; writes metrics.json and per_frame.json into the run folder (or --out).
+    """Score a trained scene, or another program's images; writes metrics.json and per_frame.json.
 
     Splits other than test have files of their own: metrics_train.json, per_frame_train.json.
     """
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
-    """Run folder."""
+    """Run folder; with --pictures the sequence folder."""
     data: Path | None = None
-    """Sequence folder; default: the one the run was trained on."""
+    """Sequence folder. Default: the one the run was trained on."""
     split: Literal["test", "train", "video"] = "test"
     """Frames to score."""
     out: Path | None = None
-    """Folder for the two files."""
+    """Folder for the two files. Default: RUN, or the folder of --pictures."""
+    pictures: Path | None = None
+    """Score the frames in this folder, PNG of 8 or 16 bits, in place of a run (docs/benchmarks.md)."""
+    depth_pictures: Path | None = None
+    """Depth of these frames: NPY in mm, or 16-bit PNG with --depth-scale."""
+    depth_scale: float | None = None
+    """mm per unit of the depth files."""
+    name: str = ""
+    """Name of the method in metrics.json; Default: that of the folder."""
     networks: bool = True
-    """Also compute the scores that need a network (RAFT, LPIPS), where their weights are found."""
+    """Scores by networks (RAFT, LPIPS). They need their weights."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     device: Wanted = "auto"
-    """Where to render; `auto` uses CUDA only if everything it needs works (see `endoprior doctor`)."""
+    """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
+
+
+HELP = Help(examples=(("RUN",), ("RUN", "--split", "train")))
 
 
 def run(argv: list[str]) -> None:
     """Score and print."""
-    args = parse(Eval, argv, "eval")
+    args = parse(Eval, argv, "eval", HELP)
     from ..runs.stored_run import sequence_of_run
     from .output_paths import require_writable_folder
 
     if args.weights_dir and not args.weights_dir.is_dir():
-        raise input_error(args.weights_dir, "a folder of network weights", "none", "correct --weights-dir.")
+        raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
+    if args.pictures:
+        evaluate_pictures(args, args.pictures)
+        return
+    if given := [o for o in ("depth_pictures", "depth_scale", "name") if getattr(args, o) not in (None, "")]:
+        option = f"--{given[0].replace('_', '-')}"
+        raise input_error(option, "--pictures beside it", "a run", f"remove {option} or add --pictures FOLDER.")
     scene = open_scene(args.run)
     require_writable_folder(
         "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
@@ -73,23 +98,50 @@ def evaluate_run(
     Depth is scored against measured depth, even where the run's preset trained on filled-in depth.
     """
     from ..data import load_sequence
-    from ..evaluation.registry import all_scores
     from ..evaluation.scoring import evaluate, scored_data
 
     sequence = load_sequence(data, scored_data(scene.config.data))
     result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir)
     result.scores |= extra
+    save_and_print(result, sequence, out, split)
+
+
+def evaluate_pictures(args: Eval, folder: Path) -> None:
+    """Score the rendered frames in `folder` on the sequence that takes the place of the run."""
+    from ..data import load_sequence
+    from ..evaluation.pictures import Pictures
+    from ..evaluation.scoring import evaluate
+    from .output_paths import require_writable_folder
+
+    if args.data:
+        raise input_error("--data", "--pictures FOLDER DATA", "--data as well", "remove --data.")
+    if args.depth_scale is not None and not 0 < args.depth_scale <= MOST_MM_PER_UNIT:
+        want = f"a number above 0, up to {MOST_MM_PER_UNIT:g}"
+        raise input_error("--depth-scale", want, f"{args.depth_scale}", "correct it.")
+    out = args.out or folder
+    require_writable_folder("--out" if args.out else "--pictures", out)
+    sequence = load_sequence(args.run)
+    depth = {"depth_folder": args.depth_pictures, "depth_scale": args.depth_scale}
+    pictures = Pictures(folder, sequence, args.split, name=args.name, **depth)
+    for line in pictures.remarks:
+        say(line)
+    result = evaluate(pictures, sequence, args.split, networks=args.networks, weights_dir=args.weights_dir)
+    save_and_print(result, sequence, out, args.split)
+
+
+def save_and_print(
+    result: Evaluation, sequence: FrameSequence, out: Path, split: Literal["test", "train", "video"]
+) -> None:
+    """Write the two files into `out`, and print a table."""
     file = result.save(out)
-    say(f"\nscores on the {split} split ({len(sequence.indices(split))} frames)")
-    for name, value in result.scores.items():
-        say(f"  {name:<28}{all_scores()[name].text(value)}")
-    for name, reason in result.skipped.items():
-        say(f"  {name:<28}skipped: {reason}")
+    better = "\u2191 higher is better, \u2193 lower is better"
+    say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({better})")
+    for line in score_table(result.scores, result.skipped):
+        say(line)
     if outliers := result.outlier_frames():
         frames = ", ".join(map(str, outliers))
-        say(
-            f"note: tissue PSNR of frames {frames} is more than 3 dB below the median; see them with `endoprior render`"
-        )
+        look = f"endoprior render RUN --split {split}"
+        say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median. To see them: `{look}`")
     if sequence.depth_is_relative:
-        say("note: the sequence's depth is relative: scores in mm compare runs on it, but are not millimeters")
-    say(f"{file}")
+        say("note: the depth of the sequence is relative. Scores in mm compare runs on it, but are not millimeters.")
+    say(f"all scores: {file}; what they mean: docs/scores.md")

@@ -1,4 +1,4 @@
-"""`endoprior export RUN OUT --format ...`."""
+"""`endoprior export RUN OUT`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from ..export.options import ExportOptions
+from .help_page import Help
 from .parsing import parse
 from .progress import Counting, say
 from .trained_scene import open_scene
@@ -17,17 +18,32 @@ from .trained_scene import open_scene
 
 @dataclass(frozen=True, kw_only=True)
 class Export(ExportOptions):
-    """Write a trained scene in a format that other programs read; docs/export.md says which."""
+    """Write a trained scene in a format that other programs read (docs/export.md)."""
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder, or a scene.safetensors."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
-    """File, if it ends in the format's suffix and there is one time step to write; else a new folder."""
+    """A file, or a new folder with one file for each time step. Its suffix says the format."""
+
+
+HELP = Help(
+    examples=(
+        ("RUN", "tissue.ply", "--times", "0.5"),
+        ("RUN", "tissue.obj", "--times", "0.5"),
+        ("RUN", "OUT", "--format", "mesh", "--split", "test"),
+        ("RUN", "player.html"),
+    ),
+    basics={
+        "what to write": ("--format", "--mesh-format", "--frame"),
+        "which times": ("--times", "--split", "--canonical"),
+        "details": ("--mesh-method", "--min-alpha", "--points"),
+    },
+)
 
 
 def run(argv: list[str]) -> None:
     """Export."""
-    args = parse(Export, argv, "export")
+    args = parse(Export, argv, "export", HELP)
     from ..export import export
 
     options = ExportOptions(**{field.name: getattr(args, field.name) for field in fields(ExportOptions)})
@@ -37,4 +53,4 @@ def run(argv: list[str]) -> None:
     for path in written:
         say(f"{path}")
     if scene.lengths_are_relative:
-        say("note: the scale of this scene is assumed: its lengths are not millimeters")
+        say("note: the scale of this scene is assumed. Its lengths are not millimeters.")

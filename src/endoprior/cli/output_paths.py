@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
+import os
 from pathlib import Path
 
 from ..core.checks import input_error
 from ..data.reading import kind_of
+from ..system.paths import lies_in
 
 
 def require_writable_file(option: str, path: Path, keep: Path) -> None:
@@ -22,7 +23,7 @@ def require_writable_file(option: str, path: Path, keep: Path) -> None:
     kind = kind_of(path)
     if kind not in ("a file", "nothing"):
         raise input_error(f"{option} {path}", "the path of a file", kind, "Choose another name.")
-    if kind == "a file" and keep.resolve() in path.resolve().parents:
+    if kind == "a file" and lies_in(path, keep):
         raise input_error(f"{option} {path}", f"a path outside of {keep}", "a file in it", "Choose another name.")
     _require_writable(option, path, path.absolute().parent)
 
@@ -36,12 +37,14 @@ def require_writable_folder(option: str, path: Path) -> None:
 
 
 def _require_writable(option: str, path: Path, folder: Path) -> None:
-    """Try to write an anonymous file in the nearest existing parent folder."""
+    """Try to write a file in the nearest existing parent folder."""
     while kind_of(folder) == "nothing" and folder != folder.parent:
         folder = folder.parent
     try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
+        # Not by `tempfile`: on Windows it tries two billion names if the folder is not writable.
+        probe = folder / f".writable.{os.getpid()}.partial"
+        probe.touch()
+        probe.unlink()
     except OSError as error:
         got = f"{error.strerror} at {folder}"
         raise input_error(f"{option} {path}", "a writable path", got, "Choose another path.") from None

@@ -1,59 +1,65 @@
-"""Parse command-line arguments into dataclasses with tyro; usage errors become one line."""
+"""Parse command-line arguments into dataclasses with tyro."""
 
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
-import re
+from collections.abc import Mapping
 from typing import TypeVar
 
 import tyro
 
 from ..core.checks import InputError, input_error
 from ..core.config_io import current_value
+from .help_page import PLAIN, Help, help_page
+from .options import option_name, options
+from .progress import say
+from .usage_errors import reject_unknown, usage_error
 
 A = TypeVar("A")
-BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
 
 
-def parse(cls: type[A], argv: list[str], command: str, default: A | None = None) -> A:
-    """Fill the dataclass `cls` from `argv`; `--help` prints and exits with status 0.
+def parse(cls: type[A], argv: list[str], command: str, page: Help = PLAIN, default: A | None = None) -> A:
+    """Fill the dataclass `cls` from `argv`; `--help` and `--help-all` print a page and exit with status 0.
 
+    Args:
+        page: short names of options, and what `--help` shows.
+        default: an instance with the defaults; None takes those of the class.
     Raises:
         InputError: an unknown option, a missing argument, or a value of the wrong kind or range.
     """
+    arguments = options(cls, default)
+    if asked := {"-h", "--help", "--help-all"} & set(argv):
+        say(help_page(command, inspect.getdoc(cls), arguments, page, everything="--help-all" in asked))
+        raise SystemExit(0)
     if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in argv):
         fix = "Set the shell variable, or remove the empty argument."
         raise input_error(f"endoprior {command}", "no empty argument", "one", fix)
-    words, errors = _current(argv), io.StringIO()
+    reject_unknown(argv, command, [*page.short, *(name for option in arguments for name in option.names)])
+    words, errors = _current(argv, page.short), io.StringIO()
     extra = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(errors):
-            return tyro.cli(cls, args=words, prog=f"endoprior {command}", description=cls.__doc__, **extra)
-    except SystemExit as exit_:
-        if exit_.code == 0:
-            raise
-        raise InputError(f"{_one_line(errors.getvalue())}. Fix: `endoprior {command} --help`.") from None
+            return tyro.cli(cls, args=words, prog=f"endoprior {command}", add_help=False, **extra)
+    except SystemExit:
+        raise usage_error(errors.getvalue(), argv, command, arguments, page.short) from None
     except InputError:
         raise
     except ValueError as error:  # a range check of the config
         raise InputError(f"{str(error).removesuffix('.')}. Fix: `endoprior {command} --help`.") from None
 
 
-def _current(argv: list[str]) -> list[str]:
-    """The words with values of earlier versions replaced: `--render.backend cpu` is `--render.backend numba`."""
-    words = []
-    for word, before in zip(argv, ["", *argv], strict=False):
-        option, equals, value = word.partition("=")
-        if equals:
-            words.append(f"{option}={current_value(option.removeprefix('--'), value, hint=True)}")
+def _current(argv: list[str], short: Mapping[str, str]) -> list[str]:
+    """The words with short names written out, and values of earlier versions replaced by what they are called now."""
+    words: list[str] = []
+    for word in argv:
+        _, equals, value = word.partition("=")
+        option = short.get(option_name(word), option_name(word)).removeprefix("--")
+        if word.startswith("--") and equals:
+            words.append(f"--{option}={current_value(option, value, hint=True)}")
+        elif word.startswith("--"):
+            words.append(f"--{option}")
         else:
-            words.append(current_value(before.removeprefix("--"), word, hint=True))
+            words.append(current_value(words[-1].removeprefix("--") if words else "", word, hint=True))
     return words
-
-
-def _one_line(page: str) -> str:
-    """The error in tyro's framed page, without the frame, its title and the closing advice."""
-    body = [BOX_DRAWING.sub(" ", line).strip() for line in page.splitlines() if not line.startswith("\u256d")]
-    text = " ".join(" ".join(body).split("For full helptext")[0].split())
-    return text.rstrip(". ")

@@ -8,7 +8,9 @@ from typing import Annotated
 
 import tyro
 
+from ..core.shell import command
 from ..phantom import PhantomConfig
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -22,10 +24,20 @@ class Phantom:
     config: Annotated[PhantomConfig, tyro.conf.arg(name="")] = field(default_factory=PhantomConfig)
 
 
+HELP = Help(
+    examples=(("DATA",), ("DATA", "--frames", "16", "--width", "320", "--height", "256", "--stereo")),
+    basics={
+        "size": ("--frames", "--width", "--height", "--stereo"),
+        "scene": ("--seed", "--breathing-mm", "--pull-mm", "--noise"),
+    },
+)
+
+
 def run(argv: list[str]) -> None:
     """Write the sequence."""
-    args = parse(Phantom, argv, "phantom")
+    args = parse(Phantom, argv, "phantom", HELP)
     from ..phantom import write_phantom
 
     write_phantom(args.out, args.config)
     say(f"{args.out}: {args.config.frames} frames of {args.config.width}x{args.config.height}")
+    say(f"next: {command('train', args.out, 'RUN')}")

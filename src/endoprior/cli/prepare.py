@@ -10,6 +10,7 @@ import tyro
 
 from ..core.shell import command
 from ..prepare.config import PrepareConfig
+from .help_page import Help
 from .parsing import parse
 from .progress import Counting, say
 
@@ -29,9 +30,23 @@ class Prepare:
     config: Annotated[PrepareConfig, tyro.conf.arg(name="")] = field(default_factory=PrepareConfig)
 
 
+HELP = Help(
+    examples=(
+        ("video.mp4", "DATA"),
+        ("stereo.mp4", "DATA", "--calibration", "calib.yaml"),
+        ("video.mp4", "DATA", "--start", "10", "--end", "20", "--frames-per-second", "10"),
+    ),
+    basics={
+        "cameras": ("--calibration", "--right"),
+        "frames": ("--start", "--end", "--frames-per-second", "--max-width"),
+        "depth, tools and camera path": ("--depth", "--masks", "--poses"),
+    },
+)
+
+
 def run(argv: list[str]) -> None:
     """Prepare the sequence."""
-    args = parse(Prepare, argv, "prepare")
+    args = parse(Prepare, argv, "prepare", HELP)
     from ..data.prepare_record import RECORD
     from ..prepare import prepare
 

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ..core.config import PriorConfig
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -26,12 +27,18 @@ class Prior:
     config: Annotated[PriorConfig, tyro.conf.arg(name="")] = field(default_factory=PriorConfig)
 
 
+HELP = Help(
+    examples=(("DATA", "OUT"), ("DATA", "OUT", "--split", "test")),
+    basics={"which frames": ("--split",)},
+)
+
+
 def run(argv: list[str]) -> None:
     """Write the maps."""
-    args = parse(Prior, argv, "prior")
+    args = parse(Prior, argv, "prior", HELP)
     from ..data import load_sequence
     from ..visualization.prior_maps import write_prior_maps
 
     sequence = load_sequence(args.data)
     sheet = write_prior_maps(sequence, args.split, args.config, args.out)
-    say(f"{len(sequence.indices(args.split))} frames\n{sheet}")
+    say(f"{len(sequence.indices(args.split))} frames: {args.out}\ncontact sheet: {sheet}")

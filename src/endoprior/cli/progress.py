@@ -16,9 +16,8 @@ PLAIN_EVERY_SECONDS = 10.0
 
 
 def say(text: str) -> None:
-    """Print one line and flush it. Characters that the terminal's encoding lacks are written as \\xNN."""
-    encoding = sys.stdout.encoding or "utf-8"
-    print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
+    """Print one line and flush it."""
+    print(text, flush=True)
 
 
 @contextmanager
@@ -35,13 +34,13 @@ class Counting:
     """Progress of countable steps: a line every few seconds, or one updated line on a terminal."""
 
     def __enter__(self) -> Counting:
-        self._terminal, self._what, self._first = sys.stderr.isatty(), "", 0
+        self._terminal, self._what, self._first, self._width = sys.stderr.isatty(), "", 0, 0
         self._began = self._last = clock.monotonic()
         return self
 
     def __exit__(self, *exc: object) -> None:
         if self._terminal and self._what:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            self._replace_line("")
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Report progress of the step `what`; a `total` of 0 is unknown."""
@@ -56,9 +55,14 @@ class Counting:
         if rate > 0 and total:
             line += f"  {rate:.1f}/s  {(total - done) / rate:.0f} s left"
         if self._terminal:
-            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+            self._replace_line(line)
         else:
             say(line)
+
+    def _replace_line(self, line: str) -> None:
+        """Overwrite the line of a terminal, without escape codes: older consoles of Windows print them."""
+        print(f"\r{line:<{self._width}}", end="\r", file=sys.stderr, flush=True)
+        self._width = len(line)
 
 
 class _PlainLines:

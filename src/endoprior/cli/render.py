@@ -11,6 +11,7 @@ import tyro
 from ..core.checks import input_error
 from ..doctor.choice import Wanted
 from .devices import on_device
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 from .trained_scene import open_scene
@@ -38,12 +39,17 @@ class Render:
     data: Path | None = None
     """Sequence folder with the input frames. Default: the one the run was trained on."""
     device: Wanted = "auto"
-    """Device; auto uses CUDA only if all of it works (`endoprior doctor`)."""
+    """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
+
+
+HELP = Help(
+    examples=(("RUN",), ("RUN", "OUT", "--split", "test"), ("RUN", "OUT", "--camera", "sway")),
+)
 
 
 def run(argv: list[str]) -> None:
     """Load the scene and render it."""
-    args = parse(Render, argv, "render")
+    args = parse(Render, argv, "render", HELP)
 
     scene = open_scene(args.run)
     render(scene, args)
@@ -63,7 +69,7 @@ def render(scene: Scene, args: Render) -> None:
 
     frames, total = None, len(scene.cameras)
     if bad := [t for t in args.times if not 0 <= t <= 1]:
-        raise input_error("--times", "times in [0, 1]", str(bad[0]), "Frame i of T is at time i / T.")
+        raise input_error("--times", "times in [0, 1]", str(bad[0]), "Correct it; frame i of T is at i / T.")
     if args.camera_path:
         views = read_path(args.camera_path, scene.cameras)
     else:
@@ -85,4 +91,4 @@ def render(scene: Scene, args: Render) -> None:
     if not args.out and out.is_symlink():  # in an untrusted run the link could point anywhere
         raise input_error(out, "a folder", "a link to one", "Remove the link, or pass OUT.")
     write_views(scene, views, out, video, frames)
-    say(f"{len(views)} views: {out}\n{video}")
+    say(f"{len(views)} frames: {out}\nvideo: {video}")

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ..core.checks import InputError, input_error
+from ..core.checks import input_error
 from ..core.config import Config
 from ..core.presets import PresetName
 from ..core.shell import command
 from ..doctor.choice import Wanted
+from .help_page import Help
 from .parsing import parse
 from .progress import say, training_progress
 from .start_config import resume_command, run_to_resume, start_config
@@ -28,34 +29,53 @@ if TYPE_CHECKING:
 
 @dataclass
 class Train:
-    """Train one scene and score it. The options below --view-port are fields of the config; the preset sets them."""
+    """Train one scene and score it. The preset sets every number of the method; options change single ones."""
 
     data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
-    """Sequence folder: images/, masks/, depth/, poses_bounds.npy. Resume a run with `--resume RUN` alone."""
+    """Sequence folder: of `endoprior prepare` or a dataset. To resume a run, `--resume RUN` alone is enough."""
     out: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="OUT")]] = None
     """Run folder to write."""
     preset: PresetName = "default"
-    """Preset of the config."""
+    """Method: a preset of the config."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
-    """config.json of another run, or YAML with some fields of the config: overrides the preset; options override it."""
-    init_budget: int | None = None
-    """Short for --init.budget."""
+    """Config of another run (config.json), or YAML with some fields. It overrides the preset; options override it."""
     device: Wanted = "auto"
-    """Device; auto uses CUDA only if all of it works (`endoprior doctor`)."""
+    """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
     weights_dir: Path | None = None
     """Folder with the weights of RAFT and LPIPS."""
     networks: bool = True
-    """Also score with RAFT and LPIPS if their weights are available."""
+    """Scores by networks (RAFT, LPIPS). They need their weights."""
     resume: bool = False
-    """Resume a run after Ctrl-C or a crash, with its data and config: `endoprior train --resume RUN`. The result is
-    bit-identical to an uninterrupted run."""
+    """Continue a run after a stop, with its data and config. The result is bit-identical to an uninterrupted run."""
     checkpoint_seconds: float = 60.0
     """Time between two checkpoints, and the most time that a crash can cost."""
     view: bool = False
-    """Show the scene in a web browser during training, at 127.0.0.1 and --view-port. This slows down training."""
+    """Show the scene in a web browser during training. At 127.0.0.1 and --view-port; it slows down training."""
     view_port: int = 8080
     """Port of --view; 0 uses any free port."""
     config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+
+
+HELP = Help(
+    examples=(
+        ("DATA", "RUN"),
+        ("DATA", "RUN", "--iterations", "3000", "--gaussians", "50000"),
+        ("--resume", "RUN"),
+    ),
+    basics={
+        "method": ("--preset", "--config", "--seed"),
+        "what to train on": ("--data.first-frames", "--data.shrink"),
+        "how long": ("--iterations", "--resume"),
+        "how large": ("--gaussians",),
+        "where it runs": ("--device",),
+        "during and after training": ("--view", "--no-networks", "--weights-dir"),
+    },
+    short={
+        "--iterations": "--schedule.fine-iterations",
+        "--gaussians": "--init.budget",
+        "--init-budget": "--init.budget",
+    },
+)
 
 
 def run(argv: list[str]) -> None:
@@ -76,11 +96,6 @@ def run(argv: list[str]) -> None:
         cfg = dataclasses.replace(cfg, render=dataclasses.replace(cfg.render, backend=choice.backend))
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
-    if args.init_budget is not None:
-        try:
-            cfg = dataclasses.replace(cfg, init=dataclasses.replace(cfg.init, budget=args.init_budget))
-        except ValueError as error:
-            raise InputError(f"--init-budget: {error}. Fix: correct the value.") from None
     port = args.view_port if args.view else None
     if not args.checkpoint_seconds >= 0:
         raise input_error("--checkpoint-seconds", "at least 0", str(args.checkpoint_seconds), "Remove it for 60.")
@@ -138,7 +153,7 @@ def train_and_evaluate(
 
 def _logged_seconds(log: Path) -> float:
     """Iterations per second: the reciprocal of the mean time of the logged iterations."""
-    seconds = [json.loads(line)["seconds"] for line in log.read_text().splitlines()]
+    seconds = [json.loads(line)["seconds"] for line in log.read_text(encoding="utf-8").splitlines()]
     return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0
 
 
@@ -150,7 +165,7 @@ def _arguments(argv: list[str]) -> Train:
     """
     name, cfg = start_config(argv)
     start = Train(data=tyro.MISSING, preset=name, config=cfg)
-    args = parse(Train, argv, "train", default=start)
+    args = parse(Train, argv, "train", HELP, default=start)
     if not args.resume:
         if args.out is None:
             fix = f"`{command('train', args.data, 'RUN')}`."
@@ -158,5 +173,5 @@ def _arguments(argv: list[str]) -> Train:
         return args
     data, out, stored = run_to_resume(args.data, args.out, argv)
     if stored is not None:
-        args = parse(Train, argv, "train", default=dataclasses.replace(start, config=stored))
+        args = parse(Train, argv, "train", HELP, default=dataclasses.replace(start, config=stored))
     return dataclasses.replace(args, data=data, out=out)

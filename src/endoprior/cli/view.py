@@ -14,6 +14,7 @@ import tyro
 from ..core.checks import InputError, input_error
 from ..doctor.choice import Wanted
 from .devices import on_device
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -37,16 +38,19 @@ class View:
     data: Path | None = None
     """Sequence folder with the input frames of a run. Default: the one it was trained on."""
     host: str = "127.0.0.1"
-    """Address to listen on. Everyone who can reach it sees the scene: there is no password."""
+    """Address to listen on. Everyone who can reach it sees the scene; there is no password."""
     port: int = DEFAULT_PORT
     """Port to listen on; 0 uses any free port."""
     device: Wanted = "auto"
-    """Device that renders a run; auto uses CUDA only if all of it works (`endoprior doctor`)."""
+    """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
+
+
+HELP = Help(examples=(("RUN",), ("DATA", "--port", "9000")))
 
 
 def run(argv: list[str]) -> None:
     """Serve until interrupted."""
-    args = parse(View, argv, "view")
+    args = parse(View, argv, "view", HELP)
     from ..view.access_control import check_address
 
     check_address(args.host, args.port)
@@ -132,7 +136,7 @@ def _originals(scene: Scene, folder: Path, data: Path | None) -> FrameSequence |
     except InputError as error:
         if data:
             raise
-        say(f"note: no input frames, differences or tools: {error}")
+        say(f"note: without input frames there are no differences and tools to show. {error}")
         return None
     if len(sequence) != len(scene.cameras):
         fix = "`--data FOLDER` with the sequence of the run."

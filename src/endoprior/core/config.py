@@ -32,11 +32,11 @@ class DataConfig(Checked):
     lift_missing_depth: bool = False
     """As EndoGaussian does: missing depth becomes the near clip value and counts as measured."""
     shrink: Annotated[int, Range(1, 64)] = 1
-    """Read frames at this fraction of their width and height: 2 averages blocks of 2 x 2 pixels."""
+    """Divide width and height by this. 2 averages blocks of 2 x 2 pixels."""
     first_frames: Count = 0
-    """Read only so many frames from the start of the sequence; 0 reads all."""
+    """Read only the first frames; 0 reads all."""
     skip_frames: str = ""
-    """Frames to leave out, such as `0-9,15`: numbers of `endoprior check`, after `stride` and `first_frames`."""
+    """Frames to leave out, such as `0-9,15`. Numbers of `endoprior check`, after `stride` and `first_frames`."""
     format: str = "auto"
     """Layout of the folder: a name in docs/datasets.md, such as `endonerf`; `auto` recognizes it."""
     stride: Annotated[int, Range(0, 10_000)] = 0
@@ -91,7 +91,7 @@ class InitConfig(Checked):
     sampler: Literal["prior", "uniform", "pool"] = "prior"
     """`prior`: Eq. (6), equal share per frame; `uniform`: the same shares, no prior; `pool`: EndoGaussian's."""
     budget: Positive = 20_000
-    """Pixels sampled over all training frames."""
+    """Gaussians to start with. So many pixels are sampled over all training frames."""
     uniform_fraction: Share = 0.45
     """eta_app: share of the probability spread evenly over the eroded tissue mask."""
     erosion_px: Annotated[int, Range(1, 1001)] = 9
@@ -338,7 +338,7 @@ class ScheduleConfig(Checked):
     coarse_iterations: Count = 1000
     """Stage one: the first training frame alone, no deformation."""
     fine_iterations: Positive = 3000
-    """Stage two: a random training frame each time, deformed."""
+    """Training iterations. Stage two: a random training frame each time, deformed."""
     sh_degree: Annotated[int, Range(0, 3)] = 3
     """Highest degree of the color's spherical harmonics."""
     half_resolution_iterations: Count = 0
@@ -352,7 +352,7 @@ class Config(Checked):
     """The whole config. Equal configs, data and machine give bit-identical results on a CPU."""
 
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
-    """Seed of sampling, initial weights, frame order and splits."""
+    """Seed of all random choices. Sampling, initial weights, frame order and splits."""
     data: DataConfig = field(default_factory=DataConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
     init: InitConfig = field(default_factory=InitConfig)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +44,8 @@ def assemble(
     cameras: list[Camera],
     decode: Callable[[int], Pixels],
     *,
-    files: list[Path],
+    images: list[Path],
+    files: Sequence[Path] = (),
     clip_depth: bool = True,
     frames_per_second: float | None = None,
     truth: Truth | None = None,
@@ -60,7 +61,8 @@ def assemble(
         cfg: `shrink` and how depth is cleaned.
         cameras: of the kept frames at full size.
         decode: pixels of kept frame i at full size.
-        files: of the sequence, for its fingerprint.
+        images: the color image of each kept frame.
+        files: the other files of the sequence, for its fingerprint.
         clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where the extremes of depth are
             reliable, because it was measured or rendered.
         frames_per_second, truth, remarks, mask_folder, depth_is_relative, sources: see `FrameSequence`.
@@ -89,7 +91,8 @@ def assemble(
         read_frame,
         frames_per_second=frames_per_second,
         mask_folder=mask_folder,
-        files=files,
+        images=images,
+        files=[*images, *files],
         truth=truth,
         remarks=remarks,
         depth_is_relative=depth_is_relative,

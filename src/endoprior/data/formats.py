@@ -9,9 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..core.config import DataConfig
+from ..system.plugins import Registry, report
 
 if TYPE_CHECKING:
     from .sequence import FrameSequence
@@ -38,6 +39,30 @@ class Format:
     """Opens a folder; raises InputError where it cannot be used."""
 
 
-def load_format(name: str) -> Format:
-    """The layout of that name in `FORMATS`; imports its module."""
-    return import_module(f".{name}", __package__).FORMAT
+def _problem(found: Any) -> str:
+    return "" if isinstance(found, Format) else f"an object of type {type(found).__name__}"
+
+
+REGISTRY: Registry[Format] = Registry(
+    "datasets",
+    FORMATS,
+    lambda name: import_module(f".{name}", __package__).FORMAT,
+    "a Format of endoprior.data.formats",
+    _problem,
+    reserved=("auto",),
+)
+"""The layouts above, and those of plugins."""
+
+
+def recognizing(path: Path) -> str | None:
+    """Name of the first layout that recognizes a folder; plugins come after the built-in layouts, before `plain`."""
+    for name in FORMATS[:-1]:
+        if REGISTRY.load(name).recognizes(path):
+            return name
+    for name, layout in REGISTRY.usable():
+        try:
+            if layout.recognizes(path):
+                return name
+        except Exception as error:  # a plugin's fault must not keep other folders from opening
+            report(REGISTRY.failure(name, error))
+    return FORMATS[-1] if REGISTRY.load(FORMATS[-1]).recognizes(path) else None

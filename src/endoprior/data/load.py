@@ -9,7 +9,7 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from .endonerf import load_endonerf
 from .files import entries
-from .formats import FORMATS, load_format
+from .formats import REGISTRY, recognizing
 from .reading import kind_of
 from .recognize import not_a_sequence
 from .sequence import FrameSequence
@@ -39,29 +39,28 @@ def load_sequence(
         raise input_error(path, "a sequence folder", got, "pass the folder that holds images/, masks/ and depth/.")
     name = find_format(path, cfg)
     if pose_axes == "opencv":
-        return load_format(name).load(path, cfg)
+        return REGISTRY.load(name).load(path, cfg)
     if name != "endonerf":
         raise ValueError(f"pose_axes must be opencv for the {name} layout, which defines it; got {pose_axes!r}")
     return load_endonerf(path, cfg, pose_axes=pose_axes)
 
 
 def find_format(path: Path, cfg: DataConfig) -> str:
-    """The name in `FORMATS` that `cfg.format` gives; for `auto` the first layout that recognizes the folder.
+    """The name of a layout that `cfg.format` gives; for `auto` the first layout that recognizes the folder.
 
     Raises:
         InputError: there is no layout of that name, or none recognizes the folder.
     """
-    if cfg.format in FORMATS:
-        return cfg.format
     if cfg.format != "auto":
-        choices = f"auto, {', '.join(FORMATS)}"
+        if cfg.format in REGISTRY.names():
+            return cfg.format
+        choices = f"auto, {', '.join(REGISTRY.names())}"
         raise input_error("data.format", f"one of {choices}", repr(cfg.format), "see docs/datasets.md.")
-    for name in FORMATS:
-        if load_format(name).recognizes(path):
-            return name
+    if name := recognizing(path):
+        return name
     if error := not_a_sequence(path):
         raise error
     names = sorted(entry.name + "/" * entry.is_dir() for entry in entries(path) if not entry.name.startswith("."))
     got = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-    known = ", ".join(FORMATS)
+    known = ", ".join(REGISTRY.names())
     raise input_error(path, f"one of the layouts {known}", got or "an empty folder", "see docs/datasets.md.")

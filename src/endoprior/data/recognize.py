@@ -11,7 +11,7 @@ from pathlib import Path
 from ..core.checks import InputError, input_error
 from ..core.shell import command, quoted
 from .files import entries, read_json
-from .formats import FORMATS, load_format
+from .formats import recognizing
 from .reading import kind_of
 from .video_files import STILL_SUFFIXES, VIDEO_SUFFIXES, is_video
 
@@ -25,7 +25,7 @@ SIDE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
 def is_sequence(folder: Path) -> bool:
     """Whether a folder has one of the layouts of docs/datasets.md."""
     try:
-        return any(load_format(name).recognizes(folder) for name in FORMATS)
+        return recognizing(folder) is not None
     except OSError:  # not readable
         return False
 

@@ -9,6 +9,7 @@ import hashlib
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from pathlib import Path
 from typing import Literal, overload
 
@@ -35,6 +36,7 @@ class FrameSequence:
         read_frame: Callable[[int], Frame],
         *,
         frames_per_second: float | None = None,
+        images: list[Path] | None = None,
         files: list[Path] | None = None,
         truth: Truth | None = None,
         remarks: list[str] | None = None,
@@ -49,6 +51,7 @@ class FrameSequence:
             cameras: the camera of each frame.
             read_frame: decodes frame i; called again if the frame is no longer in the cache.
             frames_per_second: of the video, None if unknown.
+            images: the color image of each frame, None if frames are not files of their own.
             files: every file that makes up the sequence, for `fingerprint`.
             truth: ground truth of a synthetic sequence.
             remarks: what is unusual but usable, one line each.
@@ -61,12 +64,15 @@ class FrameSequence:
         self.sources = dict(sources or {})
         self.frames_per_second = frames_per_second
         self.truth = truth
+        self.image_names = [image.stem for image in images or []]
+        """Name of each frame's color image, without its suffix; empty if frames are not files of their own."""
         self._cameras = cameras
         self._read_frame = read_frame
         self._files = files or []
         self._remarks = remarks or []
         self._masks = path / mask_folder
         self._cache: BoundedCache[Frame] = BoundedCache(cache_bytes(), _frame_bytes)
+        self._holds_out = False
 
     @property
     def remarks(self) -> list[str]:
@@ -86,7 +92,13 @@ class FrameSequence:
         Raises:
             IndexError: no such frame.
             InputError: one of its files cannot be used.
+            ValueError: it is a test frame, and this is a `training_view`.
         """
+        if self._holds_out and is_test_frame(index):
+            raise ValueError(f"frame must be a training frame; got {index}, which is held out")
+        return self._decoded(index)
+
+    def _decoded(self, index: int) -> Frame:
         if not 0 <= index < len(self):
             raise IndexError(f"frame must be in 0..{len(self) - 1}; got {index}")
         return self._cache.get(index, lambda: self._read_frame(index))
@@ -104,6 +116,12 @@ class FrameSequence:
     def frames(self, split: Split) -> FrameList:
         """The frames of a split, decoded one by one as they are used."""
         return FrameList(self, self.indices(split))
+
+    def training_view(self) -> FrameSequence:
+        """This sequence without ground truth, in which reading a test frame is an error: what a method trains on."""
+        view = copy(self)
+        view.truth, view._holds_out = None, True
+        return view
 
     def fingerprint(self) -> str:
         """SHA-256, in hex, of the names (below the folder) and contents of all files of the sequence."""
@@ -124,7 +142,7 @@ class FrameSequence:
         camera = self.camera(0)
         threads = workers(DECODING_BYTES * camera.width * camera.height)
         with ThreadPoolExecutor(threads) as pool:  # decoding releases the interpreter lock
-            contents = list(pool.map(lambda index: _contents(self.frame(index)), range(len(self))))
+            contents = list(pool.map(lambda index: _contents(self._decoded(index)), range(len(self))))
         tissue = [share for share, _, _ in contents]
         if not any(tissue):
             hint = "the polarity may be inverted: masks are 255 on tools."

@@ -12,12 +12,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..system.atomic import reject_occupied, whole_folder
-from .images import save_png
+from .images import decode_image, save_png
 
 TOOL_VALUE = 255
 """Value of tool pixels in `masks/`; tissue is 0."""
@@ -112,7 +111,7 @@ class FrameFiles:
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write `content` to `name` (relative, `.json`)."""
-        self._file(name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        self._file(name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8", newline="\n")
 
     def finish(
         self, camera_to_world: NDArray[np.float64] | None = None, unexplained_frames: list[int] | None = None
@@ -161,7 +160,7 @@ class FrameFiles:
     def _depth_bounds(self, index: int) -> tuple[float, float]:
         """Nearest and farthest depth of a written frame, mm; (0, 0) without depth."""
         path = self.file("depth", index)
-        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.exists() else np.zeros(0, np.uint16)
+        stored = decode_image(path, None) if path.exists() else np.zeros(0, np.uint16)
         measured = stored[stored > 0]
         if not measured.size:
             return 0.0, 0.0

@@ -39,6 +39,23 @@ class Report:
     """Why gsplat cannot be compiled now, in one line; empty if it can. Compiling needs no GPU."""
 
     @property
+    def broken(self) -> Line | None:
+        """What keeps this computer from training even on the CPU; None if nothing does."""
+        return next((line for line in self.lines if line.part == "machine" and line.state != "ok"), None)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence: whether this computer can train, and what of its GPU."""
+        if self.broken:
+            return f"This computer cannot train yet. {self.broken.name}: {self.broken.found}."
+        can = "This computer can train and render."
+        if self.works:
+            return f"{can} It uses its GPU."
+        if self.has_usable_gpu:
+            return f"{can} GPU: not used yet; {self.blocking.name}: {self.blocking.found.rstrip('.')}."
+        return f"{can} GPU: {self.blocking.found}; everything runs on the CPU."
+
+    @property
     def works(self) -> bool:
         """Whether the GPU can be used."""
         return self.triton or self.gsplat
@@ -49,7 +66,8 @@ class Report:
         if self.blocking is None:
             backends = [name for name, works in (("Triton", self.triton), ("gsplat", self.gsplat)) if works]
             return f"{NOTHING}: CUDA works, with {' and '.join(backends)}"
-        return self.blocking.fix or f"{NOTHING} to install. Everything runs on the CPU."
+        cpu = self.broken.fix if self.broken else f"{NOTHING} to install. Everything runs on the CPU."
+        return self.blocking.fix or cpu
 
 
 def examine(facts: Facts) -> Report:

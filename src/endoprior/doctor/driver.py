@@ -114,7 +114,7 @@ def _on_bus(folder: Path) -> int | None:
     count = 0
     for device in devices:
         try:
-            vendor, kind = ((device / name).read_text().strip() for name in ("vendor", "class"))
+            vendor, kind = ((device / name).read_text("utf-8", "replace").strip() for name in ("vendor", "class"))
         except OSError:
             continue
         count += vendor == "0x10de" and kind.startswith("0x03")

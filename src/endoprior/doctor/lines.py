@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-State = Literal["ok", "missing", "wrong"]
+State = Literal["ok", "missing", "wrong", "optional"]
+"""`optional`: not there, and only needed for what the line names."""
 Part = Literal["machine", "cuda", "triton", "gsplat", "also"]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .lines import Line, State
-from .records import Facts
+from .records import Facts, Torch
 
 PARTS = {
     "exr": ("depth in OpenEXR files", ("OpenEXR",)),
@@ -19,7 +19,7 @@ TESTS = ("ENDOPRIOR_DATA", "ENDOPRIOR_CHROMIUM", "ENDOPRIOR_HYPOTHESIS", "ENDOPR
 
 
 def machine_lines(facts: Facts) -> list[Line]:
-    """The computer and its Python."""
+    """The computer, its Python and PyTorch: all that the CPU needs."""
     system = facts.system
     inside = ", in a container" if system.container else ""
     free = "unknown" if system.free_gb is None else f"{system.free_gb:.1f} GB free"
@@ -28,7 +28,18 @@ def machine_lines(facts: Facts) -> list[Line]:
         Line("machine", "Python", "ok", system.python),
         Line("machine", "cores", "ok", f"{system.cores}"),
         Line("machine", "memory", "ok", free),
+        _pytorch(facts.torch),
     ]
+
+
+def _pytorch(torch: Torch) -> Line:
+    """What the CPU needs of PyTorch; the lines about the GPU ask for more."""
+    if not torch.version:
+        return Line("machine", "PyTorch", "missing", "not installed", "pip install torch")
+    if torch.error:
+        repair = "pip install --force-reinstall torch"
+        return Line("machine", "PyTorch", "wrong", f"{torch.version}: {torch.error}", repair)
+    return Line("machine", "PyTorch", "ok", torch.version)
 
 
 def optional_lines(facts: Facts) -> list[Line]:
@@ -37,7 +48,7 @@ def optional_lines(facts: Facts) -> list[Line]:
     for part, (purpose, packages) in PARTS.items():
         absent = [name for name in packages if not facts.packages.get(name)]
         there = ", ".join(f"{name} {facts.packages[name]}" for name in packages if name not in absent)
-        state: State = "missing" if absent else "ok"
+        state: State = "optional" if absent else "ok"
         found = f"{purpose}: {'no ' + ', '.join(absent) if absent else there}"
         lines.append(Line("also", part, state, found, f"pip install 'endoprior[{part}]'" if absent else ""))
     lines += _weights(facts)
@@ -48,12 +59,13 @@ def _weights(facts: Facts) -> list[Line]:
     if not facts.weights:
         named = "ENDOPRIOR_WEIGHTS" in facts.weights_error
         repair = "unset ENDOPRIOR_WEIGHTS, or name a folder" if named else ""
-        return [Line("also", "weights", "wrong" if named else "missing", facts.weights_error or "not checked", repair)]
-    found = ", ".join(f"{network} ({place or 'missing'})" for network, place in facts.weights.items())
-    if all(facts.weights.values()):
+        return [Line("also", "weights", "wrong" if named else "optional", facts.weights_error or "not checked", repair)]
+    found = ", ".join(f"{network} ({place})" for network, place in facts.weights.items() if place)
+    absent = ", ".join(network for network, place in facts.weights.items() if not place)
+    if not absent:
         return [Line("also", "weights", "ok", found)]
-    repair = "set ENDOPRIOR_WEIGHTS to a folder with their files; without them their scores are skipped"
-    return [Line("also", "weights", "missing", found, repair)]
+    repair = "set ENDOPRIOR_WEIGHTS to a folder with their files"
+    return [Line("also", "weights", "optional", f"network scores: {found}{'; ' * bool(found)}no {absent}", repair)]
 
 
 def _variables(facts: Facts) -> list[Line]:

@@ -14,30 +14,35 @@ TITLES: dict[Part, str] = {
     "cuda": "GPU and PyTorch, each line needs those above",
     "triton": "Triton",
     "gsplat": "gsplat",
-    "also": "optional",
+    "also": "optional parts",
 }
+
+GPU_PARTS: tuple[Part, ...] = ("cuda", "triton", "gsplat")
 
 
 def table(report: Report) -> list[str]:
-    """Lines of text: state, what, found; below it the command that fixes it."""
-    width = max(len(line.name) for line in report.lines)
-    rows = []
+    """Lines of text: the verdict; then state, what, found, and below it the command that fixes it."""
+    width = max(len(line.name) for line in report.lines if report.has_usable_gpu or line.part not in GPU_PARTS)
+    rows = [report.verdict]
     for part in TITLES:
-        lines = [line for line in report.lines if line.part == part]
-        if part in ("cuda", "triton", "gsplat") and not report.has_usable_gpu:
-            rows += ["", *_no_gpu(report.blocking)] if part == "cuda" else []
+        if part in GPU_PARTS and not report.has_usable_gpu:
             continue
         rows += ["", _title(part, report)]
-        for line in lines:
-            rows.append(f"  {line.state:<8}{line.name:<{width + 2}}{line.found}")
-            rows += [f"  {'':<{width + 10}}-> {line.fix}"] if line.fix else []
-    return rows[1:]
+        if part == "also" and not report.has_usable_gpu:
+            rows.append(f"  {'optional':<9}{'GPU':<{width + 2}}{_no_gpu(report.blocking)}")
+        for line in (line for line in report.lines if line.part == part):
+            row = f"  {line.state:<9}{line.name:<{width + 2}}{line.found}"
+            if line.state == "optional":
+                rows.append(f"{row} -> {line.fix}" if line.fix else row)
+            else:
+                rows += [row, f"  {'':<{width + 11}}-> {line.fix}"] if line.fix else [row]
+    return rows
 
 
-def _no_gpu(blocking: Line) -> list[str]:
-    rows = [f"{blocking.name}: {blocking.found}. Everything runs on the CPU."]
-    hint = "(In a container, start it with `--gpus all` to use the host's GPU.)"
-    return [*rows, hint] if blocking.state == "missing" else rows
+def _no_gpu(blocking: Line) -> str:
+    """What is known of the GPU that is not used, in one line for all of its parts."""
+    hint = "; start a container with `--gpus all` to use the host's GPU"
+    return blocking.found + hint * (blocking.state == "missing")
 
 
 def _title(part: Part, report: Report) -> str:
@@ -56,7 +61,8 @@ def as_json(facts: Facts, report: Report, device: str, backend: str, why: str, c
         compiling: the result of `--compile`, where the lines do not tell it.
     """
     return {
-        "version": 3,
+        "version": 4,
+        "verdict": report.verdict,
         "device": device,
         "backend": backend,
         "why": why,

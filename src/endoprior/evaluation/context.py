@@ -1,4 +1,4 @@
-"""What a scorer gets to see: the scene, the frames, the rendered frames, and where its scores go."""
+"""What a scorer gets to see: the frames, the rendered frames, the scene if there is one, and where its scores go."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..data import FrameList, FrameSequence, Split
 from ..model.scene import Scene
 from ..system.atomic import write_json
-from ..system.memory import BoundedCache, cache_bytes
-from .metrics import ScoreUnavailable, mean_over_frames, to_uint8
+from .metrics import ScoreUnavailable, mean_over_frames
+from .rendered import Reconstruction, RenderedFrames, SceneFrames
 
 OUTLIER_DB = 3.0
 """A frame whose PSNR lies this far below the median of its split is an outlier."""
 EXACT = "infinite: the rendered frames equal the true ones exactly"
 """Why there is no PSNR where no frame has any error; black frames, for example."""
 NETWORKS_OFF = "network scores were not asked for"
+NO_SCENE = "needs the Gaussians of a scene; there are rendered images only"
 
 
 @dataclass
@@ -36,6 +36,8 @@ class Evaluation:
     """Why a score has no value, by name."""
     per_frame: list[dict[str, Any]] = field(default_factory=list)
     """One row for each frame of the split: `index`, `time`, and the scores that a single frame has."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+    """Where rendered images come from, for `metrics.json`; a scene has its `config.json`."""
 
     def add(self, name: str, value: float, reason: str = "not finite") -> None:
         """Record a score, or `reason` where it is not finite; an int stays one."""
@@ -58,58 +60,17 @@ class Evaluation:
         """
         suffix = "" if self.protocol["split"] == "test" else f"_{self.protocol['split']}"
         file = folder / f"metrics{suffix}.json"
-        write_json(file, {k: getattr(self, k) for k in ("protocol", "scores", "skipped")})
+        facts = {name: getattr(self, name) for name in ("protocol", "scores", "skipped")}
+        write_json(file, facts | self.provenance)
         write_json(folder / f"per_frame{suffix}.json", self.per_frame)
         return file
-
-
-@dataclass(frozen=True)
-class RenderedFrame:
-    """One frame as the scene renders it."""
-
-    color: NDArray[np.float32] | None
-    """(H, W, 3) in [0, 1], not rounded; kept for frames of the split only."""
-    rgb_u8: NDArray[np.uint8]
-    """(H, W, 3) rounded to 8 bits: what the published protocol scores."""
-    depth: NDArray[np.float32]
-    """(H, W) sum of weight * z, mm."""
-
-    @property
-    def rgb(self) -> NDArray[np.float32]:
-        """(H, W, 3) `rgb_u8` in [0, 1]."""
-        return self.rgb_u8 / np.float32(255)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory it takes."""
-        return sum(array.nbytes for array in (self.color, self.rgb_u8, self.depth) if array is not None)
-
-
-class RenderedFrames:
-    """Rendered frames by index: each is rendered when first asked for, and kept as memory allows."""
-
-    def __init__(self, scene: Scene, sequence: FrameSequence, split: Split) -> None:
-        """Args: scene: what to render. sequence: times and cameras. split: frames that keep their unrounded color."""
-        self._scene, self._sequence = scene, sequence
-        self._scored = set(sequence.indices(split))
-        self._cache: BoundedCache[RenderedFrame] = BoundedCache(cache_bytes(), lambda rendered: rendered.nbytes)
-
-    def __getitem__(self, index: int) -> RenderedFrame:
-        return self._cache.get(index, lambda: self._render(index))
-
-    def _render(self, index: int) -> RenderedFrame:
-        frame = self._sequence.frame(index)
-        out = self._scene.render(frame.time, frame.camera)
-        color = out.color.cpu().numpy()
-        exact = np.clip(color, 0, 1) if index in self._scored else None
-        return RenderedFrame(exact, to_uint8(color), out.depth.cpu().numpy())
 
 
 @dataclass(frozen=True)
 class EvaluationContext:
     """One evaluation, as every scorer's `compute` takes it."""
 
-    scene: Scene
+    reconstruction: Reconstruction
     sequence: FrameSequence
     split: Split
     networks: bool
@@ -126,8 +87,19 @@ class EvaluationContext:
 
     @cached_property
     def rendered(self) -> RenderedFrames:
-        """All frames of the sequence as the scene renders them, by index."""
-        return RenderedFrames(self.scene, self.sequence, self.split)
+        """All frames of the sequence as they are rendered, by index."""
+        return RenderedFrames(self.reconstruction, self.sequence, self.split)
+
+    @property
+    def scene(self) -> Scene:
+        """The Gaussians and their motion, for scores that images do not have.
+
+        Raises:
+            ScoreUnavailable: only rendered images are scored.
+        """
+        if not isinstance(self.reconstruction, SceneFrames):
+            raise ScoreUnavailable(NO_SCENE)
+        return self.reconstruction.scene
 
     def add(self, name: str, value: float, reason: str = "not finite") -> None:
         """Record a score, or `reason` where it is not finite; an int stays one."""
@@ -154,9 +126,11 @@ class EvaluationContext:
             self.add_mean(name, [row[name] for row in rows], reason)
 
     @contextmanager
-    def skip_if_unavailable(self, name: str) -> Iterator[None]:
-        """Turn `ScoreUnavailable` into the reason why the score has no value."""
+    def skip_if_unavailable(self, *names: str) -> Iterator[None]:
+        """Turn `ScoreUnavailable` into the reason why those of these scores that have no value have none."""
         try:
             yield
         except ScoreUnavailable as reason:
-            self.skip(name, str(reason))
+            for name in names:
+                if name not in self.result.scores:
+                    self.skip(name, str(reason))

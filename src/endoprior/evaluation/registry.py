@@ -1,12 +1,19 @@
-"""Every score. To add one, write a module in `scorers/` and name it in `SCORERS`; see docs/scores.md."""
+"""Every score. To add one, write a module in `scorers/` and name it in `SCORERS`; see docs/scores.md.
+
+Other packages add scorers as plugins (docs/plugins.md).
+"""
 
 from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
-from types import ModuleType
+from typing import TYPE_CHECKING, Any, Protocol
 
+from ..system.plugins import Registry, report
 from .score import Score
+
+if TYPE_CHECKING:
+    from .context import EvaluationContext
 
 SCORERS = (
     "image",
@@ -22,12 +29,58 @@ SCORERS = (
 """Modules of `scorers/`, in the order in which they run. Each has `SCORES` and `compute(context)`."""
 
 
-def scorers() -> list[ModuleType]:
-    """The modules that `SCORERS` names."""
-    return [import_module(f".scorers.{name}", __package__) for name in SCORERS]
+class Scorer(Protocol):
+    """Computes some scores; usually a module."""
+
+    SCORES: tuple[Score, ...]
+
+    def compute(self, context: EvaluationContext) -> None:
+        """Record every score, or why it has no value.
+
+        Raises:
+            ScoreUnavailable: none of them has one; recorded as the reason of each.
+        """
+        ...
+
+
+def _problem(found: Any) -> str:
+    scores = getattr(found, "SCORES", None)
+    if not isinstance(scores, tuple) or not scores or not all(isinstance(score, Score) for score in scores):
+        return f"SCORES of type {type(scores).__name__}"
+    if not callable(getattr(found, "compute", None)):
+        return "no function compute"
+    names = {score.name for name in SCORERS for score in _builtin(name).SCORES}
+    again = [score.name for score in scores if score.name in names]
+    return f"another score {again[0]}, which is built in" if again else ""
+
+
+def _builtin(name: str) -> Scorer:
+    return import_module(f".scorers.{name}", __package__)
+
+
+REGISTRY: Registry[Scorer] = Registry(
+    "scores",
+    SCORERS,
+    _builtin,
+    "SCORES, a tuple of endoprior.evaluation.score.Score, and compute(context)",
+    _problem,
+)
+"""The scorers above, and those of plugins."""
+
+
+def scorers() -> dict[str, Scorer]:
+    """The scorers by name: those of `SCORERS`, then plugins. Of two plugins with one score, the second is left out."""
+    known, taken = {name: _builtin(name) for name in SCORERS}, set()
+    for name, scorer in REGISTRY.usable():
+        if again := sorted(taken & {score.name for score in scorer.SCORES}):
+            report(f"{name} of {REGISTRY.origin(name)} is left out: another plugin has the score {again[0]}")
+        else:
+            known[name] = scorer
+            taken |= {score.name for score in scorer.SCORES}
+    return known
 
 
 @cache
 def all_scores() -> dict[str, Score]:
     """Every score by name."""
-    return {score.name: score for scorer in scorers() for score in scorer.SCORES}
+    return {score.name: score for scorer in scorers().values() for score in scorer.SCORES}

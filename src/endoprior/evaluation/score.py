@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
+
+Group = Literal["image", "depth", "motion", "model", "speed", "other"]
+GROUPS: tuple[Group, ...] = get_args(Group)
+"""What a score is about, in the order of the printed table."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +28,21 @@ class Score:
     """One sentence for docs/scores.md."""
     compare: Literal["absolute", "relative"] = "relative"
     """How two methods differ: in the score's own unit, or as a share of the second one's value."""
+    group: Group = "other"
+    hint: str = ""
+    """A few words beside the printed value: what is good, or what to know of it. Only what can be said of any video."""
+    in_summary: bool = True
+    """Whether `endoprior train` and `eval` print it; metrics.json has every score."""
 
     @property
     def heading(self) -> str:
         """Label and unit: `tissue PSNR, dB`."""
         return f"{self.label}, {self.unit}" if self.unit else self.label
+
+    @property
+    def arrow(self) -> str:
+        """Up if higher is better, down if lower is; empty for neither."""
+        return {True: "\u2191", False: "\u2193", None: ""}[self.higher_is_better]
 
     def text(self, value: float) -> str:
         """A value with its unit: `31.27 dB`."""

@@ -1,4 +1,4 @@
-"""Score a scene against its sequence, under a protocol that is stored with the numbers.
+"""Score a scene, or rendered images, against the sequence, under a protocol that is stored with the numbers.
 
 A score that cannot be computed is listed as skipped, with the reason. No other number ever stands in for it.
 """
@@ -15,35 +15,60 @@ from ..data import FrameSequence, Split
 from ..model.scene import Scene
 from ..system.devices import name_of
 from .context import Evaluation, EvaluationContext
-from .registry import scorers
+from .metrics import ScoreUnavailable
+from .registry import REGISTRY, SCORERS, Scorer, scorers
+from .rendered import Reconstruction, SceneFrames
 from .scorers.speed import FPS_RENDERS
 
 
 def evaluate(
-    scene: Scene,
+    scene: Scene | Reconstruction,
     sequence: FrameSequence,
     split: Split = "test",
     *,
     networks: bool = True,
     weights_dir: Path | None = None,
+    reading: DataConfig | None = None,
 ) -> Evaluation:
     """Score `scene` on a split of `sequence`: every score that docs/scores.md lists.
 
     Args:
+        scene: a trained scene, or anything that renders the frames of the sequence (`Reconstruction`). Without a scene
+            the scores that need its Gaussians are skipped.
         networks: also compute the scores that need a network (RAFT, LPIPS). Their weights are looked for in
             `weights_dir`, then in `ENDOPRIOR_WEIGHTS`, then in torch's cache, and are downloaded at last.
+        reading: how `sequence` was read, for the protocol; None: as the scene's config says, or the default.
     Raises:
         InputError: the sequence is not the one the scene was trained on (the number of frames differs).
     """
-    if len(sequence) != len(scene.cameras):
+    is_scene = isinstance(scene, Scene)
+    if is_scene and len(sequence) != len(scene.cameras):
         frames = f"the {len(scene.cameras)} frames the scene was trained on"
         raise input_error(sequence.path, frames, str(len(sequence)), "pass the same sequence.")
-    result = Evaluation(_protocol(sequence, split, scene))
+    result = Evaluation(_protocol(sequence, split, reading or (scene.config.data if is_scene else DataConfig())))
+    if is_scene:
+        result.protocol |= _rendering(scene)
+    result.provenance = dict(getattr(scene, "provenance", {}))
     result.per_frame = [{"index": i, "time": i / len(sequence)} for i in sequence.indices(split)]
-    context = EvaluationContext(scene, sequence, split, networks, weights_dir, result)
-    for scorer in scorers():
-        scorer.compute(context)
+    frames = SceneFrames(scene, sequence) if is_scene else scene
+    context = EvaluationContext(frames, sequence, split, networks, weights_dir, result)
+    for name, scorer in scorers().items():
+        with context.skip_if_unavailable(*(score.name for score in scorer.SCORES)):
+            _compute(name, scorer, context)
     return result
+
+
+def _compute(name: str, scorer: Scorer, context: EvaluationContext) -> None:
+    """Run a scorer. An error in a plugin costs its own scores only."""
+    if name in SCORERS:
+        scorer.compute(context)
+        return
+    try:
+        scorer.compute(context)
+    except ScoreUnavailable:
+        raise
+    except Exception as error:
+        raise ScoreUnavailable(REGISTRY.failure(name, error)) from error
 
 
 def scored_data(trained: DataConfig) -> DataConfig:
@@ -57,8 +82,7 @@ def scored_data(trained: DataConfig) -> DataConfig:
     )
 
 
-def _protocol(sequence: FrameSequence, split: Split, scene: Scene) -> dict[str, Any]:
-    data = scene.config.data
+def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[str, Any]:
     relative = "; relative: the depth's scale is assumed, its mm are not mm" if sequence.depth_is_relative else ""
     return {
         "split": split,
@@ -73,6 +97,11 @@ def _protocol(sequence: FrameSequence, split: Split, scene: Scene) -> dict[str, 
         "flow_error": "consecutive frames of the split; *_adjacent: all adjacent frames of the video",
         "depth_instability_mm": "all adjacent frames of the video",
         "data_fingerprint": sequence.fingerprint(),
+    }
+
+
+def _rendering(scene: Scene) -> dict[str, Any]:
+    return {
         "backend": scene.backend,
         "fps": f"{FPS_RENDERS} renders of the sequence's frames, one after the other; {name_of(scene.device)}",
     }

@@ -49,7 +49,8 @@ def run_job(job: Job, started: list[subprocess.Popen] | None = None) -> Outcome:
     folder.parent.mkdir(parents=True, exist_ok=True)
     job_file, log = folder.with_suffix(".job.json"), folder.with_suffix(".log.txt")
     job.write(job_file)
-    environment = os.environ | {"OMP_NUM_THREADS": str(job.threads), "NUMBA_NUM_THREADS": str(job.threads)}
+    threads = {"OMP_NUM_THREADS": str(job.threads), "NUMBA_NUM_THREADS": str(job.threads)}
+    environment = os.environ | threads | {"PYTHONUTF8": "1"}  # the log is read as UTF-8
     environment.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     began = clock.perf_counter()
     with open(log, "wb") as output:
@@ -62,7 +63,7 @@ def run_job(job: Job, started: list[subprocess.Popen] | None = None) -> Outcome:
     if code == 0:
         job_file.unlink()
         return Outcome(job, seconds)
-    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     end = " | ".join(lines[-SHOWN_LOG_LINES:]) or "(empty)"
     return Outcome(job, seconds, f"exit status {code}; end of {log}: {end}")
 
@@ -85,7 +86,8 @@ def local_executor(num_jobs: int) -> Iterator[Executor]:
                         yield future.result()
             except BaseException:
                 for process in started:
-                    if process.poll() is None:
+                    # Windows cannot send it, but its console sends Ctrl-C to all processes.
+                    if process.poll() is None and os.name == "posix":
                         process.send_signal(signal.SIGINT)
                 raise
 

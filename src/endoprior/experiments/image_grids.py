@@ -34,11 +34,12 @@ DIFFERENCE_FULL_SCALE_MM = 0.5
 
 
 def scenes_of(matrix: Matrix, sequence: str) -> dict[str, Scene]:
-    """The trained scene of every method whose cell is finished, by label."""
+    """The trained scene of every method that has one and whose cell is finished, by label."""
     spec = matrix.spec
     budget = spec.budgets[-1] if spec.budgets else None
     folders = {m: matrix.done.get(Cell(sequence, m, budget, spec.seeds[0])) for m in spec.methods}
-    return {spec.label(m): load_scene(folder / "run") for m, folder in folders.items() if folder}
+    runs = {m: folder / "run" for m, folder in folders.items() if folder}
+    return {spec.label(m): load_scene(run) for m, run in runs.items() if (run / "scene.safetensors").exists()}
 
 
 def frames_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:

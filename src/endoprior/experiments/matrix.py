@@ -18,7 +18,9 @@ from typing import Any
 from ..core.checks import InputError, input_error
 from ..core.config_io import to_dict
 from ..data.files import read_json
+from ..evaluation.pictures import fingerprint
 from .execute import Executor
+from .method import REGISTRY
 from .spec import Cell, Spec, cells, sequence_folder
 from .worker import Job, finished
 
@@ -99,8 +101,14 @@ def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -
     for cell in cells(spec):
         if cell in matrix.missing:
             continue
-        config = to_dict(spec.config(cell.method, cell.sequence, cell.budget, cell.seed))
-        facts = [config, fingerprints[cell.sequence], spec.networks, SCORES_VERSION]
+        method, reading = spec.methods[cell.method].name, spec.sequences[cell.sequence].reading
+        options = to_dict(spec.config(cell.method, cell.sequence, cell.budget, cell.seed))
+        try:
+            made = _made_from(spec, cell, options)
+        except InputError as error:
+            matrix.missing[cell] = str(error)
+            continue
+        facts = [options, fingerprints[cell.sequence], spec.networks, SCORES_VERSION, *made]
         key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
         folder = (matrix.out / "cells" / key[:KEY_DIGITS]).absolute()
         if finished(folder, key):
@@ -110,13 +118,33 @@ def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -
             name=cell.name,
             folder=str(folder),
             data=str(matrix.data[cell.sequence].absolute()),
-            config=config,
+            method=method,
+            options=options,
+            reading=options["data"] if spec.has_config(cell.method) else reading,
+            seed=cell.seed,
             key=key,
             networks=spec.networks,
             weights_dir=str(weights_dir.absolute()) if weights_dir else None,
             threads=threads,
         )
     return jobs
+
+
+def _made_from(spec: Spec, cell: Cell, options: dict[str, Any]) -> list[Any]:
+    """What determines the result of a cell beside its options and its sequence; nothing for presets.
+
+    Raises:
+        InputError: there are no images of the sequence.
+    """
+    method = spec.methods[cell.method]
+    if method.pictures:
+        if not options["folder"]:
+            raise input_error(f"methods.{cell.method}.pictures", cell.sequence, "no entry", "name the folder.")
+        folders = [Path(options[key]) for key in ("folder", "depth_folder") if options[key]]
+        return [method.name, *map(fingerprint, folders), spec.sequences[cell.sequence].reading]
+    if origin := REGISTRY.origin(method.name):
+        return [method.name, origin, cell.seed, spec.sequences[cell.sequence].reading]
+    return []
 
 
 def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]:
@@ -139,8 +167,9 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]
 
 
 def commits_of(matrix: Matrix) -> list[str]:
-    """Commits at which the finished cells were trained, sorted; "unknown" outside a checkout."""
-    commits = {read_json(folder / "run" / "config.json").get("commit") for folder in matrix.done.values()}
+    """Commits at which the finished cells of presets were trained, sorted; "unknown" outside a checkout."""
+    records = [folder / "run" / "config.json" for folder in matrix.done.values()]
+    commits = {read_json(record).get("commit") for record in records if record.exists()}
     return sorted(commit or "unknown" for commit in commits)
 
 

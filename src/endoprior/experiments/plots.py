@@ -70,7 +70,7 @@ def _curve(folder: Path | None) -> dict[int, float]:
     """Score by frame index."""
     if folder is None:
         return {}
-    rows = json.loads((folder / "per_frame.json").read_text())
+    rows = json.loads((folder / "per_frame.json").read_text(encoding="utf-8"))
     return {row["index"]: row[CURVE_SCORE] for row in rows if CURVE_SCORE in row}
 
 

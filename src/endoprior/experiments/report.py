@@ -8,7 +8,7 @@ from typing import Any
 
 from ..core.config_io import to_dict
 from ..evaluation.registry import all_scores
-from ..system.atomic import whole_file, write_json
+from ..system.atomic import write_json, write_text
 from .image_grids import GRIDS, write_image_grids
 from .matrix import Matrix, commits_of, scores_of
 from .plots import budget_figure, curve_figure
@@ -29,10 +29,10 @@ def write_report(matrix: Matrix, out: Path) -> Path:
     results = Results.of(matrix)
     _figures(matrix, results, out / "figures")
     tables = [score_table(results, name) for name in matrix.spec.sequences if name in matrix.data]
-    _write(out / "results.tex", "\n\n".join(latex(table) for table in tables) + "\n")
-    _write(out / "results.csv", csv_lines(results))
+    write_text(out / "results.tex", "\n\n".join(latex(table) for table in tables) + "\n")
+    write_text(out / "results.csv", csv_lines(results))
     write_json(out / "results.json", _facts(matrix, results))
-    _write(out / "results.md", "\n\n".join([*_body(matrix, results, out, out, 1), *_protocol([matrix], 2)]) + "\n")
+    write_text(out / "results.md", "\n\n".join([*_body(matrix, results, out, out, 1), *_protocol([matrix], 2)]) + "\n")
     return out / "results.md"
 
 
@@ -45,7 +45,7 @@ def write_overview(reports: dict[Path, Matrix], out: Path) -> Path:
     blocks = ["# Results"]
     for folder, matrix in reports.items():
         blocks += _body(matrix, Results.of(matrix), folder, out, 2)
-    _write(out / "results.md", "\n\n".join([*blocks, *_protocol(list(reports.values()), 2)]) + "\n")
+    write_text(out / "results.md", "\n\n".join([*blocks, *_protocol(list(reports.values()), 2)]) + "\n")
     return out / "results.md"
 
 
@@ -58,11 +58,6 @@ def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int
         *_claims(results, below),
         *_figure_links(matrix, folder, base, below),
     ]
-
-
-def _write(path: Path, text: str) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def _head(matrix: Matrix, mark: str) -> list[str]:
@@ -91,12 +86,13 @@ def _some(names: list[str]) -> str:
 
 
 def _protocol(matrices: list[Matrix], level: int) -> list[str]:
-    """The protocol of the scores, from the first finished cell."""
+    """The protocol of the scores, from the first finished cell that has all of it: images have no backend."""
     folders = [folder for matrix in matrices for folder in matrix.done.values()]
     if not folders:
         return []
     hidden = ("frames", "data_fingerprint", "shrink")
-    shown = {name: text for name, text in scores_of(folders[0])["protocol"].items() if name not in hidden}
+    whole = max((scores_of(folder)["protocol"] for folder in folders), key=len)
+    shown = {name: text for name, text in whole.items() if name not in hidden}
     return [f"{'#' * level} Protocol", "\n".join(f"- `{name}`: {text}" for name, text in shown.items())]
 
 

@@ -16,12 +16,13 @@ import yaml
 from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.config_io import current_value, from_dict, to_dict
-from ..core.presets import PresetName, preset
-from ..data.formats import FORMATS
+from ..core.presets import PresetName
+from ..data.formats import REGISTRY as LAYOUTS
 from ..data.reading import read_text
 from ..data.yaml_text import load_yaml
 from ..evaluation.registry import all_scores
 from ..phantom import PhantomConfig
+from .method import PICTURES, REGISTRY
 
 Expectation = Literal["better", "no worse", "no effect"]
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
@@ -57,13 +58,31 @@ class SequenceSpec:
 
 @dataclass(frozen=True)
 class MethodSpec:
-    """One method: a preset and its changes."""
+    """One method: a preset, a method of another package, or the images of another program; and its changes."""
 
-    preset: str = "default"
+    preset: str = ""
+    """One of our presets; `default` if no method and no pictures are named."""
+    method: str = ""
+    """A name that `endoprior plugins` lists."""
+    pictures: dict[str, str] = field(default_factory=dict)
+    """Folder of rendered frames by sequence; as `SequenceSpec.path`, `{seed}` stands for the seed."""
+    depth_pictures: dict[str, str] = field(default_factory=dict)
+    """Folder of rendered depth by sequence."""
+    depth_scale: float = 0.0
+    """mm per unit of that depth, where it is PNG."""
     set: dict[str, Any] = field(default_factory=dict)
     """Config fields by dotted name, on top of the benchmark's own `set` and `set_for`."""
     label: str = ""
     """Name in tables; the method's own if empty."""
+
+    @property
+    def name(self) -> str:
+        """Name in the registry of methods."""
+        return PICTURES if self.pictures else self.method or self.preset or "default"
+
+    def differs_by_seed(self, sequence: str) -> bool:
+        """Whether there is more than one result on a sequence: images without `{seed}` are one result."""
+        return not self.pictures or "{seed}" in self.pictures.get(sequence, "")
 
 
 @dataclass(frozen=True)
@@ -98,9 +117,9 @@ class Spec:
     """Initial Gaussians; empty: each method's own."""
     seeds: tuple[int, ...] = (0,)
     set: dict[str, Any] = field(default_factory=dict)
-    """Config fields by dotted name, for all methods."""
+    """Config fields by dotted name, for all methods with our config: presets, and others that take a `Config`."""
     set_for: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """The same for all methods of a preset; a method's own `set` comes last."""
+    """Options for all methods of one name, such as a preset's; a method's own `set` comes last."""
     scores: tuple[str, ...] = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis", "num_gaussians")
     """Columns of the tables."""
     claims: tuple[ClaimSpec, ...] = ()
@@ -121,26 +140,45 @@ class Spec:
         """Name of a method in tables."""
         return self.methods[method].label or method
 
-    def config(self, method: str, sequence: str, budget: int | None, seed: int) -> Config:
-        """The full config of one cell.
+    def has_config(self, method: str) -> bool:
+        """Whether the options of a method are our `Config`, with budgets and the spec's `set`."""
+        return isinstance(REGISTRY.load(self.methods[method].name).options, Config)
+
+    def config(self, method: str, sequence: str, budget: int | None, seed: int) -> Any:
+        """The full options of one cell: a `Config`, or the dataclass of a method that has options of its own.
 
         Raises:
             InputError: an override names no field, or has a value of the wrong kind.
         """
-        chosen, data = self.methods[method], self.sequences[sequence]
-        values = to_dict(preset(chosen.preset))
+        chosen, has_config = self.methods[method], self.has_config(method)
+        options = REGISTRY.load(chosen.name).options
+        values = to_dict(options)
         for where, overrides in (
-            ("set", self.set),
-            (f"set_for.{chosen.preset}", self.set_for.get(chosen.preset, {})),
+            ("set", self.set if has_config else {}),
+            (f"set_for.{chosen.name}", self.set_for.get(chosen.name, {})),
             (f"methods.{method}.set", chosen.set),
         ):
             for name, value in overrides.items():
                 _override(values, name, value, where)
-        values["data"] |= data.reading
-        if budget is not None:
-            values["init"]["budget"] = budget
-        values["seed"] = seed
-        return from_dict(Config, values, f"methods.{method}")
+        if has_config:
+            values["data"] |= self.sequences[sequence].reading
+            if budget is not None:
+                values["init"]["budget"] = budget
+            values["seed"] = seed
+        if chosen.pictures:
+            folders = {"folder": chosen.pictures, "depth_folder": chosen.depth_pictures}
+            values |= {name: self._folder(paths.get(sequence, ""), seed) for name, paths in folders.items()}
+            values |= {"depth_scale": chosen.depth_scale, "name": self.label(method)}
+        return from_dict(type(options), values, f"methods.{method}")
+
+    def _folder(self, path: str, seed: int) -> str:
+        """A folder of images; empty if there is none."""
+        return str(self.resolved(path.replace("{seed}", str(seed))).absolute()) if path else ""
+
+    def resolved(self, path: str) -> Path:
+        """A path of the spec: `~` and `$NAME` expanded, relative to the spec's folder."""
+        expanded = Path(os.path.expandvars(path)).expanduser()
+        return expanded if expanded.is_absolute() else Path(self.folder) / expanded
 
 
 def _override(values: dict[str, Any], name: str, value: Any, where: str) -> None:
@@ -215,21 +253,22 @@ def _check(spec: Spec) -> None:
         for name in names:
             if not NAME.fullmatch(name):
                 raise input_error(kind, "a name of letters, digits and . _ + -", f"{name!r}", "rename it.")
+        if len({name.lower() for name in names}) < len(names):  # figures have these names
+            raise input_error(kind, "names that differ in more than case", ", ".join(names), "rename one.")
     for name, sequence in spec.sequences.items():
         if bool(sequence.path) == (sequence.phantom is not None):
             raise input_error(f"sequences.{name}", "either path or phantom", "both or none", "keep one.")
         if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
             raise InputError(f"sequences.{name}: a phantom has its own size. Fix: remove shrink and first_frames.")
-        if sequence.format not in ("auto", *FORMATS):
-            want = f"auto, {', '.join(FORMATS)}"
+        if sequence.format != "auto" and sequence.format not in LAYOUTS.names():
+            want = f"auto, {', '.join(LAYOUTS.names())}"
             raise input_error(f"sequences.{name}.format", want, repr(sequence.format), "see docs/datasets.md.")
+    known = [name for name in REGISTRY.names() if name != PICTURES]
     for name in spec.set_for:
-        if name not in PresetName.__args__:
-            raise input_error("set_for", f"one of {', '.join(PresetName.__args__)}", f"{name!r}", "choose one.")
+        if name not in known:
+            raise input_error("set_for", f"one of {', '.join(known)}", f"{name!r}", "choose one.")
     for name, method in spec.methods.items():
-        if method.preset not in PresetName.__args__:
-            choice = ", ".join(PresetName.__args__)
-            raise input_error(f"methods.{name}.preset", f"one of {choice}", f"{method.preset!r}", "choose one.")
+        _check_method(spec, f"methods.{name}", method, known)
     named = [spec.reference, *(name for claim in spec.claims for name in (claim.method, claim.than))]
     for name in named:
         if name not in spec.methods:
@@ -244,6 +283,23 @@ def _check(spec: Spec) -> None:
         raise input_error("methods x sequences x budgets x seeds", f"at most {MOST_CELLS}", f"{count}", "split.")
     for cell in cells(spec):
         spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
+
+
+def _check_method(spec: Spec, where: str, method: MethodSpec, known: list[str]) -> None:
+    if bool(method.preset) + bool(method.method) + bool(method.pictures) > 1:
+        raise input_error(where, "one of preset, method and pictures", "several", "keep one.")
+    for key, name, choice in (("preset", method.preset, PresetName.__args__), ("method", method.method, known)):
+        if name and name not in choice:
+            raise input_error(f"{where}.{key}", f"one of {', '.join(choice)}", f"{name!r}", "choose one.")
+    if not method.pictures and (method.depth_pictures or method.depth_scale):
+        raise input_error(where, "depth_pictures and depth_scale beside pictures", "no pictures", "add pictures.")
+    for key, folders in (("pictures", method.pictures), ("depth_pictures", method.depth_pictures)):
+        for name, path in folders.items():
+            if name not in spec.sequences:
+                choice = ", ".join(spec.sequences)
+                raise input_error(f"{where}.{key}", f"one of {choice}", f"{name!r}", "correct the name.")
+            if not path:
+                raise input_error(f"{where}.{key}.{name}", "a folder", "nothing", "name it or remove the entry.")
 
 
 @dataclass(frozen=True)
@@ -269,7 +325,8 @@ def cells(spec: Spec) -> list[Cell]:
         for seed in spec.seeds
         for sequence in spec.sequences
         for budget in (spec.budgets or (None,))
-        for method in spec.methods
+        for method, about in spec.methods.items()
+        if seed == spec.seeds[0] or about.differs_by_seed(sequence)
     ]
 
 
@@ -279,5 +336,4 @@ def sequence_folder(spec: Spec, name: str, out: Path) -> Path:
     if sequence.phantom:
         fields = json.dumps(to_dict(sequence.phantom), sort_keys=True)
         return out / "sequences" / f"{name}-{hashlib.sha256(fields.encode()).hexdigest()[:8]}"
-    path = Path(os.path.expandvars(sequence.path)).expanduser()
-    return path if path.is_absolute() else Path(spec.folder) / path
+    return spec.resolved(sequence.path)

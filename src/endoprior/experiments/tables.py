@@ -33,14 +33,21 @@ class Table:
 def score_table(results: Results, sequence: str) -> Table:
     """Mean and standard deviation over seeds of every score on one sequence; a row for each method and budget."""
     spec = results.spec
-    rows = [(budget, method) for budget in (spec.budgets or (None,)) for method in spec.methods]
+    sized = {method for method in spec.methods if spec.has_config(method)}
+    # A method without a budget has one row, not the same one for every budget.
+    rows = [
+        (budget, method)
+        for budget in (spec.budgets or (None,))
+        for method in spec.methods
+        if method in sized or not spec.budgets or budget == spec.budgets[0]
+    ]
     columns = [score for score in spec.scores if any(results.summary(sequence, *row, score).count for row in rows)]
     by_column = []
     for score in columns:
         summaries = [results.summary(sequence, *row, score) for row in rows]
         ranks = _ranks(score, [value.mean for value in summaries])
         by_column.append([Entry(number(value), rank) for value, rank in zip(summaries, ranks, strict=True)])
-    names = [spec.label(method) + (f", {budget:,}" if budget else "") for budget, method in rows]
+    names = [spec.label(method) + (f", {budget:,}" if budget and method in sized else "") for budget, method in rows]
     return Table(
         sequence,
         [all_scores()[score].heading for score in columns],

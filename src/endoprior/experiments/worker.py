@@ -18,7 +18,7 @@ from typing import Any
 
 from ..core.checks import InputError
 from ..data.files import read_json
-from ..system.atomic import write_json
+from ..system.atomic import write_json, write_text
 
 DONE = "cell.json"
 """Written last: a folder that has it, with the same key, is finished."""
@@ -33,8 +33,13 @@ class Job:
     """Folder of the cell, absolute."""
     data: str
     """Sequence folder, absolute."""
-    config: dict[str, Any]
-    """Every field of `Config`."""
+    method: str
+    """Name in the registry of methods."""
+    options: dict[str, Any]
+    """Every option of the method."""
+    reading: dict[str, Any]
+    """Fields of `DataConfig`: how the method reads the sequence."""
+    seed: int
     key: str
     """Hash of everything that determines the result."""
     networks: bool
@@ -62,39 +67,46 @@ def work(job: Job) -> None:
     Raises:
         InputError: the sequence or the config cannot be used.
     """
-    from ..core.config import Config
+    from ..core.config import DataConfig
     from ..core.config_io import from_dict
     from ..data import load_sequence
     from ..evaluation.scoring import evaluate, scored_data
-    from ..runs.training_run import train
-    from ..training.trainer import device_for
+    from ..model.scene import Scene
+    from .method import PICTURES, REGISTRY
 
-    cfg, folder = from_dict(Config, job.config), Path(job.folder)
+    method, folder = REGISTRY.load(job.method), Path(job.folder)
+    options, reading = from_dict(type(method.options), job.options), from_dict(DataConfig, job.reading)
     run, key_file = folder / "run", folder / "key"
-    resume = (run / "checkpoint.safetensors").exists() and key_file.exists() and key_file.read_text() == job.key
+    resume = run.is_dir() and key_file.exists() and key_file.read_text(encoding="utf-8") == job.key
     if not resume:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        key_file.write_text(job.key)
+        write_text(key_file, job.key)
     began = clock.perf_counter()
-    scene = train(load_sequence(job.data, cfg.data), cfg, run, resume=resume)
+    found = method.train(load_sequence(job.data, reading).training_view(), options, seed=job.seed, out=run)
     seconds = clock.perf_counter() - began
-    sequence = load_sequence(job.data, scored_data(cfg.data))
+    sequence = load_sequence(job.data, scored_data(reading))
     weights_dir = Path(job.weights_dir) if job.weights_dir else None
-    scene = scene.to(device_for(cfg.render.backend))  # score on the training device
-    result = evaluate(scene, sequence, networks=job.networks, weights_dir=weights_dir)
-    if resume:
+    result = evaluate(found, sequence, networks=job.networks, weights_dir=weights_dir, reading=reading)
+    if job.method == PICTURES:
+        result.skipped["train_seconds"] = "the images come from another program"
+    elif resume:
         result.skipped["train_seconds"] = "the run was interrupted"
     else:
         result.scores["train_seconds"] = seconds
+    if origin := REGISTRY.origin(job.method):
+        about = {"name": job.method, "package": origin, "options": job.options, "seed": job.seed}
+        result.provenance["plugin"] = about
+    if isinstance(found, Scene) and not (run / "scene.safetensors").exists():
+        found.save(run / "scene.safetensors")
     result.save(folder)
-    (run / "checkpoint.safetensors").unlink()  # large, and no longer needed
+    (run / "checkpoint.safetensors").unlink(missing_ok=True)  # large, and no longer needed
     write_json(folder / DONE, {"name": job.name, "key": job.key, "seconds": clock.perf_counter() - began})
 
 
 def main(argv: list[str]) -> int:
     """Work on the job file `argv[0]`; exit status as for the command line."""
-    job = Job(**json.loads(Path(argv[0]).read_text()))
+    job = Job(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     try:
         work(job)

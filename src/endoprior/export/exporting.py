@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.checks import input_error
 from ..system.atomic import whole_file, whole_folder, write_json
-from .formats import FORMATS, Format, Progress, load_format
+from .formats import REGISTRY, Format, Progress, formats_of, load_format
 from .options import DEFAULTS, ExportOptions
 
 if TYPE_CHECKING:
@@ -26,17 +26,38 @@ def export(
     Returns:
         What was written: one file, or one folder.
     Raises:
-        InputError: an option has no meaning for the format, `out` does not suit it, or there is nothing to write.
+        InputError: no format is named, neither by the options nor by `out`; an option has no meaning for the format;
+            `out` does not suit it; or there is nothing to write.
     """
-    chosen = load_format(options.format)
+    name = options.format or next(iter(formats_of(out.suffix)), None)
+    if name is None:
+        got = f"the suffix {out.suffix}" if out.suffix else "a name without a suffix"
+        fix = f"Add --format with one of {', '.join(REGISTRY.names())}."
+        raise input_error(out, "a file whose suffix says the format, or --format", got, fix)
+    options, chosen = replace(options, format=name), load_format(name)
     _reject_unused_options(options, chosen)
     options = replace(options, frame=options.frame or chosen.default_axes)
+    if chosen.suffix_option:
+        options = replace(options, **{chosen.suffix_option: _by_suffix(out, options, chosen)})
     if chosen.write:
-        _check_file(out, chosen.suffixes, options.format)
+        _check_file(out, chosen.suffixes, name)
         chosen.write(scene, out, options, progress)
     else:
         _export_time_steps(scene, out, options, chosen, progress)
     return [out]
+
+
+def _by_suffix(out: Path, options: ExportOptions, chosen: Format) -> str:
+    """The value of the option that chooses between the format's suffixes: as given, else as the file is named.
+
+    Raises:
+        InputError: both are given, and differ.
+    """
+    given, option = getattr(options, chosen.suffix_option), chosen.suffix_option.replace("_", "-")
+    named = out.suffix.removeprefix(".") if out.suffix in chosen.suffixes else None
+    if given and named and given != named:
+        raise input_error(f"--{option} {given}", f"a file that ends in .{given}", str(out), f"Remove --{option}.")
+    return given or named or chosen.suffixes[0].removeprefix(".")
 
 
 def _reject_unused_options(options: ExportOptions, chosen: Format) -> None:
@@ -44,7 +65,7 @@ def _reject_unused_options(options: ExportOptions, chosen: Format) -> None:
         given = getattr(options, field.name) != getattr(DEFAULTS, field.name)
         if given and field.name not in ("format", *chosen.options):
             known = ", ".join(f"--{name.replace('_', '-')}" for name in chosen.options) or "no options"
-            want, fix = f"an option of --format {options.format}", f"leave it out. The format takes {known}."
+            want, fix = f"an option of --format {options.format}", f"Leave it out. The format takes {known}."
             raise input_error(f"--{field.name.replace('_', '-')}", want, "one that it does not use", fix)
 
 
@@ -52,10 +73,12 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
     from .time_steps import selected_time_steps
 
     steps = selected_time_steps(scene, options)
-    if out.suffix in {suffix for name in FORMATS for suffix in load_format(name).suffixes}:
+    if same_suffix := formats_of(out.suffix):
         _check_file(out, chosen.suffixes, options.format)
         if len(steps) != 1:
-            fix = "pass --times T, or a folder instead of a file."
+            moving = [name for name in same_suffix if load_format(name).write]
+            instead = "".join(f", or --format {each} for all of them" for each in moving)
+            fix = f"Pass --times T with T in [0, 1], or a folder instead of a file{instead}."
             raise input_error(out, "one time step for one file", f"{len(steps)}", fix)
         contents = chosen.files(scene, steps[0], options)
         _check_file(out, tuple(contents), options.format)
@@ -79,10 +102,12 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
 def _check_file(out: Path, suffixes: tuple[str, ...], name: str) -> None:
     if suffixes and out.suffix not in suffixes:
         want = f"a file name that ends in {' or '.join(suffixes)} for --format {name}"
-        raise input_error(out, want, out.suffix or "no suffix", "choose another name.")
+        raise input_error(out, want, out.suffix or "no suffix", "Choose another name.")
     if suffixes and out.is_dir():
-        raise input_error(out, "the name of a file", "a folder", "choose another name.")
+        raise input_error(out, "the name of a file", "a folder", "Choose another name.")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise input_error(out, "a place where a file can be written", f"{error.strerror}", "choose another.") from error
+        raise input_error(
+            out, "a place where a file can be written", f"{error.strerror}", "Choose another place."
+        ) from error

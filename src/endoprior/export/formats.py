@@ -11,6 +11,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ..system.plugins import Registry
+
 if TYPE_CHECKING:
     from ..model.scene import Scene
     from .options import ExportOptions
@@ -28,6 +30,8 @@ FORMATS = (
     "gltf",
     "points",
     "mesh",
+    "animation",
+    "slicer",
     "depth",
     "tracks",
     "video",
@@ -51,18 +55,44 @@ class Format:
     """The contents of the files of one time step, by suffix."""
     write: Callable[[Scene, Path, ExportOptions, Progress], None] | None = None
     """Writes one output for the whole sequence."""
+    suffix_option: str = ""
+    """Field of `ExportOptions` that chooses between the suffixes, as `mesh_format`; by default the file's name does."""
     default_axes: Axes = "opencv"
     """What --frame stands for where it is not given."""
     index_facts: Mapping[str, Any] | None = None
     """What `index.json` says of the files' units, for a format without axes in mm."""
 
 
+def _problem(found: Any) -> str:
+    if not isinstance(found, Format):
+        return f"an object of type {type(found).__name__}"
+    has_one = (found.files is None) != (found.write is None)
+    return "" if has_one else "a Format with both or none of files and write"
+
+
+REGISTRY: Registry[Format] = Registry(
+    "exporters",
+    FORMATS,
+    lambda name: import_module(f".{name}", __package__).FORMAT,
+    "a Format of endoprior.export.formats",
+    _problem,
+)
+"""The formats above, and those of plugins."""
+
+
 def load_format(name: str) -> Format:
     """The format of that name; imports its module.
 
     Raises:
+        InputError: it is a plugin that cannot be used.
         ValueError: there is none.
     """
-    if name not in FORMATS:
-        raise ValueError(f"format must be one of {', '.join(FORMATS)}; got {name!r}")
-    return import_module(f".{name}", __package__).FORMAT
+    if name not in REGISTRY.names():
+        raise ValueError(f"format must be one of {', '.join(REGISTRY.names())}; got {name!r}")
+    return REGISTRY.load(name)
+
+
+def formats_of(suffix: str) -> list[str]:
+    """Names of the formats that write files of this suffix: the one that it stands for first, plugins last."""
+    known = [*((name, REGISTRY.load(name)) for name in FORMATS), *REGISTRY.usable()]
+    return [name for name, format_ in known if suffix in format_.suffixes]

@@ -21,6 +21,9 @@ from .surface import Surface, render_surface
 from .time_steps import TimeStep
 from .tsdf import fused_mesh, viewpoints
 
+SURFACE_OPTIONS = ("mesh_method", "mesh_step", "max_slope", "voxel_mm", "min_alpha")
+"""What `surface_mesh` uses."""
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -35,7 +38,15 @@ class Mesh:
 
 
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
-    """The mesh of one time step in the file format of the options.
+    """The mesh of one time step in the file format of the options; errors as in `surface_mesh`."""
+    mesh = surface_mesh(scene, step, options)
+    vertices = points_in_axes(mesh.vertices, options.frame)
+    content = encode_mesh(vertices, mesh.triangles, mesh.colors, options.mesh_format, options.frame)
+    return {f".{options.mesh_format}": content}
+
+
+def surface_mesh(scene: Scene, step: TimeStep, options: ExportOptions) -> Mesh:
+    """The tissue surface at one time, by the method of the options; world axes, mm.
 
     Raises:
         InputError: no surface is rendered, or a fusion has fewer than two camera positions.
@@ -49,15 +60,7 @@ def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, byt
     if not len(mesh.triangles):
         want = f"a value that leaves a surface at time {step.time:.3f}"
         raise input_error("--min-alpha", want, f"{options.min_alpha}", "lower it, or raise --max-slope.")
-    return {
-        f".{options.mesh_format}": encode_mesh(
-            points_in_axes(mesh.vertices, options.frame),
-            mesh.triangles,
-            mesh.colors,
-            options.mesh_format,
-            options.frame,
-        )
-    }
+    return mesh
 
 
 def depth_grid(surface: Surface, step: int, max_slope: float) -> Mesh:
@@ -97,6 +100,7 @@ def _is_continuous(
 
 FORMAT = Format(
     suffixes=(".ply", ".obj", ".stl"),
-    options=(*TIME_STEP_OPTIONS, *("mesh_format", "mesh_method", "mesh_step", "max_slope", "voxel_mm", "min_alpha")),
+    options=(*TIME_STEP_OPTIONS, "mesh_format", *SURFACE_OPTIONS),
     files=files,
+    suffix_option="mesh_format",
 )

@@ -7,30 +7,30 @@ from pathlib import Path
 from typing import Literal
 
 from ..core.checks import check_range
-from .formats import FORMATS, Axes
+from .formats import REGISTRY, Axes
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
     """Options of an export. Each format takes some of them and rejects the others."""
 
-    format: Literal[FORMATS]
-    """What to write."""
+    format: Literal[REGISTRY.names()] | None = None
+    """Format; by default the one of OUT's suffix. A .ply is `ply`; a folder has no default."""
     times: tuple[float, ...] = ()
-    """Times in [0, 1] to export, instead of the frames of a split; frame i of T is at i / T."""
+    """Times in [0, 1] to export instead of frames. Frame i of T is at i / T."""
     split: Literal["video", "test", "train"] = "video"
-    """Frames of the sequence to export, one set of files each; `video` is all of them."""
+    """Frames to export; `video` is all of them."""
     canonical: bool = False
-    """Export the Gaussians as they are stored, before any motion, instead of time steps."""
+    """Export the Gaussians as they are stored, before any motion."""
     frame: Axes | None = None
-    """Axes of the coordinates: opencv (x right, y down, z forward), opengl (y up, z back), ras or lps (for 3D Slicer).
-    Default: opengl for spz and gltf, whose specifications require it; else opencv."""
+    """Axes of the coordinates. opencv: x right, y down, z forward; opengl: y up, z back; ras, lps: for 3D Slicer.
+    Default: opengl for spz, gltf and animation, whose specifications require it; else opencv."""
     min_alpha: float = 0.5
-    """A pixel shows a surface if its accumulated opacity is at least this (depth, mesh, tracks)."""
+    """Accumulated opacity from which a pixel shows a surface (depth, meshes, tracks)."""
     min_opacity: float = 0.5
     """Least opacity of a Gaussian that becomes a point (points)."""
-    mesh_format: Literal["ply", "obj", "stl"] = "ply"
-    """File format of a mesh; STL has no colors."""
+    mesh_format: Literal["ply", "obj", "stl"] | None = None
+    """Files of a mesh; by default OUT's suffix. In a folder ply; STL has no colors."""
     mesh_method: Literal["grid", "tsdf"] = "grid"
     """`grid`: a grid mesh of the depth that the frame's camera sees; `tsdf`: the depths of all cameras fused."""
     mesh_step: int = 2
@@ -60,5 +60,5 @@ class ExportOptions:
         check_range("max_mb", self.max_mb, 0.1, 1000)
 
 
-DEFAULTS = ExportOptions(format=FORMATS[0])
+DEFAULTS = ExportOptions()
 """What every option is where it is not given."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 from ..core.checks import input_error
@@ -64,3 +65,16 @@ def selected_time_steps(scene: Scene, options: ExportOptions) -> list[TimeStep]:
         return [TimeStep(f"{k:06d}", time) for k, time in enumerate(options.times)]
     total = len(scene.cameras)
     return [TimeStep(f"{i:06d}", i / total, i) for i in frame_indices(total, options.split)]
+
+
+def seconds_of_motion(scene: Scene, steps: list[TimeStep]) -> list[float]:
+    """Seconds from the first frame of the sequence to each of two or more time steps.
+
+    Raises:
+        InputError: there are fewer, or they do not increase.
+    """
+    seconds = [step.time * len(scene.cameras) / scene.frames_per_second for step in steps]
+    if len(steps) < 2 or any(b <= a for a, b in pairwise(seconds)):
+        got = ", ".join(f"{step.time:g}" for step in steps)
+        raise input_error("--times, --split", "two or more increasing times", got, "list each time once, in order.")
+    return seconds

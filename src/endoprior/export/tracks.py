@@ -69,7 +69,8 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             start_pixel=queries.pixels,
             axes=np.array(options.frame),
         )
-        (folder / "tracks.csv").write_text(_table(positions, pixels, visible, times), encoding="utf-8")
+        table = _table(positions, pixels, visible, times)
+        (folder / "tracks.csv").write_text(table, encoding="utf-8", newline="\n")
 
 
 def read_query_points(file: Path, scene: Scene) -> QueryPoints:

@@ -38,6 +38,7 @@ def carry_points(
         width = np.maximum(distances.mean(1, keepdims=True), 1e-6)
         weights = opacities[carriers] * np.exp(-0.5 * (distances / width) ** 2) + 1e-12
         weights /= weights.sum(1, keepdims=True)
-        displacement = centers[:, carriers] - centers[start, carriers]
-        moved[:, tied] = points[tied] + np.einsum("tpkc,pk->tpc", displacement, weights)
+        for i, there in enumerate(centers):  # one time after the other: many points at many times fit in memory
+            displacement = there[carriers] - centers[start, carriers]
+            moved[i, tied] = points[tied] + np.einsum("pkc,pk->pc", displacement, weights)
     return moved

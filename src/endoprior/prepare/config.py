@@ -51,7 +51,7 @@ class PrepareConfig:
     start: float = 0.0
     """First time to use, seconds."""
     end: float = math.inf
-    """End time, seconds; not included."""
+    """End time, seconds; not included. inf is the end of the video."""
     frames_per_second: float = 0.0
     """Frame rate of the output; 0 uses every frame of the source."""
     folder_rate: float = 25.0

@@ -80,7 +80,7 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
             measure = _scaled(measure, samples, usable, cfg)
         notes.append(
             f"depth is relative ({source}) and scaled to a median of {cfg.working_distance_mm:g} mm: "
-            "lengths and scores in mm are relative too"
+            "lengths and scores in mm are relative too. For true mm use a stereo video or measured depth."
         )
     elif kind == "folder":
         notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.depth)
@@ -100,7 +100,7 @@ def _check_stereo(samples: list[MeasuredFrame], geometry: FrameGeometry, clip: C
         raise input_error(clip.source.path, "the left camera first", f"the right one ({shares})", fix)
     offset = float(np.nanmedian([vertical_offset_px(frame.rgb_u8, frame.right_u8) for frame in middle]))
     if offset > MAX_ROW_OFFSET_PX:
-        return [f"rows of the cameras are {offset:.1f} px apart, depth will be poor: check the calibration file"]
+        return [f"the rows of the cameras are {offset:.1f} px apart; depth will be poor. Check the calibration file."]
     return []
 
 
@@ -167,9 +167,9 @@ def _check_unit(samples: list[MeasuredFrame], depths: list[Depth], geometry: Fra
     if guess.unit in ("m", "0.01 mm"):
         fix = f"The values look like {guess.unit}: multiply --depth-unit-mm by {guess.mm_per_unit:g}."
         raise input_error("--depth-unit-mm", "tissue 20 to 250 mm away", f"{guess.median:g} mm in {folder}", fix)
-    notes = [] if guess.unit == "mm" else [f"check the depth unit: {guess.reason}"]
+    notes = [] if guess.unit == "mm" else [f"the depth unit may be wrong: {guess.reason}. Check --depth-unit-mm."]
     if max(len(np.unique(depth)) for depth in depths) <= FEWEST_STEPS:
-        notes.append("the depth has at most 256 steps: 8-bit files are too coarse for motion in mm")
+        notes.append("the depth has at most 256 steps: 8-bit files are too coarse for motion in mm. Use 16-bit files.")
     return notes
 
 
@@ -195,7 +195,7 @@ def _tools(
         source = f"tools found by color{' and depth' if depths else ''} in {model.detected_share:.0%} of the samples"
         if not model.detected_share:
             source = "no tools found by color"
-        note = f"{source}; check masks/ and correct them in any paint program (255 = tool)"
+        note = f"masks: {source}. Check masks/, and correct them in any paint program (255 = tool)."
         return lambda frame: model.mask(frame.rgb_u8, geometry.inside, frame.depth if depths else None), source, [note]
     files = match_files(Path(cfg.masks), SUFFIXES, "masks", first_pass.indices)
 

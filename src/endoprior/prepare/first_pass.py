@@ -55,7 +55,8 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         hint = "Check --start, --end and --frames-per-second."
         raise input_error(path, "at least 2 frames in the selection", str(len(indices)), hint)
     lefts = [stereo_frame.left for stereo_frame in sample.kept]
-    notes = _timing_notes(selection.gaps, selection.uneven_steps, len(indices))
+    notes = [source.note for source in (clip.source, clip.second) if source and source.note]
+    notes += _timing_notes(selection.gaps, selection.uneven_steps, len(indices))
     strips = circle = None
     labels: list[Rectangle] = []
     if cfg.border == "auto":
@@ -77,8 +78,8 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
     )
     if calibration is None:
         notes.append(
-            f"no calibration: assuming a field of view of {cfg.field_of_view_degrees:g} degrees "
-            f"(f = {geometry.matrix[0, 0]:.0f} px); set --calibration or --field-of-view-degrees to change it"
+            f"no calibration; a field of view of {cfg.field_of_view_degrees:g} degrees is assumed "
+            f"(f = {geometry.matrix[0, 0]:.0f} px). To change it: --calibration or --field-of-view-degrees."
         )
     return FirstPass(indices, sample.kept, geometry, notes)
 
@@ -107,11 +108,11 @@ def _border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rec
     notes = []
     if strips:
         sides = ", ".join(f"{n} px {side}" for side, n in vars(strips).items() if n)
-        notes.append(f"black bars or console strips cropped: {sides} (--border keep leaves them)")
+        notes.append(f"black bars or console strips were cropped: {sides}. To keep them: --border keep.")
     if circle:
         center = f"({circle.center_x:.0f}, {circle.center_y:.0f})"
-        notes.append(f"round border: center {center}, radius {circle.radius:.0f} px; masked outside")
-    notes += [f"burned-in label painted over: {x},{y},{w},{h}" for x, y, w, h in labels]
+        notes.append(f"round border: center {center}, radius {circle.radius:.0f} px. Its outside is masked.")
+    notes += [f"a burned-in label was painted over: {x},{y},{w},{h}" for x, y, w, h in labels]
     return notes
 
 

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ..core.checks import input_error, number_ranges
 from ..data import write_stir_tracks
-from ..data.images import read_color, read_depth, read_tool_mask, save_png
+from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.reading import kind_of
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
@@ -150,7 +149,7 @@ def _scale_depth(files: FrameFiles, path: PosePath) -> None:
     delete_plan(files.folder)
     for index, scale in enumerate(path.depth_scale):
         file = files.file("depth", index)
-        stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.float64) * scale
+        stored = decode_image(file, None).astype(np.float64) * scale
         save_png(file, np.clip(np.round(stored), 0, 65535).astype(np.uint16))
 
 

@@ -5,6 +5,7 @@ Only a few images are in memory at a time. A source can be iterated any number o
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +21,10 @@ from ..data.images import MOST_PIXELS, decode_image
 from ..data.reading import kind_of
 from ..data.video_files import STILL_SUFFIXES, open_container
 
-CUT_OFF = 0.98
-"""A video is truncated if it ends before this share of its announced frames."""
+LOST_SHARE, LOST_IMAGES = 0.02, 2
+"""A video is truncated if more than this share of its duration and more than so many images are missing at its end."""
+AVI = "avi"
+"""FFmpeg's name of the format that counts time in images and does not hold when they are shown."""
 RATES = (0.01, 100_000.0)
 """Plausible frame rates, 1/s; outside this range 25 is used."""
 
@@ -56,6 +59,8 @@ def open_source(path: Path, frames_per_second: float = 25.0) -> Source:
 class ImageFolder:
     """Images of one size, in the order of the numbers in their names."""
 
+    note = ""
+
     def __init__(self, path: Path, frames_per_second: float) -> None:
         """List the folder; raises InputError if it has no images."""
         self.path, self.frames_per_second = path, frames_per_second
@@ -82,9 +87,12 @@ class ImageFolder:
 class Video:
     """A video file, decoded by FFmpeg through PyAV. Metadata (names, dates, places) is not read."""
 
+    note: str
+    """What a complete iteration has found to be odd about the file, one line; else empty."""
+
     def __init__(self, path: Path) -> None:
         """Open the file and decode the first image; raises InputError if that fails."""
-        self.path = path
+        self.path, self.note = path, ""
         self._size: tuple[int, int] | None = None
         if (kind := kind_of(path)) != "a file":
             got = "no such file" if kind == "nothing" else kind
@@ -93,26 +101,26 @@ class Video:
             raise input_error(path, "a video file", "an empty file", "Copy it again.")
         with self._open() as container:
             stream = container.streams.video[0]
-            rate = float(stream.average_rate or stream.guessed_rate or 25)
+            # The average rate of some AVI files is that of their clock, such as 600.
+            rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
+            rate = min(rates, default=25.0)
             self.frames_per_second = rate if RATES[0] <= rate <= RATES[1] else 25.0
             self.num_frames = max(int(stream.frames), 0)
-            # The duration of the file equals that of the images only if there is no other stream.
-            alone = len(container.streams) == 1 and container.duration is not None
-            self._duration = container.duration / av.time_base if alone else 0.0
+            self._announced_end = _announced_end(container)
         first = next(iter(self), None)
         if first is None:
             raise input_error(path, "a video with images", "none that can be decoded", "Copy or export it again.")
         self.height, self.width = first.rgb_u8.shape[:2]
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        began, index, seconds, broken = None, 0, 0.0, ""
+        step = 1 / self.frames_per_second
+        began, index, seconds, shown_until, broken = None, 0, 0.0, 0.0, ""
         with self._open() as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
             try:
-                for frame in container.decode(stream):
+                for frame, time in _decoded(container):
                     self._demand_size(frame.width, frame.height, index)
-                    seconds = frame.time if frame.time is not None else index / self.frames_per_second
+                    seconds = time if time is not None else index * step
+                    shown_until = seconds + max(step, float((frame.duration or 0) * frame.time_base))
                     began = seconds if began is None else began
                     # Some cameras store the rotation of the images as metadata.
                     turns = round(getattr(frame, "rotation", 0) / 90) % 4
@@ -121,14 +129,34 @@ class Video:
                     index += 1
             except av.error.FFmpegError as error:
                 broken = error.strerror or str(error)
-        decoded = seconds - (began or 0.0) + 1.5 / self.frames_per_second
-        if broken or index < CUT_OFF * self.num_frames or decoded < CUT_OFF * self._duration:
+        self._check_end(index, began or 0.0, seconds, shown_until, broken)
+
+    def _check_end(self, count: int, began: float, last: float, shown_until: float, broken: str) -> None:
+        """Reject a truncated file, and note a smaller difference from what the file announces.
+
+        The number of images that a file announces proves nothing: trimmed MP4 files count images that are not shown,
+        AVI files count repetitions. The time at which the last image ends is right in both.
+
+        Args:
+            count: number of images that were decoded.
+            began, last, shown_until: start of the first image, start and end of the last one, s.
+            broken: message of the decoder if it could not go on.
+        """
+        step, duration = 1 / self.frames_per_second, self._announced_end - began
+        missing = self._announced_end - shown_until
+        known = self._announced_end > 0
+        if (broken and not known) or missing > max(LOST_SHARE * duration, LOST_IMAGES * step):
             raise input_error(
                 self.path,
-                f"{self.num_frames or self._duration * self.frames_per_second:.0f} images",
-                f"{index}, then {broken or 'the end: the file is truncated'}",
-                f"Copy it again, or use its first part with `--end {max(index - 1, 0) / self.frames_per_second:.2f}`.",
+                f"{duration / step if known else self.num_frames:.0f} images",
+                f"{count}, then {broken or 'the end: the file is truncated'}",
+                f"Copy it again, or use its first part with `--end {last - began:.2f}`.",
             )
+        ends_early = missing > 0.75 * step
+        if ends_early or broken or self.num_frames not in (0, count):
+            end = f"; the last {missing:.2f} s are missing" if ends_early else ""
+            announced = self.num_frames or round(duration / step)
+            self.note = f"{self.path.name} announces {announced} images, {count} can be decoded{end}"
 
     def _demand_size(self, width: int, height: int, index: int) -> None:
         """Reject images that are too large, and a size that changes within the video."""
@@ -148,12 +176,44 @@ class Video:
             unlisted = isinstance(error, av.error.ArgumentError)
             got = "a playlist or another kind of file" if unlisted else getattr(error, "strerror", None) or str(error)
             raise input_error(self.path, "a video file", got, "Copy or export it again.") from None
-        if not container.streams.video:
+        if not container.streams.video or (context := container.streams.video[0].codec_context) is None:
+            got = "images in an unknown format" if container.streams.video else "a file without images"
             container.close()
-            raise input_error(self.path, "a video", "a file without images", "Check the path.")
-        context = container.streams.video[0].codec_context
+            raise input_error(self.path, "a video", got, "Check the path, or export it as H.264.")
         context.options = {"max_pixels": str(MOST_PIXELS)}
         return container
+
+
+def _announced_end(container: av.container.InputContainer) -> float:
+    """Time at which the last image of a complete file ends, s; 0 if unknown."""
+    stream = container.streams.video[0]
+    if container.format.name == AVI and stream.frames:  # FFmpeg shortens the duration of a truncated file
+        return float(stream.frames * stream.time_base)
+    if stream.duration is not None:
+        return float(((stream.start_time or 0) + stream.duration) * stream.time_base)
+    # The duration of the file equals that of the images only if there is no other stream.
+    if len(container.streams) == 1 and container.duration is not None:
+        return ((container.start_time or 0) + container.duration) / av.time_base
+    return 0.0
+
+
+def _decoded(container: av.container.InputContainer) -> Iterator[tuple[av.VideoFrame, float | None]]:
+    """The images in the order in which they are shown, and their times, s; None if the file has no times.
+
+    AVI holds the times at which images are decoded, not those at which they are shown. The decoder puts the images in
+    order, and the n-th one gets the n-th time.
+    """
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    is_avi, decode_times = container.format.name == AVI, deque()
+    for packet in container.demux(stream):
+        if is_avi and packet.dts is not None:
+            decode_times.append(packet.dts)
+        for frame in packet.decode():
+            ticks = frame.pts
+            if is_avi:
+                ticks = decode_times.popleft() if decode_times else None
+            yield frame, None if ticks is None else float(ticks * stream.time_base)
 
 
 Source = ImageFolder | Video

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from ..core.checks import InputError, input_error
-from ..system.atomic import CannotWrite, flush_folder, reject_current_folder, reject_occupied, write_json, writing
+from ..system.atomic import CannotWrite, complete_folder, reject_current_folder, reject_occupied, write_json, writing
+from ..system.file_lock import locked
 
 PLAN = "plan.json"
 """Inputs and options of the folder. If they changed, the work starts from the beginning."""
@@ -36,33 +34,24 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
     folder = out.absolute().with_name(f".{out.name}.preparing")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder.with_name(folder.name + ".lock"))
-        lock.acquire(timeout=0)
-    except Timeout:
-        fix = "Wait for it, or choose another folder."
-        raise input_error(out, "a folder that no other process is writing", "one that is being written", fix) from None
     except OSError as error:
         got = error.strerror or str(error)
         raise input_error(out, "a path where a folder can be created", got, "Choose another path.") from None
-    try:
-        if _plan_of(folder) != json.loads(json.dumps(plan)):
+    with locked(out, folder.with_name(folder.name + ".lock")):
+        try:
+            if _plan_of(folder) != json.loads(json.dumps(plan)):
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                write_json(folder / PLAN, plan)
+            with writing(out):
+                yield folder
+                delete_plan(folder)
+                complete_folder(folder, out)
+        except CannotWrite:
+            raise
+        except InputError:
             shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
-            write_json(folder / PLAN, plan)
-        with writing(out):
-            yield folder
-            delete_plan(folder)
-            reject_occupied(out)
-            flush_folder(folder)
-            os.replace(folder, out)
-    except CannotWrite:
-        raise
-    except InputError:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    finally:
-        lock.release()
-        Path(lock.lock_file).unlink(missing_ok=True)
+            raise
 
 
 def delete_plan(folder: Path) -> None:

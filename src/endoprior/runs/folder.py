@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-
-from filelock import FileLock, Timeout
 
 from ..core.checks import InputError
 from ..core.shell import command
@@ -47,24 +43,3 @@ def prepare_run_folder(out: Path, *, resume: bool) -> bool:
     except OSError as error:
         raise InputError(f"{out}: expected a place for a folder; got {error.strerror}. Choose another.") from error
     return not existed
-
-
-@contextmanager
-def locked(out: Path) -> Iterator[None]:
-    """Lock the folder, so that no second process trains in it; the lock of a killed process is free.
-
-    Raises:
-        InputError: another process has the lock.
-    """
-    lock = FileLock(out / LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        raise InputError(
-            f"{out}: expected a folder that no other process trains in; one does. Wait for it or choose another folder."
-        ) from None
-    try:
-        yield
-        (out / LOCK).unlink(missing_ok=True)
-    finally:
-        lock.release()

@@ -11,7 +11,7 @@ from typing import Any
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Hold back Ctrl-C and the signals of schedulers and closing terminals, so that no iteration is cut in half.
+    """Hold back Ctrl-C and the signals of schedulers and closing terminals (SIGBREAK: of Windows).
 
     Yields a function that says whether to stop. A second Ctrl-C stops at once.
     """
@@ -26,7 +26,7 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
     if threading.current_thread() is not threading.main_thread():  # only the main one may handle signals
         yield lambda: False
         return
-    asked = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    asked = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
     previous = {number: signal.getsignal(number) for number in asked}
     try:
         for number in asked:

@@ -51,7 +51,7 @@ def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
             say("compiling kernels, once after installation (about a minute)")
             words = [sys.executable, "-m", "endoprior.runs.warm_up"]
             config = json.dumps(to_dict(cfg))
-            done = subprocess.run(words, input=config, text=True, capture_output=True, timeout=LIMIT_S, check=False)
+            done = subprocess.run(words, input=config.encode(), capture_output=True, timeout=LIMIT_S, check=False)
             if done.returncode == 0:
                 marker.touch()
 
@@ -63,7 +63,8 @@ def _key(cfg: Config) -> str:
 
     digest = hashlib.sha256()
     for file in sorted(PACKAGE.rglob("*.py")):
-        digest.update(f"{file.relative_to(PACKAGE)} {file.stat().st_size} {file.stat().st_mtime_ns}".encode())
+        name, facts = file.relative_to(PACKAGE).as_posix(), file.stat()
+        digest.update(f"{name} {facts.st_size} {facts.st_mtime_ns}".encode())
     digest.update(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()} {sys.version}".encode())
     parts = (cfg.deformation, cfg.render, cfg.schedule.sh_degree, cfg.init.motion, cfg.temporal.gradient)
     digest.update(json.dumps([to_dict(part) for part in parts]).encode())

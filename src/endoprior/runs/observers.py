@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..system.atomic import whole_file
+from ..system.atomic import write_text
 from ..training.state import Stage, StepReport
 from ..training.trainer import Trainer
 from .checkpoint import save_checkpoint
@@ -68,7 +68,7 @@ def cut_log(log: Path, stage: Stage, iteration: int) -> None:
     if not log.exists():
         return
     kept = []
-    for text in log.read_text().splitlines():
+    for text in log.read_text(encoding="utf-8").splitlines():
         try:
             line = json.loads(text)
             done = (Stage[line["stage"].upper()], line["iteration"]) <= (stage, iteration)
@@ -76,5 +76,4 @@ def cut_log(log: Path, stage: Stage, iteration: int) -> None:
             continue
         if done:
             kept.append(text + "\n")
-    with whole_file(log) as temporary:
-        temporary.write_text("".join(kept))
+    write_text(log, "".join(kept))

@@ -45,9 +45,9 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path) -
     Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; then the
     training curve, the PSNR of each test frame, and the scores of `metrics.json`.
     """
-    metrics = json.loads((run / "metrics.json").read_text())
-    per_frame = json.loads((run / "per_frame.json").read_text())
-    log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    per_frame = json.loads((run / "per_frame.json").read_text(encoding="utf-8"))
+    log = [json.loads(line) for line in (run / "log.jsonl").read_text(encoding="utf-8").splitlines()]
     rows = _image_rows(scene, sequence)
     # An own canvas: `pyplot` would choose a backend for the whole process.
     figure = Figure(figsize=(2.6 * len(rows[0]), 2.1 * len(rows) + 3.4), layout="constrained", dpi=110)

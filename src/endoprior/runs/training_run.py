@@ -13,12 +13,13 @@ from ..data import FrameSequence, load_sequence
 from ..data.files import read_json
 from ..model.scene import Scene
 from ..system.atomic import write_json, writing
+from ..system.file_lock import locked
 from ..training.divergence import Diverged
 from ..training.memory_check import reject_too_large
 from ..training.trainer import Observer, Trainer
 from . import kernel_cache
 from .checkpoint import load_checkpoint, save_checkpoint
-from .folder import locked, prepare_run_folder, reject_unusable_folder
+from .folder import LOCK, prepare_run_folder, reject_unusable_folder
 from .identity import reject_other_run
 from .interrupt import deferred_interrupt
 from .observers import CHECKPOINT_SECONDS, CheckpointWriter, LogWriter, cut_log
@@ -103,20 +104,21 @@ class TrainingRun:
             self.trainer.start()
             self.trainer.run(observers)
             return self.trainer.scene()
-        created = prepare_run_folder(self.out, resume=self.resume)
-        with locked(self.out):
-            fingerprint = self.trainer.sequence.fingerprint()
-            try:
+        created, began = prepare_run_folder(self.out, resume=self.resume), False
+        try:
+            with locked(self.out, self.out / LOCK):
+                fingerprint = self.trainer.sequence.fingerprint()
                 self._begin(self.out, fingerprint)
-            except InputError:
-                if created:  # nothing was begun
-                    shutil.rmtree(self.out, ignore_errors=True)
-                elif not self.resume:
-                    (self.out / "config.json").unlink(missing_ok=True)
-                raise
-            self._train_in(self.out, fingerprint, observers, checkpoint_seconds)
-            scene = self.trainer.scene()
-            scene.save(self.out / "scene.safetensors")
+                began = True
+                self._train_in(self.out, fingerprint, observers, checkpoint_seconds)
+                scene = self.trainer.scene()
+                scene.save(self.out / "scene.safetensors")
+        except InputError:
+            if created and not began:
+                shutil.rmtree(self.out, ignore_errors=True)
+            elif not (began or self.resume):
+                (self.out / "config.json").unlink(missing_ok=True)
+            raise
         return scene
 
     def _begin(self, out: Path, fingerprint: str) -> None:
@@ -140,7 +142,11 @@ class TrainingRun:
         """Iterate to the end or to an interruption, with log and checkpoints in `out`."""
         trainer, checkpoint, lines = self.trainer, out / CHECKPOINT, out / "log.jsonl"
         try:
-            with writing(lines), open(lines, "a", buffering=1) as file, deferred_interrupt() as interrupted:
+            with (
+                writing(lines),
+                open(lines, "a", buffering=1, encoding="utf-8", newline="\n") as file,
+                deferred_interrupt() as interrupted,
+            ):
                 writer = CheckpointWriter(checkpoint, fingerprint, checkpoint_seconds, interrupted)
                 trainer.run([LogWriter(file), *observers, writer])
                 save_checkpoint(trainer, checkpoint, fingerprint)

@@ -92,7 +92,8 @@ def load_arrays(path: Path, file_format: str, schema: Schema, fix: str) -> tuple
             headers = {name: opened.get_slice(name) for name in opened.keys()}
             stored = {name: (header.get_dtype(), tuple(header.get_shape())) for name, header in headers.items()}
             _match(stored, schema(about))
-            arrays = {name: opened.get_tensor(name) for name in stored}
+            # Copies: the library's tensors lie in the mapped file, and Windows does not replace a mapped file.
+            arrays = {name: opened.get_tensor(name).clone() for name in stored}
         for name, value in arrays.items():
             _demand_finite(name, value)
         return arrays, about

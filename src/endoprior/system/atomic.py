@@ -7,17 +7,23 @@ import json
 import os
 import re
 import shutil
+import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from ..core.checks import InputError, input_error
+from .paths import lies_in
 
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO}
 """Errors of a disk: full, over a quota or limit, read-only, no permission, broken."""
 FULL_BYTES = 2**20
 """If less is free, a write error without a reason means that the disk is full."""
+NO_FOLDER_FLUSH = {errno.EACCES, errno.EBADF, errno.EINVAL, errno.ENOTSUP}
+"""Answers of systems that do not flush folders: Windows does not open them, some network drives only open them."""
+RENAME_WAITS_S = (0.05, 0.1, 0.2, 0.4, 0.8)
+"""Waits between attempts to rename on Windows, where a virus scanner can hold a new file open for a moment."""
 
 
 class CannotWrite(InputError):
@@ -36,8 +42,9 @@ def writing(path: Path) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, InputError) or (reason := _disk_error(error, path)) is None:
             raise
+        fix = "close other programs that use it" if isinstance(error, PermissionError) else "free space"
         raise CannotWrite(
-            f"{path}: expected a disk that accepts this file, got {reason}. Fix: free space or choose another path, "
+            f"{path}: expected a disk that accepts this file, got {reason}. Fix: {fix} or choose another path, "
             "then repeat. The previous file is unchanged."
         ) from error
 
@@ -76,11 +83,12 @@ def whole_file(path: Path) -> Iterator[Path]:
             usual = _usual_mode(temporary)
             yield temporary
             os.chmod(temporary, usual)
-            _to_disk(temporary)
-            os.replace(temporary, path)
-            _to_disk(path.parent)
+            _flush_file(temporary)
+            _rename(temporary, path)
+            _flush_entries(path.parent)
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(PermissionError):  # Windows keeps a file that a failed writer left open
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -103,19 +111,26 @@ def whole_folder(path: Path) -> Iterator[Path]:
     try:
         with writing(path):
             yield temporary
-            reject_occupied(path)
-            flush_folder(temporary)
-            os.replace(temporary, path)
-            _to_disk(path.absolute().parent)
+            complete_folder(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def flush_folder(folder: Path) -> None:
-    """Flush all files of a folder to the disk, so that a power cut does not leave empty files."""
-    for place, _, files in os.walk(folder):
-        for name in (*files, "."):
-            _to_disk(Path(place, name))
+def complete_folder(temporary: Path, path: Path) -> None:
+    """Flush all files of a folder to the disk, then rename it to `path`.
+
+    Raises:
+        InputError: `path` is not empty.
+    """
+    reject_occupied(path)
+    for place, _, files in os.walk(temporary):
+        for name in files:
+            _flush_file(Path(place, name))
+        _flush_entries(Path(place))
+    if path.is_dir():
+        path.rmdir()  # Windows does not replace a folder
+    _rename(temporary, path)
+    _flush_entries(path.absolute().parent)
 
 
 def _usual_mode(path: Path) -> int:
@@ -126,38 +141,51 @@ def _usual_mode(path: Path) -> int:
     return mode
 
 
-def _to_disk(path: Path) -> None:
-    """Flush a file, or the entries of a folder, to the disk."""
-    if os.name == "nt" and path.is_dir():  # Windows does not open folders
-        return
-    number = os.open(path, os.O_RDONLY)
+def _flush_file(path: Path) -> None:
+    """Flush the content of a file to the disk."""
+    with open(path, "r+b") as file:  # Windows only flushes files that are open for writing
+        os.fsync(file.fileno())
+
+
+def _flush_entries(folder: Path) -> None:
+    """Flush the names in a folder to the disk, where the system can do that."""
     try:
-        os.fsync(number)
-    finally:
-        os.close(number)
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+    except OSError as error:
+        if error.errno not in NO_FOLDER_FLUSH:
+            raise
+
+
+def _rename(source: Path, target: Path) -> None:
+    """Rename a file or folder; replaces a file."""
+    for wait in RENAME_WAITS_S:
+        try:
+            os.replace(source, target)
+            return
+        except PermissionError as error:
+            if not hasattr(error, "winerror"):
+                raise
+            clock.sleep(wait)
+    os.replace(source, target)
 
 
 def remove_leftovers(folder: Path) -> None:
     """Remove temporary files that killed processes left in `folder`."""
+    import psutil  # os.kill(process, 0), the usual test of POSIX, ends the process on Windows
+
     for file in folder.glob(".*.partial*"):
         owner = re.search(r"\.(\d+)\.partial", file.name)
-        if owner and not _alive(int(owner[1])):
+        if owner and not psutil.pid_exists(int(owner[1])):
             shutil.rmtree(file) if file.is_dir() else file.unlink(missing_ok=True)
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # a process of another user
-        return True
-    return True
 
 
 def reject_current_folder(path: Path) -> None:
     """Raise InputError if `path` is the current folder or one of its parents, which cannot be replaced."""
-    if path.resolve() in (Path.cwd(), *Path.cwd().parents):
+    if lies_in(Path.cwd(), path):
         raise input_error(path, "the name of a new folder", "one that is in use", "Choose a new name in this folder.")
 
 
@@ -182,7 +210,12 @@ def reject_occupied(path: Path, alternative: str = "", *, ignore: str | None = N
     raise input_error(path, "a new or empty folder", found, f"Choose another folder{alternative}.")
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write `text` in UTF-8, atomically; the same bytes on every system."""
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write `value` as indented JSON, atomically; NaN is an error because it is not JSON."""
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")

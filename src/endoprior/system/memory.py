@@ -91,14 +91,11 @@ class BoundedCache(Generic[Value]):
 
 
 def _free_in_system() -> int | None:
+    import psutil
+
     try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration, ValueError):
-        pass
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
-    except (AttributeError, OSError, ValueError):
+        return psutil.virtual_memory().available
+    except (OSError, ValueError, psutil.Error):  # Linux without /proc
         return None
 
 
@@ -108,7 +105,7 @@ def _left_in_container() -> int | None:
         ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
     ):
         try:
-            return int(Path(limit).read_text()) - int(Path(used).read_text())
+            return int(Path(limit).read_text("ascii")) - int(Path(used).read_text("ascii"))
         except (OSError, ValueError):  # no such group, or no limit
             continue
     return None
@@ -119,7 +116,7 @@ def _left_of_limit() -> int | None:
     try:
         import resource
 
-        lines = (line.split() for line in Path("/proc/self/status").read_text().splitlines())
+        lines = (line.split() for line in Path("/proc/self/status").read_text("utf-8").splitlines())
         used = {words[0]: int(words[1]) * 1024 for words in lines if words and words[0] in ("VmSize:", "VmData:")}
         limits = {"VmSize:": resource.RLIMIT_AS, "VmData:": resource.RLIMIT_DATA}
         soft = {name: resource.getrlimit(kind)[0] for name, kind in limits.items()}

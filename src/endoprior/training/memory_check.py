@@ -60,5 +60,5 @@ def reject_too_large(sequence: FrameSequence, cfg: Config) -> None:
     raise InputError(
         f"{sequence.path}: expected memory for {len(sequence):,} frames of {camera.width}x{camera.height} px and "
         f"{cfg.init.budget:,} Gaussians, at least {least / 1e9:.1f} GB; got {free / 1e9:.1f} GB free. Free some, or "
-        "ask for less: --data.shrink 2, --data.stride 2, --init-budget."
+        "ask for less: --data.shrink 2, --data.stride 2, --gaussians."
     )

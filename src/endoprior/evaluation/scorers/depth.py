@@ -10,10 +10,12 @@ SCORES = (
     Score(
         "depth_rmse_mm", "depth RMSE", "mm", False, 3,
         "Root mean square error of rendered depth where depth was measured on tissue.",
+        group="depth", hint="0 is exact; measured depth errs too",
     ),
     Score(
         "depth_rmse_endogaussian", "depth RMSE (EndoGaussian's)", "", False, 3,
         "The depth figure of EndoGaussian's program, whose 8-bit depths wrap; only to compare with its tables.",
+        group="depth", in_summary=False,
     ),
 )  # fmt: skip
 

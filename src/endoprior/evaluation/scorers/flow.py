@@ -14,18 +14,22 @@ SCORES = (
     Score(
         "flow_error_dis", "flow error (DIS)", "px", False, 3,
         "Difference of rendered and true optical flow between consecutive frames of the split, by OpenCV's DIS.",
+        group="motion", hint="0 moves as the video does",
     ),
     Score(
         "flow_error", "flow error", "px", False, 3,
         "The published one: the same by RAFT-large; needs its weights.",
+        group="motion", hint="0 moves as the video does",
     ),
     Score(
         "flow_error_raft_small", "flow error (RAFT-small)", "px", False, 3,
         "The same by RAFT-small, where its weights are on this machine.",
+        group="motion", in_summary=False,
     ),
     Score(
         "flow_error_dis_adjacent", "flow error, adjacent (DIS)", "px", False, 3,
         "The same by DIS, between all adjacent frames of the video.",
+        group="motion", in_summary=False,
     ),
 )  # fmt: skip
 

@@ -10,19 +10,27 @@ SCORES = (
     Score(
         "psnr", "PSNR", "dB", True, 2,
         "The published one: both images are multiplied by the tissue mask, the mean squared error is over the frame.",
-        "absolute",
+        "absolute", group="image", hint="as published: tools count as equal",
     ),
-    Score("psnr_tissue", "tissue PSNR", "dB", True, 2, "PSNR over the tissue pixels alone.", "absolute"),
-    Score("ssim", "SSIM", "", True, 4, "Structural similarity of the masked images over the frame.", "absolute"),
+    Score(
+        "psnr_tissue", "tissue PSNR", "dB", True, 2,
+        "PSNR over the tissue pixels alone.", "absolute",
+        group="image", hint="above 35 dB hard to tell from the frame",
+    ),
+    Score(
+        "ssim", "SSIM", "", True, 4,
+        "Structural similarity of the masked images over the frame.", "absolute",
+        group="image", hint="1 is identical",
+    ),
     Score(
         "strict_psnr", "strict PSNR", "dB", True, 2,
         "PSNR over the tissue pixels of rendered color that is not rounded to 8 bits.",
-        "absolute",
+        "absolute", group="image", in_summary=False,
     ),
     Score(
         "strict_ssim", "strict SSIM", "", True, 4,
         "SSIM averaged over the tissue pixels, of rendered color that is not rounded to 8 bits.",
-        "absolute",
+        "absolute", group="image", in_summary=False,
     ),
 )  # fmt: skip
 

@@ -10,10 +10,12 @@ SCORES = (
     Score(
         "lpips", "LPIPS", "", False, 4,
         "The published one: perceptual distance of the masked images by AlexNet; needs its weights.",
+        group="image", hint="0 is identical",
     ),
     Score(
         "lpips_squeeze", "LPIPS (squeeze)", "", False, 4,
         "The same by SqueezeNet, where its weights are on this machine.",
+        group="image", in_summary=False,
     ),
 )  # fmt: skip
 

@@ -8,17 +8,25 @@ from ..score import Score
 LOW_PRIOR, LOW_PRIOR_OBSERVATIONS, LOW_OPACITY, LARGE_SCALE_MM = 0.2, 20, 0.01, 40.0
 """The paper's thresholds."""
 SCORES = (
-    Score("num_gaussians", "Gaussians", "", None, 0, "Gaussians of the scene."),
+    Score(
+        "num_gaussians", "Gaussians", "", None, 0,
+        "Gaussians of the scene.",
+        group="model", hint="more are finer and slower",
+    ),
     Score(
         "num_low_prior", "low prior", "", None, 0,
         f"Gaussians seen at least {LOW_PRIOR_OBSERVATIONS} times whose texture-prior score is below {LOW_PRIOR}.",
-        "absolute",
+        "absolute", group="model", hint="mostly seen in highlights or flat color",
     ),
-    Score("num_low_opacity", "low opacity", "", None, 0, f"Gaussians of opacity below {LOW_OPACITY}.", "absolute"),
+    Score(
+        "num_low_opacity", "low opacity", "", None, 0,
+        f"Gaussians of opacity below {LOW_OPACITY}.", "absolute",
+        group="model", in_summary=False,
+    ),
     Score(
         "num_large_scale", "large scale", "", None, 0,
         f"Gaussians whose largest standard deviation exceeds {LARGE_SCALE_MM:g} mm.",
-        "absolute",
+        "absolute", group="model", in_summary=False,
     ),
 )  # fmt: skip
 

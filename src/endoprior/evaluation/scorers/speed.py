@@ -12,21 +12,35 @@ from ..score import Score
 
 FPS_WARM_UP, FPS_RENDERS = 10, 60
 SCORES = (
-    Score("fps", "rendering", "frames/s", True, 1, "Frames rendered a second, deformation included."),
-    Score("fps_cached", "cached rendering", "frames/s", True, 1, "The same with deformations computed beforehand."),
-    # `endoprior train` and `endoprior bench` add these two: a scene does not know how long its training took.
-    Score("train_seconds", "training", "s", False, 1, "Time of the training, reading included; not after `--resume`."),
     Score(
-        "iterations_per_second", "training", "iterations/s", True, 2,
+        "fps", "rendering", "frames/s", True, 1,
+        "Frames rendered a second, deformation included.",
+        group="speed",
+    ),
+    Score(
+        "fps_cached", "cached rendering", "frames/s", True, 1,
+        "The same with deformations computed beforehand.",
+        group="speed", hint="motion computed beforehand",
+    ),
+    # `endoprior train` and `endoprior bench` add these two: a scene does not know how long its training took.
+    Score(
+        "train_seconds", "training", "s", False, 1,
+        "Time of the training, reading included; not after `--resume`.",
+        group="speed",
+    ),
+    Score(
+        "iterations_per_second", "training speed", "iterations/s", True, 2,
         "Training iterations a second, by the log of the run.",
+        group="speed",
     ),
 )  # fmt: skip
 
 
 def compute(context: EvaluationContext) -> None:
     """Time the rendering; no frame is needed."""
-    context.add("fps", frames_per_second(context.scene))
-    context.add("fps_cached", frames_per_second(context.scene, cached=True))
+    with context.skip_if_unavailable("fps", "fps_cached"):
+        context.add("fps", frames_per_second(context.scene))
+        context.add("fps_cached", frames_per_second(context.scene, cached=True))
 
 
 def frames_per_second(scene: Scene, *, cached: bool = False) -> float:

@@ -12,6 +12,7 @@ SCORES = (
     Score(
         "depth_instability_mm", "depth instability", "mm", False, 3,
         "The published one: mean absolute change of rendered depth on tissue between adjacent frames of the video.",
+        group="depth", hint="includes true motion",
     ),
 )  # fmt: skip
 

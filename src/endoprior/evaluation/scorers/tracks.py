@@ -24,30 +24,37 @@ SCORES = (
     Score(
         "track_end_error_mm", "track end error", "mm", False, 3,
         "Mean distance of points carried to the last frame to the nearest true one there, as in STIR's benchmark.",
+        group="motion", hint="0 follows the tissue",
     ),
     Score(
         "track_error_mm", "track error", "mm", False, 3,
         "Mean distance between carried and true points over all frames in which the point is visible.",
+        group="motion", hint="0 follows the tissue",
     ),
-    Score("track_error_px", "track error", "px", False, 3, "The same distance in the image."),
+    Score(
+        "track_error_px", "track error", "px", False, 3,
+        "The same distance in the image.",
+        group="motion", in_summary=False,
+    ),
     Score(
         "track_fold_rate", "folds", "", False, 4,
         "Share of lines between a point and its nearest neighbors that point against the true line.",
-        "absolute",
+        "absolute", group="motion", hint="0: neighbors keep their order",
     ),
     Score(
         "track_tear_rate", "tears", "", False, 4,
         "Share of such lines that are more than twice as long as the true line.",
-        "absolute",
+        "absolute", group="motion", hint="0: neighbors stay together",
     ),
 )  # fmt: skip
 
 
 def compute(context: EvaluationContext) -> None:
     """Score paired tracks, or the end points of unpaired ones; nothing without ground truth."""
-    scene, sequence = context.scene, context.sequence
+    sequence = context.sequence
     if sequence.truth is None:
         return
+    scene = context.scene
     if sequence.truth.tracks and not sequence.truth.tracks.paired:
         context.add("track_end_error_mm", track_end_error_mm(scene, sequence), "no point has depth at start and end")
     for name, value in track_scores(scene, sequence).items():

@@ -1,0 +1,42 @@
+"""`endoprior plugins`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..core.checks import InputError
+from .parsing import parse
+from .progress import say
+
+LINE = "{:<11}{:<20}{:<28}{}"
+
+
+@dataclass
+class Plugins:
+    """List datasets, methods, scores and exporters: what is built in, and what other packages add (docs/plugins.md)."""
+
+
+def run(argv: list[str]) -> None:
+    """Import every plugin and print one line for each."""
+    parse(Plugins, argv, "plugins")
+    from ..data.formats import REGISTRY as DATASETS
+    from ..evaluation.registry import REGISTRY as SCORES
+    from ..experiments.method import REGISTRY as METHODS
+    from ..export.formats import REGISTRY as EXPORTERS
+    from ..system.plugins import Registry, installed
+
+    def found(registry: Registry) -> list[tuple[str, str, str]]:
+        """Name, package and error of everything of a kind."""
+        rows = [(name, "built in", "") for name in registry.builtin]
+        for plugin in installed(registry.kind):
+            try:
+                registry.loaded(plugin)
+                rows.append((plugin.name, plugin.origin, ""))
+            except InputError as error:
+                rows.append((plugin.name, plugin.origin, f"error: {error}"))
+        return rows
+
+    say(LINE.format("kind", "name", "package", "").rstrip())
+    for registry in (DATASETS, METHODS, SCORES, EXPORTERS):
+        for name, package, error in found(registry):
+            say(LINE.format(registry.kind, name, package, error).rstrip())

@@ -1,0 +1,41 @@
+"""Scores as lines for people: name, value with unit, which way is better, and what is good."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ..evaluation.registry import all_scores
+from ..evaluation.score import GROUPS, Score
+
+LINE = "  {group:<7} {label:<18} {value:>15} {arrow:1}  {hint}"
+
+
+def score_table(scores: Mapping[str, float], skipped: Mapping[str, str]) -> list[str]:
+    """The lines of the table, at most 25 and as many as there are reasons for skipped scores.
+
+    Args:
+        scores: value by name.
+        skipped: reason by name, of scores that could not be computed.
+    """
+    lines = []
+    for group in GROUPS:
+        title = group
+        for score in _summary(scores):
+            if score.group == group:
+                value = score.text(scores[score.name])
+                line = LINE.format(group=title, label=score.label, value=value, arrow=score.arrow, hint=score.hint)
+                lines.append(line.rstrip())
+                title = ""
+    return [*lines, *_not_computed(skipped)]
+
+
+def _summary(names: Mapping[str, object]) -> list[Score]:
+    return [score for name, score in all_scores().items() if name in names and score.in_summary]
+
+
+def _not_computed(skipped: Mapping[str, str]) -> list[str]:
+    """One line for each reason: scores that need the same missing package stand together."""
+    labels: dict[str, list[str]] = {}
+    for score in _summary(skipped):
+        labels.setdefault(skipped[score.name], []).append(score.label)
+    return [f"  not computed: {', '.join(names)}: {reason}" for reason, names in labels.items()]

@@ -1,0 +1,83 @@
+"""Errors about arguments that cannot be parsed, one line each."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+
+from ..core.checks import InputError, input_error
+from .options import Option, option_name
+
+BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
+
+
+def reject_unknown(argv: Sequence[str], command: str, names: Sequence[str]) -> None:
+    """Raise InputError for the first option in `argv` that is not in `names`; it suggests the most similar one."""
+    for word in argv:
+        name = option_name(word)
+        if name.startswith("--") and name not in names:
+            similar = _similar(name, names)
+            meant = f"Did you mean {similar}? " if similar else ""
+            fix = f"{meant}`endoprior {command} --help-all` lists all options."
+            raise input_error(f"endoprior {command}", "an option that it has", name, fix)
+
+
+def _similar(name: str, names: Sequence[str]) -> str | None:
+    """The option with the same last part, such as `--temporal.weight` for `--weight`, else the most similar one."""
+    by_last_part = {_last_part(each): each for each in reversed(names)}
+    if _last_part(name) in by_last_part:
+        return by_last_part[_last_part(name)]
+    whole = difflib.get_close_matches(name, names, 1)
+    part = difflib.get_close_matches(_last_part(name), by_last_part, 1)
+    return whole[0] if whole else by_last_part[part[0]] if part else None
+
+
+def _last_part(name: str) -> str:
+    return name.rpartition(".")[2].removeprefix("--")
+
+
+def usage_error(
+    page: str, argv: Sequence[str], command: str, arguments: Sequence[Option], short: Mapping[str, str]
+) -> InputError:
+    """The error for what tyro says of a missing argument, one too many, or a value that does not suit its option.
+
+    Args:
+        page: what tyro printed.
+        arguments: all options and positional arguments of the command.
+        short: short names of options.
+    """
+    text, fix = _one_line(page), f"`endoprior {command} --help`."
+    places = [each.name for each in arguments if each.is_positional]
+    if "Missing from" in text:
+        missing = [name for name in places if re.search(rf"\b{re.escape(name)}\b", text)]
+        return input_error(f"endoprior {command}", " ".join(places), f"no {' and no '.join(missing)}", fix)
+    if "Unrecognized options: " in text:
+        expected = " ".join(places) or "options only"
+        return input_error(f"endoprior {command}", expected, text.partition("Unrecognized options: ")[2], fix)
+    text = text.rpartition("Error parsing ")[2]
+    by_name = {name: option for option in arguments for name in option.names}
+    for word, value in zip(argv, [*argv[1:], ""], strict=True):
+        option = by_name.get(short.get(option_name(word), option_name(word)))
+        if option and (beyond := re.match(rf"\S+: ({_last_part(option.name).replace('-', '_')} must .*)", text)):
+            return InputError(f"{option_name(word)}: {beyond[1]}. Fix: {fix}")
+        if option and re.search(rf"{re.escape(option.name)}(?![\w-]|\.\w)", text):
+            got = word.partition("=")[2] or value
+            return input_error(option_name(word), _in_words(option.metavar), repr(got) if got else "nothing", fix)
+    return InputError(f"{text}. Fix: {fix}")
+
+
+def _in_words(metavar: str) -> str:
+    """What a value must be."""
+    if metavar.startswith("{"):
+        return f"one of {', '.join(metavar.strip('{}').split(','))}"
+    return {"": "no value", "INT": "an integer", "FLOAT": "a number", "FLOAT ...": "numbers", "PATH": "a path"}.get(
+        metavar, metavar
+    )
+
+
+def _one_line(page: str) -> str:
+    """The text of tyro's framed page, without the frame, its title and the closing advice."""
+    body = [BOX_DRAWING.sub(" ", line).strip() for line in page.splitlines() if not line.startswith("\u256d")]
+    text = " ".join(" ".join(body).split("For full helptext")[0].split())
+    return text.rstrip(". ")

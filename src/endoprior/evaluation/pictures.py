@@ -1,0 +1,143 @@
+"""Frames that another program rendered, read from files and scored like our own."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import input_error
+from ..core.types import Camera
+from ..data import FrameSequence, Split, read_depth_file
+from ..data.files import entries, natural_order
+from ..data.images import decode_image, describe_pixels, single_channel
+from ..data.reading import kind_of
+from .metrics import ScoreUnavailable
+from .picture_names import IN_ORDER, NUMBERS, OWN_NAMES, match_names
+from .rendered import Rendering
+
+FULL_SCALE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}
+RULES = f"{OWN_NAMES}, or {NUMBERS}, or {IN_ORDER}"
+
+
+class Pictures:
+    """A `Reconstruction` whose frames are PNG files, and its depth, if there is any, NPY or PNG files."""
+
+    def __init__(
+        self,
+        folder: Path,
+        sequence: FrameSequence,
+        split: Split,
+        *,
+        depth_folder: Path | None = None,
+        depth_scale: float | None = None,
+        name: str = "",
+    ) -> None:
+        """Find the file of every frame; they are decoded when they are used.
+
+        Args:
+            folder: RGB images of 8 or 16 bits, of the size of the sequence's frames.
+            split: frames that must be there; scores that need others are skipped if these are not.
+            depth_folder: NPY files in mm, or 16-bit PNG files.
+            depth_scale: mm per unit of the depth files; PNG files need it.
+            name: of the method, for `metrics.json`; default: the folder's.
+        Raises:
+            InputError: no such folder, files that do not match the frames, or PNG depth without a scale.
+        """
+        self._sequence, self._scale = sequence, depth_scale
+        self._color, rule = _matched(folder, (".png",), sequence, split)
+        facts: dict[str, Any] = {"name": name or folder.resolve().name, "folder": str(folder.resolve())}
+        facts |= {"files": len(self._color), "matched_by": rule, "fingerprint": fingerprint(folder)}
+        first = next(iter(self._color.values()))
+        facts["bits"] = 8 * decode_image(first, None).dtype.itemsize
+        self._depth: dict[int, Path] = {}
+        if depth_folder:
+            self._depth, rule = _matched(depth_folder, (".npy", ".png"), sequence, split)
+            if depth_scale is None and any(file.suffix.lower() == ".png" for file in self._depth.values()):
+                fix = "pass --depth-scale, or `depth_scale` in a spec."
+                raise input_error(depth_folder, "mm per unit of PNG files", "none", fix)
+            facts |= {"depth_folder": str(depth_folder.resolve()), "depth_matched_by": rule}
+            facts |= {"depth_scale": depth_scale, "depth_fingerprint": fingerprint(depth_folder)}
+        self.provenance = {"pictures": facts}
+
+    @property
+    def remarks(self) -> list[str]:
+        """How files and frames were matched, one line for each folder."""
+        facts, total = self.provenance["pictures"], len(self._sequence)
+        lines = [f"{facts['folder']}: {len(self._color)} of {total} frames, matched by {facts['matched_by']}"]
+        if self._depth:
+            rule = facts["depth_matched_by"]
+            lines.append(f"{facts['depth_folder']}: {len(self._depth)} of {total} frames, matched by {rule}")
+        return lines
+
+    def render(self, index: int) -> Rendering:
+        """See `Reconstruction.render`.
+
+        Raises:
+            InputError: a file cannot be used, or has another size than the frames.
+            ScoreUnavailable: there is no image of this frame.
+        """
+        if index not in self._color:
+            raise ScoreUnavailable(f"needs more frames: there is no image of frame {index}")
+        camera, depth = self._sequence.camera(index), self._depth.get(index)
+        return _read_color(self._color[index], camera), depth and _read_depth(depth, self._scale, camera)
+
+
+def fingerprint(folder: Path) -> str:
+    """SHA-256, in hex, of the names and contents of the files of a folder."""
+    digest = hashlib.sha256()
+    for file in sorted(file for file in entries(folder) if file.is_file() and file.suffix.lower() in (".png", ".npy")):
+        digest.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _matched(
+    folder: Path, suffixes: tuple[str, ...], sequence: FrameSequence, split: Split
+) -> tuple[dict[int, Path], str]:
+    """The file of each frame, and the rule that says so."""
+    if (kind := kind_of(folder)) != "a folder":
+        raise input_error(folder, "a folder of rendered frames", kind, "correct the path.")
+    usable = [f for f in entries(folder) if f.suffix.lower() in suffixes and not f.name.startswith(".")]
+    files = sorted(usable, key=natural_order)
+    kinds = "/".join(suffix[1:].upper() for suffix in suffixes)
+    if not files:
+        raise input_error(folder, f"{kinds} files", "none", "pass the folder that holds the files themselves.")
+    indices = sequence.indices(split)
+    match = match_names([file.stem for file in files], sequence.image_names, indices, len(sequence))
+    if isinstance(match, str):
+        want = f"{kinds} files of the {len(indices)} frames of the {split} split ({indices[0]}, ..., {indices[-1]})"
+        raise input_error(folder, want, match, f"rename them: {RULES}.")
+    return dict(zip(match.frames, files, strict=True)), match.rule
+
+
+def _read_color(file: Path, camera: Camera) -> NDArray[np.float32]:
+    """(H, W, 3) in [0, 1]."""
+    pixels = decode_image(file, None)
+    full = FULL_SCALE.get(pixels.dtype)
+    opaque = pixels.ndim == 3 and (pixels.shape[2] == 3 or (pixels.shape[2] == 4 and (pixels[..., 3] == full).all()))
+    if not full or not opaque:
+        raise input_error(file, "an 8-bit or 16-bit RGB image", describe_pixels(pixels), "save it without alpha.")
+    _demand_size(file, pixels, camera)
+    return np.ascontiguousarray(pixels[..., 2::-1]).astype(np.float32) / np.float32(full)
+
+
+def _read_depth(file: Path, scale: float | None, camera: Camera) -> NDArray[np.float32]:
+    """(H, W) mm; 0 where nothing is."""
+    if file.suffix.lower() == ".png":
+        pixels = single_channel(file, decode_image(file, None))
+        if pixels.dtype != np.uint16:
+            raise input_error(file, "16-bit depth", describe_pixels(pixels), "save depth with 16 bits.")
+        depth = pixels.astype(np.float32) * np.float32(scale)
+    else:
+        depth = read_depth_file(file, scale or 1.0)
+    _demand_size(file, depth, camera)
+    return depth
+
+
+def _demand_size(file: Path, pixels: NDArray, camera: Camera) -> None:
+    if pixels.shape[:2] != (camera.height, camera.width):
+        want = f"{camera.width}x{camera.height} px like the frames of the sequence"
+        raise input_error(file, want, f"{pixels.shape[1]}x{pixels.shape[0]}", "render at the size of the sequence.")

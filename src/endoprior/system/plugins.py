@@ -1,0 +1,150 @@
+"""Plugins: datasets, methods, scores and exporters that other packages add through entry points; docs/plugins.md.
+
+Nothing is imported before it is used. A plugin that cannot be used is reported once and left out; only a command that
+asks for it by name ends with an error.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Generic, TypeVar
+
+from ..core.checks import InputError, input_error
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """An entry point of an installed package."""
+
+    kind: str
+    """`datasets`, `methods`, `scores` or `exporters`; the group of its entry point is `endoprior.KIND`."""
+    name: str
+    """What options and specs call it."""
+    target: str
+    """What it stands for, `module` or `module:object`."""
+    package: str
+    version: str
+
+    @property
+    def origin(self) -> str:
+        """Package and version."""
+        return f"{self.package} {self.version}"
+
+    def rejected(self, expected: str, got: str, fix: str) -> InputError:
+        """The error for this plugin, on one line."""
+        subject = f"plugin {self.name} of {self.origin} ({self.target})"
+        return input_error(subject, expected, " ".join(got.split()), fix)
+
+
+@cache
+def installed(kind: str) -> tuple[Plugin, ...]:
+    """The plugins of a kind, by name and package; none is imported."""
+    found = [
+        Plugin(kind, entry.name, entry.value, entry.dist.name, entry.dist.version)
+        for entry in entry_points(group=f"endoprior.{kind}")
+    ]
+    return tuple(sorted(found, key=lambda plugin: (plugin.name, plugin.package)))
+
+
+@cache
+def report(error: str) -> None:
+    """Print why a plugin cannot be used on stderr, once per process."""
+    print(f"endoprior: {error}", file=sys.stderr)
+
+
+class Registry(Generic[T]):
+    """Everything of one kind by name: what is built in, and what plugins add."""
+
+    def __init__(
+        self,
+        kind: str,
+        builtin: tuple[str, ...],
+        load_builtin: Callable[[str], T],
+        expected: str,
+        problem: Callable[[Any], str],
+        *,
+        reserved: tuple[str, ...] = (),
+    ) -> None:
+        """Describe a kind; nothing is imported yet.
+
+        Args:
+            kind: see `Plugin.kind`.
+            load_builtin: imports the built-in one of a name.
+            expected: what an entry point must stand for, for messages.
+            problem: what is wrong with the object that an entry point stands for; empty if nothing is.
+            reserved: names with a meaning of their own, which no plugin can have.
+        """
+        self.kind, self.builtin, self.reserved = kind, builtin, reserved
+        self._load_builtin, self._expected, self._problem = load_builtin, expected, problem
+
+    def names(self) -> tuple[str, ...]:
+        """The built-in names, then those of plugins. Plugins whose name is taken are reported and left out."""
+        return (*self.builtin, *self._plugins())
+
+    def load(self, name: str) -> T:
+        """The one of that name in `names()`.
+
+        Raises:
+            InputError: it is a plugin that cannot be used; the message names package and object.
+            KeyError: there is none.
+        """
+        return self._load_builtin(name) if name in self.builtin else self.loaded(self._plugins()[name])
+
+    def usable(self) -> Iterator[tuple[str, T]]:
+        """Name and object of each plugin that can be used; the others are reported."""
+        for name, plugin in self._plugins().items():
+            try:
+                yield name, self.loaded(plugin)
+            except InputError as error:
+                report(str(error))
+
+    def origin(self, name: str) -> str:
+        """Package and version that a plugin comes from; empty for what is built in."""
+        return "" if name in self.builtin else self._plugins()[name].origin
+
+    def failure(self, name: str, error: Exception) -> str:
+        """What to say of an error inside a plugin: `mae of endoprior-example 0.1 failed: KeyError: 'x'`."""
+        return " ".join(f"{name} of {self.origin(name)} failed: {type(error).__name__}: {error}".split())
+
+    def loaded(self, plugin: Plugin) -> T:
+        """Import a plugin of this kind and check that it is what it promises.
+
+        Raises:
+            InputError: its name is taken, importing it fails, or it is something else.
+        """
+        self._demand_free_name(plugin)
+        fix = f"update or uninstall {plugin.package}."
+        try:
+            found = EntryPoint(plugin.name, plugin.target, f"endoprior.{self.kind}").load()
+            problem = self._problem(found)
+        except (Exception, SystemExit) as error:  # code of others: anything can happen
+            raise plugin.rejected(self._expected, f"{type(error).__name__}: {error}", fix) from error
+        if problem:
+            raise plugin.rejected(self._expected, problem, fix)
+        return found
+
+    def _plugins(self) -> dict[str, Plugin]:
+        """The plugins by name; those whose name is taken are reported."""
+        found = {}
+        for plugin in installed(self.kind):
+            try:
+                self._demand_free_name(plugin)
+            except InputError as error:
+                report(str(error))
+            else:
+                found[plugin.name] = plugin
+        return found
+
+    def _demand_free_name(self, plugin: Plugin) -> None:
+        if plugin.name in (*self.builtin, *self.reserved):
+            raise plugin.rejected("a name of its own", "that of a built-in one", f"uninstall {plugin.package}.")
+        if Counter(other.name for other in installed(self.kind))[plugin.name] > 1:
+            packages = ", ".join(other.package for other in installed(self.kind) if other.name == plugin.name)
+            raise plugin.rejected("a name of its own", f"one name in {packages}", "uninstall all but one.")
