@@ -2,15 +2,17 @@
 # `make test-all` runs `make test`, then the tests that take long. docs/development.md says what is where.
 # `make bench` times every stage beside plain torch and fails if one fell behind bench/baseline.json; options go in
 # BENCH, for example `make bench BENCH=--quick`.
-PYTHON ?= python3
+# `make demo PYTHON=python3.12` names the Python. `make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu` takes torch
+# from there, for the CPU alone: on Linux that saves most of the download (docs/install.md).
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+export PYTHON TORCH_INDEX
 
 .PHONY: demo test test-all test-faults lint browser bench figures clean
 
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
+	@echo "To type endoprior without its folder: source $(BIN)/activate"
 
 # Two processes, because most of a first run is compiling kernels, which takes one core. Files stay together.
 test: $(VENV)/.test-installed lint browser
@@ -25,8 +27,8 @@ test-faults: $(VENV)/.test-installed
 	$(BIN)/python faults/run.py $(FAULTS)
 
 lint: $(VENV)/.test-installed
-	$(BIN)/ruff check src tests bench faults examples
-	$(BIN)/ruff format --check src tests bench faults examples
+	$(BIN)/ruff check setup.py src tests bench faults examples
+	$(BIN)/ruff format --check setup.py src tests bench faults examples
 
 # The viewer and the player are tested in headless Chromium. Where there is none, Debian's package is installed if that is
 # possible without asking; otherwise those tests are skipped, and say so.
@@ -43,17 +45,12 @@ bench: $(VENV)/.installed
 figures: $(VENV)/.test-installed browser
 	$(BIN)/python bench/figures.py figures
 
-$(VENV)/bin/python:
-	$(PYTHON) -m venv $(VENV)
-
-# torch comes first, pinned and by itself, so that no other package picks a build of its own.
-$(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PIP) -c constraints.txt torch
-	$(PIP) -c constraints.txt -e .
+$(VENV)/.installed: pyproject.toml constraints.txt
+	sh tools/install.sh
 	touch $@
 
 $(VENV)/.test-installed: $(VENV)/.installed
-	$(PIP) -c constraints.txt -e '.[test]'
+	sh tools/install.sh test
 	touch $@
 
 clean:

@@ -1,6 +1,6 @@
 """Put the overview of a benchmark into the documentation: its text, and its figures as small JPEG files.
 
-`python bench/publish.py OUT`, after `endoprior bench bench/specs/sized OUT`, writes docs/results.md and
+`python bench/publish.py OUT`, after `endoprior bench sized OUT`, writes docs/results.md and
 docs/images/results/.
 """
 

@@ -143,7 +143,7 @@ def changed(old: str, new: str) -> Build:
 
 
 SPECS = [
-    Case("no spec", given("bench spec.yaml out"), ("spec.yaml", "o such file")),
+    Case("no spec", given("bench spec.yaml out"), ("spec.yaml", "a file, a folder or one of")),
     Case("a spec of another kind", spec("x", "spec.txt"), ("spec.txt", ".yaml")),
     Case("a folder without specs", given("bench specs out", empty_folder("specs")), ("specs", "none")),
     Case("an empty spec", spec(""), ("spec.yaml",)),

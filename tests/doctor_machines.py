@@ -28,7 +28,7 @@ WORKING = Facts(
 NO_TRITON = replace(WORKING, triton=Triton("3.7.1", "triton==3.7.1", False, "RuntimeError"))
 """The same, but Triton does not work and no fix is known: only gsplat is left."""
 ONLY_TRITON = replace(WORKING, gsplat=Gsplat(), toolkit=Toolkit(pip="/venv/nvidia/cu13"))
-"""As `pip install endoprior` leaves a machine with a driver and torch for CUDA: no gsplat, no toolkit."""
+"""As a plain installation leaves a machine with a driver and torch for CUDA: no gsplat, no toolkit."""
 NO_GPU = replace(WORKING, driver=Driver(0), torch=Torch("2.13.0+cu130", "13.0", available=False, reason="no driver"))
 """Where an image is built."""
 CHOICES = {

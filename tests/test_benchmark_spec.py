@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 import yaml
 
+from endoprior.cli import main
 from endoprior.core.checks import InputError
+from endoprior.experiments.ready_specs import find_spec, spec_names, specs_of
 from endoprior.experiments.spec import Cell, cells, load_spec, sequence_folder
 
-SPECS = Path(__file__).parents[1] / "bench" / "specs"
 PLAIN = {
     "title": "two methods",
     "sequences": {"clip": {"path": "clips/a", "shrink": 2}, "ph": {"phantom": {"frames": 9}}},
@@ -138,11 +140,30 @@ def test_unreadable_files_are_named(tmp_path):
         load_spec(written(tmp_path), {"x": tmp_path})
 
 
-@pytest.mark.parametrize(
-    "path",
-    sorted(path for path in SPECS.rglob("*.yaml") if path.name != "small.yaml"),
-    ids=lambda p: str(p.relative_to(SPECS)),
-)
-def test_ready_specs_can_be_read(path):
-    spec = load_spec(path)
-    assert cells(spec) and spec.about
+@pytest.mark.parametrize("name", spec_names())
+def test_ready_specs_are_read_by_name(name):
+    for path in specs_of(find_spec(name)):
+        spec = load_spec(path)
+        assert cells(spec) and spec.about
+
+
+def test_names_are_listed_and_win_over_paths(tmp_path, monkeypatch, capsys):
+    names = spec_names()
+    assert {"quick", "sized", "sized/phantom", "full", "full/methods"} <= {*names}
+    assert not [name for name in names if "_small" in name], "it is only there to be extended"
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path).rename("quick")
+    assert find_spec("quick").is_absolute() and find_spec("./quick") == Path("quick")
+    with pytest.raises(SystemExit):
+        main(["bench", "--help"])
+    # The help is printed in a frame, with line breaks inside of names.
+    text = "".join(re.sub(r"[\u2500-\u257f]", "", capsys.readouterr().out).split())
+    assert ",".join(names) in text
+
+
+@pytest.mark.parametrize("spec", ["quik", "nowhere/spec.yaml"])
+def test_neither_a_name_nor_a_path_is_one_line_with_the_names(tmp_path, capsys, spec):
+    assert main(["bench", spec, str(tmp_path / "out")]) == 2
+    text = capsys.readouterr().err
+    assert text.startswith(f"endoprior: {spec}: expected a file, a folder or one of full,") and "quick" in text
+    assert text.count("\n") == 1 and not (tmp_path / "out").exists()

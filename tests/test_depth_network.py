@@ -12,9 +12,7 @@ from endoprior.evaluation.metrics.torchvision_compat import import_torchvision
 from endoprior.prepare import depth_network
 from endoprior.prepare.depth_network import FILES, DepthNetwork
 
-needs_transformers = pytest.mark.skipif(
-    find_spec("transformers") is None, reason="transformers is not installed: pip install endoprior[mono]"
-)
+needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 # The library's own warnings are not ours to fix.
 pytestmark = pytest.mark.filterwarnings("default")
 
@@ -129,9 +127,9 @@ def test_a_hub_name_is_searched_in_the_cache_first(folder, monkeypatch):
     assert asked == [True, True, False] and "\n" not in str(caught.value)
 
 
-def test_without_the_package_the_extra_is_named(monkeypatch):
+def test_without_the_package_its_name_is_said(monkeypatch):
     monkeypatch.setattr(depth_network, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r'pip install "endoprior\[mono\]"'):
+    with pytest.raises(InputError, match="Fix: `pip install transformers`"):
         DepthNetwork()
 
 

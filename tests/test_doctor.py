@@ -53,7 +53,7 @@ def check_advice(facts: Facts) -> None:
     if "cuda-toolkit" in first.fix and facts.toolkit.nvcc:
         installs = (f"cuda-toolkit-{facts.toolkit.nvcc.replace('.', '-')}", f"=={facts.toolkit.nvcc}.*")
         assert not any(name in first.fix for name in installs) or not facts.toolkit.headers or not facts.toolkit.cudart
-    if "pip install 'endoprior[cuda]'" in first.fix:
+    if first.fix == "pip install gsplat":
         assert not facts.gsplat.version
     if first.fix.startswith("pip install triton"):
         assert not facts.triton.version

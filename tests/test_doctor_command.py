@@ -32,7 +32,7 @@ def test_the_command_prints_a_table(monkeypatch, capsys):
     machine = replace(NO_TRITON, gsplat=Gsplat())
     assert doctor(monkeypatch, machine) == 0
     text = capsys.readouterr().out
-    assert "-> pip install 'endoprior[cuda]'" in text and text.count("next: ") == 1
+    assert "-> pip install gsplat\n" in text and text.count("next: ") == 1
     assert "--device auto: CPU: the GPU is ready, but gsplat: not installed" in text
     assert doctor(monkeypatch, machine, None, "--compil") == 2
 

@@ -15,7 +15,7 @@ from endoprior.doctor.probe_process import MARK, Answer, run_program
 from endoprior.doctor.records import Gsplat, System, Toolkit, Torch, Triton
 from endoprior.doctor.report import table
 
-INSTALL = ["pip install 'endoprior[cuda]'"]
+INSTALL = ["pip install gsplat"]
 
 
 def test_triton_alone_is_enough():

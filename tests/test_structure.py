@@ -19,7 +19,7 @@ FLOORS = [
     {"initialization", "evaluation", "visualization", "phantom"},
     {"training", "doctor", "prepare", "check", "export", "view"},
     {"runs"},
-    {"experiments"},
+    {"experiments", "pipeline"},
     {"cli"},
 ]
 """Packages, lowest first. A package imports from floors below its own, never from its own or from above."""

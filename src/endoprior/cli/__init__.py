@@ -11,9 +11,11 @@ import sys
 from importlib import import_module
 
 from ..core.checks import InputError, input_error
+from ..system.installation import docs_folder
 from ..system.memory import reject_small_limits
 
 COMMANDS = {
+    "run": "from a video to a model to look at: prepare, check, train, score, video, player",
     "demo": "phantom sequence -> train -> eval -> render, with a summary and pictures",
     "phantom": "write a synthetic surgical sequence with full ground truth",
     "prepare": "write a sequence folder from a video: rectified frames, depth, tool masks, poses",
@@ -111,5 +113,6 @@ def overview() -> str:
             *lines,
             "",
             "`endoprior COMMAND --help` shows what most users need, `--help-all` every option.",
+            f"Pages that messages name are in {docs_folder()}",
         ]
     )

@@ -11,20 +11,24 @@ from typing import Annotated
 import tyro
 
 from ..core.checks import input_error
+from ..experiments.ready_specs import find_spec, spec_names, specs_of
 from .help_page import Help
 from .parsing import parse
 from .progress import say
 
 MOST_CORES = 4096
 """Largest --cores and --threads."""
+SPEC_HELP = (
+    "A .yaml or .toml file, a folder of them, or a name. `quick` takes minutes, `sized` has the paper's tables, sized "
+    f"for two cores, `full` at full size. All names: {', '.join(spec_names())}."
+)
 
 
 @dataclass
 class Bench:
     """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
 
-    spec: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="SPEC")]]
-    """A .yaml or .toml file, or a folder of them; bench/specs/ has those of the paper's tables."""
+    spec: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="SPEC", help=SPEC_HELP)]]
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0
@@ -42,7 +46,7 @@ class Bench:
 
 
 HELP = Help(
-    examples=(("bench/specs/small.yaml", "OUT"), ("bench/specs/small.yaml", "OUT", "--report-only")),
+    examples=(("quick", "OUT"), ("sized", "OUT", "--report-only")),
 )
 
 
@@ -64,8 +68,8 @@ def run(argv: list[str]) -> int:
             )
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
-    specs = _specs(args.spec)
-    loaded = {path: load_spec(path, _folders(args.data)) for path in specs}
+    source = find_spec(args.spec)
+    loaded = {path: load_spec(path, _folders(args.data)) for path in specs_of(source)}
     require_writable_folder("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
@@ -88,7 +92,7 @@ def run(argv: list[str]) -> int:
             executor = local_executor(max(1, (args.cores or _cores()) // args.threads))
         with executor as execute:
             for path, spec in loaded.items():
-                folder = args.out / path.stem if args.spec.is_dir() else args.out
+                folder = args.out / path.stem if source.is_dir() else args.out
                 say(f"{path}: {spec.title}")
                 matrix = run_matrix(
                     spec, args.out, execute, threads=args.threads, weights_dir=args.weights_dir, progress=say
@@ -96,7 +100,7 @@ def run(argv: list[str]) -> int:
                 report = write_report(matrix, folder)
                 failed, reports[folder] = failed + matrix.failed, matrix
                 say(f"{len(matrix.done)} cells done, {len(matrix.missing)} without a result\nreport: {report}")
-    if args.spec.is_dir():
+    if source.is_dir():
         say(f"overview: {write_overview(reports, args.out)}")
     return 1 if failed else 0
 
@@ -104,16 +108,6 @@ def run(argv: list[str]) -> int:
 def _cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _specs(path: Path) -> list[Path]:
-    """The spec, or those of a folder, sorted by name."""
-    if not path.is_dir():
-        return [path]
-    specs = sorted(file for file in path.iterdir() if file.suffix in (".yaml", ".yml", ".toml"))
-    if not specs:
-        raise input_error(path, ".yaml or .toml files", "none", "Pass a folder of specs.")
-    return specs
 
 
 def _folders(data: tuple[str, ...]) -> dict[str, Path]:

@@ -1,9 +1,12 @@
-"""Move a scene to the device that renders it."""
+"""Choose the device that trains or renders."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from ..core.checks import input_error
+from ..core.config import Config
 from ..doctor.choice import Wanted, choose_here
 from .progress import say
 
@@ -24,3 +27,22 @@ def on_device(scene: Scene, wanted: Wanted, *, fp16_planes: bool = False) -> Sce
         say(choice.why)
     on_gpu = choice.device != "cpu"
     return scene.to(choice.device, backend=choice.backend if on_gpu else None, fp16_planes=fp16_planes and on_gpu)
+
+
+def with_device(cfg: Config, wanted: Wanted) -> Config:
+    """The config with the rendering backend of the chosen device. Prints the device and the reason.
+
+    Raises:
+        InputError: CUDA was requested and is not usable, or the config names a GPU backend and the user the CPU.
+    """
+    from ..render import ON_GPU
+
+    named = cfg.render.backend if cfg.render.backend in ON_GPU else None
+    if named and wanted == "cpu":
+        fix = f"Remove --device cpu or --render.backend {named}."
+        raise input_error(f"--render.backend {named}", "--device cuda or auto", "cpu", fix)
+    choice = choose_here("cuda" if named else wanted)
+    say(choice.why)
+    if choice.device == "cpu" or named:
+        return cfg
+    return replace(cfg, render=replace(cfg.render, backend=choice.backend))

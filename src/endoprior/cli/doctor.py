@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json as json_text
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import TYPE_CHECKING
 
+from ..system.installation import docs_folder, source_commit
 from .help_page import Help
 from .parsing import parse
 from .progress import say
@@ -45,6 +47,7 @@ def run(argv: list[str]) -> int:
         found = as_json(facts, report, choice.device, choice.backend, choice.why, compiling)
         say(json_text.dumps(found, indent=1))
         return status
+    say(f"endoprior {version('endoprior')}, commit {source_commit() or 'unknown'}; documentation: {docs_folder()}\n")
     for row in table(report):
         say(row)
     say("")

@@ -10,6 +10,7 @@ from ..core.checks import input_error
 from ..core.config import Config
 from ..core.presets import PresetName, preset
 from ..core.shell import command
+from ..doctor.choice import Wanted
 
 
 def start_config(argv: Sequence[str]) -> tuple[PresetName, Config]:
@@ -52,6 +53,13 @@ def run_to_resume(data: Path, out: Path | None, argv: Sequence[str]) -> tuple[Pa
         moved = f"`{command('train', 'DATA', run, '--resume')}` with the folder of the sequence."
         data = sequence_of_run(run, moved)
     return data, run, cfg
+
+
+def device_to_resume(cfg: Config) -> Wanted:
+    """The device of the backend that a run was started with."""
+    from ..render import ON_GPU
+
+    return "cuda" if cfg.render.backend in ON_GPU else "cpu"
 
 
 def resume_command(run: Path, networks: bool, weights_dir: Path | None, checkpoint_seconds: float) -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time as clock
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,10 +15,11 @@ from ..core.config import Config
 from ..core.presets import PresetName
 from ..core.shell import command
 from ..doctor.choice import Wanted
+from .devices import with_device
 from .help_page import Help
 from .parsing import parse
 from .progress import say, training_progress
-from .start_config import resume_command, run_to_resume, start_config
+from .start_config import device_to_resume, resume_command, run_to_resume, start_config
 from .view import live_view
 
 if TYPE_CHECKING:
@@ -80,20 +80,9 @@ HELP = Help(
 
 def run(argv: list[str]) -> None:
     """Train, score, and print the results."""
-    from ..doctor.choice import choose_here
-    from ..render import ON_GPU
-
     args = _arguments(argv)
-    cfg = args.config
-    named = cfg.render.backend if cfg.render.backend in ON_GPU else None
-    if named and args.device == "cpu":
-        fix = f"Remove --device cpu or --render.backend {named}."
-        raise input_error(f"--render.backend {named}", "--device cuda or auto", "cpu", fix)
-    resumed_on_cpu = args.resume and not named and args.device == "auto"
-    choice = choose_here("cuda" if named else "cpu" if resumed_on_cpu else args.device)
-    say(choice.why)
-    if choice.device == "cuda" and not named:
-        cfg = dataclasses.replace(cfg, render=dataclasses.replace(cfg.render, backend=choice.backend))
+    wanted = device_to_resume(args.config) if args.resume and args.device == "auto" else args.device
+    cfg = with_device(args.config, wanted)
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
     port = args.view_port if args.view else None
@@ -173,5 +162,5 @@ def _arguments(argv: list[str]) -> Train:
         return args
     data, out, stored = run_to_resume(args.data, args.out, argv)
     if stored is not None:
-        args = parse(Train, argv, "train", HELP, default=dataclasses.replace(start, config=stored))
-    return dataclasses.replace(args, data=data, out=out)
+        args = parse(Train, argv, "train", HELP, default=replace(start, config=stored))
+    return replace(args, data=data, out=out)

@@ -18,7 +18,7 @@ from .config import (
     TemporalConfig,
 )
 
-PresetName = Literal["default", "paper", "released", "endogaussian"]
+PresetName = Literal["default", "preview", "paper", "released", "endogaussian"]
 
 
 def preset(name: str = "default") -> Config:
@@ -27,7 +27,13 @@ def preset(name: str = "default") -> Config:
     Raises:
         InputError: no preset has this name.
     """
-    makers = {"default": default, "paper": paper, "released": released, "endogaussian": endogaussian}
+    makers = {
+        "default": default,
+        "preview": preview,
+        "paper": paper,
+        "released": released,
+        "endogaussian": endogaussian,
+    }
     if name not in makers:
         raise InputError(
             f"preset: expected one of {', '.join(get_args(PresetName))}; got {name!r}. Choose one of them."
@@ -106,4 +112,17 @@ def default() -> Config:
         schedule=replace(
             base.schedule, coarse_iterations=0, fine_iterations=1500, half_resolution_iterations=500, sh_degree=0
         ),
+    )
+
+
+def preview() -> Config:
+    """A first look: `default` with a third of its Gaussians and iterations. For small frames; not for scores."""
+    base = default()
+    return replace(
+        base,
+        init=replace(base.init, budget=10_000),
+        temporal=replace(base.temporal, start_iteration=170),
+        density=replace(base.density, start_iteration=170),
+        optim=replace(base.optim, decay_iterations=500),
+        schedule=replace(base.schedule, fine_iterations=500, half_resolution_iterations=170),
     )

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.extras import install_command
 from .images import MOST_PIXELS, decode_image, describe_pixels, single_channel
 from .numpy_files import read_only_array
 from .reading import demand_file
@@ -69,7 +70,7 @@ def _read_exr(path: Path) -> NDArray:
     try:
         import OpenEXR  # optional: the packages of OpenCV have no EXR decoder
     except ImportError:
-        raise input_error(path, "the OpenEXR package", "none", "run pip install 'endoprior[exr]'.") from None
+        raise input_error(path, "the OpenEXR package", "none", f"`{install_command('exr')}`.") from None
     demand_file(path, "an EXR image", "write the file again.")
     try:
         with OpenEXR.File(str(path), header_only=True) as file:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import posixpath
 
+from ..core.extras import install_command
 from . import fixes
 from .lines import GpuBackend, Line, State
 from .records import Facts, number
@@ -27,7 +28,7 @@ def _line(name: str, state: State, found: str, fix: str = "") -> Line:
 def _gsplat(facts: Facts) -> Line:
     version = facts.gsplat.version
     if not version:
-        return _line("gsplat", "missing", "not installed", "pip install 'endoprior[cuda]'")
+        return _line("gsplat", "missing", "not installed", install_command("cuda"))
     if number(version) and number(version) < fixes.LEAST_GSPLAT:
         return _line("gsplat", "wrong", f"{version}; 1.5.3 or newer is needed", "pip install --upgrade 'gsplat>=1.5.3'")
     return _line("gsplat", "ok", version)

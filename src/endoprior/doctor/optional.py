@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ..core.extras import install_command
 from .lines import Line, State
 from .records import Facts, Torch
 
@@ -11,7 +12,7 @@ PARTS = {
     "networks": ("network scores", ("torchvision", "lpips")),
     "ray": ("benchmarks on a cluster", ("ray",)),
 }
-"""Optional part of the package -> what it is for, and the packages it needs."""
+"""Optional part -> what it is for, and what it imports."""
 OURS = ("ENDOPRIOR_WEIGHTS", "ENDOPRIOR_CACHE_GB")
 """Variables the program reads."""
 TESTS = ("ENDOPRIOR_DATA", "ENDOPRIOR_CHROMIUM", "ENDOPRIOR_HYPOTHESIS", "ENDOPRIOR_TEST_PICTURES")
@@ -50,7 +51,7 @@ def optional_lines(facts: Facts) -> list[Line]:
         there = ", ".join(f"{name} {facts.packages[name]}" for name in packages if name not in absent)
         state: State = "optional" if absent else "ok"
         found = f"{purpose}: {'no ' + ', '.join(absent) if absent else there}"
-        lines.append(Line("also", part, state, found, f"pip install 'endoprior[{part}]'" if absent else ""))
+        lines.append(Line("also", part, state, found, install_command(part) if absent else ""))
     lines += _weights(facts)
     return lines + _variables(facts)
 

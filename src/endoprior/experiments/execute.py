@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ..core.checks import input_error
+from ..core.extras import install_command
 from .worker import Job
 
 SHOWN_LOG_LINES = 3
@@ -104,7 +105,7 @@ def ray_executor(address: str, threads: int) -> Iterator[Executor]:
     try:
         ray: Any = importlib.import_module("ray")
     except ImportError:
-        raise input_error("--ray", "Ray", "none", "`pip install endoprior[ray]`.") from None
+        raise input_error("--ray", "Ray", "none", f"`{install_command('ray')}`.") from None
     try:
         ray.init(**({} if address == "local" else {"address": address}), log_to_driver=False, include_dashboard=False)
     except (ConnectionError, OSError, ValueError, RuntimeError) as error:

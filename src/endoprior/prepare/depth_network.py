@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_shape, input_error
+from ..core.extras import install_command
 
 if TYPE_CHECKING:
     from torch.nn import Module
@@ -40,7 +41,7 @@ class DepthNetwork:
             InputError: transformers is not installed, the files cannot be had, or they hold another network.
         """
         if find_spec("transformers") is None:
-            fix = '`pip install "endoprior[mono]"`.'
+            fix = f"`{install_command('mono')}`."
             raise input_error("--depth depth-anything", "the transformers package", "none", fix)
         self._network = _load(name_or_folder, _find(str(name_or_folder)))
         self._patch = int(self._network.config.patch_size)

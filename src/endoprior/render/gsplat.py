@@ -37,11 +37,12 @@ import torch
 from torch import Tensor
 
 from ..core.checks import InputError
+from ..core.extras import install_command
 from ..core.types import Camera, RenderOutput, Splats
 from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
 from .projection import FIELDS, check, check_device, jacobian_limits
 
-NEXT_STEP = "Install `endoprior[cuda]`; `endoprior doctor` tells what is missing."
+NEXT_STEP = f"Run `{install_command('cuda')}`; `endoprior doctor` tells what is missing."
 
 try:
     import gsplat

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from ..core.config_io import to_dict
 from ..render import ON_GPU
 from ..system.devices import name_of
+from ..system.installation import source_commit
 from ..training.trainer import Trainer
 
 
@@ -32,24 +31,3 @@ def run_facts(trainer: Trainer, fingerprint: str) -> dict[str, Any]:
             "frames": len(trainer.sequence),
         },
     }
-
-
-def source_commit() -> str | None:
-    """Commit of the checkout this package runs from, with `+` if files differ from it; None outside a checkout."""
-    here = Path(__file__).parent
-    try:
-        commit = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
-            cwd=here,
-            capture_output=True,
-            encoding="utf-8",
-            timeout=10,
-            check=True,
-        )
-        # An installed package can lie inside somebody else's checkout: only a tracked file speaks for its repository.
-        subprocess.run(
-            ["git", "ls-files", "--error-unmatch", __file__], cwd=here, capture_output=True, timeout=10, check=True
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return commit.stdout.strip()

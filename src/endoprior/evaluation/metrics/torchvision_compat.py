@@ -11,6 +11,7 @@ import importlib
 from types import ModuleType
 from typing import Any
 
+from ...core.extras import install_command
 from .weights import ScoreUnavailable
 
 MISSING_OPERATORS = (
@@ -48,7 +49,7 @@ def _import_torchvision() -> ModuleType:
         return importlib.import_module("torchvision")
     except ImportError as error:
         raise ScoreUnavailable(
-            f"torchvision cannot be imported ({error}). Install it with: pip install endoprior[networks]"
+            f"torchvision cannot be imported ({error}). Install it with: {install_command('networks')}"
         ) from error
 
 

@@ -1,0 +1,112 @@
+"""`endoprior run VIDEO OUT`."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from ..core.presets import PresetName, preset
+from ..core.shell import command
+from ..doctor.choice import Wanted
+from ..prepare.config import PrepareConfig
+from .devices import with_device
+from .help_page import Help
+from .parsing import parse
+from .progress import say
+from .step_display import StepDisplay, duration
+
+if TYPE_CHECKING:
+    from ..pipeline import Job
+
+
+@dataclass
+class Run:
+    """From a video to a model to look at, in one command: prepare, check, train, score, video and player.
+
+    OUT gets player.html (open it in a browser), video.mp4, report.png, check.png, data/ and run/. To resume after an
+    interruption, run the same command again. Your video never leaves this computer.
+    """
+
+    video: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIDEO")]]
+    """Video file, or folder of images."""
+    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    """Folder for the results; must be new or empty."""
+    preview: bool = False
+    """A first look in about a minute: at most 60 frames, 320 px wide, few Gaussians. Not for scores."""
+    preset: PresetName = "default"
+    """Preset of the training; --preview has its own."""
+    seed: int = 0
+    """Seed of the training."""
+    device: Wanted = "auto"
+    """Device that trains; auto uses CUDA only if all of it works (`endoprior doctor`)."""
+    config: Annotated[PrepareConfig, tyro.conf.arg(name="")] = field(default_factory=PrepareConfig)
+
+
+HELP = Help(
+    examples=(
+        ("video.mp4", "OUT", "--preview"),
+        ("video.mp4", "OUT"),
+        ("stereo.mp4", "OUT", "--calibration", "calib.yaml"),
+    ),
+    basics={
+        "how much": ("--preview", "--start", "--end", "--frames-per-second"),
+        "cameras": ("--calibration", "--right"),
+        "depth, tools and camera path": ("--depth", "--masks", "--poses"),
+        "training": ("--preset", "--seed", "--device"),
+    },
+)
+
+
+def run(argv: list[str]) -> None:
+    """Do every step, with one progress display."""
+    args = parse(Run, argv, "run", HELP)
+    from ..pipeline import STEPS, estimate, make_job, open_folder, run_step
+    from ..runs import kernel_cache
+
+    cfg = replace(preset("preview" if args.preview else args.preset), seed=args.seed)
+    job = make_job(args.video, args.out, args.config, with_device(cfg, args.device), preview=args.preview)
+    open_folder(job)
+    say(_part_words(job))
+    kernel_cache.fill(job.cfg, say)
+    began = clock.perf_counter()
+    waiting = [step for step in STEPS if not step.result(job).exists()]
+    seconds: dict[str, float] = {}
+    if waiting == list(STEPS) and not args.preview and job.part.num_frames:
+        say("Estimating the time ...")
+        seconds = estimate(job)
+        say(f"This takes about {duration(sum(seconds.values()))}: {_seconds_words(seconds)}.")
+        began = clock.perf_counter()
+    display = StepDisplay([step.name for step in STEPS], seconds)
+    try:
+        for step in STEPS:
+            with display.step(step.name) as progress:
+                lines = run_step(step, job, progress)
+            for line in lines or []:
+                say(f"     {line}")
+    except KeyboardInterrupt:
+        say("Stopped. To resume, run the same command again.")
+        raise
+    say(f"\nDone in {duration(clock.perf_counter() - began)}. Open {job.player} in a browser.")
+    for what, path in (("video", job.film), ("report", job.report), ("check", job.figure), ("scene", job.run)):
+        say(f"  {what:<8}{path}")
+    say(f"Turn and measure it: {command('view', job.run)}")
+    if args.preview:
+        say(f"The whole model:     {command('run', job.video, Path('OUT'))}")
+
+
+def _part_words(job: Job) -> str:
+    """What is used of the video."""
+    part = job.part
+    if not part.num_frames:
+        return f"{job.video}: all frames, {part.frames_per_second:g} a second"
+    seconds = part.num_frames / part.frames_per_second
+    words = f"{job.video}: {part.num_frames} frames, {seconds:.1f} s at {part.frames_per_second:g} frames/s"
+    return words if part.is_whole else f"{words} from {part.start:g} s on (--start and --end choose another part)"
+
+
+def _seconds_words(seconds: dict[str, float]) -> str:
+    return ", ".join(f"{name} {duration(value)}" for name, value in seconds.items())

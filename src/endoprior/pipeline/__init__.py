@@ -1,0 +1,7 @@
+"""From a video to a scene, its scores, a video and a player: all steps of the program in one call."""
+
+from .estimate import estimate
+from .job import Job, make_job, open_folder
+from .steps import STEPS, Step, run_step
+
+__all__ = ["STEPS", "Job", "Step", "estimate", "make_job", "open_folder", "run_step"]

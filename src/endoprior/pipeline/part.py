@@ -1,0 +1,76 @@
+"""Choose the part of a video that one scene can show, and the time steps that fit into a player. Pure functions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+LEAST_RATE = 10.0
+"""Frame rate, 1/s, below which tissue and camera move too far between two frames to be followed."""
+LOST_FRAMES = 5
+"""So many frames in a row without a pose: the camera is lost. Fewer are blurred or covered."""
+FEWEST_FRAMES = 20
+"""Fewer frames are not worth a scene."""
+BYTES_PER_GAUSSIAN = 9.0
+"""Size of one Gaussian at one time step in the player. Measured: 7.4 (docs/export.md); the rest is reserve."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Part of a video."""
+
+    frames_per_second: float
+    """Rate of the frames that are used."""
+    start: float
+    """First time, seconds."""
+    end: float
+    """End time, seconds, not included; infinite for the end of the video."""
+    num_frames: int
+    """Number of frames; 0 if the length of the video is unknown."""
+    is_whole: bool
+    """Whether it reaches the end that was asked for."""
+
+
+def choose_part(num_frames: int, rate: float, wanted_rate: float, start: float, end: float, most: int) -> Part:
+    """The first part of a video that has at most `most` frames.
+
+    A long video first loses frames in between, down to `LEAST_RATE`, then its end.
+
+    Args:
+        num_frames: images in the video; 0 if unknown.
+        rate: of the video, 1/s.
+        wanted_rate: rate that the user chose, 1/s; 0 for none.
+        start, end: seconds that the user chose; the end may be infinite.
+    """
+    length = num_frames / rate if num_frames else math.inf
+    duration = max(min(end, length) - start, 0.0)
+    every = 1
+    if not wanted_rate:
+        most_skipped = max(math.floor(rate / LEAST_RATE), 1)
+        needed = math.ceil(duration * rate / most) if math.isfinite(duration) else most_skipped
+        every = min(max(needed, 1), most_skipped)
+    used = wanted_rate or rate / every
+    # Frames lie on the grid start, start + 1 / used, ...: half a step keeps rounding from adding one.
+    if duration * used > most + 0.5:
+        return Part(used, start, start + (most - 0.5) / used, most, False)
+    count = round(duration * used) if math.isfinite(duration) else 0
+    return Part(used, start, end, count, True)
+
+
+def player_times(num_frames: int, num_gaussians: int, max_bytes: int) -> list[float]:
+    """Times in [0, 1) of every k-th frame, with the smallest k whose player has at most `max_bytes`."""
+    fitting = max(int(max_bytes / (num_gaussians * BYTES_PER_GAUSSIAN)), 1)
+    return [i / num_frames for i in range(0, num_frames, math.ceil(num_frames / fitting))]
+
+
+def usable_frames(num_frames: int, unexplained: list[int], cuts: list[int]) -> int:
+    """Number of frames before the camera is lost or another scene begins; all of them if too few would be left.
+
+    Args:
+        unexplained: frames without a camera pose, or of another color than the clip.
+        cuts: first frames after a scene cut.
+    """
+    missing = set(unexplained)
+    lost = [i for i in missing if all(i + k in missing for k in range(LOST_FRAMES))]
+    first = min([num_frames, *lost, *cuts])
+    return first if first >= FEWEST_FRAMES else num_frames

@@ -1,0 +1,154 @@
+"""The steps of a job. A step whose result is there is skipped, so that an interrupted job resumes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..check import draw_check, find, measure
+from ..check.report import as_json
+from ..core.config import Config
+from ..data import FrameSequence, load_sequence
+from ..data.description import read_description
+from ..data.files import read_json
+from ..evaluation.registry import all_scores
+from ..evaluation.scoring import evaluate, scored_data
+from ..export.html import write_html
+from ..model.scene import load_scene
+from ..prepare import prepare
+from ..runs.report import write_report
+from ..runs.training_run import CHECKPOINT, TrainingRun
+from ..system.atomic import write_json
+from ..visualization.image_tools import colorize, label, tile, to_u8
+from ..visualization.rendered_views import depth_span
+from ..visualization.video import write_video
+from .job import Job
+from .part import player_times, usable_frames
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how much is done, and how much there is (0: unknown)."""
+PLAYER_BYTES = 20_000_000
+"""Largest player: a browser opens it at once, and it can be sent by mail."""
+SHOWN_SCORES = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a job."""
+
+    name: str
+    result: Callable[[Job], Path]
+    """File or folder that is there when the step is done."""
+    act: Callable[[Job, Progress], list[str]]
+    """Does it; returns lines for the user."""
+
+
+def run_step(step: Step, job: Job, progress: Progress) -> list[str] | None:
+    """Do a step; None if it was done before.
+
+    Raises:
+        InputError: the input cannot be used.
+    """
+    return None if step.result(job).exists() else step.act(job, progress)
+
+
+def _prepare(job: Job, progress: Progress) -> list[str]:
+    done = prepare(job.video, job.data, job.prepare, progress)
+    return [f"{done.num_frames} frames of {done.size[0]}x{done.size[1]}", *(f"note: {note}" for note in done.notes)]
+
+
+def _check(job: Job, progress: Progress) -> list[str]:
+    progress("measuring", 0, 0)
+    sequence = load_sequence(job.data, job.cfg.data)
+    facts = measure(sequence, job.cfg.data)
+    findings = find(facts)
+    draw_check(sequence, facts, findings, job.figure)
+    write_json(job.findings, as_json(facts, findings))
+    return [f"{finding.severity}: {finding.what}" for finding in findings if finding.severity != "note"]
+
+
+def _train(job: Job, progress: Progress) -> list[str]:
+    sequence = load_sequence(job.data, job.cfg.data)
+    usable = _usable(job, len(sequence))
+    cfg, notes = job.cfg, []
+    if usable < len(sequence):
+        cfg = replace(cfg, data=replace(cfg.data, first_frames=usable))
+        sequence = load_sequence(job.data, cfg.data)
+        notes = [f"note: the camera is lost, or the scene changes, at frame {usable}: training uses the frames before"]
+    begun = (job.run / CHECKPOINT).is_file() or (job.run / "config.json").is_file()
+    run = TrainingRun(sequence, cfg, job.run, resume=begun, say=lambda text: None)
+    scene = run.complete(lambda report, trainer: progress("training", *trainer.progress()))
+    return [*notes, f"{len(scene.gaussians):,} Gaussians"]
+
+
+def _score(job: Job, progress: Progress) -> list[str]:
+    progress("rendering held-out frames", 0, 0)
+    scene = load_scene(job.run)
+    sequence = _frames_of(job, scene.config)
+    result = evaluate(scene, sequence, networks=False)
+    result.save(job.run)
+    write_report(scene, sequence, job.run, job.report)
+    shown = [
+        f"{all_scores()[name].label} {all_scores()[name].text(result.scores[name])}"
+        for name in SHOWN_SCORES
+        if name in result.scores
+    ]
+    return [f"held-out frames: {', '.join(shown)}"]
+
+
+def _film(job: Job, progress: Progress) -> list[str]:
+    scene = load_scene(job.run)
+    frames = _frames_of(job, scene.config).frames("video")
+    span = depth_span(scene)
+
+    def images() -> Iterator[NDArray[np.uint8]]:
+        for k, frame in enumerate(frames):
+            view = scene.render(frame.time, frame.camera)
+            depth = view.depth.cpu().numpy()
+            shown = {
+                "input": frame.rgb_u8,
+                "EndoPrior-GS": to_u8(view.color.cpu().numpy()),
+                "depth": colorize(depth, *span, depth > 0),
+            }
+            yield tile([label(image, name) for name, image in shown.items()], len(shown))
+            progress("rendering", k + 1, len(frames))
+
+    write_video(job.film, images(), scene.frames_per_second)
+    return []
+
+
+def _player(job: Job, progress: Progress) -> list[str]:
+    progress("packing", 0, 0)
+    scene = load_scene(job.run)
+    times = player_times(len(scene.cameras), len(scene.gaussians), PLAYER_BYTES)
+    write_html(scene, job.player, title=job.video.stem, times=times, max_bytes=PLAYER_BYTES)
+    if len(times) == len(scene.cameras):
+        return []
+    return [f"{len(times)} of {len(scene.cameras)} frames, so that the page stays below {PLAYER_BYTES / 1e6:.0f} MB"]
+
+
+STEPS = (
+    Step("prepare", lambda job: job.data, _prepare),
+    Step("check", lambda job: job.findings, _check),
+    Step("train", lambda job: job.run / "scene.safetensors", _train),
+    Step("score", lambda job: job.report, _score),
+    Step("video", lambda job: job.film, _film),
+    Step("player", lambda job: job.player, _player),
+)
+"""In order. Every result is written completely or not at all."""
+
+
+def _usable(job: Job, num_frames: int) -> int:
+    """Number of frames that one scene can explain: see `usable_frames`."""
+    unexplained = read_description(job.data / "sequence.json").get("unexplained_frames", [])
+    findings = read_json(job.findings)["findings"]
+    cuts = [frame for finding in findings if finding["code"] == "scene-cut" for frame in finding["frames"]]
+    return usable_frames(num_frames, unexplained, cuts)
+
+
+def _frames_of(job: Job, cfg: Config) -> FrameSequence:
+    return load_sequence(job.data, scored_data(cfg.data))

@@ -1,0 +1,41 @@
+"""The installed program: which commit it is, and where its documentation lies."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1]
+STAMP = PACKAGE / "commit.txt"
+"""Written when a package is built (setup.py); a checkout has none."""
+
+
+def source_commit() -> str | None:
+    """Commit the program was built from, or of the checkout it runs from; None if neither is known.
+
+    A `+` at the end says that files differed from it.
+    """
+    if STAMP.is_file():
+        return STAMP.read_text(encoding="utf-8").strip()
+    try:
+        commit = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
+            cwd=PACKAGE,
+            capture_output=True,
+            encoding="utf-8",
+            timeout=10,
+            check=True,
+        )
+        # An installed package can lie inside somebody else's checkout: only a tracked file speaks for its repository.
+        subprocess.run(
+            ["git", "ls-files", "--error-unmatch", __file__], cwd=PACKAGE, capture_output=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return commit.stdout.strip()
+
+
+def docs_folder() -> Path:
+    """The folder that messages call `docs/`: in the installed package, or in the checkout."""
+    installed = PACKAGE / "docs"
+    return installed if installed.is_dir() else PACKAGE.parents[1] / "docs"

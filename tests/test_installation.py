@@ -1,0 +1,52 @@
+"""What the program knows about its own installation: packages of optional parts, commit, documentation."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from endoprior.cli import main
+from endoprior.core.extras import install_command
+from endoprior.system import installation
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+@pytest.mark.parametrize("extra", sorted({*PROJECT["optional-dependencies"]} - {"test"}))
+def test_the_packages_of_an_optional_part_are_those_of_pyproject(extra):
+    names = [re.match(r"[\w-]+", line)[0] for line in PROJECT["optional-dependencies"][extra]]
+    assert install_command(extra) == f"pip install {' '.join(names)}"
+
+
+def test_packages_that_only_some_systems_need_are_no_optional_part(monkeypatch):
+    lines = ['b>=1; sys_platform != "none"', 'c>=2; sys_platform != "none" and extra == "x"', 'd; extra == "y"', "a"]
+    monkeypatch.setattr("endoprior.core.extras.requires", lambda name: lines)
+    install_command.cache_clear()
+    assert install_command("x") == "pip install c"
+    install_command.cache_clear()
+
+
+def test_no_message_takes_the_program_for_one_on_a_package_index():
+    for path in sorted([*ROOT.glob("src/**/*.py"), *ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]):
+        assert not re.search(r"endoprior\[|pip install endoprior", path.read_text()), path
+
+
+def test_pages_that_the_program_names_exist():
+    folder = installation.docs_folder()
+    for path in sorted((ROOT / "src").rglob("*.py")):
+        for page in re.findall(r"docs/(\w+\.md)", path.read_text()):
+            assert (folder / page).is_file(), f"{path}: docs/{page}"
+
+
+def test_help_and_doctor_say_where_the_pages_are(capsys):
+    assert main(["--help"]) == 0 and main(["doctor"]) == 0
+    assert capsys.readouterr().out.count(str(ROOT / "docs")) == 2
+
+
+def test_the_stamp_of_a_built_package_comes_before_git(tmp_path, monkeypatch):
+    monkeypatch.setattr(installation, "STAMP", tmp_path / "commit.txt")
+    assert installation.source_commit() != "0123456789ab"
+    (tmp_path / "commit.txt").write_text("0123456789ab\n")
+    assert installation.source_commit() == "0123456789ab"

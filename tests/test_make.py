@@ -1,0 +1,118 @@
+"""`make` on machines that lack something, and with uv: programs that stand in for Python and uv."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TARGET = ".venv/.test-installed"
+OLD = "sys.version_info = (3, 9, 2, 'final', 0)"
+WITHOUT_VENV = "sys.modules['ensurepip'] = None"
+RECORDS = '#!/bin/sh\necho "{name} $*" >> calls\ncase "$*" in *.venv) mkdir -p .venv/bin; {then};; esac\n'
+
+pytestmark = pytest.mark.skipif(not shutil.which("make"), reason="make is not installed")
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """What `make` needs to install, and a folder of programs that is the whole PATH."""
+    for name in ("Makefile", "constraints.txt", "pyproject.toml", "tools"):
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+        copy(ROOT / name, tmp_path / name)
+    programs = tmp_path / "programs"
+    programs.mkdir()
+    for name in ("make", "sh", "mkdir", "touch", "cp", "chmod"):
+        (programs / name).symlink_to(shutil.which(name))
+    return tmp_path
+
+
+def program(checkout: Path, name: str, text: str) -> None:
+    """Put a shell script into the checkout's PATH."""
+    path = checkout / "programs" / name
+    path.write_text(text)
+    path.chmod(0o755)
+
+
+def python_with(change: str) -> str:
+    """A Python that runs this statement before the code it is given."""
+    return f'#!/bin/sh\nexec {sys.executable} -c "import sys; {change}; exec(sys.argv[1])" "$2"\n'
+
+
+def make(checkout: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run `make` in the checkout, with nothing but its programs."""
+    ours = ("PYTHON", "TORCH_INDEX", "MAKEFLAGS", "MFLAGS", "MAKELEVEL")
+    environment = {key: value for key, value in os.environ.items() if key not in ours}
+    environment["PATH"] = str(checkout / "programs")
+    return subprocess.run(
+        ["make", *words, TARGET], cwd=checkout, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("python3", None, "python3: expected Python 3.11 or newer, got none. Fix: install it"),
+        ("python3", python_with(OLD), "python3: expected Python 3.11 or newer, got 3.9. Fix: install it"),
+        ("python9", python_with(OLD), "python9: expected Python 3.11 or newer, got 3.9. Fix: install it"),
+        (
+            "python3",
+            python_with(WITHOUT_VENV),
+            "python3: expected the modules venv and ensurepip, got none. "
+            f"Fix: `sudo apt install python{sys.version_info.major}.{sys.version_info.minor}-venv`",
+        ),
+    ],
+)
+def test_what_python_lacks_is_one_line_with_the_fix(checkout, name, text, says):
+    if text:
+        program(checkout, name, text)
+    done = make(checkout, *([] if name == "python3" else [f"PYTHON={name}"]))
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("make")]
+    assert done.returncode == 2 and len(lines) == 1 and lines[0].startswith(f"endoprior: {says}")
+    assert not (checkout / ".venv").exists()
+
+
+def calls(checkout: Path) -> list[str]:
+    """The recorded calls of Python and uv, without the words that all of them have."""
+    text = (checkout / "calls").read_text()
+    for words in ("--constraint constraints.txt ", "--quiet ", "--disable-pip-version-check "):
+        text = text.replace(words, "")
+    return text.splitlines()
+
+
+def test_pip_installs_torch_first(checkout):
+    then = "cp programs/python3 .venv/bin/python; touch .venv/bin/pip"
+    program(checkout, "python3", RECORDS.format(name="python", then=then))
+    done = make(checkout)
+    assert done.returncode == 0, done.stderr
+    assert [line for line in calls(checkout) if " -c " not in line] == [
+        "python -m venv .venv",
+        "python -m pip install torch",
+        "python -m pip install --editable .",
+        "python -m pip install torch",
+        "python -m pip install --editable .[test]",
+    ]
+    before = calls(checkout)
+    assert make(checkout).returncode == 0 and calls(checkout) == before, "nothing is left to do"
+
+
+def test_uv_is_used_where_it_is_and_takes_torch_from_the_index(checkout):
+    program(checkout, "uv", RECORDS.format(name="uv", then="touch .venv/bin/python"))
+    done = make(checkout, "PYTHON=python3.12", "TORCH_INDEX=https://index.example/cpu")
+    assert done.returncode == 0, done.stderr
+    install = "uv pip install --python .venv/bin/python"
+    assert calls(checkout) == [
+        "uv venv --seed --python python3.12 .venv",
+        f"{install} --no-deps --index-url https://index.example/cpu torch",
+        f"{install} --editable .",
+        f"{install} --no-deps --index-url https://index.example/cpu torch",
+        f"{install} --editable .[test]",
+    ]
+    # Without a Python or an index, uv chooses.
+    shutil.rmtree(checkout / ".venv")
+    (checkout / "calls").unlink()
+    assert make(checkout).returncode == 0
+    assert calls(checkout)[:2] == ["uv venv --seed .venv", f"{install} torch"]

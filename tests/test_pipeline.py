@@ -1,0 +1,109 @@
+"""`endoprior run`: from a video to a player in one command, resumed after an interruption."""
+
+import json
+
+import cv2
+import pytest
+from tiny_training import tiny_config
+from video_files import write_video
+
+from endoprior.cli import main
+from endoprior.model.scene import load_scene
+from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.pipeline import STEPS, make_job, open_folder, run_step
+from endoprior.prepare.config import PrepareConfig
+
+FRAMES = 27
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    write_phantom(folder / "phantom", PhantomConfig(frames=FRAMES, width=128, height=96))
+    images = [cv2.imread(str(file))[..., ::-1] for file in sorted((folder / "phantom/images").glob("*.png"))]
+    return write_video(folder / "Fall 7.mp4", images)
+
+
+def quiet(what, done, total):
+    """No progress."""
+
+
+def job_of(video, out):
+    return make_job(video, out, PrepareConfig(), tiny_config("basis"), preview=True)
+
+
+@pytest.fixture(scope="module")
+def done(video, tmp_path_factory):
+    """A finished job."""
+    job = job_of(video, tmp_path_factory.mktemp("done") / "out")
+    open_folder(job)
+    for step in STEPS:
+        run_step(step, job, quiet)
+    return job
+
+
+def test_every_step_leaves_its_result(done):
+    assert all(step.result(done).exists() for step in STEPS)
+    assert (done.run / "metrics.json").is_file() and done.report.is_file()
+    assert len(load_scene(done.run).cameras) == FRAMES
+
+
+def test_a_finished_step_is_not_repeated(done):
+    before = {step.name: step.result(done).stat().st_mtime_ns for step in STEPS}
+    assert [run_step(step, done, quiet) for step in STEPS] == [None] * len(STEPS)
+    assert before == {step.name: step.result(done).stat().st_mtime_ns for step in STEPS}
+
+
+def test_an_interrupted_training_resumes_bit_identically(video, done, tmp_path):
+    job = job_of(video, tmp_path / "out")
+    open_folder(job)
+
+    def stop(what, at, total):
+        if what == "training" and at == 9:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        for step in STEPS:
+            run_step(step, job, stop)
+    assert not (job.run / "scene.safetensors").exists()
+    open_folder(job)  # the same settings
+    for step in STEPS[:3]:
+        run_step(step, job, quiet)
+    assert (job.run / "scene.safetensors").read_bytes() == (done.run / "scene.safetensors").read_bytes()
+
+
+def test_another_job_does_not_take_the_folder(video, done, capsys):
+    assert main(["run", str(video), str(done.out)]) == 2
+    assert "others. Fix: Choose another folder: `endoprior run" in capsys.readouterr().err
+
+
+def test_a_camera_that_is_lost_ends_the_training_frames(video, tmp_path):
+    job = job_of(video, tmp_path / "out")
+    open_folder(job)
+    for step in STEPS[:2]:
+        run_step(step, job, quiet)
+    about = job.data / "sequence.json"
+    lost = list(range(22, FRAMES))
+    about.write_text(json.dumps(json.loads(about.read_text()) | {"unexplained_frames": lost}))
+    assert "at frame 22" in run_step(STEPS[2], job, quiet)[0]
+    assert len(load_scene(job.run).cameras) == 22
+
+
+@pytest.mark.slow
+def test_the_command_ends_with_a_player(video, tmp_path, capsys):
+    out = tmp_path / "mein Ordner"
+    assert main(["run", str(video), str(out), "--preview"]) == 0
+    printed = capsys.readouterr().out
+    assert f"Open {out / 'player.html'} in a browser." in printed
+    assert f"endoprior view '{out / 'run'}'" in printed
+    assert "<script>" in (out / "player.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_whole_run_says_first_how_long_it_takes(video, tmp_path, capsys):
+    assert main(["run", str(video), str(tmp_path / "out")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    says = next(k for k, line in enumerate(lines) if line.startswith("This takes about"))
+    starts = next(k for k, line in enumerate(lines) if line.startswith("1/6  prepare"))
+    assert says < starts
+    assert not (tmp_path / "out/.trial").exists()

@@ -1,0 +1,90 @@
+"""Which part of a video becomes a scene, how long that takes, and what fits into a player: pure functions."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from endoprior.cli.step_display import duration
+from endoprior.core.presets import preset
+from endoprior.pipeline.estimate import FRAMES, Trial, scaled, shortened
+from endoprior.pipeline.part import BYTES_PER_GAUSSIAN, choose_part, player_times, usable_frames
+
+WHOLE = (0.0, math.inf)
+
+
+def test_a_short_video_is_used_as_it_is():
+    part = choose_part(250, 25.0, 0.0, *WHOLE, most=300)
+    assert (part.frames_per_second, part.num_frames, part.end, part.is_whole) == (25.0, 250, math.inf, True)
+
+
+def test_a_longer_video_first_loses_frames_in_between():
+    part = choose_part(500, 25.0, 0.0, *WHOLE, most=300)
+    assert (part.frames_per_second, part.num_frames, part.is_whole) == (12.5, 250, True)
+
+
+def test_a_long_video_then_loses_its_end():
+    part = choose_part(7500, 25.0, 0.0, *WHOLE, most=300)
+    assert (part.frames_per_second, part.num_frames, part.is_whole) == (12.5, 300, False)
+    assert part.end == pytest.approx(299.5 / 12.5)
+
+
+def test_the_choices_of_the_user_stay():
+    part = choose_part(7500, 25.0, 25.0, 10.0, 12.0, most=300)
+    assert (part.frames_per_second, part.start, part.end, part.num_frames) == (25.0, 10.0, 12.0, 50)
+
+
+@pytest.mark.parametrize("rate", [1.0, 8.0, 10.0, 24.0, 29.97, 60.0, 1000.0])
+@pytest.mark.parametrize("num_frames", [0, 2, 59, 60, 61, 1000])
+def test_a_part_never_has_too_many_frames_nor_too_low_a_rate(rate, num_frames):
+    part = choose_part(num_frames, rate, 0.0, *WHOLE, most=60)
+    assert part.num_frames <= 60
+    assert part.frames_per_second >= min(rate, 10.0)
+    if math.isfinite(part.end):
+        assert math.floor((part.end - part.start) * part.frames_per_second) + 1 <= 60
+
+
+def test_a_video_of_unknown_length_is_limited_too():
+    part = choose_part(0, 25.0, 0.0, *WHOLE, most=60)
+    assert not part.is_whole
+    assert part.num_frames == 60
+
+
+def test_a_player_keeps_every_frame_that_fits():
+    assert player_times(4, 1000, 10**9) == [0, 0.25, 0.5, 0.75]
+    times = player_times(250, 30_000, 20_000_000)
+    assert len(times) * 30_000 * BYTES_PER_GAUSSIAN <= 20_000_000
+    assert times[0] == 0 and len(times) > 40
+    assert player_times(10, 10**9, 1) == [0]
+
+
+def test_frames_end_where_the_camera_is_lost():
+    assert usable_frames(100, [], []) == 100
+    assert usable_frames(100, [33, 60], []) == 100, "single frames are blurred, the camera is not lost"
+    assert usable_frames(100, list(range(40, 100)), []) == 40
+    assert usable_frames(100, list(range(40, 100)), [30]) == 30
+    assert usable_frames(100, list(range(7, 100)), []) == 100, "too few frames would be left"
+
+
+def test_the_estimate_of_the_trial_itself_is_what_the_trial_took():
+    trial = Trial(
+        decode=0.01, look=1.0, write=0.2, follow=0.5, check=3.0, start=1.0, half_iteration=0.02, iteration=0.05,
+        render=0.01, score=2.5, film=0.6, player=0.7,
+    )  # fmt: skip
+    cfg = replace(preset(), schedule=replace(preset().schedule, fine_iterations=1500, half_resolution_iterations=500))
+    seconds = scaled(trial, cfg, FRAMES, FRAMES)
+    assert seconds["prepare"] == pytest.approx(1.0 + FRAMES * 0.2 + 0.5 + FRAMES * 0.01 - FRAMES * 0.01)
+    assert seconds["train"] == pytest.approx(1.0 + 500 * 0.02 + 1000 * 0.05)
+    assert (seconds["check"], seconds["score"]) == (pytest.approx(3.0), pytest.approx(2.5))
+    assert scaled(trial, cfg, 10 * FRAMES, 10 * FRAMES)["video"] == pytest.approx(6.0)
+
+
+def test_iterations_of_the_trial_cost_what_those_of_the_job_cost():
+    cfg = shortened(preset(), 250)
+    assert cfg.deformation.basis.num_bases == preset().fitted(250).deformation.basis.num_bases
+    assert cfg.schedule.half_resolution_iterations * 2 == cfg.schedule.fine_iterations
+    assert cfg.temporal.start_iteration == cfg.schedule.half_resolution_iterations + 1
+
+
+def test_durations_are_readable():
+    assert [duration(s) for s in (0.4, 42, 100, 120, 3900)] == ["0 s", "42 s", "1 min 40 s", "2 min", "1 h 5 min"]
