@@ -72,7 +72,7 @@ def test_help_is_one_page_with_examples_that_parse(command, printed, parsed):
     page = printed(command, "--help")
     assert page == printed(command, "-h") and len(page.splitlines()) <= MOST_LINES
     assert page.startswith(f"usage: endoprior {command} ") and page.isascii()
-    assert len(examples(page)) >= 2
+    assert len(examples(page)) >= (2 if "options]" in page and "--" in page else 1)
     for words in examples(page):
         assert words[0] == command
         parsed(*words)

@@ -11,24 +11,23 @@ from typing import Annotated
 import tyro
 
 from ..core.checks import input_error
-from ..experiments.ready_specs import find_spec, spec_names, specs_of
+from ..experiments.ready_specs import find_spec, specs_of
 from .help_page import Help
 from .parsing import parse
 from .progress import say
 
 MOST_CORES = 4096
 """Largest --cores and --threads."""
-SPEC_HELP = (
-    "A .yaml or .toml file, a folder of them, or a name. `quick` takes minutes, `sized` has the paper's tables, sized "
-    f"for two cores, `full` at full size. All names: {', '.join(spec_names())}."
-)
 
 
 @dataclass
 class Bench:
     """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
 
-    spec: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="SPEC", help=SPEC_HELP)]]
+    spec: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="SPEC")]]
+    """A .yaml or .toml file, a folder of them, or a name. quick: minutes. sized: the paper's tables, for two cores.
+    full: the same at full size. One table: sized/NAME or full/NAME with budgets, instability, ladder, methods,
+    primitives, temporal; and sized/phantom."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..core.checks import InputError
+from .help_page import Help
 from .parsing import parse
 from .progress import say
 
@@ -16,9 +17,12 @@ class Plugins:
     """List datasets, methods, scores and exporters: what is built in, and what other packages add (docs/plugins.md)."""
 
 
+HELP = Help(examples=((),))
+
+
 def run(argv: list[str]) -> None:
     """Import every plugin and print one line for each."""
-    parse(Plugins, argv, "plugins")
+    parse(Plugins, argv, "plugins", HELP)
     from ..data.formats import REGISTRY as DATASETS
     from ..evaluation.registry import REGISTRY as SCORES
     from ..experiments.method import REGISTRY as METHODS

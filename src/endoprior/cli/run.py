@@ -36,7 +36,7 @@ class Run:
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for the results; must be new or empty."""
     preview: bool = False
-    """A first look in about a minute: at most 60 frames, 320 px wide, few Gaussians. Not for scores."""
+    """A first look in about a minute: at most 60 frames, 320 px wide. Not for scores."""
     preset: PresetName = "default"
     """Preset of the training; --preview has its own."""
     seed: int = 0
@@ -53,10 +53,10 @@ HELP = Help(
         ("stereo.mp4", "OUT", "--calibration", "calib.yaml"),
     ),
     basics={
-        "how much": ("--preview", "--start", "--end", "--frames-per-second"),
+        "how much": ("--preview", "--start", "--end"),
         "cameras": ("--calibration", "--right"),
-        "depth, tools and camera path": ("--depth", "--masks", "--poses"),
-        "training": ("--preset", "--seed", "--device"),
+        "depth and tools": ("--depth", "--masks"),
+        "training": ("--preset", "--device"),
     },
 )
 

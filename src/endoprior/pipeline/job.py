@@ -83,7 +83,7 @@ def make_job(video: Path, out: Path, prepare: PrepareConfig, cfg: Config, *, pre
     """
     source = open_source(video, prepare.folder_rate)
     rate, most = source.frames_per_second, PREVIEW_FRAMES if preview else MOST_FRAMES
-    part = choose_part(source.num_frames, rate, prepare.frames_per_second, prepare.start, prepare.end, most)
+    part = choose_part(source.seconds, rate, prepare.frames_per_second, prepare.start, prepare.end, most)
     width = min(prepare.max_width or PREVIEW_WIDTH, PREVIEW_WIDTH) if preview else prepare.max_width
     chosen = replace(prepare, frames_per_second=part.frames_per_second, end=part.end, max_width=width)
     return Job(video, out, chosen, cfg, part)

@@ -31,23 +31,22 @@ class Part:
     """Whether it reaches the end that was asked for."""
 
 
-def choose_part(num_frames: int, rate: float, wanted_rate: float, start: float, end: float, most: int) -> Part:
+def choose_part(seconds: float, rate: float, wanted_rate: float, start: float, end: float, most: int) -> Part:
     """The first part of a video that has at most `most` frames.
 
     A long video first loses frames in between, down to `LEAST_RATE`, then its end.
 
     Args:
-        num_frames: images in the video; 0 if unknown.
+        seconds: duration of the video; 0 if unknown.
         rate: of the video, 1/s.
         wanted_rate: rate that the user chose, 1/s; 0 for none.
-        start, end: seconds that the user chose; the end may be infinite.
+        start, end: times that the user chose; the end may be infinite.
     """
-    length = num_frames / rate if num_frames else math.inf
-    duration = max(min(end, length) - start, 0.0)
+    duration = max(min(end, seconds or math.inf) - start, 0.0)
     every = 1
     if not wanted_rate:
         most_skipped = max(math.floor(rate / LEAST_RATE), 1)
-        needed = math.ceil(duration * rate / most) if math.isfinite(duration) else most_skipped
+        needed = math.ceil((duration * rate - 0.5) / most) if math.isfinite(duration) else most_skipped
         every = min(max(needed, 1), most_skipped)
     used = wanted_rate or rate / every
     # Frames lie on the grid start, start + 1 / used, ...: half a step keeps rounding from adding one.

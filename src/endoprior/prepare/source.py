@@ -47,7 +47,7 @@ def open_source(path: Path, frames_per_second: float = 25.0) -> Source:
     Args:
         frames_per_second: rate of a folder of images.
     Returns:
-        The source. `num_frames` is the announced number of images, 0 if unknown.
+        The source. `num_frames` and `seconds` are the announced number of images and duration, 0 if unknown.
     Raises:
         InputError: the file does not exist or cannot be read.
     """
@@ -68,7 +68,7 @@ class ImageFolder:
         self.files = sorted(found, key=natural_order)
         if not self.files:
             raise input_error(path, "images (PNG, JPEG, TIFF, BMP) or a video file", "none", "Check the path.")
-        self.num_frames = len(self.files)
+        self.num_frames, self.seconds = len(self.files), len(self.files) / frames_per_second
         self.height, self.width = self._read(self.files[0]).shape[:2]
 
     def __iter__(self) -> Iterator[SourceFrame]:
@@ -107,6 +107,7 @@ class Video:
             self.frames_per_second = rate if RATES[0] <= rate <= RATES[1] else 25.0
             self.num_frames = max(int(stream.frames), 0)
             self._announced_end = _announced_end(container)
+            self.seconds = self._announced_end or self.num_frames / self.frames_per_second
         first = next(iter(self), None)
         if first is None:
             raise input_error(path, "a video with images", "none that can be decoded", "Copy or export it again.")
