@@ -141,4 +141,5 @@ def test_bad_config_files(tmp_path, name, text, says):
 
 def test_typed_options():
     assert typed(["a", "--preset", "x", "--preset=y"], "--preset") == "y"
+    assert typed([], "--preset") is None
     assert typed(["--presets", "x", "--preset"], "--preset") is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import get_args
 
@@ -75,7 +76,7 @@ def resume_command(run: Path, networks: bool, weights_dir: Path | None, checkpoi
 def typed(argv: Sequence[str], option: str) -> str | None:
     """The value of an option in the arguments, the last one if there are several; None without it."""
     value = None
-    for word, following in zip(argv, [*argv[1:], None], strict=True):
+    for word, following in zip_longest(argv, argv[1:]):
         if word == option and following is not None:
             value = following
         elif word.startswith(f"{option}="):
