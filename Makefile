@@ -8,7 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHON TORCH_INDEX
 
-.PHONY: demo test test-all test-faults lint browser bench figures clean
+.PHONY: demo test test-all test-faults lint browser bench figures docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
@@ -27,8 +27,8 @@ test-faults: $(VENV)/.test-installed
 	$(BIN)/python faults/run.py $(FAULTS)
 
 lint: $(VENV)/.test-installed
-	$(BIN)/ruff check setup.py src tests bench faults examples
-	$(BIN)/ruff format --check setup.py src tests bench faults examples
+	$(BIN)/ruff check setup.py src tests bench faults docs examples
+	$(BIN)/ruff format --check setup.py src tests bench faults docs examples
 
 # The viewer and the player are tested in headless Chromium. Where there is none, Debian's package is installed if that is
 # possible without asking; otherwise those tests are skipped, and say so.
@@ -44,6 +44,12 @@ bench: $(VENV)/.installed
 # The documentation's pictures; ENDOPRIOR_DATA holds the two clips.
 figures: $(VENV)/.test-installed browser
 	$(BIN)/python bench/figures.py figures
+	$(BIN)/python bench/method_figures.py figures
+
+# The site, in build/docs/html; it needs no network. Warnings, such as a link that leads nowhere, are errors.
+docs: $(VENV)/.docs-installed
+	$(BIN)/python -m sphinx -W --keep-going -q -c docs . build/docs/html
+	@echo "build/docs/html/index.html"
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	sh tools/install.sh
@@ -51,6 +57,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(VENV)/.test-installed: $(VENV)/.installed
 	sh tools/install.sh test
+	touch $@
+
+$(VENV)/.docs-installed: $(VENV)/.installed
+	sh tools/install.sh docs
 	touch $@
 
 clean:

@@ -23,7 +23,7 @@ def scores(scene: Scene, sequence: FrameSequence) -> np.ndarray:
     """(F,) tissue PSNR of each test frame, of the rendered color."""
     found = []
     for frame in sequence.frames("test"):
-        color = np.clip(scene.render(frame.time, frame.camera).color.numpy(), 0, 1)
+        color = scene.render(frame.time, frame.camera).color.numpy()
         found.append(metrics.psnr_tissue(color, frame.rgb, frame.tissue_mask))
     return np.array(found)
 

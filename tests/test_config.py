@@ -94,6 +94,29 @@ def test_basis_functions_follow_the_length_of_the_sequence():
         attribute_shapes(preset("default"))
 
 
+def test_replaced_fields_are_set_and_the_others_stay():
+    cfg = preset("default")
+    changed = cfg.replace({"seed": 3, "optim.means_lr": 2e-3, "init.budget": "x0.5"})
+    assert (changed.seed, changed.optim.means_lr, changed.init.budget) == (3, 2e-3, cfg.init.budget // 2)
+    assert changed.replace({"seed": cfg.seed, "optim.means_lr": cfg.optim.means_lr, "init.budget": "x2"}) == cfg
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"optim.mean_lr": 1.0}, r"got optim\.mean_lr\. Fix: use `optim\.means_lr`\."),
+        ({"budget": 3}, r"got budget\. Fix: use `init\.budget`\."),
+        ({"init": 3}, "got init"),
+        ({"zzz": 3}, r"got zzz\. Fix: see `endoprior train --help-all`\."),
+        ({"init.budget": 0}, r"budget must be in \[1, 1e\+07\], got 0"),
+        ({"init.budget": "many"}, r"config\.init\.budget: expected an integer"),
+    ],
+)
+def test_wrong_replacements_are_named(changes, says):
+    with pytest.raises(InputError, match=says):
+        preset("default").replace(changes)
+
+
 @pytest.mark.parametrize(("former", "current"), [("cpu", "numba"), ("cuda", "gsplat"), ("triton", "triton")])
 def test_files_with_former_names_of_backends_are_read(former, current, capsys):
     stored, now = {"render": {"backend": former}}, Config(render=RenderConfig(current))

@@ -213,7 +213,7 @@ def picture(page: Page, path: Path) -> NDArray[np.float64]:
 
 def rendered(scene: Scene, time: float) -> NDArray[np.float64]:
     """(H, W, 3) the renderer's picture, 0..255."""
-    return 255.0 * scene.render(time).color.numpy().clip(0, 1)
+    return 255.0 * scene.render(time).color.numpy()
 
 
 @pytest.fixture

@@ -98,7 +98,8 @@ def test_16_bits_are_not_rounded(tmp_path, sequence):
 
 
 def test_scores_of_images_and_reasons_for_the_rest(tmp_path, sequence):
-    result = evaluate(Pictures(write_frames(tmp_path / "p", sequence, TEST, change=5), sequence, "test"), sequence)
+    pictures = Pictures(write_frames(tmp_path / "p", sequence, TEST, change=5), sequence, "test")
+    result = evaluate(pictures, sequence, networks=False)
     mse = np.mean([((f.rgb - g) ** 2)[f.tissue_mask].mean() for f, g in shifted(sequence)])
     assert result.scores["psnr_tissue"] == pytest.approx(-10 * np.log10(mse), abs=0.05)
     assert {"psnr", "ssim", "strict_psnr", "strict_ssim", "flow_error_dis"} <= result.scores.keys()

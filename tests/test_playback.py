@@ -11,7 +11,7 @@ import torch
 from endoprior.core.config import Config
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera
-from endoprior.model.gaussians import create_gaussians
+from endoprior.model.gaussians import Gaussians, create_gaussians
 from endoprior.model.playback import Playback
 from endoprior.model.scene import Scene
 
@@ -42,6 +42,16 @@ def test_kept_frames_draw_as_the_scene_does(scene):
         for i in range(NUM_FRAMES):
             assert pictures_equal(playback.render(i), scene.render(i / NUM_FRAMES))
     assert not pictures_equal(playback.render(0), playback.render(3))
+
+
+def test_color_is_an_image_and_the_unclamped_one_is_at_hand(scene):
+    gaussians = {name: value.detach().clone() for name, value in scene.gaussians.tensors.items()}
+    gaussians["sh_dc"] += 10.0
+    bright = replace(scene, gaussians=Gaussians(gaussians))
+    views = (bright.render(0.4), *bright.render_many([0.4], [bright.camera_at(0.4)]), Playback(bright).render(2))
+    for view in views:
+        assert view.unclamped_color.max() > 1.02 and view.color.max() == 1 and view.color.min() >= 0
+        assert torch.equal(view.color, view.unclamped_color.clamp(0, 1))
 
 
 def test_several_frames_at_once_are_the_frames(scene):

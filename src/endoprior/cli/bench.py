@@ -12,9 +12,9 @@ import tyro
 
 from ..core.checks import input_error
 from ..experiments.ready_specs import find_spec, specs_of
+from ..system.console import say
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 
 MOST_CORES = 4096
 """Largest --cores and --threads."""

@@ -10,9 +10,9 @@ import tyro
 
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
+from ..system.console import say
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 
 
 @dataclass

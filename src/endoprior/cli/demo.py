@@ -10,9 +10,9 @@ from typing import Annotated
 import tyro
 
 from ..core.presets import PresetName, preset
+from ..system.console import say
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 
 
 @dataclass

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ..core.checks import input_error
 from ..core.config import Config
 from ..doctor.choice import Wanted, choose_here
-from .progress import say
+from ..system.console import say
 
 if TYPE_CHECKING:
     from ..model.scene import Scene

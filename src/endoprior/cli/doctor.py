@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
+from ..system.console import say
 from ..system.installation import docs_folder, source_commit
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 
 if TYPE_CHECKING:
     from ..doctor import Facts

@@ -10,10 +10,10 @@ import tyro
 
 from ..core.checks import input_error
 from ..doctor.choice import Wanted
+from ..system.console import say
 from .devices import on_device
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 from .score_table import score_table
 from .trained_scene import open_scene
 
@@ -49,7 +49,7 @@ class Eval:
     depth_scale: float | None = None
     """mm per unit of the depth files."""
     name: str = ""
-    """Name of the method in metrics.json; Default: that of the folder."""
+    """Name of the method in metrics.json. Default: that of the folder."""
     networks: bool = True
     """Scores by networks (RAFT, LPIPS). They need their weights."""
     weights_dir: Path | None = None
@@ -58,7 +58,7 @@ class Eval:
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
 
-HELP = Help(examples=(("RUN",), ("RUN", "--split", "train")))
+HELP = Help(examples=(("RUN",), ("RUN", "--split", "train"), ("--pictures", "FOLDER", "DATA")))
 
 
 def run(argv: list[str]) -> None:
@@ -74,7 +74,7 @@ def run(argv: list[str]) -> None:
         return
     if given := [o for o in ("depth_pictures", "depth_scale", "name") if getattr(args, o) not in (None, "")]:
         option = f"--{given[0].replace('_', '-')}"
-        raise input_error(option, "--pictures beside it", "a run", f"remove {option} or add --pictures FOLDER.")
+        raise input_error(option, "--pictures beside it", "a run", f"Remove {option}, or add --pictures FOLDER.")
     scene = open_scene(args.run)
     require_writable_folder(
         "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
@@ -114,10 +114,10 @@ def evaluate_pictures(args: Eval, folder: Path) -> None:
     from .output_paths import require_writable_folder
 
     if args.data:
-        raise input_error("--data", "--pictures FOLDER DATA", "--data as well", "remove --data.")
+        raise input_error("--data", "--pictures FOLDER DATA", "--data as well", "Remove --data.")
     if args.depth_scale is not None and not 0 < args.depth_scale <= MOST_MM_PER_UNIT:
         want = f"a number above 0, up to {MOST_MM_PER_UNIT:g}"
-        raise input_error("--depth-scale", want, f"{args.depth_scale}", "correct it.")
+        raise input_error("--depth-scale", want, f"{args.depth_scale}", "Correct it.")
     out = args.out or folder
     require_writable_folder("--out" if args.out else "--pictures", out)
     sequence = load_sequence(args.run)
@@ -140,8 +140,8 @@ def save_and_print(
         say(line)
     if outliers := result.outlier_frames():
         frames = ", ".join(map(str, outliers))
-        look = f"endoprior render RUN --split {split}"
-        say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median. To see them: `{look}`")
+        look = "" if "pictures" in result.provenance else f" To see them: `endoprior render RUN --split {split}`"
+        say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median.{look}")
     if sequence.depth_is_relative:
         say("note: the depth of the sequence is relative. Scores in mm compare runs on it, but are not millimeters.")
     say(f"all scores: {file}; what they mean: docs/scores.md")

@@ -10,9 +10,10 @@ from typing import Annotated
 import tyro
 
 from ..export.options import ExportOptions
+from ..system.console import say
 from .help_page import Help
 from .parsing import parse
-from .progress import Counting, say
+from .progress import Counting
 from .trained_scene import open_scene
 
 

@@ -40,7 +40,7 @@ def help_page(name: str, about: str, arguments: Sequence[Option], page: Help, *,
     named = [each for each in arguments if not each.is_positional]
     places = " ".join(each.name if each.is_required else f"[{each.name}]" for each in positional)
     layout = partial(HelpFormatter, max_help_position=28)
-    usage = f"endoprior {name} {places}".rstrip() + " [options]"
+    usage = f"endoprior {name} {places}".rstrip() + (" [options]" if named else "")
     parser = ArgumentParser(usage=usage, description=about.replace("%", "%%"), add_help=False, formatter_class=layout)
     for each in positional:
         parser.add_argument(each.name, help=_explanation(each, each.text))

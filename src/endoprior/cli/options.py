@@ -80,7 +80,7 @@ def _walk(cls: type, default: Any, section: str, about: str) -> Iterator[Option]
         if is_dataclass(kind):
             yield from _walk(kind, field.default, path, inspect.getdoc(kind).splitlines()[0])
             continue
-        text = field.helptext() if callable(field.helptext) else field.helptext
+        text = named.get("help") or (field.helptext() if callable(field.helptext) else field.helptext)
         found = {"default": field.default, "text": " ".join((text or "").split()), "section": section, "about": about}
         if Positional in _extras(field.type):
             yield Option(named["metavar"], named["metavar"], **found)

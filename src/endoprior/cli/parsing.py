@@ -12,9 +12,9 @@ import tyro
 
 from ..core.checks import InputError, input_error
 from ..core.config_io import current_value
+from ..system.console import say
 from .help_page import PLAIN, Help, help_page
 from .options import option_name, options
-from .progress import say
 from .usage_errors import reject_unknown, usage_error
 
 A = TypeVar("A")

@@ -10,9 +10,9 @@ import tyro
 
 from ..core.shell import command
 from ..phantom import PhantomConfig
+from ..system.console import say
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 
 
 @dataclass

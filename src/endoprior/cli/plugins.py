@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..core.checks import InputError
+from ..system.console import say
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 
 LINE = "{:<11}{:<20}{:<28}{}"
 

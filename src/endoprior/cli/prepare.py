@@ -10,9 +10,10 @@ import tyro
 
 from ..core.shell import command
 from ..prepare.config import PrepareConfig
+from ..system.console import say
 from .help_page import Help
 from .parsing import parse
-from .progress import Counting, say
+from .progress import Counting
 
 
 @dataclass

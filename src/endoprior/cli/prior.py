@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import tyro
 
 from ..core.config import PriorConfig
+from ..system.console import say
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 
 
 @dataclass

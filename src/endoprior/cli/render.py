@@ -10,10 +10,10 @@ import tyro
 
 from ..core.checks import input_error
 from ..doctor.choice import Wanted
+from ..system.console import say
 from .devices import on_device
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 from .trained_scene import open_scene
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ from ..core.presets import PresetName, preset
 from ..core.shell import command
 from ..doctor.choice import Wanted
 from ..prepare.config import PrepareConfig
+from ..system.console import say
 from .devices import with_device
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 from .step_display import StepDisplay, duration
 
 if TYPE_CHECKING:

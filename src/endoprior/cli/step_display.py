@@ -7,7 +7,8 @@ import time as clock
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from .progress import PLAIN_EVERY_SECONDS, say
+from ..runs.progress import PLAIN_EVERY_SECONDS
+from ..system.console import say
 
 UPDATE_SECONDS = 0.2
 """Time between two updates of the line on a terminal."""

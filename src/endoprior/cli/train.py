@@ -6,7 +6,7 @@ import json
 import time as clock
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
@@ -15,16 +15,13 @@ from ..core.config import Config
 from ..core.presets import PresetName
 from ..core.shell import command
 from ..doctor.choice import Wanted
+from ..runs.progress import training_progress
+from ..system.console import say
 from .devices import with_device
 from .help_page import Help
 from .parsing import parse
-from .progress import say, training_progress
 from .start_config import device_to_resume, resume_command, run_to_resume, start_config
 from .view import live_view
-
-if TYPE_CHECKING:
-    from ..training.state import StepReport
-    from ..training.trainer import Trainer
 
 
 @dataclass
@@ -118,12 +115,7 @@ def train_and_evaluate(
     began = clock.perf_counter()
     try:
         with training_progress() as show_progress, live_view(view_port) as show_scene:
-
-            def on_step(report: StepReport, trainer: Trainer) -> None:
-                show_progress(report, trainer)
-                show_scene(report, trainer)
-
-            scene = training.complete(on_step, checkpoint_seconds=checkpoint_seconds)
+            scene = training.complete(show_progress, show_scene, checkpoint_seconds=checkpoint_seconds)
     except KeyboardInterrupt:
         resume_with = resume_command(out, networks, weights_dir, checkpoint_seconds)
         say(f"Stopped; the state is saved in {out}. To resume, run `{resume_with}`.")

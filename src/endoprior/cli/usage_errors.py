@@ -77,7 +77,7 @@ def _in_words(metavar: str) -> str:
 
 
 def _one_line(page: str) -> str:
-    """The text of tyro's framed page, without the frame, its title and the closing advice."""
+    """The error in tyro's framed page, without the frame, its title, explanations and the closing advice."""
     body = [BOX_DRAWING.sub(" ", line).strip() for line in page.splitlines() if not line.startswith("\u256d")]
-    text = " ".join(" ".join(body).split("For full helptext")[0].split())
-    return text.rstrip(". ")
+    text = " ".join(" ".join(body).split())
+    return re.split("Argument helptext:|For full helptext", text)[0].rstrip(". ")

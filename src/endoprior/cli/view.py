@@ -13,10 +13,10 @@ import tyro
 
 from ..core.checks import InputError, input_error
 from ..doctor.choice import Wanted
+from ..system.console import say
 from .devices import on_device
 from .help_page import Help
 from .parsing import parse
-from .progress import say
 
 if TYPE_CHECKING:
     from ..data import FrameSequence

@@ -9,10 +9,12 @@ come from anywhere.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from .checks import InputError, check_range, read_ranges
+from .config_io import from_dict, override, to_dict
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
 Backend = Literal["reference", "numba", "triton", "gsplat"]
@@ -371,6 +373,18 @@ class Config(Checked):
                 f"init.motion: expected rest with deformation.kind {self.deformation.kind}; got flow, which only the "
                 "temporal basis can start from. Set --init.motion rest."
             )
+
+    def replace(self, changes: Mapping[str, Any]) -> Config:
+        """This config with other values: `preset("default").replace({"seed": 1, "optim.means_lr": 2e-3})`.
+
+        Args:
+            changes: new value by the field's dotted name; docs/config.md lists all fields.
+        Raises:
+            InputError: no field has this name, or the value has the wrong type or range.
+        """
+        values = to_dict(self)
+        override(values, changes, "config")
+        return from_dict(Config, values)
 
     def fitted(self, num_frames: int) -> Config:
         """The config with the fields filled in that depend on the length of the sequence."""

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
 import math
+import re
 import sys
 import types
 import typing
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from .checks import InputError, input_error
@@ -16,6 +19,7 @@ C = TypeVar("C")
 _hints = functools.cache(typing.get_type_hints)
 FORMER_VALUES = {"render.backend": {"cpu": "numba", "cuda": "gsplat"}}
 """Config field -> value of earlier versions -> what it is called now."""
+FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
 
 
 def current_value(field: str, value: Any, *, hint: bool = False) -> Any:
@@ -46,6 +50,36 @@ def to_dict(cfg: Any) -> Any:
     if isinstance(cfg, dict):
         return {key: to_dict(value) for key, value in cfg.items()}
     return [to_dict(value) for value in cfg] if isinstance(cfg, tuple | list) else cfg
+
+
+def override(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> None:
+    """Set fields of a nested dict from `to_dict` by their dotted names, such as `init.budget`; `from_dict` checks them.
+
+    Args:
+        changes: new value by name; a text such as "x0.75" multiplies the number that is there.
+        where: what the error message calls the changes.
+    Raises:
+        InputError: no field has this name; the message proposes the nearest one.
+    """
+    for name, value in changes.items():
+        *path, last = str(name).split(".")
+        group: Any = values
+        for part in path:
+            group = group.get(part) if isinstance(group, dict) else None
+        if not isinstance(group, dict) or last not in group or isinstance(group[last], dict):
+            nearest = difflib.get_close_matches(str(name), _dotted_names(values), 1)
+            fix = f"use `{nearest[0]}`." if nearest else "see `endoprior train --help-all`."
+            raise input_error(where, "the dotted name of a config field", str(name), fix)
+        if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(group[last]) in (int, float):
+            value = type(group[last])(group[last] * float(factor[1]))
+        group[last] = current_value(str(name), value, hint=True)
+
+
+def _dotted_names(values: dict[str, Any], prefix: str = "") -> list[str]:
+    names = []
+    for name, value in values.items():
+        names += _dotted_names(value, f"{prefix}{name}.") if isinstance(value, dict) else [f"{prefix}{name}"]
+    return names
 
 
 def from_dict(cls: type[C], values: Any, where: str = "config") -> C:

@@ -18,7 +18,7 @@ from .config import (
     TemporalConfig,
 )
 
-PresetName = Literal["default", "preview", "paper", "released", "endogaussian"]
+PresetName = Literal["default", "paper", "released", "endogaussian", "preview"]
 
 
 def preset(name: str = "default") -> Config:
@@ -29,10 +29,10 @@ def preset(name: str = "default") -> Config:
     """
     makers = {
         "default": default,
-        "preview": preview,
         "paper": paper,
         "released": released,
         "endogaussian": endogaussian,
+        "preview": preview,
     }
     if name not in makers:
         raise InputError(

@@ -86,6 +86,23 @@ class Splats:
 
 
 @dataclass(frozen=True)
+class RenderedView:
+    """A scene as one camera sees it at one time."""
+
+    unclamped_color: Tensor
+    """(H, W, 3) composited color; a little above 1 where bright Gaussians overlap."""
+    depth: Tensor
+    """(H, W) sum of weight * z, mm; divide by alpha for the expected depth."""
+    alpha: Tensor
+    """(H, W) accumulated opacity in [0, 1)."""
+
+    @property
+    def color(self) -> Tensor:
+        """(H, W, 3) color in [0, 1], to show or save as an image."""
+        return self.unclamped_color.clamp(0, 1)
+
+
+@dataclass(frozen=True)
 class RenderOutput:
     """Output of every backend. Density control reads `means2d.grad` (px) after `means2d.retain_grad()`."""
 
@@ -99,3 +116,8 @@ class RenderOutput:
     """(N, 2) projected centers, px; pixel (0, 0) is centered at (0.5, 0.5)."""
     radii: Tensor
     """(N,) int32 radius of the rendered footprint, px; 0 where culled."""
+
+    @property
+    def view(self) -> RenderedView:
+        """What users of a scene get of it."""
+        return RenderedView(self.color, self.depth, self.alpha)

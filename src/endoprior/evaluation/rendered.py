@@ -46,7 +46,7 @@ class SceneFrames:
         """See `Reconstruction.render`."""
         frame = self._sequence.frame(index)
         out = self.scene.render(frame.time, frame.camera)
-        return np.clip(out.color.cpu().numpy(), 0, 1), out.depth.cpu().numpy()
+        return out.color.cpu().numpy(), out.depth.cpu().numpy()
 
 
 @dataclass(frozen=True)

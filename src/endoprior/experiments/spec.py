@@ -15,7 +15,7 @@ import yaml
 
 from ..core.checks import InputError, input_error
 from ..core.config import Config
-from ..core.config_io import current_value, from_dict, to_dict
+from ..core.config_io import from_dict, override, to_dict
 from ..core.presets import PresetName
 from ..data.formats import REGISTRY as LAYOUTS
 from ..data.reading import read_text
@@ -29,8 +29,6 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 """Names of methods and sequences become folders."""
 MOST_EXTENDED = 8
 MOST_CELLS = 100_000
-FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
-"""A value such as `x0.75` multiplies the value of the preset and of the settings before it."""
 
 
 @dataclass(frozen=True)
@@ -158,8 +156,7 @@ class Spec:
             (f"set_for.{chosen.name}", self.set_for.get(chosen.name, {})),
             (f"methods.{method}.set", chosen.set),
         ):
-            for name, value in overrides.items():
-                _override(values, name, value, where)
+            override(values, overrides, where)
         if has_config:
             values["data"] |= self.sequences[sequence].reading
             if budget is not None:
@@ -179,19 +176,6 @@ class Spec:
         """A path of the spec: `~` and `$NAME` expanded, relative to the spec's folder."""
         expanded = Path(os.path.expandvars(path)).expanduser()
         return expanded if expanded.is_absolute() else Path(self.folder) / expanded
-
-
-def _override(values: dict[str, Any], name: str, value: Any, where: str) -> None:
-    *path, last = name.split(".")
-    for part in path:
-        values = values.get(part)
-        if not isinstance(values, dict):
-            break
-    if not isinstance(values, dict) or last not in values or isinstance(values[last], dict):
-        raise input_error(where, "the dotted name of a config field", f"{name}", "see `endoprior train -h`.")
-    if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(values[last]) in (int, float):
-        value = type(values[last])(values[last] * float(factor[1]))
-    values[last] = current_value(name, value, hint=True)
 
 
 def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:

@@ -31,6 +31,8 @@ from .time_steps import seconds_of_motion, selected_time_steps
 FOLDER = "tissue"
 """Folder in each archive, and name of the scene in it."""
 MODEL_FILE, SEQUENCE_FILE = "Data/tissue.ply", "Data/tissue.seq.mrb"
+IN_MEMORY_BYTES = 2**28
+"""A larger sequence waits in a temporary file."""
 VIEW_ANGLE = 30.0
 """Vertical angle of Slicer's 3D view, degrees."""
 
@@ -48,7 +50,7 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     steps = selected_time_steps(scene, options)
     seconds = seconds_of_motion(scene, steps)
     meshes = (surface_mesh(scene, step, options) for step in steps)
-    with whole_file(out) as temporary, tempfile.TemporaryFile(dir=out.parent) as sequence:
+    with whole_file(out) as temporary, tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES) as sequence:
         first = next(meshes)
         _write_sequence(sequence, chain([first], meshes), seconds, progress)
         with ZipFile(temporary, "w") as archive:

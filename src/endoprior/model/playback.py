@@ -7,7 +7,7 @@ from collections import OrderedDict
 import torch
 
 from .. import render
-from ..core.types import Camera, RenderOutput, Splats
+from ..core.types import Camera, RenderedView, Splats
 from .scene import Scene
 
 DEFAULT_MAX_BYTES = 1 << 30
@@ -53,15 +53,16 @@ class Playback:
         return self._kept[index]
 
     @torch.no_grad()
-    def render(self, index: int, camera: Camera | None = None) -> RenderOutput:
+    def render(self, index: int, camera: Camera | None = None) -> RenderedView:
         """Render frame `index`, from `camera` or else from its own. See `Scene.render`."""
-        return self._rasterize(self.splats(index), camera or self.scene.cameras[index], background=self._background)
+        splats = self.splats(index)
+        return self._rasterize(splats, camera or self.scene.cameras[index], background=self._background).view
 
     @torch.no_grad()
-    def render_many(self, indices: list[int]) -> list[RenderOutput]:
+    def render_many(self, indices: list[int]) -> list[RenderedView]:
         """Render several frames from their own cameras. See `Scene.render_many`."""
         splats, cameras = [self.splats(i) for i in indices], [self.scene.cameras[i] for i in indices]
-        return render.load_many(self.scene.backend)(splats, cameras, background=self._background)
+        return [out.view for out in render.load_many(self.scene.backend)(splats, cameras, background=self._background)]
 
 
 def _num_bytes(splats: Splats) -> int:

@@ -20,7 +20,7 @@ from ..core.config_io import from_dict, to_dict
 from ..core.geometry import FARTHEST_MM
 from ..core.ranges import Checked, Range
 from ..core.shell import command
-from ..core.types import Camera, RenderOutput, Splats
+from ..core.types import Camera, RenderedView, Splats
 from ..system.arrays_file import ArraySpec, load_arrays, part, rejecting, save_arrays
 from .basis import basis_offsets
 from .deformation import HexPlaneField, Offsets
@@ -103,25 +103,29 @@ class Scene:
         return Splats(**{name: value.detach() for name, value in vars(found).items()})
 
     @torch.no_grad()
-    def render(self, time: float, camera: Camera | None = None) -> RenderOutput:
+    def render(self, time: float, camera: Camera | None = None) -> RenderedView:
         """Render the scene at `time` in [0, 1], from `camera` or else the camera of the frame nearest in time.
 
         Returns:
-            color (H, W, 3), depth (H, W) mm as the sum of weight * z, alpha (H, W).
+            color (H, W, 3) in [0, 1], depth (H, W) mm as the sum of weight * z, alpha (H, W) in [0, 1), and
+            unclamped_color (H, W, 3).
+        Raises:
+            ValueError: time is not in [0, 1].
         """
         splats = self.at(time)
         rasterize = render.load(self.backend)
-        return rasterize(splats, camera or self.camera_at(time), background=splats.means.new_zeros(3))
+        return rasterize(splats, camera or self.camera_at(time), background=splats.means.new_zeros(3)).view
 
     @torch.no_grad()
-    def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderOutput]:
+    def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
         """`render` at several times, one camera each, in one call where the backend can: faster on a GPU.
 
         Raises:
             ValueError: a time is not in [0, 1], or cameras differ in size where the backend renders them together.
         """
         splats = [self.at(time) for time in times]
-        return render.load_many(self.backend)(splats, cameras, background=splats[0].means.new_zeros(3))
+        outputs = render.load_many(self.backend)(splats, cameras, background=splats[0].means.new_zeros(3))
+        return [out.view for out in outputs]
 
     @property
     def device(self) -> torch.device:

@@ -71,8 +71,9 @@ class PrepareConfig:
     """Resize wider images to this width, px; 0 keeps the size."""
 
     depth: str = "auto"
-    """`sgbm` (stereo), `shading` (monocular, relative), `depth-anything[:FOLDER]` (network, relative), a folder of
-    depth files, or `none`. `auto` is `sgbm` for two cameras and `shading` for one."""
+    """`sgbm` (stereo), `shading` (monocular, relative), `depth-anything` (network, relative; the folder of its weights
+    may follow after a colon), a folder of depth files, or `none`. `auto` is `sgbm` for two cameras, `shading` for one.
+    """
     depth_unit_mm: float = 0.0
     """mm per unit of the files in a depth folder; required with such a folder unless its depth is relative."""
     depth_relative: Literal["no", "depth", "disparity"] = "no"

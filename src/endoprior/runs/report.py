@@ -74,7 +74,7 @@ def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, N
     rows = []
     for frame in (frames[k] for k in shown):
         out = scene.render(frame.time, frame.camera)
-        color, depth = np.clip(out.color.cpu().numpy(), 0, 1), out.depth.cpu().numpy()
+        color, depth = out.color.cpu().numpy(), out.depth.cpu().numpy()
         error = np.abs(color - frame.rgb).mean(-1)
         cells = [(f"input, frame {frame.index} (test)", frame.rgb_u8), ("rendered, tool removed", to_u8(color))]
         tissue = sequence.truth.tissue(frame.index) if sequence.truth else None

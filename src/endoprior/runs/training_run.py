@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import shutil
+import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 from ..core.checks import InputError
@@ -23,6 +25,7 @@ from .folder import LOCK, prepare_run_folder, reject_unusable_folder
 from .identity import reject_other_run
 from .interrupt import deferred_interrupt
 from .observers import CHECKPOINT_SECONDS, CheckpointWriter, LogWriter, cut_log
+from .progress import is_watched, training_progress
 from .provenance import run_facts
 from .stored_run import config_of_run, sequence_of_run
 
@@ -41,6 +44,7 @@ def train(
     resume: bool = False,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     on_step: Observer | None = None,
+    progress: bool | None = None,
 ) -> Scene:
     """Train one scene.
 
@@ -50,7 +54,8 @@ def train(
         out: run folder for config, log, checkpoints and `scene.safetensors`; None keeps everything in memory.
         resume: continue the run in `out`, from its last checkpoint if there is one.
         checkpoint_seconds: time between two checkpoints.
-        on_step: called after each iteration.
+        on_step: called as `on_step(report, trainer)` after each iteration; see `StepReport` for what it gets.
+        progress: print notes about the sequence, rate and remaining time; None: on a terminal or in a notebook only.
     Raises:
         InputError: the sequence cannot be used, needs more memory than there is, or `out` holds another run.
         Diverged: the loss or a gradient is not finite, or the images show nothing; `out` keeps the state before.
@@ -63,8 +68,16 @@ def train(
         sequence = load_sequence(sequence_of_run(Path(out)), cfg.data) if sequence is None else sequence
     if sequence is None or cfg is None:
         raise ValueError("train needs a sequence and a config; only with resume=True and out it takes those of the run")
-    run = TrainingRun(sequence, cfg, out, resume=resume, say=log.info)
-    return run.complete(on_step, checkpoint_seconds=checkpoint_seconds)
+    if progress is None:
+        progress = is_watched()
+    run = TrainingRun(sequence, cfg, out, resume=resume, say=_print_note if progress else log.info)
+    with training_progress() if progress else nullcontext() as show_progress:
+        observers = [observer for observer in (show_progress, on_step) if observer is not None]
+        return run.complete(*observers, checkpoint_seconds=checkpoint_seconds)
+
+
+def _print_note(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 class TrainingRun:
@@ -97,12 +110,11 @@ class TrainingRun:
             say(f"note: {warning}")
         self.trainer = Trainer(sequence, cfg)
 
-    def complete(self, on_step: Observer | None = None, *, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> Scene:
-        """Train to the end; see `train`."""
-        observers = [on_step] if on_step else []
+    def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> Scene:
+        """Train to the end; `observers` are called after each iteration, in this order. See `train`."""
         if self.out is None:
             self.trainer.start()
-            self.trainer.run(observers)
+            self.trainer.run(list(observers))
             return self.trainer.scene()
         created, began = prepare_run_folder(self.out, resume=self.resume), False
         try:
@@ -110,7 +122,7 @@ class TrainingRun:
                 fingerprint = self.trainer.sequence.fingerprint()
                 self._begin(self.out, fingerprint)
                 began = True
-                self._train_in(self.out, fingerprint, observers, checkpoint_seconds)
+                self._train_in(self.out, fingerprint, list(observers), checkpoint_seconds)
                 scene = self.trainer.scene()
                 scene.save(self.out / "scene.safetensors")
         except InputError:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.types import Frame, RenderOutput
+from ..core.types import Frame, RenderedView
 from ..model.scene import Scene
 from ..system.atomic import whole_file
 from .camera_paths import View
@@ -52,7 +52,7 @@ def write_views(
     write_video(video, images(), scene.frames_per_second)
 
 
-def _render(scene: Scene, views: list[View]) -> Iterator[RenderOutput]:
+def _render(scene: Scene, views: list[View]) -> Iterator[RenderedView]:
     """Render each view; in batches on a GPU."""
     at_a_time = 1 if scene.device.type == "cpu" else AT_A_TIME
     for start in range(0, len(views), at_a_time):

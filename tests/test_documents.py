@@ -1,0 +1,121 @@
+"""The documents, taken at their word: links lead somewhere, commands and code parse, named files exist."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+import yaml
+from markdown_it import MarkdownIt
+from markdown_it.token import Token
+
+from endoprior.cli import COMMANDS, MODULES
+from endoprior.cli.parsing import parse
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")})
+COMMANDS_OF_THE_LOG = ROOT / "docs" / "log.md"
+"""What it tells of belongs to earlier versions."""
+CURRENT = [page for page in PAGES if page not in (COMMANDS_OF_THE_LOG, ROOT / "CHANGELOG.md")]
+ELSEWHERE = ("http://", "https://", "mailto:")
+TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+OWN_PATH = re.compile(r"(?<![\w/])(?:bench|docs|faults|src|tests)/[\w./*-]+")
+PLACEHOLDERS = {"COMMAND", "...", "NAME"}
+"""Words that stand for a command, a choice or the rest of a line."""
+
+
+@cache
+def tokens(page: Path) -> list[Token]:
+    """Everything on a page, inline parts too, in order."""
+    blocks = MarkdownIt("commonmark").enable("table").parse(page.read_text(encoding="utf-8"))
+    return [token for block in blocks for token in (block, *(block.children or ()))]
+
+
+@cache
+def anchors(page: Path) -> set[str]:
+    """The names that GitHub and the site give to the headings of a page."""
+    found = tokens(page)
+    titles = [found[i + 1].content for i, token in enumerate(found) if token.type == "heading_open"]
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def code_lines(page: Path) -> list[str]:
+    """The lines of code blocks without a language, and the code inside of sentences."""
+    blocks = [token for token in tokens(page) if token.type in ("fence", "code_block") and not token.info]
+    lines = [line for token in blocks for line in token.content.splitlines()]
+    return lines + [" ".join(token.content.split()) for token in tokens(page) if token.type == "code_inline"]
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The words of each `endoprior` command on a page that has arguments."""
+    found = []
+    for line in code_lines(page):
+        for part in re.split(r"&&|\s#\s.*", line):
+            words = part.replace(".venv/bin/", "").split()
+            if words[:1] == ["endoprior"] and len(words) > 2 and not PLACEHOLDERS & set(words):
+                found.append(shlex.split(part.replace(".venv/bin/", ""))[1:])
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_images_lead_somewhere(page):
+    for token in tokens(page):
+        target = token.attrGet({"link_open": "href", "image": "src"}.get(token.type, ""))
+        if not target or str(target).startswith(ELSEWHERE):
+            continue
+        name, _, anchor = unquote(str(target)).partition("#")
+        path = (page.parent / name).resolve() if name else page
+        assert path.exists(), f"{page.name}: {target}: there is no such file"
+        assert not anchor or anchor in anchors(path), f"{page.name}: {target}: there is no such heading"
+
+
+class Parsed(Exception):
+    """The arguments of a command are right."""
+
+
+@pytest.mark.parametrize("page", CURRENT, ids=lambda page: page.name)
+def test_commands_parse(page, monkeypatch):
+    def parse_only(*args: object, **kwargs: object) -> None:
+        parse(*args, **kwargs)
+        raise Parsed
+
+    for name, *rest in commands(page):
+        assert name in COMMANDS, f"{page.name}: endoprior {name}: there is no such command"
+        module = import_module(f"endoprior.cli.{MODULES.get(name, name)}")
+        monkeypatch.setattr(module, "parse", parse_only)
+        try:
+            with pytest.raises((Parsed, SystemExit)):  # --help exits
+                module.run(rest)
+        except ValueError as error:
+            pytest.fail(f"{page.name}: endoprior {name} {' '.join(rest)}: {error}")
+
+
+@pytest.mark.parametrize("page", CURRENT, ids=lambda page: page.name)
+def test_targets_of_make_and_files_exist(page):
+    for line in code_lines(page):
+        for target in re.findall(r"(?:^|\s)make ([a-z][a-z-]*)", line):
+            assert target in TARGETS, f"{page.name}: make {target}: there is no such target"
+        for path in OWN_PATH.findall(line):
+            if "NAME" not in path:
+                assert any(ROOT.glob(path.rstrip("/."))), f"{page.name}: {path}: there is no such file"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_and_yaml_parse(page):
+    for token in tokens(page):
+        if token.type == "fence" and token.info == "python":
+            ast.parse(token.content, f"{page.name}:{token.map[0] + 1}")
+        elif token.type == "fence" and token.info == "yaml":
+            yaml.safe_load(token.content)
+
+
+def test_there_is_something_to_check():
+    """The patterns above match: a page that shows every kind."""
+    assert ["train", "DATA", "RUN"] in commands(ROOT / "README.md") and "your-own-video" in anchors(ROOT / "README.md")
+    assert sum(len(commands(page)) for page in PAGES) > 50 and {"test", "docs"} <= TARGETS
