@@ -27,3 +27,9 @@ def change_poses(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> No
     path = folder / "poses_bounds.npy"
     poses = np.load(path)
     np.save(path, change(poses))
+
+
+def edit(folder: Path, change: Callable[[np.ndarray, int], np.ndarray]) -> None:
+    """Replace every image of a folder by a function of it and its position."""
+    for position, file in enumerate(sorted(folder.iterdir())):
+        write(file, change(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), position))

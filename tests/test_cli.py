@@ -101,6 +101,18 @@ def test_eval_repeats_the_scores_of_train(run, tmp_path):
     assert {k: v for k, v in first.items() if k not in timed} == {k: v for k, v in second.items() if k not in timed}
 
 
+@pytest.mark.parametrize("split", ["train", "video"])
+def test_another_split_does_not_replace_the_test_scores(run, split, capsys):
+    _, folder = run
+    before = {name: (folder / name).read_bytes() for name in ("metrics.json", "per_frame.json")}
+    assert main(["eval", str(folder), "--split", split, "--no-networks"]) == 0
+    assert {name: (folder / name).read_bytes() for name in before} == before
+    metrics = json.loads((folder / f"metrics_{split}.json").read_text())
+    rows = json.loads((folder / f"per_frame_{split}.json").read_text())
+    assert metrics["protocol"]["split"] == split and metrics["protocol"]["frames"] == [row["index"] for row in rows]
+    assert str(folder / f"metrics_{split}.json") in capsys.readouterr().out.splitlines()[-1]
+
+
 def test_eval_of_other_data_is_an_error(run, make_tiny_sequence, capsys):
     _, folder = run
     assert main(["eval", str(folder), "--data", str(make_tiny_sequence("short", num_frames=9))]) == 2

@@ -14,8 +14,16 @@ from endoprior.cli.parsing import parse
 from endoprior.core.checks import InputError
 
 MOST_LINES = 45
-VALUES = {"INT": "1", "FLOAT": "300", "PATH": "x", "STR": "x", "FLOAT ...": "0.5", "STR ...": "x"}
-"""Values of options without a default, by what the page calls them."""
+VALUES = {
+    "INT": "1",
+    "FLOAT": "300",
+    "PATH": "x",
+    "STR": "x",
+    "FLOAT ...": "0.5",
+    "STR ...": "x",
+    "--data.skip-frames": "0-9",
+}
+"""Values of options without a default, by their name or by what the page calls them."""
 
 
 class Parsed(BaseException):
@@ -71,14 +79,16 @@ def test_help_is_one_page_with_examples_that_parse(command, printed, parsed):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_option_of_help_all_can_be_typed(command, printed, parsed):
+def test_every_option_of_help_all_can_be_typed(command, printed, parsed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "FILE").write_text("seed: 1")  # --config FILE is read before the options
     page = printed(command, "--help-all")
     args, cls, help_, default = parsed(*examples(page)[0])
     words, named = [command], [each for each in options(cls, default) if not each.is_positional]
     for each in options(cls, default):
         value = each.default
         if value in (None, "", ()) or each.is_positional:
-            value = VALUES.get(each.metavar) or re.findall(r"[\w-]+", each.metavar)[0]
+            value = VALUES.get(each.name) or VALUES.get(each.metavar) or re.findall(r"[\w-]+", each.metavar)[0]
         if each.is_flag:
             words.append(each.off if value else each.name)
         else:
@@ -96,7 +106,7 @@ def test_every_option_of_help_all_can_be_typed(command, printed, parsed):
 
 @pytest.mark.parametrize(
     ("command", "usage"),
-    [("render", "RUN [OUT] [options]"), ("demo", "[OUT] [options]"), ("train", "DATA OUT [options]")],
+    [("render", "RUN [OUT] [options]"), ("demo", "[OUT] [options]"), ("train", "DATA [OUT] [options]")],
 )
 def test_optional_arguments_stand_in_brackets(command, usage, printed):
     assert printed(command, "--help").splitlines()[0] == f"usage: endoprior {command} {usage}"
@@ -138,8 +148,8 @@ def test_a_wrong_option_is_named_with_what_was_meant(words, said, capsys):
 
 
 def test_missing_arguments_are_named():
-    from endoprior.cli.train import HELP, Train
+    from endoprior.cli.prepare import HELP, Prepare
 
-    for words, missing in ((["a"], "no OUT"), ([], "no DATA and no OUT")):
-        with pytest.raises(InputError, match=rf"^endoprior train: expected DATA OUT, got {missing}\. Fix: "):
-            parse(Train, words, "train", HELP)
+    for words, missing in ((["a"], "no OUT"), ([], "no VIDEO and no OUT")):
+        with pytest.raises(InputError, match=rf"^endoprior prepare: expected VIDEO OUT, got {missing}\. Fix: "):
+            parse(Prepare, words, "prepare", HELP)

@@ -24,6 +24,7 @@ from ..footage.overlays import find_static_overlays
 from ..footage.polarity import Polarity, mask_polarity
 from ..initialization.sampling import initial_points
 from .depth_facts import DepthFacts, measure_depth
+from .remake import Remakes, find_remakes
 from .stereo_facts import StereoFacts, measure_stereo
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ MOTION_FRAMES = 300
 """Largest number of frames for the camera motion."""
 CERTAIN = 0.5
 """Least certainty to report masks as inverted."""
+LABEL_ON_TISSUE = 0.75
+"""Least share of a text box that the masks mark as tissue; of the rim of a masked round border it is half."""
 POINT_FRAMES = 24
 """Largest number of training frames for the initial points."""
 
@@ -113,6 +116,10 @@ class Facts:
     """None without right images."""
     cloud: PointCloud | None
     """Initial points from at most 24 training frames; None if there are none."""
+    data: DataConfig
+    """Options with which the sequence was opened."""
+    remakes: Remakes
+    """What the sequence can be made from again."""
 
     @property
     def camera_is_fixed(self) -> bool:
@@ -129,6 +136,7 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
     Raises:
         InputError: a file cannot be used.
     """
+    cfg = cfg or DataConfig()
     count = len(sequence)
     frames = sequence.frames("video")
     samples = [sequence.frame(int(i)) for i in spread(count, SAMPLES)]
@@ -157,11 +165,11 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         changes=find_changes(frame.rgb_u8 for frame in frames),
         masks=masks,
         border=_border(images, tissue),
-        depth=measure_depth(
-            sequence, samples, [masks.tissue(frame) for frame in samples], described, cfg or DataConfig()
-        ),
+        depth=measure_depth(sequence, samples, tissue, described, cfg),
         stereo=measure_stereo(sequence),
         cloud=_first_points(sequence),
+        data=cfg,
+        remakes=find_remakes(sequence, described, cfg),
     )
 
 
@@ -198,7 +206,7 @@ def _is_label(box: tuple[int, int, int, int], tissue: NDArray[np.floating], bord
     """Whether a text box lies inside the border, and the masks mark most of it as tissue."""
     x, y, width, height = box
     inside = slice(y, y + height), slice(x, x + width)
-    return _mean(tissue[inside]) > 0.5 and _mean(border[inside]) < 0.5
+    return _mean(tissue[inside]) > LABEL_ON_TISSUE and _mean(border[inside]) < 0.5
 
 
 def _mean(values: NDArray) -> float:

@@ -209,14 +209,12 @@ def _draw_cloud(front: Axes, side: Axes, facts: Facts) -> None:
 
 
 def _draw_findings(axis: Axes, facts: Facts, findings: list[Finding]) -> None:
-    """The findings, and below them as much of the table of facts as fits."""
+    """The findings without their fixes, which are long, and below them as much of the table of facts as fits."""
     axis.set_axis_off()
     lines: list[tuple[str, str, str]] = []
     for finding in findings:
         lines.append((f"{finding.severity}: {finding.code}", SEVERITY_COLOR[finding.severity], "bold"))
-        lines += [(line, "black", "normal") for line in textwrap.wrap(finding.what, WRAPPED_AT)]
-        fix = textwrap.wrap(f"fix: {finding.fix}", WRAPPED_AT, subsequent_indent="     ")
-        lines += [(line, "#444444", "normal") for line in fix] + [("", "black", "normal")]
+        lines += [(line, "black", "normal") for line in [*textwrap.wrap(finding.what, WRAPPED_AT), ""]]
     if not findings:
         lines += [("no problems", "#2e8b57", "bold"), ("", "black", "normal")]
     for name, value in table(facts):

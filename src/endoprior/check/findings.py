@@ -12,9 +12,11 @@ from typing import Literal
 import numpy as np
 
 from ..core.checks import number_ranges
-from ..core.shell import command
+from ..core.config import DataConfig
 from ..footage.camera_motion import MOVING_FRACTION
 from .facts import Facts
+from .fixes import detect_tools, in_stored_px, longest_part, measure_depth_again, set_values, skip, train
+from .remake import field_of_view, swapped
 
 Severity = Literal["error", "warning", "note"]
 
@@ -30,6 +32,8 @@ VERTICAL_PX = 1.5
 """Largest vertical offset of rectified cameras, px."""
 ODD_VIEW_DEG = (20.0, 120.0)
 """Range of the horizontal field of view of endoscopes."""
+USUAL_FOCAL = 0.9
+"""Focal length of a usual endoscope, image widths: 58 degrees."""
 DEPTH_JUMP = 0.2
 """Change of the log median depth between two frames that is too large for tissue motion."""
 
@@ -45,7 +49,7 @@ class Finding:
     what: str
     """The problem, on one line."""
     fix: str
-    """The command to type, or what to do."""
+    """What to do: commands in backticks, or an edit. A complete command unless only the user knows a value."""
     frames: tuple[int, ...] = ()
     """Affected frames; empty for all."""
 
@@ -65,14 +69,18 @@ def _size(facts: Facts) -> Iterator[Finding]:
         what = f"{facts.frames} frames, {facts.test_frames} of them to test"
         yield Finding("few-frames", "warning", what, f"give at least {FEW_FRAMES}; 50 to 200 are usual")
     camera = facts.camera
-    view = 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx))
+    view = field_of_view(camera)
     off_center = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
     if not ODD_VIEW_DEG[0] <= view <= ODD_VIEW_DEG[1] or off_center > 0.2 or not 0.8 < camera.fx / camera.fy < 1.25:
         what = (
             f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px give {view:.0f} degrees across "
             f"{camera.width}x{camera.height} px; they may belong to images of another size"
         )
-        yield Finding("intrinsics", "warning", what, f'set "fx", "fy", "cx", "cy" in {facts.path}/sequence.json, px')
+        width, height = in_stored_px(facts, camera.width, camera.height)
+        usual = {"fx": USUAL_FOCAL * width, "fy": USUAL_FOCAL * width, "cx": width / 2, "cy": height / 2}
+        fix = set_values(facts, **{name: f"{value:g}" for name, value in usual.items()})
+        fix += f", which is usual for endoscopes, or what the calibration says for {width}x{height} px"
+        yield Finding("intrinsics", "warning", what, fix)
 
 
 def _masks(facts: Facts) -> Iterator[Finding]:
@@ -80,40 +88,37 @@ def _masks(facts: Facts) -> Iterator[Finding]:
     if masks.inverted:
         what = f"tissue and tool are swapped in the masks ({masks.reason})"
         value = 0 if facts.described.get("mask_tool_value", 255) == 255 else 255
-        fix = f'set "mask_tool_value": {value} in {facts.path}/sequence.json'
-        yield Finding("mask-polarity", "error", what, fix)
+        yield Finding("mask-polarity", "error", what, set_values(facts, mask_tool_value=value))
     elif mean > TOOL_MOST:
         what = f"{mean:.0%} of all pixels are tool"
-        yield Finding("tool-fraction", "warning", what, "check the masks; 5 % to 40 % are usual")
+        again = f", or {command} detects tools by color" if (command := detect_tools(facts)) else ""
+        yield Finding("tool-fraction", "warning", what, f"correct the masks, 5 % to 40 % are usual{again}")
     elif not masks.tool_fraction.any():
         what = "no mask marks a tool"
-        yield Finding("tool-fraction", "note", what, "nothing if no instrument is in view, else add masks")
+        fix = detect_tools(facts) or f"paint them in {facts.path}/masks"
+        yield Finding("tool-fraction", "note", what, f"nothing if no instrument is in view; else {fix}")
 
 
 def _depth(facts: Facts) -> Iterator[Finding]:
     depth, path, unit = facts.depth, facts.path, facts.depth.unit
+    again = measure_depth_again(facts)
     # With inverted masks, depth on tissue cannot be checked.
     empty = tuple(int(i) for i in np.flatnonzero(depth.coverage == 0))
     if len(empty) == facts.frames and unit.unit == "none":
-        yield Finding(
-            "no-depth-frames", "error", "no frame has depth", f"endoprior prepare CLIP NEW, or add {path}/depth in mm"
-        )
+        yield Finding("no-depth-frames", "error", "no frame has depth", again or f"add {path}/depth in mm")
         return
     if empty and not facts.masks.inverted:
         what = f"no depth on tissue in {_frames(empty)}"
-        yield Finding("no-depth-frames", "warning", what, f"measure it, or remove these frames from {path}", empty)
+        fix = again if again and len(empty) > facts.frames / 2 else skip(facts, empty)
+        yield Finding("no-depth-frames", "warning", what, fix, empty)
     covered = float(np.median(depth.coverage))
     if 0 < covered < COVERED and not facts.masks.inverted:
         what = f"depth on {covered:.0%} of the tissue of a usual frame"
-        yield Finding(
-            "depth-sparse", "warning", what, "measure it again with a denser method, endoprior prepare --help"
-        )
+        yield Finding("depth-sparse", "warning", what, again or "measure it by a denser method")
     if depth.bits == 8:
         known = f" {unit.unit}" if unit.mm_per_unit else ""
         what = f"8 bits a value, steps of {depth.step:.3g}{known}"
-        fix = (
-            f'write {path}/depth as 16-bit PNG in units of 0.01 mm and set "depth_scale": 0.01 in {path}/sequence.json'
-        )
+        fix = f"export {path}/depth as 16-bit PNG{f', or {again} measures it again' if again else ''}"
         yield Finding("depth-8-bit", "warning", what, fix)
     if depth.relative:
         fix = "nothing for rendering; for lengths in mm use stereo depth"
@@ -124,13 +129,17 @@ def _depth(facts: Facts) -> Iterator[Finding]:
     jumps = tuple(int(i) + 1 for i in np.flatnonzero(steps > max(DEPTH_JUMP, 6 * usual)))
     if jumps:
         what = f"the median depth jumps at {_frames(jumps)}"
-        yield Finding("depth-jumps", "warning", what, "bring the depth of all frames to one scale", jumps)
+        fix = f"bring the depth of all frames to one scale{f', or {again} measures it again' if again else ''}"
+        yield Finding("depth-jumps", "warning", what, fix, jumps)
 
 
 def _unit(facts: Facts) -> Iterator[Finding]:
     unit = facts.depth.unit
     if unit.unit == "disparity":
-        fix = "store depth in mm: focal length (px) x baseline (mm) / disparity (px)"
+        fix, remake = "store depth in mm: focal length (px) x baseline (mm) / disparity (px)", facts.remakes.best
+        if remake and "--depth" in remake.options:
+            command = remake.command({"--depth-relative": ("disparity",), "--depth-unit-mm": None})
+            fix += f", or {command} for relative depth"
         yield Finding("depth-disparity", "error", unit.reason, fix)
     elif facts.depth.relative or unit.unit in ("mm", "none"):
         return
@@ -144,32 +153,35 @@ def _unit(facts: Facts) -> Iterator[Finding]:
 
 
 def _set_scale(facts: Facts, factor: float | None) -> str:
-    """The command that multiplies depth by `factor`; None if the factor is unknown."""
-    scale = "MM_PER_UNIT" if factor is None else f"{facts.depth.scale * factor:.6g}"
-    return (
-        f'set "depth_scale": {scale} in {facts.path}/sequence.json, '
-        f"or {command('train', facts.path, 'RUN', '--data.depth-unit-mm', scale)}"
-    )
+    """What multiplies depth by `factor`; None if the factor is unknown."""
+    if factor is None:
+        return set_values(facts, depth_scale="MM_PER_UNIT")
+    scale = float(f"{facts.depth.scale * factor:.6g}")
+    return f"{set_values(facts, depth_scale=f'{scale:g}')}, or {train(facts, depth_unit_mm=scale)}"
 
 
 def _border(facts: Facts) -> Iterator[Finding]:
-    border, camera = facts.border, facts.camera
-    strips = border.strips
+    border, camera, remakes = facts.border, facts.camera, facts.remakes
+    strips, frames = border.strips, remakes.from_frames
     if border.strips_as_tissue > SEEN_AS_TISSUE and strips:
         sides = " and ".join(f"{size} px at the {name}" for name, size in vars(strips).items() if size)
         what = f"a bar or console strip of {sides} counts as tissue"
-        width = camera.width - strips.left - strips.right
-        height = camera.height - strips.top - strips.bottom
-        crop = command("prepare", "CLIP", "NEW", "--crop", f"{strips.left},{strips.top},{width},{height}")
-        fix = f"{crop}, or mark it in the masks"
+        width, height = camera.width, camera.height
+        x0, x1 = strips.left / width, 1 - strips.right / width
+        y0, y1 = strips.top / height, 1 - strips.bottom / height
+        command = remakes.crop(x0, y0, x1, y1, in_stored_px(facts, width, height))
+        fix = f"{command}, or mark it in the masks" if command else "mark it in the masks"
         yield Finding("console-strip", "warning", what, fix)
     if border.circle and border.outside_as_tissue > SEEN_AS_TISSUE:
         what = f"the image is round (radius {border.circle.radius:.0f} px) and its outside counts as tissue"
-        yield Finding("round-border", "warning", what, "mark the outside in the masks; endoprior prepare does")
+        command = frames and frames.command({"--border": None})
+        yield Finding("round-border", "warning", what, command or "mark the outside in the masks")
     if border.overlays:
         boxes = ", ".join(f"{width}x{height} px at {x}, {y}" for x, y, width, height in border.overlays[:3])
         what = f"burned-in text counts as tissue: {boxes}{' and more' if len(border.overlays) > 3 else ''}"
-        yield Finding("burned-in-text", "warning", what, "mark it in the masks; endoprior prepare does")
+        blank = tuple(",".join(map(str, in_stored_px(facts, *box))) for box in border.overlays)
+        command = frames and frames.command({"--blank": blank})
+        yield Finding("burned-in-text", "warning", what, command or "mark it in the masks")
 
 
 def _motion(facts: Facts) -> Iterator[Finding]:
@@ -179,18 +191,21 @@ def _motion(facts: Facts) -> Iterator[Finding]:
     first = int(beyond[0]) * facts.motion_step if len(beyond) else 0
     what = f"the camera moves, but it is static in the stored poses ({facts.motion.reason})"
     enough = first >= max(FEW_FRAMES, facts.frames / 2)
-    fix = "endoprior prepare CLIP NEW --poses estimate"
-    yield Finding("camera-moves", "warning", what, f"{fix}, or {_until(facts, first)}" if enough else fix)
+    remake = facts.remakes.best
+    fixes = [remake.command({"--poses": ("estimate",)})] if remake else []
+    fixes += [train(facts, first_frames=first)] if enough else []
+    yield Finding("camera-moves", "warning", what, ", or ".join(fixes) or "store the poses of the camera")
 
 
 def _changes(facts: Facts) -> Iterator[Finding]:
-    changes, path = facts.changes, facts.path
+    changes = facts.changes
     if copies := changes.duplicates:
         what = f"{len(copies)} of {facts.frames} frames repeat the one before: {_frames(copies)}"
         originals = sorted(set(range(facts.frames)) - set(copies))
         stride = originals[1] if len(originals) > 1 else 0
         regular = stride > 1 and originals == list(range(0, facts.frames, stride))
-        fix = command("train", path, "RUN", "--data.stride", str(stride)) if regular else f"remove them from {path}"
+        regular = regular and facts.data in (DataConfig(), DataConfig(shrink=facts.data.shrink))
+        fix = train(facts, stride=stride) if regular else skip(facts, copies)
         yield Finding("duplicate-frames", "warning", what, fix, copies)
     for code, frames, what in (
         ("exposure-jump", changes.exposure_jumps, "the brightness of the whole image jumps at"),
@@ -198,11 +213,11 @@ def _changes(facts: Facts) -> Iterator[Finding]:
     ):
         if frames:
             severity: Severity = "error" if code == "scene-cut" else "warning"
-            yield Finding(code, severity, f"{what} {_frames(frames)}", _until(facts, frames[0]), frames)
+            yield Finding(code, severity, f"{what} {_frames(frames)}", longest_part(facts, frames), frames)
     odd = tuple(sorted({*changes.blurred, *changes.off_color}))
     if odd:
         what = f"blurred, covered or outside the body: {_frames(odd)}"
-        yield Finding("unexplained-frames", "warning", what, f"remove them from {path}", odd)
+        yield Finding("unexplained-frames", "warning", what, skip(facts, odd), odd)
 
 
 def _stereo(facts: Facts) -> Iterator[Finding]:
@@ -210,11 +225,14 @@ def _stereo(facts: Facts) -> Iterator[Finding]:
     if stereo is None:
         return
     if stereo.order.swapped:
-        fix = f"swap the folders {path}/images and {path}/right, and measure depth again"
-        yield Finding("swapped-eyes", "error", f"left and right images are swapped ({stereo.reason})", fix)
+        by_hand = f"swap the folders {path}/images and {path}/right, and measure depth again"
+        what = f"left and right images are swapped ({stereo.reason})"
+        yield Finding("swapped-eyes", "error", what, swapped(facts.remakes) or by_hand)
     if stereo.vertical_px > VERTICAL_PX:
         what = f"the rows of left and right images are {stereo.vertical_px:.1f} px apart"
-        yield Finding("vertical-offset", "warning", what, "rectify: endoprior prepare CLIP NEW --calibration FILE")
+        video = facts.remakes.from_video
+        fix = video.command({"--calibration": ("FILE",)}) if video else "rectify both cameras by their calibration"
+        yield Finding("vertical-offset", "warning", what, f"{fix}; FILE must belong to this video" if video else fix)
 
 
 def _points(facts: Facts) -> Iterator[Finding]:
@@ -246,10 +264,3 @@ CHECKS: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
 def _frames(frames: tuple[int, ...]) -> str:
     """Frame numbers as text, at most six ranges: `frames 3-7, 9`."""
     return f"frame{'s' if len(frames) > 1 else ''} {number_ranges(frames, 6)}"
-
-
-def _until(facts: Facts, first: int) -> str:
-    """The command that leaves out the frames from `first` on, or those before it, whichever are fewer."""
-    if first >= facts.frames / 2:
-        return command("train", facts.path, "RUN", "--data.first-frames", str(first))
-    return f"remove frames 0-{first - 1} from {facts.path}"

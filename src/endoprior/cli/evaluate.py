@@ -16,6 +16,7 @@ from .devices import on_device
 from .help_page import Help
 from .parsing import parse
 from .score_table import score_table
+from .trained_scene import open_scene
 
 if TYPE_CHECKING:
     from ..data import FrameSequence
@@ -29,7 +30,10 @@ MOST_MM_PER_UNIT = 1e6
 
 @dataclass
 class Eval:
-    """Score a trained scene, or another program's images; writes metrics.json and per_frame.json."""
+    """Score a trained scene, or another program's images; writes metrics.json and per_frame.json.
+
+    Splits other than test have files of their own: metrics_train.json, per_frame_train.json.
+    """
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder; with --pictures the sequence folder."""
@@ -55,13 +59,13 @@ class Eval:
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
 
-HELP = Help(examples=(("RUN",), ("RUN", "--split", "train", "--out", "OTHER"), ("--pictures", "FOLDER", "DATA")))
+HELP = Help(examples=(("RUN",), ("RUN", "--split", "train"), ("--pictures", "FOLDER", "DATA")))
 
 
 def run(argv: list[str]) -> None:
     """Score and print."""
     args = parse(Eval, argv, "eval", HELP)
-    from ..model.scene import load_scene
+    from ..runs.stored_run import sequence_of_run
     from .output_paths import require_writable_folder
 
     if args.weights_dir and not args.weights_dir.is_dir():
@@ -72,7 +76,7 @@ def run(argv: list[str]) -> None:
     if given := [o for o in ("depth_pictures", "depth_scale", "name") if getattr(args, o) not in (None, "")]:
         option = f"--{given[0].replace('_', '-')}"
         raise input_error(option, "--pictures beside it", "a run", f"Remove {option}, or add --pictures FOLDER.")
-    scene = load_scene(args.run)
+    scene = open_scene(args.run)
     require_writable_folder(
         "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
     )
@@ -136,7 +140,7 @@ def save_and_print(
     run: Path | None = None,
 ) -> None:
     """Write the two files into `out`, and print a table; name frames to look at in the `run`, if there is one."""
-    result.save(out)
+    file = result.save(out)
     better = "\u2191 higher is better, \u2193 lower is better"
     say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({better})")
     for line in score_table(result.scores, result.skipped):
@@ -147,24 +151,4 @@ def save_and_print(
         say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median{look}")
     if sequence.depth_is_relative:
         say("note: the depth of the sequence is relative. Scores in mm compare runs on it, but are not millimeters.")
-    say(f"all scores: {out / 'metrics.json'}; what they mean: docs/scores.md")
-
-
-def sequence_of_run(run_folder: Path) -> Path:
-    """The sequence folder a run was trained on, from its config.json.
-
-    Raises:
-        InputError: config.json is missing or does not name the folder, or the folder is gone.
-    """
-    from ..data.files import read_json
-    from ..data.reading import kind_of
-
-    file, hint = run_folder / "config.json", "Pass --data FOLDER."
-    facts = read_json(file, hint).get("data")
-    path = facts.get("path") if isinstance(facts, dict) else None
-    if not isinstance(path, str) or not path:
-        raise input_error(file, "the path of the sequence", repr(path), hint)
-    data = Path(path)
-    if kind_of(data) != "a folder":
-        raise input_error(data, "the sequence this run was trained on", "no such folder", hint)
-    return data
+    say(f"all scores: {file}; what they mean: docs/scores.md")

@@ -14,6 +14,7 @@ from ..system.console import say
 from .help_page import Help
 from .parsing import parse
 from .progress import Counting
+from .trained_scene import open_scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,10 +46,9 @@ def run(argv: list[str]) -> None:
     """Export."""
     args = parse(Export, argv, "export", HELP)
     from ..export import export
-    from ..model.scene import load_scene
 
     options = ExportOptions(**{field.name: getattr(args, field.name) for field in fields(ExportOptions)})
-    scene = load_scene(args.run)
+    scene = open_scene(args.run)
     with Counting() as progress:
         written = export(scene, args.out, options, partial(progress, "exporting"))
     for path in written:

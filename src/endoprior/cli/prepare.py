@@ -20,8 +20,8 @@ from .progress import Counting
 class Prepare:
     """Write a sequence folder from an endoscope video: rectified frames, depth, tool masks and camera poses.
 
-    To resume after an interruption, run the same command again. Your video never leaves this computer, and no metadata
-    is copied. `--depth depth-anything` downloads its network.
+    To resume after an interruption, run the same command again. Your video never leaves this computer. Of its metadata
+    only its path is kept, in OUT/prepare.json. `--depth depth-anything` downloads its network.
     """
 
     video: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIDEO")]]
@@ -48,12 +48,14 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Prepare the sequence."""
     args = parse(Prepare, argv, "prepare", HELP)
+    from ..data.prepare_record import RECORD
     from ..prepare import prepare
 
     with Counting() as progress:
         done = prepare(args.video, args.out, args.config, progress)
     for note in done.notes:
         say(f"note: {note}")
+    say(f"note: {done.out / RECORD} holds the path of your video; delete it before you share the folder")
     say(f"{done.out}: {done.num_frames} frames of {done.size[0]}x{done.size[1]}")
     say(f"next: {command('check', done.out)}")
     say(f"then: {command('train', done.out, 'RUN')}")

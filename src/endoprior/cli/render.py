@@ -14,6 +14,7 @@ from ..system.console import say
 from .devices import on_device
 from .help_page import Help
 from .parsing import parse
+from .trained_scene import open_scene
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
@@ -49,9 +50,8 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Load the scene and render it."""
     args = parse(Render, argv, "render", HELP)
-    from ..model.scene import load_scene
 
-    scene = load_scene(args.run)
+    scene = open_scene(args.run)
     render(scene, args)
 
 
@@ -63,9 +63,9 @@ def render(scene: Scene, args: Render) -> None:
     scene = on_device(scene, args.device, fp16_planes=True)
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
+    from ..runs.stored_run import sequence_of_run
     from ..visualization.camera_paths import read_path, sway_path, times_path
     from ..visualization.rendered_views import depth_span, write_views
-    from .evaluate import sequence_of_run
 
     frames, total = None, len(scene.cameras)
     if bad := [t for t in args.times if not 0 <= t <= 1]:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import time as clock
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated
 
 import tyro
 
 from ..core.checks import input_error
 from ..core.config import Config
-from ..core.presets import PresetName, preset
+from ..core.presets import PresetName
 from ..core.shell import command
 from ..doctor.choice import Wanted
 from ..runs.progress import training_progress
@@ -20,6 +20,7 @@ from ..system.console import say
 from .devices import with_device
 from .help_page import Help
 from .parsing import parse
+from .start_config import device_to_resume, resume_command, run_to_resume, start_config
 from .view import live_view
 
 
@@ -28,11 +29,13 @@ class Train:
     """Train one scene and score it. The preset sets every number of the method; options change single ones."""
 
     data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
-    """Sequence folder: of `endoprior prepare` or a dataset."""
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    """Sequence folder: of `endoprior prepare` or a dataset. To resume a run, `--resume RUN` alone is enough."""
+    out: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="OUT")]] = None
     """Run folder to write."""
     preset: PresetName = "default"
     """Method: a preset of the config."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
+    """Config of another run (config.json), or YAML with some fields. It overrides the preset; options override it."""
     device: Wanted = "auto"
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
     weights_dir: Path | None = None
@@ -40,7 +43,7 @@ class Train:
     networks: bool = True
     """Scores by networks (RAFT, LPIPS). They need their weights."""
     resume: bool = False
-    """Continue the run in OUT after a stop. The result is bit-identical to an uninterrupted run."""
+    """Continue a run after a stop, with its data and config. The result is bit-identical to an uninterrupted run."""
     checkpoint_seconds: float = 60.0
     """Time between two checkpoints, and the most time that a crash can cost."""
     view: bool = False
@@ -54,10 +57,10 @@ HELP = Help(
     examples=(
         ("DATA", "RUN"),
         ("DATA", "RUN", "--iterations", "3000", "--gaussians", "50000"),
-        ("DATA", "RUN", "--resume"),
+        ("--resume", "RUN"),
     ),
     basics={
-        "method": ("--preset", "--seed"),
+        "method": ("--preset", "--config", "--seed"),
         "what to train on": ("--data.first-frames", "--data.shrink"),
         "how long": ("--iterations", "--resume"),
         "how large": ("--gaussians",),
@@ -74,8 +77,9 @@ HELP = Help(
 
 def run(argv: list[str]) -> None:
     """Train, score, and print the results."""
-    args = parse(Train, argv, "train", HELP, default=_preset_defaults(argv))
-    cfg = with_device(args.config, args.device)
+    args = _arguments(argv)
+    wanted = device_to_resume(args.config) if args.resume and args.device == "auto" else args.device
+    cfg = with_device(args.config, wanted)
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
     port = args.view_port if args.view else None
@@ -113,7 +117,8 @@ def train_and_evaluate(
         with training_progress() as show_progress, live_view(view_port) as show_scene:
             scene = training.complete(show_progress, show_scene, checkpoint_seconds=checkpoint_seconds)
     except KeyboardInterrupt:
-        say(f"Stopped; the state is saved in {out}. To resume, run the same command with --resume.")
+        resume_with = resume_command(out, networks, weights_dir, checkpoint_seconds)
+        say(f"Stopped; the state is saved in {out}. To resume, run `{resume_with}`.")
         raise
     seconds = clock.perf_counter() - began
     del training  # frees its cached frames; scoring loads its own
@@ -133,14 +138,21 @@ def _logged_seconds(log: Path) -> float:
     return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0
 
 
-def _preset_defaults(argv: list[str]) -> Train:
-    """Defaults from the preset named in `argv`, so that --help shows its values and options override them."""
-    name = "default"
-    for i, word in enumerate(argv):
-        if word == "--preset" and i + 1 < len(argv):
-            name = argv[i + 1]
-        elif word.startswith("--preset="):
-            name = word.removeprefix("--preset=")
-    if name not in get_args(PresetName):
-        raise input_error("--preset", f"one of {', '.join(get_args(PresetName))}", repr(name), "`--preset default`.")
-    return Train(data=tyro.MISSING, out=tyro.MISSING, preset=name, config=preset(name))
+def _arguments(argv: list[str]) -> Train:
+    """The parsed arguments. A resumed run takes its config from its folder, and its data too if only RUN is given.
+
+    Raises:
+        InputError: as `parse`; OUT is missing; or the run to resume cannot be read.
+    """
+    name, cfg = start_config(argv)
+    start = Train(data=tyro.MISSING, preset=name, config=cfg)
+    args = parse(Train, argv, "train", HELP, default=start)
+    if not args.resume:
+        if args.out is None:
+            fix = f"`{command('train', args.data, 'RUN')}`."
+            raise input_error("endoprior train", "the run folder to write after DATA", "nothing", fix)
+        return args
+    data, out, stored = run_to_resume(args.data, args.out, argv)
+    if stored is not None:
+        args = parse(Train, argv, "train", HELP, default=replace(start, config=stored))
+    return replace(args, data=data, out=out)

@@ -131,7 +131,7 @@ def _originals(scene: Scene, folder: Path, data: Path | None) -> FrameSequence |
     """
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
-    from .evaluate import sequence_of_run
+    from ..runs.stored_run import sequence_of_run
 
     try:
         sequence = load_sequence(data or sequence_of_run(folder), scored_data(scene.config.data))

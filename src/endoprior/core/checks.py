@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,22 @@ def number_ranges(numbers: Iterable[int], most: int = 8) -> str:
             ranges.append([number, number])
     text = ", ".join(f"{first}" if first == last else f"{first}-{last}" for first, last in ranges[:most])
     return text + (f" and {len(ranges) - most} more" if len(ranges) > most else "")
+
+
+def read_ranges(name: str, text: str) -> frozenset[int]:
+    """The numbers in a text such as `3-5,9`; the inverse of `number_ranges`.
+
+    Args:
+        name: what the error message calls the text.
+    Raises:
+        ValueError: the text has another form, or a number has more than 6 digits.
+    """
+    numbers: set[int] = set()
+    for part in text.replace(" ", "").split(",") if text.strip() else []:
+        if not (ends := re.fullmatch(r"([0-9]{1,6})(?:-([0-9]{1,6}))?", part)):
+            raise ValueError(f"{name} must look like `3-5,9`, got {text[:80]!r}")
+        numbers.update(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
+    return frozenset(numbers)
 
 
 def check_shape(spec: str, **arrays: Any) -> dict[str, int]:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
-from .checks import InputError, check_range
+from .checks import InputError, check_range, read_ranges
 from .config_io import from_dict, override, to_dict
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
@@ -37,6 +37,8 @@ class DataConfig(Checked):
     """Divide width and height by this. 2 averages blocks of 2 x 2 pixels."""
     first_frames: Count = 0
     """Read only the first frames; 0 reads all."""
+    skip_frames: str = ""
+    """Frames to leave out, such as `0-9,15`. Numbers of `endoprior check`, after `stride` and `first_frames`."""
     format: str = "auto"
     """Layout of the folder: a name in docs/datasets.md, such as `endonerf`; `auto` recognizes it."""
     stride: Annotated[int, Range(0, 10_000)] = 0
@@ -46,6 +48,7 @@ class DataConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        read_ranges("skip_frames", self.skip_frames)
         check_range("depth_clip_high_percentile", self.depth_clip_high_percentile, self.depth_clip_low_percentile, 100)
 
 

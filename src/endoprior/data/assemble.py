@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error
+from ..core.checks import input_error, read_ranges
 from ..core.config import DataConfig
 from ..core.geometry import FARTHEST_MM
 from ..core.types import Camera, Frame
@@ -24,16 +24,18 @@ LEAST_FOCAL_PX, MOST_PX = 1e-2, 1e6
 """Range of focal lengths; the principal point, too, lies within the upper one."""
 
 
-def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1) -> range:
+def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1) -> list[int]:
     """Positions in the folder of the frames to read.
 
     Args:
         count: frames in the folder.
-        cfg: `stride` and `first_frames`, which counts frames after striding.
+        cfg: `stride`, `first_frames`, which counts frames after striding, and `skip_frames`, which counts what is left.
         own_stride: the dataset's published stride, used where `cfg.stride` is 0.
     """
     kept = range(0, count, cfg.stride or own_stride)
-    return kept[: cfg.first_frames] if cfg.first_frames else kept
+    kept = kept[: cfg.first_frames] if cfg.first_frames else kept
+    skipped = read_ranges("skip_frames", cfg.skip_frames)
+    return [frame for position, frame in enumerate(kept) if position not in skipped]
 
 
 def assemble(
@@ -69,7 +71,7 @@ def assemble(
     """
     count, width, height = len(cameras), cameras[0].width, cameras[0].height
     if count < 2 or min(width, height) // cfg.shrink < 1:
-        hint = "lower data.shrink or data.stride, or raise data.first_frames."
+        hint = "lower data.shrink or data.stride, raise data.first_frames, or shorten data.skip_frames."
         raise input_error(path, "at least 2 frames of 1x1 px", f"{count} of {width}x{height} / {cfg.shrink}", hint)
 
     _demand_usable(path, cameras)

@@ -11,6 +11,7 @@ from .endonerf import load_endonerf
 from .files import entries
 from .formats import REGISTRY, recognizing
 from .reading import kind_of
+from .recognize import not_a_sequence
 from .sequence import FrameSequence
 
 
@@ -32,6 +33,8 @@ def load_sequence(
     cfg = cfg or DataConfig()
     path = Path(path).expanduser()
     if (kind := kind_of(path)) != "a folder":
+        if error := not_a_sequence(path):
+            raise error
         got = "no such folder" if kind == "nothing" else kind
         raise input_error(path, "a sequence folder", got, "pass the folder that holds images/, masks/ and depth/.")
     name = find_format(path, cfg)
@@ -55,6 +58,8 @@ def find_format(path: Path, cfg: DataConfig) -> str:
         raise input_error("data.format", f"one of {choices}", repr(cfg.format), "see docs/datasets.md.")
     if name := recognizing(path):
         return name
+    if error := not_a_sequence(path):
+        raise error
     names = sorted(entry.name + "/" * entry.is_dir() for entry in entries(path) if not entry.name.startswith("."))
     got = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     known = ", ".join(REGISTRY.names())

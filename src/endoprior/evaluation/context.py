@@ -52,11 +52,18 @@ class Evaluation:
         median = float(np.median([value for _, value in scored])) if scored else 0.0
         return [index for index, value in scored if value < median - OUTLIER_DB]
 
-    def save(self, folder: Path) -> None:
-        """Write `metrics.json` and `per_frame.json`."""
+    def save(self, folder: Path) -> Path:
+        """Write `metrics.json` and `per_frame.json`; for other splits than test `metrics_SPLIT.json` and so on.
+
+        Returns:
+            The file of the scores.
+        """
+        suffix = "" if self.protocol["split"] == "test" else f"_{self.protocol['split']}"
+        file = folder / f"metrics{suffix}.json"
         facts = {name: getattr(self, name) for name in ("protocol", "scores", "skipped")}
-        write_json(folder / "metrics.json", facts | self.provenance)
-        write_json(folder / "per_frame.json", self.per_frame)
+        write_json(file, facts | self.provenance)
+        write_json(folder / f"per_frame{suffix}.json", self.per_frame)
+        return file
 
 
 @dataclass(frozen=True)

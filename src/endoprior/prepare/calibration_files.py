@@ -53,7 +53,7 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     table = {_plain(name): value for name, value in table.items()}
     size, layout = _size(table, path), table.get("layout") if isinstance(table.get("layout"), str) else None
     # Files of this package count pixel centers from 0.5; OpenCV and all others count them from 0.
-    offset = 0.5 - _number(table, "pixelcenter", path, 0.0)
+    offset = 0.5 - _number(table, "pixelcenter", path, 0.5 if path.name == "sequence.json" else 0.0)
     if "fcxleft" in table:
         left, right = _da_vinci_camera(table, "left", offset, path), _da_vinci_camera(table, "right", offset, path)
     else:

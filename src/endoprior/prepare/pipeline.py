@@ -23,6 +23,7 @@ from .first_pass import run_first_pass, source_facts
 from .frame_geometry import FrameGeometry
 from .frames import write_frames
 from .poses import PoseInput, PosePath, estimate_poses, read_poses
+from .record import record_of
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
@@ -87,6 +88,7 @@ def prepare(
         if path is not None and meta.depth_relative:
             _scale_depth(files, path)
         files.finish(None if path is None else path.camera_to_world, unexplained)
+        record_of(video, cfg, first_pass.geometry).save(folder)
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
         notes = [*first_pass.notes, *chosen.notes, *motion_notes]

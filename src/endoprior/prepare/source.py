@@ -19,12 +19,10 @@ from ..core.checks import input_error
 from ..data.files import entries, natural_order
 from ..data.images import MOST_PIXELS, decode_image
 from ..data.reading import kind_of
+from ..data.video_files import STILL_SUFFIXES, open_container
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 LOST_SHARE, LOST_IMAGES = 0.02, 2
 """A video is truncated if more than this share of its duration and more than so many images are missing at its end."""
-CONTAINERS = "mov,mp4,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,ogg,asf,flv,mxf,dv,h264,hevc,av1,obu,ivf,nut,gif"
-"""FFmpeg formats that hold images themselves. Playlists are excluded: they name other files and addresses."""
 AVI = "avi"
 """FFmpeg's name of the format that counts time in images and does not hold when they are shown."""
 RATES = (0.01, 100_000.0)
@@ -66,7 +64,7 @@ class ImageFolder:
     def __init__(self, path: Path, frames_per_second: float) -> None:
         """List the folder; raises InputError if it has no images."""
         self.path, self.frames_per_second = path, frames_per_second
-        found = (file for file in entries(path) if file.suffix.lower() in IMAGE_SUFFIXES and file.name[0] != ".")
+        found = (file for file in entries(path) if file.suffix.lower() in STILL_SUFFIXES and file.name[0] != ".")
         self.files = sorted(found, key=natural_order)
         if not self.files:
             raise input_error(path, "images (PNG, JPEG, TIFF, BMP) or a video file", "none", "Check the path.")
@@ -172,10 +170,8 @@ class Video:
             raise input_error(self.path, want, got, "Cut the video there, or export it at one size.")
 
     def _open(self) -> av.container.InputContainer:
-        # The scheme keeps FFmpeg from reading a colon in the name as an address; the lists restrict it to this file.
-        limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
         try:
-            container = av.open(f"file:{self.path.absolute()}", options=limits)
+            container = open_container(self.path)
         except (av.error.FFmpegError, OSError, UnicodeError) as error:
             # FFmpeg raises ArgumentError for a format that is not in the list.
             unlisted = isinstance(error, av.error.ArgumentError)

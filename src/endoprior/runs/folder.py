@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..core.checks import InputError
+from ..core.shell import command
 from ..data.reading import kind_of
 from ..system.atomic import reject_occupied, remove_leftovers
 
@@ -22,7 +23,9 @@ def reject_unusable_folder(out: Path, *, resume: bool) -> None:
     if exists:
         remove_leftovers(out)
     if not (resume and exists):
-        reject_occupied(out, ", or add --resume to continue a run", ignore=LOCK)
+        is_run = exists and (out / "config.json").is_file()
+        resume_it = f", or resume the run in it: `{command('train', '--resume', out)}`" if is_run else ""
+        reject_occupied(out, resume_it, ignore=LOCK)
 
 
 def prepare_run_folder(out: Path, *, resume: bool) -> bool:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ..core.checks import InputError
 from ..core.config import Config
-from ..core.config_io import current_value, to_dict
+from ..core.config_io import to_dict
+from ..core.shell import command
+from .stored_run import config_of
 
 
 def reject_other_run(
@@ -24,19 +26,22 @@ def reject_other_run(
     Raises:
         InputError: the config differs, or the data do.
     """
-    current = json.loads(json.dumps(to_dict(cfg)))
-    if changed := _first_difference(stored_config if isinstance(stored_config, dict) else {}, current):
-        raise InputError(f"{file}: config differs at {changed}. Resume with the options the run was started with.")
+    reject_other_config(file, config_of(stored_config, file), cfg)
     if stored_fingerprint != fingerprint:
         raise InputError(f"{file}: was trained on other data than {data}. Pass the same sequence.")
 
 
-def _first_difference(old: dict, new: dict, where: str = "") -> str:
-    """Path and both values of the first field that differs."""
+def reject_other_config(file: Path, stored: Config, cfg: Config) -> None:
+    """Raise InputError, with the names of all fields that differ, unless both configs are equal."""
+    if changed := ", ".join(_differences(to_dict(stored), to_dict(cfg))):
+        fix = f"`{command('train', '--resume', file.parent)}` takes the options of the folder"
+        raise InputError(f"{file}: config differs at {changed}. Fix: {fix}; a new run needs a new folder.")
+
+
+def _differences(old: dict[str, Any], new: dict[str, Any], where: str = "") -> Iterator[str]:
+    """Each field that differs, with both values."""
     for name, value in new.items():
-        if isinstance(value, dict) and isinstance(old.get(name), dict):
-            if found := _first_difference(old[name], value, f"{where}{name}."):
-                return found
-        elif name not in old or value != current_value(f"{where}{name}", old[name]):
-            return f"{where}{name} ({old.get(name)!s:.80} in the folder, {value!s:.80} now)"
-    return next((f"{where}{name:.80} (unknown to this version)" for name in old if name not in new), "")
+        if isinstance(value, dict) and isinstance(old[name], dict):
+            yield from _differences(old[name], value, f"{where}{name}.")
+        elif value != old[name]:
+            yield f"{where}{name} ({old[name]!s:.80} in the folder, {value!s:.80} now)"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..core.checks import InputError
 from ..core.config import Config
-from ..data import FrameSequence
+from ..data import FrameSequence, load_sequence
 from ..data.files import read_json
 from ..model.scene import Scene
 from ..system.atomic import write_json, writing
@@ -27,6 +27,7 @@ from .interrupt import deferred_interrupt
 from .observers import CHECKPOINT_SECONDS, CheckpointWriter, LogWriter, cut_log
 from .progress import is_watched, training_progress
 from .provenance import run_facts
+from .stored_run import config_of_run, sequence_of_run
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +37,8 @@ LAST_GOOD = "last_good.safetensors"
 
 
 def train(
-    sequence: FrameSequence,
-    cfg: Config,
+    sequence: FrameSequence | None = None,
+    cfg: Config | None = None,
     out: str | Path | None = None,
     *,
     resume: bool = False,
@@ -48,8 +49,8 @@ def train(
     """Train one scene.
 
     Args:
-        sequence: from `load_sequence`.
-        cfg: from `preset`.
+        sequence: from `load_sequence`; None with `resume`: the sequence of the run.
+        cfg: from `preset`; None with `resume`: the config of the run.
         out: run folder for config, log, checkpoints and `scene.safetensors`; None keeps everything in memory.
         resume: continue the run in `out`, from its last checkpoint if there is one.
         checkpoint_seconds: time between two checkpoints.
@@ -60,7 +61,13 @@ def train(
         Diverged: the loss or a gradient is not finite, or the images show nothing; `out` keeps the state before.
         CannotWrite: a file cannot be written; the last complete state is kept.
         KeyboardInterrupt: the user stopped; a checkpoint has been written.
+        ValueError: no sequence or no config without `resume`.
     """
+    if resume and out is not None:
+        cfg = config_of_run(Path(out)) if cfg is None else cfg
+        sequence = load_sequence(sequence_of_run(Path(out)), cfg.data) if sequence is None else sequence
+    if sequence is None or cfg is None:
+        raise ValueError("train needs a sequence and a config; only with resume=True and out it takes those of the run")
     if progress is None:
         progress = is_watched()
     run = TrainingRun(sequence, cfg, out, resume=resume, say=_print_note if progress else log.info)

@@ -1,0 +1,66 @@
+"""What to type against a problem: commands in backticks, complete, and edits of `sequence.json`. Pure functions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+from ..core.checks import number_ranges, read_ranges
+from ..core.options import changed_options, command_of
+from .facts import Facts
+
+MEASURED_DEPTH = dict.fromkeys(("--depth", "--depth-unit-mm", "--depth-relative"))
+"""Options of depth that comes from files; without them `prepare` measures it."""
+
+
+def set_values(facts: Facts, **values: Any) -> str:
+    """The edit that sets entries of `sequence.json`; it may not exist yet."""
+    entries = ", ".join(f'"{name}": {value}' for name, value in values.items())
+    file = facts.path / "sequence.json"
+    return f"set {entries} in {file}" if facts.described else f"write {{{entries}}} to {file}"
+
+
+def train(facts: Facts, **changes: Any) -> str:
+    """The command that trains with other options of `DataConfig` than those of this check."""
+    options = changed_options(replace(facts.data, **changes), "data.")
+    return f"`{command_of('train', (facts.path, 'RUN'), options)}`"
+
+
+def skip(facts: Facts, frames: tuple[int, ...]) -> str:
+    """The command that trains without some frames, numbered as in this check."""
+    before = read_ranges("skip_frames", facts.data.skip_frames)
+    # Positions of the frames of this check among those that it would have without `skip_frames`.
+    places = [place for place in range(facts.frames + len(before)) if place not in before]
+    left_out = sorted({*before, *(places[frame] for frame in frames)})
+    return train(facts, skip_frames=number_ranges(left_out, len(left_out)).replace(" ", ""))
+
+
+def longest_part(facts: Facts, jumps: tuple[int, ...]) -> str:
+    """The command that trains on the longest part between jumps, each the first frame of a part."""
+    edges = [0, *jumps, facts.frames]
+    first, end = max(pairwise(edges), key=lambda part: part[1] - part[0])
+    if first == 0 and not facts.data.skip_frames:
+        return train(facts, first_frames=end)
+    return skip(facts, (*range(first), *range(end, facts.frames)))
+
+
+def measure_depth_again(facts: Facts) -> str | None:
+    """The command that measures depth by another method than the present one; None if there is none."""
+    remake, present = facts.remakes.best, facts.sources.get("depth", "")
+    if remake is None or present == "shading":
+        return None
+    return remake.command(MEASURED_DEPTH | ({"--depth": ("shading",)} if present.startswith("stereo") else {}))
+
+
+def detect_tools(facts: Facts) -> str | None:
+    """The command that detects tools by color; None if this was done, or cannot be."""
+    remake, present = facts.remakes.best, facts.sources.get("masks", "")
+    if remake is None or "found by color" in present:
+        return None
+    return remake.command({"--masks": None, "--mask-tool-value": None})
+
+
+def in_stored_px(facts: Facts, *values: float) -> list[int]:
+    """Pixels of the frames as read, in pixels of the stored frames."""
+    return [round(value * facts.data.shrink) for value in values]

@@ -1,0 +1,135 @@
+"""What lies at a path that is not a sequence folder, and the command that makes use of it. Reads names only."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from ..core.checks import InputError, input_error
+from ..core.shell import command, quoted
+from .files import entries, read_json
+from .formats import recognizing
+from .reading import kind_of
+from .video_files import STILL_SUFFIXES, VIDEO_SUFFIXES, is_video
+
+ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".7z", ".rar")
+CALIBRATIONS = (".ini", ".yaml", ".yml", ".npz")
+RUN_FILES = ("scene.safetensors", "checkpoint.safetensors", "log.jsonl")
+SIDE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
+"""The word of a name that tells the left camera from the right one."""
+
+
+def is_sequence(folder: Path) -> bool:
+    """Whether a folder has one of the layouts of docs/datasets.md."""
+    try:
+        return recognizing(folder) is not None
+    except OSError:  # not readable
+        return False
+
+
+def is_run(folder: Path) -> bool:
+    """Whether `train` wrote a folder."""
+    return (folder / "config.json").is_file() and any((folder / name).is_file() for name in RUN_FILES)
+
+
+def not_a_sequence(path: Path) -> InputError | None:
+    """The error for a path that is no sequence folder but can be used otherwise; None if nothing is recognized.
+
+    Raises:
+        InputError: the path cannot be read.
+    """
+    kind = kind_of(path)
+    if kind == "a file":
+        found = _file(path)
+    else:
+        found = _folder(path) if kind == "a folder" else None
+    return found and input_error(path, "a sequence folder", *found)
+
+
+def not_a_run(path: Path) -> InputError | None:
+    """The error for a path that is no run folder but can be trained on, perhaps after `prepare`; None for others."""
+    if kind_of(path) == "a folder" and is_sequence(path):
+        fix = f"`{command('train', path, 'RUN')}`, then pass RUN."
+        return input_error(path, "a run folder", "a sequence folder", fix)
+    if kind_of(path) == "a file" and is_video(path):
+        return input_error(path, "a run folder", "a video", f"{_prepare(path)}, and train on it.")
+    return None
+
+
+def _file(path: Path) -> tuple[str, str] | None:
+    """What a file is, and the fix; None if it is not recognized."""
+    if path.suffix.lower() in ARCHIVES:
+        return "an archive", "unpack it and pass the folder."
+    if path.name in RUN_FILES:
+        return "a file of a run", f"`{command('view', path.parent)}`, or pass the sequence folder of the run."
+    return ("a video", f"{_prepare(path)}.") if is_video(path) else None
+
+
+def _folder(path: Path) -> tuple[str, str] | None:
+    """What a folder is, and the fix; None if it is not recognized."""
+    if is_run(path):
+        return "a run folder", _fix_of_run(path)
+    parent = Path(os.path.abspath(path)).parent
+    if is_sequence(parent):
+        return "a part of a sequence folder", f"pass {quoted(parent)}."
+    inside = sorted(entry for entry in entries(path) if not entry.name.startswith("."))
+    folders = [entry for entry in inside if entry.is_dir()]
+    sequences = [folder for folder in folders if is_sequence(folder)]
+    if len(sequences) == 1:
+        return "a folder with one sequence folder in it", f"pass {quoted(sequences[0])}."
+    videos = [entry for entry in inside if entry.suffix.lower() in VIDEO_SUFFIXES and entry.is_file()]
+    if len(videos) == 1:
+        return "a folder with a video", f"{_prepare(videos[0])}."
+    for what, pair in (("videos", _pair(videos)), ("image folders", _pair([f for f in folders if _has_images(f)]))):
+        if pair:
+            return f"{what} of two cameras", f"{_prepare_pair(*pair, inside)}."
+    if not sequences and _has_images(path):
+        return "a folder of images", f"{_prepare(path)}."
+    return None
+
+
+def _fix_of_run(path: Path) -> str:
+    is_done = (path / "scene.safetensors").is_file()
+    use = command("view", path) if is_done else command("train", "--resume", path)
+    data = None
+    with suppress(InputError):  # a damaged file: the run can still be named
+        data = read_json(path / "config.json").get("data")
+    place = data.get("path") if isinstance(data, dict) else None
+    sequence = f"pass its sequence, {quoted(place)}" if isinstance(place, str) and place else "pass a sequence folder"
+    return f"`{use}` {'shows' if is_done else 'resumes'} the run; else {sequence}."
+
+
+def _prepare(path: Path, *options: str | Path) -> str:
+    """The commands that make a sequence folder beside `path`, and check it."""
+    whole = path if path.name not in ("", "..") else Path(os.path.abspath(path))
+    out = whole.with_name(f"{whole.stem if whole.is_file() else whole.name}_data")
+    return f"`{command('prepare', path, out, *options)}`, then `{command('check', out)}`"
+
+
+def _prepare_pair(left: Path, right: Path, inside: Sequence[Path]) -> str:
+    files = [entry for entry in inside if entry.suffix.lower() in CALIBRATIONS]
+    files += [entry for entry in inside if entry.suffix == ".json" and "calib" in entry.name.lower()]
+    return _prepare(left, "--right", right, "--calibration", files[0] if len(files) == 1 else "FILE")
+
+
+def _pair(paths: Sequence[Path]) -> tuple[Path, Path] | None:
+    """(left, right) if there are two paths whose names differ in that word only."""
+    sides = {}
+    for path in paths:
+        if (words := SIDE.findall(path.stem)) and len(words) == 1:
+            sides[words[0][0].lower()] = path
+    if len(paths) != 2 or set(sides) != {"l", "r"}:
+        return None
+    rest = {SIDE.sub("", path.stem) for path in paths}
+    return (sides["l"], sides["r"]) if len(rest) == 1 else None
+
+
+def _has_images(folder: Path) -> bool:
+    """Whether a folder has two images or more."""
+    try:
+        return sum(entry.suffix.lower() in STILL_SUFFIXES and entry.name[0] != "." for entry in folder.iterdir()) > 1
+    except OSError:  # not readable
+        return False
