@@ -8,7 +8,7 @@ import pytest
 from endoprior.cli.step_display import duration
 from endoprior.core.presets import preset
 from endoprior.pipeline.estimate import FRAMES, Trial, scaled, shortened
-from endoprior.pipeline.part import BYTES_PER_GAUSSIAN, choose_part, player_times, usable_frames
+from endoprior.pipeline.part import choose_part, every_kth_time, usable_frames
 
 WHOLE = (0.0, math.inf)
 
@@ -50,12 +50,10 @@ def test_a_video_of_unknown_length_is_limited_too():
     assert part.num_frames == 60
 
 
-def test_a_player_keeps_every_frame_that_fits():
-    assert player_times(4, 1000, 10**9) == [0, 0.25, 0.5, 0.75]
-    times = player_times(250, 30_000, 20_000_000)
-    assert len(times) * 30_000 * BYTES_PER_GAUSSIAN <= 20_000_000
-    assert times[0] == 0 and len(times) > 40
-    assert player_times(10, 10**9, 1) == [0]
+def test_times_are_those_of_evenly_spaced_frames():
+    assert every_kth_time(4, 4) == [0, 0.25, 0.5, 0.75]
+    assert every_kth_time(4, 3.9) == [0, 0.5]
+    assert every_kth_time(10, 0.2) == [0]
 
 
 def test_frames_end_where_the_camera_is_lost():
@@ -69,14 +67,14 @@ def test_frames_end_where_the_camera_is_lost():
 def test_the_estimate_of_the_trial_itself_is_what_the_trial_took():
     trial = Trial(
         decode=0.01, look=1.0, write=0.2, follow=0.5, check=3.0, start=1.0, half_iteration=0.02, iteration=0.05,
-        render=0.01, score=2.5, film=0.6, player=0.7,
+        render=0.01, score=2.5, film=0.06, player=0.7,
     )  # fmt: skip
     cfg = replace(preset(), schedule=replace(preset().schedule, fine_iterations=1500, half_resolution_iterations=500))
     seconds = scaled(trial, cfg, FRAMES, FRAMES)
     assert seconds["prepare"] == pytest.approx(1.0 + FRAMES * 0.2 + 0.5 + FRAMES * 0.01 - FRAMES * 0.01)
     assert seconds["train"] == pytest.approx(1.0 + 500 * 0.02 + 1000 * 0.05)
     assert (seconds["check"], seconds["score"]) == (pytest.approx(3.0), pytest.approx(2.5))
-    assert scaled(trial, cfg, 10 * FRAMES, 10 * FRAMES)["video"] == pytest.approx(6.0)
+    assert scaled(trial, cfg, 100, 100)["video"] == pytest.approx(100 * 0.06)
 
 
 def test_iterations_of_the_trial_cost_what_those_of_the_job_cost():

@@ -11,8 +11,10 @@ import tomllib
 import zipfile
 from pathlib import Path
 
+import cv2
 import pytest
 import yaml
+from video_files import write_video
 
 ROOT = Path(__file__).parents[1]
 LEFT_OUT = {".git", ".venv", ".hypothesis", ".pytest_cache", ".ruff_cache", "build", "demo", "dist", "figures", "runs"}
@@ -118,12 +120,16 @@ def test_the_wheel_works_outside_of_the_repository(endoprior, commit, tmp_path):
     assert f"commit {commit};" in doctor
     (docs,) = {Path(text.split("in ")[-1].strip()) for text in help_text.splitlines() if text.endswith("docs")}
     assert docs.parts[-2:] == ("endoprior", "docs") and (docs / "datasets.md").is_file()
-    run("phantom", "data", "--frames", "9", "--width", "64", "--height", "48")
+    run("phantom", "data", "--frames", "12", "--width", "128", "--height", "96")
     run("train", "data", "run", *SMALL_TRAINING)
     assert json.loads((tmp_path / "run" / "config.json").read_text())["commit"] == commit
     run("export", "run", "player.html", "--format", "html")
     assert (tmp_path / "player.html").stat().st_size > 10_000
     assert "Quick look" in run("bench", "quick", "quick", "--report-only")
+    images = [cv2.imread(str(file))[..., ::-1] for file in sorted((tmp_path / "data" / "images").glob("*.png"))]
+    write_video(tmp_path / "clip.mp4", images)
+    assert "Open first/player.html in a browser." in run("run", "clip.mp4", "first", "--preview")
+    assert (tmp_path / "first" / "player.html").stat().st_size > 10_000
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(SPEC))
     run("bench", "tiny.yaml", "tiny", "--cores", "1")
     assert f"trained at commit {commit}." in (tmp_path / "tiny" / "results.md").read_text()

@@ -16,12 +16,22 @@ from typing import Any
 
 import numpy as np
 
-from ..core.checks import input_error
+from ..core.checks import InputError, input_error
 from ..model.scene import Scene
 from ..system.atomic import whole_file
 from .formats import Format, Progress
 from .html_data import CHANNELS, Quantized, pack, quantize
 from .options import ExportOptions
+
+
+class PageTooLarge(InputError):
+    """The page would exceed the limit."""
+
+    def __init__(self, message: str, num_bytes: int) -> None:
+        super().__init__(message)
+        self.num_bytes = num_bytes
+        """Size of the page."""
+
 
 DATA_FORMAT = "endoprior-player-1"
 """Name and version of the data in the page."""
@@ -58,7 +68,7 @@ def write_html(
         `out`.
     Raises:
         InputError: `out` is a folder, `times` is empty or not increasing, no Gaussian is visible, or the page would
-            exceed `max_bytes`.
+            exceed `max_bytes` (`PageTooLarge`).
         ValueError: a time is not in [0, 1].
     """
     out = Path(out)
@@ -74,7 +84,8 @@ def write_html(
     if len(page) > max_bytes:
         got = f"{len(page) / 1e6:.1f} MB for {len(times)} time steps of {quantized.values.shape[2]} Gaussians"
         fix = "choose fewer with --times (the size grows with their number), or raise --max-mb."
-        raise input_error(out, f"at most {max_bytes / 1e6:.1f} MB", got, fix)
+        error = input_error(out, f"at most {max_bytes / 1e6:.1f} MB", got, fix)
+        raise PageTooLarge(str(error), len(page))
     with whole_file(out) as temporary:
         temporary.write_bytes(page)
     return out

@@ -24,10 +24,12 @@ from ..training.trainer import Trainer
 from .job import Job
 from .steps import STEPS, run_step
 
-FRAMES = 12
+FRAMES = 10
 """Frames of the trial."""
 ITERATIONS = 6
-"""Timed iterations at each resolution, after one that fills caches and is not timed."""
+"""Timed iterations at each resolution, after one that is not timed."""
+CHECK_FRAMES = 120
+"""So many more frames double the time of `check`, most of which goes into a few samples. Measured: docs/log.md."""
 A = TypeVar("A")
 
 
@@ -45,13 +47,14 @@ class Trial:
     """Camera path."""
     check: float
     start: float
-    """First points and their motion."""
+    """First points and their motion, and everything that is computed once for each frame."""
     half_iteration: float
     iteration: float
     render: float
     """One frame."""
     score: float
     film: float
+    """One frame of the video."""
     player: float
 
 
@@ -85,10 +88,10 @@ def scaled(trial: Trial, cfg: Config, num_frames: int, num_images: int) -> dict[
         + (trial.look - FRAMES * trial.decode) * min(SAMPLES, num_frames) / FRAMES
         + num_frames * (trial.write - trial.decode)
         + trial.follow * more,
-        "check": trial.check * more,
+        "check": trial.check * (1 + (num_frames - FRAMES) / CHECK_FRAMES),
         "train": trial.start * more + half * trial.half_iteration + full * trial.iteration,
         "score": max(trial.score - speed, 0.0) * more + speed,
-        "video": trial.film * more,
+        "video": trial.film * num_frames,
         "player": trial.player * more,
     }
 
@@ -99,43 +102,37 @@ def _measure(job: Job, folder: Path) -> Trial:
     end = part.start + (FRAMES - 0.5) / part.frames_per_second
     short = replace(job, out=folder, prepare=replace(job.prepare, end=min(end, job.prepare.end)))
     folder.mkdir(parents=True)
-    times: dict[str, list[float]] = {}
-
-    def note_time(what: str, done: int, total: int) -> None:
-        times.setdefault(what, []).append(clock.perf_counter())
-
+    stamps = Stamps()
     source = open_source(job.video, job.prepare.folder_rate)
     decode, _ = _timed(lambda: [None for _ in islice(source, FRAMES)])
-    prepare(short.video, short.data, short.prepare, note_time)
+    prepare(short.video, short.data, short.prepare, stamps)
     prepared = clock.perf_counter()
-    looked, written, followed = (
-        times[phase] for phase in ("looking through", "writing frames", "following the camera")
-    )
-    write = (written[-1] - written[0]) / max(len(written) - 1, 1)
+    looked, followed = stamps.at["looking through"][0], stamps.at["following the camera"][0]
+    write = stamps.step("writing frames")
 
     trainer = Trainer(load_sequence(short.data, job.cfg.data), shortened(job.cfg, part.num_frames))
-    start, _ = _timed(trainer.start)
+    start, _ = _timed(partial(_start, trainer))
     iterations = [_timed(trainer.step)[0] for _ in range(2 * ITERATIONS + 2)]
     scene = trainer.scene()
     scene.save(short.run / "scene.safetensors")
     sequence = load_sequence(short.data, scored_data(job.cfg.data))
     score, result = _timed(lambda: evaluate(scene, sequence, networks=False))
     steps = {step.name: step for step in STEPS}
-    check, film, player = (
-        _timed(partial(run_step, steps[name], short, _quiet))[0] for name in ("check", "video", "player")
+    check, _, player = (
+        _timed(partial(run_step, steps[name], short, stamps))[0] for name in ("check", "video", "player")
     )
     return Trial(
         decode=decode / FRAMES,
-        look=written[0] - looked[0] - REACH * write,  # the first frame waits for its neighbors
+        look=stamps.at["writing frames"][0] - looked - REACH * write,  # the first frame waits for its neighbors
         write=write,
-        follow=prepared - followed[0],
+        follow=prepared - followed,
         check=check,
         start=start,
         half_iteration=median(iterations[1 : ITERATIONS + 1]),
         iteration=median(iterations[ITERATIONS + 2 :]),
         render=1 / result.scores["fps"],
         score=score,
-        film=film,
+        film=stamps.step("rendering"),
         player=player,
     )
 
@@ -152,8 +149,29 @@ def shortened(cfg: Config, num_frames: int) -> Config:
     return replace(cfg.fitted(num_frames), schedule=schedule, temporal=temporal)
 
 
-def _quiet(what: str, done: int, total: int) -> None:
-    """No progress."""
+class Stamps:
+    """A progress callback that keeps the time of each call."""
+
+    def __init__(self) -> None:
+        self.at: dict[str, list[float]] = {}
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """See `Progress`."""
+        self.at.setdefault(what, []).append(clock.perf_counter())
+
+    def step(self, what: str) -> float:
+        """Mean time between two calls, s."""
+        times = self.at[what]
+        return (times[-1] - times[0]) / max(len(times) - 1, 1)
+
+
+def _start(trainer: Trainer) -> None:
+    """Start the training, and fill its caches: in the trial, few iterations would meet a frame for the first time."""
+    trainer.start()
+    frames = trainer.step_once.frames
+    for position in range(len(frames)):
+        frames.frame(position, half=True)
+        frames.prior(position)
 
 
 def _timed(act: Callable[[], A]) -> tuple[float, A]:

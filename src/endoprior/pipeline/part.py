@@ -1,4 +1,4 @@
-"""Choose the part of a video that one scene can show, and the time steps that fit into a player. Pure functions."""
+"""Choose the part of a video that one scene can show. Pure functions."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ LOST_FRAMES = 5
 """So many frames in a row without a pose: the camera is lost. Fewer are blurred or covered."""
 FEWEST_FRAMES = 20
 """Fewer frames are not worth a scene."""
-BYTES_PER_GAUSSIAN = 9.0
-"""Size of one Gaussian at one time step in the player. Measured: 7.4 (docs/export.md); the rest is reserve."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +54,9 @@ def choose_part(seconds: float, rate: float, wanted_rate: float, start: float, e
     return Part(used, start, end, count, True)
 
 
-def player_times(num_frames: int, num_gaussians: int, max_bytes: int) -> list[float]:
-    """Times in [0, 1) of every k-th frame, with the smallest k whose player has at most `max_bytes`."""
-    fitting = max(int(max_bytes / (num_gaussians * BYTES_PER_GAUSSIAN)), 1)
-    return [i / num_frames for i in range(0, num_frames, math.ceil(num_frames / fitting))]
+def every_kth_time(num_frames: int, most: float) -> list[float]:
+    """Times in [0, 1) of every k-th frame, with the smallest k that gives at most `most` of them, or one."""
+    return [i / num_frames for i in range(0, num_frames, math.ceil(num_frames / max(int(most), 1)))]
 
 
 def usable_frames(num_frames: int, unexplained: list[int], cuts: list[int]) -> int:

@@ -17,7 +17,7 @@ from ..data.description import read_description
 from ..data.files import read_json
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
-from ..export.html import write_html
+from ..export.html import PageTooLarge, write_html
 from ..model.scene import load_scene
 from ..prepare import prepare
 from ..runs.report import write_report
@@ -27,12 +27,14 @@ from ..visualization.image_tools import colorize, label, tile, to_u8
 from ..visualization.rendered_views import depth_span
 from ..visualization.video import write_video
 from .job import Job
-from .part import player_times, usable_frames
+from .part import every_kth_time, usable_frames
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much is done, and how much there is (0: unknown)."""
-PLAYER_BYTES = 20_000_000
-"""Largest player: a browser opens it at once, and it can be sent by mail."""
+PLAYER_BYTES = 40_000_000
+"""Largest player; browsers open it in a second or two."""
+LEAST_BYTES = 7
+"""Size of one Gaussian at one time step in the player; at least this (docs/export.md)."""
 SHOWN_SCORES = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis")
 
 
@@ -124,8 +126,14 @@ def _film(job: Job, progress: Progress) -> list[str]:
 def _player(job: Job, progress: Progress) -> list[str]:
     progress("packing", 0, 0)
     scene = load_scene(job.run)
-    times = player_times(len(scene.cameras), len(scene.gaussians), PLAYER_BYTES)
-    write_html(scene, job.player, title=job.video.stem, times=times, max_bytes=PLAYER_BYTES)
+    times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (len(scene.gaussians) * LEAST_BYTES))
+    while not job.player.exists():
+        try:
+            write_html(scene, job.player, title=job.video.stem, times=times, max_bytes=PLAYER_BYTES)
+        except PageTooLarge as error:  # its size is known only when it is packed
+            if len(times) == 1:
+                raise
+            times = every_kth_time(len(scene.cameras), len(times) * PLAYER_BYTES / error.num_bytes)
     if len(times) == len(scene.cameras):
         return []
     return [f"{len(times)} of {len(scene.cameras)} frames, so that the page stays below {PLAYER_BYTES / 1e6:.0f} MB"]
