@@ -77,7 +77,7 @@ def test_unknown_folder_is_described(tmp_path):
 
 def test_missing_folder_and_file(tmp_path):
     assert_rejected(tmp_path / "gone", "gone", "got no such folder")
-    assert_rejected(touch(tmp_path, "a.mp4") / "a.mp4", "a.mp4", "got a file")
+    assert_rejected(touch(tmp_path, "a.mp4") / "a.mp4", "a.mp4", "got a video. Fix: `endoprior prepare")
 
 
 def test_ranges_of_the_options():

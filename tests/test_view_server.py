@@ -305,4 +305,4 @@ def test_wrong_input_is_one_line(tmp_path, capsys, tiny_sequence):
     assert main(["view", str(running)]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 4 and all(line.startswith("endoprior: ") for line in lines)
-    assert "train --view" in lines[3]
+    assert "endoprior train --resume" in lines[3]

@@ -111,7 +111,7 @@ def open_viewable(path: Path, data: Path | None, device: Wanted = "cpu") -> tupl
     folder = path.parent if path.name == "scene.safetensors" else path
     if not os.path.isfile(folder / "scene.safetensors"):  # pathlib raises for a name that is too long
         if (folder / "config.json").is_file() and (folder / "log.jsonl").is_file():
-            again = command("train", "DATA", folder, "--resume", "--view")
+            again = command("train", "--resume", folder, "--view")
             fix = f"Wait until training is done. To see it before, stop it and run `{again}`."
             raise input_error(folder / "scene.safetensors", "a trained scene", "none yet", fix)
         return ViewableSequence(load_sequence(path)), None
