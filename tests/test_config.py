@@ -104,10 +104,10 @@ def test_replaced_fields_are_set_and_the_others_stay():
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"optim.mean_lr": 1.0}, r"got optim\.mean_lr\. Fix: use `optim\.means_lr`\."),
-        ({"budget": 3}, r"got budget\. Fix: use `init\.budget`\."),
+        ({"optim.mean_lr": 1.0}, r"got optim\.mean_lr\. Fix: Use `optim\.means_lr`\."),
+        ({"budget": 3}, r"got budget\. Fix: Use `init\.budget`\."),
         ({"init": 3}, "got init"),
-        ({"zzz": 3}, r"got zzz\. Fix: see `endoprior train --help-all`\."),
+        ({"zzz": 3}, r"got zzz\. Fix: See `endoprior train --help-all`\."),
         ({"init.budget": 0}, r"budget must be in \[1, 1e\+07\], got 0"),
         ({"init.budget": "many"}, r"config\.init\.budget: expected an integer"),
     ],

@@ -129,12 +129,12 @@ ON_VALIDATE = {
     "mask of 0 and 1": (
         replaced("masks/000003.png", np.eye(*SIZE, dtype=np.uint8)),
         "masks/000003.png",
-        "got 1. Fix: multiply",
+        "got 1. Fix: Multiply",
     ),
     "mask smoothed": (
         replaced("masks/000003.png", np.arange(1920, dtype=np.uint8).reshape(SIZE)),
         "masks/000003.png",
-        "expected mask values 0 and 255, got 1, 2, 3, 4 and more. Fix: threshold",
+        "expected mask values 0 and 255, got 1, 2, 3, 4 and more. Fix: Threshold",
     ),
     "mask 16 bit": (replaced("masks/000003.png", np.zeros(SIZE, np.uint16)), "masks/000003.png", "an 8-bit mask"),
     "mask in color": (

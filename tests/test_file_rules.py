@@ -109,7 +109,7 @@ def test_a_failure_with_an_open_file_is_reported_as_such(windows, tmp_path):
 
 def test_a_file_that_another_program_holds_is_named_in_one_line(windows, tmp_path):
     write_text(tmp_path / "a.txt", "before")
-    with open(tmp_path / "a.txt", "rb"), pytest.raises(CannotWrite, match="Fix: close other programs that use it"):
+    with open(tmp_path / "a.txt", "rb"), pytest.raises(CannotWrite, match="Fix: Close other programs that use it"):
         write_text(tmp_path / "a.txt", "after")
     assert names_in(tmp_path) == ["a.txt"] and (tmp_path / "a.txt").read_bytes() == b"before"
 

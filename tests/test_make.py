@@ -55,9 +55,9 @@ def make(checkout: Path, *words: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("name", "text", "says"),
     [
-        ("python3", None, "python3: expected Python 3.11 or newer, got none. Fix: install it"),
-        ("python3", python_with(OLD), "python3: expected Python 3.11 or newer, got 3.9. Fix: install it"),
-        ("python9", python_with(OLD), "python9: expected Python 3.11 or newer, got 3.9. Fix: install it"),
+        ("python3", None, "python3: expected Python 3.11 or newer, got none. Fix: Install it"),
+        ("python3", python_with(OLD), "python3: expected Python 3.11 or newer, got 3.9. Fix: Install it"),
+        ("python9", python_with(OLD), "python9: expected Python 3.11 or newer, got 3.9. Fix: Install it"),
         (
             "python3",
             python_with(WITHOUT_VENV),

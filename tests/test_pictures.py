@@ -138,7 +138,7 @@ def test_depth_is_scored(tmp_path, sequence, suffix, scale):
     [
         (np.zeros((40, 50, 3), np.uint8), "expected 48x40 px like the frames of the sequence, got 50x40"),
         (np.zeros((40, 48), np.uint8), "expected an 8-bit or 16-bit RGB image, got 8-bit, 1 channel"),
-        (np.zeros((40, 48, 4), np.uint8), "got 8-bit, 4 channels. Fix: save it without alpha"),
+        (np.zeros((40, 48, 4), np.uint8), "got 8-bit, 4 channels. Fix: Save it without alpha"),
     ],
 )
 def test_files_that_cannot_be_scored_are_named(tmp_path, sequence, pixels, said):

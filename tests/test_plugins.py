@@ -89,7 +89,7 @@ def test_a_plugin_that_is_not_what_it_promises_is_named(install, capsys, registr
 
 def test_a_missing_object_is_named(install):
     install({"datasets": {"mine": "good_module:ABSENT"}}, good_module="")
-    with pytest.raises(InputError, match=r"has no attribute 'ABSENT'\. Fix: update or uninstall other-pkg"):
+    with pytest.raises(InputError, match=r"has no attribute 'ABSENT'\. Fix: Update or uninstall other-pkg"):
         DATASETS.load("mine")
 
 

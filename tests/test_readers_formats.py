@@ -70,7 +70,7 @@ def test_option_wins_over_what_the_folder_looks_like(tmp_path, name):
 
 def test_unknown_folder_is_described(tmp_path):
     known = "scared, c3vd, stir, stereomis, hamlyn, endonerf, plain"
-    assert_rejected(tmp_path, tmp_path.name, f"the layouts {known}, got an empty folder. Fix: see docs/datasets.md.")
+    assert_rejected(tmp_path, tmp_path.name, f"the layouts {known}, got an empty folder. Fix: See docs/datasets.md.")
     touch(tmp_path, *"abcdef", "g/x", ".hidden")
     assert_rejected(tmp_path, tmp_path.name, "got a, b, c, d, e and 2 more")
 
@@ -122,7 +122,7 @@ def test_origins_of_an_endonerf_folder(tiny_sequence):
 
 def test_description_is_checked_before_pictures_are_read(tiny_sequence):
     (tiny_sequence / "sequence.json").write_text(json.dumps({"format_version": 99}))
-    with pytest.raises(InputError, match="update endoprior"):
+    with pytest.raises(InputError, match="Update endoprior"):
         load_sequence(tiny_sequence)
 
 

@@ -78,14 +78,14 @@ def test_fingerprint_knows_the_calibration(prepared):
 def test_raw_sequence_is_sent_to_prepare(tmp_path):
     (tmp_path / "masks").mkdir()
     (tmp_path / "StereoCalibration.ini").write_text("[StereoLeft]\n")
-    assert_rejected(tmp_path, "StereoCalibration.ini", "run endoprior prepare on its video")
+    assert_rejected(tmp_path, "StereoCalibration.ini", "Run endoprior prepare on its video")
 
 
 BAD = {
     "other split": (
         lambda f: edit_json(f / "split.json", test_indices=[0, 8]),
         "split.json",
-        "test_indices of the rule (i - 1) % 8 == 0, 2 frames, got 2 frames that differ. Fix: remove split.json",
+        "test_indices of the rule (i - 1) % 8 == 0, 2 frames, got 2 frames that differ. Fix: Remove split.json",
     ),
     "missing key": (lambda f: edit_json(f / "split.json", train_indices=None), "split.json", "a list train_indices"),
     "broken split": (lambda f: (f / "split.json").write_text("["), "split.json", "a JSON object"),

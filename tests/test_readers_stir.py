@@ -81,7 +81,7 @@ def test_errors_go_to_the_nearest_end():
 
 
 def test_a_cropped_folder_is_rejected(clip, make_tiny_sequence):
-    with pytest.raises(InputError, match=r"whole image of .*icgstartseg\.png, got 48x30 px for 96x80\. Fix: prepare"):
+    with pytest.raises(InputError, match=r"whole image of .*icgstartseg\.png, got 48x30 px for 96x80\. Fix: Prepare"):
         write_stir_tracks(clip, make_tiny_sequence("cropped", height=30))
 
 

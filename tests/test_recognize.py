@@ -88,8 +88,8 @@ def test_two_cameras(tmp_path, frames, capsys, kind):
 def test_a_folder_around_or_in_a_sequence(tmp_path, make_tiny_sequence, capsys):
     data = make_tiny_sequence("a b/data")
     text = complaint(capsys, "check", data.parent)
-    assert f"got a folder with one sequence folder in it. Fix: pass '{data}'." in text
-    assert f"got a part of a sequence folder. Fix: pass '{data}'." in complaint(capsys, "check", data / "images")
+    assert f"got a folder with one sequence folder in it. Fix: Pass '{data}'." in text
+    assert f"got a part of a sequence folder. Fix: Pass '{data}'." in complaint(capsys, "check", data / "images")
     shutil.copytree(data, data.parent / "data2")
     assert "expected one of the layouts" in complaint(capsys, "check", data.parent)
 
@@ -123,9 +123,9 @@ def test_a_sequence_or_a_video_where_a_run_is_expected(tmp_path, make_tiny_seque
 def test_archives_and_what_is_not_recognized(tmp_path, capsys):
     for name in ("data.zip", "data.tar.gz"):
         (tmp_path / name).write_bytes(b"PK")
-        assert "got an archive. Fix: unpack it and pass the folder." in complaint(capsys, "check", tmp_path / name)
+        assert "got an archive. Fix: Unpack it and pass the folder." in complaint(capsys, "check", tmp_path / name)
     (tmp_path / "notes.txt").write_text("no video")
-    assert "got a file. Fix: pass the folder that holds images/" in complaint(capsys, "check", tmp_path / "notes.txt")
+    assert "got a file. Fix: Pass the folder that holds images/" in complaint(capsys, "check", tmp_path / "notes.txt")
     assert "got no such folder." in complaint(capsys, "check", tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "got an empty folder." in complaint(capsys, "check", tmp_path / "empty")

@@ -11,9 +11,9 @@ stop() {
 # What the system's Python lacks, before venv fails in words of its own.
 check_python() {
     found=$("$1" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null) ||
-        stop "$1: expected Python 3.11 or newer, got none. Fix: install it, or name it, as in \`make demo PYTHON=python3.12\`."
+        stop "$1: expected Python 3.11 or newer, got none. Fix: Install it, or name it, as in \`make demo PYTHON=python3.12\`."
     "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
-        stop "$1: expected Python 3.11 or newer, got $found. Fix: install it, then \`make demo PYTHON=python3.12\`."
+        stop "$1: expected Python 3.11 or newer, got $found. Fix: Install it, then \`make demo PYTHON=python3.12\`."
     "$1" -c 'import ensurepip, venv' 2>/dev/null ||
         stop "$1: expected the modules venv and ensurepip, got none. Fix: \`sudo apt install python$found-venv\` (Debian, Ubuntu)."
 }

@@ -86,18 +86,18 @@ def system_failure(error: Exception) -> str | None:
     whole = " ".join(str(error).split())
     if type(error).__name__ == "OutOfMemoryError":  # raised by torch for a GPU; its message starts with the numbers
         return (
-            f"expected enough GPU memory, got {whole[:160]!r}. Fix: use smaller frames, fewer --gaussians or "
+            f"expected enough GPU memory, got {whole[:160]!r}. Fix: Use smaller frames, fewer --gaussians or "
             "--device cpu. The last checkpoint of a run is complete; resume with `endoprior train --resume RUN`."
         )
     text = whole[-160:]
     if isinstance(error, MemoryError) or any(words in text for words in NO_MEMORY):
         return (
-            f"expected enough memory, got {text or 'none'}. Fix: free memory, or use smaller frames. The last "
+            f"expected enough memory, got {text or 'none'}. Fix: Free memory, or use smaller frames. The last "
             "checkpoint of a run is complete; resume with `endoprior train --resume RUN`."
         )
     if isinstance(error, OSError) and error.filename is not None:
         named = ascii(os.fsdecode(error.filename))[1:-1][-160:]
-        return f"{named}: expected a usable file, got {error.strerror}. Fix: check the path, permissions and disk."
+        return f"{named}: expected a usable file, got {error.strerror}. Fix: Check the path, permissions and disk."
     return None
 
 

@@ -17,9 +17,9 @@ def input_error(subject: Path | str, expected: str, got: str, fix: str) -> Input
 
     Args:
         subject: name of the file, folder or option.
-        fix: the command to run, in backticks, or one sentence; with its final period.
+        fix: the command to run, in backticks, or one sentence; with its final period. It starts with a capital letter.
     """
-    return InputError(f"{subject}: expected {expected}, got {got}. Fix: {fix}")
+    return InputError(f"{subject}: expected {expected}, got {got}. Fix: {fix[:1].upper()}{fix[1:]}")
 
 
 def number_ranges(numbers: Iterable[int], most: int = 8) -> str:

@@ -102,7 +102,7 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     try:
         return cls(**built)
     except ValueError as error:
-        raise InputError(f"{where}: {error}. Fix: correct the value.") from error
+        raise InputError(f"{where}: {error}. Fix: Correct the value.") from error
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:

@@ -98,7 +98,7 @@ class RenderedFrames:
         color, depth = self._reconstruction.render(index)
         if problem := _problem(color, depth, self._sequence.camera(index)):
             maker = type(self._reconstruction).__name__
-            raise InputError(f"{maker}.render({index}): {problem}. Fix: correct the method that returned it.")
+            raise InputError(f"{maker}.render({index}): {problem}. Fix: Correct the method that returned it.")
         return RenderedFrame(color if index in self._scored else None, to_uint8(color), depth)
 
 

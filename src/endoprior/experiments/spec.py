@@ -195,7 +195,7 @@ def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
         spec = replace(from_dict(Spec, values, "spec"), folder=str(path.parent))
         for name, folder in (data or {}).items():
             if name not in spec.sequences:
-                raise InputError(f"--data {name}: expected one of {', '.join(spec.sequences)}. Fix: correct the name.")
+                raise InputError(f"--data {name}: expected one of {', '.join(spec.sequences)}. Fix: Correct the name.")
             known = replace(spec.sequences[name], path=str(folder.absolute()), phantom=None)
             spec = replace(spec, sequences=spec.sequences | {name: known})
         _check(spec)
@@ -215,9 +215,9 @@ def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
         raise input_error(path, "a .yaml or .toml file", f"{path.suffix or 'no suffix'}", "rename it.")
     text = read_text(path, "a readable file", "Correct the path.")
     if path.resolve() in chain:
-        raise InputError(f"{path}: expected a file that does not extend itself. Fix: remove one `extends`.")
+        raise InputError(f"{path}: expected a file that does not extend itself. Fix: Remove one `extends`.")
     if len(chain) >= MOST_EXTENDED:
-        raise InputError(f"{path}: expected at most {MOST_EXTENDED} files that extend each other. Fix: merge some.")
+        raise InputError(f"{path}: expected at most {MOST_EXTENDED} files that extend each other. Fix: Merge some.")
     try:
         values = readers[path.suffix](text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # such as a number of 5000 digits
@@ -243,7 +243,7 @@ def _check(spec: Spec) -> None:
         if bool(sequence.path) == (sequence.phantom is not None):
             raise input_error(f"sequences.{name}", "either path or phantom", "both or none", "keep one.")
         if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
-            raise InputError(f"sequences.{name}: a phantom has its own size. Fix: remove shrink and first_frames.")
+            raise InputError(f"sequences.{name}: a phantom has its own size. Fix: Remove shrink and first_frames.")
         if sequence.format != "auto" and sequence.format not in LAYOUTS.names():
             want = f"auto, {', '.join(LAYOUTS.names())}"
             raise input_error(f"sequences.{name}.format", want, repr(sequence.format), "see docs/datasets.md.")

@@ -37,7 +37,7 @@ SMALLEST_SCALE_PX = 0.02
 """Scales below this at the working distance are stored as this: the renderer's blur is 27 times wider."""
 OPACITY_STEP = 1 / 1020
 COLOR_STEP = 1 / 255
-NOTHING_VISIBLE = "scene: expected Gaussians in front of the camera, got none that is visible. Fix: train it again."
+NOTHING_VISIBLE = "scene: expected Gaussians in front of the camera, got none that is visible. Fix: Train it again."
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ def find_weights(files: WeightFiles, weights_dir: Path | None = None, *, downloa
     searched = ", ".join(f"{source} {folder}" for source, folder in places)
     raise WeightsMissing(
         f"no weights for {files.network}: expected {' or '.join(files.names)} in {searched}; {tried}. "
-        f"Fix: put the file in a folder and name it with --weights-dir or {ENVIRONMENT_VARIABLE}."
+        f"Fix: Put the file in a folder and name it with --weights-dir or {ENVIRONMENT_VARIABLE}."
     )
 
 
@@ -127,10 +127,10 @@ def load_weights(found: FoundWeights) -> Mapping[str, Tensor]:
             stored = torch.load(found.path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, RuntimeError, ValueError, UnpicklingError, SafetensorError) as error:
         raise WeightsMissing(
-            f"{found.path}: expected network weights, got an unreadable file ({_first_line(error)}). Fix: replace it."
+            f"{found.path}: expected network weights, got an unreadable file ({_first_line(error)}). Fix: Replace it."
         ) from error
     if not (isinstance(stored, Mapping) and all(isinstance(value, torch.Tensor) for value in stored.values())):
-        raise WeightsMissing(f"{found.path}: expected network weights, got no named tensors. Fix: replace it.")
+        raise WeightsMissing(f"{found.path}: expected network weights, got no named tensors. Fix: Replace it.")
     return stored
 
 
