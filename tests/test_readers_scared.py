@@ -238,7 +238,7 @@ def test_version_2_of_another_size_is_rejected(tmp_path):
 def test_raw_keyframe_is_recognized_and_rejected(tmp_path):
     (tmp_path / "data").mkdir()
     (tmp_path / "data/frame_data.tar.gz").write_bytes(b"")
-    assert_rejected(tmp_path, "data/frame_data", "process the keyframe first, see docs/datasets.md.")
+    assert_rejected(tmp_path, "data/frame_data", "Process the keyframe first, see docs/datasets.md.")
 
 
 def test_depth_survives_shrinking(keyframe):
