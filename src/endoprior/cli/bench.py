@@ -66,8 +66,8 @@ def run(argv: list[str]) -> int:
             )
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
-    source = find_spec(args.spec)
-    loaded = {path: load_spec(path, _folders(args.data)) for path in specs_of(source)}
+    folders, source = _folders(args.data), find_spec(args.spec)
+    loaded = {path: load_spec(path, folders) for path in specs_of(source)}
     require_writable_folder("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
