@@ -91,7 +91,12 @@ def run(argv: list[str]) -> None:
         say("Stopped. To resume, run the same command again.")
         raise
     say(f"\nDone in {duration(clock.perf_counter() - began)}. Open {job.player} in a browser.")
-    for what, path in (("video", job.film), ("report", job.report), ("check", job.figure), ("scene", job.run)):
+    for what, path in (
+        ("video", job.rendered_video),
+        ("report", job.report),
+        ("check", job.figure),
+        ("scene", job.run),
+    ):
         say(f"  {what:<8}{path}")
     say(f"Turn and measure it: {command('view', job.run)}")
     if args.preview:

@@ -31,7 +31,7 @@ ITERATIONS = 6
 CHECK_FRAMES = 120
 """So many more frames double the time of `check`, most of which goes into a few samples. Measured: docs/log.md."""
 RESERVE = 1.15
-"""Whole jobs took 1.15 and 1.2 times what their trials said: Gaussians grow in number, caches fill (docs/log.md)."""
+"""Whole jobs took 1.15 and 1.22 times what their trials said: Gaussians grow in number, caches fill (docs/log.md)."""
 A = TypeVar("A")
 
 
@@ -55,13 +55,13 @@ class Trial:
     render: float
     """One frame."""
     score: float
-    film: float
+    rendered_video: float
     """One frame of the video."""
     player: float
 
 
 def estimate(job: Job) -> dict[str, float]:
-    """Seconds of each step of a job, by its name. Takes some 10 s itself, and leaves nothing behind."""
+    """Seconds of each step of a job, by its name. Takes some 20 s itself, and leaves nothing behind."""
     folder = job.out / ".trial"
     shutil.rmtree(folder, ignore_errors=True)
     try:
@@ -94,7 +94,7 @@ def scaled(trial: Trial, cfg: Config, num_frames: int, num_images: int) -> dict[
         "check": trial.check * (1 + (num_frames - FRAMES) / CHECK_FRAMES),
         "train": trial.start * more + half * trial.half_iteration + full * trial.iteration,
         "score": max(trial.score - speed, 0.0) * more + speed,
-        "video": trial.film * num_frames,
+        "video": trial.rendered_video * num_frames,
         "player": trial.player * more,
     }
 
@@ -135,7 +135,7 @@ def _measure(job: Job, folder: Path) -> Trial:
         iteration=median(iterations[ITERATIONS + 2 :]),
         render=1 / result.scores["fps"],
         score=score,
-        film=stamps.step("rendering"),
+        rendered_video=stamps.step("rendering"),
         player=player,
     )
 

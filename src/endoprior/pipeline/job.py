@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,7 @@ class Job:
         return self.out / "report.png"
 
     @property
-    def film(self) -> Path:
+    def rendered_video(self) -> Path:
         """Input, rendered model and depth beside each other."""
         return self.out / "video.mp4"
 
@@ -102,17 +103,10 @@ def open_folder(job: Job) -> None:
     """
     file, wanted = job.out / SETTINGS, settings(job)
     if file.is_file():
-        if read_json(file) != _as_json(wanted):
+        if read_json(file) != json.loads(json.dumps(wanted)):
             fix = f"Choose another folder: `{command('run', job.video, Path('OUT2'))}`."
             raise input_error(job.out, "results of the same video and options", "others", fix)
         return
     reject_occupied(job.out)
     job.out.mkdir(parents=True, exist_ok=True)
     write_json(file, wanted)
-
-
-def _as_json(value: Any) -> Any:
-    """The value as it comes back from a JSON file: tuples become lists."""
-    if isinstance(value, dict):
-        return {key: _as_json(item) for key, item in value.items()}
-    return [_as_json(item) for item in value] if isinstance(value, list | tuple) else value

@@ -20,6 +20,7 @@ from ..evaluation.scoring import evaluate, scored_data
 from ..export.html import PageTooLarge, write_html
 from ..model.scene import load_scene
 from ..prepare import prepare
+from ..prepare.pipeline import Progress
 from ..runs.report import write_report
 from ..runs.training_run import CHECKPOINT, TrainingRun
 from ..system.atomic import write_json
@@ -29,10 +30,8 @@ from ..visualization.video import write_video
 from .job import Job
 from .part import every_kth_time, usable_frames
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much is done, and how much there is (0: unknown)."""
 PLAYER_BYTES = 40_000_000
-"""Largest player; browsers open it in a second or two."""
+"""Largest player."""
 LEAST_BYTES = 7
 """Size of one Gaussian at one time step in the player; at least this (docs/export.md)."""
 SHOWN_SCORES = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis")
@@ -102,7 +101,7 @@ def _score(job: Job, progress: Progress) -> list[str]:
     return [f"held-out frames: {', '.join(shown)}"]
 
 
-def _film(job: Job, progress: Progress) -> list[str]:
+def _render_video(job: Job, progress: Progress) -> list[str]:
     scene = load_scene(job.run)
     frames = _frames_of(job, scene.config).frames("video")
     span = depth_span(scene)
@@ -119,7 +118,7 @@ def _film(job: Job, progress: Progress) -> list[str]:
             yield tile([label(image, name) for name, image in shown.items()], len(shown))
             progress("rendering", k + 1, len(frames))
 
-    write_video(job.film, images(), scene.frames_per_second)
+    write_video(job.rendered_video, images(), scene.frames_per_second)
     return []
 
 
@@ -144,7 +143,7 @@ STEPS = (
     Step("check", lambda job: job.findings, _check),
     Step("train", lambda job: job.run / "scene.safetensors", _train),
     Step("score", lambda job: job.report, _score),
-    Step("video", lambda job: job.film, _film),
+    Step("video", lambda job: job.rendered_video, _render_video),
     Step("player", lambda job: job.player, _player),
 )
 """In order. Every result is written completely or not at all."""

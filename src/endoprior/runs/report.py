@@ -76,7 +76,7 @@ def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, N
         out = scene.render(frame.time, frame.camera)
         color, depth = out.color.cpu().numpy(), out.depth.cpu().numpy()
         error = np.abs(color - frame.rgb).mean(-1)
-        cells = [(f"input, frame {frame.index} (test)", frame.rgb_u8), ("rendered, tool removed", to_u8(color))]
+        cells = [(f"input, frame {frame.index} (test)", frame.rgb_u8), ("rendered", to_u8(color))]
         tissue = sequence.truth.tissue(frame.index) if sequence.truth else None
         if tissue is not None:
             cells.append(("true tissue", tissue))

@@ -42,7 +42,7 @@ def writing(path: Path) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, InputError) or (reason := _disk_error(error, path)) is None:
             raise
-        fix = "Close other programs that use it" if isinstance(error, PermissionError) else "free space"
+        fix = "Close other programs that use it" if isinstance(error, PermissionError) else "Free space"
         raise CannotWrite(
             f"{path}: expected a disk that accepts this file, got {reason}. Fix: {fix} or choose another path, "
             "then repeat. The previous file is unchanged."
