@@ -5,9 +5,10 @@ import json
 from pathlib import Path
 
 import pytest
+import tyro
 
 from endoprior.cli.parsing import parse
-from endoprior.cli.train import Train
+from endoprior.cli.train import HELP, Train
 from endoprior.core import config_io
 from endoprior.core.checks import InputError
 from endoprior.core.config import BasisConfig, Config, DensityConfig, HexPlaneConfig, RenderConfig
@@ -101,11 +102,31 @@ def test_replaced_fields_are_set_and_the_others_stay():
     assert changed.replace({"seed": cfg.seed, "optim.means_lr": cfg.optim.means_lr, "init.budget": "x2"}) == cfg
 
 
+def test_short_names_are_those_of_the_command_line():
+    cfg = preset("default").replace({"iterations": 7, "gaussians": "x0.5"})
+    assert (cfg.schedule.fine_iterations, cfg.init.budget) == (7, 15_000)
+    assert preset("default", iterations=7, gaussians=15_000) == cfg
+    words, start = ["--iterations", "7", "--gaussians", "15000", "d", "o"], Train(tyro.MISSING, config=preset("default"))
+    assert parse(Train, words, "train", HELP, start).config == cfg
+    assert all(f"--{name}".replace("_", "-") in HELP.short for name in config_io.SHORT_NAMES)
+
+
+def test_a_field_goes_before_a_short_name_of_another():
+    values = {"iterations": 1}
+    config_io.override(values, {"iterations": 2}, "options of a plugin")
+    assert values == {"iterations": 2}
+    with pytest.raises(InputError, match=r"got gaussian\. Fix: See"):
+        config_io.override(values, {"gaussian": 2}, "options of a plugin")
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
         ({"optim.mean_lr": 1.0}, r"got optim\.mean_lr\. Fix: Use `optim\.means_lr`\."),
         ({"budget": 3}, r"got budget\. Fix: Use `init\.budget`\."),
+        ({"train.iterations": 3}, r"got train\.iterations\. Fix: Use `iterations`\."),
+        ({"num_gaussians": 3}, r"got num_gaussians\. Fix: Use `gaussians`\."),
+        ({"fine_iterations": 3}, r"got fine_iterations\. Fix: Use `schedule\.fine_iterations`\."),
         ({"init": 3}, "got init"),
         ({"zzz": 3}, r"got zzz\. Fix: See `endoprior train --help-all`\."),
         ({"init.budget": 0}, r"budget must be in \[1, 1e\+07\], got 0"),

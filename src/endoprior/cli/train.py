@@ -12,6 +12,7 @@ import tyro
 
 from ..core.checks import input_error
 from ..core.config import Config
+from ..core.config_io import SHORT_NAMES
 from ..core.presets import PresetName
 from ..core.shell import command
 from ..doctor.choice import Wanted
@@ -67,11 +68,7 @@ HELP = Help(
         "where it runs": ("--device",),
         "during and after training": ("--view", "--no-networks", "--weights-dir"),
     },
-    short={
-        "--iterations": "--schedule.fine-iterations",
-        "--gaussians": "--init.budget",
-        "--init-budget": "--init.budget",
-    },
+    short={f"--{short}".replace("_", "-"): f"--{full}".replace("_", "-") for short, full in SHORT_NAMES.items()},
 )
 
 

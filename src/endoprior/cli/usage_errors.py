@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping, Sequence
 
-from ..core.checks import InputError, input_error
+from ..core.checks import InputError, input_error, last_part, similar_name
 from .options import Option, option_name
 
 BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
@@ -17,24 +16,10 @@ def reject_unknown(argv: Sequence[str], command: str, names: Sequence[str]) -> N
     for word in argv:
         name = option_name(word)
         if name.startswith("--") and name not in names:
-            similar = _similar(name, names)
+            similar = similar_name(name, names)
             meant = f"Did you mean {similar}? " if similar else ""
             fix = f"{meant}`endoprior {command} --help-all` lists all options."
             raise input_error(f"endoprior {command}", "an option that it has", name, fix)
-
-
-def _similar(name: str, names: Sequence[str]) -> str | None:
-    """The option with the same last part, such as `--temporal.weight` for `--weight`, else the most similar one."""
-    by_last_part = {_last_part(each): each for each in reversed(names)}
-    if _last_part(name) in by_last_part:
-        return by_last_part[_last_part(name)]
-    whole = difflib.get_close_matches(name, names, 1)
-    part = difflib.get_close_matches(_last_part(name), by_last_part, 1)
-    return whole[0] if whole else by_last_part[part[0]] if part else None
-
-
-def _last_part(name: str) -> str:
-    return name.rpartition(".")[2].removeprefix("--")
 
 
 def usage_error(
@@ -59,7 +44,7 @@ def usage_error(
     by_name = {name: option for option in arguments for name in option.names}
     for word, value in zip(argv, [*argv[1:], ""], strict=True):
         option = by_name.get(short.get(option_name(word), option_name(word)))
-        if option and (beyond := re.match(rf"\S+: ({_last_part(option.name).replace('-', '_')} must .*)", text)):
+        if option and (beyond := re.match(rf"\S+: ({last_part(option.name).replace('-', '_')} must .*)", text)):
             return InputError(f"{option_name(word)}: {beyond[1]}. Fix: {fix}")
         if option and re.search(rf"{re.escape(option.name)}(?![\w-]|\.\w)", text):
             got = word.partition("=")[2] or value

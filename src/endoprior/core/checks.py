@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,26 @@ def input_error(subject: Path | str, expected: str, got: str, fix: str) -> Input
         fix: the command to run, in backticks, or one sentence; with its final period. It starts with a capital letter.
     """
     return InputError(f"{subject}: expected {expected}, got {got}. Fix: {fix[:1].upper()}{fix[1:]}")
+
+
+def similar_name(name: str, names: Sequence[str]) -> str | None:
+    """The name with the same last part, such as `temporal.weight` for `weight`, else the most similar one.
+
+    Args:
+        name: what was typed: a dotted name, or an option with its dashes.
+        names: those that there are; of equally good ones the first is taken.
+    """
+    by_last_part = {last_part(each): each for each in reversed(names)}
+    if last_part(name) in by_last_part:
+        return by_last_part[last_part(name)]
+    whole = difflib.get_close_matches(name, names, 1)
+    part = difflib.get_close_matches(last_part(name), by_last_part, 1)
+    return whole[0] if whole else by_last_part[part[0]] if part else None
+
+
+def last_part(name: str) -> str:
+    """What stands behind the last dot of a dotted name or option, without dashes in front."""
+    return name.rpartition(".")[2].removeprefix("--")
 
 
 def number_ranges(numbers: Iterable[int], most: int = 8) -> str:

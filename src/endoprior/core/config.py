@@ -375,10 +375,11 @@ class Config(Checked):
             )
 
     def replace(self, changes: Mapping[str, Any]) -> Config:
-        """This config with other values: `preset("default").replace({"seed": 1, "optim.means_lr": 2e-3})`.
+        """This config with other values: `preset("default").replace({"iterations": 3000, "optim.means_lr": 2e-3})`.
 
         Args:
-            changes: new value by the field's dotted name; docs/config.md lists all fields.
+            changes: new value by the field's dotted name (docs/config.md lists all) or short name: `iterations` is
+                `schedule.fine_iterations`, `gaussians` is `init.budget`.
         Raises:
             InputError: no field has this name, or the value has the wrong type or range.
         """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import math
 import re
@@ -13,12 +12,18 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from .checks import InputError, input_error
+from .checks import InputError, input_error, similar_name
 
 C = TypeVar("C")
 _hints = functools.cache(typing.get_type_hints)
 FORMER_VALUES = {"render.backend": {"cpu": "numba", "cuda": "gsplat"}}
 """Config field -> value of earlier versions -> what it is called now."""
+SHORT_NAMES = {
+    "iterations": "schedule.fine_iterations",
+    "gaussians": "init.budget",
+    "init_budget": "init.budget",
+}
+"""Short name of a config field -> its dotted name; in Python, in specs and, with dashes, on the command line."""
 FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
 
 
@@ -53,26 +58,28 @@ def to_dict(cfg: Any) -> Any:
 
 
 def override(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> None:
-    """Set fields of a nested dict from `to_dict` by their dotted names, such as `init.budget`; `from_dict` checks them.
+    """Set fields of a nested dict from `to_dict` by their dotted or short names; `from_dict` checks the values.
 
     Args:
-        changes: new value by name; a text such as "x0.75" multiplies the number that is there.
+        changes: new value by name, such as `init.budget`, or `gaussians` (see `SHORT_NAMES`); a text such as "x0.75" multiplies the number that is there.
         where: what the error message calls the changes.
     Raises:
         InputError: no field has this name; the message proposes the nearest one.
     """
     for name, value in changes.items():
-        *path, last = str(name).split(".")
+        full = name if name in values else SHORT_NAMES.get(name, name)  # a plugin's options can have such a field
+        *path, last = str(full).split(".")
         group: Any = values
         for part in path:
             group = group.get(part) if isinstance(group, dict) else None
         if not isinstance(group, dict) or last not in group or isinstance(group[last], dict):
-            nearest = difflib.get_close_matches(str(name), _dotted_names(values), 1)
-            fix = f"use `{nearest[0]}`." if nearest else "see `endoprior train --help-all`."
-            raise input_error(where, "the dotted name of a config field", str(name), fix)
+            names = _dotted_names(values)
+            nearest = similar_name(str(name), [*(s for s, of in SHORT_NAMES.items() if of in names), *names])
+            fix = f"use `{nearest}`." if nearest else "see `endoprior train --help-all`."
+            raise input_error(where, "the name of a config field", str(name), fix)
         if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(group[last]) in (int, float):
             value = type(group[last])(group[last] * float(factor[1]))
-        group[last] = current_value(str(name), value, hint=True)
+        group[last] = current_value(str(full), value, hint=True)
 
 
 def _dotted_names(values: dict[str, Any], prefix: str = "") -> list[str]:

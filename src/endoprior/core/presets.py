@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from .checks import InputError
 from .config import (
@@ -21,11 +21,13 @@ from .config import (
 PresetName = Literal["default", "paper", "released", "endogaussian", "preview"]
 
 
-def preset(name: str = "default") -> Config:
-    """The config of a preset.
+def preset(name: str = "default", **changes: Any) -> Config:
+    """The config of a preset: `preset("default", iterations=3000, seed=1)`.
 
+    Args:
+        changes: other values, by names that `Config.replace` knows.
     Raises:
-        InputError: no preset has this name.
+        InputError: no preset or field has this name, or a value has the wrong type or range.
     """
     makers = {
         "default": default,
@@ -38,7 +40,7 @@ def preset(name: str = "default") -> Config:
         raise InputError(
             f"preset: expected one of {', '.join(get_args(PresetName))}; got {name!r}. Choose one of them."
         )
-    return makers[name]()
+    return makers[name]().replace(changes)
 
 
 def paper() -> Config:
