@@ -87,6 +87,22 @@ def test_a_plugin_that_is_not_what_it_promises_is_named(install, capsys, registr
     assert line.startswith(kind) and "other-pkg 1.0" in line and said in line
 
 
+@pytest.mark.parametrize(
+    ("bad", "place"),
+    [
+        ("x = 1\nraise RuntimeError('no')", "bad_module.py:2"),
+        ("import helper_of_others\n\nhelper_of_others.fail()", "bad_module.py:3"),
+        ("def broken(:", "bad_module.py:1"),
+    ],
+)
+def test_the_place_in_the_plugins_own_code_is_named(install, tmp_path, bad, place):
+    helper = "def fail():\n    raise RuntimeError('no')"
+    install({"scores": {"mine": "bad_module"}}, bad_module=bad, helper_of_others=helper)
+    with pytest.raises(InputError) as caught:
+        SCORES.load("mine")
+    assert f"({tmp_path / 'site-other-pkg' / place}). Fix: Update" in str(caught.value)
+
+
 def test_a_missing_object_is_named(install):
     install({"datasets": {"mine": "good_module:ABSENT"}}, good_module="")
     with pytest.raises(InputError, match=r"has no attribute 'ABSENT'\. Fix: Update or uninstall other-pkg"):
@@ -143,10 +159,13 @@ FORMAT = Format(lambda path: 1 / 0, None)
     install({"datasets": {"mine": "a_layout:FORMAT"}, "scores": {"mine": "a_score"}}, a_layout=layout, a_score=score)
     shutil.copytree(tiny_sequence / "images", tmp_path / "plain" / "images")
     sequence = load_sequence(tmp_path / "plain")
-    assert problems(capsys) == ["endoprior: mine of other-pkg 1.0 failed: ZeroDivisionError: division by zero"]
+    (line,) = problems(capsys)
+    assert line.startswith("endoprior: mine of other-pkg 1.0 failed: ZeroDivisionError: division by zero (")
+    assert line.endswith("a_layout.py:3)")
     result = evaluate(Truth(sequence), sequence, networks=False)
     assert "psnr" in result.scores
-    assert result.skipped["extra"] == "mine of other-pkg 1.0 failed: KeyError: 'key'"
+    assert result.skipped["extra"].startswith("mine of other-pkg 1.0 failed: KeyError: 'key' (")
+    assert result.skipped["extra"].endswith("a_score.py:5)")
 
 
 def test_scores_of_a_plugin_are_computed_and_known(install, tiny_sequence):
@@ -171,13 +190,13 @@ def test_nothing_is_imported_before_it_is_used(install, tiny_sequence):
 
 
 def test_the_page_shows_the_example_as_it_is():
-    page = (EXAMPLE.parents[1] / "docs" / "plugins.md").read_text()
-    files = [file.read_text() for file in [*EXAMPLE.glob("*/*.py"), EXAMPLE / "pyproject.toml"]]
-    blocks = re.findall(r"```(?:python|toml)\n(.*?)```", page, re.DOTALL)
-    blocks = [re.sub(r" +#.*", "", block).strip() for block in blocks]
-    assert len(blocks) >= 6
-    for block in blocks:
-        assert any(block in text for text in files), block
+    """Whole files, which the tests of the example import and use; of pyproject.toml a part."""
+    page = (EXAMPLE.parents[1] / "docs" / "plugins.md").read_text(encoding="utf-8")
+    shown = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    files = [file.read_text(encoding="utf-8") for file in EXAMPLE.glob("endoprior_example/[!_]*.py")]
+    assert sorted(shown) == sorted(files)
+    (entry,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert re.sub(r" +#.*", "", entry).strip() in (EXAMPLE / "pyproject.toml").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

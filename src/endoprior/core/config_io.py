@@ -61,7 +61,8 @@ def override(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> 
     """Set fields of a nested dict from `to_dict` by their dotted or short names; `from_dict` checks the values.
 
     Args:
-        changes: new value by name, such as `init.budget`, or `gaussians` (see `SHORT_NAMES`); a text such as "x0.75" multiplies the number that is there.
+        changes: new value by name, such as `init.budget`, or `gaussians` (see `SHORT_NAMES`); a text such as "x0.75"
+            multiplies the number that is there.
         where: what the error message calls the changes.
     Raises:
         InputError: no field has this name; the message proposes the nearest one.

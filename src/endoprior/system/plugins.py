@@ -7,6 +7,7 @@ asks for it by name ends with an error.
 from __future__ import annotations
 
 import sys
+import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -41,6 +42,17 @@ class Plugin:
         """The error for this plugin, on one line."""
         subject = f"plugin {self.name} of {self.origin} ({self.target})"
         return input_error(subject, expected, " ".join(got.split()), fix)
+
+    def words_for(self, error: BaseException) -> str:
+        """An error inside this plugin on one line: `KeyError: 'x' (FILE:LINE)`, the last place in its own package."""
+        package = self.target.partition(":")[0].partition(".")[0]
+        frames = traceback.walk_tb(error.__traceback__)
+        own = [(f, line) for f, line in frames if f.f_globals.get("__name__", "").partition(".")[0] == package]
+        if isinstance(error, SyntaxError) and error.filename:  # raised before a frame of the file exists
+            place = f" ({error.filename}:{error.lineno})"
+        else:
+            place = f" ({own[-1][0].f_code.co_filename}:{own[-1][1]})" if own else ""
+        return " ".join(f"{type(error).__name__}: {error}{place}".split())
 
 
 @cache
@@ -110,8 +122,8 @@ class Registry(Generic[T]):
         return "" if name in self.builtin else self._plugins()[name].origin
 
     def failure(self, name: str, error: Exception) -> str:
-        """What to say of an error inside a plugin: `mae of endoprior-example 0.1 failed: KeyError: 'x'`."""
-        return " ".join(f"{name} of {self.origin(name)} failed: {type(error).__name__}: {error}".split())
+        """What to say of an error inside a plugin: `mae of endoprior-example 0.1 failed: KeyError: 'x' (mae.py:9)`."""
+        return f"{name} of {self.origin(name)} failed: {self._plugins()[name].words_for(error)}"
 
     def loaded(self, plugin: Plugin) -> T:
         """Import a plugin of this kind and check that it is what it promises.
@@ -125,7 +137,7 @@ class Registry(Generic[T]):
             found = EntryPoint(plugin.name, plugin.target, f"endoprior.{self.kind}").load()
             problem = self._problem(found)
         except (Exception, SystemExit) as error:  # code of others: anything can happen
-            raise plugin.rejected(self._expected, f"{type(error).__name__}: {error}", fix) from error
+            raise plugin.rejected(self._expected, plugin.words_for(error), fix) from error
         if problem:
             raise plugin.rejected(self._expected, problem, fix)
         return found
