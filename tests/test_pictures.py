@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import cv2
 import numpy as np
@@ -225,3 +226,17 @@ def test_a_training_view_hides_test_frames(sequence):
     with pytest.raises(ValueError, match="got 1, which is held out"):
         view.frame(1)
     assert view.validate() == sequence.validate() and view.fingerprint() == sequence.fingerprint()
+
+
+@pytest.mark.parametrize(("option", "named"), [("folder", "rgb"), ("depth_folder", "depth")])
+def test_a_folder_of_folders_names_the_one_to_pass(tiny_sequence, tmp_path, option, named):
+    """What `endoprior render` writes, given as a whole."""
+    sequence = load_sequence(tiny_sequence)
+    for folder, suffix in (("depth", ".npy"), ("rgb", ".png"), ("side_by_side", ".png")):
+        (tmp_path / folder).mkdir()
+        for index in TEST:
+            (tmp_path / folder / f"{index:06d}{suffix}").touch()
+    save_png(tmp_path / "rgb/000001.png", sequence.frame(1).rgb_u8)
+    folders = {"folder": tmp_path / "rgb"} | {option: tmp_path}
+    with pytest.raises(InputError, match=f"got none. Fix: Pass {re.escape(str(tmp_path / named))}\\.$"):
+        Pictures(sequence=sequence, split="test", **folders)

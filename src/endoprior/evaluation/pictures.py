@@ -100,17 +100,26 @@ def _matched(
     """The file of each frame, and the rule that says so."""
     if (kind := kind_of(folder)) != "a folder":
         raise input_error(folder, "a folder of rendered frames", kind, "correct the path.")
-    usable = [f for f in entries(folder) if f.suffix.lower() in suffixes and not f.name.startswith(".")]
-    files = sorted(usable, key=natural_order)
+    files = _files(folder, suffixes)
     kinds = "/".join(suffix[1:].upper() for suffix in suffixes)
     if not files:
-        raise input_error(folder, f"{kinds} files", "none", "pass the folder that holds the files themselves.")
+        holders = [sub for sub in sorted(entries(folder)) if sub.is_dir() and _files(sub, suffixes)]
+        usual = "depth" if ".npy" in suffixes else "rgb"  # as `endoprior render` calls them
+        named = next((sub for sub in holders if sub.name == usual), holders[0] if holders else None)
+        fix = f"pass {named}." if named else "pass the folder that holds the files themselves."
+        raise input_error(folder, f"{kinds} files", "none", fix)
     indices = sequence.indices(split)
     match = match_names([file.stem for file in files], sequence.image_names, indices, len(sequence))
     if isinstance(match, str):
         want = f"{kinds} files of the {len(indices)} frames of the {split} split ({indices[0]}, ..., {indices[-1]})"
         raise input_error(folder, want, match, f"rename them: {RULES}.")
     return dict(zip(match.frames, files, strict=True)), match.rule
+
+
+def _files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """The files of a folder with one of the suffixes, in natural order; hidden ones do not count."""
+    usable = [f for f in entries(folder) if f.suffix.lower() in suffixes and not f.name.startswith(".")]
+    return sorted(usable, key=natural_order)
 
 
 def _read_color(file: Path, camera: Camera) -> NDArray[np.float32]:
