@@ -1,19 +1,28 @@
 """`endoprior run`: from a video to a player in one command, resumed after an interruption."""
 
 import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import pytest
+from matplotlib.figure import Figure
 from tiny_training import tiny_config
 from video_files import write_video
 
 from endoprior.cli import main
+from endoprior.cli.run import resume_words
+from endoprior.cli.step_display import StepDisplay
+from endoprior.core.checks import InputError
 from endoprior.model.scene import load_scene
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.pipeline import STEPS, make_job, open_folder, run_step
+from endoprior.pipeline import STEPS, make_job, notes_of, open_folder, run_step
+from endoprior.pipeline.steps import PREVIEW_TITLE
 from endoprior.prepare.config import PrepareConfig
 
 FRAMES = 27
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -72,9 +81,62 @@ def test_an_interrupted_training_resumes_bit_identically(video, done, tmp_path):
     assert (job.run / "scene.safetensors").read_bytes() == (done.run / "scene.safetensors").read_bytes()
 
 
-def test_another_job_does_not_take_the_folder(video, done, capsys):
+def test_a_resumed_job_says_so_and_repeats_the_notes(video, tmp_path, capsys):
+    job = job_of(video, tmp_path / "out")
+    assert not open_folder(job)
+    lines = [line for step in STEPS[:2] for line in run_step(step, job, quiet)]
+    assert len(lines) > 2 and open_folder(job)
+    assert [line for step in STEPS for line in notes_of(step, job)] == lines
+    assert resume_words(["a", "b", "c"], ["b", "c"]) == "Resuming at b; done before: a."
+    assert resume_words(["a", "b"], ["a", "b"]) == "Resuming at a; done before: nothing."
+    assert resume_words(["a", "b"], []) == "All done before: a, b."
+    StepDisplay(["prepare", "check"], {}).skip("check")
+    assert capsys.readouterr().out == "2/2  check    done before\n"
+
+
+def test_a_job_with_other_settings_does_not_take_the_folder(video, done, tmp_path, capsys):
     assert main(["run", str(video), str(done.out)]) == 2
-    assert "others. Fix: Choose another folder: `endoprior run" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "got --preview: stored yes, given no. Fix: Give the stored settings to resume, or" in said
+    assert f"`endoprior run '{video}' OUT2`." in said
+    assert main(["run", str(video), str(done.out), "--preview", "--end", "0.9", "--crop", "0,0,64,64"]) == 2
+    said = capsys.readouterr().err
+    assert "got --end: stored the default, given 0.9; --crop: stored the default, given 0,0,64,64. Fix:" in said
+    assert "OUT2 --preview --end 0.9 --crop 0,0,64,64`." in said
+    other = shutil.copy(video, tmp_path / "other.mp4")
+    with pytest.raises(InputError, match=r"got VIDEO: stored Fall 7\.mp4, given other\.mp4\. Fix:"):
+        open_folder(job_of(other, done.out))
+    with pytest.raises(InputError, match=r"got --seed: stored the default, given 5\. Fix:"):
+        cfg = tiny_config("basis").replace({"seed": 5})
+        open_folder(make_job(video, done.out, PrepareConfig(), cfg, preview=True))
+    with pytest.raises(InputError, match=r"got config\.optim\.means_lr: stored 0\.\d+, given 0\.5\. Fix:"):
+        open_folder(replace(done, cfg=done.cfg.replace({"optim.means_lr": 0.5})))
+    (tmp_path / "settings.json").write_text('{"prepare": "PrepareConfig(...)"}')
+    with pytest.raises(InputError, match=r"got settings of another version\. Fix:"):
+        open_folder(replace(done, out=tmp_path))
+
+
+def test_a_preview_says_that_it_is_one(video, done, tmp_path, monkeypatch):
+    said = []
+    monkeypatch.setattr(Figure, "suptitle", lambda figure, text, **kwargs: said.append(text))
+    for job in (done, replace(done, options={})):
+        for name in ("report.png", "player.html"):
+            (job.out / name).rename(tmp_path / name)
+        for step in (STEPS[3], STEPS[5]):
+            run_step(step, job, quiet)
+        said.append("Fall 7 (preview)" in job.player.read_text(encoding="utf-8"))
+        for name in ("report.png", "player.html"):
+            (tmp_path / name).replace(job.out / name)
+    assert said == [PREVIEW_TITLE, True, False]
+
+
+def test_the_pages_name_every_file_that_names_the_video(done):
+    files = [file for file in done.out.rglob("*") if file.is_file() and b"Fall 7" in file.read_bytes()]
+    names = sorted(file.relative_to(done.out).as_posix() for file in files)
+    assert names == ["check.json", "data/prepare.json", "player.html", "settings.json"]
+    for page in ("README.md", "docs/run.md"):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        assert all(f"`{name}`" in text for name in names), page
 
 
 def test_a_camera_that_is_lost_ends_the_training_frames(video, tmp_path):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from ..core.options import command_of
 from ..core.presets import PresetName, preset
 from ..core.shell import command
 from ..doctor.choice import Wanted
@@ -34,7 +35,7 @@ class Run:
     video: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIDEO")]]
     """Video file, or folder of images."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
-    """Folder for the results; must be new or empty."""
+    """Folder for the results: new, empty, or resumed."""
     preview: bool = False
     """A first look in about a minute: at most 60 frames, 320 px wide. Not for scores."""
     preset: PresetName = "default"
@@ -64,27 +65,33 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Do every step, with one progress display."""
     args = parse(Run, argv, "run", HELP)
-    from ..pipeline import STEPS, estimate, make_job, open_folder, run_step
+    from ..pipeline import STEPS, estimate, make_job, notes_of, open_folder, run_step
     from ..runs import kernel_cache
 
-    cfg = replace(preset("preview" if args.preview else args.preset), seed=args.seed)
-    job = make_job(args.video, args.out, args.config, with_device(cfg, args.device), preview=args.preview)
-    open_folder(job)
-    say(_part_words(job))
-    kernel_cache.fill(job.cfg, say)
     began = clock.perf_counter()
+    cfg = replace(preset("preview" if args.preview else args.preset), seed=args.seed)
+    cfg = with_device(cfg, args.device)
+    job = make_job(args.video, args.out, args.config, cfg, preset=args.preset, preview=args.preview)
+    resumes = open_folder(job)
+    say(_part_words(job))
     waiting = [step for step in STEPS if not step.result(job).exists()]
+    if resumes:
+        say(resume_words([step.name for step in STEPS], [step.name for step in waiting]))
+    kernel_cache.fill(job.cfg, say)
     seconds: dict[str, float] = {}
     if waiting == list(STEPS) and not args.preview and job.part.num_frames:
         say("Estimating the time ...")
         seconds = estimate(job)
         say(f"This takes about {duration(sum(seconds.values()))}: {_seconds_words(seconds)}.")
-        began = clock.perf_counter()
     display = StepDisplay([step.name for step in STEPS], seconds)
     try:
         for step in STEPS:
-            with display.step(step.name) as progress:
-                lines = run_step(step, job, progress)
+            if step in waiting:
+                with display.step(step.name) as progress:
+                    lines = run_step(step, job, progress)
+            else:
+                display.skip(step.name)
+                lines = notes_of(step, job)
             for line in lines or []:
                 say(f"     {line}")
     except KeyboardInterrupt:
@@ -100,7 +107,13 @@ def run(argv: list[str]) -> None:
         say(f"  {what:<8}{path}")
     say(f"Turn and measure it: {command('view', job.run)}")
     if args.preview:
-        say(f"The whole model:     {command('run', job.video, Path('OUT'))}")
+        say(f"The whole model:     {_whole_command(job)}")
+
+
+def _whole_command(job: Job) -> str:
+    """The command for the whole model, with the options of the preview: a stereo video needs its calibration again."""
+    options = {name: words for name, words in job.options.items() if name != "--preview"}
+    return command_of("run", (job.video, Path("OUT")), options)
 
 
 def _part_words(job: Job) -> str:
@@ -111,6 +124,12 @@ def _part_words(job: Job) -> str:
     seconds = part.num_frames / part.frames_per_second
     words = f"{job.video}: {part.num_frames} frames, {seconds:.1f} s at {part.frames_per_second:g} frames/s"
     return words if part.is_whole else f"{words} from {part.start:g} s on (--start and --end choose another part)"
+
+
+def resume_words(names: list[str], waiting: list[str]) -> str:
+    """Where a job goes on, and what is there already."""
+    done = ", ".join(name for name in names if name not in waiting) or "nothing"
+    return f"Resuming at {waiting[0]}; done before: {done}." if waiting else f"All done before: {done}."
 
 
 def _seconds_words(seconds: dict[str, float]) -> str:

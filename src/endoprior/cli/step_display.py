@@ -24,7 +24,7 @@ class StepDisplay:
     @contextmanager
     def step(self, name: str) -> Iterator[Callable[[str, int, int], None]]:
         """Yield the progress callback of a step: (what is being done, how much is done, how much there is)."""
-        head, began = f"{self._names.index(name) + 1}/{len(self._names)}  {name}", clock.monotonic()
+        head, began = self._head(name), clock.monotonic()
         shown_at = began
 
         def progress(what: str, done: int, total: int) -> None:
@@ -45,6 +45,13 @@ class StepDisplay:
             if self._terminal:
                 print("\r\x1b[K", end="", file=sys.stderr, flush=True)
         say(f"{head:<14}{duration(clock.monotonic() - began)}")
+
+    def skip(self, name: str) -> None:
+        """Say that a step was done before."""
+        say(f"{self._head(name):<14}done before")
+
+    def _head(self, name: str) -> str:
+        return f"{self._names.index(name) + 1}/{len(self._names)}  {name}"
 
     def _left(self, name: str, elapsed: float) -> str:
         """The time that is left of all steps, as text; empty without an estimate."""

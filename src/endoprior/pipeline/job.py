@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from ..core.checks import input_error
 from ..core.config import Config
-from ..core.config_io import to_dict
-from ..core.shell import command
-from ..data.files import read_json
+from ..core.options import Options, changed_options
 from ..prepare.config import PrepareConfig
-from ..prepare.first_pass import source_facts
 from ..prepare.source import open_source
-from ..system.atomic import reject_occupied, write_json
 from .part import Part, choose_part
 
-SETTINGS = "settings.json"
-"""File in the output folder with everything that decides the results; a resumed job must have the same."""
 MOST_FRAMES = 300
 PREVIEW_FRAMES = 60
 PREVIEW_WIDTH = 320
@@ -36,6 +27,13 @@ class Job:
     """Options of `prepare`, for `part` only."""
     cfg: Config
     part: Part
+    options: Options
+    """What the user chose, as it is typed; all of the above follows from it: `{"--preview": (), "--end": ("2.5",)}`."""
+
+    @property
+    def is_preview(self) -> bool:
+        """Whether it is a first look: few and small frames, a short training."""
+        return "--preview" in self.options
 
     @property
     def data(self) -> Path:
@@ -58,6 +56,11 @@ class Job:
         return self.out / "check.json"
 
     @property
+    def notes(self) -> Path:
+        """What each finished step told the user."""
+        return self.out / "notes.json"
+
+    @property
     def report(self) -> Path:
         """One image of held-out frames, curves and scores."""
         return self.out / "report.png"
@@ -73,11 +76,14 @@ class Job:
         return self.out / "player.html"
 
 
-def make_job(video: Path, out: Path, prepare: PrepareConfig, cfg: Config, *, preview: bool = False) -> Job:
+def make_job(
+    video: Path, out: Path, prepare: PrepareConfig, cfg: Config, *, preset: str = "default", preview: bool = False
+) -> Job:
     """Choose the part of the video and the sizes.
 
     Args:
         prepare: the user's options; frame rate and end are filled in.
+        preset: what the user calls `cfg`; a preview has its own.
         preview: at most `PREVIEW_FRAMES` frames of at most `PREVIEW_WIDTH` px.
     Raises:
         InputError: the video cannot be read.
@@ -87,26 +93,6 @@ def make_job(video: Path, out: Path, prepare: PrepareConfig, cfg: Config, *, pre
     part = choose_part(source.seconds, rate, prepare.frames_per_second, prepare.start, prepare.end, most)
     width = min(prepare.max_width or PREVIEW_WIDTH, PREVIEW_WIDTH) if preview else prepare.max_width
     chosen = replace(prepare, frames_per_second=part.frames_per_second, end=part.end, max_width=width)
-    return Job(video, out, chosen, cfg, part)
-
-
-def settings(job: Job) -> dict[str, Any]:
-    """Everything that decides the results of a job."""
-    return {"video": source_facts(job.video), "prepare": repr(job.prepare), "config": to_dict(job.cfg)}
-
-
-def open_folder(job: Job) -> None:
-    """Create the output folder, or accept that of an interrupted job with the same settings.
-
-    Raises:
-        InputError: the folder holds something else.
-    """
-    file, wanted = job.out / SETTINGS, settings(job)
-    if file.is_file():
-        if read_json(file) != json.loads(json.dumps(wanted)):
-            fix = f"Choose another folder: `{command('run', job.video, Path('OUT2'))}`."
-            raise input_error(job.out, "results of the same video and options", "others", fix)
-        return
-    reject_occupied(job.out)
-    job.out.mkdir(parents=True, exist_ok=True)
-    write_json(file, wanted)
+    options: Options = {"--preview": ()} if preview else {"--preset": (preset,)} if preset != "default" else {}
+    options |= {"--seed": (str(cfg.seed),)} if cfg.seed else {}
+    return Job(video, out, chosen, cfg, part, options | changed_options(prepare))

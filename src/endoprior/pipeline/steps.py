@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ PLAYER_BYTES = 40_000_000
 """Largest player."""
 LEAST_BYTES = 7
 """Size of one Gaussian at one time step in the player; at least this (docs/export.md)."""
+PREVIEW_TITLE = "Preview: small frames, short training. Not for scores."
 SHOWN_SCORES = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis")
 
 
@@ -49,12 +51,26 @@ class Step:
 
 
 def run_step(step: Step, job: Job, progress: Progress) -> list[str] | None:
-    """Do a step; None if it was done before.
+    """Do a step, and keep what it returns for a resumed job; None if it was done before.
 
     Raises:
         InputError: the input cannot be used.
     """
-    return None if step.result(job).exists() else step.act(job, progress)
+    if step.result(job).exists():
+        return None
+    lines = step.act(job, progress)
+    write_json(job.notes, _stored_notes(job) | {step.name: lines})
+    return lines
+
+
+def notes_of(step: Step, job: Job) -> list[str]:
+    """What a step that was done before returned."""
+    lines = _stored_notes(job).get(step.name)
+    return [str(line) for line in lines] if isinstance(lines, list) else []
+
+
+def _stored_notes(job: Job) -> dict[str, Any]:
+    return read_json(job.notes) if job.notes.is_file() else {}
 
 
 def _prepare(job: Job, progress: Progress) -> list[str]:
@@ -92,7 +108,7 @@ def _score(job: Job, progress: Progress) -> list[str]:
     sequence = _frames_of(job, scene.config)
     result = evaluate(scene, sequence, networks=False)
     result.save(job.run)
-    write_report(scene, sequence, job.run, job.report)
+    write_report(scene, sequence, job.run, job.report, PREVIEW_TITLE if job.is_preview else "")
     shown = [
         f"{all_scores()[name].label} {all_scores()[name].text(result.scores[name])}"
         for name in SHOWN_SCORES
@@ -126,9 +142,10 @@ def _player(job: Job, progress: Progress) -> list[str]:
     progress("packing", 0, 0)
     scene = load_scene(job.run)
     times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (len(scene.gaussians) * LEAST_BYTES))
+    title = f"{job.video.stem} (preview)" if job.is_preview else job.video.stem
     while not job.player.exists():
         try:
-            write_html(scene, job.player, title=job.video.stem, times=times, max_bytes=PLAYER_BYTES)
+            write_html(scene, job.player, title=title, times=times, max_bytes=PLAYER_BYTES)
         except PageTooLarge as error:  # its size is known only when it is packed
             if len(times) == 1:
                 raise

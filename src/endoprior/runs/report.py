@@ -39,11 +39,11 @@ ERROR_FULL_SCALE = 0.15
 """Color error, in [0, 1], at the end of the error map's color scale."""
 
 
-def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path) -> None:
+def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, title: str = "") -> None:
     """Write the report of a finished run folder as one PNG.
 
     Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; then the
-    training curve, the PSNR of each test frame, and the scores of `metrics.json`.
+    training curve, the PSNR of each test frame, and the scores of `metrics.json`. A `title` stands above all.
     """
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     per_frame = json.loads((run / "per_frame.json").read_text(encoding="utf-8"))
@@ -52,6 +52,8 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path) -
     # An own canvas: `pyplot` would choose a backend for the whole process.
     figure = Figure(figsize=(2.6 * len(rows[0]), 2.1 * len(rows) + 3.4), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(title, fontsize=12)
     top, bottom = figure.subfigures(2, 1, height_ratios=[2.1 * len(rows), 3.4])
     axes = np.atleast_2d(top.subplots(len(rows), len(rows[0])))
     for row, cells in zip(axes, rows, strict=True):
