@@ -9,6 +9,21 @@ from collections.abc import Mapping, Sequence
 from ..core.checks import InputError, input_error
 from .options import Option, option_name
 
+MEANT = {
+    "fps": "--frames-per-second",
+    "rate": "--frames-per-second",
+    "epochs": "--iterations",
+    "iters": "--iterations",
+    "steps": "--iterations",
+    "cuda": "--device",
+    "gpu": "--device",
+    "force": "--overwrite",
+    "output": "--out",
+    "resolution": "--max-width",
+}
+"""Words of other programs -> the option of the same meaning."""
+SIMILAR = 0.75
+"""Least similarity (difflib's ratio) of two names of which one may be a slip of the other; 0.6 lets `port` mean `preset`."""
 BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
 
 
@@ -24,13 +39,31 @@ def reject_unknown(argv: Sequence[str], command: str, names: Sequence[str]) -> N
 
 
 def _similar(name: str, names: Sequence[str]) -> str | None:
-    """The option with the same last part, such as `--temporal.weight` for `--weight`, else the most similar one."""
+    """The option of the same meaning or last part, such as `--temporal.weight` for `--weight`, else a similar one."""
+    if (meant := MEANT.get(_last_part(name))) in names:
+        return meant
     by_last_part = {_last_part(each): each for each in reversed(names)}
     if _last_part(name) in by_last_part:
         return by_last_part[_last_part(name)]
-    whole = difflib.get_close_matches(name, names, 1)
-    part = difflib.get_close_matches(_last_part(name), by_last_part, 1)
-    return whole[0] if whole else by_last_part[part[0]] if part else None
+    by_name = {each.removeprefix("--"): each for each in names}  # equal dashes would make any two names similar
+    for known, word in ((by_name, name.removeprefix("--")), (by_last_part, _last_part(name))):
+        if close := difflib.get_close_matches(word, known, 1, SIMILAR):
+            return known[close[0]]
+    words = set(_last_part(name).split("-"))
+    one_more = [part for part in by_last_part if len(words ^ set(part.split("-"))) == 1]  # `max-width` for `width`
+    return by_last_part[one_more[0]] if len(one_more) == 1 else None
+
+
+def unknown_command(name: str, commands: Mapping[str, str]) -> InputError:
+    """The error for a word that is no command; suggests the most similar one.
+
+    Args:
+        commands: what the user may type -> the command it stands for.
+    """
+    similar = difflib.get_close_matches(name.lower(), commands, 1)
+    meant = f"Did you mean `endoprior {commands[similar[0]]}`? " if similar else ""
+    listed = ", ".join(dict.fromkeys(commands.values()))
+    return input_error(name, f"one of {listed}", "no such command", f"{meant}`endoprior --help` explains each.")
 
 
 def _last_part(name: str) -> str:

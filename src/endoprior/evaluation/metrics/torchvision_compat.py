@@ -11,7 +11,7 @@ import importlib
 from types import ModuleType
 from typing import Any
 
-from ...core.extras import install_command
+from ...core.extras import install_command, missing_package
 from .weights import ScoreUnavailable
 
 MISSING_OPERATORS = (
@@ -48,9 +48,7 @@ def _import_torchvision() -> ModuleType:
         importlib.import_module("torchvision.models.optical_flow")
         return importlib.import_module("torchvision")
     except ImportError as error:
-        raise ScoreUnavailable(
-            f"torchvision cannot be imported ({error}). Install it with: {install_command('networks')}"
-        ) from error
+        raise ScoreUnavailable(missing_package("torchvision", "networks", error)) from error
 
 
 def _declare_operators() -> None:
@@ -70,5 +68,5 @@ def _broken(error: RuntimeError) -> ScoreUnavailable:
 
     cause = str(error).strip().splitlines()[0]
     return ScoreUnavailable(
-        f"torchvision does not work beside torch {torch.__version__} ({cause}). Install the matching one"
+        f"torchvision does not work beside torch {torch.__version__} ({cause}). Fix: `{install_command('networks')}`."
     )
