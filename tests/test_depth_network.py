@@ -129,7 +129,7 @@ def test_a_hub_name_is_searched_in_the_cache_first(folder, monkeypatch):
 
 def test_without_the_package_its_name_is_said(monkeypatch):
     monkeypatch.setattr(depth_network, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match="Fix: `pip install -c constraints.txt transformers`"):
+    with pytest.raises(InputError, match=r"Fix: `pip install -c constraints\.txt transformers`"):
         DepthNetwork()
 
 

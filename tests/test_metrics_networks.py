@@ -198,7 +198,10 @@ def test_a_package_that_is_not_installed_is_a_reason(no_weights, monkeypatch, pa
     (no_weights / ALEXNET.names[1]).touch()
     for name in [name for name in sys.modules if name.split(".")[0] == package]:
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(ScoreUnavailable, match=rf"^{package} is not installed\. Fix: `pip install -c constraints.txt torchvision lpips`\.$"):
+    with pytest.raises(
+        ScoreUnavailable,
+        match=rf"^{package} is not installed\. Fix: `pip install -c constraints.txt torchvision lpips`\.$",
+    ):
         lpips_distance("alex", no_weights, download=False)
 
 

@@ -23,7 +23,7 @@ MEANT = {
 }
 """Words of other programs -> the option of the same meaning."""
 SIMILAR = 0.75
-"""Least similarity (difflib's ratio) of two names of which one may be a slip of the other; 0.6 lets `port` mean `preset`."""
+"""Least similarity, difflib's ratio, of a name and what may be meant by it; at 0.6 `port` would mean `preset`."""
 BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
 
 

@@ -73,7 +73,9 @@ def import_viewer() -> type[Viewer]:
     try:
         from ..view.server import Viewer
     except ModuleNotFoundError as error:
-        raise input_error("the viewer", f"the package {error.name}", "none", "`pip install -c constraints.txt viser`.") from None
+        raise input_error(
+            "the viewer", f"the package {error.name}", "none", "`pip install -c constraints.txt viser`."
+        ) from None
     return Viewer
 
 

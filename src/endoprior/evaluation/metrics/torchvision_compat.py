@@ -31,24 +31,23 @@ def import_torchvision() -> ModuleType:
         ScoreUnavailable: torchvision is not installed, or does not work with this torch.
     """
     try:
+        try:
+            return _import_torchvision()
+        except RuntimeError as error:
+            if "operator torchvision::" not in str(error):
+                raise
+        _declare_operators()
         return _import_torchvision()
-    except RuntimeError as error:
-        if "operator torchvision::" not in str(error):
-            raise _broken(error) from error
-    _declare_operators()
-    try:
-        return _import_torchvision()
+    except ImportError as error:
+        raise ScoreUnavailable(missing_package("torchvision", "networks", error)) from error
     except RuntimeError as error:
         raise _broken(error) from error
 
 
 def _import_torchvision() -> ModuleType:
     """The torchvision module with the parts used here; RuntimeError if it does not match torch."""
-    try:
-        importlib.import_module("torchvision.models.optical_flow")
-        return importlib.import_module("torchvision")
-    except ImportError as error:
-        raise ScoreUnavailable(missing_package("torchvision", "networks", error)) from error
+    importlib.import_module("torchvision.models.optical_flow")
+    return importlib.import_module("torchvision")
 
 
 def _declare_operators() -> None:
