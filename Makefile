@@ -59,7 +59,8 @@ $(VENV)/.test-installed: $(VENV)/.installed
 	sh tools/install.sh test
 	touch $@
 
-$(VENV)/.docs-installed: $(VENV)/.installed
+# The site takes the program from src/: one that is installed stays as it is, so a plain install does not become editable.
+$(VENV)/.docs-installed: pyproject.toml constraints.txt
 	sh tools/install.sh docs
 	touch $@
 

@@ -50,7 +50,10 @@ def test_every_command_explains_itself(command, capsys):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["trian"], "trian: expected one of"),
+        (["trian"], "trian: expected one of run, demo, "),
+        (["trian"], "got no such command. Fix: Did you mean `endoprior train`? "),
+        (["evaluate", "RUN"], "Did you mean `endoprior eval`? "),
+        (["zzz"], "got no such command. Fix: `endoprior --help` explains each."),
         (["train"], "expected DATA OUT, got no DATA"),
         (["train", "nowhere", "out"], "nowhere"),
         (["train", "nowhere", "out", "--sed", "1"], "--sed"),

@@ -95,5 +95,5 @@ def test_bad_files_are_named(tmp_path, name, capfd):
 def test_exr_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     (tmp_path / "a.exr").write_bytes(b"x")
-    with pytest.raises(InputError, match="Fix: `pip install OpenEXR`"):
+    with pytest.raises(InputError, match=r"Fix: `pip install -c constraints\.txt OpenEXR`"):
         read_depth_file(tmp_path / "a.exr")

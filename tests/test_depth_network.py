@@ -129,8 +129,28 @@ def test_a_hub_name_is_searched_in_the_cache_first(folder, monkeypatch):
 
 def test_without_the_package_its_name_is_said(monkeypatch):
     monkeypatch.setattr(depth_network, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match="Fix: `pip install transformers`"):
+    with pytest.raises(InputError, match=r"Fix: `pip install -c constraints\.txt transformers`"):
         DepthNetwork()
+
+
+@needs_transformers
+def test_a_package_that_transformers_lacks_is_one_line(folder, monkeypatch):
+    import transformers
+
+    def broken(name):
+        try:
+            raise ImportError("No module named 'torchvision'\nmore")
+        except ImportError as error:
+            raise RuntimeError("Failed to import transformers because of the following error (look up)") from error
+
+    monkeypatch.delitem(vars(transformers), "DepthAnythingForDepthEstimation", raising=False)
+    monkeypatch.setattr(type(transformers), "__getattr__", lambda module, name: broken(name))
+    with pytest.raises(InputError) as caught:
+        DepthNetwork(folder)
+    assert str(caught.value) == (
+        "--depth depth-anything: expected transformers that can be imported, got No module named 'torchvision'. "
+        "Fix: `pip install -c constraints.txt transformers torchvision`."
+    )
 
 
 def test_importing_the_module_loads_neither_torch_nor_transformers():

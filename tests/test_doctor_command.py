@@ -100,8 +100,8 @@ def test_a_broken_gpu_is_fixed_first():
 @pytest.mark.parametrize(
     ("torch", "says", "step"),
     [
-        (Torch(), "cannot train yet. PyTorch: not installed.", "pip install torch"),
-        (Torch("2.13.0+cpu", error="no libgomp"), "PyTorch: 2.13.0+cpu: no libgomp.", "pip install --force-reinstall"),
+        (Torch(), "cannot train yet. PyTorch: not installed.", "pip install -c constraints.txt torch"),
+        (Torch("2.13.0+cpu", error="no libgomp"), "2.13.0+cpu: no libgomp.", "pip install --force-reinstall -c constr"),
         (Torch("2.13.0+cpu"), "can train and render.", "nothing to install"),
     ],
 )

@@ -246,7 +246,35 @@ def test_every_suffix_has_a_format_and_ambiguous_ones_the_first():
 def test_a_name_without_a_known_suffix_lists_the_formats(run, tmp_path, capsys, name):
     assert main(["export", str(run), str(tmp_path / name)]) == 2
     error = capsys.readouterr().err
+    assert ".ply .splat .spz .glb .obj .stl .mrb " in error
     assert ", ".join(FORMATS) in error and error.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("a.ply", (), "{count} Gaussians; for colored points: --format points; for a mesh: --format mesh"),
+        ("a.glb", (), "{count} Gaussians; for a moving mesh: --format animation"),
+        ("a.obj", (), "a mesh"),
+        ("a.ply", ("--format", "mesh"), "a mesh"),
+        ("folder", ("--format", "spz"), "{count} Gaussians, one file for each time step"),
+    ],
+)
+def test_the_command_says_what_it_wrote(run, tmp_path, capsys, name, options, words):
+    out = tmp_path / name
+    assert main(["export", str(run), str(out), "--times", "0.5", *options]) == 0
+    count = f"{len(load_scene(run)):,}"
+    assert f"{out}: {words.format(count=count)}\n" in capsys.readouterr().out
+
+
+def test_an_existing_file_is_kept_unless_it_may_be_overwritten(run, tmp_path, capsys):
+    out = tmp_path / "a.ply"
+    out.write_text("mine")
+    words = ["export", str(run), str(out), "--times", "0.5"]
+    assert main(words) == 2 and out.read_text() == "mine"
+    fix = "Fix: Choose another name, or add --overwrite."
+    assert capsys.readouterr().err == f"endoprior: {out}: expected a new file, got one that exists. {fix}\n"
+    assert main([*words, "--overwrite"]) == 0 and out.read_bytes().startswith(b"ply")
 
 
 def test_video_has_the_frames_of_the_split(run, tmp_path):

@@ -147,6 +147,27 @@ def test_a_wrong_option_is_named_with_what_was_meant(words, said, capsys):
     assert said in error and error.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("command", "option", "meant"),
+    [
+        ("run", "--fps", "--frames-per-second"),
+        ("prepare", "--fps", "--frames-per-second"),
+        ("train", "--epochs", "--iterations"),
+        ("train", "--gpu", "--device"),
+        ("export", "--force", "--overwrite"),
+        ("export", "--fps", None),
+        ("run", "--pose", "--poses"),
+        ("run", "--depht", "--depth"),
+        ("run", "--width", "--max-width"),
+        ("train", "--lr", None),
+    ],
+)
+def test_only_a_plausible_option_is_suggested(command, option, meant, capsys):
+    assert main([command, "a", "b", option, "1"]) == 2
+    said = f"Did you mean {meant}? `" if meant else "`"
+    assert f"got {option}. Fix: {said}endoprior {command} --help-all`" in capsys.readouterr().err
+
+
 def test_missing_arguments_are_named():
     from endoprior.cli.prepare import HELP, Prepare
 

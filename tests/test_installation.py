@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from endoprior.cli import main
-from endoprior.core.extras import install_command
+from endoprior.core.extras import install_command, missing_package
 from endoprior.system import installation
 
 ROOT = Path(__file__).parents[1]
@@ -17,15 +17,26 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 @pytest.mark.parametrize("extra", sorted({*PROJECT["optional-dependencies"]} - {"test"}))
 def test_the_packages_of_an_optional_part_are_those_of_pyproject(extra):
     names = [re.match(r"[\w-]+", line)[0] for line in PROJECT["optional-dependencies"][extra]]
-    assert install_command(extra) == f"pip install {' '.join(names)}"
+    constraints = "" if extra == "cuda" else "-c constraints.txt "  # gsplat keeps whichever torch is there
+    assert install_command(extra) == f"pip install {constraints}{' '.join(names)}"
+    if extra in ("networks", "mono", "exr", "ray"):
+        assert f"`{install_command(extra)}`" in (ROOT / "docs" / "install.md").read_text()
 
 
 def test_packages_that_only_some_systems_need_are_no_optional_part(monkeypatch):
     lines = ['b>=1; sys_platform != "none"', 'c>=2; sys_platform != "none" and extra == "x"', 'd; extra == "y"', "a"]
     monkeypatch.setattr("endoprior.core.extras.requires", lambda name: lines)
     install_command.cache_clear()
-    assert install_command("x") == "pip install c"
+    assert install_command("x") == "pip install -c constraints.txt c"
     install_command.cache_clear()
+
+
+def test_a_missing_package_is_told_apart_from_one_that_fails():
+    fix = "Fix: `pip install -c constraints.txt torchvision lpips`."
+    absent = ModuleNotFoundError("No module named 'lpips'", name="lpips")
+    assert missing_package("lpips", "networks", absent) == f"lpips is not installed. {fix}"
+    said = missing_package("lpips", "networks", ModuleNotFoundError("No module named 'scipy'\nx", name="scipy"))
+    assert said == f"lpips cannot be imported (No module named 'scipy'). {fix}"
 
 
 def test_no_message_takes_the_program_for_one_on_a_package_index():

@@ -42,13 +42,13 @@ def python_with(change: str) -> str:
     return f'#!/bin/sh\nexec {sys.executable} -c "import sys; {change}; exec(sys.argv[1])" "$2"\n'
 
 
-def make(checkout: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def make(checkout: Path, *words: str, target: str = TARGET) -> subprocess.CompletedProcess[str]:
     """Run `make` in the checkout, with nothing but its programs."""
     ours = ("PYTHON", "TORCH_INDEX", "MAKEFLAGS", "MFLAGS", "MAKELEVEL")
     environment = {key: value for key, value in os.environ.items() if key not in ours}
     environment["PATH"] = str(checkout / "programs")
     return subprocess.run(
-        ["make", *words, TARGET], cwd=checkout, env=environment, capture_output=True, text=True, check=False
+        ["make", *words, target], cwd=checkout, env=environment, capture_output=True, text=True, check=False
     )
 
 
@@ -116,3 +116,17 @@ def test_uv_is_used_where_it_is_and_takes_torch_from_the_index(checkout):
     (checkout / "calls").unlink()
     assert make(checkout).returncode == 0
     assert calls(checkout)[:2] == ["uv venv --seed .venv", f"{install} torch"]
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_docs_do_not_change_how_the_program_is_installed(checkout, installed):
+    answers = f'case "$*" in *m.version*) exit {1 - installed};; *tomllib*) echo "furo>=2 sphinx>=8";; esac'
+    program(checkout, "python3", RECORDS.format(name="python", then="true") + answers)
+    (checkout / ".venv" / "bin").mkdir(parents=True)
+    shutil.copy(checkout / "programs" / "python3", checkout / ".venv" / "bin" / "python")
+    (checkout / ".venv" / "bin" / "pip").touch()
+    done = make(checkout, target=".venv/.docs-installed")
+    assert done.returncode == 0, done.stderr
+    whole = ["python -m pip install torch", "python -m pip install --editable .[docs]"]
+    wanted = ["python -m pip install furo>=2 sphinx>=8"] if installed else whole
+    assert [line for line in calls(checkout) if "pip install" in line] == wanted

@@ -24,7 +24,7 @@ from endoprior.evaluation.metrics.weights import ALEXNET, RAFT_LARGE, RAFT_SMALL
 
 pytestmark = pytest.mark.skipif(
     not all(find_spec(package) for package in ("lpips", "torchvision")),
-    reason="NETWORK SCORES ARE NOT TESTED: pip install torchvision lpips",
+    reason="NETWORK SCORES ARE NOT TESTED: pip install -c constraints.txt torchvision lpips",
 )
 
 WEIGHTS = Path(os.environ.get("ENDOPRIOR_WEIGHTS", Path(__file__).parents[2] / "shared" / "weights"))
@@ -198,7 +198,10 @@ def test_a_package_that_is_not_installed_is_a_reason(no_weights, monkeypatch, pa
     (no_weights / ALEXNET.names[1]).touch()
     for name in [name for name in sys.modules if name.split(".")[0] == package]:
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(ScoreUnavailable, match=rf"{package} cannot be imported .*pip install torchvision lpips"):
+    with pytest.raises(
+        ScoreUnavailable,
+        match=rf"^{package} is not installed\. Fix: `pip install -c constraints.txt torchvision lpips`\.$",
+    ):
         lpips_distance("alex", no_weights, download=False)
 
 

@@ -11,7 +11,9 @@ from video_files import write_video
 
 from endoprior.cli import main
 
-PREPARED = re.compile(r"Fix: `(endoprior prepare .*?)`, then `(endoprior check .*?)`\.")
+PREPARED = re.compile(
+    r"Fix: `(endoprior prepare .*?)`, then `(endoprior check .*?)`; every step: `(endoprior run .*?)`\."
+)
 
 
 @pytest.fixture
@@ -46,6 +48,7 @@ def test_every_command_that_takes_data_names_prepare_for_a_video(tmp_path, frame
     assert [shlex.split(words) for words in PREPARED.search(text).groups()] == [
         ["endoprior", "prepare", str(video), str(data)],
         ["endoprior", "check", str(data)],
+        ["endoprior", "run", str(video), str(tmp_path / "my clip_out")],
     ]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["my clip.mp4"]
 
@@ -63,7 +66,7 @@ def test_the_printed_commands_work(tmp_path, frames, capsys, monkeypatch, kind):
         given = write_video(tmp_path / "v.mkv", frames).rename(tmp_path / "without suffix")
     text = complaint(capsys, "check", given)
     assert f"got {kind}." in text
-    for words in PREPARED.search(text).groups():
+    for words in PREPARED.search(text).groups()[:2]:
         assert main(shlex.split(words)[1:]) == 0, capsys.readouterr().err
 
 
@@ -79,6 +82,7 @@ def test_two_cameras(tmp_path, frames, capsys, kind):
     text = complaint(capsys, "check", tmp_path)
     assert f"got {kind} of two cameras." in text
     assert f"`endoprior prepare {left} {out} --right {right} --calibration FILE`" in text
+    assert f"`endoprior run {left} {left.with_name('case_Left_out')} --right {right} --calibration FILE`" in text
     (tmp_path / "calib.ini").write_text("")
     assert f"--calibration {tmp_path}/calib.ini`" in complaint(capsys, "check", tmp_path)
     left.rename(tmp_path / f"other_Left{suffix}")
@@ -92,6 +96,20 @@ def test_a_folder_around_or_in_a_sequence(tmp_path, make_tiny_sequence, capsys):
     assert f"got a part of a sequence folder. Fix: Pass '{data}'." in complaint(capsys, "check", data / "images")
     shutil.copytree(data, data.parent / "data2")
     assert "expected one of the layouts" in complaint(capsys, "check", data.parent)
+
+
+def test_the_results_of_run_name_their_parts(tmp_path, make_tiny_sequence, capsys):
+    data = make_tiny_sequence("my out/data")
+    out, run = data.parent, data.parent / "run"
+    run.mkdir()
+    for name in ("config.json", "scene.safetensors"):
+        (run / name).write_text("{}")
+    for command in ("check", "view"):
+        text = complaint(capsys, command, out)
+        assert f"got a folder with a sequence and a run in it. Fix: Pass '{data}'; the run is '{run}'." in text
+    for command in ("eval", "render"):
+        text = complaint(capsys, command, out)
+        assert f"{out}: expected a run folder, got a folder with a run in it. Fix: Pass '{run}'." in text
 
 
 def test_a_run_where_a_sequence_is_expected(tmp_path, make_tiny_sequence, capsys):
@@ -117,7 +135,15 @@ def test_a_sequence_or_a_video_where_a_run_is_expected(tmp_path, make_tiny_seque
     text = complaint(capsys, command, data, *out)
     assert f"{data}: expected a run folder, got a sequence folder. Fix: `endoprior train {data} RUN`" in text
     video = write_video(tmp_path / "v.mkv", frames)
-    assert "expected a run folder, got a video. Fix: `endoprior prepare" in complaint(capsys, command, video, *out)
+    made = tmp_path / "v_out"
+    text = complaint(capsys, command, video, *out)
+    assert f"expected a run folder, got a video. Fix: `endoprior run {video} {made}`, then pass {made / 'run'}." in text
+    images = write_images(tmp_path / "frames", frames)
+    text = complaint(capsys, command, images, *out)
+    assert f"{images}: expected a run folder, got a folder of images. Fix: `endoprior run {images} " in text
+    nowhere = tmp_path / "nowhere"
+    text = complaint(capsys, command, nowhere, *out)
+    assert f"{nowhere}: expected a run folder, got no such folder. Fix: Correct the path" in text
 
 
 def test_archives_and_what_is_not_recognized(tmp_path, capsys):

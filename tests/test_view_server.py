@@ -306,3 +306,13 @@ def test_wrong_input_is_one_line(tmp_path, capsys, tiny_sequence):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 4 and all(line.startswith("endoprior: ") for line in lines)
     assert "endoprior train --resume" in lines[3]
+
+
+def test_ctrl_c_is_the_usual_way_to_end_the_viewer(tiny_sequence, capsys, monkeypatch):
+    def stop(self, wait=0.0):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "work", stop)
+    assert main(["view", str(tiny_sequence), "--port", "0"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.endswith("viewer closed\n") and "interrupted" not in printed.err

@@ -1,5 +1,6 @@
 #!/bin/sh
 # Make .venv and install the program there, in the versions of constraints.txt: `sh tools/install.sh [EXTRA]`.
+# The extra `docs` does not change how the program is installed, if it is.
 # PYTHON is the Python to use, TORCH_INDEX the package index that torch comes from. uv is used if it is there.
 set -eu
 
@@ -25,6 +26,14 @@ if command -v uv >/dev/null; then
 else
     [ -e .venv/bin/pip ] || { check_python "${PYTHON:-python3}" && "${PYTHON:-python3}" -m venv .venv; }
     install() { .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt "$@"; }
+fi
+
+if [ "${1:-}" = docs ] && .venv/bin/python -c 'import importlib.metadata as m; m.version("endoprior")' 2>/dev/null; then
+    packages=$(.venv/bin/python -c 'import tomllib
+project = tomllib.load(open("pyproject.toml", "rb"))["project"]
+print(*project["optional-dependencies"]["docs"])')
+    install $packages # unquoted: one word for each
+    exit
 fi
 
 # torch comes first, pinned and by itself, so that no other package picks a build of its own.

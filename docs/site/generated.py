@@ -81,6 +81,7 @@ class Generated(SphinxDirective):
     """Puts generated Markdown in place of itself: `{generated} commands` or `{generated} config`."""
 
     required_arguments = 1
+    has_content = True  # for readers of the file: where the generated text is
 
     def run(self) -> list[nodes.Node]:
         """The nodes of the page."""

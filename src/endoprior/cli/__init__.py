@@ -10,9 +10,10 @@ import os
 import sys
 from importlib import import_module
 
-from ..core.checks import InputError, input_error
+from ..core.checks import InputError
 from ..system.installation import docs_folder
 from ..system.memory import reject_small_limits
+from .usage_errors import unknown_command
 
 COMMANDS = {
     "run": "from a video to a model to look at: prepare, check, train, score, video, player",
@@ -62,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
     name, rest = argv[0], argv[1:]
     try:
         if name not in COMMANDS:
-            raise input_error(name, f"one of {', '.join(COMMANDS)}", "no such command", "`endoprior --help`.")
+            raise unknown_command(name, {word: word for word in COMMANDS} | {MODULES[word]: word for word in MODULES})
         reject_small_limits()
         return import_module(f".{MODULES.get(name, name)}", __package__).run(rest) or 0
     except InputError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -16,6 +16,9 @@ from .parsing import parse
 from .progress import Counting
 from .trained_scene import open_scene
 
+if TYPE_CHECKING:
+    from ..model.scene import Scene
+
 
 @dataclass(frozen=True, kw_only=True)
 class Export(ExportOptions):
@@ -24,7 +27,9 @@ class Export(ExportOptions):
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder, or a scene.safetensors."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
-    """A file, or a new folder with one file for each time step. Its suffix says the format."""
+    """A new file, or a new folder with one file for each time step. Its suffix says the format."""
+    overwrite: bool = False
+    """Replace OUT if it is a file that exists."""
 
 
 HELP = Help(
@@ -32,10 +37,11 @@ HELP = Help(
         ("RUN", "tissue.ply", "--times", "0.5"),
         ("RUN", "tissue.obj", "--times", "0.5"),
         ("RUN", "OUT", "--format", "mesh", "--split", "test"),
+        ("RUN", "for_blender.glb", "--format", "animation"),
         ("RUN", "player.html"),
     ),
     basics={
-        "what to write": ("--format", "--mesh-format", "--frame"),
+        "what to write": ("--format", "--mesh-format", "--frame", "--overwrite"),
         "which times": ("--times", "--split", "--canonical"),
         "details": ("--mesh-method", "--min-alpha", "--points"),
     },
@@ -46,12 +52,31 @@ def run(argv: list[str]) -> None:
     """Export."""
     args = parse(Export, argv, "export", HELP)
     from ..export import export
+    from .output_paths import require_new_file
 
     options = ExportOptions(**{field.name: getattr(args, field.name) for field in fields(ExportOptions)})
     scene = open_scene(args.run)
+    if not args.overwrite:
+        require_new_file(args.out)
     with Counting() as progress:
         written = export(scene, args.out, options, partial(progress, "exporting"))
     for path in written:
-        say(f"{path}")
+        say(f"{path}: {_words(scene, path, options)}")
     if scene.lengths_are_relative:
         say("note: the scale of this scene is assumed. Its lengths are not millimeters.")
+
+
+def _words(scene: Scene, out: Path, options: ExportOptions) -> str:
+    """What was written; without --format also what else a file of this suffix can hold, and how to get that."""
+    from ..export.exporting import format_name
+    from ..export.formats import formats_of, load_format
+
+    name = format_name(out, options)
+    holds, count = load_format(name).holds or name, f"{len(scene):,} "
+    words = f"{count if holds == 'Gaussians' else ''}{holds}"
+    if out.is_dir():
+        words += ", one file for each time step" if load_format(name).files else ""
+    elif options.format is None:
+        others = [other for other in formats_of(out.suffix) if other != name]
+        words += "".join(f"; for {load_format(other).holds or other}: --format {other}" for other in others)
+    return words

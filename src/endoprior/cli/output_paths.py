@@ -28,6 +28,12 @@ def require_writable_file(option: str, path: Path, keep: Path) -> None:
     _require_writable(option, path, path.absolute().parent)
 
 
+def require_new_file(path: Path) -> None:
+    """Reject an existing file; the caller has an option --overwrite that permits it."""
+    if kind_of(path) == "a file":
+        raise input_error(path, "a new file", "one that exists", "Choose another name, or add --overwrite.")
+
+
 def require_writable_folder(option: str, path: Path) -> None:
     """Reject a path where no folder can be created or written; see `require_writable_file`."""
     kind = kind_of(path)

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Mapping, Sequence
 
 from ..core.checks import InputError, input_error, last_part, similar_name
 from .options import Option, option_name
 
+MEANT = {
+    "fps": "--frames-per-second",
+    "rate": "--frames-per-second",
+    "epochs": "--iterations",
+    "iters": "--iterations",
+    "steps": "--iterations",
+    "cuda": "--device",
+    "gpu": "--device",
+    "force": "--overwrite",
+    "output": "--out",
+    "resolution": "--max-width",
+}
+"""Words of other programs -> the option of the same meaning."""
 BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
 
 
@@ -16,10 +30,23 @@ def reject_unknown(argv: Sequence[str], command: str, names: Sequence[str]) -> N
     for word in argv:
         name = option_name(word)
         if name.startswith("--") and name not in names:
-            similar = similar_name(name, names)
+            same = MEANT.get(last_part(name))
+            similar = same if same in names else similar_name(name, names)
             meant = f"Did you mean {similar}? " if similar else ""
             fix = f"{meant}`endoprior {command} --help-all` lists all options."
             raise input_error(f"endoprior {command}", "an option that it has", name, fix)
+
+
+def unknown_command(name: str, commands: Mapping[str, str]) -> InputError:
+    """The error for a word that is no command; suggests the most similar one.
+
+    Args:
+        commands: what the user may type -> the command it stands for.
+    """
+    similar = difflib.get_close_matches(name.lower(), commands, 1)
+    meant = f"Did you mean `endoprior {commands[similar[0]]}`? " if similar else ""
+    listed = ", ".join(dict.fromkeys(commands.values()))
+    return input_error(name, f"one of {listed}", "no such command", f"{meant}`endoprior --help` explains each.")
 
 
 def usage_error(

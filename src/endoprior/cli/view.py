@@ -58,7 +58,10 @@ def run(argv: list[str]) -> None:
     viewable, out = open_viewable(args.path, args.data, args.device)
     viewer = import_viewer()(viewable, host=args.host, port=args.port, out=out)
     say(f"{viewable.title}: {viewer.url}  (Ctrl-C stops)")
-    viewer.run()
+    try:
+        viewer.run()
+    except KeyboardInterrupt:  # the usual way to end it
+        say("viewer closed")
 
 
 def import_viewer() -> type[Viewer]:
@@ -70,7 +73,9 @@ def import_viewer() -> type[Viewer]:
     try:
         from ..view.server import Viewer
     except ModuleNotFoundError as error:
-        raise input_error("the viewer", f"the package {error.name}", "none", "`pip install viser`.") from None
+        raise input_error(
+            "the viewer", f"the package {error.name}", "none", "`pip install -c constraints.txt viser`."
+        ) from None
     return Viewer
 
 

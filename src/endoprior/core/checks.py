@@ -23,6 +23,10 @@ def input_error(subject: Path | str, expected: str, got: str, fix: str) -> Input
     return InputError(f"{subject}: expected {expected}, got {got}. Fix: {fix[:1].upper()}{fix[1:]}")
 
 
+SIMILAR = 0.75
+"""Least similarity, difflib's ratio, of a name and what may be meant by it; at 0.6 `port` would mean `preset`."""
+
+
 def similar_name(name: str, names: Sequence[str]) -> str | None:
     """The name with the same last part, such as `temporal.weight` for `weight`, else the most similar one.
 
@@ -33,9 +37,13 @@ def similar_name(name: str, names: Sequence[str]) -> str | None:
     by_last_part = {last_part(each): each for each in reversed(names)}
     if last_part(name) in by_last_part:
         return by_last_part[last_part(name)]
-    whole = difflib.get_close_matches(name, names, 1)
-    part = difflib.get_close_matches(last_part(name), by_last_part, 1)
-    return whole[0] if whole else by_last_part[part[0]] if part else None
+    by_name = {each.removeprefix("--"): each for each in names}  # equal dashes would make any two names similar
+    for known, word in ((by_name, name.removeprefix("--")), (by_last_part, last_part(name))):
+        if close := difflib.get_close_matches(word, known, 1, SIMILAR):
+            return known[close[0]]
+    words = set(last_part(name).split("-"))
+    one_more = [part for part in by_last_part if len(words ^ set(part.split("-"))) == 1]  # `max-width` for `width`
+    return by_last_part[one_more[0]] if len(one_more) == 1 else None
 
 
 def last_part(name: str) -> str:

@@ -11,9 +11,10 @@ from packaging.requirements import Requirement
 
 @cache
 def install_command(extra: str) -> str:
-    """The command that installs the packages of an optional part: `pip install torchvision lpips`.
+    """The command that installs the packages of an optional part: `pip install -c constraints.txt torchvision lpips`.
 
-    It names the packages, because the program itself need not be on a package index.
+    It names the packages, because the program itself need not be on a package index. The constraints keep torch as it
+    is; gsplat is installed without them, because it fits every torch and a GPU may need another version than theirs.
 
     Args:
         extra: a name of `[project.optional-dependencies]`, `networks` for instance.
@@ -21,7 +22,15 @@ def install_command(extra: str) -> str:
     listed = [Requirement(line) for line in requires("endoprior") or ()]
     names = [each.name for each in listed if each.marker and _wants(each.marker, extra)]
     assert names, f"no optional part {extra}"
-    return " ".join(["pip install", *names])
+    return " ".join(["pip install", *([] if extra == "cuda" else ["-c constraints.txt"]), *names])
+
+
+def missing_package(package: str, extra: str, error: ImportError) -> str:
+    """One sentence about a package of an optional part that is not installed or cannot be imported, and the fix."""
+    is_absent = isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] == package
+    reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    state = "is not installed" if is_absent else f"cannot be imported ({reason})"
+    return f"{package} {state}. Fix: `{install_command(extra)}`."
 
 
 def _wants(marker: Marker, extra: str) -> bool:

@@ -50,12 +50,20 @@ def not_a_sequence(path: Path) -> InputError | None:
 
 
 def not_a_run(path: Path) -> InputError | None:
-    """The error for a path that is no run folder but can be trained on, perhaps after `prepare`; None for others."""
-    if kind_of(path) == "a folder" and is_sequence(path):
+    """The error for a path that is no run folder but holds one or leads to one; None for others."""
+    kind = kind_of(path)
+    if kind == "nothing":
+        got, fix = f"no such {'file' if path.name == RUN_FILES[0] else 'folder'}", "Correct the path, or make a run: "
+        return input_error(path, "a run folder", got, f"{fix}`{command('train', 'DATA', path)}`.")
+    if kind == "a folder" and is_sequence(path):
         fix = f"`{command('train', path, 'RUN')}`, then pass RUN."
         return input_error(path, "a run folder", "a sequence folder", fix)
-    if kind_of(path) == "a file" and is_video(path):
-        return input_error(path, "a run folder", "a video", f"{_prepare(path)}, and train on it.")
+    if kind == "a folder" and is_run(path / "run"):
+        return input_error(path, "a run folder", "a folder with a run in it", f"pass {quoted(path / 'run')}.")
+    if (kind == "a file" and is_video(path)) or (kind == "a folder" and not is_run(path) and _has_images(path)):
+        what, out = "a video" if kind == "a file" else "a folder of images", _beside(path, "out")
+        fix = f"`{command('run', path, out)}`, then pass {quoted(out / 'run')}."
+        return input_error(path, "a run folder", what, fix)
     return None
 
 
@@ -78,6 +86,9 @@ def _folder(path: Path) -> tuple[str, str] | None:
     inside = sorted(entry for entry in entries(path) if not entry.name.startswith("."))
     folders = [entry for entry in inside if entry.is_dir()]
     sequences = [folder for folder in folders if is_sequence(folder)]
+    if len(sequences) == 1 and is_run(path / "run"):
+        fix = f"pass {quoted(sequences[0])}; the run is {quoted(path / 'run')}."
+        return "a folder with a sequence and a run in it", fix
     if len(sequences) == 1:
         return "a folder with one sequence folder in it", f"pass {quoted(sequences[0])}."
     videos = [entry for entry in inside if entry.suffix.lower() in VIDEO_SUFFIXES and entry.is_file()]
@@ -103,10 +114,16 @@ def _fix_of_run(path: Path) -> str:
 
 
 def _prepare(path: Path, *options: str | Path) -> str:
-    """The commands that make a sequence folder beside `path`, and check it."""
+    """The command that does every step, or those that make a sequence folder beside `path` and check it."""
+    data = _beside(path, "data")
+    every_step = command("run", path, _beside(path, "out"), *options)
+    return f"`{command('prepare', path, data, *options)}`, then `{command('check', data)}`; every step: `{every_step}`"
+
+
+def _beside(path: Path, ending: str) -> Path:
+    """A folder beside `path`, named after it: `clip_data` for `clip.mp4`."""
     whole = path if path.name not in ("", "..") else Path(os.path.abspath(path))
-    out = whole.with_name(f"{whole.stem if whole.is_file() else whole.name}_data")
-    return f"`{command('prepare', path, out, *options)}`, then `{command('check', out)}`"
+    return whole.with_name(f"{whole.stem if whole.is_file() else whole.name}_{ending}")
 
 
 def _prepare_pair(left: Path, right: Path, inside: Sequence[Path]) -> str:

@@ -36,9 +36,9 @@ def machine_lines(facts: Facts) -> list[Line]:
 def _pytorch(torch: Torch) -> Line:
     """What the CPU needs of PyTorch; the lines about the GPU ask for more."""
     if not torch.version:
-        return Line("machine", "PyTorch", "missing", "not installed", "pip install torch")
+        return Line("machine", "PyTorch", "missing", "not installed", "pip install -c constraints.txt torch")
     if torch.error:
-        repair = "pip install --force-reinstall torch"
+        repair = "pip install --force-reinstall -c constraints.txt torch"
         return Line("machine", "PyTorch", "wrong", f"{torch.version}: {torch.error}", repair)
     return Line("machine", "PyTorch", "ok", torch.version)
 

@@ -87,4 +87,10 @@ def encode_animation(
     return buffer.file(document, extras)
 
 
-FORMAT = Format(suffixes=(".glb",), options=(*TIME_STEP_OPTIONS, *SURFACE_OPTIONS), write=write, default_axes="opengl")
+FORMAT = Format(
+    suffixes=(".glb",),
+    options=(*TIME_STEP_OPTIONS, *SURFACE_OPTIONS),
+    write=write,
+    default_axes="opengl",
+    holds="a moving mesh",
+)

@@ -41,4 +41,5 @@ FORMAT = Format(
     options=("times", "split", "min_alpha"),
     files=files,
     index_facts={"png_unit_mm": 1 / PNG_STEPS_PER_MM, "npy_unit_mm": 1.0, "missing": 0},
+    holds="depth",
 )

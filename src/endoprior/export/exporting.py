@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.checks import input_error
 from ..system.atomic import whole_file, whole_folder, write_json
-from .formats import REGISTRY, Format, Progress, formats_of, load_format
+from .formats import REGISTRY, Format, Progress, formats_of, known_suffixes, load_format
 from .options import DEFAULTS, ExportOptions
 
 if TYPE_CHECKING:
@@ -29,11 +29,7 @@ def export(
         InputError: no format is named, neither by the options nor by `out`; an option has no meaning for the format;
             `out` does not suit it; or there is nothing to write.
     """
-    name = options.format or next(iter(formats_of(out.suffix)), None)
-    if name is None:
-        got = f"the suffix {out.suffix}" if out.suffix else "a name without a suffix"
-        fix = f"Add --format with one of {', '.join(REGISTRY.names())}."
-        raise input_error(out, "a file whose suffix says the format, or --format", got, fix)
+    name = format_name(out, options)
     options, chosen = replace(options, format=name), load_format(name)
     _reject_unused_options(options, chosen)
     options = replace(options, frame=options.frame or chosen.default_axes)
@@ -45,6 +41,21 @@ def export(
     else:
         _export_time_steps(scene, out, options, chosen, progress)
     return [out]
+
+
+def format_name(out: Path, options: ExportOptions) -> str:
+    """The format that `options` name, else the first one of `out`'s suffix.
+
+    Raises:
+        InputError: neither names one.
+    """
+    name = options.format or next(iter(formats_of(out.suffix)), None)
+    if name is None:
+        got = f"the suffix {out.suffix}" if out.suffix else "a name without a suffix"
+        fix = f"Choose a suffix of {' '.join(known_suffixes())}, or add --format with one of "
+        fix += f"{', '.join(REGISTRY.names())}."
+        raise input_error(out, "a file whose suffix says the format, or --format", got, fix)
+    return name
 
 
 def _by_suffix(out: Path, options: ExportOptions, chosen: Format) -> str:

@@ -59,6 +59,8 @@ class Format:
     """Field of `ExportOptions` that chooses between the suffixes, as `mesh_format`; by default the file's name does."""
     default_axes: Axes = "opencv"
     """What --frame stands for where it is not given."""
+    holds: str = ""
+    """What is in a file, in plain words: `a mesh`; `endoprior export` says it of what it wrote."""
     index_facts: Mapping[str, Any] | None = None
     """What `index.json` says of the files' units, for a format without axes in mm."""
 
@@ -94,5 +96,14 @@ def load_format(name: str) -> Format:
 
 def formats_of(suffix: str) -> list[str]:
     """Names of the formats that write files of this suffix: the one that it stands for first, plugins last."""
-    known = [*((name, REGISTRY.load(name)) for name in FORMATS), *REGISTRY.usable()]
-    return [name for name, format_ in known if suffix in format_.suffixes]
+    return [name for name, format_ in _loaded() if suffix in format_.suffixes]
+
+
+def known_suffixes() -> list[str]:
+    """Every suffix that says a format, without repetition."""
+    return list(dict.fromkeys(suffix for _, format_ in _loaded() for suffix in format_.suffixes))
+
+
+def _loaded() -> list[tuple[str, Format]]:
+    """Name and format of all that can be used, plugins last."""
+    return [*((name, REGISTRY.load(name)) for name in FORMATS), *REGISTRY.usable()]

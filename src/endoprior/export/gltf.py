@@ -71,4 +71,6 @@ def splat_attributes(splats: Splats) -> dict[str, NDArray[np.float32]]:
     return {name: np.ascontiguousarray(values, "<f4") for name, values in attributes.items()}
 
 
-FORMAT = Format(suffixes=(".glb",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, default_axes="opengl")
+FORMAT = Format(
+    suffixes=(".glb",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, default_axes="opengl", holds="Gaussians"
+)

@@ -124,4 +124,4 @@ def _page(title: str, about: dict[str, Any], data: bytes) -> str:
     return re.sub(r"@@([A-Z]+)@@", lambda match: parts[match[1]], template)
 
 
-FORMAT = Format(suffixes=(".html",), options=("times", "title", "max_mb"), write=write)
+FORMAT = Format(suffixes=(".html",), options=("times", "title", "max_mb"), write=write, holds="a player")

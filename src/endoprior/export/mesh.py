@@ -103,4 +103,5 @@ FORMAT = Format(
     options=(*TIME_STEP_OPTIONS, "mesh_format", *SURFACE_OPTIONS),
     files=files,
     suffix_option="mesh_format",
+    holds="a mesh",
 )

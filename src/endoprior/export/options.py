@@ -15,7 +15,8 @@ class ExportOptions:
     """Options of an export. Each format takes some of them and rejects the others."""
 
     format: Literal[REGISTRY.names()] | None = None
-    """Format; by default the one of OUT's suffix. A .ply is `ply`; a folder has no default."""
+    """Format; by default the one of OUT's suffix: .ply and .glb are Gaussians, .obj is a mesh.
+    Blender opens `animation` (a moving mesh, .glb) and `mesh`. A folder has no default."""
     times: tuple[float, ...] = ()
     """Times in [0, 1] to export instead of frames. Frame i of T is at i / T."""
     split: Literal["video", "test", "train"] = "video"

@@ -76,4 +76,4 @@ def ply_bytes(vertices: NDArray, axes: Axes, triangles: NDArray[np.int32] | None
     return ("\n".join([*lines, "end_header"]) + "\n").encode() + body
 
 
-FORMAT = Format(suffixes=(".ply",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files)
+FORMAT = Format(suffixes=(".ply",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, holds="Gaussians")

@@ -37,4 +37,6 @@ def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, byt
     return {".ply": ply_bytes(vertex_table(columns), options.frame)}
 
 
-FORMAT = Format(suffixes=(".ply",), options=(*TIME_STEP_OPTIONS, "canonical", "min_opacity"), files=files)
+FORMAT = Format(
+    suffixes=(".ply",), options=(*TIME_STEP_OPTIONS, "canonical", "min_opacity"), files=files, holds="colored points"
+)

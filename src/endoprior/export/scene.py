@@ -15,4 +15,4 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     progress(1, 1)
 
 
-FORMAT = Format(suffixes=(".safetensors",), options=(), write=write)
+FORMAT = Format(suffixes=(".safetensors",), options=(), write=write, holds="the whole scene, motion included")

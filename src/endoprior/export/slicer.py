@@ -143,4 +143,6 @@ def _entry(name: str) -> ZipInfo:
     return ZipInfo(f"{FOLDER}/{name}")
 
 
-FORMAT = Format(suffixes=(".mrb",), options=("times", "split", *SURFACE_OPTIONS), write=write)
+FORMAT = Format(
+    suffixes=(".mrb",), options=("times", "split", *SURFACE_OPTIONS), write=write, holds="a sequence of meshes"
+)

@@ -37,4 +37,4 @@ def encode_splat(splats: Splats) -> bytes:
     return records[order].tobytes()
 
 
-FORMAT = Format(suffixes=(".splat",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files)
+FORMAT = Format(suffixes=(".splat",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, holds="Gaussians")

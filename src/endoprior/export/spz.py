@@ -82,4 +82,6 @@ def _well_conditioned(quats: NDArray[np.float64]) -> NDArray[np.float64]:
     return chosen * np.where(chosen[:, :1] < 0, -1, 1)
 
 
-FORMAT = Format(suffixes=(".spz",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, default_axes="opengl")
+FORMAT = Format(
+    suffixes=(".spz",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, default_axes="opengl", holds="Gaussians"
+)

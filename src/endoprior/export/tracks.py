@@ -154,4 +154,4 @@ def _table(positions: NDArray, pixels: NDArray, visible: NDArray, times: list[fl
     return text.getvalue()
 
 
-FORMAT = Format(suffixes=(), options=("frame", "points", "grid_px", "min_alpha"), write=write)
+FORMAT = Format(suffixes=(), options=("frame", "points", "grid_px", "min_alpha"), write=write, holds="tracks of points")

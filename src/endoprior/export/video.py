@@ -28,4 +28,4 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     write_video(out, images(), scene.frames_per_second)
 
 
-FORMAT = Format(suffixes=(".mp4",), options=("split",), write=write)
+FORMAT = Format(suffixes=(".mp4",), options=("split",), write=write, holds="a video")

@@ -112,8 +112,14 @@ def _load(name: str | Path, folder: Path) -> Module:
 
         with suppress(ScoreUnavailable):
             import_torchvision()
-    from transformers import DepthAnythingForDepthEstimation
-
+    try:
+        from transformers import DepthAnythingForDepthEstimation
+    except Exception as error:  # the library raises what the packages that it imports raise, in sentences of its own
+        while error.__cause__:
+            error = error.__cause__
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        fix = f"`{install_command('mono')} torchvision`."  # an old or unfit torchvision is the usual reason
+        raise input_error("--depth depth-anything", "transformers that can be imported", reason, fix) from None
     try:
         network, report = DepthAnythingForDepthEstimation.from_pretrained(
             folder, local_files_only=True, use_safetensors=True, output_loading_info=True

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import check_shape
-from ...core.extras import install_command
+from ...core.extras import missing_package
 from .torchvision_compat import import_torchvision
 from .weights import ALEXNET, SQUEEZENET, FoundWeights, ScoreUnavailable, find_weights, load_weights, select_weights
 
@@ -108,9 +108,7 @@ def _untrained(backbone: str) -> tuple[Module, FoundWeights]:
     try:
         import lpips
     except ImportError as error:
-        raise ScoreUnavailable(
-            f"lpips cannot be imported ({error}). Install it with: {install_command('networks')}"
-        ) from error
+        raise ScoreUnavailable(missing_package("lpips", "networks", error)) from error
     # A new network has random weights; creating them must not change the caller's random numbers.
     with torch.random.fork_rng(devices=[]), warnings.catch_warnings():
         # The package names the classifier's weights in torchvision's old way, even when it needs none.

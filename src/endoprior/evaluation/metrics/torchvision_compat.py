@@ -11,7 +11,7 @@ import importlib
 from types import ModuleType
 from typing import Any
 
-from ...core.extras import install_command
+from ...core.extras import install_command, missing_package
 from .weights import ScoreUnavailable
 
 MISSING_OPERATORS = (
@@ -31,26 +31,23 @@ def import_torchvision() -> ModuleType:
         ScoreUnavailable: torchvision is not installed, or does not work with this torch.
     """
     try:
+        try:
+            return _import_torchvision()
+        except RuntimeError as error:
+            if "operator torchvision::" not in str(error):
+                raise
+        _declare_operators()
         return _import_torchvision()
-    except RuntimeError as error:
-        if "operator torchvision::" not in str(error):
-            raise _broken(error) from error
-    _declare_operators()
-    try:
-        return _import_torchvision()
+    except ImportError as error:
+        raise ScoreUnavailable(missing_package("torchvision", "networks", error)) from error
     except RuntimeError as error:
         raise _broken(error) from error
 
 
 def _import_torchvision() -> ModuleType:
     """The torchvision module with the parts used here; RuntimeError if it does not match torch."""
-    try:
-        importlib.import_module("torchvision.models.optical_flow")
-        return importlib.import_module("torchvision")
-    except ImportError as error:
-        raise ScoreUnavailable(
-            f"torchvision cannot be imported ({error}). Install it with: {install_command('networks')}"
-        ) from error
+    importlib.import_module("torchvision.models.optical_flow")
+    return importlib.import_module("torchvision")
 
 
 def _declare_operators() -> None:
@@ -70,5 +67,5 @@ def _broken(error: RuntimeError) -> ScoreUnavailable:
 
     cause = str(error).strip().splitlines()[0]
     return ScoreUnavailable(
-        f"torchvision does not work beside torch {torch.__version__} ({cause}). Install the matching one"
+        f"torchvision does not work beside torch {torch.__version__} ({cause}). Fix: `{install_command('networks')}`."
     )
