@@ -64,7 +64,7 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Do every step, with one progress display."""
     args = parse(Run, argv, "run", HELP)
-    from ..pipeline import STEPS, estimate, make_job, open_folder, run_step
+    from ..pipeline import STEPS, estimate, make_job, open_folder, problems, run_step
     from ..runs import kernel_cache
 
     cfg = replace(preset("preview" if args.preview else args.preset), seed=args.seed)
@@ -98,6 +98,8 @@ def run(argv: list[str]) -> None:
         ("scene", job.run),
     ):
         say(f"  {what:<8}{path}")
+    for line in problems(job):
+        say(line)
     say(f"Turn and measure it: {command('view', job.run)}")
     if args.preview:
         say(f"The whole model:     {command('run', job.video, Path('OUT'))}")
@@ -106,8 +108,6 @@ def run(argv: list[str]) -> None:
 def _part_words(job: Job) -> str:
     """What is used of the video."""
     part = job.part
-    if not part.num_frames:
-        return f"{job.video}: all frames, {part.frames_per_second:g} a second"
     seconds = part.num_frames / part.frames_per_second
     words = f"{job.video}: {part.num_frames} frames, {seconds:.1f} s at {part.frames_per_second:g} frames/s"
     return words if part.is_whole else f"{words} from {part.start:g} s on (--start and --end choose another part)"

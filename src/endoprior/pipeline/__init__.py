@@ -2,6 +2,6 @@
 
 from .estimate import estimate
 from .job import Job, make_job, open_folder
-from .steps import STEPS, Step, run_step
+from .steps import STEPS, Step, problems, run_step
 
-__all__ = ["STEPS", "Job", "Step", "estimate", "make_job", "open_folder", "run_step"]
+__all__ = ["STEPS", "Job", "Step", "estimate", "make_job", "open_folder", "problems", "run_step"]
