@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -109,6 +110,14 @@ def test_table_ranks_rounds_and_leaves_out_what_nobody_has():
     assert [e.text for e in a] == ["31.0 ± 1.0", "0.5000 ± 0.0000", "12,345 ± 0", "-"]
     assert [e.rank for e in a] == [2, 2, 0, 0] and [e.rank for e in b] == [1, 1, 0, 0]
     assert b[3].text == "0.0414"
+
+
+def test_lengths_on_a_sequence_of_relative_depth_are_not_called_mm():
+    measured = results()
+    scores = {cell: {**values, "depth_rmse_mm": 1.0} for cell, values in measured.scores.items()}
+    spec = replace(measured.spec, scores=("psnr", "depth_rmse_mm"))
+    assert score_table(Results(spec, scores), "s").columns == ["PSNR, dB", "depth RMSE, mm"]
+    assert score_table(Results(spec, scores, frozenset({"s"})), "s").columns == ["PSNR, dB", "depth RMSE, rel."]
 
 
 def test_markdown_and_latex_mark_best_and_second():

@@ -8,12 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from sequence_edits import change_poses, describe, edit
 
-from endoprior.check import Facts, Finding, find, measure
+from endoprior.check import Facts, Finding, draw_check, find, measure
+from endoprior.check.report import as_json, table
 from endoprior.cli import main
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
+from endoprior.footage.border import Circle
 from endoprior.footage.units import guess_unit
 from endoprior.phantom import PhantomConfig, write_phantom
 
@@ -233,7 +237,68 @@ def test_sparse_depth_and_depth_jumps(data):
 def test_masks_that_are_full_or_empty(data):
     edit(data / "masks", lambda mask, _: np.zeros_like(mask))
     finding = only(data, "tool-fraction")
-    assert finding.severity == "note" and finding.what == "no mask marks a tool"
+    assert finding.severity == "warning"
+    assert finding.what == "no tools were found; if tools are in view, they become tissue"
+    assert finding.fix.startswith("nothing if no tool is in view; else `endoprior prepare ")
+
+
+def test_a_masked_border_is_no_tool(data, facts):
+    """Black corners and a label in the image, masked in every frame, beside the tools."""
+    border = ~Circle(WIDTH / 2, HEIGHT / 2, 120).mask(WIDTH, HEIGHT)
+    border[90:100, 120:140] = True
+    edit(data / "images", lambda image, _: np.where(border[..., None], np.uint8(0), image))
+    edit(data / "masks", lambda mask, _: np.where(border, np.uint8(255), mask))
+    found = measure(load_sequence(data))
+    assert found.border.masked.mean() == pytest.approx(border.mean(), abs=0.01)
+    tools = [(~frame.tissue_mask & ~border).sum() / (~border).sum() for frame in load_sequence(data).frames("video")]
+    assert found.masks.tool_fraction == pytest.approx(np.array(tools), abs=0.01) and min(tools) > 0.01
+    assert find(found) == []
+    assert as_json(found, [])["facts"]["border"]["masked"] == found.border.masked.mean()
+
+
+def test_masks_of_the_border_alone_hold_no_tools(data):
+    border = ~Circle(WIDTH / 2, HEIGHT / 2, 120).mask(WIDTH, HEIGHT)
+    edit(data / "images", lambda image, _: np.where(border[..., None], np.uint8(0), image))
+    edit(data / "masks", lambda mask, _: np.where(border, np.uint8(255), np.uint8(0)))
+    describe(data, sources={"masks": "no tools found by color"})
+    facts = measure(load_sequence(data))
+    assert not facts.masks.tool_fraction.any()
+    (finding,) = find(facts)
+    assert (finding.code, finding.severity) == ("tool-fraction", "warning")
+    assert "the masks cover only the border; if tools are in view, they become tissue" in finding.what
+    assert f"paint them white (255) in {data}/masks, or `endoprior prepare " in finding.fix
+    assert "--masks FOLDER" in finding.fix
+
+
+def test_relative_lengths_are_not_called_mm(facts):
+    relative = replace(facts, depth=replace(facts.depth, relative=True), camera_path_mm=5.0)
+    rows = dict(table(relative))
+    assert rows["camera"].startswith("moves up to 5 rel.") and rows["depth"].endswith(" rel.")
+    assert "mm" not in " ".join(rows.values())
+    assert " mm" in dict(table(facts))["depth"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_relative", [False, True])
+def test_no_text_of_the_figure_is_cut_off(facts, whole, tmp_path, monkeypatch, is_relative):
+    shown, save = [], Figure.savefig
+
+    def record(figure, *args):
+        save(figure, *args)
+        axes_texts = [
+            text for axes in figure.findobj(Axes) for text in (axes.title, axes.xaxis.label, axes.yaxis.label)
+        ]
+        shown.extend(text for text in axes_texts if text.get_text())
+        page = figure.bbox
+        for text in shown:
+            box = text.get_window_extent()
+            assert page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1, text
+
+    monkeypatch.setattr(Figure, "savefig", record)
+    facts = replace(facts, depth=replace(facts.depth, relative=is_relative))
+    draw_check(load_sequence(whole), facts, find(facts), tmp_path / "check.png")
+    lengths = [text.get_text() for text in shown if "distance" in text.get_text() or "median" in text.get_text()]
+    assert len(lengths) >= 2 and all(("rel." in text) == is_relative for text in lengths)
 
 
 def test_blurred_frames_and_few_frames(data):
@@ -259,7 +324,7 @@ def test_findings_from_edited_facts(facts):
     assert [(f.code, f.severity) for f in relative] == [("relative-depth", "note")]
     assert [f.code for f in find(replace(facts, notes=("odd",), cloud=None))] == ["no-points", "reader"]
     much = find(replace(facts, masks=replace(facts.masks, tool_fraction=np.full(FRAMES, 0.7))))
-    assert [f.what for f in much] == ["70% of all pixels are tool"]
+    assert [f.what for f in much] == ["70% of the pixels inside the border are tool"]
     cut = find(replace(facts, changes=replace(facts.changes, cuts=(3,))))
     assert [f.fix for f in cut] == [f"`endoprior train {facts.path} RUN --data.skip-frames 0-2`"]
 

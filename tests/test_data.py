@@ -290,7 +290,7 @@ def test_remarks(tiny_sequence):
     describe(tiny_sequence, fx=None)
     change_poses(tiny_sequence, lambda p: np.where(np.arange(17) == 4, 512, p))
     remarks = load_sequence(tiny_sequence).validate()
-    for part in ("000018.png: matched by order", "79% of all pixels are tool", "1 frames have no depth", "48x512 px"):
+    for part in ("000018.png: matched by order", "79% of all pixels are masked", "1 frames have no depth", "48x512 px"):
         assert sum(part in remark for remark in remarks) == 1
     assert len(remarks) == 4 and not any("\n" in remark for remark in remarks)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 
 import cv2
@@ -54,10 +55,24 @@ def test_ply_of_all_frames_and_their_index(run, tmp_path):
     assert names == [f"{i:06d}.ply" for i in range(10)] + ["index.json"]
     index = json.loads((tmp_path / "out" / "index.json").read_text())
     assert (index["axes"], index["unit"], index["frames_per_second"]) == ("lps", "mm", 25.0)
+    assert b"comment axes lps, unit mm\n" in (tmp_path / "out/000000.ply").read_bytes()
     assert index["time_steps"][7] == {"files": ["000007.ply"], "time": 0.7, "frame": 7}
     for i in (0, 7):
         want = points_in_axes(scene.at(i / 10).means.numpy(), "lps")
         assert positions(tmp_path / "out" / f"{i:06d}.ply") == pytest.approx(want, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["x.ply", "x.obj", "x.stl", "x.glb", "x.html", "points.ply", "mesh.ply", "moving.glb"])
+def test_no_file_calls_relative_lengths_mm(tmp_path, name):
+    scene = replace(moving_scene(sh_degree=1, moving_camera=True), lengths_are_relative=True)
+    scene.save(tmp_path / "run/scene.safetensors")
+    formats = {"x.glb": "gltf", "points.ply": "points", "mesh.ply": "mesh", "moving.glb": "animation"}
+    options = ["--times", "0", "0.5"] if name in ("moving.glb", "x.html") else ["--times", "0"]
+    options += ["--format", formats[name]] if name in formats else []
+    assert main(["export", str(tmp_path / "run"), str(tmp_path / name), *options]) == 0
+    content = (tmp_path / name).read_bytes()
+    assert re.search(rb'unit rel\.|"unit": ?"rel\."|Depth, rel\.', content)
+    assert not re.search(rb'unit mm|"unit": ?"mm"|Depth, mm', content)
 
 
 @pytest.mark.parametrize(

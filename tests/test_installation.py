@@ -44,6 +44,12 @@ def test_no_message_takes_the_program_for_one_on_a_package_index():
         assert not re.search(r"endoprior\[|pip install endoprior", path.read_text()), path
 
 
+def test_a_page_is_a_file_of_this_machine_or_an_address(monkeypatch, tmp_path):
+    assert Path(installation.page("scores.md")).samefile(ROOT / "docs/scores.md")
+    monkeypatch.setattr(installation, "PACKAGE", tmp_path / "a/b")
+    assert installation.page("scores.md") == PROJECT["urls"]["Paper"]
+
+
 def test_pages_that_the_program_names_exist():
     folder = installation.docs_folder()
     for path in sorted((ROOT / "src").rglob("*.py")):

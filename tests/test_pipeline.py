@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -11,15 +11,17 @@ from matplotlib.figure import Figure
 from tiny_training import tiny_config
 from video_files import write_video
 
+from endoprior.check import Finding
 from endoprior.cli import main
 from endoprior.cli.run import resume_words
 from endoprior.cli.step_display import StepDisplay
 from endoprior.core.checks import InputError
 from endoprior.model.scene import load_scene
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.pipeline import STEPS, make_job, notes_of, open_folder, run_step
+from endoprior.pipeline import STEPS, make_job, notes_of, open_folder, problems, run_step
 from endoprior.pipeline.steps import PREVIEW_TITLE
 from endoprior.prepare.config import PrepareConfig
+from endoprior.system.atomic import write_json
 
 FRAMES = 27
 ROOT = Path(__file__).parents[1]
@@ -55,6 +57,15 @@ def test_every_step_leaves_its_result(done):
     assert all(step.result(done).exists() for step in STEPS)
     assert (done.run / "metrics.json").is_file() and done.report.is_file()
     assert len(load_scene(done.run).cameras) == FRAMES
+
+
+def test_the_problems_of_the_video_are_told_with_their_fixes(done, tmp_path):
+    assert json.loads(done.findings.read_text())["findings"], "relative depth is noted"
+    assert problems(done) == []
+    job = replace(done, out=tmp_path)
+    no_tools = Finding("tool-fraction", "warning", "no tools were found", "paint them")
+    write_json(job.findings, {"findings": [asdict(no_tools), asdict(replace(no_tools, severity="note"))]})
+    assert problems(job) == ["warning: tool-fraction: no tools were found. Fix: paint them"]
 
 
 def test_a_finished_step_is_not_repeated(done):
@@ -154,10 +165,12 @@ def test_a_camera_that_is_lost_ends_the_training_frames(video, tmp_path):
 @pytest.mark.slow
 def test_the_command_ends_with_a_player(video, tmp_path, capsys):
     out = tmp_path / "mein Ordner"
-    assert main(["run", str(video), str(out), "--preview"]) == 0
+    assert main(["run", str(video), str(out), "--preview", "--masks", "none"]) == 0
     printed = capsys.readouterr().out
     assert f"Open {out / 'player.html'} in a browser." in printed
     assert f"endoprior view '{out / 'run'}'" in printed
+    assert "warning: tool-fraction: no tools were found" in printed[printed.index("in a browser.") :]
+    assert " mm" not in printed.replace("For mm use", ""), "depth of one camera is relative"
     assert "<script>" in (out / "player.html").read_text(encoding="utf-8")
 
 

@@ -3,12 +3,15 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from endoprior.cli.step_display import duration
 from endoprior.core.presets import preset
 from endoprior.pipeline.estimate import FRAMES, Trial, scaled, shortened
 from endoprior.pipeline.part import choose_part, every_kth_time, usable_frames
+from endoprior.prepare.frame_selection import FrameSelection
+from endoprior.prepare.source import SourceFrame
 
 WHOLE = (0.0, math.inf)
 
@@ -32,6 +35,21 @@ def test_a_long_video_then_loses_its_end():
 def test_the_choices_of_the_user_stay():
     part = choose_part(300.0, 25.0, 25.0, 10.0, 12.0, most=300)
     assert (part.frames_per_second, part.start, part.end, part.num_frames) == (25.0, 10.0, 12.0, 50)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.5, 1.23])
+@pytest.mark.parametrize("wanted_rate", [0.0, 10.0, 7.0, 50.0])
+@pytest.mark.parametrize("end", [2.5, 3.99, 4.0, math.inf])
+@pytest.mark.parametrize("most", [20, 60, 300])
+def test_it_has_as_many_frames_as_prepare_selects(start, wanted_rate, end, most):
+    part = choose_part(10.0, 25.0, wanted_rate, start, end, most)
+    images = [SourceFrame(i, i / 25, np.empty((1, 1, 3), np.uint8)) for i in range(250)]
+    selected = list(FrameSelection(part.frames_per_second, part.start, part.end, 25.0).pick(images))
+    assert part.num_frames == len(selected) <= most
+
+
+def test_the_frame_at_half_a_step_before_the_end_counts():
+    assert choose_part(10.0, 25.0, 0.0, 0.0, 2.5, most=300).num_frames == 63
 
 
 @pytest.mark.parametrize("rate", [1.0, 8.0, 10.0, 24.0, 29.97, 60.0, 1000.0])

@@ -144,6 +144,7 @@ def test_monocular_video_without_options(tmp_path, phantom):
     assert np.median(np.concatenate(tissue)) == pytest.approx(70, rel=0.1)
     text = " ".join(done.notes)
     assert "no calibration" in text and "relative (shading)" in text and "static" in text
+    assert "70 mm" not in text
     assert sequence.validate() is not None
 
 

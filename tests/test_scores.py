@@ -52,4 +52,14 @@ def test_values_are_shown_with_their_unit():
     shown = {"psnr": 31.267, "ssim": 0.95, "num_gaussians": 20_000, "fps": 45.01}
     texts = [all_scores()[name].text(value) for name, value in shown.items()]
     assert texts == ["31.27 dB", "0.9500", "20,000", "45.0 frames/s"]
-    assert all_scores()["psnr"].heading == "PSNR, dB" and all_scores()["ssim"].heading == "SSIM"
+    assert all_scores()["psnr"].heading() == "PSNR, dB" and all_scores()["ssim"].heading() == "SSIM"
+
+
+def test_lengths_of_relative_depth_are_not_called_mm():
+    rmse, instability = all_scores()["depth_rmse_mm"], all_scores()["depth_instability_mm"]
+    assert rmse.text(1.1, relative=True) == "1.100 rel." and instability.heading(True) == "depth instability, rel."
+    table = score_table(dict.fromkeys(all_scores(), 1.0), {}, relative=True)
+    assert not any(" mm" in line for line in table)
+    assert table[-1].startswith("  rel.: the scale of the depth is unknown.")
+    without = score_table({"psnr": 30.0, "ssim": 0.9, "flow_error_dis": 1.0}, {}, relative=True)
+    assert not any("rel." in line for line in without), "a note on lengths that the table does not have"

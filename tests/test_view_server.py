@@ -253,7 +253,7 @@ def test_lengths_of_relative_depth_are_not_called_mm(tiny_sequence):
     viewable, out = open_viewable(tiny_sequence, None)
     assert viewable.relative and out is None and "mm" not in viewable.legend(ViewSettings(layer="depth"))
     viewer = Viewer(viewable)
-    assert "not mm" in viewer.panel.status.content and "relative" in viewer.panel.clip.label
+    assert "not mm" in viewer.panel.status.content and "rel." in viewer.panel.clip.label
     viewer.close()
 
 

@@ -17,12 +17,11 @@ from ..core.config import DataConfig
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..data.description import read_description
-from ..footage.border import Circle, Strips, find_circle, find_strips
 from ..footage.camera_motion import CameraMotion, camera_motion
 from ..footage.changes import Changes, find_changes
-from ..footage.overlays import find_static_overlays
 from ..footage.polarity import Polarity, mask_polarity
 from ..initialization.sampling import initial_points
+from .border_facts import BorderFacts, find_outline, masked_border, measure_border
 from .depth_facts import DepthFacts, measure_depth
 from .remake import Remakes, find_remakes
 from .stereo_facts import StereoFacts, measure_stereo
@@ -36,18 +35,16 @@ MOTION_FRAMES = 300
 """Largest number of frames for the camera motion."""
 CERTAIN = 0.5
 """Least certainty to report masks as inverted."""
-LABEL_ON_TISSUE = 0.75
-"""Least share of a text box that the masks mark as tissue; of the rim of a masked round border it is half."""
 POINT_FRAMES = 24
 """Largest number of training frames for the initial points."""
 
 
 @dataclass(frozen=True)
 class MaskFacts:
-    """Masks as read; every pixel that is not tissue is tool."""
+    """Masks as read; every pixel that is neither tissue nor border is tool."""
 
     tool_fraction: NDArray[np.float64]
-    """(T,) share of tool pixels."""
+    """(T,) share of tool pixels inside the masked border."""
     polarity: Polarity
     """Polarity of the masks as read: `tool_is_high` False means that tissue and tool are swapped."""
 
@@ -64,22 +61,6 @@ class MaskFacts:
     def tissue(self, frame: Frame) -> NDArray[np.bool_]:
         """(H, W) True on the tissue of a frame; inverted masks are corrected."""
         return ~frame.tissue_mask if self.inverted else frame.tissue_mask
-
-
-@dataclass(frozen=True)
-class BorderFacts:
-    """Borders around the endoscope image, and how much of them the masks mark as tissue."""
-
-    strips: Strips
-    """Static or black strips at the sides, px."""
-    strips_as_tissue: float
-    """Share of the strips' pixels that are marked as tissue; 0 without strips."""
-    circle: Circle | None
-    """Round border of the endoscope image."""
-    outside_as_tissue: float
-    """Share of the pixels outside the circle that are marked as tissue; 0 without a circle."""
-    overlays: tuple[tuple[int, int, int, int], ...]
-    """x, y, width, height of burned-in labels that are marked as tissue, px."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +123,10 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
     samples = [sequence.frame(int(i)) for i in spread(count, SAMPLES)]
     images = [frame.rgb_u8 for frame in samples]
     polarity = mask_polarity([~frame.tissue_mask for frame in samples], images)
-    masks = MaskFacts(np.array([1 - frame.tissue_mask.mean() for frame in frames]), polarity)
+    outline = find_outline(images)
+    masked = masked_border(outline, images, (frame.tissue_mask for frame in frames))
+    view = max(int((~masked).sum()), 1)
+    masks = MaskFacts(np.array([1 - frame.tissue_mask.sum() / view for frame in frames]), polarity)
     tissue = [masks.tissue(frame) for frame in samples]
     step = -(-count // MOTION_FRAMES)
     followed = [sequence.frame(i) for i in range(0, count, step)]
@@ -164,7 +148,7 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         motion_step=step,
         changes=find_changes(frame.rgb_u8 for frame in frames),
         masks=masks,
-        border=_border(images, tissue),
+        border=measure_border(outline, images, tissue, masked),
         depth=measure_depth(sequence, samples, tissue, described, cfg),
         stereo=measure_stereo(sequence),
         cloud=_first_points(sequence),
@@ -184,33 +168,6 @@ def _camera_path(cameras: list[Camera]) -> tuple[float, float]:
     distance = max(float(np.linalg.norm(camera.center - first.center)) for camera in cameras)
     turns = [camera.world_to_camera[:3, :3] @ first.world_to_camera[:3, :3].T for camera in cameras]
     return distance, float(np.degrees(max(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)) for turn in turns)))
-
-
-def _border(images: list[NDArray[np.uint8]], tissue_masks: list[NDArray[np.bool_]]) -> BorderFacts:
-    tissue = np.mean(tissue_masks, axis=0)
-    height, width = tissue.shape
-    strips, circle = find_strips(images), find_circle(images)
-    in_strip = np.ones((height, width), bool)
-    in_strip[strips.top : height - strips.bottom, strips.left : width - strips.right] = False
-    outside = ~circle.mask(width, height) if circle else np.zeros((height, width), bool)
-    return BorderFacts(
-        strips,
-        _mean(tissue[in_strip]),
-        circle,
-        _mean(tissue[outside]),
-        tuple(box for box in find_static_overlays(images) if _is_label(box, tissue, in_strip | outside)),
-    )
-
-
-def _is_label(box: tuple[int, int, int, int], tissue: NDArray[np.floating], border: NDArray[np.bool_]) -> bool:
-    """Whether a text box lies inside the border, and the masks mark most of it as tissue."""
-    x, y, width, height = box
-    inside = slice(y, y + height), slice(x, x + width)
-    return _mean(tissue[inside]) > LABEL_ON_TISSUE and _mean(border[inside]) < 0.5
-
-
-def _mean(values: NDArray) -> float:
-    return float(values.mean()) if values.size else 0.0
 
 
 def _first_points(sequence: FrameSequence) -> PointCloud | None:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
-from ..core.geometry import project
+from ..core.geometry import length_unit, project
 from ..core.types import Frame
 from ..data import FrameSequence
 from ..footage.units import FAR_MM, NEAR_MM
@@ -24,7 +24,7 @@ from ..system.atomic import whole_file
 from ..visualization.image_tools import colorize
 from .facts import Facts, spread
 from .findings import SEEN_AS_TISSUE, Finding
-from .report import table
+from .report import table, unit_reason
 
 SHOWN = 4
 """Number of frames shown."""
@@ -33,6 +33,8 @@ RULER_MM = 10.0
 TOOL_COLOR, BORDER_COLOR, FLAG_COLOR = "#ff3b30", "#ffd60a", "#d62728"
 WRAPPED_AT, ROWS = 84, 34
 """Characters per line and number of lines of the findings panel."""
+LABEL_WIDTH = 70
+"""Characters per line below the histogram."""
 SEVERITY_COLOR = {"error": "#b00020", "warning": "#b26a00", "note": "#3a5a78"}
 
 
@@ -72,9 +74,8 @@ def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
     low, high = facts.depth.low, facts.depth.high
     for column, frame in enumerate(frames):
         top, bottom = axes[:, column]
-        top.imshow(_outlined(frame))
-        tool = 1 - frame.tissue_mask.mean()
-        top.set_title(f"frame {frame.index}: {tool:.0%} tool", fontsize=9)
+        top.imshow(_outlined(frame, facts.border.masked))
+        top.set_title(f"frame {frame.index}: {facts.masks.tool_fraction[frame.index]:.0%} tool", fontsize=9)
         _draw_border(top, facts)
         if not facts.depth.relative:
             _draw_ruler(top, frame)
@@ -94,14 +95,14 @@ def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
         pad=0.01,
         aspect=45,
     )
-    bar.set_label(f"depth, {_unit(facts)}", fontsize=8)
+    bar.set_label(f"depth, {length_unit(facts.depth.relative)}", fontsize=8)
     bar.ax.tick_params(labelsize=8)
 
 
-def _outlined(frame: Frame) -> NDArray[np.uint8]:
-    """The frame with tools tinted and outlined in red."""
+def _outlined(frame: Frame, border: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The frame with tools tinted and outlined in red; a masked border (H, W) is no tool."""
     image = frame.rgb_u8.copy()
-    tool = ~frame.tissue_mask
+    tool = ~frame.tissue_mask & ~border
     red = np.array([int(TOOL_COLOR[i : i + 2], 16) for i in (1, 3, 5)], np.float32)
     image[tool] = (0.72 * image[tool] + 0.28 * red).astype(np.uint8)
     outlines, _ = cv2.findContours(tool.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -147,12 +148,14 @@ def _draw_histogram(axis: Axes, facts: Facts) -> None:
     depth = facts.depth
     axis.stairs(depth.counts / max(depth.counts.sum(), 1), depth.edges, fill=True, color="#4a7fb5")
     low, high = depth.edges[0], depth.edges[-1]
-    usual = max(low, NEAR_MM), min(high, FAR_MM)
-    if usual[0] < usual[1]:
-        axis.axvspan(*usual, color="#2e8b57", alpha=0.10, zorder=0)
+    title, usual = "depth of tissue", (max(low, NEAR_MM), min(high, FAR_MM))
+    if not depth.relative:
+        title += f", green: {NEAR_MM:g}-{FAR_MM:g} mm is usual"
+        if usual[0] < usual[1]:
+            axis.axvspan(*usual, color="#2e8b57", alpha=0.10, zorder=0)
     axis.set_xlim(low, high)
-    axis.set_title(f"depth of tissue, green: {NEAR_MM:g}-{FAR_MM:g} mm is usual", fontsize=9)
-    axis.set_xlabel(f"{_unit(facts)}   ({depth.unit.reason})", fontsize=8, wrap=True)
+    axis.set_title(title, fontsize=9)
+    axis.set_xlabel(textwrap.fill(f"{length_unit(depth.relative)}   ({unit_reason(facts)})", LABEL_WIDTH), fontsize=8)
     axis.set_yticks([])
     axis.tick_params(labelsize=8)
 
@@ -160,11 +163,11 @@ def _draw_histogram(axis: Axes, facts: Facts) -> None:
 def _draw_curves(part: SubFigure, facts: Facts, findings: list[Finding]) -> None:
     """Four curves over the frames, each with the frames of its findings marked."""
     moved = np.arange(1, len(facts.motion.pixels_per_frame) + 1) * facts.motion_step
-    every = np.arange(facts.frames)
+    every, unit = np.arange(facts.frames), length_unit(facts.depth.relative)
     curves = (
         ("brightness", every, facts.changes.brightness, {"exposure-jump", "unexplained-frames", "scene-cut"}),
-        ("tool, share of pixels", every, facts.masks.tool_fraction, set()),
-        (f"median depth, {_unit(facts)}", every, facts.depth.median, {"depth-jumps", "no-depth-frames"}),
+        ("tool, share of pixels inside the border", every, facts.masks.tool_fraction, set()),
+        (f"median depth, {unit}", every, facts.depth.median, {"depth-jumps", "no-depth-frames"}),
         ("image motion, px per frame", moved, facts.motion.pixels_per_frame, {"duplicate-frames"}),
     )
     for axis, (title, x, y, codes) in zip(part.subplots(2, 2, sharex=True).flat, curves, strict=True):
@@ -181,7 +184,9 @@ def _draw_curves(part: SubFigure, facts: Facts, findings: list[Finding]) -> None
 
 def _draw_cloud(front: Axes, side: Axes, facts: Facts) -> None:
     """The initial points, from the first camera and from the side with the camera at the left edge."""
-    for axis, title in ((front, "initial points, from the camera"), (side, "from the side")):
+    # Above, not below the axes: they keep their aspect, so that the layout would not leave room for a label there.
+    distance = f"from the side; distance from the camera, {length_unit(facts.depth.relative)}"
+    for axis, title in ((front, "initial points, from the camera"), (side, distance)):
         axis.set_facecolor("#101418")
         axis.set_title(title, fontsize=9)
         axis.tick_params(labelsize=8)
@@ -205,7 +210,6 @@ def _draw_cloud(front: Axes, side: Axes, facts: Facts) -> None:
     for edge in (offset - half, offset + half):
         side.plot([0, reach], [0, edge * reach], color="#8899aa", linewidth=0.7, linestyle=":")
     side.set(xlim=(0, reach), ylim=((offset + half) * reach, (offset - half) * reach), aspect="equal")
-    side.set_xlabel(f"distance from the camera, {_unit(facts)}", fontsize=8)
 
 
 def _draw_findings(axis: Axes, facts: Facts, findings: list[Finding]) -> None:
@@ -223,8 +227,3 @@ def _draw_findings(axis: Axes, facts: Facts, findings: list[Finding]) -> None:
     for row, (text, color, weight) in enumerate(lines[:ROWS]):
         at = {"x": 0, "y": 1 - row / ROWS, "va": "top", "transform": axis.transAxes}
         axis.text(**at, s=text, parse_math=False, color=color, weight=weight, fontsize=7.5, family="monospace")
-
-
-def _unit(facts: Facts) -> str:
-    """Unit of the depth as read."""
-    return "relative" if facts.depth.relative else "mm"

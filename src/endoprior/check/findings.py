@@ -13,9 +13,10 @@ import numpy as np
 
 from ..core.checks import number_ranges
 from ..core.config import DataConfig
+from ..core.geometry import length_unit
 from ..footage.camera_motion import MOVING_FRACTION
 from .facts import Facts
-from .fixes import detect_tools, in_stored_px, longest_part, measure_depth_again, set_values, skip, train
+from .fixes import detect_tools, in_stored_px, longest_part, mask_tools, measure_depth_again, set_values, skip, train
 from .remake import field_of_view, swapped
 
 Severity = Literal["error", "warning", "note"]
@@ -90,13 +91,13 @@ def _masks(facts: Facts) -> Iterator[Finding]:
         value = 0 if facts.described.get("mask_tool_value", 255) == 255 else 255
         yield Finding("mask-polarity", "error", what, set_values(facts, mask_tool_value=value))
     elif mean > TOOL_MOST:
-        what = f"{mean:.0%} of all pixels are tool"
+        what = f"{mean:.0%} of the pixels inside the border are tool"
         again = f", or {command} detects tools by color" if (command := detect_tools(facts)) else ""
         yield Finding("tool-fraction", "warning", what, f"correct the masks, 5 % to 40 % are usual{again}")
     elif not masks.tool_fraction.any():
-        what = "no mask marks a tool"
-        fix = detect_tools(facts) or f"paint them in {facts.path}/masks"
-        yield Finding("tool-fraction", "note", what, f"nothing if no instrument is in view; else {fix}")
+        only = ": the masks cover only the border" if facts.border.masked.any() else ""
+        what = f"no tools were found{only}; if tools are in view, they become tissue"
+        yield Finding("tool-fraction", "warning", what, f"nothing if no tool is in view; else {mask_tools(facts)}")
 
 
 def _depth(facts: Facts) -> Iterator[Finding]:
@@ -116,12 +117,12 @@ def _depth(facts: Facts) -> Iterator[Finding]:
         what = f"depth on {covered:.0%} of the tissue of a usual frame"
         yield Finding("depth-sparse", "warning", what, again or "measure it by a denser method")
     if depth.bits == 8:
-        known = f" {unit.unit}" if unit.mm_per_unit else ""
+        known = f" {length_unit(True) if depth.relative else unit.unit}" if unit.mm_per_unit else ""
         what = f"8 bits a value, steps of {depth.step:.3g}{known}"
         fix = f"export {path}/depth as 16-bit PNG{f', or {again} measures it again' if again else ''}"
         yield Finding("depth-8-bit", "warning", what, fix)
     if depth.relative:
-        fix = "nothing for rendering; for lengths in mm use stereo depth"
+        fix = "nothing for rendering; for lengths in mm use a stereo video or measured depth"
         yield Finding("relative-depth", "note", "the scale of the depth is unknown or assumed", fix)
     yield from _unit(facts)
     steps = np.abs(np.diff(np.log(np.where(depth.median > 0, depth.median, np.nan))))

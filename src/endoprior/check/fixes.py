@@ -61,6 +61,17 @@ def detect_tools(facts: Facts) -> str | None:
     return remake.command({"--masks": None, "--mask-tool-value": None})
 
 
+def mask_tools(facts: Facts) -> str:
+    """What adds tools to masks without any: the command that detects them, else painting, or masks of the user."""
+    if command := detect_tools(facts):
+        return command
+    painted = f"paint them white (255) in {facts.path / 'masks'}"
+    if facts.remakes.best is None:
+        return painted
+    given = facts.remakes.best.command({"--masks": ("FOLDER",), "--mask-tool-value": None})
+    return f"{painted}, or {given} with a mask for each frame in FOLDER"
+
+
 def in_stored_px(facts: Facts, *values: float) -> list[int]:
     """Pixels of the frames as read, in pixels of the stored frames."""
     return [round(value * facts.data.shrink) for value in values]

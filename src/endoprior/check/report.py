@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.geometry import length_unit
 from .facts import Facts
 from .findings import Finding
 
@@ -18,7 +19,7 @@ def table(facts: Facts) -> list[tuple[str, str]]:
     rate = facts.frames_per_second
     seconds = f", {facts.frames / rate:.1f} s at {rate:g} frames/s" if rate else ", rate unknown"
     view = 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx))
-    tool = facts.masks.tool_fraction
+    tool, unit = facts.masks.tool_fraction, length_unit(depth.relative)
     value = "high" if facts.described.get("mask_tool_value", 255) == 255 else "low"
     rows = [
         ("frames", f"{facts.frames}: {facts.train_frames} to train, {facts.test_frames} to test{seconds}"),
@@ -29,15 +30,16 @@ def table(facts: Facts) -> list[tuple[str, str]]:
         ),
         ("camera", _camera_words(facts)),
         ("image motion", facts.motion.reason),
-        ("tools", f"{tool.mean():.1%} of pixels ({tool.min():.1%} to {tool.max():.1%})"),
+        ("tools", f"{tool.mean():.1%} of the pixels inside the border ({tool.min():.1%} to {tool.max():.1%})"),
         ("mask polarity", f"read as tool = {value}; {facts.masks.reason}"),
         ("border", _border_words(facts)),
         ("labels", f"{len(border.overlays)} burned in and not masked"),
         (
             "depth",
-            f"{depth.low:.4g} to {depth.high:.4g}, median {depth.unit.median:.4g}; as read, mm if the unit is right",
+            f"{depth.low:.4g} to {depth.high:.4g}, median {depth.unit.median:.4g} {unit}"
+            f"{'' if depth.relative else ', if the unit is right'}",
         ),
-        ("depth unit", f"{depth.unit.unit}: {depth.unit.reason}"),
+        ("depth unit", f"{depth.unit.unit if _unit_is_guessed(facts) else unit}: {unit_reason(facts)}"),
         (
             "depth coverage",
             f"{depth.coverage.mean():.1%} of tissue ({depth.coverage.min():.1%} to {depth.coverage.max():.1%})",
@@ -59,20 +61,35 @@ def table(facts: Facts) -> list[tuple[str, str]]:
 
 
 def as_json(facts: Facts, findings: list[Finding]) -> dict[str, Any]:
-    """Facts and findings as JSON values. Of the initial points only the number is written; NaN becomes None."""
+    """Facts and findings as JSON values. NaN becomes None.
+
+    Of the initial points only the number is written, of the mask of the border its share of the pixels.
+    """
     return {"facts": _plain(facts), "findings": _plain(findings)}
+
+
+def unit_reason(facts: Facts) -> str:
+    """Why the depth has the unit that it seems to have."""
+    return facts.depth.unit.reason if _unit_is_guessed(facts) else "its scale is unknown or assumed"
+
+
+def _unit_is_guessed(facts: Facts) -> bool:
+    return not facts.depth.relative or facts.depth.unit.unit == "disparity"
 
 
 def _camera_words(facts: Facts) -> str:
     if facts.camera_is_fixed:
         return "static in the stored poses"
-    return f"moves up to {facts.camera_path_mm:.3g} mm and {facts.camera_turn_deg:.3g} degrees in the stored poses"
+    path = f"{facts.camera_path_mm:.3g} {length_unit(facts.depth.relative)}"
+    return f"moves up to {path} and {facts.camera_turn_deg:.3g} degrees in the stored poses"
 
 
 def _border_words(facts: Facts) -> str:
     strips, circle = facts.border.strips, facts.border.circle
     words = [f"strip of {size} px at the {name}" for name, size in vars(strips).items() if size]
     words += [f"round, radius {circle.radius:.0f} px"] if circle else []
+    masked = float(facts.border.masked.mean())
+    words += [f"{masked:.1%} of pixels masked"] if masked else []
     return ", ".join(words) or "none"
 
 
@@ -84,6 +101,8 @@ def _plain(value: Any) -> Any:
         return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray) and value.dtype == bool:
+        return float(value.mean())
     if isinstance(value, np.ndarray):
         return _plain(value.tolist())
     if isinstance(value, list | tuple):

@@ -12,6 +12,7 @@ from ..core.checks import input_error
 from ..core.shell import command
 from ..doctor.choice import Wanted
 from ..system.console import say
+from ..system.installation import page
 from .devices import on_device
 from .help_page import Help
 from .parsing import parse
@@ -143,12 +144,10 @@ def save_and_print(
     file = result.save(out)
     better = "\u2191 higher is better, \u2193 lower is better"
     say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({better})")
-    for line in score_table(result.scores, result.skipped):
+    for line in score_table(result.scores, result.skipped, sequence.depth_is_relative):
         say(line)
     if outliers := result.outlier_frames():
         frames = ", ".join(map(str, outliers))
         look = f". To see them: `{command('render', run, '--split', split)}`" if run else ""
         say(f"note: tissue PSNR of frames {frames} is more than 3 dB below the median{look}")
-    if sequence.depth_is_relative:
-        say("note: the depth of the sequence is relative. Scores in mm compare runs on it, but are not millimeters.")
-    say(f"all scores: {file}; what they mean: docs/scores.md")
+    say(f"all scores: {file}; what they mean: {page('scores.md')}")

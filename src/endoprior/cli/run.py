@@ -65,7 +65,7 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Do every step, with one progress display."""
     args = parse(Run, argv, "run", HELP)
-    from ..pipeline import STEPS, estimate, make_job, notes_of, open_folder, run_step
+    from ..pipeline import STEPS, estimate, make_job, notes_of, open_folder, problems, run_step
     from ..runs import kernel_cache
 
     began = clock.perf_counter()
@@ -105,6 +105,8 @@ def run(argv: list[str]) -> None:
         ("scene", job.run),
     ):
         say(f"  {what:<8}{path}")
+    for line in problems(job):
+        say(line)
     say(f"Turn and measure it: {command('view', job.run)}")
     if args.preview:
         say(f"The whole model:     {_whole_command(job)}")
@@ -119,8 +121,6 @@ def _whole_command(job: Job) -> str:
 def _part_words(job: Job) -> str:
     """What is used of the video."""
     part = job.part
-    if not part.num_frames:
-        return f"{job.video}: all frames, {part.frames_per_second:g} a second"
     seconds = part.num_frames / part.frames_per_second
     words = f"{job.video}: {part.num_frames} frames, {seconds:.1f} s at {part.frames_per_second:g} frames/s"
     return words if part.is_whole else f"{words} from {part.start:g} s on (--start and --end choose another part)"

@@ -10,22 +10,25 @@ from ..evaluation.score import GROUPS, Score
 LINE = "  {group:<7} {label:<18} {value:>15} {arrow:1}  {hint}"
 
 
-def score_table(scores: Mapping[str, float], skipped: Mapping[str, str]) -> list[str]:
-    """The lines of the table, at most 25 and as many as there are reasons for skipped scores.
+def score_table(scores: Mapping[str, float], skipped: Mapping[str, str], relative: bool = False) -> list[str]:
+    """The lines of the table, at most 26 and as many as there are reasons for skipped scores.
 
     Args:
         scores: value by name.
         skipped: reason by name, of scores that could not be computed.
+        relative: whether the scale of the depth is unknown, so that lengths are not in mm.
     """
     lines = []
     for group in GROUPS:
         title = group
         for score in _summary(scores):
             if score.group == group:
-                value = score.text(scores[score.name])
+                value = score.text(scores[score.name], relative)
                 line = LINE.format(group=title, label=score.label, value=value, arrow=score.arrow, hint=score.hint)
                 lines.append(line.rstrip())
                 title = ""
+    if relative and any(score.is_length for score in _summary(scores)):
+        lines.append("  rel.: the scale of the depth is unknown. Compare these scores on this sequence only.")
     return [*lines, *_not_computed(skipped)]
 
 

@@ -14,6 +14,11 @@ FARTHEST_MM = 1e6
 """Largest coordinate or depth that is accepted: a kilometer. Beyond it float32 does not resolve 0.1 mm."""
 
 
+def length_unit(relative: bool) -> str:
+    """The unit to show beside lengths: mm, or `rel.` where the scale of the depth is unknown or assumed."""
+    return "rel." if relative else "mm"
+
+
 def pixel_centers(width: int, height: int) -> NDArray[np.float32]:
     """(H, W, 2) coordinates (x, y) of the pixel centers, px."""
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5)

@@ -156,7 +156,7 @@ class FrameSequence:
         remarks = self.remarks
         tool = 1 - sum(tissue) / len(tissue)
         if tool > TOOL_FRACTION_WARNING:
-            remarks.append(f"{self._masks}: {tool:.0%} of all pixels are tool; the polarity may be inverted")
+            remarks.append(f"{self._masks}: {tool:.0%} of all pixels are masked; the polarity may be inverted")
         if self.depth_is_relative:
             remarks.append(f"{self.path}: the scale of its depth is unknown or assumed; lengths are not millimeters")
         empty = [index for index, (_, _, has_tissue_depth) in enumerate(contents) if not has_tissue_depth]

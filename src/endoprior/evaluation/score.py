@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from ..core.geometry import length_unit
+
 Group = Literal["image", "depth", "motion", "model", "speed", "other"]
 GROUPS: tuple[Group, ...] = get_args(Group)
 """What a score is about, in the order of the printed table."""
@@ -35,15 +37,24 @@ class Score:
     """Whether `endoprior train` and `eval` print it; metrics.json has every score."""
 
     @property
-    def heading(self) -> str:
+    def is_length(self) -> bool:
+        """Whether it is in mm, which it is not where depth is relative."""
+        return self.unit == "mm"
+
+    def shown_unit(self, relative: bool = False) -> str:
+        """The unit to show. `relative`: whether the scale of the depth is unknown."""
+        return length_unit(relative) if self.is_length else self.unit
+
+    def heading(self, relative: bool = False) -> str:
         """Label and unit: `tissue PSNR, dB`."""
-        return f"{self.label}, {self.unit}" if self.unit else self.label
+        unit = self.shown_unit(relative)
+        return f"{self.label}, {unit}" if unit else self.label
 
     @property
     def arrow(self) -> str:
         """Up if higher is better, down if lower is; empty for neither."""
         return {True: "\u2191", False: "\u2193", None: ""}[self.higher_is_better]
 
-    def text(self, value: float) -> str:
+    def text(self, value: float, relative: bool = False) -> str:
         """A value with its unit: `31.27 dB`."""
-        return f"{value:,.{self.digits}f} {self.unit}".rstrip()
+        return f"{value:,.{self.digits}f} {self.shown_unit(relative)}".rstrip()

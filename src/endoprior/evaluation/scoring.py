@@ -83,7 +83,7 @@ def scored_data(trained: DataConfig) -> DataConfig:
 
 
 def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[str, Any]:
-    relative = "; relative: the depth's scale is assumed, its mm are not mm" if sequence.depth_is_relative else ""
+    unit = "relative units: the depth's scale is assumed" if sequence.depth_is_relative else "mm"
     return {
         "split": split,
         "split_rule": "test iff (i - 1) % 8 == 0",
@@ -93,7 +93,7 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
         "masks": f"{'gt_masks/' if data.use_gt_masks else 'masks/'} of the sequence, tissue = not tool",
         "strict_*": "rendered color, not rounded to 8 bits; tissue pixels only; flow: flow_error_dis_adjacent",
         "depth_rmse_endogaussian": "8-bit depths that wrap, only to compare with that paper's tables",
-        "depth": "sum of weight * z against measured depth on tissue, mm, mean of per-frame RMSE" + relative,
+        "depth": "sum of weight * z against measured depth on tissue, mean of per-frame RMSE; " + unit,
         "flow_error": "consecutive frames of the split; *_adjacent: all adjacent frames of the video",
         "depth_instability_mm": "all adjacent frames of the video",
         "data_fingerprint": sequence.fingerprint(),

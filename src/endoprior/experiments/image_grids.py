@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.config import DataConfig, PriorConfig
-from ..core.geometry import project
+from ..core.geometry import length_unit, project
 from ..core.types import Frame
 from ..data import FrameSequence, load_sequence
 from ..model.scene import Scene, load_scene
@@ -88,18 +88,18 @@ def _outlined(image: NDArray[np.uint8], windows: dict[str, tuple[slice, slice]])
 
 def instability_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
     """Mean absolute change of rendered depth between adjacent frames, and each method's minus the first's."""
-    frames = list(sequence.frames("video"))
+    frames, unit = list(sequence.frames("video")), length_unit(sequence.depth_is_relative)
     maps = {name: instability_map(scene, frames) for name, scene in scenes.items()}
     first = next(iter(maps))
     top = [
-        _labeled(colorize(values, 0, INSTABILITY_FULL_SCALE_MM, np.isfinite(values)), f"{name}, 0..1 mm")
+        _labeled(colorize(values, 0, INSTABILITY_FULL_SCALE_MM, np.isfinite(values)), f"{name}, 0..1 {unit}")
         for name, values in maps.items()
     ]
     bottom = []
     for values in maps.values():
         change = values - maps[first]
         shown = colorize(change, -DIFFERENCE_FULL_SCALE_MM, DIFFERENCE_FULL_SCALE_MM, np.isfinite(change))
-        bottom.append(_labeled(shown, f"minus {first}, -0.5..0.5 mm"))
+        bottom.append(_labeled(shown, f"minus {first}, -0.5..0.5 {unit}"))
     return tile(top + bottom, len(maps))
 
 

@@ -13,7 +13,7 @@ import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..core.checks import InputError, input_error
 from ..core.config_io import to_dict
@@ -23,6 +23,9 @@ from .execute import Executor
 from .method import REGISTRY
 from .spec import Cell, Spec, cells, sequence_folder
 from .worker import Job, finished
+
+if TYPE_CHECKING:
+    from ..data import FrameSequence
 
 KEY_DIGITS = 16
 SCORES_VERSION = 1
@@ -43,6 +46,8 @@ class Matrix:
     """Number of cells among them that ran and failed."""
     data: dict[str, Path] = field(default_factory=dict)
     """Folder of each readable sequence."""
+    relative: set[str] = field(default_factory=set)
+    """Names of those whose depth has no known scale, so that lengths are not in mm."""
 
 
 def run_matrix(
@@ -95,7 +100,9 @@ def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -
     fingerprints: dict[str, str] = {}
     for name in spec.sequences:
         try:
-            matrix.data[name], fingerprints[name] = _sequence(spec, name, matrix.out, write)
+            sequence = _sequence(spec, name, matrix.out, write)
+            matrix.data[name], fingerprints[name] = sequence.path, sequence.fingerprint()
+            matrix.relative |= {name} if sequence.depth_is_relative else set()
         except InputError as error:
             matrix.missing |= {cell: str(error) for cell in cells(spec) if cell.sequence == name}
     for cell in cells(spec):
@@ -147,8 +154,8 @@ def _made_from(spec: Spec, cell: Cell, options: dict[str, Any]) -> list[Any]:
     return []
 
 
-def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]:
-    """Folder and fingerprint of a sequence; a missing phantom is written.
+def _sequence(spec: Spec, name: str, out: Path, write: bool) -> FrameSequence:
+    """A sequence; a missing phantom is written.
 
     Raises:
         InputError: it is missing or cannot be read.
@@ -162,8 +169,7 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> tuple[Path, str]
         raise input_error(chosen.path, f"the variable {unset[1]}", "none", f"set it, or use --data {name}=FOLDER.")
     if chosen.phantom and write and not folder.is_dir():
         write_phantom(folder, chosen.phantom)
-    data = DataConfig(**chosen.reading)
-    return folder, load_sequence(folder, data).fingerprint()
+    return load_sequence(folder, DataConfig(**chosen.reading))
 
 
 def commits_of(matrix: Matrix) -> list[str]:

@@ -42,7 +42,7 @@ def budget_figure(results: Results, path: Path) -> None:
                 label=spec.label(method),
             )
         axis.set_xlabel("Gaussians")
-        axis.set_ylabel(all_scores()[score].heading)
+        axis.set_ylabel(all_scores()[score].heading())
 
     _panels(list(spec.sequences), plot, path)
 
@@ -61,7 +61,7 @@ def curve_figure(results: Results, matrix: Matrix, path: Path) -> None:
                 means = [float(np.mean([curve[i] for curve in known])) for i in frames]
                 axis.plot(frames, means, marker=".", label=spec.label(method))
         axis.set_xlabel("frame")
-        axis.set_ylabel(all_scores()[CURVE_SCORE].heading)
+        axis.set_ylabel(all_scores()[CURVE_SCORE].heading())
 
     _panels(list(spec.sequences), plot, path)
 

@@ -107,7 +107,8 @@ def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
         known = [score for score in spec.scores if any(difference.count for difference in changes[score])]
         rows = [[spec.label(m), *(change(s, changes[s][i]) for s in known)] for i, m in enumerate(others)]
         if known:
-            lines = [["method", *(all_scores()[s].heading for s in known)], ["---"] * (len(known) + 1), *rows]
+            headings = [all_scores()[s].heading(name in results.relative) for s in known]
+            lines = [["method", *headings], ["---"] * (len(known) + 1), *rows]
             table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
             than = spec.label(spec.reference)
             about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over seeds]:"
@@ -158,7 +159,7 @@ def _claims(results: Results, mark: str) -> list[str]:
 def sentence(results: Results, claim: ClaimSpec) -> str:
     """The claim in words."""
     ours, theirs = results.spec.label(claim.method), results.spec.label(claim.than)
-    score, by = all_scores()[claim.score].heading, _amount(claim.score, claim.by)
+    score, by = all_scores()[claim.score].heading(bool(results.relative)), _amount(claim.score, claim.by)
     at = f" at {claim.budget:,} initial Gaussians" if claim.budget else ""
     if claim.expect == "better":
         return f"{ours} is better than {theirs} in {score}" + (f" by at least {by}" if claim.by else "") + at

@@ -19,12 +19,15 @@ class Results:
 
     spec: Spec
     scores: dict[Cell, dict[str, float]]
+    relative: frozenset[str] = frozenset()
+    """Sequences whose lengths are not in mm."""
 
     @staticmethod
     def of(matrix: Matrix) -> Results:
         """Read the scores of all finished cells, in the order of the spec."""
         order = sorted(matrix.done, key=lambda c: (c.sequence, c.budget or 0, c.method, c.seed))
-        return Results(matrix.spec, {cell: scores_of(matrix.done[cell])["scores"] for cell in order})
+        scores = {cell: scores_of(matrix.done[cell])["scores"] for cell in order}
+        return Results(matrix.spec, scores, frozenset(matrix.relative))
 
     def value(self, cell: Cell, score: str) -> float:
         """A score; NaN where it was skipped."""

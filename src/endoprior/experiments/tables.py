@@ -50,7 +50,7 @@ def score_table(results: Results, sequence: str) -> Table:
     names = [spec.label(method) + (f", {budget:,}" if budget and method in sized else "") for budget, method in rows]
     return Table(
         sequence,
-        [all_scores()[score].heading for score in columns],
+        [all_scores()[score].heading(sequence in results.relative) for score in columns],
         [(name, [column[i] for column in by_column]) for i, name in enumerate(names)],
     )
 

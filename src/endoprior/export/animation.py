@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.geometry import length_unit
 from ..model.carry import carry_points
 from ..model.scene import Scene
 from ..system.atomic import whole_file
@@ -38,7 +39,8 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     carried = carry_points(scene, mesh.vertices, at_first, [step.time for step in steps])
     positions = points_in_axes(carried, options.frame)
     names = [step.name for step in steps]
-    extras = {"unit": "mm", "axes": options.frame, "lengths_are_relative": scene.lengths_are_relative}
+    relative = scene.lengths_are_relative
+    extras = {"unit": length_unit(relative), "axes": options.frame, "lengths_are_relative": relative}
     with whole_file(out) as temporary:
         temporary.write_bytes(encode_animation(positions, mesh.triangles, mesh.colors, seconds, names, extras))
     progress(1, 1)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core.checks import input_error
+from ..core.geometry import length_unit
 from ..system.atomic import whole_file, whole_folder, write_json
 from .formats import REGISTRY, Format, Progress, formats_of, known_suffixes, load_format
 from .options import DEFAULTS, ExportOptions
@@ -105,8 +106,9 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
                 (folder / f"{step.name}{suffix}").write_bytes(content)
             written.append({"files": [f"{step.name}{suffix}" for suffix in contents], **step.facts()})
             progress(k + 1, len(steps))
-        units: Mapping[str, Any] = chosen.index_facts or {"axes": options.frame, "unit": "mm"}
-        facts = {"lengths_are_relative": scene.lengths_are_relative, "frames_per_second": scene.frames_per_second}
+        relative = scene.lengths_are_relative
+        units: Mapping[str, Any] = chosen.index_facts or {"axes": options.frame, "unit": length_unit(relative)}
+        facts = {"lengths_are_relative": relative, "frames_per_second": scene.frames_per_second}
         write_json(folder / "index.json", {"format": options.format, **units, **facts, "time_steps": written})
 
 

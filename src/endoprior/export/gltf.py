@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.geometry import length_unit
 from ..core.types import Splats
 from ..model.gaussians import SH_C0
 from ..model.scene import Scene
@@ -25,7 +26,7 @@ _POINTS = 0
 
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The .glb file of one time step."""
-    extras = {"unit": "mm", "axes": options.frame, "time": step.time}
+    extras = {"unit": length_unit(scene.lengths_are_relative), "axes": options.frame, "time": step.time}
     return {".glb": encode_glb(step.splats(scene, options.frame), extras)}
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..core.checks import InputError, input_error
+from ..core.geometry import length_unit
 from ..model.scene import Scene
 from ..system.atomic import whole_file
 from .formats import Format, Progress
@@ -80,7 +81,8 @@ def write_html(
         raise input_error("times", "one or more increasing times", f"{times}", "list each time once.")
     quantized = quantize(scene, times)
     data, channels = pack(quantized.values, DEFLATE_LEVEL)
-    page = _page(title or DEFAULT_TITLE, _about(scene, times, quantized, channels), data).encode()
+    unit = length_unit(scene.lengths_are_relative)
+    page = _page(title or DEFAULT_TITLE, unit, _about(scene, times, quantized, channels), data).encode()
     if len(page) > max_bytes:
         got = f"{len(page) / 1e6:.1f} MB for {len(times)} time steps of {quantized.values.shape[2]} Gaussians"
         fix = "choose fewer with --times (the size grows with their number), or raise --max-mb."
@@ -111,11 +113,12 @@ def _about(scene: Scene, times: list[float], quantized: Quantized, channels: lis
     }
 
 
-def _page(title: str, about: dict[str, Any], data: bytes) -> str:
+def _page(title: str, unit: str, about: dict[str, Any], data: bytes) -> str:
     script = "\n".join((PLAYER / name).read_text(encoding="utf-8") for name in SCRIPTS)
     parts = {
         "TITLE": html.escape(title),
         "STYLE": (PLAYER / "player.css").read_text(encoding="utf-8"),
+        "UNIT": unit,
         "ABOUT": json.dumps(about, allow_nan=False).replace("<", "\\u003c"),
         "DATA": base64.b64encode(data).decode(),
         "SCRIPT": script,

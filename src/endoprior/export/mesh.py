@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.geometry import back_project, pixel_centers
+from ..core.geometry import back_project, length_unit, pixel_centers
 from ..model.scene import Scene
 from .axes import points_in_axes
 from .formats import TIME_STEP_OPTIONS, Format
@@ -41,7 +41,8 @@ def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, byt
     """The mesh of one time step in the file format of the options; errors as in `surface_mesh`."""
     mesh = surface_mesh(scene, step, options)
     vertices = points_in_axes(mesh.vertices, options.frame)
-    content = encode_mesh(vertices, mesh.triangles, mesh.colors, options.mesh_format, options.frame)
+    unit = length_unit(scene.lengths_are_relative)
+    content = encode_mesh(vertices, mesh.triangles, mesh.colors, options.mesh_format, options.frame, unit)
     return {f".{options.mesh_format}": content}
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.geometry import length_unit
 from ..core.types import Splats
 from ..model.scene import Scene
 from .formats import TIME_STEP_OPTIONS, Axes, Format
@@ -22,10 +23,11 @@ _TYPES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The PLY file of one time step."""
-    return {".ply": encode_ply(step.splats(scene, options.frame), options.frame)}
+    unit = length_unit(scene.lengths_are_relative)
+    return {".ply": encode_ply(step.splats(scene, options.frame), options.frame, unit)}
 
 
-def encode_ply(splats: Splats, axes: Axes = "opencv") -> bytes:
+def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm") -> bytes:
     """Binary PLY with one vertex per Gaussian, all properties float32.
 
     x y z (mm), nx ny nz (0), f_dc_0..2, f_rest_0.. (all of red, then green, then blue, each in the order of
@@ -41,9 +43,9 @@ def encode_ply(splats: Splats, axes: Axes = "opencv") -> bytes:
     columns |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
     columns["opacity"] = np.log(opacities / (1 - opacities))
     columns |= {f"scale_{i}": np.log(splats.scales.numpy()[:, i].clip(1e-30)) for i in range(3)}
-    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    columns |= {f"rot_{i}": unit[:, i] for i in range(4)}
-    return ply_bytes(vertex_table(columns), axes)
+    rotations = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    columns |= {f"rot_{i}": rotations[:, i] for i in range(4)}
+    return ply_bytes(vertex_table(columns), axes, unit)
 
 
 def vertex_table(columns: dict[str, NDArray]) -> NDArray:
@@ -55,15 +57,16 @@ def vertex_table(columns: dict[str, NDArray]) -> NDArray:
     return table
 
 
-def ply_bytes(vertices: NDArray, axes: Axes, triangles: NDArray[np.int32] | None = None) -> bytes:
+def ply_bytes(vertices: NDArray, axes: Axes, unit: str, triangles: NDArray[np.int32] | None = None) -> bytes:
     """A little-endian binary PLY file.
 
     Args:
         vertices: structured array, one field per property.
         axes: named in a comment; `SPACE=LPS` or `SPACE=RAS` is what 3D Slicer looks for.
+        unit: of lengths, named in the same comment.
         triangles: (F, 3) vertex numbers.
     """
-    lines = ["ply", "format binary_little_endian 1.0", f"comment axes {axes}, unit mm"]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment axes {axes}, unit {unit}"]
     lines += [f"comment SPACE={axes.upper()}"] if axes in ("lps", "ras") else []
     lines += [f"element vertex {len(vertices)}"]
     lines += [f"property {_TYPES[vertices.dtype[name].str.lstrip('|')]} {name}" for name in vertices.dtype.names]

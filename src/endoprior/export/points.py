@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from ..core.checks import input_error
+from ..core.geometry import length_unit
 from ..model.scene import Scene
 from ..render import sh
 from .axes import points_in_axes
@@ -34,7 +35,8 @@ def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, byt
     positions = points_in_axes(means.numpy(), options.frame)
     columns = {name: positions[:, i] for i, name in enumerate("xyz")}
     columns |= {name: rgb[:, i] for i, name in enumerate(("red", "green", "blue"))}
-    return {".ply": ply_bytes(vertex_table(columns), options.frame)}
+    unit = length_unit(scene.lengths_are_relative)
+    return {".ply": ply_bytes(vertex_table(columns), options.frame, unit)}
 
 
 FORMAT = Format(

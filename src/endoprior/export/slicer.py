@@ -17,6 +17,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 import numpy as np
 
 from ..core.checks import input_error
+from ..core.geometry import length_unit
 from ..core.types import Camera
 from ..model.scene import Scene
 from ..system.atomic import whole_file
@@ -50,12 +51,13 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     steps = selected_time_steps(scene, options)
     seconds = seconds_of_motion(scene, steps)
     meshes = (surface_mesh(scene, step, options) for step in steps)
+    unit = length_unit(scene.lengths_are_relative)
     with whole_file(out) as temporary, tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES) as sequence:
         first = next(meshes)
-        _write_sequence(sequence, chain([first], meshes), seconds, progress)
+        _write_sequence(sequence, chain([first], meshes), unit, seconds, progress)
         with ZipFile(temporary, "w") as archive:
             _put(archive, f"{FOLDER}.mrml", _scene_text(first, steps[0].camera(scene), seconds))
-            _put(archive, MODEL_FILE, _ply(first))
+            _put(archive, MODEL_FILE, _ply(first, unit))
             entry = _entry(SEQUENCE_FILE)  # stored as it is: its files are compressed
             entry.file_size = sequence.tell()
             sequence.seek(0)
@@ -63,13 +65,15 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
                 shutil.copyfileobj(sequence, stored)
 
 
-def _write_sequence(file: BinaryIO, meshes: Iterable[Mesh], seconds: list[float], progress: Progress) -> None:
+def _write_sequence(
+    file: BinaryIO, meshes: Iterable[Mesh], unit: str, seconds: list[float], progress: Progress
+) -> None:
     """Write the archive of a sequence: one model for each time step, and an index of them."""
     scene = SlicerScene()
     with ZipFile(file, "w") as archive:
         for k, mesh in enumerate(meshes):
             name = f"Data/tissue_{k}.ply"
-            _put(archive, name, _ply(mesh))
+            _put(archive, name, _ply(mesh, unit))
             scene.add_model(name)
             progress(k + 1, len(seconds))
         scene.add("Sequence", "tissue", singleton="SequenceIndex", **_index(seconds))
@@ -130,8 +134,8 @@ def _view(mesh: Mesh, camera: Camera) -> dict[str, str]:
     return {name: " ".join(f"{x:.6g}" for x in points_in_axes(place, "ras")) for name, place in places.items()}
 
 
-def _ply(mesh: Mesh) -> bytes:
-    return encode_mesh(points_in_axes(mesh.vertices, "lps"), mesh.triangles, mesh.colors, "ply", "lps")
+def _ply(mesh: Mesh, unit: str) -> bytes:
+    return encode_mesh(points_in_axes(mesh.vertices, "lps"), mesh.triangles, mesh.colors, "ply", "lps", unit)
 
 
 def _put(archive: ZipFile, name: str, content: bytes) -> None:

@@ -3,6 +3,6 @@
 from .estimate import estimate
 from .job import Job, make_job
 from .settings import open_folder
-from .steps import STEPS, Step, notes_of, run_step
+from .steps import STEPS, Step, notes_of, problems, run_step
 
-__all__ = ["STEPS", "Job", "Step", "estimate", "make_job", "notes_of", "open_folder", "run_step"]
+__all__ = ["STEPS", "Job", "Step", "estimate", "make_job", "notes_of", "open_folder", "problems", "run_step"]

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
+from itertools import islice
+
+from ..prepare.frame_selection import FrameSelection
 
 LEAST_RATE = 10.0
 """Frame rate, 1/s, below which tissue and camera move too far between two frames to be followed."""
@@ -24,7 +28,7 @@ class Part:
     end: float
     """End time, seconds, not included; infinite for the end of the video."""
     num_frames: int
-    """Number of frames; 0 if the length of the video is unknown."""
+    """Number of frames."""
     is_whole: bool
     """Whether it reaches the end that was asked for."""
 
@@ -40,18 +44,29 @@ def choose_part(seconds: float, rate: float, wanted_rate: float, start: float, e
         wanted_rate: rate that the user chose, 1/s; 0 for none.
         start, end: times that the user chose; the end may be infinite.
     """
-    duration = max(min(end, seconds or math.inf) - start, 0.0)
+    images = round(seconds * rate) if seconds else sys.maxsize
+
+    def num_frames(used: float, end: float, most: int) -> int:
+        """Number of frames, up to `most`, that `prepare` selects if the time steps of the video are even."""
+        # One image earlier: the grid takes an image that is up to half a step too early.
+        times = (_Image(i / rate) for i in range(max(math.floor(start * rate) - 1, 0), images))
+        return sum(1 for _ in islice(FrameSelection(used, start, end, rate).pick(times), most))
+
     every = 1
     if not wanted_rate:
         most_skipped = max(math.floor(rate / LEAST_RATE), 1)
-        needed = math.ceil((duration * rate - 0.5) / most) if math.isfinite(duration) else most_skipped
-        every = min(max(needed, 1), most_skipped)
+        every = max(math.ceil(num_frames(rate, end, most_skipped * most) / most), 1)
     used = wanted_rate or rate / every
+    if (count := num_frames(used, end, most + 1)) <= most:
+        return Part(used, start, end, count, True)
     # Frames lie on the grid start, start + 1 / used, ...: half a step keeps rounding from adding one.
-    if duration * used > most + 0.5:
-        return Part(used, start, start + (most - 0.5) / used, most, False)
-    count = round(duration * used) if math.isfinite(duration) else 0
-    return Part(used, start, end, count, True)
+    end = start + (most - 0.5) / used
+    return Part(used, start, end, num_frames(used, end, most), False)
+
+
+@dataclass(frozen=True)
+class _Image:
+    seconds: float
 
 
 def every_kth_time(num_frames: int, most: float) -> list[float]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..check import draw_check, find, measure
+from ..check import Finding, draw_check, find, measure
 from ..check.report import as_json
 from ..core.config import Config
 from ..data import FrameSequence, load_sequence
@@ -88,6 +88,12 @@ def _check(job: Job, progress: Progress) -> list[str]:
     return [f"{finding.severity}: {finding.what}" for finding in findings if finding.severity != "note"]
 
 
+def problems(job: Job) -> list[str]:
+    """Errors and warnings of `check`, each with its fix, one line each."""
+    found = (Finding(**finding) for finding in read_json(job.findings)["findings"])
+    return [str(finding) for finding in found if finding.severity != "note"]
+
+
 def _train(job: Job, progress: Progress) -> list[str]:
     sequence = load_sequence(job.data, job.cfg.data)
     usable = _usable(job, len(sequence))
@@ -109,11 +115,8 @@ def _score(job: Job, progress: Progress) -> list[str]:
     result = evaluate(scene, sequence, networks=False)
     result.save(job.run)
     write_report(scene, sequence, job.run, job.report, PREVIEW_TITLE if job.is_preview else "")
-    shown = [
-        f"{all_scores()[name].label} {all_scores()[name].text(result.scores[name])}"
-        for name in SHOWN_SCORES
-        if name in result.scores
-    ]
+    known = [all_scores()[name] for name in SHOWN_SCORES if name in result.scores]
+    shown = [f"{score.label} {score.text(result.scores[score.name], sequence.depth_is_relative)}" for score in known]
     return [f"held-out frames: {', '.join(shown)}"]
 
 

@@ -79,8 +79,8 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
         else:
             measure = _scaled(measure, samples, usable, cfg)
         notes.append(
-            f"depth is relative ({source}) and scaled to a median of {cfg.working_distance_mm:g} mm: "
-            "lengths and scores in mm are relative too. For true mm use a stereo video or measured depth."
+            f"depth is relative ({source}), with its median set to {cfg.working_distance_mm:g}: lengths have no unit "
+            "(rel.). For mm use a stereo video or measured depth."
         )
     elif kind == "folder":
         notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.depth)
@@ -193,10 +193,12 @@ def _tools(
     if cfg.masks == "auto":
         model = fit_tools([frame.rgb_u8 for frame in samples], [geometry.inside] * len(samples), depths)
         source = f"tools found by color{' and depth' if depths else ''} in {model.detected_share:.0%} of the samples"
+        hint = "Check masks/, and correct them in any paint program (255 = tool)."
         if not model.detected_share:
             source = "no tools found by color"
-        note = f"masks: {source}. Check masks/, and correct them in any paint program (255 = tool)."
-        return lambda frame: model.mask(frame.rgb_u8, geometry.inside, frame.depth if depths else None), source, [note]
+            hint = "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
+        note = [f"masks: {source}. {hint}"]
+        return lambda frame: model.mask(frame.rgb_u8, geometry.inside, frame.depth if depths else None), source, note
     files = match_files(Path(cfg.masks), SUFFIXES, "masks", first_pass.indices)
 
     def high(frame: MeasuredFrame) -> Mask:

@@ -63,7 +63,6 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         circle = find_circle(lefts)
         strips = find_strips(lefts) or None
         labels = [tuple(box) for box in find_static_overlays([_without(p, strips) for p in lefts])]
-        notes += _border_notes(strips, circle, labels)
     geometry = make_geometry(
         clip.camera_size,
         calibration,
@@ -76,6 +75,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         strips=strips,
         circle=circle,
     )
+    notes += _border_notes(strips, circle, labels, float(1 - geometry.inside.mean()))
     if calibration is None:
         notes.append(
             f"no calibration; a field of view of {cfg.field_of_view_degrees:g} degrees is assumed "
@@ -104,14 +104,16 @@ def _timing_notes(gaps: int, uneven: int, count: int) -> list[str]:
     return notes
 
 
-def _border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle]) -> list[str]:
+def _border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:
+    """Args: outside: share of the pixels of a frame that show nothing."""
     notes = []
     if strips:
         sides = ", ".join(f"{n} px {side}" for side, n in vars(strips).items() if n)
         notes.append(f"black bars or console strips were cropped: {sides}. To keep them: --border keep.")
     if circle:
         center = f"({circle.center_x:.0f}, {circle.center_y:.0f})"
-        notes.append(f"round border: center {center}, radius {circle.radius:.0f} px. Its outside is masked.")
+        where = f"center {center}, radius {circle.radius:.0f} px"
+        notes.append(f"round border: {where}. Its outside is masked, {outside:.1%} of a frame.")
     notes += [f"a burned-in label was painted over: {x},{y},{w},{h}" for x, y, w, h in labels]
     return notes
 

@@ -9,11 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-
-from .source import SourceFrame
+from typing import Protocol, TypeVar
 
 EVEN = 0.25
 """A time step that differs from the nominal one by more than this share is uneven."""
+
+
+class Timed(Protocol):
+    """An image of a source, or only its time."""
+
+    @property
+    def seconds(self) -> float:
+        """Time since the first image."""
+        ...
+
+
+Image = TypeVar("Image", bound=Timed)
 
 
 @dataclass
@@ -34,7 +45,7 @@ class FrameSelection:
     uneven_steps: int = field(default=0, init=False)
     """Time steps of the source that differ from the nominal one."""
 
-    def pick(self, images: Iterable[SourceFrame]) -> Iterator[SourceFrame]:
+    def pick(self, images: Iterable[Image]) -> Iterator[Image]:
         """The images on the grid, in order; stops at `end`."""
         step = 1 / self.frames_per_second
         nominal = 1 / self.source_rate if self.source_rate else step

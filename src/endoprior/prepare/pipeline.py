@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.checks import input_error, number_ranges
+from ..core.geometry import length_unit
 from ..data import write_stir_tracks
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.reading import kind_of
@@ -140,7 +141,7 @@ def _camera_path(cfg: PrepareConfig, files: FrameFiles, meta: SequenceMeta) -> t
     matrix = np.array([[meta.fx, 0, meta.cx], [0, meta.fy, meta.cy], [0, 0, 1]])
     path = estimate_poses(load, files.count, matrix, relative_depth=meta.depth_relative)
     reach = np.linalg.norm(path.camera_to_world[:, :3, 3], axis=1).max()
-    unit = "mm (relative)" if meta.depth_relative else "mm"
+    unit = length_unit(meta.depth_relative)
     return path, [f"the camera moves: {motion.reason}; the estimated path reaches {reach:.0f} {unit} from its start"]
 
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..core.config import PriorConfig
+from ..core.geometry import length_unit
 from ..data import FrameSequence
 from ..evaluation.registry import all_scores
 from ..model.scene import Scene
@@ -19,6 +20,7 @@ from ..priors import joint_texture_prior
 from ..system.atomic import whole_file
 from ..visualization.image_tools import colorize, to_u8
 from ..visualization.rendered_views import depth_span
+from .observers import LOG_EVERY
 
 SHOWN_SCORES = (
     "psnr_tissue",
@@ -64,7 +66,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     loss_axis, psnr_axis, table_axis = bottom.subplots(1, 3, width_ratios=[1, 1, 1.1])
     _plot_loss(loss_axis, log)
     _plot_psnr(psnr_axis, per_frame)
-    _write_scores(table_axis, metrics)
+    _write_scores(table_axis, metrics, sequence.depth_is_relative)
     with whole_file(path) as temporary:
         figure.savefig(temporary)
 
@@ -72,7 +74,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
 def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, NDArray[np.uint8]]]]:
     frames = sequence.frames("test")
     shown = sorted({int(k) for k in np.linspace(0, len(frames) - 1, 3)})
-    span, unit = depth_span(scene), "relative" if sequence.depth_is_relative else "mm"
+    span, unit = depth_span(scene), length_unit(sequence.depth_is_relative)
     rows = []
     for frame in (frames[k] for k in shown):
         out = scene.render(frame.time, frame.camera)
@@ -93,12 +95,13 @@ def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, N
 
 
 def _plot_loss(axis: Axes, log: list[dict]) -> None:
-    axis.semilogy([sum(line["terms"].values()) for line in log], linewidth=0.6, color="tab:red")
-    starts = [k for k in range(1, len(log)) if log[k]["stage"] != log[k - 1]["stage"]]
-    for k in starts:
-        axis.axvline(k, color="gray", linestyle=":", label="fine stage begins")
+    iterations = [LOG_EVERY * (k + 1) for k in range(len(log))]  # of both stages; the log counts each from 1
+    axis.semilogy(iterations, [sum(line["terms"].values()) for line in log], linewidth=0.6, color="tab:red")
+    starts = [iterations[k - 1] for k in range(1, len(log)) if log[k]["stage"] != log[k - 1]["stage"]]
+    for start in starts:
+        axis.axvline(start, color="gray", linestyle=":", label="fine stage begins")
     axis.set_title("training objective", fontsize=9)
-    axis.set_xlabel("log line (every 10 iterations)", fontsize=8)
+    axis.set_xlabel("iteration", fontsize=8)
     if starts:
         axis.legend(fontsize=7)
 
@@ -107,13 +110,14 @@ def _plot_psnr(axis: Axes, per_frame: list[dict]) -> None:
     points = [(row["index"], row["psnr_tissue"]) for row in per_frame if "psnr_tissue" in row]
     if points:
         axis.plot(*zip(*points, strict=True), "o-", color="tab:blue", markersize=4)
-    axis.set_title(f"{all_scores()['psnr_tissue'].heading}, test frames", fontsize=9)
+    axis.set_title(f"{all_scores()['psnr_tissue'].heading()}, test frames", fontsize=9)
     axis.set_xlabel("frame", fontsize=8)
     axis.grid(alpha=0.3)
 
 
-def _write_scores(axis: Axes, metrics: dict) -> None:
-    scores, known = metrics["scores"], all_scores()
-    lines = [f"{known[name].label:<20}{known[name].text(scores[name]):>16}" for name in SHOWN_SCORES if name in scores]
+def _write_scores(axis: Axes, metrics: dict, relative: bool) -> None:
+    scores = metrics["scores"]
+    shown = [(all_scores()[name], scores[name]) for name in SHOWN_SCORES if name in scores]
+    lines = [f"{score.label:<20}{score.text(value, relative):>16}" for score, value in shown]
     axis.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=axis.transAxes)
     axis.set_axis_off()

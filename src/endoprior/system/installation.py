@@ -6,6 +6,8 @@ import subprocess
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
+ADDRESS = "https://jiaqi-huang-77.github.io/EndoPrior-GS/"
+"""The project in the web."""
 STAMP = PACKAGE / "commit.txt"
 """Written when a package is built (setup.py); a checkout has none."""
 
@@ -39,3 +41,9 @@ def docs_folder() -> Path:
     """The folder that messages call `docs/`: in the installed package, or in the checkout."""
     installed = PACKAGE / "docs"
     return installed if installed.is_dir() else PACKAGE.parents[1] / "docs"
+
+
+def page(name: str) -> str:
+    """Where the user finds a page of the documentation: its file, or the address of the project if there is none."""
+    file = docs_folder() / name
+    return str(file) if file.is_file() else ADDRESS

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.geometry import back_project
+from ..core.geometry import back_project, length_unit
 from ..core.types import Camera
 
 
@@ -54,7 +54,7 @@ def measurement_text(measured: Measurement | None, frame: int, relative: bool) -
         return "Click two points."
     if measured.paths.shape[1] < 2:
         return "Click a second point."
-    unit = "(relative, not mm)" if relative else "mm"
+    unit = length_unit(relative)
     distances = measured.distances
     if not np.isfinite(distances[frame]):
         return f"Measured in frame {measured.frame}; the points are unknown in this one."

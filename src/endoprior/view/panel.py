@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..core.geometry import length_unit
 from .access_control import are_numbers
 from .view_settings import Layer, ViewSettings
 from .viewable import Viewable
@@ -59,7 +60,7 @@ class Panel:
             self.tracks = gui.add_checkbox("Material tracks", False)
             self.clip_end = float(np.ceil(CLIP_MARGIN * viewable.span[1])) or 1.0
             step = 10.0 ** np.floor(np.log10(self.clip_end / 100))
-            unit = "relative" if viewable.relative else "mm"
+            unit = length_unit(viewable.relative)
             self.clip = gui.add_multi_slider(
                 f"Depth range, {unit}", 0.0, self.clip_end, float(step), (0.0, self.clip_end)
             )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
-from ..core.geometry import back_project, expected_depth, quaternion_to_matrix
+from ..core.geometry import back_project, expected_depth, length_unit, quaternion_to_matrix
 from ..core.types import Camera, RenderOutput, Splats
 from ..data import FrameSequence
 from ..model.carry import carry_points
@@ -173,7 +173,7 @@ class ViewableScene:
 
     def legend(self, settings: ViewSettings) -> str:
         """See `Viewable.legend`."""
-        unit = "(relative)" if self.relative else "mm"
+        unit = length_unit(self.relative)
         return {
             "depth": f"blue {self.span[0]:.1f} to red {self.span[1]:.1f} {unit}",
             "alpha": "black 0 to white 1: coverage by the Gaussians",

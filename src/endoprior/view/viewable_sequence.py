@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.geometry import back_project, pixel_centers
+from ..core.geometry import back_project, length_unit, pixel_centers
 from ..core.types import Camera
 from ..data import FrameSequence
 from ..priors import joint_texture_prior
@@ -114,7 +114,7 @@ class ViewableSequence:
 
     def legend(self, settings: ViewSettings) -> str:
         """See `Viewable.legend`."""
-        unit = "(relative)" if self.relative else "mm"
+        unit = length_unit(self.relative)
         return {
             "depth": f"blue {self.span[0]:.1f} to red {self.span[1]:.1f} {unit}",
             "prior": "joint texture prior: blue 0 to red 1",

@@ -1,0 +1,103 @@
+"""Measure the borders around the endoscope image: where they are, and how the masks mark them.
+
+Shared letters: `H, W` image size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..footage.border import BLACK_LEVEL, Circle, Strips, find_circle, find_strips
+from ..footage.overlays import find_static_overlays
+
+LABEL_ON_TISSUE = 0.75
+"""Least share of a text box that the masks mark as tissue; of the rim of a masked round border it is half."""
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Where the endoscope image ends, judging by the images alone."""
+
+    strips: Strips
+    circle: Circle | None
+    in_strip: Mask
+    """(H, W) True in the strips."""
+    outside: Mask
+    """(H, W) True outside of the circle."""
+
+
+@dataclass(frozen=True)
+class BorderFacts:
+    """Borders around the endoscope image, and how much of them the masks mark as tissue."""
+
+    strips: Strips
+    """Static or black strips at the sides, px."""
+    strips_as_tissue: float
+    """Share of the strips' pixels that are marked as tissue; 0 without strips."""
+    circle: Circle | None
+    """Round border of the endoscope image."""
+    outside_as_tissue: float
+    """Share of the pixels outside the circle that are marked as tissue; 0 without a circle."""
+    overlays: tuple[tuple[int, int, int, int], ...]
+    """x, y, width, height of burned-in labels that are marked as tissue, px."""
+    masked: Mask
+    """(H, W) True on the pixels that the masks exclude as border, not as tool: see `masked_border`."""
+
+
+def find_outline(images: list[NDArray[np.uint8]]) -> Outline:
+    """Detect strips and a round border in (H, W, 3) sample images."""
+    height, width = images[0].shape[:2]
+    strips, circle = find_strips(images), find_circle(images)
+    in_strip = np.ones((height, width), bool)
+    in_strip[strips.top : height - strips.bottom, strips.left : width - strips.right] = False
+    outside = ~circle.mask(width, height) if circle else np.zeros((height, width), bool)
+    return Outline(strips, circle, in_strip, outside)
+
+
+def masked_border(outline: Outline, images: list[NDArray[np.uint8]], tissue_masks: Iterable[Mask]) -> Mask:
+    """(H, W) True where no frame is tissue and no image shows anything: black, or beyond the outline.
+
+    Args:
+        images: sample images, (H, W, 3).
+        tissue_masks: (H, W) each, of every frame.
+    """
+    masked = outline.in_strip | outline.outside | (np.maximum.reduce(images).max(-1) < BLACK_LEVEL)
+    for tissue in tissue_masks:
+        masked &= ~tissue
+    return masked
+
+
+def measure_border(
+    outline: Outline, images: list[NDArray[np.uint8]], tissue_masks: list[Mask], masked: Mask
+) -> BorderFacts:
+    """Measure how the masks mark the outline and the labels.
+
+    Args:
+        images, tissue_masks: of the samples; inverted masks are corrected.
+        masked: from `masked_border`.
+    """
+    tissue = np.mean(tissue_masks, axis=0)
+    return BorderFacts(
+        outline.strips,
+        _mean(tissue[outline.in_strip]),
+        outline.circle,
+        _mean(tissue[outline.outside]),
+        tuple(b for b in find_static_overlays(images) if _is_label(b, tissue, outline.in_strip | outline.outside)),
+        masked,
+    )
+
+
+def _is_label(box: tuple[int, int, int, int], tissue: NDArray[np.floating], border: Mask) -> bool:
+    """Whether a text box lies inside the border, and the masks mark most of it as tissue."""
+    x, y, width, height = box
+    inside = slice(y, y + height), slice(x, x + width)
+    return _mean(tissue[inside]) > LABEL_ON_TISSUE and _mean(border[inside]) < 0.5
+
+
+def _mean(values: NDArray) -> float:
+    return float(values.mean()) if values.size else 0.0
