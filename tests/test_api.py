@@ -9,11 +9,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import endoprior
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(endoprior.__file__).parent
 SHORT = """
+import pytest
+
 import endoprior
 full = endoprior.preset
 endoprior.preset = lambda name: full(name).replace({"gaussians": 200})
@@ -21,6 +25,7 @@ endoprior.preset = lambda name: full(name).replace({"gaussians": 200})
 """Runs before README's block: the same preset with few Gaussians."""
 
 
+@pytest.mark.slow
 def test_readmes_python_block_runs_as_it_stands(tiny_sequence, tmp_path):
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     assert '"DATA"' in block and '"RUN"' in block

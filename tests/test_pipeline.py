@@ -74,6 +74,7 @@ def test_a_finished_step_is_not_repeated(done):
     assert before == {step.name: step.result(done).stat().st_mtime_ns for step in STEPS}
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_resumes_bit_identically(video, done, tmp_path):
     job = job_of(video, tmp_path / "out")
     open_folder(job)
@@ -127,6 +128,7 @@ def test_a_job_with_other_settings_does_not_take_the_folder(video, done, tmp_pat
         open_folder(replace(done, out=tmp_path))
 
 
+@pytest.mark.slow
 def test_a_preview_says_that_it_is_one(video, done, tmp_path, monkeypatch):
     said = []
     monkeypatch.setattr(Figure, "suptitle", lambda figure, text, **kwargs: said.append(text))
@@ -150,6 +152,7 @@ def test_the_pages_name_every_file_that_names_the_video(done):
         assert all(f"`{name}`" in text for name in names), page
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_lost_ends_the_training_frames(video, tmp_path):
     job = job_of(video, tmp_path / "out")
     open_folder(job)

@@ -67,6 +67,7 @@ def test_the_api_takes_data_and_config_of_the_run(interrupted, parts):
         endoprior.train(out=parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [["--seed", "3"], QUICK])
 def test_both_folders_with_any_options_that_agree(interrupted, parts, options, capsys):
     assert main(["train", str(interrupted[0]), str(parts), "--resume", *options, "--no-networks"]) == 0
