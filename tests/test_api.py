@@ -16,8 +16,6 @@ import endoprior
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(endoprior.__file__).parent
 SHORT = """
-import pytest
-
 import endoprior
 full = endoprior.preset
 endoprior.preset = lambda name: full(name).replace({"gaussians": 200})
