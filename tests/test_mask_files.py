@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from endoprior.core.checks import InputError
-from endoprior.prepare.mask_files import read_user_mask, tool_polarity
+from endoprior.data.mask_files import read_user_mask, tool_polarity
 
 SIZE = (64, 48)
 TRUE = np.zeros((48, 64), bool)

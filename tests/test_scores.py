@@ -2,7 +2,10 @@
 
 from pathlib import Path
 
+import pytest
+
 from endoprior.cli.score_table import score_table
+from endoprior.evaluation.mask_scores import SCORES
 from endoprior.evaluation.registry import all_scores, scorers
 
 PAGE = Path(__file__).parents[1] / "docs" / "scores.md"
@@ -14,17 +17,18 @@ def test_every_score_has_one_scorer():
     assert len(names) == len(set(names)) == len(all_scores())
 
 
-def test_the_page_lists_every_score():
+@pytest.mark.parametrize("scores", [all_scores().values(), SCORES], ids=["of a scene", "of masks"])
+def test_the_page_lists_every_score(scores):
     rows = [
         f"| `{s.name}` | {s.label} | {s.unit or '-'} | {BETTER[s.higher_is_better]} | {s.description} "
         f"| {s.hint or '-' if s.in_summary else 'not printed'} |"
-        for s in all_scores().values()
+        for s in scores
     ]
     assert "\n".join(rows) + "\n\n" in PAGE.read_text(encoding="utf-8"), "expected this table:\n" + "\n".join(rows)
 
 
 def test_every_score_has_a_group_and_a_meaning():
-    for score in all_scores().values():
+    for score in (*all_scores().values(), *SCORES):
         assert score.group != "other" and score.description.endswith(".") and len(score.hint) <= 40
 
 

@@ -11,24 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..footage.border import BLACK_LEVEL, Circle, Strips, find_circle, find_strips
+from ..footage.border import BLACK_LEVEL, Circle, Outline, Strips
 from ..footage.overlays import find_static_overlays
 
 LABEL_ON_TISSUE = 0.75
 """Least share of a text box that the masks mark as tissue; of the rim of a masked round border it is half."""
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Outline:
-    """Where the endoscope image ends, judging by the images alone."""
-
-    strips: Strips
-    circle: Circle | None
-    in_strip: Mask
-    """(H, W) True in the strips."""
-    outside: Mask
-    """(H, W) True outside of the circle."""
 
 
 @dataclass(frozen=True)
@@ -47,16 +35,6 @@ class BorderFacts:
     """x, y, width, height of burned-in labels that are marked as tissue, px."""
     masked: Mask
     """(H, W) True on the pixels that the masks exclude as border, not as tool: see `masked_border`."""
-
-
-def find_outline(images: list[NDArray[np.uint8]]) -> Outline:
-    """Detect strips and a round border in (H, W, 3) sample images."""
-    height, width = images[0].shape[:2]
-    strips, circle = find_strips(images), find_circle(images)
-    in_strip = np.ones((height, width), bool)
-    in_strip[strips.top : height - strips.bottom, strips.left : width - strips.right] = False
-    outside = ~circle.mask(width, height) if circle else np.zeros((height, width), bool)
-    return Outline(strips, circle, in_strip, outside)
 
 
 def masked_border(outline: Outline, images: list[NDArray[np.uint8]], tissue_masks: Iterable[Mask]) -> Mask:

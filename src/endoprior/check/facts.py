@@ -17,11 +17,12 @@ from ..core.config import DataConfig
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..data.description import read_description
+from ..footage.border import find_outline
 from ..footage.camera_motion import CameraMotion, camera_motion
 from ..footage.changes import Changes, find_changes
 from ..footage.polarity import Polarity, mask_polarity
 from ..initialization.sampling import initial_points
-from .border_facts import BorderFacts, find_outline, masked_border, measure_border
+from .border_facts import BorderFacts, masked_border, measure_border
 from .depth_facts import DepthFacts, measure_depth
 from .remake import Remakes, find_remakes
 from .stereo_facts import StereoFacts, measure_stereo

@@ -1,8 +1,8 @@
-"""`endoprior eval RUN`, and `endoprior eval --pictures FOLDER DATA`."""
+"""`endoprior eval RUN`, `endoprior eval --pictures FOLDER DATA`, and `endoprior eval --masks TRUTH DATA`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -25,31 +25,34 @@ if TYPE_CHECKING:
     from ..model.scene import Scene
 
 
+BETTER = "\u2191 higher is better, \u2193 lower is better"
 MOST_MM_PER_UNIT = 1e6
 """Largest --depth-scale."""
 
 
 @dataclass
 class Eval:
-    """Score a trained scene, or another program's images; writes metrics.json and per_frame.json.
+    """Score a trained scene, another program's images, or tool masks; writes metrics.json and per_frame.json.
 
     Splits other than test have files of their own: metrics_train.json, per_frame_train.json.
     """
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
-    """Run folder; with --pictures the sequence folder."""
+    """Run folder; with --pictures or --masks the sequence folder."""
     data: Path | None = None
     """Sequence folder. Default: the one the run was trained on."""
     split: Literal["test", "train", "video"] = "test"
     """Frames to score."""
     out: Path | None = None
-    """Folder for the two files. Default: RUN, or the folder of --pictures."""
+    """Folder for the two files. Default: RUN, or the folder of --pictures; with --masks none are written."""
     pictures: Path | None = None
     """Score the frames in this folder, PNG of 8 or 16 bits, in place of a run (docs/benchmarks.md)."""
     depth_pictures: Path | None = None
     """Depth of these frames: NPY in mm, or 16-bit PNG with --depth-scale."""
     depth_scale: float | None = None
     """mm per unit of the depth files."""
+    masks: Path | None = None
+    """Score the tool masks of DATA against the true masks in this folder (docs/scores.md)."""
     name: str = ""
     """Name of the method in metrics.json. Default: that of the folder."""
     networks: bool = True
@@ -60,7 +63,9 @@ class Eval:
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
 
-HELP = Help(examples=(("RUN",), ("RUN", "--split", "train"), ("--pictures", "FOLDER", "DATA")))
+HELP = Help(
+    examples=(("RUN",), ("RUN", "--split", "train"), ("--pictures", "FOLDER", "DATA"), ("--masks", "TRUTH", "DATA"))
+)
 
 
 def run(argv: list[str]) -> None:
@@ -69,6 +74,9 @@ def run(argv: list[str]) -> None:
     from ..runs.stored_run import sequence_of_run
     from .output_paths import require_writable_folder
 
+    if args.masks:
+        evaluate_masks(args, args.masks)
+        return
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
     if args.pictures:
@@ -133,6 +141,36 @@ def evaluate_pictures(args: Eval, folder: Path) -> None:
     save_and_print(result, sequence, out, args.split)
 
 
+def evaluate_masks(args: Eval, folder: Path) -> None:
+    """Score the masks of the sequence that takes the place of the run against the true masks in `folder`."""
+    from ..data import load_sequence
+    from ..evaluation.mask_scores import SCORES
+    from ..evaluation.true_masks import TrueMasks, score_masks
+    from .output_paths import require_writable_folder
+
+    plain = Eval(args.run, out=args.out, masks=folder)
+    if other := next((f.name for f in fields(Eval) if getattr(args, f.name) != getattr(plain, f.name)), None):
+        option = f"--{'no-' if other == 'networks' else ''}{other.replace('_', '-')}"
+        raise input_error(
+            option, "--masks TRUTH DATA, with no option but --out", f"{option} as well", f"Remove {option}."
+        )
+    if args.out:
+        require_writable_folder("--out", args.out)
+    sequence = load_sequence(args.run)
+    truth = TrueMasks(folder, sequence)
+    total = len(sequence)
+    say(f"{truth.folder}: true masks of {len(truth.indices)} of {total} frames, matched by {truth.matched_by}")
+    say(f"true masks: {truth.polarity}")
+    result = score_masks(sequence, truth)
+    say(f"\nscores of the tool masks in {len(truth.indices)} frames ({BETTER})")
+    for line in score_table(result.scores, result.skipped, known={score.name: score for score in SCORES}):
+        say(line)
+    if left_out := result.protocol["share_of_pixels_left_out"]:
+        say(f"note: {left_out:.1%} of the pixels do not count: border around the image, or burned-in labels")
+    saved = f"all scores: {result.save(args.out)}" if args.out else "to keep the scores: --out FOLDER"
+    say(f"{saved}; what they mean: {page('scores.md')}")
+
+
 def save_and_print(
     result: Evaluation,
     sequence: FrameSequence,
@@ -142,8 +180,7 @@ def save_and_print(
 ) -> None:
     """Write the two files into `out`, and print a table; name frames to look at in the `run`, if there is one."""
     file = result.save(out)
-    better = "\u2191 higher is better, \u2193 lower is better"
-    say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({better})")
+    say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({BETTER})")
     for line in score_table(result.scores, result.skipped, sequence.depth_is_relative):
         say(line)
     if outliers := result.outlier_frames():

@@ -35,6 +35,16 @@ def natural_order(file: Path) -> list[int | str]:
     return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", file.name))]
 
 
+def files_with(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """The entries of a folder with one of the suffixes, in natural order; hidden ones do not count.
+
+    Raises:
+        InputError: the folder is not readable.
+    """
+    usable = [file for file in entries(folder) if file.suffix.lower() in suffixes and not file.name.startswith(".")]
+    return sorted(usable, key=natural_order)
+
+
 def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str = "") -> list[Path]:
     """The files of a folder with one of the suffixes, in natural order; hidden ones do not count.
 

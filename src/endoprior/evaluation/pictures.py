@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.types import Camera
 from ..data import FrameSequence, Split, read_depth_file
-from ..data.files import entries, natural_order
+from ..data.files import entries, files_with
 from ..data.images import decode_image, describe_pixels, single_channel
 from ..data.reading import kind_of
 from .metrics import ScoreUnavailable
@@ -86,10 +86,10 @@ class Pictures:
         return _read_color(self._color[index], camera), depth and _read_depth(depth, self._scale, camera)
 
 
-def fingerprint(folder: Path) -> str:
-    """SHA-256, in hex, of the names and contents of the files of a folder."""
+def fingerprint(folder: Path, suffixes: tuple[str, ...] = (".png", ".npy")) -> str:
+    """SHA-256, in hex, of the names and contents of the files of a folder with one of the suffixes."""
     digest = hashlib.sha256()
-    for file in sorted(file for file in entries(folder) if file.is_file() and file.suffix.lower() in (".png", ".npy")):
+    for file in sorted(file for file in entries(folder) if file.is_file() and file.suffix.lower() in suffixes):
         digest.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 
@@ -100,10 +100,10 @@ def _matched(
     """The file of each frame, and the rule that says so."""
     if (kind := kind_of(folder)) != "a folder":
         raise input_error(folder, "a folder of rendered frames", kind, "correct the path.")
-    files = _files(folder, suffixes)
+    files = files_with(folder, suffixes)
     kinds = "/".join(suffix[1:].upper() for suffix in suffixes)
     if not files:
-        holders = [sub for sub in sorted(entries(folder)) if sub.is_dir() and _files(sub, suffixes)]
+        holders = [sub for sub in sorted(entries(folder)) if sub.is_dir() and files_with(sub, suffixes)]
         usual = "depth" if ".npy" in suffixes else "rgb"  # as `endoprior render` calls them
         named = next((sub for sub in holders if sub.name == usual), holders[0] if holders else None)
         fix = f"pass {named}." if named else "pass the folder that holds the files themselves."
@@ -114,12 +114,6 @@ def _matched(
         want = f"{kinds} files of the {len(indices)} frames of the {split} split ({indices[0]}, ..., {indices[-1]})"
         raise input_error(folder, want, match, f"rename them: {RULES}.")
     return dict(zip(match.frames, files, strict=True)), match.rule
-
-
-def _files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The files of a folder with one of the suffixes, in natural order; hidden ones do not count."""
-    usable = [f for f in entries(folder) if f.suffix.lower() in suffixes and not f.name.startswith(".")]
-    return sorted(usable, key=natural_order)
 
 
 def _read_color(file: Path, camera: Camera) -> NDArray[np.float32]:

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from ..core.geometry import length_unit
 
-Group = Literal["image", "depth", "motion", "model", "speed", "other"]
+Group = Literal["image", "depth", "motion", "model", "speed", "masks", "other"]
 GROUPS: tuple[Group, ...] = get_args(Group)
 """What a score is about, in the order of the printed table."""
 

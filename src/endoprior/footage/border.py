@@ -59,6 +59,28 @@ class Circle:
         return x * x + y * y < (self.radius - margin_px) ** 2
 
 
+@dataclass(frozen=True)
+class Outline:
+    """Where the endoscope image ends, judging by the images alone."""
+
+    strips: Strips
+    circle: Circle | None
+    in_strip: NDArray[np.bool_]
+    """(H, W) True in the strips."""
+    outside: NDArray[np.bool_]
+    """(H, W) True outside of the circle."""
+
+
+def find_outline(images: Sequence[NDArray[np.uint8]]) -> Outline:
+    """Detect strips and a round border in (H, W, 3) sample images."""
+    height, width = images[0].shape[:2]
+    strips, circle = find_strips(images), find_circle(images)
+    in_strip = np.ones((height, width), bool)
+    in_strip[strips.top : height - strips.bottom, strips.left : width - strips.right] = False
+    outside = ~circle.mask(width, height) if circle else np.zeros((height, width), bool)
+    return Outline(strips, circle, in_strip, outside)
+
+
 def find_strips(images: Sequence[NDArray[np.uint8]]) -> Strips:
     """Detect black bars and static gray console strips at the sides.
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_values
+from ..data.mask_files import MASK_SUFFIXES, read_user_mask, tool_polarity
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit
@@ -21,7 +22,6 @@ from .first_pass import FirstPass
 from .frame_files import match_files
 from .frame_geometry import FrameGeometry
 from .frames import Depth, FrameMethods, Mask, MeasuredFrame
-from .mask_files import SUFFIXES, read_user_mask, tool_polarity
 from .relative_depth import Kind, fit_reference, relative_to_mm
 from .shading import fit_shading
 from .stereo import stereo_depth
@@ -199,7 +199,7 @@ def _tools(
             hint = "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
         note = [f"masks: {source}. {hint}"]
         return lambda frame: model.mask(frame.rgb_u8, geometry.inside, frame.depth if depths else None), source, note
-    files = match_files(Path(cfg.masks), SUFFIXES, "masks", first_pass.indices)
+    files = match_files(Path(cfg.masks), MASK_SUFFIXES, "masks", first_pass.indices)
 
     def high(frame: MeasuredFrame) -> Mask:
         return geometry.values(_of_either_size(read_user_mask, files[frame.index], geometry))

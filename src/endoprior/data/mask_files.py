@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..data.images import decode_image
-from ..data.numpy_files import read_only_array
 from ..footage.polarity import Polarity, mask_polarity
+from .images import decode_image
+from .numpy_files import read_only_array
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz")
+MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz")
 LOSSY = (".jpg", ".jpeg", ".webp")
 JPEG_ERROR = 32
 """Largest compression error next to an outline, in levels 0..255."""
