@@ -260,7 +260,7 @@ def test_masks_of_the_border_alone_hold_no_tools(data):
     border = ~Circle(WIDTH / 2, HEIGHT / 2, 120).mask(WIDTH, HEIGHT)
     edit(data / "images", lambda image, _: np.where(border[..., None], np.uint8(0), image))
     edit(data / "masks", lambda mask, _: np.where(border, np.uint8(255), np.uint8(0)))
-    describe(data, sources={"masks": "no tools found by color"})
+    describe(data, sources={"masks": "no tools found"})
     facts = measure(load_sequence(data))
     assert not facts.masks.tool_fraction.any()
     (finding,) = find(facts)

@@ -329,7 +329,7 @@ def test_the_command(tmp_path, phantom, capsys):
     calibration = str(phantom / "calibration.json")
     assert main(["prepare", str(video), str(tmp_path / "out"), "--calibration", calibration]) == 0
     said = capsys.readouterr().out
-    assert f"{FRAMES} frames of {WIDTH}x{HEIGHT}" in said and "note: masks: tools found by color and depth" in said
+    assert f"{FRAMES} frames of {WIDTH}x{HEIGHT}" in said and "note: masks: tools found in" in said
     assert main(["check", str(tmp_path / "out"), "--out", str(tmp_path / "check.png")]) == 0
     assert main(["prepare", str(video), str(tmp_path / "out"), "--calibration", calibration]) == 2
     assert "expected a new or empty folder" in capsys.readouterr().err

@@ -14,7 +14,7 @@ FILES = sorted(SRC.rglob("*.py"))
 
 FLOORS = [
     {"core", "compute"},
-    {"system", "render", "priors", "footage"},
+    {"system", "render", "priors", "footage", "tool_masks"},
     {"data", "model"},
     {"initialization", "evaluation", "visualization", "phantom"},
     {"training", "doctor", "prepare", "check", "export", "view"},

@@ -92,7 +92,7 @@ def _masks(facts: Facts) -> Iterator[Finding]:
         yield Finding("mask-polarity", "error", what, set_values(facts, mask_tool_value=value))
     elif mean > TOOL_MOST:
         what = f"{mean:.0%} of the pixels inside the border are tool"
-        again = f", or {command} detects tools by color" if (command := detect_tools(facts)) else ""
+        again = f", or {command} finds tools" if (command := detect_tools(facts)) else ""
         yield Finding("tool-fraction", "warning", what, f"correct the masks, 5 % to 40 % are usual{again}")
     elif not masks.tool_fraction.any():
         only = ": the masks cover only the border" if facts.border.masked.any() else ""

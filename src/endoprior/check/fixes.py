@@ -54,9 +54,9 @@ def measure_depth_again(facts: Facts) -> str | None:
 
 
 def detect_tools(facts: Facts) -> str | None:
-    """The command that detects tools by color; None if this was done, or cannot be."""
+    """The command that finds tools; None if this was done, or cannot be."""
     remake, present = facts.remakes.best, facts.sources.get("masks", "")
-    if remake is None or "found by color" in present:
+    if remake is None or "tools found" in present:
         return None
     return remake.command({"--masks": None, "--mask-tool-value": None})
 

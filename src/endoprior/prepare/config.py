@@ -83,7 +83,7 @@ class PrepareConfig:
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
     masks: str = "auto"
-    """`auto` (tools detected by color and depth), `none`, or a folder of masks."""
+    """`auto` (tools are found in the clip itself), `none`, or a folder of masks."""
     mask_tool_value: Literal["auto", "high", "low"] = "auto"
     """Which value marks tools in the mask folder."""
 

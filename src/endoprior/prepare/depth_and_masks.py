@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ from ..data.mask_files import MASK_SUFFIXES, read_user_mask, tool_polarity
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit
+from ..tool_masks import ToolSample, fit_tools
 from .config import PrepareConfig
 from .first_pass import FirstPass
 from .frame_files import match_files
@@ -25,7 +26,6 @@ from .frames import Depth, FrameMethods, Mask, MeasuredFrame
 from .relative_depth import Kind, fit_reference, relative_to_mm
 from .shading import fit_shading
 from .stereo import stereo_depth
-from .tool_mask import fit_tools
 from .video_clip import Clip
 
 FITTED_SAMPLES = 16
@@ -60,16 +60,22 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
         InputError: a folder named by an option cannot be used, or an option needs a second camera.
     """
     geometry, step = first_pass.geometry, max(len(first_pass.samples) // FITTED_SAMPLES, 1)
-    samples = []
-    for stereo_frame in first_pass.samples[::step]:
-        right = None if stereo_frame.right is None else geometry.image(stereo_frame.right, right=True)
-        samples.append(MeasuredFrame(0, stereo_frame.index, geometry.image(stereo_frame.left), right, None))
+    samples, later = [], []
+    for sampled in first_pass.samples[::step]:
+        frame = sampled.frame
+        right = None if frame.right is None else geometry.image(frame.right, right=True)
+        samples.append(MeasuredFrame(0, frame.index, geometry.image(frame.left), right, None))
+        later.append(None if sampled.later is None else geometry.image(sampled.later))
     notes = _check_stereo(samples, geometry, clip) if clip.stereo else []
     kind = _depth_kind(cfg, clip)
     relative = kind in ("shading", "network") or cfg.depth_relative != "no"
     measure, source = (None, kind) if kind in ("none", "shading") else _measured_depth(kind, cfg, clip, first_pass)
-    near = [measure(frame) for frame in samples] if measure and not relative and cfg.masks == "auto" else None
-    tools, mask_source, mask_note = _tools(cfg, first_pass, samples, near)
+    nearness = measure if not relative and cfg.masks == "auto" else None
+    tool_samples = [
+        ToolSample(frame.rgb_u8, geometry.inside, image, nearness(frame) if nearness else None)
+        for frame, image in zip(samples, later, strict=True)
+    ]
+    tools, mask_source, mask_note = _tools(cfg, first_pass, samples, tool_samples)
     notes += mask_note
     shade: Shade | None = None
     if relative:
@@ -184,21 +190,24 @@ def _of_either_size(read: Callable[[Path, tuple[int, int]], NDArray], path: Path
 
 
 def _tools(
-    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame], depths: Sequence[Depth] | None
+    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame], tool_samples: list[ToolSample]
 ) -> tuple[Callable[[MeasuredFrame], Mask], str, list[str]]:
     """A function that returns the tool mask of a frame, the name of its source, and a note."""
     geometry = first_pass.geometry
     if cfg.masks == "none":
         return lambda frame: np.zeros_like(geometry.inside), "none", []
     if cfg.masks == "auto":
-        model = fit_tools([frame.rgb_u8 for frame in samples], [geometry.inside] * len(samples), depths)
-        source = f"tools found by color{' and depth' if depths else ''} in {model.detected_share:.0%} of the samples"
-        hint = "Check masks/, and correct them in any paint program (255 = tool)."
+        model = fit_tools(tool_samples, len(first_pass.indices))
+        source = f"tools found in {model.detected_share:.0%} of the samples"
+        hint = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
         if not model.detected_share:
-            source = "no tools found by color"
+            source = "no tools found"
             hint = "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
-        note = [f"masks: {source}. {hint}"]
-        return lambda frame: model.mask(frame.rgb_u8, geometry.inside, frame.depth if depths else None), source, note
+        return (
+            lambda frame: model.find(frame.rgb_u8, geometry.inside, frame.depth).mask,
+            source,
+            [f"masks: {source}. {hint}"],
+        )
     files = match_files(Path(cfg.masks), MASK_SUFFIXES, "masks", first_pass.indices)
 
     def high(frame: MeasuredFrame) -> Mask:

@@ -14,10 +14,12 @@ from ..footage.overlays import find_static_overlays
 from .calibration import Calibration
 from .config import PrepareConfig, Rectangle, parse_rectangle
 from .frame_geometry import FrameGeometry, make_geometry
-from .video_clip import Clip, EvenSample, StereoFrame
+from .video_clip import Clip, EvenSample, SampledFrame
 
 SAMPLES = 24
 """Number of frames used to detect borders, labels, tools and lighting."""
+MOTION_S = 0.1
+"""Time from a sample to the frame that shows its motion, s: long enough for a breath to move tissue by a pixel."""
 
 
 @dataclass
@@ -26,7 +28,7 @@ class FirstPass:
 
     indices: list[int]
     """Positions of the selected frames in the source."""
-    samples: list[StereoFrame]
+    samples: list[SampledFrame]
     """At most `SAMPLES` of them, evenly spaced."""
     geometry: FrameGeometry
     notes: list[str] = field(default_factory=list)
@@ -41,7 +43,8 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
     Raises:
         InputError: too few or too many frames, or a file is damaged.
     """
-    selection, sample = clip.selection(), EvenSample(SAMPLES)
+    selection = clip.selection()
+    sample = EvenSample(SAMPLES, ahead=max(1, round(MOTION_S * clip.frames_per_second)))
     indices: list[int] = []
     path = str(clip.source.path)
     for stereo_frame in clip.stereo_frames(selection):
@@ -54,7 +57,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
     if len(indices) < 2:
         hint = "Check --start, --end and --frames-per-second."
         raise input_error(path, "at least 2 frames in the selection", str(len(indices)), hint)
-    lefts = [stereo_frame.left for stereo_frame in sample.kept]
+    lefts = [sampled.frame.left for sampled in sample.kept]
     notes = [source.note for source in (clip.source, clip.second) if source and source.note]
     notes += _timing_notes(selection.gaps, selection.uneven_steps, len(indices))
     strips = circle = None
