@@ -18,8 +18,8 @@ from ..core.checks import check_shape
 from .optical_flow import MIN_SIZE_PX, flow_pair, flow_shrink, gray_for_flow
 
 RETURN_PX, RETURN_SHARE = 1.5, 0.1
-"""A pixel returns if forward and backward flow disagree by at most this, plus this share of the step; px of the flow. DIS
-is exact to a fraction of a pixel where it follows the image, and wrong by several pixels where it does not."""
+"""A pixel returns if forward and backward flow disagree by at most this, px of the flow, plus this share of the step.
+DIS is exact to a fraction of a pixel where it follows the image, and wrong by several pixels where it does not."""
 LEAST_RETURNING = 0.5
 """Carrying stops where a smaller share of the region returns: the outline is uncertain, and the next step would start
 from it. At the rim of a tool, tissue appears and disappears; this never returns and is up to half of a thin region."""
@@ -99,9 +99,7 @@ class _Small:
         return cls(gray, cv2.GaussianBlur(color, (0, 0), BLUR_PX))
 
 
-def _follow(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], region: NDArray[np.bool_]
-) -> tuple[float, Positions]:
+def _follow(first: NDArray[np.uint8], second: NDArray[np.uint8], region: NDArray[np.bool_]) -> tuple[float, Positions]:
     """The share of a region (H, W) of the first gray image that returns, and where pixels of the second come from."""
     onward, back = flow_pair(first, second)
     small, returns = _at_size(region, first), _returns(onward, back)
@@ -206,8 +204,8 @@ def _returns(onward: NDArray[np.float32], back: NDArray[np.float32]) -> NDArray[
 def sampled(values: NDArray, positions: Positions) -> NDArray:
     """The values (H, W) or (H, W, C) of an image at positions in it, bilinear; of a mask, where more than half is True.
 
-    Outside of the image the nearest pixel counts: a tool that reaches the border continues beyond it. Where the position
-    is NaN, a mask is False, an image is 0 and numbers are NaN.
+    Outside of the image the nearest pixel counts: a tool that reaches the border continues beyond it. Where the
+    position is NaN, a mask is False, an image is 0 and numbers are NaN.
     """
     unknown = _unknown(positions)
     x, y = (np.where(unknown, np.float32(0), positions[..., k]) for k in (0, 1))
