@@ -186,7 +186,7 @@ def test_painting_carrying_undoing_and_saving_over_the_protocol(tiny_sequence, c
         wait_until(lambda: "Forward until" in panel.corrected.content)
         assert 1 in edits.unsaved and "Changed frames: 1" in panel.corrected.content
         client.set(panel.save_masks, True)
-        wait_until(lambda: "Saved the masks of frames 0-" in panel.corrected.content)
+        wait_until(lambda: "Saved: frames 0-" in panel.corrected.content)
         assert np.array_equal(tool(tiny_sequence / "masks", "000000.png"), edits.tool(0))
         bad = {"phase": "start", "button": "left", "name": "/points", "owner": "", "instance_index": None}
         places = dict.fromkeys(("start_screen_pos", "end_screen_pos"), (0.5, 0.5))

@@ -126,13 +126,18 @@ class MaskEditor:
             InputError: they cannot be written.
         """
         frames = self.edits.save()
-        self._say(f"Saved the masks of frames {number_ranges(frames)}." if frames else "Nothing to save.")
+        self._say(f"Saved: {_frames(frames)}." if frames else "Nothing to save.")
 
     def _say(self, text: str) -> None:
         """Show a text and which masks are not saved."""
         unsaved = self.edits.unsaved
         lines = [text] if text else []
         if unsaved:
-            lines.append(f"Not saved: frames {number_ranges(unsaved)}.")
+            lines.append(f"Not saved: {_frames(unsaved)}.")
         self._controls.corrected.content = "  \n".join(lines)
         self._changed()
+
+
+def _frames(numbers: list[int]) -> str:
+    """Such as `frames 3-5, 9`."""
+    return f"frame{'s' if len(numbers) > 1 else ''} {number_ranges(numbers)}"
