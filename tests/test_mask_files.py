@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from endoprior.core.checks import InputError
 from endoprior.data.mask_files import read_user_mask, tool_polarity
@@ -54,6 +55,8 @@ EXACT = {
     "colors, opaque.png": np.dstack([colored(), np.full((48, 64), 255, np.uint8)]),
     "bool.npy": TRUE,
     "sam.npy": np.stack([LABELS == 1, LABELS == 2, LABELS == 7]),
+    "sam 2.npy": np.stack([LABELS == 1, LABELS == 2])[:, None],
+    "sam 2, one object.npy": TRUE[None, None],
     "one channel.npy": TRUE[..., None],
     "labels.npy": LABELS.astype(np.int64),
     "probability.npy": np.where(TRUE, 0.8, 0.3).astype(np.float32),
@@ -66,6 +69,14 @@ EXACT = {
 @pytest.mark.parametrize("name", EXACT)
 def test_every_format_gives_the_same_mask(tmp_path, name):
     assert (read_user_mask(save(tmp_path / name, EXACT[name]), SIZE) == TRUE).all()
+
+
+def test_a_palette_image_as_annotation_programs_write_it(tmp_path):
+    image = Image.fromarray(LABELS)
+    image.putpalette([0, 0, 0, 51, 221, 255, 250, 50, 83])  # background, and two labels
+    assert image.mode == "P"
+    image.save(tmp_path / "frame_000000.png")
+    assert (read_user_mask(tmp_path / "frame_000000.png", SIZE) == TRUE).all()
 
 
 @pytest.mark.parametrize("name", ["smooth.png", "gray.jpg", "gray as color.jpg", "colors.jpg"])

@@ -3,6 +3,7 @@
 The pictures are kept in `build/view/` to be looked at.
 """
 
+import shutil
 import time
 from dataclasses import replace
 
@@ -30,6 +31,9 @@ KNOWN = ("THREE.Clock", "GPU stall due to ReadPixels", "GL Driver Message", "Aut
 """Messages of viser's own page in a browser without a GPU: notes on speed and on an old name."""
 SPLAT_NOTE = "computeBoundingSphere"
 """viser 1.1.1 gives its splats corners of two coordinates; three.js complains when it is asked for their extent."""
+
+DRAG_NOTE = "Unable to preventDefault inside passive event listener"
+"""Chromium's note when viser drags an object of the scene."""
 
 
 @pytest.fixture(scope="module")
@@ -205,3 +209,43 @@ def test_a_raw_sequence(phantom):
         points = settled(page, "sequence_points")
         assert np.abs(points - seen).mean() > 1 and points.std() > 20
         assert not unexpected(page.problems)
+
+
+def test_masks_are_painted_by_dragging_carried_and_saved(phantom, tmp_path):
+    folder = shutil.copytree(phantom.path, tmp_path / "data")
+    viewable, _ = open_viewable(folder, None)
+    with at_work(Viewer(viewable)) as viewer, open_page(viewer.url, width=WIDTH, height=HEIGHT) as page:
+        page.wait_for("document.querySelector('[role=slider]') !== null")
+        wait_until(lambda: canvas(page).std() > 20, 30)
+        viewer.panel.correct.value = True
+        viewer.jobs.put(viewer.read_panel)
+        wait_until(lambda: viewer.settings.correcting)
+        before, shown = viewable.mask_edits.tool(0), settled(page, "mask_before")
+        left, top, width, height = page.box("canvas")
+        viewport = endoscope_viewport(viewable.cameras[0], bounded_aspect(width, height))
+
+        def on_page(column, row):
+            x, y = viewport.screen((column, row))
+            return left + x * width, top + y * height
+
+        page.drag([on_page(60 + 4 * k, 110) for k in range(11)])
+        wait_until(lambda: (viewable.mask_edits.tool(0) & ~before).any())
+        began = time.monotonic()
+        wait_until(lambda: np.abs(canvas(page) - shown).mean() > 0.5)
+        assert time.monotonic() - began < 3  # a screenshot alone takes a while in software
+        settled(page, "mask_painted")
+        added = np.argwhere(viewable.mask_edits.tool(0) & ~before)
+        radius = viewer.panel.radius.value
+        assert added[:, 0].mean() == pytest.approx(110, abs=1)
+        assert (added[:, 1].min(), added[:, 1].max()) == pytest.approx((60 - radius, 100 + radius), abs=2)
+        page.click_at(*on_page(120, 130))
+        wait_until(lambda: viewable.mask_edits.tool(0)[130, 120])
+        press_button(page, "Carry to other frames")
+        wait_until(lambda: "Forward until" in viewer.panel.corrected.content, 30)
+        assert viewable.mask_edits.tool(1)[110, 80]
+        press_button(page, "Save masks")
+        wait_until(lambda: "Saved:" in viewer.panel.corrected.content)
+        page.wait_for("document.body.innerText.includes('Saved: frames 0')")
+        settled(page, "mask_saved")
+        assert np.array_equal(~load_sequence(folder).frame(1).tissue_mask, viewable.mask_edits.tool(1))
+        assert not unexpected(page.problems, DRAG_NOTE)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from websockets.protocol import State
 from websockets.sync.client import connect
 
+from endoprior.view.access_control import BRUSH_NODE
 from endoprior.view.panel import control_id
 
 VISER = "viser-v1.1.1"
@@ -51,6 +52,24 @@ class Client:
         """Click the canvas; (0, 0) is its upper left corner, (1, 1) its lower right."""
         ray = {"ray_origin": (0, 0, 0), "ray_direction": (0, 0, 1)}
         self.send("ScenePointerMessage", event_type="click", screen_pos=((x, y),), modifier=None, **ray)
+
+    def drag(self, points: list[tuple[float, float]], modifier: str | None = None) -> None:
+        """Drag the brush over the canvas, from point to point."""
+        for k, point in enumerate([*points[1:], points[-1]]):
+            phase = "start" if k == 0 else "end" if k == len(points) - 1 else "update"
+            self.send(
+                "SceneNodeDragMessage",
+                phase=phase,
+                name=BRUSH_NODE,
+                instance_index=None,
+                start_position=(0, 0, 5000),
+                start_screen_pos=points[0],
+                end_position=(0, 0, 5000),
+                end_screen_pos=point,
+                button="left",
+                modifier=modifier,
+                owner="",
+            )
 
     def read(self, timeout: float) -> list[dict]:
         """The next messages; of an image the pixels, (H, W, 3) RGB, under `image`."""

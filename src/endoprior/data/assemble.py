@@ -51,6 +51,8 @@ def assemble(
     truth: Truth | None = None,
     remarks: list[str] | None = None,
     mask_folder: str = "masks",
+    mask_files: list[Path] | None = None,
+    mask_tool_value: int = 255,
     depth_is_relative: bool = False,
     sources: dict[str, str] | None = None,
 ) -> FrameSequence:
@@ -66,6 +68,7 @@ def assemble(
         clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where the extremes of depth are
             reliable, because it was measured or rendered.
         frames_per_second, truth, remarks, mask_folder, depth_is_relative, sources: see `FrameSequence`.
+        mask_files, mask_tool_value: see `FrameSequence`; at full size.
     Raises:
         InputError: fewer than 2 frames or no pixel would be left, or a camera has impossible numbers.
     """
@@ -91,6 +94,8 @@ def assemble(
         read_frame,
         frames_per_second=frames_per_second,
         mask_folder=mask_folder,
+        mask_files=mask_files if cfg.shrink == 1 else None,
+        mask_tool_value=mask_tool_value,
         images=images,
         files=[*images, *files],
         truth=truth,

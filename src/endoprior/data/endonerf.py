@@ -70,9 +70,10 @@ def load_endonerf(
     kept = kept_frames(len(images), cfg)
     images, masks, depths = ([files[i] for i in kept] for files in (images, masks, depths))
     size, scale = (width, height), cfg.depth_unit_mm or described.get("depth_scale", 1.0)
+    tool_value = described.get("mask_tool_value", 255)
 
     def decode(index: int) -> Pixels:
-        tool = read_tool_mask(masks[index], described.get("mask_tool_value", 255), size)
+        tool = read_tool_mask(masks[index], tool_value, size)
         return read_color(images[index], size), ~tool, read_depth(depths[index], scale, size)
 
     truth = None
@@ -94,6 +95,8 @@ def load_endonerf(
         truth=truth,
         remarks=remarks,
         mask_folder=folders[1],
+        mask_files=masks,
+        mask_tool_value=tool_value,
         depth_is_relative=described.get("depth_relative", False),
         sources=described.get("sources"),
     )

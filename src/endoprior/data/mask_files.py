@@ -80,9 +80,9 @@ def _load_array(path: Path) -> NDArray:
     """(H, W) numbers; the union of a stack of bool masks."""
     hint = "Save one array of shape (height, width)."
     loaded = read_only_array(path, hint)
-    if loaded.dtype == bool and loaded.ndim == 3 and 1 not in loaded.shape:
-        loaded = loaded.any(0)
     values = np.squeeze(loaded)
+    if values.dtype == bool and values.ndim == 3:
+        values = values.any(0)
     if values.ndim != 2 or values.dtype.kind not in "buif":
         raise input_error(path, "numbers of shape (height, width)", f"{loaded.dtype} of {loaded.shape}", hint)
     return values

@@ -79,6 +79,8 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
         frames_per_second=float(rate) / (cfg.stride or 1) if rate is not None else None,
         remarks=remarks,
         mask_folder=mask_folder,
+        mask_files=masks,
+        mask_tool_value=tool_value,
         depth_is_relative=described.get("depth_relative", not unit),
         sources=described.get("sources"),
     )

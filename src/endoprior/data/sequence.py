@@ -41,6 +41,8 @@ class FrameSequence:
         truth: Truth | None = None,
         remarks: list[str] | None = None,
         mask_folder: str = "masks",
+        mask_files: list[Path] | None = None,
+        mask_tool_value: int = 255,
         depth_is_relative: bool = False,
         sources: dict[str, str] | None = None,
     ) -> None:
@@ -56,6 +58,8 @@ class FrameSequence:
             truth: ground truth of a synthetic sequence.
             remarks: what is unusual but usable, one line each.
             mask_folder: name of the folder of the masks, for messages.
+            mask_files: the PNG of each frame's mask at the size of the frame; None if there are no such files.
+            mask_tool_value: value of tools in these files, 255 or 0.
             depth_is_relative: the scale of depth is unknown or assumed, so that lengths are not in mm.
             sources: origin of each part, such as {"depth": "stereo"}.
         """
@@ -66,6 +70,7 @@ class FrameSequence:
         self.truth = truth
         self.image_names = [image.stem for image in images or []]
         """Name of each frame's color image, without its suffix; empty if frames are not files of their own."""
+        self.mask_files, self.mask_tool_value = list(mask_files or []), mask_tool_value
         self._cameras = cameras
         self._read_frame = read_frame
         self._files = files or []

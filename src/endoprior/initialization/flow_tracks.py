@@ -20,16 +20,13 @@ from numpy.typing import NDArray
 from ..core.config import BasisConfig
 from ..core.geometry import back_project, bilinear, project
 from ..core.types import Camera, Frame
+from ..footage.optical_flow import MIN_SIZE_PX, FlowPair, flow_pair, gray_for_flow
 from ..model.basis import basis_weights
 from ..system.memory import BoundedCache, cache_bytes, workers
 from . import track_kernels as kernels
 from .cleanup import PointCloud
 from .sampling import has_surface
 
-MIN_SIZE_PX = 32
-"""Smallest image side that dense inverse search supports."""
-HALVED_FROM_PX = 256
-"""Frames with at least this shorter side are tracked at half size: four times faster, almost as accurate."""
 RETURN_PX, RETURN_SHARE = 1.0, 0.05
 """A point is lost where forward and backward flow disagree by more than this, plus this share of the step."""
 STATIC_MARGIN = 1.1
@@ -93,32 +90,15 @@ def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.i
     return pixels
 
 
-FlowPair = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Flow (h, w, 2) from a frame to the next and back, in px of the image it was computed on."""
-
-
 def _flows(frames: Sequence[Frame]) -> Callable[[int], FlowPair]:
     """A function that returns the flows between frames k and k + 1; it caches as many as memory allows."""
     height, width = frames[0].tissue_mask.shape
-    shrink = 2 if min(height, width) >= HALVED_FROM_PX else 1
-    size = (width // shrink, height // shrink)
-
-    def gray(k: int) -> NDArray[np.uint8]:
-        full = cv2.cvtColor(frames[k].rgb_u8, cv2.COLOR_RGB2GRAY)
-        return cv2.resize(full, size, interpolation=cv2.INTER_AREA)
 
     def chunk(number: int) -> list[FlowPair]:
         first = number * FLOW_CHUNK
-        grays = [gray(k) for k in range(first, min(first + FLOW_CHUNK + 1, len(frames)))]
-
-        def both_ways(k: int) -> FlowPair:
-            # A new estimator for each pair: it keeps buffers, and a result must not depend on the previous pair.
-            estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-            forward = estimator.calc(grays[k], grays[k + 1], None)
-            return forward, estimator.calc(grays[k + 1], grays[k], None)
-
+        grays = [gray_for_flow(frames[k].rgb_u8) for k in range(first, min(first + FLOW_CHUNK + 1, len(frames)))]
         with ThreadPoolExecutor(workers(FLOW_BYTES * width * height)) as pool:  # OpenCV releases the interpreter lock
-            return list(pool.map(both_ways, range(len(grays) - 1)))
+            return list(pool.map(flow_pair, grays[:-1], grays[1:]))
 
     cache: BoundedCache[list[FlowPair]] = BoundedCache(
         cache_bytes(), lambda pairs: sum(flow.nbytes for pair in pairs for flow in pair)

@@ -22,6 +22,8 @@ MAX_BROWSERS = 32
 """Largest number of simultaneous connections."""
 MAX_PER_SECOND = 500
 """Largest message rate of one connection; dragging sends one per screen refresh."""
+BRUSH_NODE = "/brush"
+"""The only object of the scene that browsers can drag: see `mask_editor`."""
 LARGEST_CANVAS = 100_000
 """Largest side of a canvas, px."""
 
@@ -90,6 +92,8 @@ def is_valid_message(kind: str, message: Mapping[str, Any], accepts: Callable[[s
         return is_camera(message) and _is_canvas(message)
     if kind == "ScenePointerMessage":
         return _is_click(message)
+    if kind == "SceneNodeDragMessage":
+        return _is_drag(message)
     if kind == "GuiUpdateMessage":
         updates, uuid = message["updates"], message["uuid"]
         # viser would set any other attribute too, such as callbacks or visibility.
@@ -119,5 +123,18 @@ def _is_canvas(fields: Mapping[str, Any]) -> bool:
 def _is_click(fields: Mapping[str, Any]) -> bool:
     places, ray = fields["screen_pos"], (fields["ray_origin"], fields["ray_direction"])
     clicked = fields["event_type"] == "click" and isinstance(places, list | tuple) and len(places) == 1
-    known = fields["modifier"] is None or isinstance(fields["modifier"], str)
+    known = _is_modifier(fields["modifier"])
     return clicked and known and are_numbers(places[0], 2, 1e3) and all(are_numbers(v, 3, FARTHEST_MM) for v in ray)
+
+
+def _is_drag(fields: Mapping[str, Any]) -> bool:
+    places = fields["start_screen_pos"], fields["end_screen_pos"]
+    points = fields["start_position"], fields["end_position"]
+    known = fields["phase"] in ("start", "update", "end") and fields["button"] == "left"
+    known = known and fields["name"] == BRUSH_NODE and fields["owner"] == "" and fields["instance_index"] is None
+    finite = all(are_numbers(v, 2, 1e3) for v in places) and all(are_numbers(v, 3, FARTHEST_MM) for v in points)
+    return known and finite and _is_modifier(fields["modifier"])
+
+
+def _is_modifier(value: Any) -> bool:
+    return value is None or isinstance(value, str)

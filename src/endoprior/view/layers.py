@@ -14,6 +14,8 @@ LARGEST_DIFFERENCE = 0.25
 SOLID_ALPHA = 0.5
 """There is no surface where alpha is lower."""
 OUTLINE = (0, 255, 255)
+MASK_SHARE = 0.4
+"""Share of the overlay's color over a mask."""
 
 
 def fitted(image: NDArray, camera: Camera) -> NDArray:
@@ -48,6 +50,18 @@ def with_tool(
 ) -> NDArray[np.uint8]:
     """A copy with the tool of the original image on top, outlined."""
     picture = np.where(tissue_mask[..., None], picture, original)
-    outlines, _ = cv2.findContours((~tissue_mask).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return outlined(picture, ~tissue_mask)
+
+
+def with_mask(picture: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A copy of an (H, W, 3) image with a mask (H, W) in a transparent color, outlined."""
+    picture = picture.copy()
+    picture[mask] = (1 - MASK_SHARE) * picture[mask] + MASK_SHARE * np.array(OUTLINE)
+    return outlined(picture, mask)
+
+
+def outlined(picture: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The image (H, W, 3), with the outline of a mask (H, W) drawn into it."""
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(picture, outlines, -1, OUTLINE, 1)
     return picture

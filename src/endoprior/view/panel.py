@@ -64,6 +64,15 @@ class Panel:
             self.clip = gui.add_multi_slider(
                 f"Depth range, {unit}", 0.0, self.clip_end, float(step), (0.0, self.clip_end)
             )
+        with gui.add_folder("Correct tool masks", visible=viewable.mask_edits is not None):
+            width = viewable.cameras[0].width
+            self.correct = gui.add_checkbox("Correct by painting", False)
+            self.erase = gui.add_checkbox("Erase", False, hint="Or hold Shift.")
+            self.radius = gui.add_slider("Brush radius, px", 1, max(width // 8, 2), 1, max(width // 50, 1))
+            self.undo = gui.add_button("Undo")
+            self.carry = gui.add_button("Carry to other frames", hint="Moves the correction along with the image.")
+            self.save_masks = gui.add_button("Save masks")
+            self.corrected = gui.add_markdown("")
         with gui.add_folder("Measure"):
             self.measure = gui.add_checkbox("Measure by clicking", False)
             self.clear = gui.add_button("Clear measurement")
@@ -89,8 +98,11 @@ class Panel:
         last, end = self.frame.max, self.clip_end
         allow(lambda value: are_numbers([value], 1, last) and value >= 0, self.frame)
         allow(lambda value: are_numbers(value, 2, end) and min(value) >= 0, self.clip)
+        allow(lambda value: are_numbers([value], 1, self.radius.max) and value >= self.radius.min, self.radius)
         buttons = self.play, self.clear, self.screenshot, self.keep, self.forget, self.video
-        allow(lambda value: isinstance(value, bool), self.tool, self.tracks, self.measure, *buttons)
+        buttons += self.undo, self.carry, self.save_masks
+        switches = self.tool, self.tracks, self.measure, self.correct, self.erase
+        allow(lambda value: isinstance(value, bool), *switches, *buttons)
         for handle in (self.speed, self.layer, self.camera, self.rendered_by, self.rendered_as):
             allow(lambda value, names=handle.options: isinstance(value, str) and value in names, handle)
         return found
@@ -116,6 +128,7 @@ class Panel:
             in_browser=self.rendered_by.value == BROWSER,
             points=self.rendered_as.value == POINTS,
             tool=self.tool.value,
+            correcting=self.correct.value,
             tracks=self.tracks.value,
             near=near,
             far=far if far < self.clip_end else float("inf"),
@@ -137,6 +150,8 @@ def status(viewable: Viewable, settings: ViewSettings, num_kept: int) -> str:
         lines.append("This layer is rendered by the server.")
     if not settings.endoscope and settings.layer in ORIGINALS and "color" in viewable.layers:
         lines.append("Input frames are available in the endoscope view only; showing color.")
+    if settings.correcting and not settings.endoscope:
+        lines.append("Tool masks are corrected in the endoscope view.")
     if viewable.relative:
         lines.append("Depth is **relative**: lengths are not mm.")
     if num_kept:

@@ -6,16 +6,13 @@ loop, or a training run between two iterations) runs the jobs and renders. Rende
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import io
-import logging
 import sys
 import time as clock
 import traceback
 import warnings
-from collections import defaultdict
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,10 +23,12 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError
 from . import panel, saving
-from .access_control import MAX_BROWSERS, MAX_MESSAGE_BYTES, RateLimit, check_address, is_trusted, is_valid_message
+from .access_control import check_address
 from .browsers import Browsers, camera_pose, picture_with_lines
+from .connections import ConnectionFilter
 from .job_queue import JobQueue
 from .line_overlay import Lines, concatenated, no_lines, ruler, track_lines
+from .mask_editor import MaskEditor, Spot
 from .measure import Measurement, measurement_text, pick
 from .video_path import PathPoint, follow_frames, interpolate
 from .view_settings import IDLE_SECONDS, ViewSettings, frame_due
@@ -76,7 +75,7 @@ class Viewer:
         self._version, self._moved_at = 0, clock.monotonic() - IDLE_SECONDS
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
             self.server = _LocalServer(host=host, port=port, label="EndoPrior-GS", verbose=False)
-        self._install_filter()
+        ConnectionFilter(self.server, host, self._accepts)
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
         self.server.scene.set_up_direction("-y")
@@ -85,6 +84,10 @@ class Viewer:
         start.fov = endoscope_viewport(viewable.cameras[0], 1.0).fov
         self._browsers = Browsers(self.server)
         self.panel = panel.Panel(self.server.gui, viewable, viser.uplot)
+        edits = viewable.mask_edits
+        self._editor = edits and MaskEditor(
+            edits, self.panel, self.server.scene, self.jobs, self._mask_spot, self._masks_changed
+        )
         self._listen()
         self._update_panel()
 
@@ -98,11 +101,6 @@ class Viewer:
         """Address for a browser on this machine."""
         host = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
-
-    @property
-    def connections(self) -> dict[int, Any]:
-        """Open connections of viser, by client id."""
-        return self.server._websock_server._live_connections
 
     @property
     def watched(self) -> bool:
@@ -158,6 +156,11 @@ class Viewer:
             traceback.print_exc(file=sys.stderr)
             self._browsers.notify("That did not work", f"{type(error).__name__}: {error}")
 
+    def _accepts(self, uuid: str, value: Any) -> bool:
+        """Whether a control can have this value; there is no panel while the viewer starts."""
+        controls = getattr(self, "panel", None)
+        return controls is not None and controls.accepts(uuid, value)
+
     # Callbacks of the controls.
 
     def _listen(self) -> None:
@@ -172,7 +175,7 @@ class Viewer:
 
         on_change(lambda: self._go_to(controls.frame.value), controls.frame)
         shown = controls.layer, controls.camera, controls.rendered_by, controls.rendered_as
-        on_change(self.read_panel, *shown, controls.tool, controls.tracks, controls.clip)
+        on_change(self.read_panel, *shown, controls.tool, controls.tracks, controls.clip, controls.correct)
         on_change(self._restart_clock, controls.speed)
         on_change(self.read_measuring, controls.measure)
         on_press(controls.play, lambda _: self._toggle_play())
@@ -181,63 +184,15 @@ class Viewer:
         on_press(controls.forget, lambda _: self._forget_views())
         on_press(controls.screenshot, self._screenshot)
         on_press(controls.video, self._save_video)
+        if editor := self._editor:
+            on_press(controls.undo, lambda _: editor.undo())
+            on_press(controls.carry, lambda _: editor.carry(self.settings.frame))
+            on_press(controls.save_masks, lambda _: editor.save())
         self.server.on_client_connect(lambda client: ask(lambda: self._welcome(client), surely=True))
         self.server.on_client_disconnect(self._goodbye)
 
     async def _goodbye(self, client: viser.ClientHandle) -> None:  # async: viser's threads may have ended
         self.jobs.put(lambda: self._browsers.leave(client), surely=True)
-
-    # Access control.
-
-    def _install_filter(self) -> None:
-        """Filter all incoming connections and messages."""
-        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # it logs a traceback for each malformed request
-        server = self.server._websock_server
-        server._handle_incoming_message = self._filtered(server._handle_incoming_message)
-        server.on_client_connect(self._admit)
-        for client_id in tuple(server._live_connections):  # connected before the line above
-            asyncio.run_coroutine_threadsafe(self._check_connection(client_id), self.server._event_loop)
-
-    async def _admit(self, connection: Any) -> None:
-        """Check a new connection before anything is sent or read."""
-        connection._handle_incoming_message = self._filtered(connection._handle_incoming_message)
-        await self._check_connection(connection.client_id)
-
-    async def _check_connection(self, client_id: int) -> None:
-        """Close connections of foreign pages, and those beyond `MAX_BROWSERS`."""
-        connections = self.connections
-        if (connection := connections.get(client_id)) is None:
-            return
-        connection.protocol.max_message_size = MAX_MESSAGE_BYTES
-        if not self._is_trusted(client_id):
-            await connection.close(1008, "not this viewer's page")
-        elif len(connections) > MAX_BROWSERS:
-            await connection.close(1013, "too many browsers")
-
-    def _is_trusted(self, client_id: int) -> bool:
-        """Whether to serve an open connection."""
-        connection = self.connections.get(client_id)
-        if connection is None:
-            return False
-        origins, hosts = (connection.request.headers.get_all(name) for name in ("Origin", "Host"))
-        return len(origins) < 2 and is_trusted(next(iter(origins), None), next(iter(hosts), None), self.host)
-
-    def _filtered(self, handle: Callable[[int, Any], Awaitable[None]]) -> Callable[[int, Any], Awaitable[None]]:
-        """A version of `handle` that drops invalid messages and foreign pages, and closes a connection that floods."""
-        paces: defaultdict[int, RateLimit] = defaultdict(RateLimit)
-
-        async def filtered(client_id: int, message: Any) -> None:
-            controls = getattr(self, "panel", None)  # None while the viewer starts
-            accepts = controls.accepts if controls else lambda uuid, value: False
-            connection = self.connections.get(client_id)
-            if connection is None:
-                paces.pop(client_id, None)
-            elif paces[client_id].exceeded(clock.monotonic()):
-                connection.transport.abort()
-            elif self._is_trusted(client_id) and is_valid_message(type(message).__name__, vars(message), accepts):
-                await handle(client_id, message)
-
-        return filtered
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         self._browsers.join(client)
@@ -253,6 +208,8 @@ class Viewer:
         if settings.endoscope and not self.settings.endoscope:
             self._browsers.return_to_endoscope()
         self.settings = settings
+        if self._editor:
+            self._editor.listen(settings.correcting and settings.endoscope)
         self._update_panel()
 
     def _go_to(self, frame: int) -> None:
@@ -303,15 +260,18 @@ class Viewer:
     def read_measuring(self) -> None:
         """Switch measuring by clicks on or off, as the control is set."""
         scene = self.server.scene
-        scene.remove_click_callback("all")
+        scene.remove_click_callback(self._on_click)
         if self.panel.measure.value:
-            scene.on_click()(lambda event: self.jobs.put(lambda: self._pick(event.client, event.screen_pos)))
+            scene.on_click()(self._on_click)
         self._update_panel()
+
+    def _on_click(self, event: viser.SceneClickEvent) -> None:
+        self.jobs.put(lambda: self._pick(event.client, event.screen_pos))
 
     def _pick(self, client: viser.ClientHandle, screen: tuple[float, float]) -> None:
         """Add the point under a click: the first, the second, or the first of the next measurement."""
         viewport = self._browsers.viewport(client, self.viewable, self.settings)
-        if viewport is None:
+        if viewport is None or self.settings.correcting:  # a click paints
             return
         depth = self.viewable.surface(self.settings, viewport.camera)
         point = pick(depth, viewport.camera, viewport.pixel(screen))
@@ -327,6 +287,20 @@ class Viewer:
     def _clear_measurement(self) -> None:
         self.measured, self._picked = None, []
         self._update_panel()
+
+    # Correcting tool masks.
+
+    def _mask_spot(self, client: viser.ClientHandle, screen: tuple[float, float]) -> Spot | None:
+        """The frame, and the position in its mask, at a position on a browser's canvas."""
+        viewport = self._browsers.viewport(client, self.viewable, self.settings)
+        if viewport is None or not self.settings.endoscope:
+            return None
+        (x, y), own = viewport.pixel(screen), self.viewable.cameras[self.settings.frame]
+        return self.settings.frame, (x * own.width / viewport.camera.width, y * own.height / viewport.camera.height)
+
+    def _masks_changed(self) -> None:
+        self._version += 1
+        self._moved_at = clock.monotonic()
 
     # Saving.
 

@@ -30,6 +30,8 @@ class ViewSettings:
     """Small opaque dots in place of splats."""
     tool: bool = False
     """Show the tool of the input frame on top, with an outline."""
+    correcting: bool = False
+    """Show the tool mask in color, to correct it; only with the endoscope camera of a sequence."""
     near: float = 0.0
     """Smallest depth to render, mm."""
     far: float = float("inf")

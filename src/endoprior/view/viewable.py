@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Camera
+from .mask_edits import MaskEdits
 from .view_settings import Layer, ViewSettings
 
 
@@ -43,6 +44,8 @@ class Viewable(Protocol):
     """Depth range of nearly all content, seen from the endoscope, mm."""
     has_tool: bool
     """Whether the tool overlay is available."""
+    mask_edits: MaskEdits | None
+    """Corrections of the tool masks; None where there are no mask files to correct."""
 
     def picture(self, settings: ViewSettings, camera: Camera) -> NDArray[np.uint8]:
         """(H, W, 3) image of the selected layer and frame from `camera`."""

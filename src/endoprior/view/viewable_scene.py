@@ -52,6 +52,7 @@ class ViewableScene:
         self.frames_per_second = scene.frames_per_second
         self.relative = scene.lengths_are_relative
         self.has_tool = sequence is not None
+        self.mask_edits = None
         self._playback = Playback(scene)
         self._rasterize = render.load(scene.backend)
 

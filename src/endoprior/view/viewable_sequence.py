@@ -13,6 +13,7 @@ from ..core.types import Camera
 from ..data import FrameSequence
 from ..priors import joint_texture_prior
 from . import layers
+from .mask_edits import MaskEdits
 from .point_rendering import render_points
 from .view_settings import Layer, ViewSettings
 from .viewable import Cloud
@@ -34,6 +35,8 @@ class ViewableSequence:
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
         self.frames_per_second = sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND
         self.relative = sequence.depth_is_relative
+        self._masks = MaskEdits(sequence)
+        self.mask_edits = self._masks if sequence.mask_files else None
 
     @cached_property
     def span(self) -> tuple[float, float]:
@@ -58,10 +61,10 @@ class ViewableSequence:
             picture = layers.fitted(frame.rgb_u8, camera)
             if settings.near > 0 or settings.far < float("inf"):
                 picture = picture * (self.surface(settings, camera) > 0)[..., None]
-        if not settings.tool:
-            return picture
-        mask = layers.fitted(frame.tissue_mask, camera)
-        return layers.with_tool(picture, layers.fitted(frame.rgb_u8, camera), mask)
+        tool = layers.fitted(self._masks.tool(settings.frame), camera)
+        if settings.correcting:
+            return layers.with_mask(picture, tool)
+        return layers.with_tool(picture, layers.fitted(frame.rgb_u8, camera), ~tool) if settings.tool else picture
 
     def _dots(self, settings: ViewSettings, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         cloud = self.cloud(settings)
@@ -69,7 +72,7 @@ class ViewableSequence:
 
     def _prior(self, index: int, camera: Camera) -> NDArray[np.float32]:
         frame = self.sequence.frame(index)
-        return layers.fitted(joint_texture_prior(frame.rgb, frame.tissue_mask), camera)
+        return layers.fitted(joint_texture_prior(frame.rgb, ~self._masks.tool(index)), camera)
 
     def surface(self, settings: ViewSettings, camera: Camera) -> NDArray[np.float32]:
         """See `Viewable.surface`: the measured depth."""
@@ -85,10 +88,10 @@ class ViewableSequence:
 
     def cloud(self, settings: ViewSettings) -> Cloud:
         """See `Viewable.cloud`: measured points; those of the tool only with the tool overlay."""
-        frame, camera = self.sequence.frame(settings.frame), self.cameras[settings.frame]
-        settings = replace(settings, endoscope=True)
+        camera = self.cameras[settings.frame]
+        settings = replace(settings, endoscope=True, correcting=False)
         depth = self.surface(settings, camera)
-        seen = (depth > 0) & (frame.tissue_mask | settings.tool)
+        seen = (depth > 0) & (~self._masks.tool(settings.frame) | settings.tool)
         step = int(np.ceil(np.sqrt(max(seen.sum() / MAX_POINTS, 1))))
         rows, columns = (indices * step for indices in np.nonzero(seen[::step, ::step]))
         pixels = pixel_centers(camera.width, camera.height)[rows, columns]

@@ -1,0 +1,173 @@
+"""Corrections of the tool masks of a sequence folder: brush strokes, carrying to other frames, undo, saving."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar, overload
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import input_error, number_ranges
+from ..data import FrameSequence
+from ..data.images import read_tool_mask, save_png
+from ..footage.carry_masks import CarriedEdit, carry_mask_edit
+from ..system.atomic import whole_file, write_json
+
+MOST_UNDO = 100
+"""Number of steps that can be undone."""
+NOTE = "changes.json"
+"""In the folder of the original masks: the files that were changed, and by how many pixels."""
+
+Mask = NDArray[np.bool_]
+"""(H, W) True on tools."""
+Masks = dict[int, Mask]
+"""By frame. A mask is never changed, only replaced."""
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class _State:
+    """All corrections at one time."""
+
+    masks: Masks = field(default_factory=dict)
+    """Masks that were corrected."""
+    uncarried: Masks = field(default_factory=dict)
+    """The masks before the strokes that were not carried yet."""
+
+
+class MaskEdits:
+    """Corrected masks of one sequence. Nothing is written before `save`."""
+
+    def __init__(self, sequence: FrameSequence) -> None:
+        self._sequence = sequence
+        self._state, self._undo = _State(), list[_State]()
+        self._saved: Masks = {}
+        """Masks of files that differ from what `sequence` has read."""
+
+    def tool(self, frame: int) -> Mask:
+        """The mask of a frame, with its corrections."""
+        found = self._state.masks.get(frame)
+        return ~self._sequence.frame(frame).tissue_mask if found is None else found
+
+    @property
+    def unsaved(self) -> list[int]:
+        """The frames whose mask was changed since it was read or saved."""
+        current = self._state.masks
+        return sorted(i for i in {*current, *self._saved} if current.get(i) is not self._saved.get(i))
+
+    def begin(self) -> None:
+        """Begin a stroke: `undo` goes back to here."""
+        self._undo = [*self._undo, self._state][-MOST_UNDO:]
+
+    def draw(self, frame: int, points: Sequence[tuple[float, float]], radius: float, paint: bool) -> None:
+        """Continue the stroke through points (x, y), px of the mask. Args: as `stroke`."""
+        before = self.tool(frame)
+        masks = {**self._state.masks, frame: stroke(before, points, radius, paint)}
+        self._state = _State(masks, {frame: before, **self._state.uncarried})
+
+    def carry(self, frame: int) -> CarriedEdit:
+        """Carry what was corrected in a frame since the last time to the frames around it."""
+        total = len(self._sequence)
+        frames = _Lazy(total, lambda i: self._sequence.frame(i).rgb_u8)
+        masks = _Lazy(total, lambda i: self._state.uncarried.get(i, self.tool(i)) if i == frame else self.tool(i))
+        done = carry_mask_edit(frames, masks, frame, self.tool(frame))
+        if done.masks:
+            self.begin()
+            uncarried = {i: mask for i, mask in self._state.uncarried.items() if i != frame}
+            self._state = _State(self._state.masks | done.masks, uncarried)
+        return done
+
+    def undo(self) -> bool:
+        """Go back by one stroke or one carrying; False if there is none."""
+        if not self._undo:
+            return False
+        *self._undo, self._state = self._undo
+        return True
+
+    def save(self) -> list[int]:
+        """Write every changed mask to its file, keep the original once, and note what changed. Returns the frames.
+
+        Raises:
+            InputError: the folder is read-only, or the disk rejects a file; masks written before it stay written.
+        """
+        frames, files = self.unsaved, self._sequence.mask_files
+        if not frames:
+            return []
+        folder = files[0].parent
+        kept = folder.with_name(f"{folder.name}_before")
+        for place in (folder, folder.parent):
+            if not os.access(place, os.W_OK):
+                fix = "Copy the data folder to a place of your own, and view the copy."
+                raise input_error(place, "a folder that can be written", "a read-only one", fix)
+        for frame in frames:
+            original = kept / files[frame].name
+            if not original.exists():
+                with whole_file(original) as temporary:
+                    shutil.copyfile(files[frame], temporary)
+            high = self.tool(frame) == (self._sequence.mask_tool_value == 255)
+            with whole_file(files[frame]) as temporary:
+                save_png(temporary, np.where(high, 255, 0).astype(np.uint8))
+            self._saved.pop(frame, None)
+            if frame in self._state.masks:
+                self._saved[frame] = self._state.masks[frame]
+        write_json(kept / NOTE, changes(kept, folder, self._sequence.mask_tool_value))
+        return frames
+
+
+def stroke(mask: Mask, points: Sequence[tuple[float, float]], radius: float, paint: bool) -> Mask:
+    """A copy of a mask with a brush stroke.
+
+    Args:
+        mask: (H, W) bool.
+        points: (x, y) through which the center of the brush moves, px; (0, 0) is the upper left corner of the image.
+        radius: of the brush, px; at least one pixel is changed.
+        paint: True adds pixels, False removes them.
+    """
+    drawn = np.zeros(mask.shape, np.uint8)
+    # Sixteenths of a pixel; OpenCV counts pixel centers from 0. Positions far outside would overflow.
+    limit = 4 * max(mask.shape)
+    fixed = [[round(16 * (min(max(v, -limit), limit) - 0.5)) for v in point] for point in points]
+    cv2.polylines(drawn, [np.array(fixed, np.int32)], False, 1, max(round(2 * radius), 1), cv2.LINE_8, 4)
+    for point in fixed:
+        cv2.circle(drawn, point, round(16 * radius), 1, -1, cv2.LINE_8, 4)
+    return mask | (drawn > 0) if paint else mask & (drawn == 0)
+
+
+def changes(kept: Path, folder: Path, tool_value: int) -> dict[str, dict[str, int]]:
+    """For every original mask in `kept`, how many pixels its corrected version in `folder` adds and removes."""
+    found = {}
+    for original in sorted(kept.glob("*.png")):
+        before, now = (read_tool_mask(file, tool_value) for file in (original, folder / original.name))
+        found[original.name] = {"added_px": int((now & ~before).sum()), "removed_px": int((before & ~now).sum())}
+    return found
+
+
+def carried_text(done: CarriedEdit) -> str:
+    """What carrying changed and why it stopped, in a few lines."""
+    changed = f"Changed frames: {number_ranges(done.masks)}." if done.masks else "No frame changed."
+    return f"{changed}  \nBackward until {done.before}.  \nForward until {done.after}."
+
+
+class _Lazy(Sequence[Value]):
+    """A sequence whose items are made when they are used."""
+
+    def __init__(self, length: int, item: Callable[[int], Value]) -> None:
+        self._length, self._item = length, item
+
+    def __len__(self) -> int:
+        return self._length
+
+    @overload
+    def __getitem__(self, index: int) -> Value: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Value]: ...
+    def __getitem__(self, index: int | slice) -> Value | Sequence[Value]:
+        if isinstance(index, slice):
+            return [self._item(i) for i in range(self._length)[index]]
+        return self._item(index)

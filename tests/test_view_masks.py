@@ -1,0 +1,203 @@
+"""Correcting tool masks in the viewer: the brush, undo, carrying, saving, and the same over the viewer's protocol."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import cv2
+import numpy as np
+import pytest
+from view_client import Client, at_work
+
+from endoprior.cli.view import open_viewable
+from endoprior.core.checks import InputError
+from endoprior.data import load_sequence
+from endoprior.view import layers, mask_edits
+from endoprior.view.mask_edits import MaskEdits, stroke
+from endoprior.view.server import Viewer
+from endoprior.view.view_settings import ViewSettings
+from endoprior.view.viewable_sequence import ViewableSequence
+
+SHAPE = (48, 64)
+
+
+@pytest.fixture
+def edits(tiny_sequence):
+    """Corrections of the tiny sequence."""
+    return MaskEdits(load_sequence(tiny_sequence))
+
+
+def tool(folder, name: str) -> np.ndarray:
+    """What a mask file holds."""
+    pixels = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
+    assert set(np.unique(pixels)) <= {0, 255}
+    return pixels == 255
+
+
+def wait_until(condition, seconds: float = 10) -> None:
+    """Until it is true."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("points", [[(20.5, 30.5)], [(10.0, 12.0), (50.0, 30.0)], [(5, 5), (40, 9), (30, 44)]])
+@pytest.mark.parametrize("radius", [1, 4, 9.0])
+def test_a_stroke_equals_a_slow_loop(points, radius):
+    drawn = stroke(np.zeros(SHAPE, bool), points, radius, True)
+    ends = np.array(points, float)
+    for row in range(SHAPE[0]):
+        for column in range(SHAPE[1]):
+            here, distance = np.array([column + 0.5, row + 0.5]), np.inf
+            for a, b in zip(ends, [*ends[1:], ends[-1]], strict=True):
+                along = np.clip((here - a) @ (b - a) / max((b - a) @ (b - a), 1e-9), 0, 1)
+                distance = min(distance, float(np.hypot(*(a + along * (b - a) - here))))
+            if abs(distance - radius) > 1:  # OpenCV rounds outlines
+                assert drawn[row, column] == (distance < radius), (row, column, distance)
+    erased = stroke(np.ones(SHAPE, bool), points, radius, False)
+    assert np.array_equal(erased, ~drawn)
+
+
+def test_a_stroke_changes_a_copy_and_may_leave_the_image():
+    mask = np.zeros(SHAPE, bool)
+    assert stroke(mask, [(-1e9, 20), (30, 20)], 3, True)[20, :30].all() and not mask.any()
+    assert not stroke(mask, [(1e9, 1e9)], 3, True).any()
+
+
+def test_undo_goes_back_by_one_stroke_or_one_carrying(edits):
+    first = edits.tool(2)
+    edits.begin()
+    edits.draw(2, [(10, 10)], 4, True)
+    edits.draw(2, [(10, 10), (20, 10)], 4, True)
+    painted = edits.tool(2)
+    assert painted[10, 20] and edits.unsaved == [2]
+    changed = edits.carry(2).masks
+    assert 1 in changed and 3 in changed and edits.unsaved == sorted([2, *changed])
+    assert edits.undo() and edits.unsaved == [2] and np.array_equal(edits.tool(2), painted)
+    assert edits.undo() and edits.unsaved == [] and np.array_equal(edits.tool(2), first)
+    assert not edits.undo()
+
+
+def test_carrying_takes_only_what_was_corrected_since_the_last_time(edits):
+    edits.begin()
+    edits.draw(2, [(12, 12)], 5, True)
+    edits.carry(2)
+    assert edits.tool(3)[12, 12]
+    edits.begin()
+    edits.draw(3, [(12, 12)], 8, False)
+    before = edits.tool(2)
+    assert not edits.carry(2).masks and np.array_equal(edits.tool(2), before)  # nothing new in frame 2
+    edits.carry(3)
+    assert not edits.tool(2)[12, 12] and not edits.tool(4)[12, 12]
+
+
+@pytest.mark.parametrize("tool_value", [255, 0])
+def test_saving_keeps_the_first_original_and_notes_what_changed(tiny_sequence, tool_value):
+    if tool_value == 0:
+        file = tiny_sequence / "sequence.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"mask_tool_value": 0}))
+        for mask in (tiny_sequence / "masks").iterdir():
+            cv2.imwrite(str(mask), 255 - cv2.imread(str(mask), cv2.IMREAD_UNCHANGED))
+    edits = MaskEdits(load_sequence(tiny_sequence))
+    kept, name = tiny_sequence / "masks_before", "000002.png"
+    original = (tiny_sequence / "masks" / name).read_bytes()
+    assert edits.save() == [] and not kept.exists()
+    for point in ((10, 10), (10, 14)):
+        edits.begin()
+        edits.draw(2, [point], 3, True)
+        assert edits.save() == [2] and edits.unsaved == []
+    assert (kept / name).read_bytes() == original
+    assert sorted(file.name for file in kept.iterdir()) == [name, "changes.json"]
+    assert not list((tiny_sequence / "masks").glob(".*"))
+    again = load_sequence(tiny_sequence)
+    assert np.array_equal(~again.frame(2).tissue_mask, edits.tool(2)) and edits.tool(2)[14, 10]
+    noted = json.loads((kept / "changes.json").read_text())[name]
+    assert noted["added_px"] > 40 and noted["removed_px"] == 0
+    edits.undo()  # after saving, the file is the newer one
+    assert edits.unsaved == [2] and edits.save() == [2]
+    assert not edits.tool(2)[16, 10] and tool(tiny_sequence / "masks", name)[16, 10] == (tool_value == 0)
+
+
+def test_a_read_only_folder_is_one_clear_line(edits, monkeypatch, tiny_sequence):
+    edits.begin()
+    edits.draw(0, [(10, 10)], 3, True)
+    monkeypatch.setattr(mask_edits.os, "access", lambda path, mode: False)
+    with pytest.raises(InputError, match=r"read-only one\. Fix: Copy the data folder") as error:
+        edits.save()
+    assert "\n" not in str(error.value) and not (tiny_sequence / "masks_before").exists()
+    assert edits.unsaved == [0]
+
+
+def test_the_overlay_shows_the_corrected_mask_and_points_leave_it_out(tiny_sequence):
+    viewable = ViewableSequence(load_sequence(tiny_sequence))
+    settings, camera = ViewSettings(frame=2, layer="frame", correcting=True), viewable.cameras[2]
+    before, original = viewable.picture(settings, camera), viewable.sequence.frame(2).rgb_u8
+    mask = viewable.mask_edits.tool(2)
+    assert (before[mask] != original[mask]).any(-1).all() and np.array_equal(before[~mask], original[~mask])
+    points = len(viewable.cloud(ViewSettings(frame=2, layer="frame")).points)
+    viewable.mask_edits.begin()
+    viewable.mask_edits.draw(2, [(15, 25)], 5, True)
+    now = viewable.picture(settings, camera)
+    assert (now[25, 15] != before[25, 15]).any() and np.array_equal(now[5, 40], before[5, 40])
+    assert len(viewable.cloud(ViewSettings(frame=2, layer="frame")).points) < points
+    assert np.array_equal(layers.with_mask(original, mask & False), original)
+
+
+def test_only_folders_with_mask_files_can_be_corrected(tiny_sequence):
+    for file in (tiny_sequence / "masks").iterdir():
+        file.unlink()
+    (tiny_sequence / "masks").rmdir()
+    (tiny_sequence / "poses_bounds.npy").unlink()
+    viewable = ViewableSequence(load_sequence(tiny_sequence))
+    assert viewable.mask_edits is None
+    Viewer(viewable).close()
+
+
+def test_painting_carrying_undoing_and_saving_over_the_protocol(tiny_sequence, capfd):
+    viewable, _ = open_viewable(tiny_sequence, None)
+    with at_work(Viewer(viewable)) as viewer:
+        panel, edits = viewer.panel, viewable.mask_edits
+        client = Client(viewer.port)
+        client.send_camera()
+        plain = client.image()
+        client.drag([(0.3, 0.3), (0.5, 0.3)])  # the pointer belongs to the camera
+        client.set(panel.correct, True)
+        assert np.abs(client.image().astype(int) - plain).max() > 20
+        assert not edits.unsaved
+        before = edits.tool(0)
+        client.set(panel.radius, 3)
+        client.drag([(0.3, 0.3), (0.4, 0.3), (0.5, 0.3)])
+        wait_until(lambda: edits.unsaved == [0])
+        top = viewer.viewable.cameras[0].height
+        client.image()
+        added = np.argwhere(edits.tool(0) & ~before)
+        width = viewer.viewable.cameras[0].width
+        assert np.ptp(added[:, 1]) == pytest.approx(0.2 * width + 6, abs=2) and np.ptp(added[:, 0]) <= 7
+        assert added[:, 1].mean() == pytest.approx(0.4 * width, abs=1) and added[:, 0].mean() < 0.4 * top
+        client.drag([(0.3, 0.3), (0.5, 0.3)], modifier="shift")
+        wait_until(lambda: not (edits.tool(0) & ~before).any())
+        client.set(panel.undo, True)
+        wait_until(lambda: (edits.tool(0) & ~before).any())
+        client.click(0.2, 0.7)
+        wait_until(lambda: (edits.tool(0) & ~before).sum() > len(added))
+        client.set(panel.carry, True)
+        wait_until(lambda: "Forward until" in panel.corrected.content)
+        assert 1 in edits.unsaved and "Changed frames: 1" in panel.corrected.content
+        client.set(panel.save_masks, True)
+        wait_until(lambda: "Saved: frames 0-" in panel.corrected.content)
+        assert np.array_equal(tool(tiny_sequence / "masks", "000000.png"), edits.tool(0))
+        bad = {"phase": "start", "button": "left", "name": "/points", "owner": "", "instance_index": None}
+        places = dict.fromkeys(("start_screen_pos", "end_screen_pos"), (0.5, 0.5))
+        ends = dict.fromkeys(("start_position", "end_position"), (0, 0, 1))
+        saved = edits.tool(0)
+        client.send("SceneNodeDragMessage", modifier=None, **bad, **places, **ends)
+        nowhere = dict.fromkeys(places, (float("nan"), 0.5))
+        client.send("SceneNodeDragMessage", modifier=None, **bad | {"name": "/brush"}, **nowhere, **ends)
+        client.set(panel.radius, -5)
+        client.set(panel.correct, False)
+        time.sleep(0.4)
+        assert client.connected and edits.tool(0) is saved and panel.radius.value == 3
+        client.socket.close()
+    assert not capfd.readouterr().err
