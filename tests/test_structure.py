@@ -14,9 +14,9 @@ FILES = sorted(SRC.rglob("*.py"))
 
 FLOORS = [
     {"core", "compute"},
-    {"system", "render", "priors", "footage", "tool_masks"},
+    {"system", "render", "priors", "footage"},
     {"data", "model"},
-    {"initialization", "evaluation", "visualization", "phantom"},
+    {"initialization", "evaluation", "visualization", "phantom", "tool_masks"},
     {"training", "doctor", "prepare", "check", "export", "view"},
     {"runs"},
     {"experiments", "pipeline"},

@@ -30,7 +30,16 @@ def gray_for_flow(rgb_u8: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def flow_pair(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> FlowPair:
     """Flow from the first (h, w) gray image to the second, and back; both sides at least `MIN_SIZE_PX`."""
-    # A new estimator for each pair: it keeps buffers, and a result must not depend on the previous pair.
-    estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    estimator = _estimator()
     forward = estimator.calc(first, second, None)
     return forward, estimator.calc(second, first, None)
+
+
+def flow_between(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Flow (h, w, 2) from the first (h, w) gray image to the second; both sides at least `MIN_SIZE_PX`."""
+    return _estimator().calc(first, second, None)
+
+
+def _estimator() -> cv2.DISOpticalFlow:
+    """A new one for each pair: it keeps buffers, and a result must not depend on the previous pair."""
+    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from ..footage.optical_flow import flow_between
 from .colors import ClipColors, log_ratios
 
 BINS = (32, 24, 6)
@@ -64,7 +65,7 @@ def independence(
         (h, w) difference of the two motions over their sum, 0 (attached) to 1; (h, w) True where it says anything.
     """
     gray, later = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (rgb_u8, later_u8))
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(gray, later, None)
+    flow = flow_between(gray, later)
     weight = ((guess < SURELY_TISSUE) & view).astype(np.float32) + np.float32(1e-4) * view
     total = cv2.GaussianBlur(flow * weight[..., None], (0, 0), SURROUNDINGS_PX)
     around = total / np.maximum(cv2.GaussianBlur(weight, (0, 0), SURROUNDINGS_PX), 1e-6)[..., None]

@@ -33,6 +33,8 @@ UNSURE = 0.35
 """Pixels whose first guess is a higher probability are not used as examples of tissue."""
 UNSURE_RIM_PX = 6
 """Nor are those closer to them than this, px of the network's image: thin jaws are seldom guessed."""
+MISSED_PX = 12
+"""Near a given mask, pixels up to this distance may be a part that it misses."""
 STEPS_PER_FRAME, STEPS = 4, (40, 200)
 """Training steps for each frame of the clip, and their limits: short clips are not kept waiting."""
 SHINE = (0.6, 0.8)
@@ -53,6 +55,8 @@ class ToolSample:
     """(H, W, 3) a frame about a tenth of a second later, 0..255; None at the end of the clip."""
     depth: NDArray[np.float32] | None = None
     """(H, W) z, mm, 0 or not finite where missing; None without depth."""
+    given: NDArray[np.bool_] | None = None
+    """(H, W) True on tools, a mask that is right but may miss parts; None without such masks."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,7 @@ class ToolModel:
         found = tool_regions(probability, work.view)
         wide = cv2.dilate(found.astype(np.uint8), disk(RIM_PX))
         large = cv2.resize(wide.astype(np.float32), view.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        maybe = probability[found | (probability > 0.1)]
+        maybe = probability[found | (probability > UNSURE)]
         confidence = float(np.abs(2 * maybe - 1).mean()) if maybe.size else 1.0
         return FoundTools((large > 0.5) & view, confidence)
 
@@ -141,7 +145,10 @@ def _work_sample(sample: ToolSample) -> ToolSample:
         depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
         depth = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
     view = cv2.resize(sample.view.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    return ToolSample(cv2.resize(sample.rgb_u8, size, interpolation=kind), view, later, depth)
+    given = None
+    if sample.given is not None:
+        given = cv2.resize(sample.given.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return ToolSample(cv2.resize(sample.rgb_u8, size, interpolation=kind), view, later, depth, given)
 
 
 def _guesses(samples: Sequence[ToolSample], clip: ClipColors) -> list[NDArray[np.float32]]:
@@ -173,8 +180,13 @@ def _background(sample: ToolSample, guess: NDArray[np.float32], clip: ClipColors
     """The sample at the size of the network, and which of its pixels are surely tissue."""
     size = network_size(sample.view.shape[::-1])
     view = shrunk(sample.view.astype(np.float32), size) > 0.5
-    unsure = cv2.dilate((shrunk(guess, size) > UNSURE).astype(np.uint8), disk(UNSURE_RIM_PX)) > 0
-    return Background(shrunk(sample.rgb_u8, size).astype(np.float32) / np.float32(clip.white), view, view & ~unsure)
+    rgb = shrunk(sample.rgb_u8, size).astype(np.float32) / np.float32(clip.white)
+    if sample.given is None:
+        tools, unsure, rim_px = np.zeros_like(view), shrunk(guess, size) > UNSURE, UNSURE_RIM_PX
+    else:
+        tools = view & (shrunk(sample.given.astype(np.float32), size) > 0.5)
+        unsure, rim_px = tools, MISSED_PX
+    return Background(rgb, view, view & ~(cv2.dilate(unsure.astype(np.uint8), disk(rim_px)) > 0), tools)
 
 
 def _probability(

@@ -4,6 +4,7 @@ Where the first guess is sure of tissue, a frame shows what is not a tool in thi
 highlights. What a tool looks like comes from the painted instruments. Pixels of which the first guess is not sure,
 such as those of the real tools, do not count. So no labels are needed, no weights are shipped, and pale organs of the
 clip at hand are learned as tissue.
+If there are masks to start from, their tools count too.
 
 The network is a U-Net of 60,000 weights on images of 192 px. `h, w` size of such an image.
 """
@@ -48,6 +49,8 @@ class Background:
     """(h, w) True inside the endoscope's image."""
     tissue: NDArray[np.bool_]
     """(h, w) True where it surely shows tissue."""
+    tools: NDArray[np.bool_]
+    """(h, w) True where it surely shows a tool: masks that somebody made."""
 
 
 class ToolNetwork(nn.Module):
@@ -127,7 +130,7 @@ def _example(
     """(4, h, w) image, (h, w) 1 on instruments, (h, w) 1 where the loss counts."""
     background = backgrounds[rng.integers(len(backgrounds))]
     gain = np.exp(rng.normal(0, EXPOSURE) + rng.normal(0, TINT, 3)).astype(np.float32)
-    rgb, tool = background.rgb * gain, np.zeros_like(background.view)
+    rgb, tool = background.rgb * gain, background.tools.copy()
     for _ in range(rng.choice(3, p=TOOLS)):
         rgb, painted = paint_tool(rng, rgb, background.view)
         tool |= painted

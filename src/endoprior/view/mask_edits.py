@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TypeVar, overload
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error, number_ranges
+from ..core.checks import number_ranges
 from ..data import FrameSequence
-from ..data.images import read_tool_mask, save_png
+from ..data.mask_writing import replace_masks
 from ..footage.carry_masks import CarriedEdit, carry_mask_edit
-from ..system.atomic import whole_file, write_json
 
 MOST_UNDO = 100
 """Number of steps that can be undone."""
-NOTE = "changes.json"
-"""In the folder of the original masks: the files that were changed, and by how many pixels."""
-
 Mask = NDArray[np.bool_]
 """(H, W) True on tools."""
 Masks = dict[int, Mask]
@@ -96,27 +89,14 @@ class MaskEdits:
         Raises:
             InputError: the folder is read-only, or the disk rejects a file; masks written before it stay written.
         """
-        frames, files = self.unsaved, self._sequence.mask_files
+        frames = self.unsaved
         if not frames:
             return []
-        folder = files[0].parent
-        kept = folder.with_name(f"{folder.name}_before")
-        for place in (folder, folder.parent):
-            if not os.access(place, os.W_OK):
-                fix = "Copy the data folder to a place of your own, and view the copy."
-                raise input_error(place, "a folder that can be written", "a read-only one", fix)
+        replace_masks(self._sequence, {frame: self.tool(frame) for frame in frames})
         for frame in frames:
-            original = kept / files[frame].name
-            if not original.exists():
-                with whole_file(original) as temporary:
-                    shutil.copyfile(files[frame], temporary)
-            high = self.tool(frame) == (self._sequence.mask_tool_value == 255)
-            with whole_file(files[frame]) as temporary:
-                save_png(temporary, np.where(high, 255, 0).astype(np.uint8))
             self._saved.pop(frame, None)
             if frame in self._state.masks:
                 self._saved[frame] = self._state.masks[frame]
-        write_json(kept / NOTE, changes(kept, folder, self._sequence.mask_tool_value))
         return frames
 
 
@@ -137,15 +117,6 @@ def stroke(mask: Mask, points: Sequence[tuple[float, float]], radius: float, pai
     for point in fixed:
         cv2.circle(drawn, point, round(16 * radius), 1, -1, cv2.LINE_8, 4)
     return mask | (drawn > 0) if paint else mask & (drawn == 0)
-
-
-def changes(kept: Path, folder: Path, tool_value: int) -> dict[str, dict[str, int]]:
-    """For every original mask in `kept`, how many pixels its corrected version in `folder` adds and removes."""
-    found = {}
-    for original in sorted(kept.glob("*.png")):
-        before, now = (read_tool_mask(file, tool_value) for file in (original, folder / original.name))
-        found[original.name] = {"added_px": int((now & ~before).sum()), "removed_px": int((before & ~now).sum())}
-    return found
 
 
 def carried_text(done: CarriedEdit) -> str:

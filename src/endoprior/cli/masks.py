@@ -1,0 +1,75 @@
+"""`endoprior masks DATA`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from ..core.checks import number_ranges
+from ..core.shell import command
+from ..system.console import say
+from .help_page import Help
+from .parsing import parse
+from .progress import Counting
+
+UNCERTAIN = 0.5
+"""Frames of a lower confidence are listed."""
+SHEET, SHARES = "tool_masks.png", "tool_masks.json"
+SHOWN, COLUMNS = 24, 6
+"""Number of frames on the sheet, and of its columns."""
+WIDTH_PX = 320
+"""Of a frame on the sheet."""
+
+
+@dataclass
+class Masks:
+    """Find the tools in a sequence folder and write their masks to DATA/masks (255 = tool).
+
+    The masks that were there are kept in DATA/masks_before. DATA/tool_masks.png shows frames to look at, and
+    DATA/tool_masks.json holds the share and the confidence of each frame.
+    """
+
+    data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    """Sequence folder."""
+    refine: bool = False
+    """The masks of DATA are right but miss parts, such as jaws: learn from them, and only add pixels."""
+
+
+HELP = Help(examples=(("DATA",), ("DATA", "--refine")))
+
+
+def run(argv: list[str]) -> None:
+    """Find tools and write their masks."""
+    args = parse(Masks, argv, "masks", HELP)
+    from ..core.config import DataConfig
+    from ..data import load_sequence
+    from ..data.mask_writing import replace_masks
+    from ..system.atomic import write_json
+    from ..tool_masks.sequence import find_in_sequence
+    from ..visualization.image_tools import write_png
+    from ..visualization.mask_sheet import mask_sheet
+
+    sequence = load_sequence(args.data, DataConfig())
+    masks, tools, confidences = {}, {}, []
+    with Counting() as progress:
+        for i, (mask, found) in enumerate(find_in_sequence(sequence, refine=args.refine, progress=progress)):
+            masks[i], tools[i] = mask, found.mask
+            confidences.append(found.confidence)
+    shares = [float(tool.mean()) for tool in tools.values()]
+    shown = sorted({round(i) for i in np.linspace(0, len(sequence) - 1, min(SHOWN, len(sequence)))})
+    replace_masks(sequence, masks)
+    pictures = [(sequence.frame(i).rgb_u8, tools[i], f"{i}: {shares[i]:.1%}") for i in shown]
+    write_png(args.data / SHEET, mask_sheet(pictures, COLUMNS, WIDTH_PX))
+    write_json(
+        args.data / SHARES,
+        [{"frame": i, "share": share, "confidence": confidences[i]} for i, share in enumerate(shares)],
+    )
+    with_tools = [i for i, share in enumerate(shares) if share > 0]
+    say(f"tools in {len(with_tools)} of {len(shares)} frames, at most {max(shares):.1%} of a frame")
+    if uncertain := [i for i in with_tools if confidences[i] < UNCERTAIN]:
+        say(f"uncertain: frames {number_ranges(uncertain)}")
+    say(f"look at {args.data / SHEET}; correct masks: {command('view', args.data)}")

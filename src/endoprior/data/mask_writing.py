@@ -1,0 +1,65 @@
+"""Write corrected tool masks into a sequence folder, and keep the originals."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import input_error
+from ..system.atomic import whole_file, write_json
+from .images import read_tool_mask, save_png
+from .sequence import FrameSequence
+
+NOTE = "changes.json"
+"""In the folder of the original masks: the files that were changed, and by how many pixels."""
+
+
+def replace_masks(sequence: FrameSequence, masks: Mapping[int, NDArray[np.bool_]]) -> None:
+    """Write masks to their files. The first original of each is kept in a folder `masks_before` beside them.
+
+    Args:
+        sequence: if it has no mask files yet, a folder `masks` is made; `masks` must then hold every frame.
+        masks: by frame, (H, W) True on tools.
+    Raises:
+        InputError: the folder is read-only, the sequence is of a dataset without mask files, or the disk rejects a
+            file; masks written before it stay written.
+    """
+    files = sequence.mask_files or _new_files(sequence, len(masks))
+    folder = files[0].parent
+    kept = folder.with_name(f"{folder.name}_before")
+    for place in (folder, folder.parent):
+        if place.exists() and not os.access(place, os.W_OK):
+            fix = "Copy the data folder to a place of your own, and use the copy."
+            raise input_error(place, "a folder that can be written", "a read-only one", fix)
+    folder.mkdir(exist_ok=True)
+    for frame, mask in masks.items():
+        file, original = files[frame], kept / files[frame].name
+        if file.exists() and not original.exists():
+            with whole_file(original) as temporary:
+                shutil.copyfile(file, temporary)
+        high = mask == (sequence.mask_tool_value == 255)
+        with whole_file(file) as temporary:
+            save_png(temporary, np.where(high, 255, 0).astype(np.uint8))
+    if kept.exists():
+        write_json(kept / NOTE, changes(kept, folder, sequence.mask_tool_value))
+
+
+def _new_files(sequence: FrameSequence, count: int) -> list[Path]:
+    if count != len(sequence.image_names):
+        fix = "Convert it to a sequence folder, or make a video of it for `endoprior prepare`."
+        raise input_error(sequence.path, "a sequence folder with one mask file per frame", "another dataset", fix)
+    return [sequence.path / "masks" / f"{name}.png" for name in sequence.image_names]
+
+
+def changes(kept: Path, folder: Path, tool_value: int) -> dict[str, dict[str, int]]:
+    """For every original mask in `kept`, how many pixels its corrected version in `folder` adds and removes."""
+    found = {}
+    for original in sorted(kept.glob("*.png")):
+        before, now = (read_tool_mask(file, tool_value) for file in (original, folder / original.name))
+        found[original.name] = {"added_px": int((now & ~before).sum()), "removed_px": int((before & ~now).sum())}
+    return found

@@ -1,0 +1,77 @@
+"""`endoprior masks DATA`: new masks in the folder, the originals beside them, a sheet, shares and confidence."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from endoprior.cli import main
+from endoprior.core.config import DataConfig
+from endoprior.data import load_sequence
+from endoprior.data.images import read_tool_mask
+from endoprior.data.mask_writing import replace_masks
+from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.visualization.mask_sheet import mask_sheet
+
+FRAMES = 4
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_phantom(tmp_path / "DATA", PhantomConfig(frames=FRAMES, width=128, height=96, seed=4))
+    return tmp_path / "DATA"
+
+
+def masks_of(folder):
+    return [read_tool_mask(file) for file in sorted(folder.glob("*.png"))]
+
+
+def test_masks_are_replaced_and_the_originals_kept(folder, capsys):
+    before = masks_of(folder / "masks")
+    assert main(["masks", str(folder)]) == 0
+    assert all((a == b).all() for a, b in zip(masks_of(folder / "masks_before"), before, strict=True))
+    assert len(masks_of(folder / "masks")) == FRAMES
+    shares = json.loads((folder / "tool_masks.json").read_text())
+    assert [entry["frame"] for entry in shares] == list(range(FRAMES))
+    for entry, mask in zip(shares, masks_of(folder / "masks"), strict=True):
+        assert entry["share"] == pytest.approx(mask.mean()) and 0 <= entry["confidence"] <= 1
+    assert cv2.imread(str(folder / "tool_masks.png")).shape[1] == 6 * 320
+    said = capsys.readouterr().out
+    assert f"of {FRAMES} frames" in said and "endoprior view" in said
+    load_sequence(folder, DataConfig()).validate()  # the sheet does not disturb the folder
+
+
+def test_refining_only_adds_pixels(folder):
+    true = masks_of(folder / "masks")
+    for file, mask in zip(sorted((folder / "masks").glob("*.png")), true, strict=True):
+        shorter = mask.copy()
+        shorter[:, 60:70] = False
+        cv2.imwrite(str(file), np.where(shorter, 255, 0).astype(np.uint8))
+    given = masks_of(folder / "masks")
+    assert main(["masks", str(folder), "--refine"]) == 0
+    assert not any((a & ~b).any() for a, b in zip(given, masks_of(folder / "masks"), strict=True))
+
+
+def test_a_folder_without_masks_gets_them(tmp_path):
+    rng = np.random.default_rng(0)
+    (tmp_path / "images").mkdir()
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), rng.integers(0, 255, (48, 64, 3), np.uint8))
+    sequence = load_sequence(tmp_path, DataConfig())
+    mask = np.zeros((48, 64), bool)
+    mask[10:20] = True
+    replace_masks(sequence, dict.fromkeys(range(3), mask))
+    again = load_sequence(tmp_path, DataConfig())
+    assert all((~again.frame(i).tissue_mask == mask).all() for i in range(3))
+    assert not (tmp_path / "masks_before").exists()
+
+
+def test_the_sheet_tints_and_outlines_tools():
+    image = np.full((40, 60, 3), 100, np.uint8)
+    mask = np.zeros((40, 60), bool)
+    mask[10:30, 20:40] = True
+    sheet = mask_sheet([(image, mask, ""), (image, ~mask & mask, "")], 2, 60)
+    assert sheet.shape == (40, 120, 3)
+    assert tuple(sheet[20, 30]) == (60, 140, 162) and tuple(sheet[10, 25]) == (0, 200, 255)
+    assert (sheet[5, :] == 100).all() and (sheet[:35, 60:] == 100).all()
