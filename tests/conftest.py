@@ -93,3 +93,11 @@ def write_tiny_sequence(
     )
     (out / "sequence.json").write_text(description, encoding="utf-8")
     return out
+
+
+@pytest.fixture(autouse=True, scope="session")
+def short_training_of_tool_masks():
+    """`prepare` trains a network for its masks: a few steps are enough where masks are not the subject."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endoprior.tool_masks.model.STEPS", 20)
+        yield

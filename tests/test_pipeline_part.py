@@ -84,12 +84,12 @@ def test_frames_end_where_the_camera_is_lost():
 
 def test_the_estimate_of_the_trial_itself_is_what_the_trial_took():
     trial = Trial(
-        decode=0.01, look=1.0, write=0.2, follow=0.5, check=3.0, start=1.0, half_iteration=0.02, iteration=0.05,
-        render=0.01, score=2.5, rendered_video=0.06, player=0.7,
+        decode=0.01, look=1.0, learn=2.0, write=0.2, follow=0.5, check=3.0, start=1.0, half_iteration=0.02,
+        iteration=0.05, render=0.01, score=2.5, rendered_video=0.06, player=0.7,
     )  # fmt: skip
     cfg = replace(preset(), schedule=replace(preset().schedule, fine_iterations=1500, half_resolution_iterations=500))
     seconds = scaled(trial, cfg, FRAMES, FRAMES)
-    assert seconds["prepare"] == pytest.approx(1.0 + FRAMES * 0.2 + 0.5 + FRAMES * 0.01 - FRAMES * 0.01)
+    assert seconds["prepare"] == pytest.approx(1.0 + 2.0 + FRAMES * 0.2 + 0.5 + FRAMES * 0.01 - FRAMES * 0.01)
     assert seconds["train"] == pytest.approx(1.0 + 500 * 0.02 + 1000 * 0.05)
     assert (seconds["check"], seconds["score"]) == (pytest.approx(3.0), pytest.approx(2.5))
     assert scaled(trial, cfg, 100, 100)["video"] == pytest.approx(100 * 0.06)

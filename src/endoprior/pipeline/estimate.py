@@ -43,6 +43,8 @@ class Trial:
     """One image of the video."""
     look: float
     """First pass of `prepare`."""
+    learn: float
+    """Fitting its models of tools and light to samples."""
     write: float
     """One frame of its second pass."""
     follow: float
@@ -89,6 +91,7 @@ def scaled(trial: Trial, cfg: Config, num_frames: int, num_images: int) -> dict[
     return {
         "prepare": 2 * num_images * trial.decode
         + (trial.look - FRAMES * trial.decode) * min(SAMPLES, num_frames) / FRAMES
+        + trial.learn
         + num_frames * (trial.write - trial.decode)
         + trial.follow * more,
         "check": trial.check * (1 + (num_frames - FRAMES) / CHECK_FRAMES),
@@ -111,7 +114,7 @@ def _measure(job: Job, folder: Path) -> Trial:
     prepare(short.video, short.data, short.prepare, stamps)
     prepared = clock.perf_counter()
     looked, followed = stamps.at["looking through"][0], stamps.at["following the camera"][0]
-    write = stamps.step("writing frames")
+    learned, write = stamps.at["learning tools and light"][0], stamps.step("writing frames")
 
     trainer = Trainer(load_sequence(short.data, job.cfg.data), shortened(job.cfg, part.num_frames))
     start, _ = _timed(partial(_start, trainer))
@@ -126,7 +129,8 @@ def _measure(job: Job, folder: Path) -> Trial:
     )
     return Trial(
         decode=decode / FRAMES,
-        look=stamps.at["writing frames"][0] - looked - REACH * write,  # the first frame waits for its neighbors
+        look=learned - looked,
+        learn=stamps.at["writing frames"][0] - learned - REACH * write,  # the first frame waits for its neighbors
         write=write,
         follow=prepared - followed,
         check=check,

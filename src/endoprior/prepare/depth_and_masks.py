@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from ..data.mask_files import MASK_SUFFIXES, read_user_mask, tool_polarity
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit
-from ..tool_masks import ToolSample, fit_tools
 from .config import PrepareConfig
 from .first_pass import FirstPass
 from .frame_files import match_files
@@ -27,6 +26,9 @@ from .relative_depth import Kind, fit_reference, relative_to_mm
 from .shading import fit_shading
 from .stereo import stereo_depth
 from .video_clip import Clip
+
+if TYPE_CHECKING:
+    from ..tool_masks import ToolSample
 
 FITTED_SAMPLES = 16
 """Number of frames to which the tool and shading models are fitted."""
@@ -70,6 +72,8 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
     kind = _depth_kind(cfg, clip)
     relative = kind in ("shading", "network") or cfg.depth_relative != "no"
     measure, source = (None, kind) if kind in ("none", "shading") else _measured_depth(kind, cfg, clip, first_pass)
+    from ..tool_masks import ToolSample  # imports torch
+
     nearness = measure if not relative and cfg.masks == "auto" else None
     tool_samples = [
         ToolSample(frame.rgb_u8, geometry.inside, image, nearness(frame) if nearness else None)
@@ -197,7 +201,9 @@ def _tools(
     if cfg.masks == "none":
         return lambda frame: np.zeros_like(geometry.inside), "none", []
     if cfg.masks == "auto":
-        model = fit_tools(tool_samples, len(first_pass.indices))
+        from ..tool_masks import fit_tools
+
+        model = fit_tools(tool_samples)
         source = f"tools found in {model.detected_share:.0%} of the samples"
         hint = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
         if not model.detected_share:

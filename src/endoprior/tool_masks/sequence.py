@@ -42,7 +42,7 @@ def find_in_sequence(
         given = ~frame.tissue_mask & view if refine else None
         samples.append(ToolSample(frame.rgb_u8, view, later, _depth(sequence, frame), given))
     progress("learning", 0, 0)
-    model = fit_tools(samples, total)
+    model = fit_tools(samples)
     for i in range(total):
         frame = sequence.frame(i)
         found = model.find(frame.rgb_u8, view, _depth(sequence, frame))
