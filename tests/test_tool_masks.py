@@ -11,7 +11,6 @@ from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.tool_masks import ToolSample, fit_tools
 from endoprior.tool_masks.attachment import attachment_log_odds, color_cells, independence
 from endoprior.tool_masks.colors import ClipColors, first_guess
-from endoprior.tool_masks.network import network_size
 from endoprior.tool_masks.regions import entering_regions
 from endoprior.tool_masks.relief import relief_cells, relief_log_odds
 from endoprior.tool_masks.synthetic import paint_tool
@@ -63,7 +62,7 @@ def test_tools_of_the_phantom_are_found(phantom, model):
     images, true, depths, _ = phantom
     found = [model.find(image, VIEW, depth) for image, depth in zip(images, depths, strict=True)]
     overlap, precision = scores([tools.mask for tools in found], true)
-    assert overlap > 0.8 and precision > 0.85
+    assert overlap > 0.8 and precision > 0.95  # 0.865 and 0.984 at least, for three phantoms and two seeds
     assert model.detected_share == 1 and model.relief is not None
     assert all(0.3 < tools.confidence <= 1 for tools in found)
 
@@ -197,10 +196,6 @@ def test_tools_enter_end_first(box, kept):
     mask = np.zeros((100, 120), np.uint8)
     mask[box] = 1
     assert entering_regions(mask, np.ones((100, 120), bool)).any() == kept
-
-
-def test_small_images_keep_their_size_for_the_network():
-    assert network_size((640, 512)) == (192, 154) and network_size((90, 60)) == (90, 60)
 
 
 def test_mismatched_shapes_are_named():

@@ -5,13 +5,12 @@ Shared letters: `H, W` image size.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..footage.border import BLACK_LEVEL, Circle, Outline, Strips
+from ..footage.border import Circle, Outline, Strips
 from ..footage.overlays import find_static_overlays
 
 LABEL_ON_TISSUE = 0.75
@@ -34,20 +33,7 @@ class BorderFacts:
     overlays: tuple[tuple[int, int, int, int], ...]
     """x, y, width, height of burned-in labels that are marked as tissue, px."""
     masked: Mask
-    """(H, W) True on the pixels that the masks exclude as border, not as tool: see `masked_border`."""
-
-
-def masked_border(outline: Outline, images: list[NDArray[np.uint8]], tissue_masks: Iterable[Mask]) -> Mask:
-    """(H, W) True where no frame is tissue and no image shows anything: black, or beyond the outline.
-
-    Args:
-        images: sample images, (H, W, 3).
-        tissue_masks: (H, W) each, of every frame.
-    """
-    masked = outline.in_strip | outline.outside | (np.maximum.reduce(images).max(-1) < BLACK_LEVEL)
-    for tissue in tissue_masks:
-        masked &= ~tissue
-    return masked
+    """(H, W) True on the pixels that the masks exclude as border, not as tool: see `footage.border.masked_border`."""
 
 
 def measure_border(
@@ -57,7 +43,7 @@ def measure_border(
 
     Args:
         images, tissue_masks: of the samples; inverted masks are corrected.
-        masked: from `masked_border`.
+        masked: from `footage.border.masked_border`.
     """
     tissue = np.mean(tissue_masks, axis=0)
     return BorderFacts(

@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError
 from ..core.config import DataConfig
+from ..core.spread import spread
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..data.description import read_description
-from ..footage.border import find_outline
+from ..footage.border import find_outline, masked_border
 from ..footage.camera_motion import CameraMotion, camera_motion
 from ..footage.changes import Changes, find_changes
 from ..footage.polarity import Polarity, mask_polarity
 from ..initialization.sampling import initial_points
-from .border_facts import BorderFacts, masked_border, measure_border
+from .border_facts import BorderFacts, measure_border
 from .depth_facts import DepthFacts, measure_depth
 from .remake import Remakes, find_remakes
 from .stereo_facts import StereoFacts, measure_stereo
@@ -156,11 +157,6 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         data=cfg,
         remakes=find_remakes(sequence, described, cfg),
     )
-
-
-def spread(count: int, wanted: int) -> list[int]:
-    """At most `wanted` evenly spaced positions of 0..count-1, both ends included."""
-    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, wanted)).round()})
 
 
 def _camera_path(cameras: list[Camera]) -> tuple[float, float]:

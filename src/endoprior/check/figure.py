@@ -17,12 +17,13 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
 from ..core.geometry import length_unit, project
+from ..core.spread import spread
 from ..core.types import Frame
 from ..data import FrameSequence
 from ..footage.units import FAR_MM, NEAR_MM
 from ..system.atomic import whole_file
 from ..visualization.image_tools import colorize
-from .facts import Facts, spread
+from .facts import Facts
 from .findings import SEEN_AS_TISSUE, Finding
 from .report import table, unit_reason
 

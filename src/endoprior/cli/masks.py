@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
 
 from ..core.checks import number_ranges
 from ..core.shell import command
+from ..core.spread import spread
 from ..system.console import say
 from .help_page import Help
 from .parsing import parse
@@ -54,22 +54,19 @@ def run(argv: list[str]) -> None:
     from ..visualization.mask_sheet import mask_sheet
 
     sequence = load_sequence(args.data, DataConfig())
-    masks, tools, confidences = {}, {}, []
+    shown = set(spread(len(sequence), SHOWN))
+    masks, rows, pictures = {}, [], []
     with Counting() as progress:
         for i, (mask, found) in enumerate(find_in_sequence(sequence, refine=args.refine, progress=progress)):
-            masks[i], tools[i] = mask, found.mask
-            confidences.append(found.confidence)
-    shares = [float(tool.mean()) for tool in tools.values()]
-    shown = sorted({round(i) for i in np.linspace(0, len(sequence) - 1, min(SHOWN, len(sequence)))})
+            masks[i], share = mask, float(found.mask.mean())
+            rows.append({"frame": i, "share": share, "confidence": found.confidence})
+            if i in shown:
+                pictures.append((sequence.frame(i).rgb_u8, found.mask, f"{i}: {share:.1%}"))
     replace_masks(sequence, masks)
-    pictures = [(sequence.frame(i).rgb_u8, tools[i], f"{i}: {shares[i]:.1%}") for i in shown]
     write_png(args.data / SHEET, mask_sheet(pictures, COLUMNS, WIDTH_PX))
-    write_json(
-        args.data / SHARES,
-        [{"frame": i, "share": share, "confidence": confidences[i]} for i, share in enumerate(shares)],
-    )
-    with_tools = [i for i, share in enumerate(shares) if share > 0]
-    say(f"tools in {len(with_tools)} of {len(shares)} frames, at most {max(shares):.1%} of a frame")
-    if uncertain := [i for i in with_tools if confidences[i] < UNCERTAIN]:
+    write_json(args.data / SHARES, rows)
+    with_tools = [row for row in rows if row["share"]]
+    say(f"tools in {len(with_tools)} of {len(rows)} frames, at most {max(row['share'] for row in rows):.1%} of a frame")
+    if uncertain := [row["frame"] for row in with_tools if row["confidence"] < UNCERTAIN]:
         say(f"uncertain: frames {number_ranges(uncertain)}")
     say(f"look at {args.data / SHEET}; correct masks: {command('view', args.data)}")

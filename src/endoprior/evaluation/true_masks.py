@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.spread import spread
 from ..data import FrameSequence
 from ..data.description import read_description
 from ..data.files import IMAGE_SUFFIXES, files_with
@@ -68,7 +69,7 @@ class TrueMasks:
             self._tool_is_high = read_description(folder / "sequence.json").get("mask_tool_value", 255) == 255
             self.polarity = f"{'high' if self._tool_is_high else 'low'} values mark tools, as in every sequence folder"
         else:
-            some = [self.indices[i] for i in _spread(len(self.indices))]
+            some = [self.indices[i] for i in spread(len(self.indices), SAMPLES)]
             highs = [read_user_mask(self._files[i], self._size) for i in some]
             polarity = tool_polarity("auto", highs, [sequence.frame(i).rgb_u8 for i in some])
             self._tool_is_high, self.polarity = polarity.tool_is_high, polarity.reason
@@ -94,8 +95,8 @@ def _demand_same_frames(folder: Path, frames: Sequence[int], sequence: FrameSequ
     images = files_with(folder, IMAGE_SUFFIXES)
     if len(images) != len(frames):
         return
-    others = {index: _thumbnail(sequence.frame(index).rgb_u8) for index in _spread(len(sequence))}
-    checked, wrong = _spread(len(images)), []
+    others = {index: _thumbnail(sequence.frame(index).rgb_u8) for index in spread(len(sequence), SAMPLES)}
+    checked, wrong = spread(len(images), SAMPLES), []
     for place in checked:
         image, index = _thumbnail(read_color(images[place])), frames[place]
         here = np.abs(image - _thumbnail(sequence.frame(index).rgb_u8)).mean()
@@ -143,7 +144,7 @@ def score_masks(sequence: FrameSequence, truth: TrueMasks) -> MaskEvaluation:
     for index in truth.indices:
         always_found &= ~sequence.frame(index).tissue_mask
         always_true &= truth.tool(index)
-    samples = [sequence.frame(index).rgb_u8 for index in _spread(len(sequence))]
+    samples = [sequence.frame(index).rgb_u8 for index in spread(len(sequence), SAMPLES)]
     counted = counted_pixels(samples, always_found | always_true)
     total, tools, rows = MaskCounts(), 0, []
     for index in truth.indices:
@@ -167,8 +168,3 @@ def score_masks(sequence: FrameSequence, truth: TrueMasks) -> MaskEvaluation:
     scores = total.scores()
     skipped = {name: NO_VALUE[name] for name, value in scores.items() if not math.isfinite(value)}
     return MaskEvaluation(protocol, {n: v for n, v in scores.items() if n not in skipped}, skipped, rows)
-
-
-def _spread(total: int) -> list[int]:
-    """At most `SAMPLES` evenly spaced positions of 0..total-1, both ends included."""
-    return [int(i) for i in np.linspace(0, total - 1, min(total, SAMPLES)).round()]

@@ -6,7 +6,7 @@ in all samples.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -79,6 +79,21 @@ def find_outline(images: Sequence[NDArray[np.uint8]]) -> Outline:
     in_strip[strips.top : height - strips.bottom, strips.left : width - strips.right] = False
     outside = ~circle.mask(width, height) if circle else np.zeros((height, width), bool)
     return Outline(strips, circle, in_strip, outside)
+
+
+def masked_border(
+    outline: Outline, images: Sequence[NDArray[np.uint8]], tissue_masks: Iterable[NDArray[np.bool_]]
+) -> NDArray[np.bool_]:
+    """(H, W) True where no frame is tissue and no image shows anything: black, or beyond the outline.
+
+    Args:
+        images: sample images, (H, W, 3).
+        tissue_masks: (H, W) each, of every frame.
+    """
+    masked = outline.in_strip | outline.outside | (np.maximum.reduce(images).max(-1) < BLACK_LEVEL)
+    for tissue in tissue_masks:
+        masked &= ~tissue
+    return masked
 
 
 def find_strips(images: Sequence[NDArray[np.uint8]]) -> Strips:

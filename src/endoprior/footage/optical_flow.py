@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 MIN_SIZE_PX = 32
 """Smallest image side that dense inverse search supports."""
+MOTION_S = 0.1
+"""Time between two frames that show how tissue moves, s: long enough for a breath to move it by a pixel."""
 HALVED_FROM_PX = 256
 """Frames with at least this shorter side are tracked at half size: four times faster, almost as accurate."""
 

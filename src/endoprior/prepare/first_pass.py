@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..footage.border import Circle, Strips, find_circle, find_strips
+from ..footage.optical_flow import MOTION_S
 from ..footage.overlays import find_static_overlays
 from .calibration import Calibration
 from .config import PrepareConfig, Rectangle, parse_rectangle
@@ -18,8 +19,6 @@ from .video_clip import Clip, EvenSample, SampledFrame
 
 SAMPLES = 24
 """Number of frames used to detect borders, labels, tools and lighting."""
-MOTION_S = 0.1
-"""Time from a sample to the frame that shows its motion, s: long enough for a breath to move tissue by a pixel."""
 
 
 @dataclass

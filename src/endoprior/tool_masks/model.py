@@ -36,7 +36,8 @@ UNSURE_RIM_PX = 6
 MISSED_PX = 12
 """Near a given mask, pixels up to this distance may be a part that it misses."""
 STEPS = 150
-"""Training steps of the network. With 70 the tools of a phantom are half as sure, with 200 hardly more."""
+"""Training steps of the network. With 72 the tools of a phantom are hardly above the threshold, with 48 below it; with
+200 the end of the fast tool of `mono_endo` is covered better, but a preview takes over a minute (docs/log.md)."""
 GUESS_WEIGHT = 0.3
 """Weight of the first guess beside the network, which sees half of the resolution: it sharpens the outlines."""
 SHINE = (0.6, 0.8)
@@ -89,7 +90,7 @@ class ToolModel:
     def find(
         self, rgb_u8: NDArray[np.uint8], view: NDArray[np.bool_], depth: NDArray[np.float32] | None = None
     ) -> FoundTools:
-        """Find the tools of one frame; about 40 ms at 640x512.
+        """Find the tools of one frame.
 
         Args:
             rgb_u8: (H, W, 3) color, 0..255.
@@ -102,7 +103,8 @@ class ToolModel:
         if self.network is None or not view.any():
             return FoundTools(np.zeros_like(view), 1.0)
         work = _work_sample(ToolSample(rgb_u8, view, None, depth))
-        probability = _probability(self.network, self.attachment, self.relief, work, self.clip)
+        guess = first_guess(work.rgb_u8, work.view, self.clip) + self.attachment[color_cells(work.rgb_u8, self.clip)]
+        probability = _probability(self.network, guess, self.relief, work, self.clip)
         found = tool_regions(probability, work.view)
         wide = cv2.dilate(found.astype(np.uint8), disk(RIM_PX))
         large = cv2.resize(wide.astype(np.float32), view.shape[::-1], interpolation=cv2.INTER_LINEAR)
@@ -112,7 +114,7 @@ class ToolModel:
 
 
 def fit_tools(samples: Sequence[ToolSample], seed: int = 0) -> ToolModel:
-    """Fit the model; 5 to 15 s on two cores.
+    """Fit the model: about 18 s on two cores for 16 samples of 640x512.
 
     Args:
         samples: 10 to 20 frames spread over the clip, of one size.
@@ -126,10 +128,16 @@ def fit_tools(samples: Sequence[ToolSample], seed: int = 0) -> ToolModel:
     usable = [sample for sample in work if sample.view.any()]
     if not usable or clip.redness < LEAST_REDNESS:
         return ToolModel(clip, None, np.zeros(0, np.float32), None, 0.0)
-    attachment = _attachment(usable, clip)
-    backgrounds = [_background(sample, _guess(sample, attachment, clip), clip) for sample in usable]
+    colors = [first_guess(sample.rgb_u8, sample.view, clip) for sample in usable]
+    cells = [color_cells(sample.rgb_u8, clip) for sample in usable]
+    attachment = _attachment(usable, colors, cells)
+    guesses = [color + attachment[cell] for color, cell in zip(colors, cells, strict=True)]
+    backgrounds = [_background(sample, guess, clip) for sample, guess in zip(usable, guesses, strict=True)]
     network = train_network(backgrounds, clip, STEPS, seed)
-    tools = [tool_regions(_probability(network, attachment, None, sample, clip), sample.view) for sample in usable]
+    tools = [
+        tool_regions(_probability(network, guess, None, sample, clip), sample.view)
+        for sample, guess in zip(usable, guesses, strict=True)
+    ]
     measured = [(s.depth, tool, s.view) for s, tool in zip(usable, tools, strict=True) if s.depth is not None]
     return ToolModel(
         clip, network, attachment, relief_log_odds(measured), sum(tool.any() for tool in tools) / len(samples)
@@ -156,20 +164,21 @@ def _work_sample(sample: ToolSample) -> ToolSample:
     return ToolSample(cv2.resize(sample.rgb_u8, size, interpolation=kind), view, later, depth, given)
 
 
-def _attachment(samples: Sequence[ToolSample], clip: ClipColors) -> NDArray[np.float32]:
-    """(cells,) log-odds of a tool for each color, from the motion of all samples."""
-    moved = []
-    for sample in samples:
-        if sample.later_u8 is not None:
-            guess = first_guess(sample.rgb_u8, sample.view, clip)
-            evidence = independence(sample.rgb_u8, sample.later_u8, sample.view, guess)
-            moved.append((color_cells(sample.rgb_u8, clip), *evidence))
+def _attachment(
+    samples: Sequence[ToolSample], colors: Sequence[NDArray[np.float32]], cells: Sequence[NDArray[np.int32]]
+) -> NDArray[np.float32]:
+    """(cells,) log-odds of a tool for each color, from the motion of all samples.
+
+    Args:
+        colors: (h, w) first guess of each sample.
+        cells: (h, w) color cells of each sample.
+    """
+    moved = [
+        (cell, *independence(sample.rgb_u8, sample.later_u8, sample.view, guess))
+        for sample, guess, cell in zip(samples, colors, cells, strict=True)
+        if sample.later_u8 is not None
+    ]
     return attachment_log_odds(moved, sum(int(sample.view.sum()) for sample in samples))
-
-
-def _guess(sample: ToolSample, attachment: NDArray[np.float32], clip: ClipColors) -> NDArray[np.float32]:
-    """(h, w) log-odds of a tool from color and motion."""
-    return first_guess(sample.rgb_u8, sample.view, clip) + attachment[color_cells(sample.rgb_u8, clip)]
 
 
 def _without_highlights(probability: NDArray[np.float32], sample: ToolSample, clip: ClipColors) -> NDArray[np.float32]:
@@ -197,17 +206,17 @@ def _background(sample: ToolSample, guess: NDArray[np.float32], clip: ClipColors
 
 def _probability(
     network: ToolNetwork,
-    attachment: NDArray[np.float32],
+    guess: NDArray[np.float32],
     relief: NDArray[np.float32] | None,
     work: ToolSample,
     clip: ClipColors,
 ) -> NDArray[np.float32]:
-    """(h, w) probability of a tool."""
+    """(h, w) probability of a tool; `guess` (h, w) is its log-odds from color and motion."""
     size = network_size(work.view.shape[::-1])
     rgb = shrunk(work.rgb_u8, size).astype(np.float32) / np.float32(clip.white)
     log_odds = log_odds_of(network, rgb, shrunk(work.view.astype(np.float32), size) > 0.5, clip)
     log_odds = cv2.resize(log_odds, work.view.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    log_odds = log_odds + np.float32(GUESS_WEIGHT) * _guess(work, attachment, clip)
+    log_odds = log_odds + np.float32(GUESS_WEIGHT) * guess
     if relief is not None and work.depth is not None:
         log_odds = log_odds + relief[relief_cells(work.depth, work.view & (log_odds < 0))]
     return _sigmoid(log_odds) * work.view

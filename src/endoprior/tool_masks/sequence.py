@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.spread import spread
 from ..core.types import Frame
 from ..data import FrameSequence
-from ..footage.border import BLACK_LEVEL, find_outline
+from ..footage.border import find_outline, masked_border
+from ..footage.optical_flow import MOTION_S
 from .model import FoundTools, ToolSample, fit_tools
 
 SAMPLES = 16
 """Number of frames that the model is fitted to."""
-MOTION_S = 0.1
-"""Time from a sample to the frame that shows its motion, s."""
 Progress = Callable[[str, int, int], None]
 
 
@@ -32,7 +32,7 @@ def find_in_sequence(
         (H, W) True on everything that is not tissue, as a mask file stores it; and the tools of the frame.
     """
     total = len(sequence)
-    chosen = sorted({round(i) for i in np.linspace(0, total - 1, min(SAMPLES, total))})
+    chosen = spread(total, SAMPLES)
     ahead = max(1, round(MOTION_S * (sequence.frames_per_second or 10.0)))
     frames = [sequence.frame(i) for i in chosen]
     view = _view(frames)
@@ -41,7 +41,7 @@ def find_in_sequence(
         later = sequence.frame(i + ahead).rgb_u8 if i + ahead < total else None
         given = ~frame.tissue_mask & view if refine else None
         samples.append(ToolSample(frame.rgb_u8, view, later, _depth(sequence, frame), given))
-    progress("learning", 0, 0)
+    progress("learning tools", 0, total)
     model = fit_tools(samples)
     for i in range(total):
         frame = sequence.frame(i)
@@ -53,10 +53,10 @@ def find_in_sequence(
 
 
 def _view(frames: list[Frame]) -> NDArray[np.bool_]:
-    """(H, W) True inside the endoscope's image: not beyond its border, and not painted black in all frames."""
+    """(H, W) True inside the endoscope's image: not beyond its border, and not masked and black in all frames."""
     images = [frame.rgb_u8 for frame in frames]
     outline = find_outline(images)
-    masked = np.logical_and.reduce([~frame.tissue_mask & (frame.rgb_u8.max(-1) < BLACK_LEVEL) for frame in frames])
+    masked = masked_border(outline, images, (frame.tissue_mask for frame in frames))
     return ~(outline.in_strip | outline.outside | masked)
 
 
