@@ -144,7 +144,6 @@ def evaluate_pictures(args: Eval, folder: Path) -> None:
 def evaluate_masks(args: Eval, folder: Path) -> None:
     """Score the masks of the sequence that takes the place of the run against the true masks in `folder`."""
     from ..data import load_sequence
-    from ..evaluation.mask_scores import SCORES
     from ..evaluation.true_masks import TrueMasks, score_masks
     from .output_paths import require_writable_folder
 
@@ -163,7 +162,7 @@ def evaluate_masks(args: Eval, folder: Path) -> None:
     say(f"true masks: {truth.polarity}")
     result = score_masks(sequence, truth)
     say(f"\nscores of the tool masks in {len(truth.indices)} frames ({BETTER})")
-    for line in score_table(result.scores, result.skipped, known={score.name: score for score in SCORES}):
+    for line in score_table(result.scores, result.skipped):
         say(line)
     if left_out := result.protocol["share_of_pixels_left_out"]:
         say(f"note: {left_out:.1%} of the pixels do not count: border around the image, or burned-in labels")

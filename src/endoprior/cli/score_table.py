@@ -14,7 +14,6 @@ def score_table(
     scores: Mapping[str, float],
     skipped: Mapping[str, str],
     relative: bool = False,
-    known: Mapping[str, Score] | None = None,
 ) -> list[str]:
     """The lines of the table, at most 26 and as many as there are reasons for skipped scores.
 
@@ -22,30 +21,28 @@ def score_table(
         scores: value by name.
         skipped: reason by name, of scores that could not be computed.
         relative: whether the scale of the depth is unknown, so that lengths are not in mm.
-        known: what is known of each score by name; default: those of scenes.
     """
-    known = all_scores() if known is None else known
     lines = []
     for group in GROUPS:
         title = group
-        for score in _summary(scores, known):
+        for score in _summary(scores):
             if score.group == group:
                 value = score.text(scores[score.name], relative)
                 line = LINE.format(group=title, label=score.label, value=value, arrow=score.arrow, hint=score.hint)
                 lines.append(line.rstrip())
                 title = ""
-    if relative and any(score.is_length for score in _summary(scores, known)):
+    if relative and any(score.is_length for score in _summary(scores)):
         lines.append("  rel.: the scale of the depth is unknown. Compare these scores on this sequence only.")
-    return [*lines, *_not_computed(skipped, known)]
+    return [*lines, *_not_computed(skipped)]
 
 
-def _summary(names: Mapping[str, object], known: Mapping[str, Score]) -> list[Score]:
-    return [score for name, score in known.items() if name in names and score.in_summary]
+def _summary(names: Mapping[str, object]) -> list[Score]:
+    return [score for name, score in all_scores().items() if name in names and score.in_summary]
 
 
-def _not_computed(skipped: Mapping[str, str], known: Mapping[str, Score]) -> list[str]:
+def _not_computed(skipped: Mapping[str, str]) -> list[str]:
     """One line for each reason: scores that need the same missing package stand together."""
     labels: dict[str, list[str]] = {}
-    for score in _summary(skipped, known):
+    for score in _summary(skipped):
         labels.setdefault(skipped[score.name], []).append(score.label)
     return [f"  not computed: {', '.join(names)}: {reason}" for reason, names in labels.items()]

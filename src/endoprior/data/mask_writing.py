@@ -42,11 +42,20 @@ def replace_masks(sequence: FrameSequence, masks: Mapping[int, NDArray[np.bool_]
         if file.exists() and not original.exists():
             with whole_file(original) as temporary:
                 shutil.copyfile(file, temporary)
-        high = mask == (sequence.mask_tool_value == 255)
-        with whole_file(file) as temporary:
-            save_png(temporary, np.where(high, 255, 0).astype(np.uint8))
+        write_mask(file, mask, sequence.mask_tool_value)
     if kept.exists():
         write_json(kept / NOTE, changes(kept, folder, sequence.mask_tool_value))
+
+
+def write_mask(file: Path, mask: NDArray[np.bool_], tool_value: int) -> None:
+    """Write one mask file, atomically.
+
+    Args:
+        mask: (H, W) True on tools.
+        tool_value: value of tools in the file, 255 or 0.
+    """
+    with whole_file(file) as temporary:
+        save_png(temporary, np.where(mask == (tool_value == 255), 255, 0).astype(np.uint8))
 
 
 def _new_files(sequence: FrameSequence, count: int) -> list[Path]:

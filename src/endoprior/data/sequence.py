@@ -10,8 +10,11 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, overload
+
+import numpy as np
 
 from ..core.checks import input_error
 from ..core.types import Camera, Frame
@@ -73,7 +76,8 @@ class FrameSequence:
         self.mask_files, self.mask_tool_value = list(mask_files or []), mask_tool_value
         self._cameras = cameras
         self._read_frame = read_frame
-        self._files = files or []
+        self.files = list(files or [])
+        """Every file that makes up the sequence."""
         self._remarks = remarks or []
         self._masks = path / mask_folder
         self._cache: BoundedCache[Frame] = BoundedCache(cache_bytes(), _frame_bytes)
@@ -128,10 +132,17 @@ class FrameSequence:
         view.truth, view._holds_out = None, True
         return view
 
+    def without_masks(self) -> FrameSequence:
+        """This sequence with its masks hidden: every pixel counts as tissue."""
+        view = copy(self)
+        view._read_frame = lambda index: _all_tissue(self._read_frame(index))
+        view._cache = BoundedCache(cache_bytes(), _frame_bytes)
+        return view
+
     def fingerprint(self) -> str:
         """SHA-256, in hex, of the names (below the folder) and contents of all files of the sequence."""
         digest = hashlib.sha256()
-        for file in sorted(self._files):
+        for file in sorted(self.files):
             digest.update(os.fsencode(file.relative_to(self.path).as_posix()) + b"\0")
             digest.update(hashlib.sha256(file.read_bytes()).digest())
         return digest.hexdigest()
@@ -168,6 +179,10 @@ class FrameSequence:
         if empty:
             remarks.append(f"{self.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")
         return remarks
+
+
+def _all_tissue(frame: Frame) -> Frame:
+    return replace(frame, tissue_mask=np.ones_like(frame.tissue_mask))
 
 
 def _contents(frame: Frame) -> tuple[float, bool, bool]:

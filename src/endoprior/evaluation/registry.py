@@ -49,7 +49,7 @@ def _problem(found: Any) -> str:
         return f"SCORES of type {type(scores).__name__}"
     if not callable(getattr(found, "compute", None)):
         return "no function compute"
-    names = {score.name for name in SCORERS for score in _builtin(name).SCORES}
+    names = {score.name for name in SCORERS for score in _builtin(name).SCORES} | _mask_scores().keys()
     again = [score.name for score in scores if score.name in names]
     return f"another score {again[0]}, which is built in" if again else ""
 
@@ -82,5 +82,9 @@ def scorers() -> dict[str, Scorer]:
 
 @cache
 def all_scores() -> dict[str, Score]:
-    """Every score by name."""
-    return {score.name: score for scorer in scorers().values() for score in scorer.SCORES}
+    """Every score by name: those of scenes, then those of tool masks, which need no scene."""
+    return {score.name: score for scorer in scorers().values() for score in scorer.SCORES} | _mask_scores()
+
+
+def _mask_scores() -> dict[str, Score]:
+    return {score.name: score for score in import_module(".mask_scores", __package__).SCORES}

@@ -25,6 +25,7 @@ from .mask_scores import NO_VALUE, TIP, TOLERANCE, MaskCounts, count, counted_pi
 from .picture_names import IN_ORDER_ALL, NUMBERS, OWN_NAMES, match_names
 from .pictures import fingerprint
 
+SCORES_FILE = "mask_scores.json"
 SAMPLES = 20
 """Largest number of frames in which the border and the polarity of the true masks are looked for."""
 MORE_ALIKE = 0.8
@@ -127,7 +128,7 @@ class MaskEvaluation:
 
     def save(self, folder: Path) -> Path:
         """Write `mask_scores.json` and `mask_scores_per_frame.json`; returns the first."""
-        file = folder / "mask_scores.json"
+        file = folder / SCORES_FILE
         write_json(file, {name: getattr(self, name) for name in ("protocol", "scores", "skipped")})
         write_json(folder / "mask_scores_per_frame.json", self.per_frame)
         return file

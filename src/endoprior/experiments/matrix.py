@@ -1,7 +1,7 @@
-"""The whole matrix: write phantoms, find finished cells, run the others.
+"""The whole matrix: write phantoms, find tool masks, find finished cells, run the others.
 
-Below OUT: `sequences/` (phantoms) and `cells/KEY/` (metrics, run folder). A cell's folder is named by a hash of
-everything that determines its result, so that equal cells of different specs run once.
+Below OUT: `sequences/` (phantoms, sequences with found masks) and `cells/KEY/` (metrics, run folder). A cell's folder
+is named by a hash of everything that determines its result, so that equal cells of different specs run once.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from ..core.checks import InputError, input_error
 from ..core.config_io import to_dict
 from ..data.files import read_json
 from ..evaluation.pictures import fingerprint
+from ..evaluation.true_masks import SCORES_FILE
 from .execute import Executor
 from .method import REGISTRY
 from .spec import Cell, Spec, cells, sequence_folder
@@ -45,7 +46,7 @@ class Matrix:
     failed: int = 0
     """Number of cells among them that ran and failed."""
     data: dict[str, Path] = field(default_factory=dict)
-    """Folder of each readable sequence."""
+    """Folder of each readable sequence that its cells are scored on."""
     relative: set[str] = field(default_factory=set)
     """Names of those whose depth has no known scale, so that lengths are not in mm."""
 
@@ -68,7 +69,7 @@ def run_matrix(
         progress: takes a line of text.
     """
     matrix = Matrix(spec, out)
-    jobs = _jobs(matrix, threads, weights_dir, write=execute is not None)
+    jobs = _jobs(matrix, threads, weights_dir, progress, write=execute is not None)
     total = len(cells(spec))
     progress(f"{total} cells: {len(matrix.done)} done before, {len(jobs)} to run, {len(matrix.missing)} without data")
     for name, reason in {cell.sequence: reason for cell, reason in matrix.missing.items()}.items():
@@ -94,14 +95,22 @@ def run_matrix(
     return matrix
 
 
-def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -> dict[Cell, Job]:
-    """A job for each cell that is not finished; fills `done`, `missing` and `data` of the matrix."""
+def _jobs(
+    matrix: Matrix, threads: int, weights_dir: Path | None, progress: Callable[[str], None], write: bool
+) -> dict[Cell, Job]:
+    """A job for each cell that is not finished; fills `done`, `missing`, `data` and `relative` of the matrix."""
     spec, jobs = matrix.spec, {}
-    fingerprints: dict[str, str] = {}
+    trained_on: dict[str, Path] = {}
+    known: dict[str, list[Any]] = {}  # what determines results on a sequence
     for name in spec.sequences:
         try:
             sequence = _sequence(spec, name, matrix.out, write)
-            matrix.data[name], fingerprints[name] = sequence.path, sequence.fingerprint()
+            trained_on[name], known[name] = sequence.path, [sequence.fingerprint()]
+            if spec.sequences[name].masks == "found":
+                found = _with_found_masks(spec, name, sequence.path, matrix.out, progress, write)
+                trained_on[name] = found.path
+                known[name] += [found.fingerprint(), read_json(found.path / SCORES_FILE)["scores"]]
+            matrix.data[name] = sequence.path
             matrix.relative |= {name} if sequence.depth_is_relative else set()
         except InputError as error:
             matrix.missing |= {cell: str(error) for cell in cells(spec) if cell.sequence == name}
@@ -115,7 +124,8 @@ def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -
         except InputError as error:
             matrix.missing[cell] = str(error)
             continue
-        facts = [options, fingerprints[cell.sequence], spec.networks, SCORES_VERSION, *made]
+        first, *others = known[cell.sequence]
+        facts = [options, first, spec.networks, SCORES_VERSION, *made, *others]
         key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
         folder = (matrix.out / "cells" / key[:KEY_DIGITS]).absolute()
         if finished(folder, key):
@@ -124,7 +134,8 @@ def _jobs(matrix: Matrix, threads: int, weights_dir: Path | None, write: bool) -
         jobs[cell] = Job(
             name=cell.name,
             folder=str(folder),
-            data=str(matrix.data[cell.sequence].absolute()),
+            data=str(trained_on[cell.sequence].absolute()),
+            scored_on=str(matrix.data[cell.sequence].absolute()),
             method=method,
             options=options,
             reading=options["data"] if spec.has_config(cell.method) else reading,
@@ -170,6 +181,27 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> FrameSequence:
     if chosen.phantom and write and not folder.is_dir():
         write_phantom(folder, chosen.phantom)
     return load_sequence(folder, DataConfig(**chosen.reading))
+
+
+def _with_found_masks(
+    spec: Spec, name: str, folder: Path, out: Path, progress: Callable[[str], None], write: bool
+) -> FrameSequence:
+    """The copy of a sequence that has found masks; a missing one is written.
+
+    Raises:
+        InputError: it has no masks to hide, or is missing or cannot be read.
+    """
+    from ..core.config import DataConfig
+    from ..data import load_sequence
+    from .found_masks import whole_sequence, write_found
+
+    chosen = spec.sequences[name]
+    whole = whole_sequence(folder, name, chosen.format)
+    key = hashlib.sha256(f"{whole.fingerprint()} {SCORES_VERSION}".encode()).hexdigest()[:8]
+    copy = out / "sequences" / f"{folder.resolve().name}-found-{key}"
+    if write:
+        write_found(whole, copy, progress)
+    return load_sequence(copy, DataConfig(**chosen.reading))
 
 
 def commits_of(matrix: Matrix) -> list[str]:

@@ -13,7 +13,7 @@ from .image_grids import GRIDS, write_image_grids
 from .matrix import Matrix, commits_of, scores_of
 from .plots import budget_figure, curve_figure
 from .results import Results
-from .spec import ClaimSpec
+from .spec import ClaimSpec, Spec
 from .statistics import MIN_PAIRS, Difference
 from .tables import csv_lines, latex, markdown, score_table
 
@@ -102,18 +102,30 @@ def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
         if name not in matrix.data:
             continue
         blocks += [f"{mark} {name}", "Best in bold, second best underlined.", markdown(score_table(results, name))]
-        others = [method for method in spec.methods if method != spec.reference]
-        changes = {s: [results.difference(s, method, spec.reference, name) for method in others] for s in spec.scores}
-        known = [score for score in spec.scores if any(difference.count for difference in changes[score])]
-        rows = [[spec.label(m), *(change(s, changes[s][i]) for s in known)] for i, m in enumerate(others)]
-        if known:
-            headings = [all_scores()[s].heading(name in results.relative) for s in known]
-            lines = [["method", *headings], ["---"] * (len(known) + 1), *rows]
-            table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-            than = spec.label(spec.reference)
-            about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over seeds]:"
-            blocks += [about, table]
+        scores, others = _of_scenes(spec), [method for method in spec.methods if method != spec.reference]
+        changes = {m: {s: results.difference(s, m, spec.reference, name) for s in scores} for m in others}
+        blocks += _differences(results, name, spec.label(spec.reference), changes)
+        if own := spec.with_own_masks(name):
+            changes = {m: {s: results.gain_of_masks(s, m, name, own) for s in scores} for m in spec.methods}
+            blocks += _differences(results, name, f"{own}, which has its own masks", changes)
     return blocks
+
+
+def _of_scenes(spec: Spec) -> list[str]:
+    """The scores without those of masks, which are equal for all methods."""
+    return [score for score in spec.scores if all_scores()[score].group != "masks"]
+
+
+def _differences(results: Results, sequence: str, than: str, changes: dict[str, dict[str, Difference]]) -> list[str]:
+    """The paired differences of methods, by score, as a table with a line above it; nothing without pairs."""
+    known = [score for score in _of_scenes(results.spec) if any(row[score].count for row in changes.values())]
+    if not known:
+        return []
+    headings = [all_scores()[score].heading(sequence in results.relative) for score in known]
+    rows = [[results.spec.label(method), *(change(s, row[s]) for s in known)] for method, row in changes.items()]
+    lines = [["method", *headings], ["---"] * (len(known) + 1), *rows]
+    about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over seeds]:"
+    return [about, "\n".join("| " + " | ".join(line) + " |" for line in lines)]
 
 
 def change(score: str, difference: Difference) -> str:
@@ -205,7 +217,15 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
         for name in spec.sequences
         for method in spec.methods
         if method != spec.reference
-        for score in spec.scores
+        for score in _of_scenes(spec)
+    ]
+    gains_of_masks = [
+        {"sequence": name, "than": own, "method": method, "score": score}
+        | _json(results.gain_of_masks(score, method, name, own))
+        for name in spec.sequences
+        if (own := spec.with_own_masks(name))
+        for method in spec.methods
+        for score in _of_scenes(spec)
     ]
     missing = {cell.name: reason for cell, reason in matrix.missing.items()}
     return {
@@ -213,6 +233,7 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
         "commits": commits_of(matrix),
         "cells": cells,
         "differences": differences,
+        "gains_of_found_masks": gains_of_masks,
         "claims": claims,
         "missing": missing,
     }

@@ -42,17 +42,33 @@ class Results:
     ) -> NDArray:
         """(K,) paired `statistics.gains` over sequences, budgets and seeds, positive where `method` is better."""
         pairs = [
-            (self.value(Cell(name, method, size, seed), score), self.value(Cell(name, than, size, seed), score))
+            (Cell(name, method, size, seed), Cell(name, than, size, seed))
             for name in ([sequence] if sequence else self.spec.sequences)
             for size in ((budget,) if budget else self.spec.budgets or (None,))
             for seed in self.spec.seeds
         ]
-        ours, theirs = np.array(pairs).T
+        return self._gains(score, pairs)
+
+    def _gains(self, score: str, pairs: list[tuple[Cell, Cell]]) -> NDArray:
+        ours, theirs = np.array([[self.value(cell, score) for cell in pair] for pair in pairs]).T
         return gains(score, ours, theirs)
 
     def difference(self, score: str, method: str, than: str, sequence: str | None = None) -> Difference:
         """Mean paired difference with its interval."""
         return difference(self.gains(score, method, than, sequence=sequence))
+
+    def gain_of_masks(self, score: str, method: str, sequence: str, own: str) -> Difference:
+        """Mean paired difference of one method with found masks to the same with the sequence's `own` masks.
+
+        Args:
+            sequence, own: names of the sequence with found masks, and with its own.
+        """
+        pairs = [
+            (Cell(sequence, method, size, seed), Cell(own, method, size, seed))
+            for size in self.spec.budgets or (None,)
+            for seed in self.spec.seeds
+        ]
+        return difference(self._gains(score, pairs))
 
     def check(self, claim: ClaimSpec, sequence: str | None = None) -> tuple[Difference, Verdict]:
         """Whether a claim holds, on one sequence or on all."""

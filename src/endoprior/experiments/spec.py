@@ -47,6 +47,8 @@ class SequenceSpec:
     """Read every n-th frame; 0 is the dataset's published stride."""
     format: str = "auto"
     """Layout of the folder (docs/datasets.md)."""
+    masks: Literal["given", "found"] = "given"
+    """`found`: train with tool masks found from the footage; the sequence's own ones are the truth of all scores."""
 
     @property
     def reading(self) -> dict[str, Any]:
@@ -137,6 +139,12 @@ class Spec:
     def label(self, method: str) -> str:
         """Name of a method in tables."""
         return self.methods[method].label or method
+
+    def with_own_masks(self, sequence: str) -> str | None:
+        """The sequence that differs from one with found masks in having its own; None if there is none."""
+        chosen = self.sequences[sequence]
+        own = replace(chosen, masks="given")
+        return next((name for name, other in self.sequences.items() if own == other != chosen), None)
 
     def has_config(self, method: str) -> bool:
         """Whether the options of a method are our `Config`, with budgets and the spec's `set`."""
@@ -266,7 +274,11 @@ def _check(spec: Spec) -> None:
     if count > MOST_CELLS:
         raise input_error("methods x sequences x budgets x seeds", f"at most {MOST_CELLS}", f"{count}", "split.")
     for cell in cells(spec):
-        spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
+        options = spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
+        found = spec.sequences[cell.sequence].masks == "found"
+        if found and spec.has_config(cell.method) and options.data.use_gt_masks:
+            fix = "remove data.use_gt_masks."
+            raise input_error(f"sequences.{cell.sequence}.masks", "either found or gt_masks", "both", fix)
 
 
 def _check_method(spec: Spec, where: str, method: MethodSpec, known: list[str]) -> None:
@@ -319,5 +331,5 @@ def sequence_folder(spec: Spec, name: str, out: Path) -> Path:
     sequence = spec.sequences[name]
     if sequence.phantom:
         fields = json.dumps(to_dict(sequence.phantom), sort_keys=True)
-        return out / "sequences" / f"{name}-{hashlib.sha256(fields.encode()).hexdigest()[:8]}"
+        return out / "sequences" / f"phantom-{hashlib.sha256(fields.encode()).hexdigest()[:8]}"
     return spec.resolved(sequence.path)

@@ -22,6 +22,8 @@ from ..system.atomic import write_json, write_text
 
 DONE = "cell.json"
 """Written last: a folder that has it, with the same key, is finished."""
+FOUND = "trained with masks found from the footage; their scores: all frames at full size, against the own masks"
+"""Protocol of cells on sequences with `masks: found`."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,9 @@ class Job:
     folder: str
     """Folder of the cell, absolute."""
     data: str
-    """Sequence folder, absolute."""
+    """Sequence folder to train on, absolute."""
+    scored_on: str
+    """Sequence folder to score on: `data`, or with found masks the one that has the true ones."""
     method: str
     """Name in the registry of methods."""
     options: dict[str, Any]
@@ -71,6 +75,7 @@ def work(job: Job) -> None:
     from ..core.config_io import from_dict
     from ..data import load_sequence
     from ..evaluation.scoring import evaluate, scored_data
+    from ..evaluation.true_masks import SCORES_FILE
     from ..model.scene import Scene
     from .method import PICTURES, REGISTRY
 
@@ -85,9 +90,14 @@ def work(job: Job) -> None:
     began = clock.perf_counter()
     found = method.train(load_sequence(job.data, reading).training_view(), options, seed=job.seed, out=run)
     seconds = clock.perf_counter() - began
-    sequence = load_sequence(job.data, scored_data(reading))
+    sequence = load_sequence(job.scored_on, scored_data(reading))
     weights_dir = Path(job.weights_dir) if job.weights_dir else None
     result = evaluate(found, sequence, networks=job.networks, weights_dir=weights_dir, reading=reading)
+    if job.scored_on != job.data:
+        of_masks = read_json(Path(job.data) / SCORES_FILE)
+        result.scores |= of_masks["scores"]
+        result.skipped |= of_masks["skipped"]
+        result.protocol["masks: found"] = FOUND
     if job.method == PICTURES:
         result.skipped["train_seconds"] = "the images come from another program"
     elif resume:
