@@ -89,6 +89,17 @@ def test_places_of_sequences(tmp_path, monkeypatch):
     assert sequence_folder(replaced, "clip", tmp_path) == tmp_path / "mine"
 
 
+def test_a_sequence_with_found_masks_knows_the_one_with_its_own(tmp_path):
+    ph, clip = {"phantom": {"frames": 9}}, {"path": "clips/a", "shrink": 2}
+    found = {"found": clip | {"masks": "found"}, "ph_found": ph | {"masks": "found"}, "other": {"path": "b"}}
+    spec = load_spec(written(tmp_path, sequences={"clip": clip, "ph": ph} | found))
+    own = {name: spec.with_own_masks(name) for name in spec.sequences}
+    assert own == {"clip": None, "ph": None, "found": "clip", "ph_found": "ph", "other": None}
+    assert sequence_folder(spec, "ph", tmp_path) == sequence_folder(spec, "ph_found", tmp_path)
+    alone = load_spec(written(tmp_path, sequences={"found": found["found"], "larger": clip | {"shrink": 1}}))
+    assert alone.with_own_masks("found") is None
+
+
 def test_toml_says_the_same(tmp_path):
     path = tmp_path / "spec.toml"
     path.write_text('title = "t"\nseeds = [4]\n[sequences.s]\npath = "x"\n[methods.m.set]\n"temporal.weight" = 0\n')
@@ -110,6 +121,11 @@ def test_toml_says_the_same(tmp_path):
         ({"sequences": {"a": {"phantom": {"frames": 1}}}}, "frames"),
         ({"sequences": {"a": {"phantom": {}, "shrink": 2}}}, "a phantom has its own size"),
         ({"sequences": {"a": {"path": "x", "format": "endo"}}}, "sequences.a.format: expected auto, scared"),
+        ({"sequences": {"a": {"path": "x", "masks": "hidden"}}}, "sequences.a.masks: expected one of 'given', 'found'"),
+        (
+            {"sequences": {"a": {"path": "x", "masks": "found"}}, "set": {"data.use_gt_masks": True}},
+            "sequences.a.masks: expected either found or gt_masks, got both",
+        ),
         ({"methods": {"m": {"preset": "best"}}}, "methods.m.preset: expected one of default"),
         ({"methods": {"m": {"set": {"init": 3}}}}, "methods.m.set: expected the name of a config field"),
         ({"methods": {"m": {"set": {"init.bugdet": 3}}}}, "methods.m.set: expected the name of a config field"),
@@ -149,7 +165,7 @@ def test_ready_specs_are_read_by_name(name):
 
 def test_names_are_listed_and_win_over_paths(tmp_path, monkeypatch, capsys):
     names = spec_names()
-    assert {"quick", "sized", "sized/phantom", "full", "full/methods"} <= {*names}
+    assert {"quick", "masks", "sized", "sized/phantom", "full", "full/methods"} <= {*names}
     assert not [name for name in names if "_small" in name], "it is only there to be extended"
     monkeypatch.chdir(tmp_path)
     written(tmp_path).rename("quick")

@@ -5,35 +5,36 @@ from pathlib import Path
 import pytest
 
 from endoprior.cli.score_table import score_table
-from endoprior.evaluation.mask_scores import SCORES
 from endoprior.evaluation.registry import all_scores, scorers
 
 PAGE = Path(__file__).parents[1] / "docs" / "scores.md"
+OF_MASKS = {name: score for name, score in all_scores().items() if score.group == "masks"}
+OF_SCENES = {name: score for name, score in all_scores().items() if score.group != "masks"}
 BETTER = {True: "higher", False: "lower", None: "-"}
 
 
 def test_every_score_has_one_scorer():
     names = [score.name for scorer in scorers().values() for score in scorer.SCORES]
-    assert len(names) == len(set(names)) == len(all_scores())
+    assert len(names) == len(set(names)) == len(OF_SCENES) and len(all_scores()) == len(OF_SCENES) + len(OF_MASKS)
 
 
-@pytest.mark.parametrize("scores", [all_scores().values(), SCORES], ids=["of a scene", "of masks"])
+@pytest.mark.parametrize("scores", [OF_SCENES, OF_MASKS], ids=["of a scene", "of masks"])
 def test_the_page_lists_every_score(scores):
     rows = [
         f"| `{s.name}` | {s.label} | {s.unit or '-'} | {BETTER[s.higher_is_better]} | {s.description} "
         f"| {s.hint or '-' if s.in_summary else 'not printed'} |"
-        for s in scores
+        for s in scores.values()
     ]
     assert "\n".join(rows) + "\n\n" in PAGE.read_text(encoding="utf-8"), "expected this table:\n" + "\n".join(rows)
 
 
 def test_every_score_has_a_group_and_a_meaning():
-    for score in (*all_scores().values(), *SCORES):
+    for score in all_scores().values():
         assert score.group != "other" and score.description.endswith(".") and len(score.hint) <= 40
 
 
 def test_the_printed_table_fits_a_page_and_says_which_way_is_better():
-    table = score_table(dict.fromkeys(all_scores(), 1.0), {})
+    table = score_table(dict.fromkeys(OF_SCENES, 1.0), {})
     assert len(table) <= 25 and all(len(line) <= 90 for line in table)
     by_label = {line[10:29].strip(): line for line in table}
     assert "1.00 dB \u2191  above 35 dB" in by_label["tissue PSNR"] and "0 is identical" in by_label["LPIPS"]
@@ -62,7 +63,7 @@ def test_values_are_shown_with_their_unit():
 def test_lengths_of_relative_depth_are_not_called_mm():
     rmse, instability = all_scores()["depth_rmse_mm"], all_scores()["depth_instability_mm"]
     assert rmse.text(1.1, relative=True) == "1.100 rel." and instability.heading(True) == "depth instability, rel."
-    table = score_table(dict.fromkeys(all_scores(), 1.0), {}, relative=True)
+    table = score_table(dict.fromkeys(OF_SCENES, 1.0), {}, relative=True)
     assert not any(" mm" in line for line in table)
     assert table[-1].startswith("  rel.: the scale of the depth is unknown.")
     without = score_table({"psnr": 30.0, "ssim": 0.9, "flow_error_dis": 1.0}, {}, relative=True)

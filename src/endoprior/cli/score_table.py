@@ -10,11 +10,7 @@ from ..evaluation.score import GROUPS, Score
 LINE = "  {group:<7} {label:<18} {value:>15} {arrow:1}  {hint}"
 
 
-def score_table(
-    scores: Mapping[str, float],
-    skipped: Mapping[str, str],
-    relative: bool = False,
-) -> list[str]:
+def score_table(scores: Mapping[str, float], skipped: Mapping[str, str], relative: bool = False) -> list[str]:
     """The lines of the table, at most 26 and as many as there are reasons for skipped scores.
 
     Args:

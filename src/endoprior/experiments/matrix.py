@@ -193,14 +193,17 @@ def _with_found_masks(
     """
     from ..core.config import DataConfig
     from ..data import load_sequence
-    from .found_masks import whole_sequence, write_found
+    from .found_masks import whole_sequence, write_found, write_scores
 
     chosen = spec.sequences[name]
-    whole = whole_sequence(folder, name, chosen.format)
+    whole = whole_sequence(folder, chosen.format)
     key = hashlib.sha256(f"{whole.fingerprint()} {SCORES_VERSION}".encode()).hexdigest()[:8]
     copy = out / "sequences" / f"{folder.resolve().name}-found-{key}"
-    if write:
-        write_found(whole, copy, progress)
+    if write and not copy.is_dir():
+        progress(f"{name}: finding tools in {len(whole)} frames")
+        write_found(whole, copy)
+    if write and not (copy / SCORES_FILE).exists():
+        write_scores(whole, copy, chosen.format)
     return load_sequence(copy, DataConfig(**chosen.reading))
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..evaluation.registry import all_scores
 from .matrix import Matrix, scores_of
 from .spec import Cell, ClaimSpec, Spec
 from .statistics import Difference, Summary, Verdict, difference, gains, summary, verdict
@@ -34,8 +35,9 @@ class Results:
         return float(self.scores.get(cell, {}).get(score, math.nan))
 
     def summary(self, sequence: str, budget: int | None, method: str, score: str) -> Summary:
-        """Mean and standard deviation over seeds."""
-        return summary([self.value(Cell(sequence, method, budget, seed), score) for seed in self.spec.seeds])
+        """Mean and standard deviation over seeds; scores of masks, which are found once, have no deviation."""
+        values = [self.value(Cell(sequence, method, budget, seed), score) for seed in self.spec.seeds]
+        return summary([*{*values}] if all_scores()[score].group == "masks" else values)
 
     def gains(
         self, score: str, method: str, than: str, *, sequence: str | None = None, budget: int | None = None

@@ -22,7 +22,7 @@ from ..system.atomic import write_json, write_text
 
 DONE = "cell.json"
 """Written last: a folder that has it, with the same key, is finished."""
-FOUND = "trained with masks found from the footage; their scores: all frames at full size, against the own masks"
+FOUND = "methods train with masks found from the footage; scores of these masks: all frames, full size, against masks/"
 """Protocol of cells on sequences with `masks: found`."""
 
 
