@@ -28,6 +28,7 @@ from endoprior.experiments.results import Results
 from endoprior.experiments.spec import Cell, load_spec
 from endoprior.experiments.worker import Job, work
 from endoprior.model.scene import load_scene
+from endoprior.tool_masks import FoundTools
 
 OWN, FOUND = Cell("tiny", "m", None, 0), Cell("tiny_found", "m", None, 0)
 QUICK = {"schedule.fine_iterations": 6, "schedule.coarse_iterations": 0, "init.budget": 200, "init.motion": "rest"}
@@ -163,7 +164,7 @@ def test_found_masks_are_found_once_and_again_for_other_files(finished, tmp_path
     monkeypatch.setattr(found_masks, "find_in_sequence", lambda sequence: calls.append(1) or iter(masks()))
 
     def masks():
-        return [(np.zeros((40, 48), bool), None)] * 17
+        return [(np.zeros((40, 48), bool), FoundTools(np.zeros((40, 48), bool), 1.0))] * 17
 
     spec, before = load_spec(tmp_path / "spec.yaml"), contents(tmp_path / "out")
     again = run_matrix(spec, tmp_path / "out", in_this_process)
@@ -181,7 +182,7 @@ def test_the_masks_are_hidden_from_the_finder_and_an_interruption_leaves_nothing
 
     def interrupted(hidden):
         assert all(frame.tissue_mask.all() for frame in hidden.frames("video"))
-        yield np.zeros((40, 48), bool), None
+        yield np.zeros((40, 48), bool), FoundTools(np.zeros((40, 48), bool), 1.0)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(found_masks, "find_in_sequence", interrupted)
@@ -197,7 +198,7 @@ def test_masks_of_either_polarity_are_written_as_the_sequence_has_them(tmp_path,
     (data / "sequence.json").write_text(description.replace('"mask_tool_value": 255', '"mask_tool_value": 0'))
     mask = np.zeros((40, 48), bool)
     mask[:, 30:] = True
-    monkeypatch.setattr(found_masks, "find_in_sequence", lambda sequence: iter([(mask, None)] * 17))
+    monkeypatch.setattr(found_masks, "find_in_sequence", lambda sequence: iter([(mask, FoundTools(mask, 1.0))] * 17))
     found_masks.write_found(found_masks.whole_sequence(data, "auto"), tmp_path / "copy")
     assert all((found == mask).all() for found in masks_of(tmp_path / "copy"))
 

@@ -47,7 +47,7 @@ def run(argv: list[str]) -> None:
     args = parse(Masks, argv, "masks", HELP)
     from ..core.config import DataConfig
     from ..data import load_sequence
-    from ..data.mask_writing import replace_masks
+    from ..data.mask_writing import note_found_masks, replace_masks
     from ..system.atomic import write_json
     from ..tool_masks.sequence import find_in_sequence
     from ..visualization.image_tools import write_png
@@ -66,6 +66,7 @@ def run(argv: list[str]) -> None:
     write_png(args.data / SHEET, mask_sheet(pictures, COLUMNS, WIDTH_PX))
     write_json(args.data / SHARES, rows)
     with_tools = [row for row in rows if row["share"]]
+    note_found_masks(args.data, len(with_tools) / len(rows))
     say(f"tools in {len(with_tools)} of {len(rows)} frames, at most {max(row['share'] for row in rows):.1%} of a frame")
     if uncertain := [row["frame"] for row in with_tools if row["confidence"] < UNCERTAIN]:
         say(f"uncertain: frames {number_ranges(uncertain)}")

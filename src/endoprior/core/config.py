@@ -212,6 +212,8 @@ class LossConfig(Checked):
     """Depth that is compared: sum of weight * z, or that divided by alpha."""
     min_depth_pixels: Count = 10
     """A frame with fewer measured tissue depths gets no depth loss."""
+    trust_masks: bool = True
+    """False: where the masks were found by a program, leave out what looks like a missed tool (docs/prepare.md)."""
 
 
 @dataclass(frozen=True)

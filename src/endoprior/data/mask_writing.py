@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..system.atomic import whole_file, write_json
+from .description import TOOLS_FOUND, read_description
 from .images import read_tool_mask, save_png
 from .sequence import FrameSequence
 
@@ -56,6 +57,18 @@ def write_mask(file: Path, mask: NDArray[np.bool_], tool_value: int) -> None:
     """
     with whole_file(file) as temporary:
         save_png(temporary, np.where(mask == (tool_value == 255), 255, 0).astype(np.uint8))
+
+
+def note_found_masks(folder: Path, with_tools: float) -> None:
+    """Note in `sequence.json` of a sequence folder that a program found its masks.
+
+    Args:
+        with_tools: share of the frames in which it found tools, 0..1.
+    """
+    path = folder / "sequence.json"
+    described = read_description(path)
+    source = f"{TOOLS_FOUND} in {with_tools:.0%} of the frames" if with_tools else f"no {TOOLS_FOUND}"
+    write_json(path, described | {"sources": described.get("sources", {}) | {"masks": source}})
 
 
 def _new_files(sequence: FrameSequence, count: int) -> list[Path]:

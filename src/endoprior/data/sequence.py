@@ -19,6 +19,7 @@ import numpy as np
 from ..core.checks import input_error
 from ..core.types import Camera, Frame
 from ..system.memory import BoundedCache, cache_bytes, workers
+from .description import TOOLS_FOUND
 from .truth import Truth
 
 Split = Literal["train", "test", "video"]
@@ -87,6 +88,11 @@ class FrameSequence:
     def remarks(self) -> list[str]:
         """What is unusual but usable, one line each."""
         return list(self._remarks)
+
+    @property
+    def masks_are_found(self) -> bool:
+        """Whether a program found the tools, rather than a person."""
+        return TOOLS_FOUND in self.sources.get("masks", "")
 
     def __len__(self) -> int:
         return len(self._cameras)

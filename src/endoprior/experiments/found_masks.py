@@ -8,7 +8,7 @@ from pathlib import Path
 from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..data import FrameSequence, load_sequence
-from ..data.mask_writing import write_mask
+from ..data.mask_writing import note_found_masks, write_mask
 from ..evaluation.true_masks import TrueMasks, score_masks
 from ..system.atomic import whole_folder
 from ..tool_masks.sequence import find_in_sequence
@@ -45,9 +45,11 @@ def write_found(sequence: FrameSequence, folder: Path) -> None:
             place.parent.mkdir(parents=True, exist_ok=True)
             if file not in own:
                 shutil.copyfile(file, place)
-        found = find_in_sequence(sequence.without_masks())
-        for file, (mask, _) in zip(sequence.mask_files, found, strict=True):
+        found, with_tools = find_in_sequence(sequence.without_masks()), 0
+        for file, (mask, tools) in zip(sequence.mask_files, found, strict=True):
             write_mask(places[file], mask, sequence.mask_tool_value)
+            with_tools += bool(tools.mask.any())
+        note_found_masks(temporary, with_tools / len(sequence))
 
 
 def write_scores(sequence: FrameSequence, folder: Path, data_format: str) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_values
+from ..data.description import TOOLS_FOUND
 from ..data.mask_files import MASK_SUFFIXES, read_user_mask, tool_polarity
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
@@ -204,10 +205,10 @@ def _tools(
         from ..tool_masks import fit_tools
 
         model = fit_tools(tool_samples)
-        source = f"tools found in {model.detected_share:.0%} of the samples"
+        source = f"{TOOLS_FOUND} in {model.detected_share:.0%} of the samples"
         hint = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
         if not model.detected_share:
-            source = "no tools found"
+            source = f"no {TOOLS_FOUND}"
             hint = "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
         return (
             lambda frame: model.find(frame.rgb_u8, geometry.inside, frame.depth).mask,

@@ -25,6 +25,8 @@ DARK = 0.04
 MATTE = (0.08, 0.6)
 """A pixel whose largest channel is above the first and whose smallest is below the second shows a surface's color, not
 noise and not a highlight."""
+FEATURES_PX = 384
+"""Longer side of the images that the radii of the features are made for: a shaft is about 30 px wide, a jaw 6."""
 NEUTRAL = 0.45
 """Chroma, as a share of that of the surroundings, at which neutrality has dropped to 1/e."""
 SURROUNDINGS_PX = 30
@@ -95,7 +97,7 @@ def first_guess(rgb_u8: NDArray[np.uint8], view: NDArray[np.bool_], clip: ClipCo
     """Log-odds of a tool at each pixel, from color and contrast alone.
 
     Args:
-        rgb_u8: (H, W, 3), 0..255; radii fit an image whose longer side is 384 px.
+        rgb_u8: (H, W, 3), 0..255; its longer side is `FEATURES_PX`.
         view: (H, W) True inside the endoscope's image.
     Returns:
         (H, W), in [-5, 5].

@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 
 from ..core.checks import check_shape
 from .attachment import attachment_log_odds, color_cells, independence
-from .colors import ClipColors, first_guess
+from .colors import FEATURES_PX, ClipColors, first_guess
 from .network import Background, ToolNetwork, log_odds_of, network_size, shrunk, train_network
 from .regions import disk, tool_regions
 from .relief import relief_cells, relief_log_odds
 
-WORK_PX = 384
-"""Longer side of the resized image, px: a shaft is about 30 px wide, a jaw 6."""
 LEAST_REDNESS = 0.06
 """Median log(red / green) below which a clip is gray: its colors tell nothing, and no tools are looked for."""
 UNSURE = 0.35
@@ -42,7 +40,7 @@ GUESS_WEIGHT = 0.3
 """Weight of the first guess beside the network, which sees half of the resolution: it sharpens the outlines."""
 SHINE = (0.6, 0.8)
 """Range of the smallest channel over which a pixel changes from surface color to pure highlight."""
-RIM_PX = 2
+RIM_PX = 1
 """The mask is dilated by this much to cover mixed pixels at the tool's edge."""
 
 
@@ -145,10 +143,10 @@ def fit_tools(samples: Sequence[ToolSample], seed: int = 0) -> ToolModel:
 
 
 def _work_sample(sample: ToolSample) -> ToolSample:
-    """The sample, resized to `WORK_PX` on its longer side, so that radii have the same meaning for every size."""
+    """The sample, resized to `FEATURES_PX` on its longer side, so that radii have the same meaning for every size."""
     check_shape("rgb_u8:H,W,3 view:H,W", rgb_u8=sample.rgb_u8, view=sample.view)
     height, width = sample.view.shape
-    scale = WORK_PX / max(height, width)
+    scale = FEATURES_PX / max(height, width)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     later = None if sample.later_u8 is None else cv2.resize(sample.later_u8, size, interpolation=kind)

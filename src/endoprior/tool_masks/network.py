@@ -3,7 +3,7 @@
 Where the first guess is sure of tissue, a frame shows what is not a tool in this clip: its organs, its light, its
 highlights. What a tool looks like comes from the painted instruments. Pixels of which the first guess is not sure,
 such as those of the real tools, do not count. So no labels are needed, no weights are shipped, and pale organs of the
-clip at hand are learned as tissue.
+clip at hand are learned as tissue. Examples are lit anew, so that overexposed tissue is known too.
 If there are masks to start from, their tools count too.
 
 The network is a U-Net of 100,000 weights on images of 192 px. `h, w` size of such an image.
@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from .colors import ClipColors, log_ratios
+from .lighting import exposed, overexposed
 from .synthetic import paint_tool
 
 LONG_SIDE_PX = 192
@@ -35,8 +36,6 @@ TOOLS = (0.1, 0.5, 0.4)
 """Probability of none, one and two instruments in an example."""
 RATE = 8e-3
 """Highest learning rate of the one-cycle schedule (Smith and Topin 2019)."""
-EXPOSURE, TINT = 0.15, 0.04
-"""Standard deviation of the random exposure and of the random gain of each channel, in log units."""
 
 
 @dataclass(frozen=True)
@@ -129,13 +128,12 @@ def _example(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """(4, h, w) image, (h, w) 1 on instruments, (h, w) 1 where the loss counts."""
     background = backgrounds[rng.integers(len(backgrounds))]
-    gain = np.exp(rng.normal(0, EXPOSURE) + rng.normal(0, TINT, 3)).astype(np.float32)
-    rgb, tool = background.rgb * gain, background.tools.copy()
+    rgb, tool = exposed(rng, background.rgb), background.tools.copy()
     for _ in range(rng.choice(3, p=TOOLS)):
         rgb, painted = paint_tool(rng, rgb, background.view)
         tool |= painted
     counted = background.view & (tool | background.tissue)
-    parts = network_input(np.clip(rgb, 0, 1.1), background.view, clip), tool, counted
+    parts = network_input(overexposed(rng, rgb), background.view, clip), tool, counted
     if rng.random() < 0.5:
         parts = tuple(part[..., ::-1] for part in parts)
     image, tool, counted = (np.ascontiguousarray(part, np.float32) for part in parts)

@@ -35,7 +35,7 @@ def find_in_sequence(
     chosen = spread(total, SAMPLES)
     ahead = max(1, round(MOTION_S * (sequence.frames_per_second or 10.0)))
     frames = [sequence.frame(i) for i in chosen]
-    view = _view(frames)
+    view = view_of(frames)
     samples = []
     for i, frame in zip(chosen, frames, strict=True):
         later = sequence.frame(i + ahead).rgb_u8 if i + ahead < total else None
@@ -52,7 +52,7 @@ def find_in_sequence(
         yield found.mask | ~view, found
 
 
-def _view(frames: list[Frame]) -> NDArray[np.bool_]:
+def view_of(frames: list[Frame]) -> NDArray[np.bool_]:
     """(H, W) True inside the endoscope's image: not beyond its border, and not masked and black in all frames."""
     images = [frame.rgb_u8 for frame in frames]
     outline = find_outline(images)

@@ -19,6 +19,8 @@ from .densify import apply_plan
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .frames import TrainingFrame, TrainingFrames
 from .losses import supervised_terms
+from .mask_doubt import MaskDoubt
+from .missed_tools import START
 from .ops import TrainingOps
 from .state import Stage, StepReport, TrainState
 from .temporal import temporal_terms
@@ -51,6 +53,8 @@ class TrainingStep:
     rasterize: Rasterizer
     ops: TrainingOps
     check: DivergenceCheck
+    doubt: MaskDoubt | None = None
+    """Takes missed tools out of the frames; None trusts the masks."""
     background: Tensor = field(default_factory=lambda: torch.zeros(3))
     """(3,) color behind everything."""
 
@@ -72,7 +76,10 @@ class TrainingStep:
             splats, batch.frame.camera, background=self.background, depth_grad_to_means=cfg.render.depth_grad_to_means
         )
         out.means2d.retain_grad()
-        terms = supervised_terms(out, batch.frame, cfg.loss, self.ops)
+        counted = batch.frame
+        if self.doubt and fine and iteration > START * stage_length(cfg, Stage.FINE):
+            counted = self.doubt.counted(counted, out.color)
+        terms = supervised_terms(out, counted, cfg.loss, self.ops)
         if batch.before is not None:
             terms |= temporal_terms(state, batch.frame, batch.before, splats.means, means_before, out, cfg, self.ops)
         sum(terms.values()).backward()

@@ -26,6 +26,7 @@ from ..system.arrays_file import part
 from .density import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
+from .mask_doubt import MaskDoubt
 from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
 from .state import Stage, StepReport, TrainState
@@ -67,6 +68,7 @@ class Trainer:
             render.load(cfg.render.backend),
             self.ops,
             DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
+            MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
             torch.zeros(3, device=self.device),
         )
         self.state: TrainState | None = None
