@@ -213,7 +213,7 @@ class LossConfig(Checked):
     min_depth_pixels: Count = 10
     """A frame with fewer measured tissue depths gets no depth loss."""
     trust_masks: bool = True
-    """False: where the masks were found by a program, leave out what looks like a missed tool (docs/prepare.md)."""
+    """Tool masks are right. If not, and a program found them, what looks like a missed tool is left out."""
 
 
 @dataclass(frozen=True)
