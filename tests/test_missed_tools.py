@@ -82,6 +82,8 @@ def phantom(tmp_path_factory):
     """(folder with true masks, folder whose masks were found and are empty in frame 3)."""
     true = tmp_path_factory.mktemp("doubt") / "true"
     write_phantom(true, PhantomConfig(frames=9, width=160, height=128, seed=4))
+    described = json.loads((true / "sequence.json").read_text())
+    (true / "sequence.json").write_text(json.dumps(described | {"sources": {"depth": "known"}}))
     found = true.with_name("found")
     shutil.copytree(true, found)
     save_png(found / "masks" / "000003.png", np.zeros((128, 160), np.uint8))
@@ -91,7 +93,7 @@ def phantom(tmp_path_factory):
 
 def test_found_masks_are_noted_beside_what_was_there(phantom):
     true, found = (json.loads((folder / "sequence.json").read_text()) for folder in phantom)
-    assert found.pop("sources") == true.pop("sources", {}) | {"masks": "tools found in 89% of the frames"}
+    assert found.pop("sources") == true.pop("sources") | {"masks": "tools found in 89% of the frames"}
     assert found == true
     assert [load_sequence(folder).masks_are_found for folder in phantom] == [False, True]
 

@@ -67,7 +67,7 @@ def missed_tools(
     body = (seed > 0) | (possible & (cv2.dilate(seed, disk(NEAR_PX)) > 0))
     tools = view & ~tissue_mask
     closed = filled(cv2.morphologyEx((body | tools).astype(np.uint8), cv2.MORPH_CLOSE, disk(GAP_PX)))
-    added = closed & tissue_mask & view & (cv2.dilate(body.astype(np.uint8), disk(GAP_PX)) > 0)
+    added = closed & tissue_mask & (cv2.dilate(body.astype(np.uint8), disk(GAP_PX)) > 0)
     added = cv2.morphologyEx(added.astype(np.uint8), cv2.MORPH_OPEN, disk(2)) > 0
     entering = entering_regions((added | tools).astype(np.uint8), view) & added
     return (cv2.dilate(entering.astype(np.uint8), disk(1)) > 0) & tissue_mask
