@@ -58,6 +58,7 @@ def scores(found, true):
     return (found & true).sum() / (found | true).sum(), (found & true).sum() / max(found.sum(), 1)
 
 
+@pytest.mark.slow
 def test_tools_of_the_phantom_are_found(phantom, model):
     images, true, depths, _ = phantom
     found = [model.find(image, VIEW, depth) for image, depth in zip(images, depths, strict=True)]
@@ -67,6 +68,7 @@ def test_tools_of_the_phantom_are_found(phantom, model):
     assert all(0.3 < tools.confidence <= 1 for tools in found)
 
 
+@pytest.mark.slow
 def test_masks_are_filled_regions(phantom, model):
     mask = model.find(phantom[0][0], VIEW).mask
     regions = cv2.connectedComponents(mask.astype(np.uint8))[0] - 1

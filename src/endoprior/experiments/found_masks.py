@@ -40,7 +40,7 @@ def write_found(sequence: FrameSequence, folder: Path) -> None:
     """
     own = set(sequence.mask_files)
     with whole_folder(folder) as temporary:
-        places = {file: temporary / file.relative_to(sequence.path) for file in sequence.files}
+        places = {file: temporary / file.relative_to(sequence.path).as_posix() for file in sequence.files}
         for file, place in places.items():
             place.parent.mkdir(parents=True, exist_ok=True)
             if file not in own:
