@@ -62,7 +62,7 @@ HELP = Help(
     ),
     basics={
         "method": ("--preset", "--config", "--seed"),
-        "what to train on": ("--data.first-frames", "--data.shrink", "--trust-masks"),
+        "what to train on": ("--data.first-frames", "--data.shrink"),
         "how long": ("--iterations", "--resume"),
         "how large": ("--gaussians",),
         "where it runs": ("--device",),
