@@ -111,6 +111,15 @@ def test_pixels_of_a_missed_tool_do_not_count(phantom):
     assert MaskDoubt(sequence).counted(frame, frame.rgb) is frame
 
 
+def test_frames_of_half_and_full_resolution_share_what_is_surely_tissue(tmp_path):
+    write_phantom(tmp_path, PhantomConfig(frames=3, width=328, height=213))  # 104 and 103 rows of 160 px
+    sequence = load_sequence(tmp_path).training_view()
+    frames, doubt = Trainer(sequence, tiny_config("basis")).step_once.frames, MaskDoubt(sequence)
+    for half in (True, False):
+        frame = frames.frame(0, half=half)
+        assert doubt.counted(frame, frame.rgb) is frame
+
+
 @pytest.mark.parametrize(("which", "trust", "doubts"), [(1, False, True), (1, True, False), (0, False, False)])
 def test_only_found_masks_that_are_not_trusted_are_doubted(phantom, which, trust, doubts):
     cfg = tiny_config("basis").replace({"trust_masks": trust})

@@ -39,30 +39,34 @@ class MaskDoubt:
         Args:
             color: (H, W, 3) the rendered frame, in [0, 1].
         """
-        rendered, target = _resized(color.detach().cpu().numpy()), _resized(frame.rgb.cpu().numpy())
-        mask = frame.tissue_mask.cpu().numpy()
-        size = rendered.shape[1::-1]
-        tissue, view = (
-            cv2.resize(x.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for x in (mask, self._view)
-        )
+        mask, size = frame.tissue_mask.cpu().numpy(), self._size(WORK_PX)
+        rendered, target = (_resized(x.detach().cpu().numpy(), size) for x in (color, frame.rgb))
+        tissue, view = (_resized_mask(x, size) for x in (mask, self._view))
         surely_tissue = self._tissue.get(frame.index, lambda: self._surely_tissue(frame.index, size))
         missed = missed_tools(rendered, target, tissue, view, surely_tissue)
         if not missed.any():
             return frame
-        large = cv2.resize(missed.astype(np.uint8), mask.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
-        keep = torch.from_numpy(~large).to(frame.tissue_mask.device)
+        keep = torch.from_numpy(~_resized_mask(missed, mask.shape[::-1])).to(frame.tissue_mask.device)
         measured = frame.measured & keep
         return replace(frame, tissue_mask=frame.tissue_mask & keep, measured=measured, num_measured=int(measured.sum()))
 
     def _surely_tissue(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_]:
         """(h, w) True where the color of the frame is surely that of tissue; `size` is (w, h)."""
-        rgb_u8 = _resized(self._sequence.frame(index).rgb_u8, FEATURES_PX)
-        view = cv2.resize(self._view.astype(np.uint8), rgb_u8.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
-        return cv2.resize(first_guess(rgb_u8, view, self._clip), size, interpolation=cv2.INTER_AREA) < SURELY_TISSUE
+        features_size = self._size(FEATURES_PX)
+        rgb_u8 = _resized(self._sequence.frame(index).rgb_u8, features_size)
+        guess = first_guess(rgb_u8, _resized_mask(self._view, features_size), self._clip)
+        return cv2.resize(guess, size, interpolation=cv2.INTER_AREA) < SURELY_TISSUE
+
+    def _size(self, longer_px: int) -> tuple[int, int]:
+        """(w, h) with that longer side: one for a frame at full and at half resolution, which round differently."""
+        height, width = self._view.shape
+        scale = longer_px / max(height, width)
+        return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _resized(image: NDArray, longer_px: int = WORK_PX) -> NDArray:
-    """`image` with its longer side resized to `longer_px`."""
-    scale = longer_px / max(image.shape[:2])
-    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+def _resized(image: NDArray, size: tuple[int, int]) -> NDArray:
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR)
+
+
+def _resized_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
