@@ -34,8 +34,9 @@ UNSURE_RIM_PX = 6
 MISSED_PX = 12
 """Near a given mask, pixels up to this distance may be a part that it misses."""
 STEPS = 150
-"""Training steps of the network. With 72 the tools of a phantom are hardly above the threshold, with 48 below it; with
-200 the end of the fast tool of `mono_endo` is covered better, but a preview takes over a minute; with 300 more tissue is taken (docs/log.md)."""
+"""Training steps of the network. With 72 the tools of a phantom are hardly above the threshold, with 48 below it. With
+200 the end of the fast tool of `mono_endo` is covered better, but a preview takes over a minute; with 300 more tissue
+is taken (docs/log.md)."""
 GUESS_WEIGHT = 0.3
 """Weight of the first guess beside the network, which sees half of the resolution: it sharpens the outlines."""
 SHINE = (0.6, 0.8)
