@@ -8,7 +8,7 @@ import pytest
 
 from endoprior.data.images import read_color, read_depth, read_tool_mask
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.tool_masks import ToolSample, fit_tools
+from endoprior.tool_masks import FoundTools, ToolSample, fit_tools
 from endoprior.tool_masks.attachment import attachment_log_odds, color_cells, independence
 from endoprior.tool_masks.colors import ClipColors, first_guess
 from endoprior.tool_masks.regions import entering_regions
@@ -106,6 +106,12 @@ def test_equal_samples_give_equal_masks_inside_the_view(phantom, monkeypatch):
     for one, other in zip(first, second, strict=True):
         assert (one.mask == other.mask).all() and one.confidence == other.confidence
         assert not (one.mask & ~view).any()
+
+
+def test_masks_of_low_confidence_are_uncertain_and_empty_ones_are_not():
+    tool, none = np.ones((4, 4), bool), np.zeros((4, 4), bool)
+    expected = [(tool, 0.49, True), (tool, 0.51, False), (none, 0.1, False)]
+    assert [FoundTools(mask, confidence).uncertain for mask, confidence, _ in expected] == [e for *_, e in expected]
 
 
 def test_gray_clips_and_empty_views_give_empty_masks():

@@ -16,8 +16,6 @@ from .help_page import Help
 from .parsing import parse
 from .progress import Counting
 
-UNCERTAIN = 0.5
-"""Frames of a lower confidence are listed."""
 SHEET, SHARES = "tool_masks.png", "tool_masks.json"
 SHOWN, COLUMNS = 24, 6
 """Number of frames on the sheet, and of its columns."""
@@ -55,11 +53,13 @@ def run(argv: list[str]) -> None:
 
     sequence = load_sequence(args.data, DataConfig())
     shown = set(spread(len(sequence), SHOWN))
-    masks, rows, pictures = {}, [], []
+    masks, rows, pictures, uncertain = {}, [], [], []
     with Counting() as progress:
         for i, (mask, found) in enumerate(find_in_sequence(sequence, refine=args.refine, progress=progress)):
             masks[i], share = mask, float(found.mask.mean())
             rows.append({"frame": i, "share": share, "confidence": found.confidence})
+            if found.uncertain:
+                uncertain.append(i)
             if i in shown:
                 pictures.append((sequence.frame(i).rgb_u8, found.mask, f"{i}: {share:.1%}"))
     replace_masks(sequence, masks)
@@ -68,6 +68,6 @@ def run(argv: list[str]) -> None:
     with_tools = [row for row in rows if row["share"]]
     note_found_masks(args.data, len(with_tools) / len(rows))
     say(f"tools in {len(with_tools)} of {len(rows)} frames, at most {max(row['share'] for row in rows):.1%} of a frame")
-    if uncertain := [row["frame"] for row in with_tools if row["confidence"] < UNCERTAIN]:
+    if uncertain:
         say(f"uncertain: frames {number_ranges(uncertain)}")
     say(f"look at {args.data / SHEET}; correct masks: {command('view', args.data)}")

@@ -207,6 +207,9 @@ def _tools(
         model = fit_tools(tool_samples)
         source = f"{TOOLS_FOUND} in {model.detected_share:.0%} of the samples"
         hint = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
+        if unsure := sum(found.uncertain for found in model.in_samples):
+            doubt = f"Unsure in {unsure} of {len(model.in_samples)} samples"
+            hint = f"{doubt}: `endoprior masks DATA` lists such frames. {hint}"
         if not model.detected_share:
             source = f"no {TOOLS_FOUND}"
             hint = "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."

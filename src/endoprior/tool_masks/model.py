@@ -43,6 +43,8 @@ SHINE = (0.6, 0.8)
 """Range of the smallest channel over which a pixel changes from surface color to pure highlight."""
 RIM_PX = 1
 """The mask is dilated by this much to cover mixed pixels at the tool's edge."""
+UNCERTAIN = 0.5
+"""Masks of a lower confidence should be looked at."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,11 @@ class FoundTools:
     """0..1: how far the probabilities of all pixels that may be a tool are from one half, on average; 1 if there are
     none."""
 
+    @property
+    def uncertain(self) -> bool:
+        """Whether the mask should be looked at."""
+        return bool(self.mask.any()) and self.confidence < UNCERTAIN
+
 
 @dataclass(frozen=True)
 class ToolModel:
@@ -83,8 +90,13 @@ class ToolModel:
     """(cells,) log-odds of the cells of `color_cells`, from motion."""
     relief: NDArray[np.float32] | None
     """(cells,) log-odds of `relief_cells`; None without depth."""
-    detected_share: float
-    """Share of the samples in which a tool was found, 0..1."""
+    in_samples: tuple[FoundTools, ...]
+    """The tools of each sample whose view is not empty, at the size that the model works on; none for a gray clip."""
+
+    @property
+    def detected_share(self) -> float:
+        """Share of the samples in which a tool was found, 0..1."""
+        return sum(bool(found.mask.any()) for found in self.in_samples) / max(len(self.in_samples), 1)
 
     def find(
         self, rgb_u8: NDArray[np.uint8], view: NDArray[np.bool_], depth: NDArray[np.float32] | None = None
@@ -103,13 +115,10 @@ class ToolModel:
             return FoundTools(np.zeros_like(view), 1.0)
         work = _work_sample(ToolSample(rgb_u8, view, None, depth))
         guess = first_guess(work.rgb_u8, work.view, self.clip) + self.attachment[color_cells(work.rgb_u8, self.clip)]
-        probability = _probability(self.network, guess, self.relief, work, self.clip)
-        found = tool_regions(probability, work.view)
-        wide = cv2.dilate(found.astype(np.uint8), disk(RIM_PX))
+        found = _found(_probability(self.network, guess, self.relief, work, self.clip), work.view)
+        wide = cv2.dilate(found.mask.astype(np.uint8), disk(RIM_PX))
         large = cv2.resize(wide.astype(np.float32), view.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        maybe = probability[found | (probability > UNSURE)]
-        confidence = float(np.abs(2 * maybe - 1).mean()) if maybe.size else 1.0
-        return FoundTools((large > 0.5) & view, confidence)
+        return FoundTools((large > 0.5) & view, found.confidence)
 
 
 def fit_tools(samples: Sequence[ToolSample], seed: int = 0) -> ToolModel:
@@ -126,7 +135,7 @@ def fit_tools(samples: Sequence[ToolSample], seed: int = 0) -> ToolModel:
     clip = ClipColors.of([sample.rgb_u8 for sample in work], [sample.view for sample in work])
     usable = [sample for sample in work if sample.view.any()]
     if not usable or clip.redness < LEAST_REDNESS:
-        return ToolModel(clip, None, np.zeros(0, np.float32), None, 0.0)
+        return ToolModel(clip, None, np.zeros(0, np.float32), None, ())
     colors = [first_guess(sample.rgb_u8, sample.view, clip) for sample in usable]
     cells = [color_cells(sample.rgb_u8, clip) for sample in usable]
     attachment = _attachment(usable, colors, cells)
@@ -134,13 +143,18 @@ def fit_tools(samples: Sequence[ToolSample], seed: int = 0) -> ToolModel:
     backgrounds = [_background(sample, guess, clip) for sample, guess in zip(usable, guesses, strict=True)]
     network = train_network(backgrounds, clip, STEPS, seed)
     tools = [
-        tool_regions(_probability(network, guess, None, sample, clip), sample.view)
+        _found(_probability(network, guess, None, sample, clip), sample.view)
         for sample, guess in zip(usable, guesses, strict=True)
     ]
-    measured = [(s.depth, tool, s.view) for s, tool in zip(usable, tools, strict=True) if s.depth is not None]
-    return ToolModel(
-        clip, network, attachment, relief_log_odds(measured), sum(tool.any() for tool in tools) / len(samples)
-    )
+    measured = [(s.depth, tool.mask, s.view) for s, tool in zip(usable, tools, strict=True) if s.depth is not None]
+    return ToolModel(clip, network, attachment, relief_log_odds(measured), tuple(tools))
+
+
+def _found(probability: NDArray[np.float32], view: NDArray[np.bool_]) -> FoundTools:
+    """The tools of one frame, from the probability (h, w) of each pixel."""
+    mask = tool_regions(probability, view)
+    maybe = probability[mask | (probability > UNSURE)]
+    return FoundTools(mask, float(np.abs(2 * maybe - 1).mean()) if maybe.size else 1.0)
 
 
 def _work_sample(sample: ToolSample) -> ToolSample:
