@@ -76,6 +76,8 @@ def test_references_stand_beside_the_score_that_they_belong_to():
     scores = {"track_delta_avg": 0.9, "track_delta_avg_dis": 0.8, "track_delta_avg_still": 0.25, "track_error_mm": 1.0}
     table = score_table(scores, {})
     assert [line.split("  ")[-1] for line in table] == ["0 follows the tissue", "chained flow 0.800, no motion 0.250"]
+    flow = score_table({"flow_error": 1.0, "flow_error_dis": 2.0}, {})  # two scores, not a score and its reference
+    assert not any("chained flow" in line for line in flow)
     every = score_table(dict.fromkeys(OF_SCENES, 12.3456), {})
     assert all(len(line) <= 90 for line in every)
 

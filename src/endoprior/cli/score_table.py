@@ -38,7 +38,9 @@ def _summary(names: Mapping[str, object]) -> list[Score]:
 
 
 def _references(score: Score, scores: Mapping[str, float]) -> str:
-    """What chained optical flow and no motion score, where that is known."""
+    """What chained optical flow and no motion score, for scores of tracks."""
+    if f"{score.name}_still" not in scores:
+        return ""
     known = {what: scores.get(f"{score.name}_{end}") for end, what in (("dis", "chained flow"), ("still", "no motion"))}
     return ", ".join(f"{what} {value:,.{score.digits}f}" for what, value in known.items() if value is not None)
 
