@@ -14,7 +14,7 @@ from endoprior.data import FrameSequence, load_sequence
 from endoprior.data.truth import Tracks
 from endoprior.evaluation.metrics import ScoreUnavailable, track_accuracy
 from endoprior.evaluation.predicted_tracks import PredictedTracks, by_chained_flow, true_tracks, without_motion
-from endoprior.evaluation.scorers.tracks import near_tool, seen_again, track_scores
+from endoprior.evaluation.scorers.tracks import near_tool, parts_of, seen_again, track_scores
 from endoprior.phantom import PhantomConfig, write_phantom
 
 WIDTH, HEIGHT, NUM_FRAMES, DEPTH, FOCAL = 160, 128, 6, 50.0, 200.0
@@ -103,6 +103,11 @@ def moving_plane(
     return sequence
 
 
+def scored(predicted: PredictedTracks, true, sequence: FrameSequence) -> dict[str, float]:
+    """All scores of a prediction."""
+    return track_scores(predicted, true, parts_of(true, sequence), sequence.camera(0))
+
+
 def perfect(true) -> PredictedTracks:
     """The truth as a prediction."""
     return PredictedTracks(true.points, true.pixels, true.visible)
@@ -118,7 +123,7 @@ def phantom(tmp_path_factory):
 
 def test_true_tracks_as_predictions_are_perfect(phantom):
     true = true_tracks(phantom)
-    scores = track_scores(perfect(true), true, phantom)
+    scores = scored(perfect(true), true, phantom)
     shares = {"track_delta_avg", "track_average_jaccard", "track_occlusion_accuracy"}
     assert {name: scores[name] for name in shares} == dict.fromkeys(shares, 1.0)
     assert all(value == 0 for name, value in scores.items() if name not in shares), scores
@@ -127,7 +132,7 @@ def test_true_tracks_as_predictions_are_perfect(phantom):
 def test_an_offset_is_the_error_of_every_part(phantom):
     true = true_tracks(phantom)
     moved = PredictedTracks(true.points + np.array([0, 3, 4]), true.pixels + np.array([6, 8]), true.visible)
-    scores = track_scores(moved, true, phantom)
+    scores = scored(moved, true, phantom)
     for name in ("", "_after_hidden", "_near_tool", "_pulled", "_smooth"):
         assert scores[f"track_error{name}_mm"] == pytest.approx(5)
     assert scores["track_error_median_px"] == scores["track_error_p90_px"] == pytest.approx(10)
@@ -137,7 +142,7 @@ def test_an_offset_is_the_error_of_every_part(phantom):
 def test_points_behind_the_camera_are_infinitely_far():
     true = true_tracks(moving_plane(1.0))
     lost = PredictedTracks(-true.points, np.full_like(true.pixels, np.inf), ~true.visible)
-    scores = track_scores(lost, true, moving_plane(1.0))
+    scores = scored(lost, true, moving_plane(1.0))
     assert (scores["track_delta_avg"], scores["track_average_jaccard"]) == (0, 0)
     assert scores["track_error_median_px"] == scores["track_error_p90_px"] == np.inf
     assert np.isnan(scores["track_error_px"]) and np.isnan(scores["track_error_pulled_mm"])
@@ -171,14 +176,14 @@ def test_near_the_tool_is_forty_px_of_an_image_640_px_wide():
 def test_no_motion_of_static_tissue_is_perfect():
     sequence = moving_plane(0.0, tool=slice(80, 95))
     true = true_tracks(sequence)
-    scores = track_scores(without_motion(true, sequence), true, sequence)
+    scores = scored(without_motion(true, sequence), true, sequence)
     assert scores["track_error_mm"] == pytest.approx(0, abs=1e-6) and scores["track_average_jaccard"] == 1
 
 
 def test_no_motion_errs_by_the_motion():
     sequence = moving_plane(4.0)
     true = true_tracks(sequence)
-    scores = track_scores(without_motion(true, sequence), true, sequence)
+    scores = scored(without_motion(true, sequence), true, sequence)
     steps = np.arange(1, NUM_FRAMES) * 4.0
     assert scores["track_error_px"] == pytest.approx(steps.mean(), rel=1e-5)
     assert scores["track_error_mm"] == pytest.approx(steps.mean() * DEPTH / FOCAL, rel=1e-5)
@@ -191,7 +196,7 @@ def test_chained_flow_follows_a_moving_plane():
     tracks = by_chained_flow(true, sequence)
     np.testing.assert_allclose(tracks.pixels, true.pixels, atol=0.5)
     np.testing.assert_allclose(tracks.points, true.points, atol=0.5 * DEPTH / FOCAL)
-    scores = track_scores(tracks, true, sequence)
+    scores = scored(tracks, true, sequence)
     assert scores["track_average_jaccard"] == 1 and scores["track_error_px"] < 0.5
 
 

@@ -8,7 +8,7 @@ the same scores of chained optical flow and of no motion.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import cv2
@@ -127,6 +127,8 @@ WHY_NOT = {
     "track_error_smooth_mm": "the truth has no such region",
 }
 NO_TRACKS = "no track is visible in two frames"
+NO_PAIRS = "no two neighbors are visible together"
+BEHIND = "a point is predicted behind the camera"
 
 
 def compute(context: EvaluationContext) -> None:
@@ -142,6 +144,7 @@ def compute(context: EvaluationContext) -> None:
         for score in (*ACCURACY, *BREAKS):
             context.skip(score.name, NO_TRACKS)
         return
+    parts, camera = parts_of(true, sequence), sequence.camera(0)
     predictions: dict[str, Callable[[], PredictedTracks]] = {
         "": lambda: by_scene(scene, true, sequence),
         "_dis": lambda: by_chained_flow(true, sequence),
@@ -150,8 +153,8 @@ def compute(context: EvaluationContext) -> None:
     for end, predict in predictions.items():
         with context.skip_if_unavailable(*(score.name + end for score in ACCURACY)):
             predicted = predict()
-            for name, value in track_scores(predicted, true, sequence).items():
-                context.add(name + end, value, WHY_NOT.get(name, NO_TRACKS))
+            for name, value in track_scores(predicted, true, parts, camera).items():
+                context.add(name + end, value, WHY_NOT.get(name, BEHIND))
             if not end:
                 add_breaks(context, predicted, true)
 
@@ -159,33 +162,43 @@ def compute(context: EvaluationContext) -> None:
 def add_breaks(context: EvaluationContext, predicted: PredictedTracks, true: TrueTracks) -> None:
     """Add folds and tears between neighboring points."""
     rates = metrics.neighbor_breaks(predicted.points, true.points, true.visible & true.counted, true.first)
-    context.add("track_fold_rate", rates.fold, NO_TRACKS)
-    context.add("track_tear_rate", rates.tear, NO_TRACKS)
+    context.add("track_fold_rate", rates.fold, NO_PAIRS)
+    context.add("track_tear_rate", rates.tear, NO_PAIRS)
 
 
-def track_scores(predicted: PredictedTracks, true: TrueTracks, sequence: FrameSequence) -> dict[str, float]:
-    """Every score of `ACCURACY` by name; NaN where nothing counts, infinite for predictions without an image."""
+def track_scores(
+    predicted: PredictedTracks, true: TrueTracks, parts: Mapping[str, NDArray[np.bool_]], camera: Camera
+) -> dict[str, float]:
+    """Every score of `ACCURACY` by name; NaN where nothing counts, infinite for predictions without an image.
+
+    Args:
+        parts: by `parts_of`. camera: intrinsics of the frames.
+    """
     visible = true.visible & true.counted
-
-    def error(chosen: NDArray[np.bool_]) -> metrics.TrackError:
-        return metrics.track_error(predicted.points, true.points, visible & chosen, sequence.camera(0))
-
     # A hidden truth may lie behind the camera: its distance does not count.
     distance = np.linalg.norm(predicted.pixels - np.where(np.isfinite(true.pixels), true.pixels, 0), axis=-1)
-    overall, accuracy = error(visible), metrics.track_accuracy(distance, predicted.visible, true.visible, true.counted)
+    error = metrics.track_error(predicted.points, true.points, visible, camera)
+    of_parts = {
+        f"track_error_{part}_mm": metrics.track_error(predicted.points, true.points, visible & chosen, camera).mm
+        for part, chosen in parts.items()
+    }
+    accuracy = metrics.track_accuracy(distance, predicted.visible, true.visible, true.counted)
     return {
-        "track_error_mm": overall.mm,
-        "track_error_px": overall.px,
+        "track_error_mm": error.mm,
+        "track_error_px": error.px,
         "track_error_median_px": _quantile(distance[visible], 0.5),
         "track_error_p90_px": _quantile(distance[visible], 0.9),
-        "track_error_after_hidden_mm": error(seen_again(true)).mm,
-        "track_error_near_tool_mm": error(near_tool(true, sequence)).mm,
-        "track_error_pulled_mm": error(_in_region(true, "pulled")).mm,
-        "track_error_smooth_mm": error(_in_region(true, "smooth")).mm,
-        "track_delta_avg": accuracy.delta_avg,
-        "track_average_jaccard": accuracy.average_jaccard,
-        "track_occlusion_accuracy": accuracy.occlusion_accuracy,
+        **of_parts,
+        **{f"track_{name}": value for name, value in accuracy._asdict().items()},
     }
+
+
+def parts_of(true: TrueTracks, sequence: FrameSequence) -> dict[str, NDArray[np.bool_]]:
+    """(T, P) points that the error of each part is over."""
+    nowhere = np.zeros(true.visible.shape[1], "U1")
+    region = nowhere if true.region is None else true.region
+    regions = {name: np.broadcast_to(region == name, true.visible.shape) for name in ("pulled", "smooth")}
+    return {"after_hidden": seen_again(true), "near_tool": near_tool(true, sequence), **regions}
 
 
 def seen_again(true: TrueTracks) -> NDArray[np.bool_]:
@@ -209,12 +222,6 @@ def _near_tool(frame: Frame) -> NDArray[np.bool_]:
     """(H, W) pixels within `NEAR_TOOL_PX` of the tool mask, which is not empty."""
     distance = cv2.distanceTransform(frame.tissue_mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return distance <= NEAR_TOOL_PX * frame.camera.width / 640
-
-
-def _in_region(true: TrueTracks, name: str) -> NDArray[np.bool_]:
-    """(T, P) points of a region; none if the truth names no regions."""
-    chosen = np.zeros(true.visible.shape[1], bool) if true.region is None else true.region == name
-    return np.broadcast_to(chosen, true.visible.shape)
 
 
 def _quantile(values: NDArray[np.floating], share: float) -> float:
