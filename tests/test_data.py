@@ -255,7 +255,7 @@ def test_truth_is_read_when_asked_for(tiny_sequence):
     seq = load_sequence(tiny_sequence)
     assert (seq.truth.tissue(2) == (3, 2, 1)).all() and (seq.truth.depth(2) == 61.5).all()
     np.testing.assert_array_equal(seq.truth.tracks.points, points.astype(np.float32))
-    assert seq.truth.tracks.visible.dtype == bool
+    assert seq.truth.tracks.visible.dtype == bool and seq.truth.tracks.region is None
     with pytest.raises(InputError, match=r"depth.*000003\.npy: expected"):
         seq.truth.depth(3)
 
@@ -268,6 +268,7 @@ def test_truth_is_read_when_asked_for(tiny_sequence):
         ({"points": np.zeros((2, 5, 3)), "visible": np.ones((2, 4))}, "with T = 2"),
         ({"points": np.zeros((2, 4, 3)), "visible": np.ones(2)}, "with T = 2"),
         ({"points": np.array([None])}, "a NumPy file"),
+        ({"points": np.zeros((2, 4, 3)), "visible": np.ones((2, 4)), "region": ["smooth"] * 3}, "region of shape"),
     ],
 )
 def test_wrong_tracks_are_rejected(tmp_path, arrays, words):

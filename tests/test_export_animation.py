@@ -15,9 +15,9 @@ from pygltflib import GLTF2, Accessor
 from endoprior.cli import main
 from endoprior.export.axes import points_in_axes
 from endoprior.export.mesh import Mesh, depth_grid
-from endoprior.export.surface import render_surface
 from endoprior.model.carry import carry_points
 from endoprior.model.scene import Scene, load_scene
+from endoprior.model.surface import render_surface
 
 TIMES = (0.1, 0.2, 0.6, 0.9)
 SECONDS = (0.04, 0.08, 0.24, 0.36)  # ten frames at 25 per second

@@ -22,10 +22,10 @@ from endoprior.core.geometry import project
 from endoprior.export.axes import points_in_axes
 from endoprior.export.depth import depth_png
 from endoprior.export.formats import FORMATS, formats_of, load_format
-from endoprior.export.surface import Surface, render_surface
-from endoprior.export.tracks import grid_query_points, project_visible
+from endoprior.export.tracks import grid_query_points
 from endoprior.model.carry import carry_points
 from endoprior.model.scene import load_scene
+from endoprior.model.surface import Surface, project_visible, render_surface
 from endoprior.render import sh
 
 

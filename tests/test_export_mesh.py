@@ -14,8 +14,8 @@ from endoprior.core.checks import InputError
 from endoprior.core.types import Camera
 from endoprior.export.mesh import depth_grid
 from endoprior.export.mesh_files import encode_mesh
-from endoprior.export.surface import Surface, render_surface
 from endoprior.export.tsdf import fused_mesh, viewpoints
+from endoprior.model.surface import Surface, render_surface
 
 CENTER, RADIUS = np.array([1.0, -2.0, 70.0]), 20.0
 

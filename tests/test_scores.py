@@ -10,6 +10,8 @@ from endoprior.evaluation.registry import all_scores, scorers
 PAGE = Path(__file__).parents[1] / "docs" / "scores.md"
 OF_MASKS = {name: score for name, score in all_scores().items() if score.group == "masks"}
 OF_SCENES = {name: score for name, score in all_scores().items() if score.group != "masks"}
+LISTED = {n: s for n, s in OF_SCENES.items() if not (n.startswith("track_") and n.endswith(("_dis", "_still")))}
+"""Scores of a scene with a row of their own; the page says of all others together what they are."""
 BETTER = {True: "higher", False: "lower", None: "-"}
 
 
@@ -18,7 +20,7 @@ def test_every_score_has_one_scorer():
     assert len(names) == len(set(names)) == len(OF_SCENES) and len(all_scores()) == len(OF_SCENES) + len(OF_MASKS)
 
 
-@pytest.mark.parametrize("scores", [OF_SCENES, OF_MASKS], ids=["of a scene", "of masks"])
+@pytest.mark.parametrize("scores", [LISTED, OF_MASKS], ids=["of a scene", "of masks"])
 def test_the_page_lists_every_score(scores):
     rows = [
         f"| `{s.name}` | {s.label} | {s.unit or '-'} | {BETTER[s.higher_is_better]} | {s.description} "
@@ -68,3 +70,21 @@ def test_lengths_of_relative_depth_are_not_called_mm():
     assert table[-1].startswith("  rel.: the scale of the depth is unknown.")
     without = score_table({"psnr": 30.0, "ssim": 0.9, "flow_error_dis": 1.0}, {}, relative=True)
     assert not any("rel." in line for line in without), "a note on lengths that the table does not have"
+
+
+def test_references_stand_beside_the_score_that_they_belong_to():
+    scores = {"track_delta_avg": 0.9, "track_delta_avg_dis": 0.8, "track_delta_avg_still": 0.25, "track_error_mm": 1.0}
+    table = score_table(scores, {})
+    assert [line.split("  ")[-1] for line in table] == ["0 follows the tissue", "chained flow 0.800, no motion 0.250"]
+    flow = score_table({"flow_error": 1.0, "flow_error_dis": 2.0}, {})  # two scores, not a score and its reference
+    assert not any("chained flow" in line for line in flow)
+    every = score_table(dict.fromkeys(OF_SCENES, 12.3456), {})
+    assert all(len(line) <= 90 for line in every)
+
+
+def test_tracks_have_both_references():
+    for name in ("track_delta_avg", "track_average_jaccard", "track_occlusion_accuracy", "track_error_after_hidden_mm"):
+        for end in ("dis", "still"):
+            reference, score = all_scores()[f"{name}_{end}"], all_scores()[name]
+            assert (reference.unit, reference.higher_is_better) == (score.unit, score.higher_is_better)
+            assert score.in_summary and not reference.in_summary

@@ -16,6 +16,7 @@ from endoprior.core.geometry import back_project, bilinear, project
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
+from endoprior.footage.optical_flow import RETURN_PX, RETURN_SHARE
 from endoprior.initialization import flow_tracks as tracks
 from endoprior.initialization import track_kernels
 from endoprior.initialization.cleanup import PointCloud
@@ -99,7 +100,7 @@ def advanced(start: np.ndarray, there: np.ndarray, back: np.ndarray, tissue_mask
     """Pixels one frame on, all points active."""
     out = np.full_like(start, 7.0)
     active = np.ones(len(start), bool)
-    track_kernels.advance(start, active, there, back, tissue_mask, tracks.RETURN_PX, tracks.RETURN_SHARE, out)
+    track_kernels.advance(start, active, there, back, tissue_mask, RETURN_PX, RETURN_SHARE, out)
     return out
 
 

@@ -24,7 +24,8 @@ def score_table(scores: Mapping[str, float], skipped: Mapping[str, str], relativ
         for score in _summary(scores):
             if score.group == group:
                 value = score.text(scores[score.name], relative)
-                line = LINE.format(group=title, label=score.label, value=value, arrow=score.arrow, hint=score.hint)
+                hint = _references(score, scores) or score.hint
+                line = LINE.format(group=title, label=score.label, value=value, arrow=score.arrow, hint=hint)
                 lines.append(line.rstrip())
                 title = ""
     if relative and any(score.is_length for score in _summary(scores)):
@@ -34,6 +35,14 @@ def score_table(scores: Mapping[str, float], skipped: Mapping[str, str], relativ
 
 def _summary(names: Mapping[str, object]) -> list[Score]:
     return [score for name, score in all_scores().items() if name in names and score.in_summary]
+
+
+def _references(score: Score, scores: Mapping[str, float]) -> str:
+    """What chained optical flow and no motion score, for scores of tracks."""
+    if f"{score.name}_still" not in scores:
+        return ""
+    known = {what: scores.get(f"{score.name}_{end}") for end, what in (("dis", "chained flow"), ("still", "no motion"))}
+    return ", ".join(f"{what} {value:,.{score.digits}f}" for what, value in known.items() if value is not None)
 
 
 def _not_computed(skipped: Mapping[str, str]) -> list[str]:

@@ -26,6 +26,8 @@ class Tracks:
     """(T, P) True where the point is in the image and not occluded."""
     paired: bool = True
     """False if points of the first and the last frame are not matched, as in STIR: each is visible once."""
+    region: NDArray[np.str_] | None = None
+    """(P,) part of the tissue each point lies in, such as `pulled` or `smooth`; None if unknown."""
 
 
 class Truth:
@@ -57,10 +59,13 @@ class Truth:
             got = ", ".join(stored) if isinstance(stored, dict) else "one array"
             raise input_error(path, "arrays points and visible", got, "write the truth again.")
         points, visible = np.asarray(stored["points"], np.float32), np.asarray(stored["visible"], bool)
-        tracks = Tracks(points, visible, bool(stored.get("paired", True)))
+        region = np.asarray(stored["region"], str) if "region" in stored else None
+        tracks = Tracks(points, visible, bool(stored.get("paired", True)), region)
         frames, count = tracks.visible.shape if tracks.visible.ndim == 2 else (-1, -1)
         if frames != len(self._names) or tracks.points.shape != (frames, count, 3):
             got = f"{tracks.points.shape} and {tracks.visible.shape}"
             want = f"shapes (T, P, 3) and (T, P) with T = {len(self._names)}"
             raise input_error(path, want, got, "write the truth again.")
+        if region is not None and region.shape != (count,):
+            raise input_error(path, f"a region of shape ({count},)", f"{region.shape}", "write the truth again.")
         return tracks

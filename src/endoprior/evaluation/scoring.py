@@ -95,6 +95,7 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
         "depth_rmse_endogaussian": "8-bit depths that wrap, only to compare with that paper's tables",
         "depth": "sum of weight * z against measured depth on tissue, mean of per-frame RMSE; " + unit,
         "flow_error": "consecutive frames of the split; *_adjacent: all adjacent frames of the video",
+        "track_*": "all frames of the video; *_dis: optical flow chained over them, held-out frames included",
         "depth_instability_mm": "all adjacent frames of the video",
         "data_fingerprint": sequence.fingerprint(),
     }

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.scene import Scene
+from ..model.surface import render_surface
 from .formats import Format
 from .options import ExportOptions
-from .surface import render_surface
 from .time_steps import TimeStep
 
 PNG_STEPS_PER_MM = 100

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.geometry import back_project, length_unit, pixel_centers
 from ..model.scene import Scene
+from ..model.surface import Surface, render_surface
 from .axes import points_in_axes
 from .formats import TIME_STEP_OPTIONS, Format
 from .mesh_files import encode_mesh
 from .options import ExportOptions
-from .surface import Surface, render_surface
 from .time_steps import TimeStep
 from .tsdf import fused_mesh, viewpoints
 

@@ -12,18 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.geometry import back_project, bilinear, project
+from ..core.geometry import back_project
 from ..model.carry import carry_points
 from ..model.scene import Scene
+from ..model.surface import Surface, depth_at, project_visible, render_surface
 from ..system.atomic import whole_folder
 from .axes import points_in_axes
 from .formats import Format, Progress
 from .options import ExportOptions
-from .surface import Surface, render_surface
 
 COLUMNS = ("frame", "time", "point", "x", "y", "z", "u", "v", "visible")
-HIDDEN_SHARE = 0.02
-"""A point is hidden if it lies deeper than the rendered surface at its pixel by more than this share."""
 
 
 @dataclass(frozen=True)
@@ -104,16 +102,10 @@ def grid_query_points(surface: Surface, spacing: int) -> QueryPoints:
     rows, columns = (np.arange(spacing // 2, n, spacing) for n in surface.depth.shape)
     row, column = (part.ravel() for part in np.meshgrid(rows, columns, indexing="ij"))
     pixels = np.column_stack([column + 0.5, row + 0.5])
-    pixels = pixels[np.isfinite(_depth_at(surface, pixels))]
+    pixels = pixels[np.isfinite(depth_at(surface, pixels))]
     if not len(pixels):
         raise input_error("--grid-px", "a grid with points on tissue in the first frame", f"{spacing}", "lower it.")
     return QueryPoints(pixels, np.zeros(len(pixels), np.intp))
-
-
-def _depth_at(surface: Surface, pixels: NDArray) -> NDArray[np.float64]:
-    """(P,) depth between the pixel centers around; NaN where one of them shows no surface."""
-    depth = np.where(surface.depth > 0, surface.depth, np.nan).astype(np.float64)
-    return bilinear(depth, pixels)
 
 
 def _back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDArray[np.float64]:
@@ -123,7 +115,7 @@ def _back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDA
         own = queries.frames == frame
         camera = scene.cameras[frame]
         surface = render_surface(scene, frame / len(scene.cameras), camera, min_alpha)
-        depth = _depth_at(surface, queries.pixels[own])
+        depth = depth_at(surface, queries.pixels[own])
         if not np.isfinite(depth).all():
             point = np.flatnonzero(own)[np.flatnonzero(~np.isfinite(depth))[0]]
             x, y = queries.pixels[point]
@@ -131,15 +123,6 @@ def _back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDA
             raise input_error("--points", "pixels that show tissue", got, "move it.")
         positions[own] = back_project(queries.pixels[own], depth, camera)
     return positions
-
-
-def project_visible(points: NDArray, surface: Surface) -> tuple[NDArray, NDArray[np.bool_]]:
-    """(P, 2) pixels of world points (P, 3), and (P,) whether they are inside the image and not behind tissue."""
-    pixels, z = project(points.astype(np.float64), surface.camera)
-    inside = (z > 0) & (pixels >= 0).all(1) & (pixels <= (surface.camera.width, surface.camera.height)).all(1)
-    depth = _depth_at(surface, pixels)
-    with np.errstate(invalid="ignore"):  # NaN: no surface, so nothing is visible
-        return pixels, inside & (z <= depth * (1 + HIDDEN_SHARE))
 
 
 def _table(positions: NDArray, pixels: NDArray, visible: NDArray, times: list[float]) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.geometry import back_project, pixel_centers, project
 from ..core.types import Camera
-from .surface import Surface
+from ..model.surface import Surface
 
 TRUNCATION_VOXELS = 3.0
 """Distances to a surface are truncated at so many voxels, before and behind it."""

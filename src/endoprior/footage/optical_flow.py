@@ -12,6 +12,10 @@ MOTION_S = 0.1
 """Time between two frames that show how tissue moves, s: long enough for a breath to move it by a pixel."""
 HALVED_FROM_PX = 256
 """Frames with at least this shorter side are tracked at half size: four times faster, almost as accurate."""
+RETURN_PX, RETURN_SHARE = 1.0, 0.05
+"""A point is lost where forward and backward flow disagree by more than this, plus this share of the step."""
+FLOW_BYTES = 40
+"""Memory per pixel while the flow of a pair of frames is computed, bytes."""
 
 FlowPair = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Flow (h, w, 2) from a frame to the next and back, in px of the image it was computed on."""

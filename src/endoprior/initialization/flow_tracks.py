@@ -20,21 +20,25 @@ from numpy.typing import NDArray
 from ..core.config import BasisConfig
 from ..core.geometry import back_project, bilinear, project
 from ..core.types import Camera, Frame
-from ..footage.optical_flow import MIN_SIZE_PX, FlowPair, flow_pair, gray_for_flow
+from ..footage.optical_flow import (
+    FLOW_BYTES,
+    MIN_SIZE_PX,
+    RETURN_PX,
+    RETURN_SHARE,
+    FlowPair,
+    flow_pair,
+    gray_for_flow,
+)
 from ..model.basis import basis_weights
 from ..system.memory import BoundedCache, cache_bytes, workers
 from . import track_kernels as kernels
 from .cleanup import PointCloud
 from .sampling import has_surface
 
-RETURN_PX, RETURN_SHARE = 1.0, 0.05
-"""A point is lost where forward and backward flow disagree by more than this, plus this share of the step."""
 STATIC_MARGIN = 1.1
 """A point is static if its color error at the static position is at most this factor times that along its track."""
 BLUR_PX = 1.5
 """Standard deviation of the blur before colors are compared."""
-FLOW_BYTES = 40
-"""Memory per pixel while the flow of a pair of frames is computed, bytes."""
 FLOW_CHUNK = 16
 """Number of frame pairs whose flow is computed and cached together."""
 RIDGE = 1e-2

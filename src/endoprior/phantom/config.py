@@ -10,6 +10,9 @@ MOST_PIXELS = 3840 * 2160
 GB_PER_PIXEL = 1.3e-6
 """Memory for writing, measured at 1920x1080."""
 
+NARROW_PULL_MM = 15.0
+"""Up to this pull, mm, the moved neighborhood keeps its size; beyond, it grows in proportion, or tissue would fold."""
+
 
 def _require(name: str, value: float, low: float, high: float) -> None:
     """Raise InputError unless low <= value <= high (NaN fails)."""
@@ -44,7 +47,11 @@ class PhantomConfig:
     breathing_mm: float = 3.0
     """Peak-to-peak breathing motion of the tissue, mm, 0..8."""
     pull_mm: float = 12.0
-    """Distance by which the grasper pulls the tissue, mm, 0..15."""
+    """Distance by which the grasper pulls the tissue, mm, 0..30. Beyond 15 mm the pull is also wider."""
+    slide_mm: float = 0.0
+    """Distance the tissue slides to each side, mm: its rim leaves and returns. 0..12, less with a narrow view."""
+    smooth_share: float = 0.0
+    """Share of the tissue with hardly any texture, in patches, 0..0.9."""
     noise: float = 1.6
     """Standard deviation of the sensor noise at mid gray, in 8-bit levels, 0..20."""
     depth_noise_px: float = 0.16
@@ -62,7 +69,10 @@ class PhantomConfig:
             ("focal_per_width", 0.5, 1.4),
             ("frames_per_second", 0.1, 1000),
             ("breathing_mm", 0, 8),
-            ("pull_mm", 0, 15),
+            ("pull_mm", 0, 30),
+            # The material reaches beyond the image by a share of its width: a narrow view has less of it.
+            ("slide_mm", 0, min(12, 10.8 / self.focal_per_width) if self.focal_per_width > 0 else 12),
+            ("smooth_share", 0, 0.9),
             ("noise", 0, 20),
             ("depth_noise_px", 0, 2),
             ("tracks", 1, 20000),
@@ -75,6 +85,11 @@ class PhantomConfig:
         # With a principal point far off center, the image would extend beyond the modeled tissue.
         _require("principal_x", self.center[0], 0.35 * self.width, 0.65 * self.width)
         _require("principal_y", self.center[1], 0.35 * self.height, 0.65 * self.height)
+
+    @property
+    def has_regions(self) -> bool:
+        """Whether tracks say which region they are in; without these options, files are those of earlier versions."""
+        return self.slide_mm > 0 or self.smooth_share > 0 or self.pull_mm > NARROW_PULL_MM
 
     @property
     def focal(self) -> float:

@@ -18,7 +18,7 @@ from .raster import FAR, rasterize, vertex_normals
 from .sensor import develop, expose, exposure_gain, stereo_depth, vignette
 from .shading import shade
 from .surface import MARGIN, Plane, build_anatomy, build_plane, organs_at, soften
-from .texture import build_texture
+from .texture import build_texture, smooth_patches
 
 SUPERSAMPLE = 2
 """Image samples per pixel along each axis."""
@@ -74,7 +74,7 @@ def build_scene(cfg: PhantomConfig) -> Scene:
     spacing = float(np.diff(a[down // 2]).mean())
     height = soften(organs_at(anatomy, a, b).height, spacing, 0.7)
     texels = round(grown * 1.8 * cfg.width), round(grown * 1.8 * cfg.height)
-    texture = build_texture(plane, anatomy, *texels)
+    texture = build_texture(plane, anatomy, *texels, cfg.smooth_share)
     return Scene(cfg, plane, build_motion(cfg, plane, anatomy), a, b, height, texture)
 
 
@@ -114,6 +114,15 @@ def choose_tracks(scene: Scene) -> NDArray[np.int64]:
     return np.stack([rows[chosen], columns[chosen]], -1)
 
 
+def regions(scene: Scene, tracked: NDArray[np.int64]) -> NDArray[np.str_]:
+    """(P,) `pulled`: moved by at least half of a pull; else `smooth`: hardly any texture; else `spread`."""
+    share = scene.cfg.smooth_share
+    pulled = np.max([pull.weight(scene.a, scene.b) for pull in scene.motion.pulls], 0) >= 0.5
+    smooth = share > 0 and smooth_patches(scene.a, scene.b, scene.cfg.seed, share) > 0.5
+    names = np.where(pulled, "pulled", np.where(smooth, "smooth", "spread"))
+    return names[tracked[:, 0], tracked[:, 1]]
+
+
 def visible_points(
     points: NDArray, z: NDArray[np.float32], tool: NDArray[np.bool_], cfg: PhantomConfig
 ) -> NDArray[np.bool_]:
@@ -136,8 +145,9 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
 
     Beside the sequence (images, masks, depth, poses, `sequence.json`) it writes `truth/tissue/*.png` (the image
     without tools and without sensor noise), `truth/depth/*.npy` ((H, W) float32 z of the tool-free tissue, mm) and
-    `truth/tracks.npz` (`points` (T, P, 3) float32 mm in camera axes, `visible` (T, P) bool); with `cfg.stereo` also
-    `right/*.png` and `calibration.json`. Tools cast no shadow, so outside them an image is the truth plus noise.
+    `truth/tracks.npz` (`points` (T, P, 3) float32 mm in camera axes, `visible` (T, P) bool; with `cfg.has_regions`
+    also `region` (P,)); with `cfg.stereo` also `right/*.png` and `calibration.json`. Tools cast no shadow, so outside
+    them an image is the truth plus noise.
 
     Args:
         out: a new or empty folder; it appears when complete.
@@ -190,7 +200,10 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
             visible.append(visible_points(followed, z, mask, cfg))
             if progress is not None:
                 progress(index + 1, cfg.frames)
-        writer.write_arrays("truth/tracks.npz", points=np.stack(points).astype(np.float32), visible=np.stack(visible))
+        tracks = {"points": np.stack(points).astype(np.float32), "visible": np.stack(visible)}
+        if cfg.has_regions:
+            tracks["region"] = regions(scene, tracked)
+        writer.write_arrays("truth/tracks.npz", **tracks)
         if cfg.stereo:
             writer.write_json("calibration.json", _calibration(cfg))
 

@@ -1,4 +1,4 @@
-"""Motion of tissue and instruments: breathing, pulls by the grasper, paths of the instrument tips.
+"""Motion of tissue and instruments: breathing, sliding, pulls by the grasper, paths of the instrument tips.
 
 Every motion is a product of smooth functions of place and time (quintic steps, cosines, Gaussians), so that velocities
 are continuous. `phase` is time as a fraction of the sequence, in [0, 1].
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .config import PhantomConfig
+from .config import NARROW_PULL_MM, PhantomConfig
 from .surface import Anatomy, Plane, organs_at
 
 _BREATH_FRAMES = 40
@@ -40,6 +40,8 @@ class Pull:
     """Phase at which this cycle of approach, pull and release begins."""
     length: float
     """Its duration in phase."""
+    width: float = 1.0
+    """Factor of the size of the moved neighborhood."""
 
     def strength(self, phase: float) -> float:
         """0..1: how far the pull has gone."""
@@ -48,7 +50,7 @@ class Pull:
 
     def weight(self, a: NDArray, b: NDArray) -> NDArray:
         """(...,) share of the pull at plane points, 1 at its center."""
-        square = (a - self.center[0]) ** 2 + (b - self.center[1]) ** 2
+        square = ((a - self.center[0]) ** 2 + (b - self.center[1]) ** 2) / self.width**2
         narrow, wide = np.exp(-square / (2 * _NARROW_MM**2)), np.exp(-square / (2 * _WIDE_MM**2))
         return _NARROW_SHARE * narrow + (1 - _NARROW_SHARE) * wide
 
@@ -75,6 +77,7 @@ class Motion:
     anatomy: Anatomy
     frames: int
     breathing_mm: float
+    slide_mm: float
     pulls: tuple[Pull, ...]
     idles: NDArray[np.float64]
     """(cycles + 1, 3) positions (a, b, height) of the grasper between grasps, mm."""
@@ -92,6 +95,9 @@ class Motion:
         slide = 0.3 * self.breathing_mm * np.sin(cycle - lag - 0.5)
         reach = 1 + 0.25 * np.cos(0.035 * a + 0.9) * np.cos(0.03 * b - 0.4)
         moved = np.stack([0.35 * slide * reach, -slide * reach, swell * reach], -1)
+        if self.slide_mm > 0:
+            # To one side and then to the other in each cycle of a pull, which is strongest when the slide is at rest.
+            moved[..., 0] += self.side * self.slide_mm * np.sin(2 * np.pi * phase * len(self.pulls)) * reach
         for pull in self.pulls:
             strength = pull.strength(phase)
             if strength > 0:
@@ -143,7 +149,9 @@ def build_motion(cfg: PhantomConfig, plane: Plane, anatomy: Anatomy) -> Motion:
         if k < cycles:
             away = np.array([side * rng.uniform(0.3, 0.75), rng.uniform(-0.35, 0.35), rng.uniform(0.65, 0.9)])
             height = float(organs_at(anatomy, *center.reshape(2, 1, 1)).height[0, 0])
-            pulls.append(Pull(center, height, cfg.pull_mm * away / np.linalg.norm(away), k / cycles, 1 / cycles))
+            vector, width = cfg.pull_mm * away / np.linalg.norm(away), max(1.0, cfg.pull_mm / NARROW_PULL_MM)
+            pulls.append(Pull(center, height, vector, k / cycles, 1 / cycles, width))
     hover = [-side * rng.uniform(17, 24), rng.uniform(8, 14), rng.uniform(21, 25)]
     hover += [rng.uniform(5, 9), rng.uniform(4, 7), rng.uniform(0, 6.3)]
-    return Motion(plane, anatomy, cfg.frames, cfg.breathing_mm, tuple(pulls), np.array(idles), np.array(hover), side)
+    motion = cfg.breathing_mm, cfg.slide_mm, tuple(pulls), np.array(idles), np.array(hover), side
+    return Motion(plane, anatomy, cfg.frames, *motion)

@@ -16,6 +16,10 @@ from .vessels import vessel_maps
 CHANNELS = 7
 """Red, green, blue (linear albedo in [0, 1]), relief slope along a and b, wetness and openness in [0, 1]."""
 
+SMOOTHED = 0.92
+"""Share of the color detail and of the fine relief that a smooth patch lacks."""
+PATCH_BLUR_MM = 6.0
+"""Color detail smaller than this is taken out of smooth patches."""
 _LOOP = (0.74, 0.40, 0.38)
 _LOOP_PALE = (0.86, 0.60, 0.53)
 _LOOP_DUSKY = (0.56, 0.25, 0.31)
@@ -37,7 +41,20 @@ def _step(low: float, high: float, x: NDArray) -> NDArray:
     return t * t * (3 - 2 * t)
 
 
-def build_texture(plane: Plane, anatomy: Anatomy, width: int, height: int) -> NDArray[np.float32]:
+def smooth_patches(a: NDArray, b: NDArray, seed: int, share: float) -> NDArray[np.float32]:
+    """In [0, 1]: how little texture the tissue has at plane points `a, b`, mm; above 0.5 on `share` of the tissue."""
+    rows, columns = np.mgrid[-60:60:1.0, -70:70:1.0].astype(np.float32)
+    level = float(np.quantile(_patch_noise(columns, rows, seed), 1 - share))
+    return _step(level - 0.12, level + 0.12, _patch_noise(a, b, seed)).astype(np.float32)
+
+
+def _patch_noise(a: NDArray, b: NDArray, seed: int) -> NDArray[np.float32]:
+    return fractal(a.astype(np.float32) / 19, b.astype(np.float32) / 19, 1, seed + 130)
+
+
+def build_texture(
+    plane: Plane, anatomy: Anatomy, width: int, height: int, smooth_share: float = 0.0
+) -> NDArray[np.float32]:
     """(TH, TW, CHANNELS) material maps for a grid of `height` x `width` texels."""
     grid_v, grid_u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
     a, b = plane.coordinates(grid_u, grid_v)
@@ -52,6 +69,10 @@ def build_texture(plane: Plane, anatomy: Anatomy, width: int, height: int) -> ND
     wrinkles = _wrinkles(organs, a, b, seed)
     albedo = _albedo(organs, a, b, plain, wrinkles, trunks, twigs, seed, rng)
     relief = _relief(organs, a, b, wrinkles, trunks, seed) * (1 - 0.6 * plain)
+    if smooth_share > 0:
+        patches = smooth_patches(a, b, anatomy.seed, smooth_share)
+        albedo += (SMOOTHED * patches)[..., None] * (_blurred(albedo, mm_per_texel) - albedo)
+        relief = relief * (1 - SMOOTHED * patches)
     smooth = soften(relief.astype(np.float32), mm_per_texel, 0.09)
     texture = np.zeros((height, width, CHANNELS), np.float32)
     texture[..., :3] = albedo
@@ -61,6 +82,14 @@ def build_texture(plane: Plane, anatomy: Anatomy, width: int, height: int) -> ND
     texture[..., 5] = np.clip(0.75 + 0.7 * fractal(a / 9, b / 9, 2, seed + 1), 0.25, 1)
     texture[..., 6] = _openness(organs.height, mm_per_texel)
     return texture
+
+
+def _blurred(albedo: NDArray[np.float32], mm_per_texel: float) -> NDArray[np.float32]:
+    """(TH, TW, 3) color without detail smaller than `PATCH_BLUR_MM`."""
+    coarse = max(1, round(0.5 / mm_per_texel))
+    small = cv2.resize(albedo, None, fx=1 / coarse, fy=1 / coarse, interpolation=cv2.INTER_AREA)
+    small = soften(small, mm_per_texel * coarse, PATCH_BLUR_MM)
+    return cv2.resize(small, albedo.shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def _wrinkles(organs: Organs, a: NDArray, b: NDArray, seed: int) -> NDArray[np.float32]:

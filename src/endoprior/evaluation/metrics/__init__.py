@@ -23,12 +23,14 @@ from .image import (
 from .lpips import lpips_distance
 from .raft import raft_flow
 from .stability import depth_instability
-from .tracks import neighbor_breaks, track_error
+from .track_accuracy import track_accuracy
+from .tracks import TrackError, neighbor_breaks, track_error
 from .weights import ScoreUnavailable, WeightsMissing
 
 __all__ = [
     "FlowEstimator",
     "ScoreUnavailable",
+    "TrackError",
     "WeightsMissing",
     "depth_instability",
     "depth_rmse",
@@ -45,5 +47,6 @@ __all__ = [
     "ssim",
     "ssim_tissue",
     "to_uint8",
+    "track_accuracy",
     "track_error",
 ]

@@ -1,31 +1,37 @@
 """Whether material points go where the scene carries them; needs ground truth.
 
 The true tracks either cover all frames, as on a phantom, or are two sets of unpaired points, those of the first frame
-and those of the last, as in STIR, which does not say which point became which.
+and those of the last, as in STIR, which does not say which point became which. Scores of paired tracks stand beside
+the same scores of chained optical flow and of no motion.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.types import Camera
+from ...core.types import Camera, Frame
 from ...data import FrameSequence, nearest_end_errors
 from ...model.carry import carry_points
 from ...model.scene import Scene
 from .. import metrics
 from ..context import EvaluationContext
+from ..predicted_tracks import PredictedTracks, TrueTracks, by_chained_flow, by_scene, true_tracks, without_motion
 from ..score import Score
 
-SCORES = (
-    Score(
-        "track_end_error_mm", "track end error", "mm", False, 3,
-        "Mean distance of points carried to the last frame to the nearest true one there, as in STIR's benchmark.",
-        group="motion", hint="0 follows the tissue",
-    ),
+NEAR_TOOL_PX = 40
+"""Points within this distance of the tool mask are near the tool; px of an image 640 px wide."""
+END_ERROR = Score(
+    "track_end_error_mm", "track end error", "mm", False, 3,
+    "Mean distance of points carried to the last frame to the nearest true one there, as in STIR's benchmark.",
+    group="motion", hint="0 follows the tissue",
+)  # fmt: skip
+ACCURACY = (
     Score(
         "track_error_mm", "track error", "mm", False, 3,
         "Mean distance between carried and true points over all frames in which the point is visible.",
@@ -37,6 +43,54 @@ SCORES = (
         group="motion", in_summary=False,
     ),
     Score(
+        "track_error_median_px", "track error, median", "px", False, 3,
+        "Median of that distance.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_error_p90_px", "track error, 90 %", "px", False, 3,
+        "90th percentile of that distance.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_error_after_hidden_mm", "seen again", "mm", False, 3,
+        "Track error where the point is visible again after at least one frame that hides it.",
+        group="motion", hint="tissue that was hidden before",
+    ),
+    Score(
+        "track_error_near_tool_mm", "track near tool", "mm", False, 3,
+        "Track error within 40 px of the tool mask, in px of an image 640 px wide.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_error_pulled_mm", "track, pulled", "mm", False, 3,
+        "Track error of points that move by at least half of a pull; phantoms with regions only.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_error_smooth_mm", "track, smooth", "mm", False, 3,
+        "Track error of other points on tissue with little texture; phantoms with regions only.",
+        group="motion", in_summary=False,
+    ),
+    Score(
+        "track_delta_avg", "delta_avg", "", True, 3,
+        "Share of visible points within 4, 8, 16, 32 and 64 px of the truth, mean of the five, as in STIR 2024.",
+        "absolute", group="motion", hint="1 follows the tissue",
+    ),
+    Score(
+        "track_average_jaccard", "average Jaccard", "", True, 3,
+        "TP / (TP + FP + FN) of position and visibility at these distances, mean of the five, as in TAP-Vid.",
+        "absolute", group="motion", hint="1: position and visibility right",
+    ),
+    Score(
+        "track_occlusion_accuracy", "occlusion accuracy", "", True, 3,
+        "Share of points whose visibility is predicted right, as in TAP-Vid.",
+        "absolute", group="motion", hint="1: visibility right",
+    ),
+)  # fmt: skip
+"""Scores that any prediction of tracks has."""
+BREAKS = (
+    Score(
         "track_fold_rate", "folds", "", False, 4,
         "Share of lines between a point and its nearest neighbors that point against the true line.",
         "absolute", group="motion", hint="0: neighbors keep their order",
@@ -47,6 +101,34 @@ SCORES = (
         "absolute", group="motion", hint="0: neighbors stay together",
     ),
 )  # fmt: skip
+REFERENCES = {"dis": "chained optical flow (DIS)", "still": "no motion"}
+"""What stands beside the scene's scores, by the end of the name."""
+SCORES = (
+    END_ERROR,
+    *ACCURACY,
+    *BREAKS,
+    *(
+        replace(
+            score,
+            name=f"{score.name}_{end}",
+            label=f"{score.label}, {'flow' if end == 'dis' else 'no motion'}",
+            description=f"`{score.name}` of {what}.",
+            in_summary=False,
+            hint="",
+        )
+        for score in ACCURACY
+        for end, what in REFERENCES.items()
+    ),
+)
+WHY_NOT = {
+    "track_error_after_hidden_mm": "no point is hidden and seen again",
+    "track_error_near_tool_mm": "no visible point is near a tool",
+    "track_error_pulled_mm": "the truth has no such region",
+    "track_error_smooth_mm": "the truth has no such region",
+}
+NO_TRACKS = "no track is visible in two frames"
+NO_PAIRS = "no two neighbors are visible together"
+BEHIND = "a point is predicted behind the camera"
 
 
 def compute(context: EvaluationContext) -> None:
@@ -57,48 +139,98 @@ def compute(context: EvaluationContext) -> None:
     scene = context.scene
     if sequence.truth.tracks and not sequence.truth.tracks.paired:
         context.add("track_end_error_mm", track_end_error_mm(scene, sequence), "no point has depth at start and end")
-    for name, value in track_scores(scene, sequence).items():
-        context.add(name, value, "no track is visible in two frames")
+    true = true_tracks(sequence)
+    if true is None:
+        for score in (*ACCURACY, *BREAKS):
+            context.skip(score.name, NO_TRACKS)
+        return
+    parts, camera = parts_of(true, sequence), sequence.camera(0)
+    predictions: dict[str, Callable[[], PredictedTracks]] = {
+        "": lambda: by_scene(scene, true, sequence),
+        "_dis": lambda: by_chained_flow(true, sequence),
+        "_still": lambda: without_motion(true, sequence),
+    }
+    for end, predict in predictions.items():
+        with context.skip_if_unavailable(*(score.name + end for score in ACCURACY)):
+            predicted = predict()
+            for name, value in track_scores(predicted, true, parts, camera).items():
+                context.add(name + end, value, WHY_NOT.get(name, BEHIND))
+            if not end:
+                add_breaks(context, predicted, true)
 
 
-@dataclass(frozen=True)
-class CarriedTracks:
-    """`P` material points over `T` frames, as the scene carries them and as they went; camera axes, mm."""
-
-    predicted: NDArray[np.floating]
-    """(T, P, 3)."""
-    truth: NDArray[np.floating]
-    """(T, P, 3)."""
-    visible: NDArray[np.bool_]
-    """(T, P) True where the point is seen and counts: not in the frame it starts in."""
-    first: NDArray[np.intp]
-    """(P,) frame each point starts in."""
-    camera: Camera
+def add_breaks(context: EvaluationContext, predicted: PredictedTracks, true: TrueTracks) -> None:
+    """Add folds and tears between neighboring points."""
+    rates = metrics.neighbor_breaks(predicted.points, true.points, true.visible & true.counted, true.first)
+    context.add("track_fold_rate", rates.fold, NO_PAIRS)
+    context.add("track_tear_rate", rates.tear, NO_PAIRS)
 
 
-def carry_tracks(scene: Scene, sequence: FrameSequence) -> CarriedTracks | None:
-    """Carry every true point that is visible in two frames, from the first of them; None without such points."""
-    tracks = sequence.truth and sequence.truth.tracks
-    if not tracks or not tracks.paired:
-        return None
-    visible_twice = tracks.visible.sum(0) > 1
-    if not visible_twice.any():
-        return None
-    points, visible = tracks.points[:, visible_twice].astype(np.float64), tracks.visible[:, visible_twice].copy()
-    first = visible.argmax(0)
-    columns = np.arange(points.shape[1])
-    cameras = scene.cameras
-    to_world = np.stack([np.linalg.inv(camera.world_to_camera) for camera in cameras])
-    start = np.einsum("pij,pj->pi", to_world[first][:, :3, :3], points[first, columns]) + to_world[first][:, :3, 3]
-    carried = carry_points(scene, start, first, [i / len(cameras) for i in range(len(cameras))])
-    predicted = np.stack(
-        [
-            p @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-            for p, camera in zip(carried, cameras, strict=True)
-        ]
-    )
-    visible[first, columns] = False
-    return CarriedTracks(predicted, points, visible, first, cameras[0])
+def track_scores(
+    predicted: PredictedTracks, true: TrueTracks, parts: Mapping[str, NDArray[np.bool_]], camera: Camera
+) -> dict[str, float]:
+    """Every score of `ACCURACY` by name; NaN where nothing counts, infinite for predictions without an image.
+
+    Args:
+        parts: by `parts_of`. camera: intrinsics of the frames.
+    """
+    visible = true.visible & true.counted
+    # A hidden truth may lie behind the camera: its distance does not count.
+    distance = np.linalg.norm(predicted.pixels - np.where(np.isfinite(true.pixels), true.pixels, 0), axis=-1)
+    error = metrics.track_error(predicted.points, true.points, visible, camera)
+    of_parts = {
+        f"track_error_{part}_mm": metrics.track_error(predicted.points, true.points, visible & chosen, camera).mm
+        for part, chosen in parts.items()
+    }
+    accuracy = metrics.track_accuracy(distance, predicted.visible, true.visible, true.counted)
+    return {
+        "track_error_mm": error.mm,
+        "track_error_px": error.px,
+        "track_error_median_px": _quantile(distance[visible], 0.5),
+        "track_error_p90_px": _quantile(distance[visible], 0.9),
+        **of_parts,
+        **{f"track_{name}": value for name, value in accuracy._asdict().items()},
+    }
+
+
+def parts_of(true: TrueTracks, sequence: FrameSequence) -> dict[str, NDArray[np.bool_]]:
+    """(T, P) points that the error of each part is over."""
+    nowhere = np.zeros(true.visible.shape[1], "U1")
+    region = nowhere if true.region is None else true.region
+    regions = {name: np.broadcast_to(region == name, true.visible.shape) for name in ("pulled", "smooth")}
+    return {"after_hidden": seen_again(true), "near_tool": near_tool(true, sequence), **regions}
+
+
+def seen_again(true: TrueTracks) -> NDArray[np.bool_]:
+    """(T, P) where a point is visible, and was hidden in a frame since the one it starts in."""
+    hidden_before = np.logical_or.accumulate(true.counted & ~true.visible, axis=0)
+    return true.visible & hidden_before
+
+
+def near_tool(true: TrueTracks, sequence: FrameSequence) -> NDArray[np.bool_]:
+    """(T, P) where a visible point lies within `NEAR_TOOL_PX` of the tool mask."""
+    near = np.zeros_like(true.visible)
+    for i, frame in enumerate(sequence.frames("video")):
+        if not frame.tissue_mask.all():
+            x, y = np.floor(true.pixels[i, true.visible[i]]).astype(np.intp).T
+            columns, rows = np.minimum(x, frame.camera.width - 1), np.minimum(y, frame.camera.height - 1)
+            near[i, true.visible[i]] = _near_tool(frame)[rows, columns]
+    return near
+
+
+def _near_tool(frame: Frame) -> NDArray[np.bool_]:
+    """(H, W) pixels within `NEAR_TOOL_PX` of the tool mask, which is not empty."""
+    distance = cv2.distanceTransform(frame.tissue_mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return distance <= NEAR_TOOL_PX * frame.camera.width / 640
+
+
+def _quantile(values: NDArray[np.floating], share: float) -> float:
+    """Linear between values as `np.quantile`, but infinite where one of the two is; NaN without values."""
+    if not len(values):
+        return math.nan
+    with np.errstate(invalid="ignore"):
+        found = float(np.quantile(values, share))
+    return math.inf if math.isnan(found) else found
 
 
 def track_end_error_mm(scene: Scene, sequence: FrameSequence) -> float:
@@ -121,19 +253,3 @@ def _to_world(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64
     """(P, 3) points in camera axes, in world axes."""
     to_world = np.linalg.inv(camera.world_to_camera)
     return points @ to_world[:3, :3].T + to_world[:3, 3]
-
-
-def track_scores(scene: Scene, sequence: FrameSequence) -> dict[str, float]:
-    """`track_error_mm`, `track_error_px`, `track_fold_rate`, `track_tear_rate`; NaN if no point can be carried."""
-    carried = carry_tracks(scene, sequence)
-    if carried is None:
-        names = ("track_error_mm", "track_error_px", "track_fold_rate", "track_tear_rate")
-        return dict.fromkeys(names, math.nan)
-    error = metrics.track_error(carried.predicted, carried.truth, carried.visible, carried.camera)
-    rates = metrics.neighbor_breaks(carried.predicted, carried.truth, carried.visible, carried.first)
-    return {
-        "track_error_mm": error.mm,
-        "track_error_px": error.px,
-        "track_fold_rate": rates.fold,
-        "track_tear_rate": rates.tear,
-    }
