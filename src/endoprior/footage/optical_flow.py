@@ -11,7 +11,9 @@ MIN_SIZE_PX = 32
 MOTION_S = 0.1
 """Time between two frames that show how tissue moves, s: long enough for a breath to move it by a pixel."""
 HALVED_FROM_PX = 256
-"""Frames with at least this shorter side are tracked at half size: four times faster, almost as accurate."""
+"""Flow of frames with at least this shorter side is computed at half size: four times faster, almost as accurate."""
+FINE_SIDE_PX = 256
+"""Fine flow is computed on images shrunk by a whole number to at least this shorter side."""
 RETURN_PX, RETURN_SHARE = 1.0, 0.05
 """A point is lost where forward and backward flow disagree by more than this, plus this share of the step."""
 FLOW_BYTES = 40
@@ -26,10 +28,15 @@ def flow_shrink(height: int, width: int) -> int:
     return 2 if min(height, width) >= HALVED_FROM_PX else 1
 
 
-def gray_for_flow(rgb_u8: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(h, w) gray image at the size at which the flow is computed, from an (H, W, 3) frame."""
+def fine_shrink(height: int, width: int) -> int:
+    """Divisor of the image size for fine flow."""
+    return max(1, min(height, width) // FINE_SIDE_PX)
+
+
+def gray_for_flow(rgb_u8: NDArray[np.uint8], shrink: int | None = None) -> NDArray[np.uint8]:
+    """(h, w) gray image for the flow, from an (H, W, 3) frame; `shrink` by default that of `flow_shrink`."""
     height, width = rgb_u8.shape[:2]
-    shrink = flow_shrink(height, width)
+    shrink = shrink or flow_shrink(height, width)
     gray = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY)
     return cv2.resize(gray, (width // shrink, height // shrink), interpolation=cv2.INTER_AREA)
 
@@ -44,6 +51,24 @@ def flow_pair(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> FlowPair:
 def flow_between(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Flow (h, w, 2) from the first (h, w) gray image to the second; both sides at least `MIN_SIZE_PX`."""
     return _estimator().calc(first, second, None)
+
+
+def fine_flow(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], start: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """Flow as by `flow_between`, but refined on the full image: twice as slow, less than half the error.
+
+    Larger steps between patches and fewer iterations than OpenCV's preset: half the time, the same error.
+
+    Args:
+        start: (h, w, 2) a guess to start from, such as the flow to the frame before `second`, px.
+    """
+    estimator = _estimator()
+    estimator.setFinestScale(0)
+    estimator.setPatchStride(4)
+    estimator.setGradientDescentIterations(12)
+    estimator.setVariationalRefinementIterations(2)
+    return estimator.calc(first, second, None if start is None else start.copy())
 
 
 def _estimator() -> cv2.DISOpticalFlow:

@@ -4,44 +4,39 @@ Coefficients that start at zero learn motion from color alone, whose gradient re
 moves farther between frames is then explained by Gaussians that fade in and out. Tracking each point by dense inverse
 search (Kroeger et al. 2016, OpenCV) provides an initial motion, which training refines.
 
+A point goes from its source frame to an anchor, and from there to every other frame: two steps of flow, each checked by
+the flow back. Of all anchors, the one counts whose two steps close best. Where none closes, the point is lost, and
+moves as the points around it do (`carried_gaps`).
+
 Shared letters: `T` training frames, `N` points, `B` basis functions.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.config import BasisConfig
-from ..core.geometry import back_project, bilinear, project
-from ..core.types import Camera, Frame
-from ..footage.optical_flow import (
-    FLOW_BYTES,
-    MIN_SIZE_PX,
-    RETURN_PX,
-    RETURN_SHARE,
-    FlowPair,
-    flow_pair,
-    gray_for_flow,
-)
+from ..core.geometry import back_project, project
+from ..core.types import Frame
+from ..footage.optical_flow import MIN_SIZE_PX, fine_shrink, gray_for_flow
 from ..model.basis import basis_weights
-from ..system.memory import BoundedCache, cache_bytes, workers
+from ..system.memory import workers
 from . import track_kernels as kernels
+from .anchor_flow import REACH, AnchorFlow, anchor_flow, anchors, neighbor_flows
+from .carried_gaps import fill_gaps
 from .cleanup import PointCloud
 from .sampling import has_surface
 
-STATIC_MARGIN = 1.1
-"""A point is static if its color error at the static position is at most this factor times that along its track."""
-BLUR_PX = 1.5
-"""Standard deviation of the blur before colors are compared."""
-FLOW_CHUNK = 16
-"""Number of frame pairs whose flow is computed and cached together."""
-RIDGE = 1e-2
+CYCLE_PX = 0.25
+"""A point is lost where forward and backward flow of its two steps disagree by more than this, px of the flow."""
+ANCHOR_BYTES = 8 * (2 * REACH + 1)
+"""Memory per pixel of the flows of one anchor, bytes."""
+RIDGE = 1e-3
 """Ridge term of the least-squares fit of coefficients to tracks; each frame has weight 1."""
 
 log = logging.getLogger(__name__)
@@ -61,84 +56,69 @@ def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig)
         log.warning("initial motion: frames of %d x %d px are too small for optical flow", width, height)
         return np.zeros((len(cloud), cfg.num_bases, 3), np.float32)
     points = cloud.points.astype(np.float64)
-    pixels = track_points(frames, points, cloud.origins)
-    moving = ~is_static(frames, points, cloud.origins, pixels)
-    log.info("initial motion: %d of %d points move", moving.sum(), len(cloud))
-    offsets = lift(frames, pixels[:, moving]) - points[moving]
-    kernels.fill_gaps(offsets)
-    motion = np.zeros((len(cloud), cfg.num_bases, 3), np.float32)
-    motion[moving] = fit_basis(offsets, [frame.time for frame in frames], cfg)
-    return motion
+    positions = lift(frames, track_points(frames, points, cloud.origins))
+    log.info("initial motion: points are followed in %.0f %% of the frames", 100 * np.isfinite(positions[..., 0]).mean())
+    positions[cloud.origins, np.arange(len(cloud))] = points
+    return fit_basis(fill_gaps(positions) - points, [frame.time for frame in frames], cfg)
 
 
 def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Pixels of each point in every frame, by chaining optical flow from its source frame in both directions.
-
-    A track ends where the point leaves the image or the tissue, or where backward flow does not return to it.
+    """Pixels of each point in every frame.
 
     Args:
         points: (N, 3) world, mm. origins: (N,) positions of their source frames in `frames`.
     Returns:
-        (T, N, 2) px; NaN where a point is lost.
+        (T, N, 2) px; NaN where a point is lost: outside of the image or the tissue, or where flow does not return.
     """
-    pixels = np.full((len(frames), len(points), 2), np.nan)
+    masks = [frame.tissue_mask for frame in frames]
+    shrink = fine_shrink(*masks[0].shape)
+    grays = [gray_for_flow(frame.rgb_u8, shrink) for frame in frames]
+    sources = np.empty((len(points), 2))
     for position in np.unique(origins):
-        own = origins == position
-        pixels[position, own] = project(points[own], frames[position].camera)[0]
-    flow, limits = _flows(frames), (RETURN_PX, RETURN_SHARE)
-    for k in range(len(frames) - 1):
-        kernels.advance(pixels[k], origins <= k, *flow(k), frames[k + 1].tissue_mask, *limits, pixels[k + 1])
-    for k in range(len(frames) - 1, 0, -1):
-        forward, backward = flow(k - 1)
-        kernels.advance(pixels[k], origins >= k, backward, forward, frames[k - 1].tissue_mask, *limits, pixels[k - 1])
+        sources[origins == position] = project(points[origins == position], frames[position].camera)[0]
+    pixels, error = np.full((len(frames), len(points), 2), np.nan), np.full((len(frames), len(points)), np.inf)
+    # OpenCV releases the interpreter lock; an anchor needs the flows to all frames that it reaches.
+    with ThreadPoolExecutor(workers(ANCHOR_BYTES * grays[0].size)) as pool:
+        neighbors = list(pool.map(lambda k: neighbor_flows(grays, k), range(len(frames) - 1)))
+        for flow in pool.map(lambda anchor: anchor_flow(grays, neighbors, anchor), anchors(len(frames))):
+            _add_tracks(flow, masks, sources, origins, CYCLE_PX * shrink, pixels, error)
+    pixels[origins, np.arange(len(points))] = sources
     return pixels
 
 
-def _flows(frames: Sequence[Frame]) -> Callable[[int], FlowPair]:
-    """A function that returns the flows between frames k and k + 1; it caches as many as memory allows."""
-    height, width = frames[0].tissue_mask.shape
-
-    def chunk(number: int) -> list[FlowPair]:
-        first = number * FLOW_CHUNK
-        grays = [gray_for_flow(frames[k].rgb_u8) for k in range(first, min(first + FLOW_CHUNK + 1, len(frames)))]
-        with ThreadPoolExecutor(workers(FLOW_BYTES * width * height)) as pool:  # OpenCV releases the interpreter lock
-            return list(pool.map(flow_pair, grays[:-1], grays[1:]))
-
-    cache: BoundedCache[list[FlowPair]] = BoundedCache(
-        cache_bytes(), lambda pairs: sum(flow.nbytes for pair in pairs for flow in pair)
-    )
-    return lambda k: cache.get(k // FLOW_CHUNK, lambda: chunk(k // FLOW_CHUNK))[k % FLOW_CHUNK]
-
-
-def is_static(
-    frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer], pixels: NDArray
-) -> NDArray[np.bool_]:
-    """(N,) whether a static point matches the frames as well as its track does.
-
-    Chained flow drifts and depth jitters, so without motion the static position is the better estimate.
+def _add_tracks(
+    flow: AnchorFlow,
+    masks: Sequence[NDArray[np.bool_]],
+    sources: NDArray[np.float64],
+    origins: NDArray[np.integer],
+    limit_px: float,
+    pixels: NDArray[np.float64],
+    error: NDArray[np.float64],
+) -> None:
+    """Follow all points by way of one anchor; update `pixels` (T, N, 2) where the `error` (T, N), px, gets smaller.
 
     Args:
-        points: (N, 3) world, mm. origins: (N,) positions in `frames`. pixels: (T, N, 2) from `track_points`.
+        masks: (H, W) tissue of each frame. sources: (N, 2) px in the frames `origins` (N,).
     """
-
-    def blurred(position: int) -> NDArray[np.uint8]:
-        return cv2.GaussianBlur(cv2.cvtColor(frames[position].rgb_u8, cv2.COLOR_RGB2GRAY), (0, 0), BLUR_PX)
-
-    own_gray, along_track, if_static = np.zeros((3, len(points)))
-    for position in np.unique(origins):
-        own = origins == position
-        own_gray[own] = bilinear(blurred(position), pixels[position, own])
-    for position in range(len(frames)):
-        image = blurred(position)
-        static = _project_in_front(points, frames[position].camera)
-        kernels.add_mismatch(image, pixels[position], origins != position, static, own_gray, along_track, if_static)
-    return if_static <= STATIC_MARGIN * along_track
+    at_anchor, first_step = np.full_like(sources, np.nan), np.full(len(sources), np.inf)
+    for t in flow.there:
+        own = np.flatnonzero(origins == t)
+        at_anchor[own], first_step[own] = _followed(sources[own], flow.back[t], flow.there[t], masks[flow.anchor])
+    near = np.flatnonzero(first_step <= limit_px)
+    for t in flow.there:
+        end, second_step = _followed(at_anchor[near], flow.there[t], flow.back[t], masks[t])
+        both = first_step[near] + second_step
+        better = (both < error[t, near]) & (both <= limit_px)
+        error[t, near[better]], pixels[t, near[better]] = both[better], end[better]
 
 
-def _project_in_front(points: NDArray, camera: Camera) -> NDArray[np.float64]:
-    """Pixels (M, 2) of world points; far outside the image for those behind the camera."""
-    pixels, z = project(points, camera)
-    return np.where((z > 0)[:, None], pixels, -1e6)
+def _followed(
+    pixels: NDArray[np.float64], there: NDArray[np.float16], back: NDArray[np.float16], mask: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels (N, 2) after one step, and by how much the step back misses (N,), px; infinite off the tissue `mask`."""
+    end, cycle_px = np.empty_like(pixels), np.empty(len(pixels))
+    kernels.follow(pixels, there.astype(np.float32), back.astype(np.float32), mask, end, cycle_px)
+    return end, cycle_px
 
 
 def lift(frames: Sequence[Frame], pixels: NDArray) -> NDArray[np.float64]:
