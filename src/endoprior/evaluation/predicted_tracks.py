@@ -20,8 +20,8 @@ from ..footage.optical_flow import (
     MIN_SIZE_PX,
     RETURN_PX,
     RETURN_SHARE,
-    FlowPair,
-    flow_pair,
+    fine_flow,
+    fine_shrink,
     gray_for_flow,
 )
 from ..model.carry import carry_points
@@ -182,10 +182,16 @@ def _flow_at(flow: NDArray[np.float32], pixels: NDArray[np.floating], frame: Fra
     return bilinear(flow, pixels / scale) * scale
 
 
-def _flows(frames: Sequence[Frame]) -> Iterator[FlowPair]:
-    """The flows between frames k and k + 1."""
+def _flows(frames: Sequence[Frame]) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """The flows from frame k to k + 1 and back: the same fine flow from which training starts."""
     camera = frames[0].camera
+    shrink = fine_shrink(camera.height, camera.width)
+
+    def pair(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return fine_flow(first, second), fine_flow(second, first)
+
     with ThreadPoolExecutor(workers(FLOW_BYTES * camera.width * camera.height)) as pool:  # OpenCV releases the lock
         for start in range(0, len(frames) - 1, FLOW_CHUNK):
-            grays = [gray_for_flow(frames[k].rgb_u8) for k in range(start, min(start + FLOW_CHUNK + 1, len(frames)))]
-            yield from pool.map(flow_pair, grays[:-1], grays[1:])
+            chunk = range(start, min(start + FLOW_CHUNK + 1, len(frames)))
+            grays = [gray_for_flow(frames[k].rgb_u8, shrink) for k in chunk]
+            yield from pool.map(pair, grays[:-1], grays[1:])

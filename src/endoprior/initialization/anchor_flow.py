@@ -48,9 +48,7 @@ def neighbor_flows(grays: Sequence[NDArray[np.uint8]], k: int) -> tuple[Flow, Fl
     return fine_flow(first, second).astype(np.float16), fine_flow(second, first).astype(np.float16)
 
 
-def anchor_flow(
-    grays: Sequence[NDArray[np.uint8]], neighbors: Sequence[tuple[Flow, Flow]], anchor: int
-) -> AnchorFlow:
+def anchor_flow(grays: Sequence[NDArray[np.uint8]], neighbors: Sequence[tuple[Flow, Flow]], anchor: int) -> AnchorFlow:
     """The flows between image `anchor` and those up to `REACH` from it.
 
     Args:

@@ -17,7 +17,7 @@ CARRIERS = 12
 """Known points that carry a lost one."""
 
 
-def fill_gaps(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+def fill_gaps(positions: NDArray[np.floating]) -> NDArray[np.floating]:
     """Tracks without gaps.
 
     A lost point keeps its place among its neighbors: those nearest to it in the last frame in which it was known, and
@@ -29,19 +29,21 @@ def fill_gaps(positions: NDArray[np.float64]) -> NDArray[np.float64]:
         (T, N, 3); a point that is never known, or whose neighbors all are lost, stays where it was last, or is NaN.
     """
     known = np.isfinite(positions[..., 0])
-    forward, since = _swept(positions, known, 1)
+    filled, since = _swept(positions, known, 1)
     backward, until = _swept(positions, known, -1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(since < 0, 0.0, np.where(until < 0, 1.0, until / (since + until)))[..., None]
-    blended = np.where(share > 0, share * forward, 0) + np.where(share < 1, (1 - share) * backward, 0)
-    return _held(np.where(known[..., None], positions, blended))
+    for t in range(len(positions)):  # one frame after the other: many points in many frames fit in memory
+        both, ahead = (since[t] > 0) & (until[t] > 0), (since[t] < 0) & (until[t] > 0)
+        share = (until[t, both] / (since[t, both] + until[t, both])).astype(positions.dtype)[:, None]
+        filled[t, both] = share * filled[t, both] + (1 - share) * backward[t, both]
+        filled[t, ahead] = backward[t, ahead]
+    return _held(filled)
 
 
 def _swept(
-    positions: NDArray[np.float64], known: NDArray[np.bool_], step: int
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    positions: NDArray[np.floating], known: NDArray[np.bool_], step: int
+) -> tuple[NDArray[np.floating], NDArray[np.int16]]:
     """Positions carried in one direction of time, and the frames since they were known; -1 where they are not."""
-    carried, age = positions.copy(), np.where(known, 0, -1)
+    carried, age = positions.copy(), np.where(known, np.int16(0), np.int16(-1))
     order = range(len(positions))[::step]
     waiting: dict[int, list[NDArray[np.intp]]] = defaultdict(list)
     for t in order[:-1]:
@@ -58,7 +60,7 @@ def _swept(
     return carried, age
 
 
-def _held(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+def _held(positions: NDArray[np.floating]) -> NDArray[np.floating]:
     """Positions (T, N, 3) with NaN replaced by the point's nearest frame before, else after."""
     for step in (1, -1):
         order = range(len(positions))[::step]

@@ -55,14 +55,14 @@ def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig)
     if min(height, width) < MIN_SIZE_PX:
         log.warning("initial motion: frames of %d x %d px are too small for optical flow", width, height)
         return np.zeros((len(cloud), cfg.num_bases, 3), np.float32)
-    points = cloud.points.astype(np.float64)
-    positions = lift(frames, track_points(frames, points, cloud.origins))
-    log.info("initial motion: points are followed in %.0f %% of the frames", 100 * np.isfinite(positions[..., 0]).mean())
-    positions[cloud.origins, np.arange(len(cloud))] = points
-    return fit_basis(fill_gaps(positions) - points, [frame.time for frame in frames], cfg)
+    positions = lift(frames, track_points(frames, cloud.points.astype(np.float64), cloud.origins))
+    followed = np.isfinite(positions[..., 0]).mean()
+    log.info("initial motion: points are followed in %.0f %% of the frames", 100 * followed)
+    positions[cloud.origins, np.arange(len(cloud))] = cloud.points
+    return fit_basis(fill_gaps(positions) - cloud.points, [frame.time for frame in frames], cfg)
 
 
-def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float64]:
+def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float32]:
     """Pixels of each point in every frame.
 
     Args:
@@ -76,7 +76,8 @@ def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.i
     sources = np.empty((len(points), 2))
     for position in np.unique(origins):
         sources[origins == position] = project(points[origins == position], frames[position].camera)[0]
-    pixels, error = np.full((len(frames), len(points), 2), np.nan), np.full((len(frames), len(points)), np.inf)
+    pixels = np.full((len(frames), len(points), 2), np.nan, np.float32)
+    error = np.full(pixels.shape[:2], np.inf, np.float32)
     # OpenCV releases the interpreter lock; an anchor needs the flows to all frames that it reaches.
     with ThreadPoolExecutor(workers(ANCHOR_BYTES * grays[0].size)) as pool:
         neighbors = list(pool.map(lambda k: neighbor_flows(grays, k), range(len(frames) - 1)))
@@ -92,8 +93,8 @@ def _add_tracks(
     sources: NDArray[np.float64],
     origins: NDArray[np.integer],
     limit_px: float,
-    pixels: NDArray[np.float64],
-    error: NDArray[np.float64],
+    pixels: NDArray[np.float32],
+    error: NDArray[np.float32],
 ) -> None:
     """Follow all points by way of one anchor; update `pixels` (T, N, 2) where the `error` (T, N), px, gets smaller.
 
@@ -121,9 +122,9 @@ def _followed(
     return end, cycle_px
 
 
-def lift(frames: Sequence[Frame], pixels: NDArray) -> NDArray[np.float64]:
+def lift(frames: Sequence[Frame], pixels: NDArray) -> NDArray[np.float32]:
     """Back-project pixels (T, N, 2) to world points (T, N, 3), mm; NaN without a pixel or measured depth."""
-    found = np.full((*pixels.shape[:2], 3), np.nan)
+    found = np.full((*pixels.shape[:2], 3), np.nan, np.float32)
     for position, frame in enumerate(frames):
         known = np.flatnonzero(np.isfinite(pixels[position, :, 0]))
         height, width = frame.tissue_mask.shape
@@ -140,7 +141,7 @@ def _nearest(pixels: NDArray, width: int, height: int) -> tuple[NDArray[np.intp]
     return np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
 
 
-def fit_basis(offsets: NDArray[np.float64], times: list[float], cfg: BasisConfig) -> NDArray[np.float32]:
+def fit_basis(offsets: NDArray[np.floating], times: list[float], cfg: BasisConfig) -> NDArray[np.float32]:
     """Least-squares coefficients (N, B, 3) of offsets (T, N, 3) mm at T `times` in [0, 1]."""
     weights = np.stack([basis_weights(time, cfg) for time in times])
     normal = weights.T @ weights + RIDGE * np.eye(cfg.num_bases)
