@@ -18,8 +18,8 @@ from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
 from endoprior.initialization import anchor_flow, track_kernels
 from endoprior.initialization import flow_tracks as tracks
-from endoprior.initialization.carried_gaps import fill_gaps
 from endoprior.initialization.cleanup import PointCloud
+from endoprior.initialization.neighbor_motion import fill_gaps, smooth_motion
 from endoprior.model.basis import basis_weights
 from endoprior.training.trainer import Trainer
 
@@ -175,6 +175,27 @@ def test_gaps_close_at_both_ends_though_the_neighbors_move_otherwise():
     positions[4:, 14] += [0.0, 0.0, 3.0]  # the point itself moved while it was hidden
     positions[1:4, 14] = np.nan
     np.testing.assert_allclose(fill_gaps(positions)[1:4, 14, 2], [50.75, 51.5, 52.25])
+
+
+def test_smooth_motion_is_that_of_the_sheet_without_its_noise():
+    positions = np.repeat(tracked_sheet(), 6, axis=1)  # 216 points
+    origins = np.arange(216) % 6
+    sources = positions[origins, np.arange(216)]
+    np.testing.assert_allclose(smooth_motion(positions, origins), positions - sources, atol=1e-5)
+    noise = np.random.default_rng(0).normal(0, 0.4, positions.shape)
+    error = smooth_motion(positions + noise, origins) - (positions - sources)
+    assert np.abs(error).mean() < 0.35 * np.abs(noise - noise[origins, np.arange(216)]).mean()
+
+
+def test_smooth_motion_is_a_weighted_mean_of_displacements():
+    rng = np.random.default_rng(1)
+    positions, origins = rng.normal(size=(3, 9, 3)).astype(np.float32), np.full(9, 1)
+    for n in range(9):
+        distance = np.linalg.norm(positions[1] - positions[1, n], axis=-1)
+        asked = np.argsort(distance)[::4]
+        weights = np.exp(-0.5 * (distance[asked] / distance[asked].mean()) ** 2)
+        expected = ((positions - positions[1])[:, asked] * weights[:, None]).sum(1) / weights.sum()
+        np.testing.assert_allclose(smooth_motion(positions, origins)[:, n], expected, atol=1e-6)
 
 
 def test_points_without_neighbors_stay():

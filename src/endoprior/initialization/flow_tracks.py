@@ -6,7 +6,7 @@ search (Kroeger et al. 2016, OpenCV) provides an initial motion, which training 
 
 A point goes from its source frame to an anchor, and from there to every other frame: two steps of flow, each checked by
 the flow back. Of all anchors, the one counts whose two steps close best. Where none closes, the point is lost, and
-moves as the points around it do (`carried_gaps`).
+moves as the points around it do (`neighbor_motion`).
 
 Shared letters: `T` training frames, `N` points, `B` basis functions.
 """
@@ -28,8 +28,8 @@ from ..model.basis import basis_weights
 from ..system.memory import workers
 from . import track_kernels as kernels
 from .anchor_flow import REACH, AnchorFlow, anchor_flow, anchors, neighbor_flows
-from .carried_gaps import fill_gaps
 from .cleanup import PointCloud
+from .neighbor_motion import fill_gaps, smooth_motion
 from .sampling import has_surface
 
 CYCLE_PX = 0.25
@@ -59,7 +59,8 @@ def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig)
     followed = np.isfinite(positions[..., 0]).mean()
     log.info("initial motion: points are followed in %.0f %% of the frames", 100 * followed)
     positions[cloud.origins, np.arange(len(cloud))] = cloud.points
-    return fit_basis(fill_gaps(positions) - cloud.points, [frame.time for frame in frames], cfg)
+    offsets = smooth_motion(fill_gaps(positions), cloud.origins)
+    return fit_basis(offsets, [frame.time for frame in frames], cfg)
 
 
 def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float32]:

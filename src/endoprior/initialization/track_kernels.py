@@ -1,4 +1,4 @@
-"""Numba kernels of the tracks: steps along optical flow, and points that are lost carried by their neighbors.
+"""Numba kernels of the tracks: steps along optical flow, and points that move as their neighbors do.
 
 Shared letters: `N` points, `T` frames. Pixels are float64 with centers at half integers. Inputs are not checked.
 """
@@ -69,6 +69,20 @@ def carry(positions, known, start, step, points, neighbors, weights, age):
             age[t, n] = age[t - step, n] + 1
             t += step
     return ends
+
+
+@njit(parallel=True, cache=True)
+def mean_displacement(positions, source, points, neighbors, weights, offsets):
+    """Set offsets (T, N, 3) of `points` (P,) to the mean displacement of `neighbors` (P, k) since frame `source`."""
+    for p in prange(len(points)):
+        for t in range(len(positions)):
+            x = y = z = 0.0
+            for k in range(neighbors.shape[1]):
+                j = neighbors[p, k]
+                x += weights[p, k] * (positions[t, j, 0] - positions[source, j, 0])
+                y += weights[p, k] * (positions[t, j, 1] - positions[source, j, 1])
+                z += weights[p, k] * (positions[t, j, 2] - positions[source, j, 2])
+            offsets[t, points[p], 0], offsets[t, points[p], 1], offsets[t, points[p], 2] = x, y, z
 
 
 @njit(inline="always")

@@ -1,4 +1,4 @@
-"""Fill the gaps of tracks: where a point is lost, it moves as the known points around it do.
+"""Neighbors move alike: fill the gaps of tracks, and average out the noise of their depth.
 
 Tissue behind a tool moves with the tissue around. `T` frames, `N` points, positions in world axes, mm.
 """
@@ -15,6 +15,8 @@ from . import track_kernels as kernels
 
 CARRIERS = 12
 """Known points that carry a lost one."""
+COMPANIONS, COMPANION_STEP = 128, 4
+"""A point moves as the mean of its 128 nearest points; every fourth of them is asked, the nearest first."""
 
 
 def fill_gaps(positions: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -52,9 +54,7 @@ def _swept(
         if not len(lost) or len(carriers) < CARRIERS:
             continue
         distances, nearest = cKDTree(carried[t, carriers]).query(carried[t, lost], k=CARRIERS)
-        weights = np.exp(-0.5 * (distances / np.maximum(distances.mean(1, keepdims=True), 1e-6)) ** 2)
-        weights /= weights.sum(1, keepdims=True)
-        ends = kernels.carry(carried, known, t, step, lost, carriers[nearest], weights, age)
+        ends = kernels.carry(carried, known, t, step, lost, carriers[nearest], _weights(distances), age)
         for end in np.unique(ends[ends >= 0]):
             waiting[int(end)].append(lost[ends == end])
     return carried, age
@@ -68,3 +68,30 @@ def _held(positions: NDArray[np.floating]) -> NDArray[np.floating]:
             gap = np.isnan(positions[t + step])
             positions[t + step][gap] = positions[t][gap]
     return positions
+
+
+def smooth_motion(positions: NDArray[np.floating], origins: NDArray[np.integer]) -> NDArray[np.float32]:
+    """Displacement of each point from its source frame: the mean of that of the points around it.
+
+    Measured depth errs by ten times as much as the flow does, and differently for each pixel. Points a fraction of a
+    millimeter apart move alike.
+
+    Args:
+        positions: (T, N, 3) finite. origins: (N,) source frame of each point.
+    Returns:
+        (T, N, 3) mm.
+    """
+    offsets = np.empty(positions.shape, np.float32)
+    count = min(COMPANIONS, positions.shape[1])
+    for source in np.unique(origins):
+        own = np.flatnonzero(origins == source)
+        tree = cKDTree(positions[source])
+        distances, nearest = tree.query(positions[source, own], k=np.arange(1, count + 1, COMPANION_STEP), workers=-1)
+        kernels.mean_displacement(positions, source, own, nearest, _weights(distances), offsets)
+    return offsets
+
+
+def _weights(distances: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(P, k) a Gaussian of the distance (P, k) whose width is the mean of the row; of sum 1."""
+    weights = np.exp(-0.5 * (distances / np.maximum(distances.mean(1, keepdims=True), 1e-6)) ** 2)
+    return weights / weights.sum(1, keepdims=True)
