@@ -99,5 +99,5 @@ def write_tiny_sequence(
 def short_training_of_tool_masks():
     """`prepare` trains a network for its masks: a few steps are enough where masks are not the subject."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endoprior.tool_masks.model.STEPS", 20)
+        patch.setattr("endoprior.tool_masks.model.STEPS", 2)
         yield

@@ -79,7 +79,6 @@ def finished(tmp_path_factory):
     train = PresetMethod.train
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PresetMethod, "train", spy)
-        patch.setattr("endoprior.tool_masks.model.STEPS", 2)  # bad masks will do
         matrix = run_matrix(load_spec(write_spec(folder)), folder / "out", in_this_process, progress=said.append)
     assert not matrix.missing and "tiny_found: finding tools in 17 frames" in said
     return matrix, trained, (before, contents(data))
