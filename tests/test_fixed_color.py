@@ -1,13 +1,12 @@
 """Fixed colors: a carried pattern moves by the known px or stays; the share of the change that color makes."""
 
 from dataclasses import replace
+from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
-from endoprior.cli import main
 from endoprior.core.geometry import back_project
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
@@ -63,7 +62,7 @@ def color_share(scene: Scene) -> float:
     mask, rgb = np.ones((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     depth = np.full((HEIGHT, WIDTH), DEPTH, np.float32)
     sequence = FrameSequence(
-        None, [CAMERA] * NUM_FRAMES, lambda i: Frame(i, i / NUM_FRAMES, CAMERA, rgb, mask, depth, mask)
+        Path("none"), [CAMERA] * NUM_FRAMES, lambda i: Frame(i, i / NUM_FRAMES, CAMERA, rgb, mask, depth, mask)
     )  # fmt: skip
     context = EvaluationContext(SceneFrames(scene, sequence), sequence, "video", False, None, Evaluation({}))
     color.compute(context)
@@ -83,7 +82,7 @@ def test_tissue_that_moves_carries_the_pattern_by_as_many_pixels():
     shift = 5 * SQUARE  # an odd number of squares: without motion every square would have the other color
     painted = paint_texture(wall(shift_mm=shift * DEPTH / FOCAL, shade=0.5))
     first, middle = seen(painted, 0), seen(painted, MIDDLE)
-    assert np.abs(middle[:, shift:] - first[:, :-shift]).max() < 2e-3
+    assert np.abs(middle[:, shift:] - first[:, :-shift]).max() < 0.01  # rays that are more oblique widen Gaussians
     assert np.abs(middle - first).mean() > 0.1
     entered = middle[4:-4, : shift - 4]  # it was outside of the first frame, and so it is gray
     assert np.abs(entered - entered.mean(-1, keepdims=True)).max() < 1e-3

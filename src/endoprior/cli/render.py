@@ -49,7 +49,12 @@ class Render:
 
 
 HELP = Help(
-    examples=(("RUN",), ("RUN", "OUT", "--split", "test"), ("RUN", "OUT", "--camera", "sway"), ("RUN", "OUT", "--layer", "texture")),
+    examples=(
+        ("RUN",),
+        ("RUN", "OUT", "--split", "test"),
+        ("RUN", "OUT", "--camera", "sway"),
+        ("RUN", "OUT", "--layer", "texture"),
+    ),
 )
 
 

@@ -18,7 +18,7 @@ from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
 from ..system.atomic import whole_file
-from ..visualization.carried_texture import paint_texture
+from ..visualization.carried_texture import PaintedTissue
 from ..visualization.image_tools import colorize, to_u8
 from ..visualization.rendered_views import depth_span
 from .observers import LOG_EVERY
@@ -98,10 +98,10 @@ def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, N
 
 
 def _texture_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[np.uint8]]]:
-    painted, cells = paint_texture(scene), []
+    painted, cells = PaintedTissue(scene), []
     for index in (0, len(sequence) // 2, len(sequence) - 1):
         frame = sequence.frame(index)
-        color = to_u8(painted.render(frame.time, frame.camera).color.cpu().numpy())
+        color = to_u8(painted.render(frame.time, frame.camera))
         if index:
             cells.append((f"input, frame {index}", frame.rgb_u8))
         cells.append((f"carried to frame {index}" if index else "pattern on frame 0", color))

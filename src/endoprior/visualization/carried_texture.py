@@ -1,6 +1,7 @@
-"""A checkerboard painted on the tissue of the first frame and carried by the Gaussians: it shows how the model moves.
+"""A grid painted on the tissue of one frame and carried by the Gaussians: it shows how the model moves.
 
-The painted scene has no color over time, so that only motion can move the pattern.
+Colors are fixed: only motion can change the picture. The grid is not a color of the Gaussians, whose size would blur
+it: what is blended is how far each has moved in the image, and each pixel looks up the grid where it came from.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..core.types import Frame
+from .. import render
+from ..core.geometry import pixel_centers, project
+from ..core.types import Camera, Frame
 from ..model.fixed_color import with_fixed_color
-from ..model.gaussians import SH_C0, Gaussians
+from ..model.gaussians import SH_C0
 from ..model.scene import Scene
 from ..model.surface import project_visible, render_surface
 from .camera_paths import View
@@ -23,55 +26,75 @@ from .image_tools import label, tile, to_u8, write_png
 from .video import write_video
 
 SQUARES = 40
-"""Squares of the checkerboard along the width of the image: 16 px of 640."""
-COLORS = np.array([(0.0, 0.1, 0.3), (0.3, 1.0, 1.0)])
-"""Colors of the squares: dark and light blue, which tissue does not have."""
+"""Squares of the grid along the width of the image: 16 px of 640."""
+LINE = 0.2
+"""Width of a line, in sides of a square."""
+COLOR = np.array((0.3, 1.0, 1.0))
+"""Color of the lines: light blue, which tissue does not have."""
 SHARE = 0.5
-"""Share of the pattern in the color of the painted tissue."""
+"""Share of that color where a line is; the rest is that of the tissue."""
+FARTHEST = 2
+"""Largest motion in the image that is carried, in widths of the image."""
 
 
-def paint_texture(scene: Scene, time: float = 0.0) -> Scene:
-    """`scene` with fixed colors and a checkerboard on the tissue that the camera sees at `time`, in [0, 1].
+class PaintedTissue:
+    """A scene with a grid on the tissue that the camera sees at one time.
 
-    Each Gaussian has its mean color over all frames. Those that the camera sees at `time` take half of their color
-    from the square that their center projects to; the others are not painted.
+    Each Gaussian has its mean color over all frames. What is hidden or outside of the image at that time is not
+    painted.
     """
-    num = len(scene.cameras)
-    fixed = with_fixed_color(scene, [i / num for i in range(num)])
-    camera = scene.camera_at(time)
-    centers = scene.at(time).means.cpu().numpy()
-    pixels, visible = project_visible(centers, render_surface(scene, time, camera))
-    chosen = torch.from_numpy(np.flatnonzero(visible)).to(scene.device)
-    pattern = torch.from_numpy((_checkerboard(pixels[visible], camera.width) - 0.5) / SH_C0).to(scene.device)
-    tensors = {name: value.detach() for name, value in fixed.gaussians.tensors.items()}
-    colors, rest = tensors["sh_dc"].clone(), tensors["sh_rest"].clone()
-    colors[chosen] = (1 - SHARE) * colors[chosen] + SHARE * pattern[:, None].to(colors)
-    rest[chosen] *= 1 - SHARE
-    return replace(fixed, gaussians=Gaussians(tensors | {"sh_dc": colors, "sh_rest": rest}))
+
+    def __init__(self, scene: Scene, time: float = 0.0) -> None:
+        """Paint what the camera sees at `time` in [0, 1]."""
+        num, camera = len(scene.cameras), scene.camera_at(time)
+        self._scene = with_fixed_color(scene, [i / num for i in range(num)])
+        self._rasterize = render.load(scene.backend)
+        means = scene.at(time).means.cpu().numpy()
+        self._pixels, self._painted = project_visible(means, render_surface(scene, time, camera))
+        self._square = camera.width / SQUARES
+
+    @torch.no_grad()
+    def render(self, time: float, camera: Camera) -> NDArray[np.float32]:
+        """(H, W, 3) color in [0, 1] at `time` in [0, 1]."""
+        splats = self._scene.at(time)
+        black = splats.means.new_zeros(3)
+        color = self._rasterize(splats, camera, background=black).view.color.cpu().numpy()
+
+        # Three numbers for each Gaussian, blended as if they were its color, in [0, 1]: the way back to where it was
+        # when it was painted, and whether it was.
+        pixels, _ = project(splats.means.cpu().numpy().astype(np.float64), camera)
+        span = 2 * FARTHEST * camera.width
+        back = np.clip((self._pixels - pixels) / span + 0.5, 0, 1)
+        numbers = torch.from_numpy(np.column_stack([back, self._painted])).to(splats.sh)
+        carried = self._rasterize(replace(splats, sh=(numbers[:, None] - 0.5) / SH_C0), camera, background=black)
+        blended, alpha = carried.color.cpu().numpy(), carried.alpha.cpu().numpy()[..., None]
+        back = (blended[..., :2] / np.maximum(alpha, 1e-6) - 0.5) * span
+        lines = _grid(pixel_centers(camera.width, camera.height) + back, self._square)
+        share = SHARE * blended[..., 2:] * lines[..., None]
+        return ((1 - share) * color + share * COLOR).astype(np.float32)
 
 
-def _checkerboard(pixels: NDArray, width: int) -> NDArray[np.float64]:
-    """(P, 3) color in [0, 1] of the square at each of (P, 2) pixels."""
-    squares = np.floor(pixels * (SQUARES / width)).astype(np.intp)
-    return COLORS[squares.sum(1) % 2]
+def _grid(pixels: NDArray, side: float) -> NDArray[np.float64]:
+    """(H, W) how much a line of a grid of `side` px covers (H, W, 2) positions, in [0, 1]; its edges are 1 px wide."""
+    distance = np.abs((pixels / side + 0.5) % 1 - 0.5).min(-1) * side
+    return np.clip(0.5 + LINE / 2 * side - distance, 0, 1)
 
 
 def write_texture_film(
     scene: Scene, views: list[View], out: Path, video: Path, frames: list[Frame] | None = None
 ) -> None:
-    """Write the scene of `paint_texture` as seen in each view, to `out/*.png`, and a video of these images.
+    """Write a grid, painted on the first frame, as it is carried to each view: `out/*.png`, and a video.
 
     Args:
         frames: the input frames, one per view, which then stand at the left.
         video: path of the mp4.
     """
-    painted = paint_texture(scene)
+    painted = PaintedTissue(scene)
 
     def images() -> Iterator[NDArray[np.uint8]]:
-        for k, (time, camera) in enumerate(views):
-            color = to_u8(painted.render(time, camera).color.cpu().numpy())
+        for k, view in enumerate(views):
             parts = [label(frames[k].rgb_u8, "input")] if frames else []
-            parts.append(label(color, "pattern of the first frame, carried"))
+            parts.append(label(to_u8(painted.render(*view)), "carried grid"))
             beside = tile(parts, len(parts))
             write_png(out / f"{frames[k].index if frames else k:06d}.png", beside)
             yield beside
