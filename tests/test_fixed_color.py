@@ -1,4 +1,4 @@
-"""Fixed colors: a carried pattern moves by the known px or stays; the share of the change that color makes."""
+"""Fixed colors: a carried grid moves by the known px or stays; the share of the change that color makes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from endoprior.core.geometry import back_project
+from endoprior.core.geometry import back_project, project
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.data import FrameSequence
@@ -18,9 +18,9 @@ from endoprior.evaluation.scorers import color
 from endoprior.model.attributes import motion_layout
 from endoprior.model.basis import basis_weights
 from endoprior.model.fixed_color import with_fixed_color
-from endoprior.model.gaussians import create_gaussians
+from endoprior.model.gaussians import Gaussians, create_gaussians
 from endoprior.model.scene import Scene
-from endoprior.visualization.carried_texture import COLORS, SQUARES, paint_texture
+from endoprior.visualization.carried_texture import SQUARES, PaintedTissue
 
 WIDTH, HEIGHT, FOCAL, DEPTH, NUM_FRAMES = 160, 96, 200.0, 60.0, 10
 CAMERA = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, np.eye(4))
@@ -69,42 +69,58 @@ def color_share(scene: Scene) -> float:
     return context.result.scores["color_share"]
 
 
-def test_the_pattern_is_a_checkerboard_on_the_first_frame():
-    # The plane is gray below 0.5, so that half of it and half of a square's color are on either side of 0.4 in green.
-    green = seen(paint_texture(wall()), 0)[..., 1]
-    center = slice(SQUARE // 2, None, SQUARE)
-    squares = green[center, center] > 0.5 * COLORS[:, 1].mean() + 0.2
-    row, column = np.indices(squares.shape)
-    assert np.array_equal(squares, (row + column) % 2 == 1)
+def painted(scene: Scene, frame: int) -> np.ndarray:
+    """(H, W) how blue a frame of the painted scene is; the wall itself is gray: 0."""
+    color = PaintedTissue(scene).render(frame / NUM_FRAMES, CAMERA)
+    return color[..., 2] - color[..., 0]
 
 
-def test_tissue_that_moves_carries_the_pattern_by_as_many_pixels():
-    shift = 5 * SQUARE  # an odd number of squares: without motion every square would have the other color
-    painted = paint_texture(wall(shift_mm=shift * DEPTH / FOCAL, shade=0.5))
-    first, middle = seen(painted, 0), seen(painted, MIDDLE)
-    assert np.abs(middle[:, shift:] - first[:, :-shift]).max() < 0.01  # rays that are more oblique widen Gaussians
-    assert np.abs(middle - first).mean() > 0.1
-    entered = middle[4:-4, : shift - 4]  # it was outside of the first frame, and so it is gray
-    assert np.abs(entered - entered.mean(-1, keepdims=True)).max() < 1e-3
+def test_the_grid_is_sharp_on_the_first_frame():
+    blue = painted(wall(), 0)[SQUARE // 2 :: SQUARE, 2 * SQUARE : -2 * SQUARE]  # rows between two lines
+    lines = blue.reshape(len(blue), -1, SQUARE)
+    assert np.abs(lines[..., 1:-1]).max() < 1e-4, "there is color between the lines"
+    assert lines[..., [0, -1]].min() > 0.1
 
 
-def test_color_that_changes_does_not_move_the_pattern():
+def test_tissue_that_moves_carries_the_grid_by_as_many_pixels():
+    shift = 4.5 * SQUARE  # without motion every line would be where there is none
+    scene = wall(shift_mm=shift * DEPTH / FOCAL, shade=0.5)
+    first, middle, shift = painted(scene, 0), painted(scene, MIDDLE), round(shift)
+    inside = slice(2, -2)
+    assert np.abs(middle[inside, shift + 4 :] - first[inside, 4:-shift]).max() < 0.02  # Gaussians of different gray
+    assert np.abs(middle - first)[inside, shift + 4 :].max() > 0.1
+    assert np.abs(middle[:, : shift - 4]).max() < 1e-3, "what came in from outside is painted"
+
+
+def test_color_that_changes_does_not_move_the_grid():
     scene = wall(shade=0.5)
-    painted = paint_texture(scene)
     assert np.abs(seen(scene, MIDDLE) - seen(scene, 0)).mean() > 0.05
-    assert np.array_equal(seen(painted, MIDDLE), seen(painted, 0))
+    assert np.array_equal(painted(scene, MIDDLE), painted(scene, 0))
 
 
-def test_what_the_first_frame_does_not_show_is_not_painted():
+def test_a_scene_without_color_over_time_is_painted_too():
+    scene = wall(shift_mm=2)
+    basis = replace(scene.config.deformation.basis, deform_color=False)
+    layout = motion_layout(scene.config.deformation)
+    config = replace(scene.config, deformation=replace(scene.config.deformation, basis=basis))
+    motion = torch.cat([scene.gaussians["motion"][..., part] for name, part in layout.items() if name != "sh_dc"], -1)
+    plain = replace(scene, config=config, gaussians=Gaussians(scene.gaussians.tensors | {"motion": motion}))
+    assert np.allclose(painted(plain, MIDDLE), painted(scene, MIDDLE), atol=1e-5)
+
+
+def test_what_the_first_frame_hides_is_not_painted():
+    # A strip in front of the wall moves away in the middle frame.
     scene = wall()
-    hidden = scene.gaussians["means"].detach().clone()
-    hidden[::2, 2] *= 1.1  # every second Gaussian lies 10 % deeper on its ray, behind the others
-    hidden[::2, :2] *= 1.1
-    scene.gaussians.tensors["means"] = hidden
-    with torch.no_grad():
-        scene.gaussians["log_scales"].add_(np.log(2))
-    painted = paint_texture(scene).gaussians["sh_dc"] - scene.gaussians["sh_dc"]
-    assert not painted[::2].any() and painted[1::2].abs().sum() > 100
+    pixels, _ = project(scene.gaussians["means"].detach().numpy(), CAMERA)
+    strip = torch.from_numpy((pixels[:, 0] > 60) & (pixels[:, 0] < 100))
+    layout, behind = motion_layout(scene.config.deformation), wall().gaussians.tensors
+    tensors = {name: torch.cat([value, behind[name][strip]]) for name, value in scene.gaussians.tensors.items()}
+    front = slice(len(scene), None)
+    tensors["means"], tensors["motion"] = tensors["means"].detach(), tensors["motion"].detach()
+    tensors["means"][front] *= 0.8
+    tensors["motion"][front, 4, layout["means"].start] = 100
+    blue = painted(replace(scene, gaussians=Gaussians(tensors)), MIDDLE)
+    assert np.abs(blue[:, 64:96]).max() < 1e-3 and blue[:, 4:56].max() > 0.1
 
 
 def test_fixed_color_is_the_mean_over_the_given_times():

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 class Render:
     """Render a trained scene: rgb/*.png, depth/*.npy (mm), side_by_side/*.png and an mp4.
 
-    With `--layer texture`: texture/*.png and texture.mp4, a checkerboard painted on the first frame that only motion
-    carries. Where it slides on the tissue of the input beside it, the model's motion is wrong (docs/trust.md).
+    With `--layer texture` it writes texture/*.png and texture.mp4: a grid painted on the first frame, carried by the
+    model's motion, beside the input. Where the grid slides on the tissue, the motion is wrong (docs/trust.md).
     """
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
@@ -35,7 +35,7 @@ class Render:
     split: Literal["video", "test", "train"] = "video"
     """Frames of the sequence to render."""
     layer: Literal["color", "texture"] = "color"
-    """Color and depth, or a checkerboard on the tissue that shows how the model moves."""
+    """Color and depth, or a grid on the tissue that shows how the model moves."""
     times: tuple[float, ...] = ()
     """Times in [0, 1] to render instead of a split."""
     camera: Literal["sequence", "sway"] = "sequence"
@@ -75,8 +75,8 @@ def render(scene: Scene, args: Render) -> None:
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
     from ..runs.stored_run import sequence_of_run
-    from ..visualization.carried_texture import write_texture_film
     from ..visualization.camera_paths import read_path, sway_path, times_path
+    from ..visualization.carried_texture import write_texture_film
     from ..visualization.rendered_views import depth_span, write_views
 
     frames, total = None, len(scene.cameras)

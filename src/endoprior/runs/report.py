@@ -46,7 +46,7 @@ ERROR_FULL_SCALE = 0.15
 def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, title: str = "") -> None:
     """Write the report of a finished run folder as one PNG.
 
-    Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; a pattern
+    Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; a grid
     painted on the first frame and carried to the middle and the last one, beside the input; then the training curve,
     the PSNR of each test frame, and the scores of `metrics.json`. A `title` stands above all.
     """
@@ -104,7 +104,7 @@ def _texture_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArr
         color = to_u8(painted.render(frame.time, frame.camera))
         if index:
             cells.append((f"input, frame {index}", frame.rgb_u8))
-        cells.append((f"carried to frame {index}" if index else "pattern on frame 0", color))
+        cells.append((f"grid carried to frame {index}" if index else "grid on frame 0", color))
     return cells
 
 

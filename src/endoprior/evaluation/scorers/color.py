@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ...model.fixed_color import changes_color, with_fixed_color
 from .. import metrics
 from ..context import EvaluationContext
@@ -11,7 +13,7 @@ from ..score import Score
 SCORES = (
     Score(
         "color_share", "change by color", "", False, 3,
-        "Squared change of tissue pixels when each Gaussian's color is fixed to its mean, over their variance in time.",
+        "Share of the change of rendered tissue over time that is lost when colors are fixed: motion does not make it.",
         "absolute", group="motion", hint="0: all by motion; 1: nothing moves",
     ),
 )  # fmt: skip
@@ -23,13 +25,13 @@ def compute(context: EvaluationContext) -> None:
     if not changes_color(scene):
         raise metrics.ScoreUnavailable("the colors of this scene do not change with time")
     fixed = SceneFrames(with_fixed_color(scene, [frame.time for frame in context.frames]), context.sequence)
-    by_color, count, total, squares = 0.0, 0.0, 0.0, 0.0
+    by_color = count = total = squares = np.float64(0)
     for frame in context.frames:
         mask = frame.tissue_mask[..., None]
-        image = context.rendered[frame.index].color.astype("float64") * mask
-        by_color += float(((image - fixed.render(frame.index)[0]) ** 2 * mask).sum())
+        image = np.float64(mask) * context.rendered[frame.index].color
+        by_color += (mask * (image - fixed.render(frame.index)[0]) ** 2).sum()
         count, total, squares = count + mask, total + image, squares + image**2
-    variance = float((squares - total**2 / (count + (count == 0))).sum())
-    if variance <= 1e-12 * float(squares.sum()):
+    change = (squares - total**2 / np.maximum(count, 1)).sum()  # over time, around the mean of each pixel
+    if change <= 1e-12 * squares.sum():
         raise metrics.ScoreUnavailable("nothing changes in the rendered frames of the split")
-    context.add("color_share", by_color / variance)
+    context.add("color_share", by_color / change)
