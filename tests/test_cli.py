@@ -162,6 +162,16 @@ def test_render_of_chosen_times_and_a_camera_path(run, tmp_path, capsys):
     assert "path.json" in complaint(capsys)
 
 
+def test_render_writes_the_carried_grid_beside_the_input(run, tmp_path):
+    _, folder = run
+    assert main(["render", str(folder), str(tmp_path), "--split", "test", "--layer", "texture"]) == 0
+    assert {p.name for p in tmp_path.iterdir()} >= {"texture", "texture.mp4"}
+    assert sorted(p.name for p in (tmp_path / "texture").iterdir()) == ["000001.png", "000009.png"]
+    assert cv2.imread(str(tmp_path / "texture" / "000001.png")).shape == (40, 2 * 48, 3)
+    assert main(["render", str(folder), str(tmp_path), "--times", "0", "--layer", "texture"]) == 0
+    assert cv2.imread(str(tmp_path / "texture" / "000000.png")).shape == (40, 48, 3), "no input at a chosen time"
+
+
 def test_prior_writes_maps_and_a_contact_sheet(run, tmp_path, capsys):
     data, _ = run
     assert main(["prior", str(data), str(tmp_path / "out"), "--split", "test"]) == 0

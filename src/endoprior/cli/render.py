@@ -22,7 +22,11 @@ if TYPE_CHECKING:
 
 @dataclass
 class Render:
-    """Render a trained scene: rgb/*.png, depth/*.npy (mm), side_by_side/*.png and an mp4."""
+    """Render a trained scene: rgb/*.png, depth/*.npy (mm), side_by_side/*.png and an mp4.
+
+    With `--layer texture` it writes texture/*.png and texture.mp4: a grid painted on the first frame, carried by the
+    model's motion, beside the input. Where the grid slides on the tissue, the motion is wrong (docs/trust.md).
+    """
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Run folder."""
@@ -30,6 +34,8 @@ class Render:
     """Output folder. Default: RUN/renders for the frames and RUN/video.mp4 for the video."""
     split: Literal["video", "test", "train"] = "video"
     """Frames of the sequence to render."""
+    layer: Literal["color", "texture"] = "color"
+    """Color and depth, or a grid on the tissue that shows how the model moves."""
     times: tuple[float, ...] = ()
     """Times in [0, 1] to render instead of a split."""
     camera: Literal["sequence", "sway"] = "sequence"
@@ -43,7 +49,12 @@ class Render:
 
 
 HELP = Help(
-    examples=(("RUN",), ("RUN", "OUT", "--split", "test"), ("RUN", "OUT", "--camera", "sway")),
+    examples=(
+        ("RUN",),
+        ("RUN", "OUT", "--split", "test"),
+        ("RUN", "OUT", "--camera", "sway"),
+        ("RUN", "OUT", "--layer", "texture"),
+    ),
 )
 
 
@@ -65,6 +76,7 @@ def render(scene: Scene, args: Render) -> None:
     from ..evaluation.scoring import scored_data
     from ..runs.stored_run import sequence_of_run
     from ..visualization.camera_paths import read_path, sway_path, times_path
+    from ..visualization.carried_texture import write_texture_film
     from ..visualization.rendered_views import depth_span, write_views
 
     frames, total = None, len(scene.cameras)
@@ -87,8 +99,12 @@ def render(scene: Scene, args: Render) -> None:
         else:
             views = times_path(times, scene.cameras)
     out = args.out or args.run / "renders"
-    video = args.out / "video.mp4" if args.out else args.run / "video.mp4"
+    video = (args.out or args.run) / ("video.mp4" if args.layer == "color" else "texture.mp4")
     if not args.out and out.is_symlink():  # in an untrusted run the link could point anywhere
         raise input_error(out, "a folder", "a link to one", "Remove the link, or pass OUT.")
-    write_views(scene, views, out, video, frames)
+    if args.layer == "color":
+        write_views(scene, views, out, video, frames)
+    else:
+        out = out / "texture"
+        write_texture_film(scene, views, out, video, frames)
     say(f"{len(views)} frames: {out}\nvideo: {video}")

@@ -19,6 +19,7 @@ SCORERS = (
     "image",
     "depth",
     "flow",
+    "color",
     "lpips",
     "stability",
     "primitives",

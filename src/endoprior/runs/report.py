@@ -18,6 +18,7 @@ from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
 from ..system.atomic import whole_file
+from ..visualization.carried_texture import PaintedTissue
 from ..visualization.image_tools import colorize, to_u8
 from ..visualization.rendered_views import depth_span
 from .observers import LOG_EVERY
@@ -28,6 +29,7 @@ SHOWN_SCORES = (
     "ssim",
     "depth_rmse_mm",
     "flow_error_dis",
+    "color_share",
     "depth_instability_mm",
     "psnr_behind_tool",
     "depth_rmse_behind_tool_mm",
@@ -44,25 +46,26 @@ ERROR_FULL_SCALE = 0.15
 def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, title: str = "") -> None:
     """Write the report of a finished run folder as one PNG.
 
-    Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; then the
-    training curve, the PSNR of each test frame, and the scores of `metrics.json`. A `title` stands above all.
+    Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; a grid
+    painted on the first frame and carried to the middle and the last one, beside the input; then the training curve,
+    the PSNR of each test frame, and the scores of `metrics.json`. A `title` stands above all.
     """
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     per_frame = json.loads((run / "per_frame.json").read_text(encoding="utf-8"))
     log = [json.loads(line) for line in (run / "log.jsonl").read_text(encoding="utf-8").splitlines()]
-    rows = _image_rows(scene, sequence)
+    rows = [*_image_rows(scene, sequence), _texture_row(scene, sequence)]
     # An own canvas: `pyplot` would choose a backend for the whole process.
     figure = Figure(figsize=(2.6 * len(rows[0]), 2.1 * len(rows) + 3.4), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, fontsize=12)
     top, bottom = figure.subfigures(2, 1, height_ratios=[2.1 * len(rows), 3.4])
-    axes = np.atleast_2d(top.subplots(len(rows), len(rows[0])))
-    for row, cells in zip(axes, rows, strict=True):
-        for axis, (title, image) in zip(row, cells, strict=True):
+    for row, cells in zip(top.subplots(len(rows), len(rows[0])), rows, strict=True):
+        for axis in row:
+            axis.set_axis_off()
+        for axis, (title, image) in zip(row, cells, strict=False):  # the last row is shorter where tissue is known
             axis.imshow(image)
             axis.set_title(title, fontsize=8)
-            axis.set_axis_off()
     loss_axis, psnr_axis, table_axis = bottom.subplots(1, 3, width_ratios=[1, 1, 1.1])
     _plot_loss(loss_axis, log)
     _plot_psnr(psnr_axis, per_frame)
@@ -92,6 +95,17 @@ def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, N
         ]
         rows.append(cells)
     return rows
+
+
+def _texture_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[np.uint8]]]:
+    painted, cells = PaintedTissue(scene), []
+    for index in (0, len(sequence) // 2, len(sequence) - 1):
+        frame = sequence.frame(index)
+        color = to_u8(painted.render(frame.time, frame.camera))
+        if index:
+            cells.append((f"input, frame {index}", frame.rgb_u8))
+        cells.append((f"grid carried to frame {index}" if index else "grid on frame 0", color))
+    return cells
 
 
 def _plot_loss(axis: Axes, log: list[dict]) -> None:
