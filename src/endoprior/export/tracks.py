@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.geometry import back_project
-from ..data import load_sequence
+from ..data import FrameSequence, load_sequence
 from ..evaluation.scoring import scored_data
 from ..model.carry import carry
 from ..model.scene import Scene
@@ -44,7 +44,7 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     """
     cameras = scene.cameras
     times = [i / len(cameras) for i in range(len(cameras))]
-    sequence = options.data and load_sequence(options.data, scored_data(scene.config.data))
+    sequence = None if options.data is None else _sequence_of(scene, options.data)
     with whole_folder(out) as folder:
         if options.points:
             queries = read_query_points(options.points, scene)
@@ -74,6 +74,21 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         )
         table = _table(positions, pixels, visible, carried.confidence, times)
         (folder / "tracks.csv").write_text(table, encoding="utf-8", newline="\n")
+
+
+def _sequence_of(scene: Scene, data: Path) -> FrameSequence:
+    """The sequence in the folder `data`.
+
+    Raises:
+        InputError: it cannot be read, or it is not the one of the scene.
+    """
+    sequence, camera = load_sequence(data, scored_data(scene.config.data)), scene.cameras[0]
+    own = sequence.camera(0)
+    want, got = (len(scene.cameras), camera.width, camera.height), (len(sequence), own.width, own.height)
+    if want != got:
+        want, got = ("{} frames of {}x{}".format(*size) for size in (want, got))
+        raise input_error(data, want, got, "pass the sequence of the run.")
+    return sequence
 
 
 def read_query_points(file: Path, scene: Scene) -> QueryPoints:

@@ -19,8 +19,9 @@ NUM_CARRIERS = 8
 """Gaussians that carry a point."""
 NEAR_PX = 4.0
 """Confidence is the probability of an error below this, px of an image 640 px wide."""
-ERROR_SHARE = 0.5
-"""Error of a carried point as a share of the disagreement of its carriers: measured on phantoms."""
+LEAST_ERROR_PX, ERROR_PER_SPREAD = 1.3, 0.65
+"""Deviation of a carried point's error, px of such an image: what remains where its carriers agree, and what is added
+for each px by which they disagree. Fitted to two phantoms (docs/log.md)."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class CarriedPoints:
     positions: NDArray[np.float32]
     """(T, P, 3) world, mm."""
     confidence: NDArray[np.float32]
-    """(T, P) in [0, 1]: by `confidence_of` from how far the carriers of a point agree; 1 in the point's own frame."""
+    """(T, P) in [0, 1]: by `confidence_of`; greatest in the point's own frame."""
 
 
 def carry_points(
@@ -81,13 +82,13 @@ def carry(scene: Scene, points: NDArray, from_frame: NDArray[np.intp], times: li
 
 
 def confidence_of(spread_px: NDArray) -> NDArray:
-    """Probability of an error below `NEAR_PX`, if the error is normal with a deviation that is a share of the spread.
+    """Probability that a carried point is less than `NEAR_PX` from the truth: both parts of its error are normal.
 
     Args:
-        spread_px: by how much the carriers of a point disagree about its motion, px of an image 640 px wide.
+        spread_px: (...) by how much its carriers disagree about its motion, px of an image 640 px wide.
     """
-    deviation = np.maximum(ERROR_SHARE * spread_px, 1e-6)
-    return 1 - np.exp(-0.5 * (NEAR_PX / deviation) ** 2)
+    variance = LEAST_ERROR_PX**2 + (ERROR_PER_SPREAD * spread_px) ** 2
+    return 1 - np.exp(-0.5 * NEAR_PX**2 / variance)
 
 
 def _spread_px(deviations: NDArray, weights: NDArray, points: NDArray, camera: Camera) -> NDArray:

@@ -11,8 +11,8 @@ from ..core.geometry import bilinear, expected_depth, project
 from ..core.types import Camera
 from .scene import Scene
 
-HIDDEN_SHARE = 0.02
-"""A point is hidden if it lies deeper than the rendered surface at its pixel by more than this share."""
+HIDDEN_SHARE = 0.04
+"""A point is hidden if it lies deeper than the rendered surface at its pixel by more than this share (docs/log.md)."""
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,7 @@ class ViewableScene:
         small = shrunk_camera(camera, max(camera.width // SEEN_WIDTH, 1))
         depth = self.surface(ViewSettings(frame=frame), small)
         surface = Surface(depth, np.zeros((*depth.shape, 3), np.float32), small)
-        return surface, None if self.sequence is None else self.sequence.frame(frame).tissue_mask
+        return surface, None if self.sequence is None else layers.fitted(self.sequence.frame(frame).tissue_mask, camera)
 
     def tracks(self) -> CarriedPoints:
         """See `Viewable.tracks`: a grid on the surface of the first frame, off the tool."""
