@@ -75,7 +75,7 @@ def _with_data(scene: Scene, run: Path, out: Path, options: ExportOptions) -> Ex
     if "data" not in load_format(format_name(out, options)).options:
         return options
     folder = run.parent if run.is_file() else run
-    sequence = sequence_of(scene, folder, options.data, "there are no tool masks: tools hide no point")
+    sequence = sequence_of(scene, folder, options.data, "there are no tool masks, and tools hide no point")
     return replace(options, data=sequence and sequence.path)
 
 
