@@ -19,6 +19,7 @@ from plyfile import PlyData
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.core.geometry import project
+from endoprior.data import load_sequence
 from endoprior.export.axes import points_in_axes
 from endoprior.export.depth import depth_png
 from endoprior.export.formats import FORMATS, formats_of, load_format
@@ -182,13 +183,48 @@ def test_tracks_of_query_points(run, tmp_path):
         pixels, _ = project(world[i], scene.cameras[i])
         assert found["pixels"][i] == pytest.approx(pixels, abs=1e-2)
     rows = read_tracks(tmp_path / "out" / "tracks.csv")
-    assert list(rows[0]) == ["frame", "time", "point", "x", "y", "z", "u", "v", "visible"] and len(rows) == 20
+    assert (
+        list(rows[0]) == ["frame", "time", "point", "x", "y", "z", "u", "v", "visible", "confidence"]
+        and len(rows) == 20
+    )
     for row in rows:
         i, p = int(row["frame"]), int(row["point"])
         assert [float(row[c]) for c in "xyz"] == pytest.approx(found["points"][i, p], abs=1e-3)
         assert float(row["u"]) == pytest.approx(found["pixels"][i, p, 0], abs=1e-3)
+        assert float(row["confidence"]) == pytest.approx(found["confidence"][i, p], abs=1e-3)
         assert (float(row["time"]), row["visible"]) == (i / 10, str(int(found["visible"][i, p])))
     assert found["visible"].mean() > 0.7
+
+
+def test_tools_hide_points_where_the_sequence_is_there(run, tmp_path, capsys, make_tiny_sequence):
+    assert export(run, tmp_path / "without", "tracks", "--grid-px", "4") == 0
+    assert "no tool masks" in capsys.readouterr().out
+    without = np.load(tmp_path / "without" / "tracks.npz")
+    data = make_tiny_sequence(num_frames=10, width=64, height=48)
+    assert export(run, tmp_path / "a", "tracks", "--grid-px", "4", "--data", str(data)) == 0
+    assert "no tool masks" not in capsys.readouterr().out
+    found = np.load(tmp_path / "a" / "tracks.npz")
+    for i, frame in enumerate(load_sequence(data).frames("video")):
+        x, y = np.clip(np.floor(found["pixels"][i]), 0, (63, 47)).astype(int).T
+        tissue = frame.tissue_mask[y, x]
+        assert np.array_equal(found["visible"][i], without["visible"][i] & tissue)
+    returned = (found["visible"][1:] & ~found["visible"][:-1]).any()
+    assert returned and found["visible"].sum() < without["visible"].sum()
+    trained = tmp_path / "run"  # a run says where its sequence is
+    trained.mkdir()
+    (trained / "config.json").write_text(json.dumps({"data": {"path": str(data)}}))
+    (trained / "scene.safetensors").write_bytes((run / "scene.safetensors").read_bytes())
+    assert export(trained, tmp_path / "b", "tracks", "--grid-px", "4") == 0
+    assert np.array_equal(np.load(tmp_path / "b" / "tracks.npz")["visible"], found["visible"])
+
+
+def test_a_sequence_that_does_not_fit_is_an_error(run, tmp_path, capsys, tiny_sequence, make_tiny_sequence):
+    assert export(run, tmp_path / "out", "tracks", "--data", str(tiny_sequence)) == 2
+    assert "expected 10 frames, got 17" in capsys.readouterr().err
+    small = make_tiny_sequence("small", num_frames=10)
+    assert export(run, tmp_path / "out", "tracks", "--data", str(small)) == 2
+    assert "expected 10 frames of 64x48, got 10 frames of 48x40" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_tracks_behind_tissue_or_outside_the_image_are_not_visible(run):

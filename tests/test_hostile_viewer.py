@@ -221,12 +221,12 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
     stranger.say(stranger.camera())
     time.sleep(0.5)
     stranger.socket.close()
-    allowed = {"measure", "tool", "tracks", "frame", "clip"}  # true and 1 are values some of them can have
+    allowed = {"measure", "follow", "tool", "tracks", "frame", "clip"}  # true and 1 are values some of them can have
     now = {name: getattr(viewer.panel, name).value for name in state}
     assert {name for name in state if state[name] != now[name]} <= allowed
     assert now["clip"] == state["clip"] and 0 <= now["frame"] <= 9
     assert resident_mb() - before < 100
-    for name in ("measure", "tool", "tracks"):
+    for name in ("measure", "follow", "tool", "tracks"):
         good.set(getattr(viewer.panel, name), False)
     if orbit:
         good.set(viewer.panel.camera, panels.ENDOSCOPE)

@@ -115,7 +115,7 @@ def choose(viewer, handle, value) -> None:
     """Set a control as a browser would; the page's own drop-downs are viser's matter."""
     client = next(iter(viewer.server.get_clients().values()))
     handle.value = value
-    viewer.jobs.put(viewer.read_panel if handle is not viewer.panel.measure else viewer.read_measuring)
+    viewer.jobs.put(viewer.read_panel if handle is not viewer.panel.measure else viewer.read_clicking)
     client.flush()
 
 

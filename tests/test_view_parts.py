@@ -84,11 +84,17 @@ def test_track_lines_end_at_the_frame_and_skip_unknown_points():
     paths = np.zeros((12, 2, 3))
     paths[:, 0, 0] = np.arange(12)
     paths[5, 1] = np.nan
-    marks = track_lines(paths, 10)
+    sure = np.ones((12, 2), bool)
+    marks = track_lines(paths, 10, sure)
     first = marks.segments[(marks.colors == marks.colors[0]).all(1)]
     assert len(first) == 8 and first[-1, 1, 0] == 10 and first[0, 0, 0] == 2
     assert np.isfinite(marks.segments).all() and len(marks) == 8 + 6
-    assert marks.dots.sum() == 2 and len(track_lines(paths, 0)) == 2
+    assert marks.dots.sum() == 2 and len(track_lines(paths, 0, sure)) == 2
+    sure[8:, 0] = False
+    faded = track_lines(paths, 10, sure)
+    assert faded.dots.tolist().count(True) == 1 and np.array_equal(faded.segments, marks.segments)
+    darker = faded.colors.max(1) < 0.5 * marks.colors.max(1)
+    assert marks.segments[darker, 1, 0].tolist() == [8, 9, 10], "where the first point is hidden or uncertain"
 
 
 def test_lines_are_drawn_at_their_projection():

@@ -27,6 +27,7 @@ from endoprior.runs.training_run import train
 from endoprior.view import live
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT, POINTS
 from endoprior.view.server import Viewer
+from endoprior.view.tracks import DrawnTracks
 from endoprior.view.view_settings import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.view.viewable_sequence import ViewableSequence
@@ -129,6 +130,41 @@ def test_two_clicks_measure_and_the_distance_follows_the_tissue(viewer, client, 
     client.click(np.nan, 0.5)
     time.sleep(0.5)
     assert viewer.measured.paths.shape[1] == 2  # clicks on nothing change nothing
+
+
+def test_a_click_in_any_frame_starts_a_track(viewer, client, scene):
+    client.set(viewer.panel.frame, 3)
+    before = client.image()
+    client.set(viewer.panel.follow, True)
+    time.sleep(0.3)
+    client.click(0.5, 0.5)
+    marked = client.image()
+    assert len(viewer.tracks.picked) == 1 and viewer.measured is None
+    (track,) = viewer.tracks.picked
+    assert track.positions[3, 0] == pytest.approx([0, 0, 50], abs=0.7)
+    moved = scene.at((NUM_FRAMES - 1) / NUM_FRAMES).means - scene.at(0).means
+    assert track.positions[-1, 0, 0] - track.positions[0, 0, 0] == pytest.approx(float(moved[0, 0]), abs=1e-3)
+    rows, columns = np.nonzero((marked != before).any(-1))
+    assert len(rows) and abs(rows.mean() - 25.5) < 2 and abs(columns.max() - 32) < 4  # a trail that ends at the click
+    client.set(viewer.panel.clear_tracks, True)
+    assert np.array_equal(client.image(), before) and not viewer.tracks.picked
+
+
+def test_a_track_fades_where_a_tool_hides_its_point_or_where_it_is_uncertain(scene, make_tiny_sequence):
+    sequence = load_sequence(make_tiny_sequence(num_frames=NUM_FRAMES, width=64, height=48))
+    viewable = ViewableScene(scene, "wall", sequence)
+    covered = np.argwhere(sequence.frame(4).tissue_mask & ~sequence.frame(1).tissue_mask)
+    y, x = covered[len(covered) // 2] + 0.5
+    under_tool = np.array([(x - 32) / 80 * 50, (y - 24) / 80 * 50, 50.0])
+    assert not viewable.shows(under_tool[None], 1)[0]
+    assert ViewableScene(scene, "wall").shows(under_tool[None], 1)[0], "without the sequence nothing is known of tools"
+    tracks = DrawnTracks(viewable)
+    tracks.pick(under_tool, 1)
+    lines = tracks.lines(1, False)
+    assert not lines.dots.any() and lines.colors[-1].max() < 128
+    assert tracks.lines(4, False).dots.any(), "seen again"
+    tracks.picked = [replace(tracks.picked[0], confidence=np.zeros((NUM_FRAMES, 1)))]
+    assert not tracks.lines(4, False).dots.any(), "not certain there any more"
 
 
 def test_play_advances_and_pauses(viewer, client):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +14,7 @@ from ..system.console import say
 from .help_page import Help
 from .parsing import parse
 from .progress import Counting
-from .trained_scene import open_scene
+from .trained_scene import open_scene, sequence_of
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
@@ -58,12 +58,25 @@ def run(argv: list[str]) -> None:
     scene = open_scene(args.run)
     if not args.overwrite:
         require_new_file(args.out)
+    options = _with_data(scene, args.run, args.out, options)
     with Counting() as progress:
         written = export(scene, args.out, options, partial(progress, "exporting"))
     for path in written:
         say(f"{path}: {_words(scene, path, options)}")
     if scene.lengths_are_relative:
         say("note: the scale of this scene is assumed. Its lengths are not millimeters.")
+
+
+def _with_data(scene: Scene, run: Path, out: Path, options: ExportOptions) -> ExportOptions:
+    """`options` with the sequence folder of the run, for a format that uses it; with a note if there is none."""
+    from ..export.exporting import format_name
+    from ..export.formats import load_format
+
+    if "data" not in load_format(format_name(out, options)).options:
+        return options
+    folder = run.parent if run.is_file() else run
+    sequence = sequence_of(scene, folder, options.data, "there are no tool masks, and tools hide no point")
+    return replace(options, data=sequence and sequence.path)
 
 
 def _words(scene: Scene, out: Path, options: ExportOptions) -> str:

@@ -1,13 +1,15 @@
-"""Open the scene of a run that the user names."""
+"""Open the scene of a run that the user names, and its sequence."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
+from ..system.console import say
 
 if TYPE_CHECKING:
+    from ..data import FrameSequence
     from ..model.scene import Scene
 
 
@@ -26,3 +28,29 @@ def open_scene(run: Path) -> Scene:
         if error := not_a_run(run):
             raise error from None
         raise
+
+
+def sequence_of(scene: Scene, run: Path, data: Path | None, without: str) -> FrameSequence | None:
+    """The sequence of a run's scene; None, with a note, if it does not exist any more.
+
+    Args:
+        run: run folder. data: sequence folder that the user names, if any.
+        without: what the note says is missing.
+    Raises:
+        InputError: `data` does not fit the run.
+    """
+    from ..data import load_sequence
+    from ..evaluation.scoring import scored_data
+    from ..runs.stored_run import sequence_of_run
+
+    try:
+        sequence = load_sequence(data or sequence_of_run(run), scored_data(scene.config.data))
+    except InputError as error:
+        if data:
+            raise
+        say(f"note: without input frames {without}. {error}")
+        return None
+    if len(sequence) != len(scene.cameras):
+        fix = "`--data FOLDER` with the sequence of the run."
+        raise input_error(sequence.path, f"{len(scene.cameras)} frames", str(len(sequence)), fix)
+    return sequence

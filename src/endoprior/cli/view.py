@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ..core.checks import InputError, input_error
+from ..core.checks import input_error
 from ..core.shell import command
 from ..doctor.choice import Wanted
 from ..system.console import say
 from .devices import on_device
 from .help_page import Help
 from .parsing import parse
+from .trained_scene import sequence_of
 
 if TYPE_CHECKING:
-    from ..data import FrameSequence
-    from ..model.scene import Scene
     from ..training.state import StepReport
     from ..training.trainer import Trainer
     from ..view.server import Viewer
@@ -124,28 +123,5 @@ def open_viewable(path: Path, data: Path | None, device: Wanted = "cpu") -> tupl
     from ..view.viewable_scene import ViewableScene
 
     scene = load_scene(folder)
-    originals = _originals(scene, folder, data)
+    originals = sequence_of(scene, folder, data, "there are no differences and tools to show")
     return ViewableScene(on_device(scene, device, fp16_planes=True), str(folder), originals), folder / "view"
-
-
-def _originals(scene: Scene, folder: Path, data: Path | None) -> FrameSequence | None:
-    """The sequence of a run; None, with a note, if it does not exist any more.
-
-    Raises:
-        InputError: `data` does not fit the run.
-    """
-    from ..data import load_sequence
-    from ..evaluation.scoring import scored_data
-    from ..runs.stored_run import sequence_of_run
-
-    try:
-        sequence = load_sequence(data or sequence_of_run(folder), scored_data(scene.config.data))
-    except InputError as error:
-        if data:
-            raise
-        say(f"note: without input frames there are no differences and tools to show. {error}")
-        return None
-    if len(sequence) != len(scene.cameras):
-        fix = "`--data FOLDER` with the sequence of the run."
-        raise input_error(sequence.path, f"{len(scene.cameras)} frames", str(len(sequence)), fix)
-    return sequence

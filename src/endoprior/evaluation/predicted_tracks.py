@@ -26,7 +26,7 @@ from ..footage.optical_flow import (
 )
 from ..model.carry import carry_points
 from ..model.scene import Scene
-from ..model.surface import project_visible, render_surface
+from ..model.surface import project_visible, render_surface, shown_pixels
 from ..system.memory import workers
 from .metrics import ScoreUnavailable
 
@@ -128,7 +128,7 @@ def by_chained_flow(true: TrueTracks, sequence: FrameSequence) -> PredictedTrack
         pixels[k + 1] = np.where(moving[:, None], pixels[k] + step, pixels[k])
         gap = np.linalg.norm(step + _flow_at(back, pixels[k + 1], frame), axis=-1)
         returns = gap <= RETURN_PX + RETURN_SHARE * np.linalg.norm(step, axis=-1)
-        shown = _on_tissue(pixels[k + 1], frame)
+        shown = shown_pixels(pixels[k + 1], frame.tissue_mask)
         x, y = _cells(pixels[k + 1], frame)
         depth = np.where(moving & shown & frame.depth_valid[y, x], frame.depth[y, x], depth)
         points[k + 1] = back_project(pixels[k + 1], depth, _at_origin(frame.camera))
@@ -143,7 +143,7 @@ def _in_frames(world: NDArray[np.floating], sequence: FrameSequence) -> Predicte
         pose = frame.camera.world_to_camera
         points.append(at @ pose[:3, :3].T + pose[:3, 3])
         pixels.append(_pixels(points[-1], frame.camera))
-        visible.append(_on_tissue(pixels[-1], frame))
+        visible.append(shown_pixels(pixels[-1], frame.tissue_mask))
     return PredictedTracks(np.stack(points), np.stack(pixels), np.stack(visible))
 
 
@@ -161,13 +161,6 @@ def _pixels(points: NDArray[np.floating], camera: Camera) -> NDArray[np.floating
     """(P, 2) pixels of points in camera axes; infinite behind the camera."""
     pixels, z = project(points, _at_origin(camera))
     return np.where((z > 0)[:, None], pixels, np.inf)
-
-
-def _on_tissue(pixels: NDArray[np.floating], frame: Frame) -> NDArray[np.bool_]:
-    """(P,) whether pixels are inside the image and not under the tool mask."""
-    x, y = _cells(pixels, frame)
-    inside = (pixels >= 0).all(1) & (pixels <= (frame.camera.width, frame.camera.height)).all(1)
-    return inside & frame.tissue_mask[y, x]
 
 
 def _cells(pixels: NDArray[np.floating], frame: Frame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

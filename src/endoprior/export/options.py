@@ -44,6 +44,8 @@ class ExportOptions:
     """CSV with columns x, y, frame: pixels to track; default: a grid on the first frame (tracks)."""
     grid_px: int = 32
     """Pixels between the points of that grid."""
+    data: Path | None = None
+    """Sequence folder whose masks tell where tools hide a point (tracks). Default: the one of the run."""
     title: str = ""
     """Title above the player (html)."""
     max_mb: float = 20.0

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.geometry import back_project
-from ..model.carry import carry_points
+from ..data import FrameSequence, load_sequence
+from ..evaluation.scoring import scored_data
+from ..model.carry import carry
 from ..model.scene import Scene
 from ..model.surface import Surface, depth_at, project_visible, render_surface
 from ..system.atomic import whole_folder
@@ -21,7 +23,7 @@ from .axes import points_in_axes
 from .formats import Format, Progress
 from .options import ExportOptions
 
-COLUMNS = ("frame", "time", "point", "x", "y", "z", "u", "v", "visible")
+COLUMNS = ("frame", "time", "point", "x", "y", "z", "u", "v", "visible", "confidence")
 
 
 @dataclass(frozen=True)
@@ -38,10 +40,11 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     """Track the points and write `out/tracks.csv` and `out/tracks.npz`.
 
     Raises:
-        InputError: the file of query points cannot be read, or a query point shows no surface.
+        InputError: the file of query points or the sequence cannot be read, or a query point shows no surface.
     """
     cameras = scene.cameras
     times = [i / len(cameras) for i in range(len(cameras))]
+    sequence = None if options.data is None else _sequence_of(scene, options.data)
     with whole_folder(out) as folder:
         if options.points:
             queries = read_query_points(options.points, scene)
@@ -49,26 +52,43 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             first = render_surface(scene, times[0], cameras[0], options.min_alpha)
             queries = grid_query_points(first, options.grid_px)
         starts = _back_projected(scene, queries, options.min_alpha)
-        carried = carry_points(scene, starts, queries.frames, times)
+        carried = carry(scene, starts, queries.frames, times)
         pixels = np.empty((len(times), len(starts), 2), np.float32)
         visible = np.empty(pixels.shape[:2], bool)
         for i, camera in enumerate(cameras):
             surface = render_surface(scene, times[i], camera, options.min_alpha)
-            pixels[i], visible[i] = project_visible(carried[i], surface)
+            mask = sequence.frame(i).tissue_mask if sequence else None
+            pixels[i], visible[i] = project_visible(carried.positions[i], surface, mask)
             progress(i + 1, len(cameras))
-        positions = points_in_axes(carried, options.frame)
+        positions = points_in_axes(carried.positions, options.frame)
         np.savez_compressed(
             folder / "tracks.npz",
             points=positions,
             pixels=pixels,
             visible=visible,
+            confidence=carried.confidence,
             times=np.array(times),
             start_frame=queries.frames,
             start_pixel=queries.pixels,
             axes=np.array(options.frame),
         )
-        table = _table(positions, pixels, visible, times)
+        table = _table(positions, pixels, visible, carried.confidence, times)
         (folder / "tracks.csv").write_text(table, encoding="utf-8", newline="\n")
+
+
+def _sequence_of(scene: Scene, data: Path) -> FrameSequence:
+    """The sequence in the folder `data`.
+
+    Raises:
+        InputError: it cannot be read, or it is not the one of the scene.
+    """
+    sequence, camera = load_sequence(data, scored_data(scene.config.data)), scene.cameras[0]
+    own = sequence.camera(0)
+    want, got = (len(scene.cameras), camera.width, camera.height), (len(sequence), own.width, own.height)
+    if want != got:
+        want, got = ("{} frames of {}x{}".format(*size) for size in (want, got))
+        raise input_error(data, want, got, "pass the sequence of the run.")
+    return sequence
 
 
 def read_query_points(file: Path, scene: Scene) -> QueryPoints:
@@ -125,7 +145,7 @@ def _back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDA
     return positions
 
 
-def _table(positions: NDArray, pixels: NDArray, visible: NDArray, times: list[float]) -> str:
+def _table(positions: NDArray, pixels: NDArray, visible: NDArray, confidence: NDArray, times: list[float]) -> str:
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(COLUMNS)
@@ -133,8 +153,10 @@ def _table(positions: NDArray, pixels: NDArray, visible: NDArray, times: list[fl
         for p in range(positions.shape[1]):
             x, y, z = (f"{value:.4f}" for value in positions[i, p])
             u, v = (f"{value:.3f}" if math.isfinite(value) else "" for value in pixels[i, p])
-            rows.writerow((i, f"{time:.6f}", p, x, y, z, u, v, int(visible[i, p])))
+            rows.writerow((i, f"{time:.6f}", p, x, y, z, u, v, int(visible[i, p]), f"{confidence[i, p]:.3f}"))
     return text.getvalue()
 
 
-FORMAT = Format(suffixes=(), options=("frame", "points", "grid_px", "min_alpha"), write=write, holds="tracks of points")
+FORMAT = Format(
+    suffixes=(), options=("frame", "points", "grid_px", "min_alpha", "data"), write=write, holds="tracks of points"
+)

@@ -1,20 +1,47 @@
-"""Material points carried by the Gaussians: where tissue that is at x now will be, or was, at other times."""
+"""Material points carried by the Gaussians: where tissue that is at x now will be, or was, and how sure that is."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from torch import Tensor
 
-from .scene import Scene
+from ..core.types import Camera
+from .gaussians import Gaussians
+from .ops import ops_for
+from .scene import Scene, offsets_at
 
 NUM_CARRIERS = 8
 """Gaussians that carry a point."""
+NEAR_PX = 4.0
+"""Confidence is the probability of an error below this, px of an image 640 px wide."""
+LEAST_ERROR_PX, ERROR_PER_SPREAD = 1.3, 0.65
+"""Deviation of a carried point's error, px of such an image: what remains where its carriers agree, and what is added
+for each px by which they disagree. Fitted to two phantoms (docs/log.md)."""
+
+
+@dataclass(frozen=True)
+class CarriedPoints:
+    """P points at T times."""
+
+    positions: NDArray[np.float32]
+    """(T, P, 3) world, mm."""
+    confidence: NDArray[np.float32]
+    """(T, P) in [0, 1]: by `confidence_of`; greatest in the point's own frame."""
 
 
 def carry_points(
     scene: Scene, points: NDArray, from_frame: NDArray[np.intp], times: list[float]
 ) -> NDArray[np.float32]:
+    """(T, P, 3) world positions of the points at all times, mm; see `carry`."""
+    return carry(scene, points, from_frame, times).positions
+
+
+def carry(scene: Scene, points: NDArray, from_frame: NDArray[np.intp], times: list[float]) -> CarriedPoints:
     """Move points with the Gaussians around them.
 
     A point is tied, at the time of its frame, to the 8 nearest Gaussians; it then moves by the mean of their
@@ -23,22 +50,62 @@ def carry_points(
     Args:
         points: (P, 3) world positions, mm.
         from_frame: (P,) position in `times` at which each point is where `points` says.
-        times: T times in [0, 1].
-    Returns:
-        (T, P, 3) world positions, mm.
+        times: T times in [0, 1]; each is seen by the camera of the nearest frame.
     """
-    centers = np.stack([scene.at(time).means.cpu().numpy() for time in times])
-    opacities = scene.gaussians.opacities.detach().cpu().numpy()
-    moved = np.empty((len(times), *points.shape), np.float32)
     k = min(NUM_CARRIERS, len(scene))
+    carriers, distances = np.empty((len(points), k), np.intp), np.empty((len(points), k))
     for start in np.unique(from_frame):
-        tied = np.flatnonzero(from_frame == start)
-        distances, carriers = cKDTree(centers[start]).query(points[tied], k=k, workers=1)
-        distances, carriers = distances.reshape(len(tied), k), carriers.reshape(len(tied), k)
-        width = np.maximum(distances.mean(1, keepdims=True), 1e-6)
-        weights = opacities[carriers] * np.exp(-0.5 * (distances / width) ** 2) + 1e-12
-        weights /= weights.sum(1, keepdims=True)
-        for i, there in enumerate(centers):  # one time after the other: many points at many times fit in memory
-            displacement = there[carriers] - centers[start, carriers]
-            moved[i, tied] = points[tied] + np.einsum("pkc,pk->pc", displacement, weights)
-    return moved
+        tied = from_frame == start
+        centers = _centers(scene, scene.gaussians, times[start])
+        found = cKDTree(centers).query(points[tied], k=k, workers=1)
+        distances[tied], carriers[tied] = (part.reshape(-1, k) for part in found)
+    opacities = scene.gaussians.opacities.detach().cpu().numpy()
+    width = np.maximum(distances.mean(1, keepdims=True), 1e-6)
+    weights = opacities[carriers] * np.exp(-0.5 * (distances / width) ** 2) + 1e-12
+    weights /= weights.sum(1, keepdims=True)
+    rows, own = np.unique(carriers, return_inverse=True)  # only those move: few points need few Gaussians
+    own = own.reshape(carriers.shape)
+    chosen = _taken(scene.gaussians, torch.from_numpy(rows).to(scene.device))
+    at_start = np.empty((len(points), k, 3), np.float32)
+    for start in np.unique(from_frame):
+        tied = from_frame == start
+        at_start[tied] = _centers(scene, chosen, times[start])[own[tied]]
+    positions = np.empty((len(times), *points.shape), np.float32)
+    confidence = np.empty(positions.shape[:2], np.float32)
+    for i, time in enumerate(times):  # one time after the other: many points at many times fit in memory
+        displacements = _centers(scene, chosen, time)[own] - at_start
+        mean = np.einsum("pkc,pk->pc", displacements, weights)
+        positions[i] = points + mean
+        spread = _spread_px(displacements - mean[:, None], weights, positions[i], scene.camera_at(time))
+        confidence[i] = confidence_of(spread)
+    return CarriedPoints(positions, confidence)
+
+
+def confidence_of(spread_px: NDArray) -> NDArray:
+    """Probability that a carried point is less than `NEAR_PX` from the truth: both parts of its error are normal.
+
+    Args:
+        spread_px: (...) by how much its carriers disagree about its motion, px of an image 640 px wide.
+    """
+    variance = LEAST_ERROR_PX**2 + (ERROR_PER_SPREAD * spread_px) ** 2
+    return 1 - np.exp(-0.5 * NEAR_PX**2 / variance)
+
+
+def _spread_px(deviations: NDArray, weights: NDArray, points: NDArray, camera: Camera) -> NDArray:
+    """(P,) standard deviation in the image, px at 640 px width, of (P, K, 3) mm; infinite behind the camera."""
+    pose = camera.world_to_camera
+    z = points @ pose[2, :3] + pose[2, 3]
+    lateral = deviations @ pose[:2, :3].T
+    mm = np.sqrt(np.einsum("pkc,pk->p", lateral**2, weights))
+    return np.where(z > 0, mm * camera.fx / np.maximum(z, 1e-6), np.inf) * (640 / camera.width)
+
+
+def _taken(gaussians: Gaussians, rows: Tensor) -> Gaussians:
+    return Gaussians({name: value.detach()[rows] for name, value in gaussians.tensors.items()})
+
+
+@torch.no_grad()
+def _centers(scene: Scene, gaussians: Gaussians, time: float) -> NDArray[np.float32]:
+    """(N, 3) centers of some Gaussians of the scene at a time, mm."""
+    offsets = offsets_at(gaussians, scene.field, time, scene.config, ops_for(scene.device))
+    return (gaussians["means"] + offsets.means).cpu().numpy()

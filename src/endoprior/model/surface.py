@@ -11,8 +11,8 @@ from ..core.geometry import bilinear, expected_depth, project
 from ..core.types import Camera
 from .scene import Scene
 
-HIDDEN_SHARE = 0.02
-"""A point is hidden if it lies deeper than the rendered surface at its pixel by more than this share."""
+HIDDEN_SHARE = 0.04
+"""A point is hidden if it lies deeper than the rendered surface at its pixel by more than this share (docs/log.md)."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,29 @@ def depth_at(surface: Surface, pixels: NDArray) -> NDArray[np.float64]:
     return bilinear(depth, pixels)
 
 
-def project_visible(points: NDArray, surface: Surface) -> tuple[NDArray, NDArray[np.bool_]]:
-    """(P, 2) pixels of world points (P, 3), and (P,) whether they are inside the image and not behind tissue."""
+def shown_pixels(pixels: NDArray, tissue_mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(P,) whether (P, 2) pixels are inside the image and on tissue.
+
+    Args:
+        tissue_mask: (H, W) False under tools.
+    """
+    size = np.array(tissue_mask.shape[::-1])
+    x, y = np.clip(np.floor(pixels), 0, size - 1).astype(np.intp).T
+    return (pixels >= 0).all(1) & (pixels <= size).all(1) & tissue_mask[y, x]
+
+
+def project_visible(
+    points: NDArray, surface: Surface, tissue_mask: NDArray[np.bool_] | None = None
+) -> tuple[NDArray, NDArray[np.bool_]]:
+    """(P, 2) pixels of world points (P, 3), and (P,) whether the image shows them.
+
+    It does where they are inside the image and neither behind rendered tissue nor under a tool.
+
+    Args:
+        tissue_mask: (H, W) False under tools; None: no tools.
+    """
     pixels, z = project(points.astype(np.float64), surface.camera)
-    inside = (z > 0) & (pixels >= 0).all(1) & (pixels <= (surface.camera.width, surface.camera.height)).all(1)
+    mask = np.ones(surface.depth.shape, bool) if tissue_mask is None else tissue_mask
     depth = depth_at(surface, pixels)
     with np.errstate(invalid="ignore"):  # NaN: no surface, so nothing is visible
-        return pixels, inside & (z <= depth * (1 + HIDDEN_SHARE))
+        return pixels, (z > 0) & shown_pixels(pixels, mask) & (z <= depth * (1 + HIDDEN_SHARE))

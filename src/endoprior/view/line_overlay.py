@@ -14,6 +14,8 @@ from ..core.types import Camera
 
 TRAIL_FRAMES = 8
 """Length of a drawn track, frames."""
+FADED = 0.4
+"""Brightness of a track where its point is hidden or uncertain, as a share."""
 RULER_COLOR = (255, 255, 0)
 
 
@@ -43,19 +45,25 @@ def concatenated(a: Lines, b: Lines) -> Lines:
     return Lines(*(np.concatenate(pair) for pair in parts))
 
 
-def track_lines(paths: NDArray, frame: int) -> Lines:
-    """The tracks `paths` (T, P, 3) over the last frames up to `frame`; NaN where a point is unknown."""
+def track_lines(paths: NDArray, frame: int, sure: NDArray[np.bool_]) -> Lines:
+    """Tracks over the last frames up to `frame`: faded, and without a dot, where a point is hidden or uncertain.
+
+    Args:
+        paths: (T, P, 3) world axes, mm; NaN where a point is unknown.
+        sure: (T, P) False where it is hidden or uncertain.
+    """
     first = max(frame - TRAIL_FRAMES, 0)
-    shown = paths[first : frame + 1]
+    shown, bright = paths[first : frame + 1], sure[first : frame + 1]
     if len(shown) == 1:  # a track of one frame is a dot
-        shown = np.concatenate([shown, shown])
+        shown, bright = np.concatenate([shown, shown]), np.concatenate([bright, bright])
     segments = np.stack([shown[:-1], shown[1:]], 2)  # (F, P, 2, 3)
     num_steps, num_points = segments.shape[:2]
     hues = np.linspace(0, 1, num_points, endpoint=False)
     colors = np.array([[round(255 * c) for c in colorsys.hsv_to_rgb(h, 0.75, 1)] for h in hues], np.uint8)
-    dots = np.repeat(np.arange(num_steps) == num_steps - 1, num_points)
+    colors = np.where(bright[1:, :, None], colors, (FADED * colors).astype(np.uint8))
+    dots = ((np.arange(num_steps) == num_steps - 1)[:, None] & bright[1:]).ravel()
     known = np.isfinite(segments).all((2, 3)).ravel()
-    parts = segments.reshape(-1, 2, 3), np.tile(colors.reshape(-1, 3), (num_steps, 1)), dots
+    parts = segments.reshape(-1, 2, 3), colors.reshape(-1, 3), dots
     return Lines(*(part[known] for part in parts))
 
 

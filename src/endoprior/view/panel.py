@@ -73,6 +73,9 @@ class Panel:
             self.carry = gui.add_button("Carry to other frames", hint="Moves the correction along with the image.")
             self.save_masks = gui.add_button("Save masks")
             self.corrected = gui.add_markdown("")
+        with gui.add_folder("Track"):
+            self.follow = gui.add_checkbox("Track by clicking", False, hint="Faded: hidden or uncertain.")
+            self.clear_tracks = gui.add_button("Clear tracks")
         with gui.add_folder("Measure"):
             self.measure = gui.add_checkbox("Measure by clicking", False)
             self.clear = gui.add_button("Clear measurement")
@@ -100,8 +103,8 @@ class Panel:
         allow(lambda value: are_numbers(value, 2, end) and min(value) >= 0, self.clip)
         allow(lambda value: are_numbers([value], 1, self.radius.max) and value >= self.radius.min, self.radius)
         buttons = self.play, self.clear, self.screenshot, self.keep, self.forget, self.video
-        buttons += self.undo, self.carry, self.save_masks
-        switches = self.tool, self.tracks, self.measure, self.correct, self.erase
+        buttons += self.undo, self.carry, self.save_masks, self.clear_tracks
+        switches = self.tool, self.tracks, self.follow, self.measure, self.correct, self.erase
         allow(lambda value: isinstance(value, bool), *switches, *buttons)
         for handle in (self.speed, self.layer, self.camera, self.rendered_by, self.rendered_as):
             allow(lambda value, names=handle.options: isinstance(value, str) and value in names, handle)

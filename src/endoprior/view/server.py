@@ -27,9 +27,10 @@ from .access_control import check_address
 from .browsers import Browsers, camera_pose, picture_with_lines
 from .connections import ConnectionFilter
 from .job_queue import JobQueue
-from .line_overlay import Lines, concatenated, no_lines, ruler, track_lines
+from .line_overlay import Lines, concatenated, ruler
 from .mask_editor import MaskEditor, Spot
 from .measure import Measurement, measurement_text, pick
+from .tracks import DrawnTracks
 from .video_path import PathPoint, follow_frames, interpolate
 from .view_settings import IDLE_SECONDS, ViewSettings, frame_due
 from .viewable import Viewable
@@ -70,7 +71,7 @@ class Viewer:
         """Frame and time at the start of playback."""
         self._picked: list[tuple[NDArray, int]] = []
         """Picked points and their frames."""
-        self._tracks: NDArray | None = None
+        self.tracks = DrawnTracks(viewable)
         self.kept_views: list[PathPoint] = []
         self._version, self._moved_at = 0, clock.monotonic() - IDLE_SECONDS
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
@@ -109,7 +110,7 @@ class Viewer:
 
     def show(self, viewable: Viewable) -> None:
         """Show another state of the same scene, with the same frames and layers. Call it in the thread of `work`."""
-        self.viewable, self._tracks = viewable, None
+        self.viewable, self.tracks = viewable, DrawnTracks(viewable)
         self._version += 1
         self._clear_measurement()
 
@@ -177,9 +178,10 @@ class Viewer:
         shown = controls.layer, controls.camera, controls.rendered_by, controls.rendered_as
         on_change(self.read_panel, *shown, controls.tool, controls.tracks, controls.clip, controls.correct)
         on_change(self._restart_clock, controls.speed)
-        on_change(self.read_measuring, controls.measure)
+        on_change(self.read_clicking, controls.measure, controls.follow)
         on_press(controls.play, lambda _: self._toggle_play())
         on_press(controls.clear, lambda _: self._clear_measurement())
+        on_press(controls.clear_tracks, lambda _: self.tracks.clear())
         on_press(controls.keep, self._keep_view)
         on_press(controls.forget, lambda _: self._forget_views())
         on_press(controls.screenshot, self._screenshot)
@@ -247,21 +249,16 @@ class Viewer:
         self._browsers.draw(self.viewable, self._version, self.settings, lines, clock.monotonic() - self._moved_at)
 
     def _lines(self, settings: ViewSettings) -> Lines:
-        lines = no_lines()
-        if settings.tracks:
-            if self._tracks is None:
-                self._tracks = self.viewable.tracks()
-            if self._tracks.shape[1]:
-                lines = track_lines(self._tracks, settings.frame)
+        lines = self.tracks.lines(settings.frame, settings.tracks)
         return concatenated(lines, ruler(self.measured.ends(settings.frame))) if self.measured else lines
 
-    # Measuring.
+    # Tracking and measuring.
 
-    def read_measuring(self) -> None:
-        """Switch measuring by clicks on or off, as the control is set."""
+    def read_clicking(self) -> None:
+        """Switch clicks on the tissue on or off, as the controls are set."""
         scene = self.server.scene
         scene.remove_click_callback(self._on_click)
-        if self.panel.measure.value:
+        if self.panel.measure.value or self.panel.follow.value:
             scene.on_click()(self._on_click)
         self._update_panel()
 
@@ -269,7 +266,7 @@ class Viewer:
         self.jobs.put(lambda: self._pick(event.client, event.screen_pos))
 
     def _pick(self, client: viser.ClientHandle, screen: tuple[float, float]) -> None:
-        """Add the point under a click: the first, the second, or the first of the next measurement."""
+        """Track the point under a click, or measure from it: the first, the second, or the first of the next two."""
         viewport = self._browsers.viewport(client, self.viewable, self.settings)
         if viewport is None or self.settings.correcting:  # a click paints
             return
@@ -277,6 +274,10 @@ class Viewer:
         point = pick(depth, viewport.camera, viewport.pixel(screen))
         if point is None:
             self._browsers.notify("No surface there", "Click on the tissue.")
+            return
+        if self.panel.follow.value:
+            self.tracks.pick(point, self.settings.frame)
+        if not self.panel.measure.value:
             return
         before = self._picked if len(self._picked) < 2 else []
         self._picked = [*before, (point, self.settings.frame)]

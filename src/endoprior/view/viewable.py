@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Camera
+from ..model.carry import CarriedPoints
 from .mask_edits import MaskEdits
 from .view_settings import Layer, ViewSettings
 
@@ -67,8 +68,16 @@ class Viewable(Protocol):
         """(T, K, 3) positions in every frame of points (K, 3), each picked in its frame of `frames`; NaN if unknown."""
         ...
 
-    def tracks(self) -> NDArray[np.float64]:
-        """(T, P, 3) tracks of material points, world axes, mm; NaN where unknown; P may be 0."""
+    def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
+        """The points of `carry` with their confidence."""
+        ...
+
+    def tracks(self) -> CarriedPoints:
+        """Tracks of material points, world axes, mm; NaN where unknown; there may be none."""
+        ...
+
+    def shows(self, points: NDArray, frame: int) -> NDArray[np.bool_]:
+        """(P,) whether the endoscope's image of a frame shows points (P, 3): neither tissue nor tool hides them."""
         ...
 
     def legend(self, settings: ViewSettings) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -11,18 +11,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
-from ..core.geometry import back_project, expected_depth, length_unit, quaternion_to_matrix
+from ..core.geometry import back_project, expected_depth, length_unit, project, quaternion_to_matrix
 from ..core.types import Camera, RenderOutput, Splats
 from ..data import FrameSequence
-from ..model.carry import carry_points
+from ..model.carry import CarriedPoints, carry
 from ..model.gaussians import SH_C0
 from ..model.playback import Playback
 from ..model.scene import Scene
+from ..model.surface import Surface, project_visible, shown_pixels
 from ..visualization.image_tools import gray, to_u8
 from ..visualization.rendered_views import depth_span
 from . import layers
 from .view_settings import Layer, ViewSettings
 from .viewable import Cloud
+from .viewport import shrunk_camera
 
 BROWSER_LAYERS = ("color", "motion", "prior")
 """Layers that are one color per Gaussian."""
@@ -31,6 +33,8 @@ DOT_PX = 0.6
 DOT_OPACITY = 0.98
 TRACK_COLUMNS = 16
 """Number of material points along a row of the image."""
+SEEN_WIDTH, SEEN_FRAMES = 160, 200
+"""Least width of the depth that tells which points a frame shows, px, and how many frames of it are cached."""
 MOTION_SAMPLES = 8
 """Number of times used for the color scale of the motion layer."""
 
@@ -55,6 +59,7 @@ class ViewableScene:
         self.mask_edits = None
         self._playback = Playback(scene)
         self._rasterize = render.load(scene.backend)
+        self._seen = lru_cache(SEEN_FRAMES)(self._surface_and_mask)
 
     @cached_property
     def span(self) -> tuple[float, float]:
@@ -155,10 +160,27 @@ class ViewableScene:
 
     def carry(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
         """See `Viewable.carry`: a point moves with the Gaussians around it."""
-        times = [i / len(self.cameras) for i in range(len(self.cameras))]
-        return carry_points(self.scene, np.asarray(points), np.array(frames), times).astype(np.float64)
+        return self.follow(points, frames).positions.astype(np.float64)
 
-    def tracks(self) -> NDArray[np.float64]:
+    def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
+        """See `Viewable.follow`."""
+        times = [i / len(self.cameras) for i in range(len(self.cameras))]
+        return carry(self.scene, np.asarray(points), np.array(frames), times)
+
+    def shows(self, points: NDArray, frame: int) -> NDArray[np.bool_]:
+        """See `Viewable.shows`: by a small rendered depth and the tool mask."""
+        surface, mask = self._seen(frame)
+        shown = project_visible(points, surface)[1]
+        return shown if mask is None else shown & shown_pixels(project(points, self.cameras[frame])[0], mask)
+
+    def _surface_and_mask(self, frame: int) -> tuple[Surface, NDArray[np.bool_] | None]:
+        camera = self.cameras[frame]
+        small = shrunk_camera(camera, max(camera.width // SEEN_WIDTH, 1))
+        depth = self.surface(ViewSettings(frame=frame), small)
+        surface = Surface(depth, np.zeros((*depth.shape, 3), np.float32), small)
+        return surface, None if self.sequence is None else layers.fitted(self.sequence.frame(frame).tissue_mask, camera)
+
+    def tracks(self) -> CarriedPoints:
         """See `Viewable.tracks`: a grid on the surface of the first frame, off the tool."""
         camera, settings = self.cameras[0], ViewSettings()
         depth = self.surface(settings, camera)
@@ -169,8 +191,8 @@ class ViewableScene:
         y, x = (values[depth[y, x] > 0] for values in (y, x))
         points = back_project(np.stack([x, y], -1) + 0.5, depth[y, x].astype(np.float64), camera)
         if not len(points):
-            return np.zeros((len(self.cameras), 0, 3))
-        return self.carry(points, [0] * len(points))
+            return CarriedPoints(np.zeros((len(self.cameras), 0, 3)), np.zeros((len(self.cameras), 0)))
+        return self.follow(points, [0] * len(points))
 
     def legend(self, settings: ViewSettings) -> str:
         """See `Viewable.legend`."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..core.geometry import back_project, length_unit, pixel_centers
 from ..core.types import Camera
 from ..data import FrameSequence
+from ..model.carry import CarriedPoints
 from ..priors import joint_texture_prior
 from . import layers
 from .mask_edits import MaskEdits
@@ -106,14 +107,22 @@ class ViewableSequence:
             paths[frame, k] = points[k]
         return paths
 
-    def tracks(self) -> NDArray[np.float64]:
+    def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
+        """See `Viewable.follow`: certain where known."""
+        return _certain(self.carry(points, frames))
+
+    def shows(self, points: NDArray, frame: int) -> NDArray[np.bool_]:
+        """See `Viewable.shows`: where points are known, they are seen."""
+        return np.isfinite(points).all(-1)
+
+    def tracks(self) -> CarriedPoints:
         """See `Viewable.tracks`: the tracks of the ground truth, if there are any."""
         tracks = self.sequence.truth.tracks if self.sequence.truth else None
         if tracks is None or not tracks.paired:
-            return np.zeros((len(self.cameras), 0, 3))
+            return _certain(np.zeros((len(self.cameras), 0, 3)))
         poses = np.stack([np.linalg.inv(camera.world_to_camera) for camera in self.cameras])
         world = np.einsum("tij,tpj->tpi", poses[:, :3, :3], tracks.points) + poses[:, None, :3, 3]
-        return np.where(tracks.visible[..., None], world, np.nan)
+        return _certain(np.where(tracks.visible[..., None], world, np.nan))
 
     def legend(self, settings: ViewSettings) -> str:
         """See `Viewable.legend`."""
@@ -122,3 +131,7 @@ class ViewableSequence:
             "depth": f"blue {self.span[0]:.1f} to red {self.span[1]:.1f} {unit}",
             "prior": "joint texture prior: blue 0 to red 1",
         }.get(settings.layer, "")
+
+
+def _certain(paths: NDArray) -> CarriedPoints:
+    return CarriedPoints(paths, np.ones(paths.shape[:2], np.float32))
