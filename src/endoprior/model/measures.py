@@ -15,8 +15,6 @@ NUM_NEIGHBORS = 16
 """Surface points around a point that its stretch is fit to."""
 SMOOTHING_FRAMES = 5
 """Frames of the moving average before a path length is summed."""
-BEYOND = 2.0
-"""A point is beyond the surface if the mean of its neighbors is this many times as far from it as they scatter."""
 THINNEST = 1e-3
 """A neighborhood says nothing about stretch if its variance across is less than this share of the one along it."""
 
@@ -126,16 +124,15 @@ def neighborhoods(points: NDArray, samples: NDArray) -> tuple[NDArray[np.intp], 
     Args:
         points: (P, 3). samples: (S, 3) points of the surface, S at least 1.
     Returns:
-        (P, K) numbers of the nearest samples, nearest first, and (P,) whether the point is on the surface; a point in
-        a corner of the samples is, see `BEYOND`.
+        (P, K) numbers of the nearest samples, nearest first, and (P,) whether the point is on the surface: the nearest
+        sample is no farther from it than its samples scatter.
     """
     k = min(NUM_NEIGHBORS, len(samples))
-    _, nearest = cKDTree(samples).query(points, k=k, workers=1)
-    nearest = nearest.reshape(len(points), k)
+    far, nearest = cKDTree(samples).query(points, k=k, workers=1)
+    far, nearest = far.reshape(len(points), k), nearest.reshape(len(points), k)
     around = samples[nearest]
-    centers = around.mean(1)
-    scatter = np.sqrt(np.square(around - centers[:, None]).sum(-1).mean(1))
-    return nearest, distance(points, centers) <= BEYOND * scatter
+    scatter = np.sqrt(np.square(around - around.mean(1, keepdims=True)).sum(-1).mean(1))
+    return nearest, far[:, 0] <= scatter
 
 
 def principal_stretches(before: NDArray, after: NDArray) -> NDArray[np.float64]:
