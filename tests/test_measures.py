@@ -93,7 +93,7 @@ def test_neighbors_lie_around_a_point_or_it_is_beyond_the_surface():
     x, y = (part.ravel() for part in np.meshgrid(np.arange(20.0), np.arange(20.0)))
     samples = np.stack([x, y, 0 * x], -1)
     nearest, around = neighborhoods(np.array([[10.0, 10, 0.1], [0, 0, 0], [10, -4, 0], [10, 10, 9]]), samples)
-    assert samples[nearest[0, 0]].tolist() == [10, 10, 0] and nearest.shape == (4, 16)
+    assert samples[nearest[0, 0]].tolist() == [10, 10, 0] and nearest.shape == (4, 24)
     assert around.tolist() == [True, True, False, False]  # a corner still is part of the surface
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-NUM_NEIGHBORS = 16
+NUM_NEIGHBORS = 24
 """Surface points around a point that its stretch is fit to."""
 SMOOTHING_FRAMES = 5
 """Frames of the moving average before a path length is summed."""

@@ -1,0 +1,103 @@
+"""Measures over time of chosen points, and maps of displacement and stretch of the surface between two frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import input_error
+from ..core.geometry import back_project, length_unit, project
+from ..model.carry import carry_points
+from ..model.measures import distance, measures_of
+from ..model.scene import Scene
+from ..model.surface import depth_at, render_surface
+from ..model.surface_motion import SurfaceMotion
+from ..system.atomic import whole_folder
+from ..visualization.measures import MeasuresFigure, displacement_span, measures_csv, stretch_span, value_colors
+from .axes import points_in_axes
+from .formats import Format, Progress
+from .mesh import depth_grid
+from .options import ExportOptions
+from .ply import ply_bytes, vertex_table
+from .tracks import QueryPoints, read_query_points
+
+
+def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
+    """Write `displacement.ply`, `stretch.ply` and `measures.png`; with points also `measures.csv`.
+
+    Raises:
+        InputError: a frame is not in the sequence, the file of points cannot be read, or a point or the whole frame
+            shows no surface.
+    """
+    last = len(scene.cameras) - 1
+    since, until = options.from_frame, last if options.to_frame is None else options.to_frame
+    for name, frame in (("--from-frame", since), ("--to-frame", until)):
+        if not 0 <= frame <= last:
+            raise input_error(name, f"a frame in 0..{last}", f"{frame}", "choose another.")
+    if since == until:
+        raise input_error("--to-frame", f"another frame than --from-frame {since}", f"{until}", "choose another.")
+    times, rate, unit = [i / (last + 1) for i in range(last + 1)], scene.frames_per_second, _unit(scene)
+    camera = scene.cameras[since]
+    surface = render_surface(scene, times[since], camera, options.min_alpha)
+    mesh = depth_grid(surface, options.mesh_step, options.max_slope)
+    if not len(mesh.triangles):
+        raise input_error("--from-frame", "a frame that shows tissue", f"{since}", "choose another, or lower --min-alpha.")
+    with whole_folder(out) as folder:
+        motion = SurfaceMotion(scene, since, options.min_alpha)
+        at_start = np.zeros(len(mesh.vertices), np.intp)
+        moved = carry_points(scene, mesh.vertices, at_start, [times[since], times[until]])[1]
+        displacement = distance(moved, mesh.vertices)
+        stretch = motion.stretch(mesh.vertices.astype(np.float64), [until])[0]
+        spans = displacement_span(displacement), stretch_span(stretch)
+        columns = {name: points_in_axes(mesh.vertices, options.frame)[:, i] for i, name in enumerate("xyz")}
+        values = {"displacement": displacement, "stretch": stretch}
+        for (name, value), span in zip(values.items(), spans, strict=True):
+            shown = value_colors(value, span)
+            colors = {color: shown[:, i] for i, color in enumerate(("red", "green", "blue"))}
+            table = vertex_table(columns | colors | values)
+            (folder / f"{name}.ply").write_bytes(ply_bytes(table, options.frame, unit, mesh.triangles))
+        figure = MeasuresFigure(f"frame {since} to frame {until}", with_curves=options.points is not None)
+        pixels = np.zeros((0, 2))
+        if options.points:
+            queries = read_query_points(options.points, scene)
+            paths = carry_points(scene, _positions(scene, queries, options.min_alpha), queries.frames, times)
+            around = motion.stretch(paths[since].astype(np.float64), list(range(len(times))))
+            found = measures_of(paths, around, since, drawn=int(queries.frames[-1]))
+            (folder / "measures.csv").write_text(measures_csv(found, rate, unit), encoding="utf-8", newline="\n")
+            figure.show_curves(found, rate, unit)
+            pixels = project(paths[since].astype(np.float64), camera)[0]
+        figure.show_points(surface.color, pixels)
+        on_image = project(mesh.vertices.astype(np.float64), camera)[0]
+        titles = f"displacement, {unit}", "largest principal stretch; 1: unchanged"
+        for place, (title, value, span) in enumerate(zip(titles, values.values(), spans, strict=True), 1):
+            figure.show_map(place, title, on_image, mesh.triangles, value, span)
+        figure.save(folder / "measures.png")
+    progress(1, 1)
+
+
+def _unit(scene: Scene) -> str:
+    return length_unit(scene.lengths_are_relative)
+
+
+def _positions(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDArray[np.float64]:
+    """(P, 3) world positions of the points, mm."""
+    positions = np.empty((len(queries.pixels), 3))
+    for p, (pixel, frame) in enumerate(zip(queries.pixels, queries.frames, strict=True)):
+        camera = scene.cameras[frame]
+        surface = render_surface(scene, frame / len(scene.cameras), camera, min_alpha)
+        depth = depth_at(surface, pixel[None])
+        if not np.isfinite(depth[0]):
+            got = f"({pixel[0]:g}, {pixel[1]:g}) in frame {frame} for point {p}, where no surface is rendered"
+            raise input_error("--points", "pixels that show tissue", got, "move it.")
+        positions[p] = back_project(pixel[None], depth, camera)[0]
+    return positions
+
+
+FORMAT = Format(
+    suffixes=(),
+    options=("frame", "points", "from_frame", "to_frame", "mesh_step", "max_slope", "min_alpha"),
+    write=write,
+    holds="measures over time",
+)
