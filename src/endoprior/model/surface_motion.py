@@ -21,7 +21,7 @@ class SurfaceMotion:
 
     def __init__(self, scene: Scene, since: int, min_alpha: float = 0.5) -> None:
         """Render the surface of frame `since`, and sample it on a grid."""
-        self._scene, self._since = scene, since
+        self._scene, self.since = scene, since
         surface = render_surface(scene, self._time(since), scene.cameras[since], min_alpha)
         step = max(surface.camera.width // SAMPLE_COLUMNS, 1)
         depth = surface.depth[step // 2 :: step, step // 2 :: step]
@@ -51,7 +51,7 @@ class SurfaceMotion:
         if not len(used):
             return found
         before = self.samples[used]
-        times = [self._time(frame) for frame in (self._since, *frames)]
+        times = [self._time(frame) for frame in (self.since, *frames)]
         moved = carry_points(self._scene, before, np.zeros(len(used), np.intp), times)[1:].astype(np.float64)
         places = places.reshape(-1, nearest.shape[1])
         for found_there, after in zip(found, moved, strict=True):

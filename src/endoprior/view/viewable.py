@@ -67,6 +67,10 @@ class Viewable(Protocol):
         """(T, K, 3) positions in every frame of points (K, 3), each picked in its frame of `frames`; NaN if unknown."""
         ...
 
+    def stretch(self, points: NDArray, since: int) -> NDArray[np.float64]:
+        """(T, K) largest principal stretch since a frame, around points (K, 3) of that frame; NaN where unknown."""
+        ...
+
     def tracks(self) -> NDArray[np.float64]:
         """(T, P, 3) tracks of material points, world axes, mm; NaN where unknown; P may be 0."""
         ...

@@ -106,6 +106,10 @@ class ViewableSequence:
             paths[frame, k] = points[k]
         return paths
 
+    def stretch(self, points: NDArray, since: int) -> NDArray[np.float64]:
+        """See `Viewable.stretch`: unknown before training."""
+        return np.full((len(self.cameras), len(points)), np.nan)
+
     def tracks(self) -> NDArray[np.float64]:
         """See `Viewable.tracks`: the tracks of the ground truth, if there are any."""
         tracks = self.sequence.truth.tracks if self.sequence.truth else None

@@ -119,7 +119,7 @@ class MeasuresFigure:
     def show_curves(self, found: Measures, frames_per_second: float, unit: str) -> None:
         """Every measure over time, in seconds; points in the colors of the image."""
         seconds = np.arange(len(found.displacement)) / frames_per_second
-        axes = self._curves.subplots(2, 3, sharex=True).ravel()
+        axes = self._curves.subplots(2, 3).ravel()
         _plot(axes[0], f"distance of points 0 and 1, {unit}", seconds, found.distance[:, None], "black")
         _plot(axes[1], f"area of the polygon, {unit}²", seconds, found.area[:, None], "black")
         _plot(axes[3], f"displacement since frame {found.since}, {unit}", seconds, found.displacement)
