@@ -61,7 +61,8 @@ def test_area_of_a_polygon_however_it_lies(corners, expected):
 
 
 @pytest.mark.parametrize(
-    "corners", [[(0, 0), (1, 0)], [(0, 0), (1, 1), (2, 2)], [(0, 0), (4, 2), (4, 0), (0, 3)], [(0, 0), (1, np.nan), (1, 1)]]
+    "corners",
+    [[(0, 0), (1, 0)], [(0, 0), (1, 1), (2, 2)], [(0, 0), (4, 2), (4, 0), (0, 3)], [(0, 0), (1, np.nan), (1, 1)]],
 )
 def test_corners_that_surround_nothing_have_no_triangles(corners):
     assert not len(polygon_triangles(np.column_stack([np.array(corners, float), np.zeros(len(corners))])))
@@ -77,7 +78,9 @@ def test_a_rigid_motion_does_not_stretch_and_a_uniform_scaling_stretches_by_its_
 def test_stretch_along_one_direction_leaves_the_other():
     before, after = patch(False), patch(False) * [1.3, 1, 1]
     assert principal_stretches(turned(before, 2), turned(after, 3)) == pytest.approx([1.3, 1])
-    shear = patch(False) @ np.array([[1, 0, 0], [0.5, 1, 0], [0, 0, 1.0]])  # x + y / 2: singular values of [[1, .5], [0, 1]]
+    shear = patch(False) @ np.array(
+        [[1, 0, 0], [0.5, 1, 0], [0, 0, 1.0]]
+    )  # x + y / 2: singular values of [[1, .5], [0, 1]]
     assert principal_stretches(before, shear) == pytest.approx(np.linalg.svd([[1, 0.5], [0, 1]])[1])
 
 

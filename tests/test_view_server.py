@@ -90,7 +90,7 @@ def test_the_slider_changes_the_image(viewer, client, scene):
 def test_every_layer_is_a_different_image(viewer, client):
     client.set(viewer.panel.frame, 4)
     images = {"color": client.image()}
-    for layer in ("depth", "alpha", "motion", "prior"):
+    for layer in ("depth", "alpha", "displacement", "stretch", "prior"):
         client.set(viewer.panel.layer, LAYER_NAMES[layer])
         images[layer] = client.image()
     for a in images:
@@ -281,7 +281,9 @@ def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path, monkey
                         client = Client(on_step.viewer.port)
                         client.send_camera()
                         threading.Event().wait(0.3)
-                    client.set(on_step.viewer.panel.layer, LAYER_NAMES["motion" if report.iteration % 2 else "prior"])
+                    client.set(
+                        on_step.viewer.panel.layer, LAYER_NAMES["displacement" if report.iteration % 2 else "prior"]
+                    )
                     threading.Event().wait(0.05)
                     shown.append(on_step.viewer.panel.status.content)
 

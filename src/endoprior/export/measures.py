@@ -43,7 +43,9 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     surface = render_surface(scene, times[since], camera, options.min_alpha)
     mesh = depth_grid(surface, options.mesh_step, options.max_slope)
     if not len(mesh.triangles):
-        raise input_error("--from-frame", "a frame that shows tissue", f"{since}", "choose another, or lower --min-alpha.")
+        raise input_error(
+            "--from-frame", "a frame that shows tissue", f"{since}", "choose another, or lower --min-alpha."
+        )
     with whole_folder(out) as folder:
         motion = SurfaceMotion(scene, since, options.min_alpha)
         at_start = np.zeros(len(mesh.vertices), np.intp)

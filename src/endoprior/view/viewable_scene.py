@@ -105,7 +105,7 @@ class ViewableScene:
 
     @torch.no_grad()
     def _draw(self, settings: ViewSettings, camera: Camera, values: Tensor | None = None) -> RenderOutput:
-        """Render the selected Gaussians; `values` (N,) in [0, 1] as red in place of color, green where they are known."""
+        """Render the selected Gaussians; `values` (N,) in [0, 1] become red, and green 1 where they are known."""
         splats = self._splats(settings)
         if values is not None:
             splats = replace(splats, sh=_value_sh(values))
@@ -133,7 +133,7 @@ class ViewableScene:
         return ((torch.from_numpy(values).to(self.scene.prior_score) - low) / (high - low)).clamp(0, 1)
 
     def _measure(self, layer: Layer, since: int, frame: int) -> NDArray[np.float32]:
-        """(N,) displacement of each center since a frame, mm, or stretch of the surface around it; NaN where unknown."""
+        """(N,) displacement of each center since a frame, mm, or stretch of the surface there; NaN where unknown."""
         before = self._playback.splats(since).means.cpu().numpy()
         if layer == "displacement":
             return distance(self._playback.splats(frame).means.cpu().numpy(), before).astype(np.float32)
@@ -148,8 +148,8 @@ class ViewableScene:
     def _span_of(self, layer: Layer, since: int) -> tuple[float, float]:
         """Ends of the color scale of a layer, the same for all frames."""
         frames = np.linspace(0, len(self.cameras) - 1, min(MOTION_SAMPLES, len(self.cameras))).astype(int)
-        values = np.concatenate([self._measured(layer, since, int(frame)) for frame in frames])
-        return displacement_span(values) if layer == "displacement" else stretch_span(values)
+        span_of = displacement_span if layer == "displacement" else stretch_span
+        return max((span_of(self._measured(layer, since, int(frame))) for frame in frames), key=lambda span: span[1])
 
     def renders_in_browser(self, settings: ViewSettings) -> bool:
         """See `Viewable.renders_in_browser`: layers that are not a color per Gaussian are rendered on the server."""

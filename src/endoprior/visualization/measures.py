@@ -86,7 +86,9 @@ class MeasuresFigure:
         self._figure = Figure(figsize=(13, 10 if with_curves else 4.2), layout="constrained", dpi=100)
         FigureCanvasAgg(self._figure)
         self._figure.suptitle(title, fontsize=11, parse_math=False)
-        parts = self._figure.subfigures(2 if with_curves else 1, 1, squeeze=False, height_ratios=[4, 6][: 1 + with_curves])
+        parts = self._figure.subfigures(
+            2 if with_curves else 1, 1, squeeze=False, height_ratios=[4, 6][: 1 + with_curves]
+        )
         self._maps = parts[0, 0].subplots(1, 3)
         self._top: SubFigure = parts[0, 0]
         self._curves: SubFigure | None = parts[1, 0] if with_curves else None
