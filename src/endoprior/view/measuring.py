@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..core.geometry import length_unit
 from ..visualization.measures import measures_csv
 from .line_overlay import Lines, no_lines, ruler
-from .measure import POINTS_OF, STRETCH, Measurement, measurement_text, unit_of
+from .measure import POINTS_OF, STRETCH, Measurement, measurement_text
 from .panel import Panel
 from .view_settings import ViewSettings
 from .viewable import Viewable
@@ -61,6 +61,4 @@ class Measuring:
         shown = self.measured or controls.measure.value
         text = measurement_text(self.measured, frame, relative, quantity) if shown else ""
         controls.distance.content = text
-        controls.show_curve(
-            self.measured.curve(quantity) if self.measured else np.zeros(0), unit_of(quantity, relative)
-        )
+        controls.show_curve(self.measured.curve(quantity) if self.measured else np.zeros(0))

@@ -86,14 +86,9 @@ class Panel:
             self.table = gui.add_button("Save table (CSV)", hint="Every quantity of the points, in all frames.")
             self.distance = gui.add_markdown("")
             axis = np.arange(total, dtype=np.float64)
-            self._series = lambda label: (
-                uplot.Series(label="frame"),
-                uplot.Series(label=label, stroke="orange", width=2),
-            )
+            series = (uplot.Series(label="frame"), uplot.Series(label="measured", stroke="orange", width=2))
             scales = {"x": uplot.Scale(time=False)}
-            self.chart = gui.add_uplot(
-                (axis, np.zeros(total)), self._series(unit), scales=scales, height=160, visible=False
-            )
+            self.chart = gui.add_uplot((axis, np.zeros(total)), series, scales=scales, height=160, visible=False)
         with gui.add_folder("Save"):
             self.screenshot = gui.add_button("Screenshot (PNG)")
             self.keep = gui.add_button("Save this view", hint="The video interpolates between saved views, in order.")
@@ -131,11 +126,10 @@ class Panel:
         """Playback speed relative to the recording."""
         return float(self.speed.value.removesuffix("x"))
 
-    def show_curve(self, values: NDArray, unit: str) -> None:
+    def show_curve(self, values: NDArray) -> None:
         """Show a quantity over the frames (T,), or hide the chart if it is known in fewer than two."""
         self.chart.visible = bool(np.isfinite(values).sum() > 1)
         if self.chart.visible:
-            self.chart.series = self._series(f"{self.quantity.value} {unit}".strip())
             self.chart.data = np.arange(len(values), dtype=np.float64), values
 
     def chosen(self, settings: ViewSettings) -> ViewSettings:

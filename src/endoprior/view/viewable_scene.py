@@ -147,9 +147,11 @@ class ViewableScene:
 
     def _span_of(self, layer: Layer, since: int) -> tuple[float, float]:
         """Ends of the color scale of a layer, the same for all frames."""
-        frames = np.linspace(0, len(self.cameras) - 1, min(MOTION_SAMPLES, len(self.cameras))).astype(int)
-        span_of = displacement_span if layer == "displacement" else stretch_span
-        return max((span_of(self._measured(layer, since, int(frame))) for frame in frames), key=lambda span: span[1])
+        frames = np.linspace(0, len(self.cameras) - 1, min(MOTION_SAMPLES, len(self.cameras))).astype(int).tolist()
+        if layer == "displacement":
+            return max(displacement_span(self._measured(layer, since, frame)) for frame in frames)
+        motion = self._surface_motion(since)
+        return max((stretch_span(each) for each in motion.stretch(motion.samples, frames)), key=lambda ends: ends[1])
 
     def renders_in_browser(self, settings: ViewSettings) -> bool:
         """See `Viewable.renders_in_browser`: layers that are not a color per Gaussian are rendered on the server."""
