@@ -1,8 +1,18 @@
 """Measures over time: closed forms first, then a scene whose motion is known, then the files."""
 
+import csv
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
+import torch
+from export_scenes import plane_camera
+from plyfile import PlyData
 
+from endoprior.cli import main
+from endoprior.core.presets import preset
+from endoprior.model.gaussians import create_gaussians
 from endoprior.model.measures import (
     area,
     distance,
@@ -13,6 +23,9 @@ from endoprior.model.measures import (
     principal_stretches,
     smoothed,
 )
+from endoprior.model.scene import Scene
+from endoprior.model.surface_motion import SurfaceMotion
+from endoprior.visualization.measures import displacement_span, measures_csv, stretch_span, value_colors
 
 
 def turned(points: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -109,3 +122,115 @@ def test_measures_of_three_points():
     assert found.displacement[:, 1].tolist() == [2, 0, 2, 4, 6]
     alone = measures_of(paths[:, :1], np.ones((5, 1)), 0, 0)
     assert np.isnan(alone.distance).all() and np.isnan(alone.area).all()
+
+
+def growing_scene(by: float) -> Scene:
+    """A wall of Gaussians at 50 mm that grows by this factor over ten frames, seen from the front."""
+    cfg = preset("default").fitted(20)
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(-24, 24, 49), np.linspace(-18, 18, 37)))
+    points = np.column_stack([x, y, np.full(x.size, 50.0)]).astype(np.float32)
+    gaussians = create_gaussians(
+        points, np.full((len(points), 3), 0.5, np.float32), np.zeros(len(points), np.float32), cfg
+    )
+    with torch.no_grad():
+        gaussians["opacity_logits"].fill_(4.0)
+        share = torch.linspace(0, 1, gaussians["motion"].shape[1])
+        gaussians["motion"][:, :, 0] = torch.from_numpy(points[:, :1]) * share * (by - 1)
+    return Scene(gaussians, None, cfg, (plane_camera(),) * 10, 25.0, torch.zeros(len(points)), torch.zeros(len(points)))
+
+
+@pytest.fixture(scope="module")
+def growing() -> Scene:
+    """It grows along x alone, so one principal stretch is 1."""
+    return growing_scene(1.3)
+
+
+def along_x(scene: Scene, since: int, until: int) -> float:
+    """How much the wall is longer along x than before."""
+    middle = (scene.gaussians["means"][:, 0].abs() - 10).abs() < 0.1
+    before, after = (scene.at(frame / 10).means[middle, 0].abs().mean() for frame in (since, until))
+    return float(after / before)
+
+
+def test_stretch_of_a_scene_is_that_of_its_gaussians(growing):
+    motion = SurfaceMotion(growing, 2)
+    points = np.array([[0.0, 0, 50], [8, -5, 50], [8, -5, 70], [np.nan, 0, 50]])
+    found = motion.stretch(points, [2, 5, 9])
+    expected = np.array([along_x(growing, 2, i) for i in (2, 5, 9)])
+    assert np.median(motion.stretch(motion.samples, [2, 5, 9]), 1) == pytest.approx(expected, abs=0.01)
+    # The eight Gaussians around a point change in steps, which a fit over a few of them shows.
+    assert found[:, :2] == pytest.approx(np.stack([expected] * 2, 1), abs=0.04)
+    assert found[2, 0] > 1.1 and np.isnan(found[:, 2:]).all()  # not on the surface; unknown
+
+
+@pytest.fixture(scope="module")
+def exported(growing, tmp_path_factory):
+    """The folder of `--format measures` with three points."""
+    folder = tmp_path_factory.mktemp("measures")
+    (folder / "points.csv").write_text("x,y,frame\n22,26,0\n38,26,0\n30,36,0\n")
+    growing.save(folder / "run/scene.safetensors")
+    options = ("--format", "measures", "--points", str(folder / "points.csv"), "--from-frame", "2", "--to-frame", "8")
+    assert main(["export", str(folder / "run"), str(folder / "out"), *options, "--mesh-step", "1"]) == 0
+    return folder / "out"
+
+
+def test_the_table_says_what_the_points_do(growing, exported):
+    rows = list(csv.DictReader((exported / "measures.csv").read_text().splitlines()))
+    assert [int(row["frame"]) for row in rows] == list(range(10)) and float(rows[5]["seconds"]) == 0.2
+    wide = np.array([float(row["distance_mm"]) for row in rows])
+    assert wide[0] == pytest.approx(16 / 80 * 50, rel=0.01)
+    assert wide[9] / wide[2] == pytest.approx(along_x(growing, 2, 9), rel=0.01)
+    areas = np.array([float(row["area_mm2"]) for row in rows])
+    assert areas == pytest.approx(wide * 10 / 80 * 50 / 2, rel=0.01)
+    assert float(rows[9]["stretch_0"]) == pytest.approx(along_x(growing, 2, 9), abs=0.01)
+    assert float(rows[2]["displacement_1_mm"]) == 0 < float(rows[1]["displacement_1_mm"])
+    assert float(rows[9]["path_1_mm"]) == pytest.approx((wide[9] - wide[0]) / 2, abs=0.05)
+
+
+def test_the_colored_surfaces_hold_the_values(growing, exported):
+    vertex = PlyData.read(str(exported / "stretch.ply"))["vertex"]
+    assert np.nanmedian(vertex["stretch"]) == pytest.approx(along_x(growing, 2, 8), abs=0.01)
+    moved = np.abs(vertex["x"]) * (along_x(growing, 2, 8) - 1)
+    assert vertex["displacement"] == pytest.approx(moved, abs=0.15)  # a tenth of the Gaussians' spacing
+    red = PlyData.read(str(exported / "displacement.ply"))["vertex"]["red"].astype(int)
+    assert red[np.argmax(moved)] > red[np.argmin(moved)]
+    assert cv2.imread(str(exported / "measures.png")).std() > 20
+
+
+def test_without_points_there_is_no_table_and_relative_lengths_are_not_mm(growing, tmp_path):
+    replace(growing, lengths_are_relative=True).save(tmp_path / "run/scene.safetensors")
+    assert main(["export", str(tmp_path / "run"), str(tmp_path / "out"), "--format", "measures"]) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "displacement.ply",
+        "measures.png",
+        "stretch.ply",
+    ]
+    assert b"unit rel." in (tmp_path / "out" / "stretch.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [("--from-frame", "10"), ("--to-frame", "-1"), ("--from-frame", "3", "--to-frame", "3"), ("--points", "none")],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(growing, tmp_path, capsys, options):
+    growing.save(tmp_path / "run/scene.safetensors")
+    assert main(["export", str(tmp_path / "run"), str(tmp_path / "out"), "--format", "measures", *options]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "Fix:" in error and not (tmp_path / "out").exists()
+
+
+def test_the_table_takes_confidences_and_leaves_unknown_cells_empty():
+    paths = np.zeros((3, 1, 3))
+    found = measures_of(paths, np.array([[1.0], [np.nan], [1.2]]), 0, 0)
+    rows = list(csv.DictReader(measures_csv(found, 10.0, "rel.", np.array([[1], [0.5], [0.25]])).splitlines()))
+    assert list(rows[0])[3:] == ["path_0_rel", "path_raw_0_rel", "displacement_0_rel", "stretch_0", "confidence_0"]
+    assert [row["stretch_0"] for row in rows] == ["1.0000", "", "1.2000"]
+    assert rows[2]["confidence_0"] == "0.2500" and rows[2]["seconds"] == "0.2000"
+
+
+def test_color_scales_of_maps():
+    values = np.array([0.9, 1.0, 1.3, np.nan])
+    low, high = stretch_span(values)
+    assert low + high == pytest.approx(2) and 1.28 < high <= 1.3
+    assert displacement_span(values)[0] == 0 and stretch_span(np.ones(4)) == pytest.approx((0.95, 1.05))
+    assert value_colors(values, (low, high))[3].tolist() == [128] * 3
