@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,10 @@ from ..model.scene import Scene
 from ..model.surface import depth_at, render_surface
 from ..model.surface_motion import SurfaceMotion
 from ..system.atomic import whole_folder
-from ..visualization.measures import MeasuresFigure, displacement_span, measures_csv, stretch_span, value_colors
+from ..visualization.measures import displacement_span, measures_csv, stretch_span, value_colors
 from .axes import points_in_axes
-from .formats import Format, Progress
-from .mesh import depth_grid
+from .formats import Axes, Format, Progress
+from .mesh import Mesh, depth_grid
 from .options import ExportOptions
 from .ply import ply_bytes, vertex_table
 from .tracks import QueryPoints, read_query_points
@@ -31,6 +32,8 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         InputError: a frame is not in the sequence, the file of points cannot be read, or a point or the whole frame
             shows no surface.
     """
+    from ..visualization.measures_figure import MeasuresFigure  # Matplotlib takes long to import
+
     last = len(scene.cameras) - 1
     since, until = options.from_frame, last if options.to_frame is None else options.to_frame
     for name, frame in (("--from-frame", since), ("--to-frame", until)):
@@ -38,7 +41,11 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             raise input_error(name, f"a frame in 0..{last}", f"{frame}", "choose another.")
     if since == until:
         raise input_error("--to-frame", f"another frame than --from-frame {since}", f"{until}", "choose another.")
-    times, rate, unit = [i / (last + 1) for i in range(last + 1)], scene.frames_per_second, _unit(scene)
+    times, rate, unit = (
+        [i / (last + 1) for i in range(last + 1)],
+        scene.frames_per_second,
+        length_unit(scene.lengths_are_relative),
+    )
     camera = scene.cameras[since]
     surface = render_surface(scene, times[since], camera, options.min_alpha)
     mesh = depth_grid(surface, options.mesh_step, options.max_slope)
@@ -46,20 +53,11 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         raise input_error(
             "--from-frame", "a frame that shows tissue", f"{since}", "choose another, or lower --min-alpha."
         )
+    motion = SurfaceMotion(scene, since, options.min_alpha)
+    maps = _maps(scene, mesh, motion, until)
     with whole_folder(out) as folder:
-        motion = SurfaceMotion(scene, since, options.min_alpha)
-        at_start = np.zeros(len(mesh.vertices), np.intp)
-        moved = carry_points(scene, mesh.vertices, at_start, [times[since], times[until]])[1]
-        displacement = distance(moved, mesh.vertices)
-        stretch = motion.stretch(mesh.vertices.astype(np.float64), [until])[0]
-        spans = displacement_span(displacement), stretch_span(stretch)
-        columns = {name: points_in_axes(mesh.vertices, options.frame)[:, i] for i, name in enumerate("xyz")}
-        values = {"displacement": displacement, "stretch": stretch}
-        for (name, value), span in zip(values.items(), spans, strict=True):
-            shown = value_colors(value, span)
-            colors = {color: shown[:, i] for i, color in enumerate(("red", "green", "blue"))}
-            table = vertex_table(columns | colors | values)
-            (folder / f"{name}.ply").write_bytes(ply_bytes(table, options.frame, unit, mesh.triangles))
+        for name, one in maps.items():
+            (folder / f"{name}.ply").write_bytes(_colored_mesh(mesh, maps, one, options.frame, unit))
         figure = MeasuresFigure(f"frame {since} to frame {until}", with_curves=options.points is not None)
         pixels = np.zeros((0, 2))
         if options.points:
@@ -73,14 +71,38 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         figure.show_points(surface.color, pixels)
         on_image = project(mesh.vertices.astype(np.float64), camera)[0]
         titles = f"displacement, {unit}", "largest principal stretch; 1: unchanged"
-        for place, (title, value, span) in enumerate(zip(titles, values.values(), spans, strict=True), 1):
-            figure.show_map(place, title, on_image, mesh.triangles, value, span)
+        for place, (title, one) in enumerate(zip(titles, maps.values(), strict=True), 1):
+            figure.show_map(place, title, on_image, mesh.triangles, one.values, one.span)
         figure.save(folder / "measures.png")
     progress(1, 1)
 
 
-def _unit(scene: Scene) -> str:
-    return length_unit(scene.lengths_are_relative)
+@dataclass(frozen=True)
+class _Map:
+    """A value for each vertex, and the ends of its color scale."""
+
+    values: NDArray
+    span: tuple[float, float]
+
+
+def _maps(scene: Scene, mesh: Mesh, motion: SurfaceMotion, until: int) -> dict[str, _Map]:
+    """Displacement and stretch of the vertices from the frame of `motion` to frame `until`."""
+    times = [frame / len(scene.cameras) for frame in (motion.since, until)]
+    moved = carry_points(scene, mesh.vertices, np.zeros(len(mesh.vertices), np.intp), times)[1]
+    displacement = distance(moved, mesh.vertices)
+    stretch = motion.stretch(mesh.vertices.astype(np.float64), [until])[0]
+    return {
+        "displacement": _Map(displacement, displacement_span(displacement)),
+        "stretch": _Map(stretch, stretch_span(stretch)),
+    }
+
+
+def _colored_mesh(mesh: Mesh, maps: dict[str, _Map], shown: _Map, axes: Axes, unit: str) -> bytes:
+    """A PLY file in the colors of one map, with the values of all."""
+    columns = dict(zip("xyz", points_in_axes(mesh.vertices, axes).T, strict=True))
+    columns |= dict(zip(("red", "green", "blue"), value_colors(shown.values, shown.span).T, strict=True))
+    columns |= {name: one.values for name, one in maps.items()}
+    return ply_bytes(vertex_table(columns), axes, unit, mesh.triangles)
 
 
 def _positions(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDArray[np.float64]:
