@@ -221,7 +221,7 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
     stranger.say(stranger.camera())
     time.sleep(0.5)
     stranger.socket.close()
-    allowed = {"measure", "tool", "tracks", "frame", "clip"}  # true and 1 are values some of them can have
+    allowed = {"measure", "tool", "tracks", "frame", "since", "clip"}  # true and 1 are values some of them can have
     now = {name: getattr(viewer.panel, name).value for name in state}
     assert {name for name in state if state[name] != now[name]} <= allowed
     assert now["clip"] == state["clip"] and 0 <= now["frame"] <= 9
