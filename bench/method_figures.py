@@ -84,9 +84,8 @@ def gaussians(scene: Scene, sequence: FrameSequence) -> None:
     show(axes[0], viewable.picture(settings, camera), "rendered")
     dots = replace(settings, layer="prior", points=True)
     show(axes[1], viewable.picture(dots, camera), "Gaussians: score $s$, blue 0 to red 1")
-    moved = replace(settings, layer="motion")
-    title = f"moved since frame 0: blue 0 to red {viewable.largest_motion:.1f} mm"
-    show(axes[2], viewable.picture(moved, camera), title)
+    moved = replace(settings, layer="displacement")
+    show(axes[2], viewable.picture(moved, camera), viewable.legend(moved))
     save(result, "gaussians")
 
 

@@ -30,7 +30,7 @@ from endoprior.view.view_settings import IDLE_SECONDS, ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 
 FRAMES = 24
-LAYERS = ("color", "depth", "motion")
+LAYERS = ("color", "depth", "displacement")
 
 
 @dataclass

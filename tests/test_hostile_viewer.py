@@ -221,7 +221,8 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
     stranger.say(stranger.camera())
     time.sleep(0.5)
     stranger.socket.close()
-    allowed = {"measure", "follow", "tool", "tracks", "frame", "clip"}  # true and 1 are values some of them can have
+    # True and 1 are values that some of them can have.
+    allowed = {"measure", "follow", "tool", "tracks", "frame", "since", "clip"}
     now = {name: getattr(viewer.panel, name).value for name in state}
     assert {name for name in state if state[name] != now[name]} <= allowed
     assert now["clip"] == state["clip"] and 0 <= now["frame"] <= 9

@@ -11,7 +11,7 @@ from endoprior.core.geometry import project
 from endoprior.core.types import Camera
 from endoprior.view.access_control import check_address, is_trusted
 from endoprior.view.line_overlay import concatenated, draw_lines, no_lines, ruler, track_lines
-from endoprior.view.measure import Measurement, measurement_text, pick
+from endoprior.view.measure import POINTS_OF, Measurement, measurement_text, pick
 from endoprior.view.point_rendering import render_points
 from endoprior.view.saving import keep, mp4_bytes, png_bytes
 from endoprior.view.video_path import PathPoint, follow_frames, interpolate
@@ -127,9 +127,10 @@ def test_a_measurement_reports_distance_and_change():
     text = measurement_text(measured, 2, relative=True)
     assert "**7.00 rel.**" in text
     paths[[0, 2]] = np.nan
+    measured = Measurement(1, paths)
     assert "**5.00 mm**" == measurement_text(measured, 1, relative=False)
     assert "frame 1" in measurement_text(measured, 0, relative=False) and len(measured.ends(0)) == 0
-    assert "second" in measurement_text(Measurement(0, paths[:, :1]), 0, relative=False)
+    assert "one more point" in measurement_text(Measurement(0, paths[:, :1]), 0, relative=False)
 
 
 def test_a_video_follows_the_frames_or_the_saved_views():
@@ -192,3 +193,22 @@ def test_files_are_never_overwritten_and_stay_in_the_folder(tmp_path):
     for name in ("../a.png", "/etc/a.png", "b/a.png", ".."):
         with pytest.raises(ValueError, match="plain file name"):
             keep(tmp_path / "view", name, b"")
+
+
+def test_the_measured_quantity_is_told_with_its_unit_and_reference():
+    paths = np.zeros((3, 3, 3))
+    paths[:, 1, 0], paths[:, 2, 1] = (4, 4, 8), 3
+    paths[:, :, 2] = np.array([0, 1, 2])[:, None]
+    measured = Measurement(0, paths, np.array([[1.0], [1.02], [1.1]]).repeat(3, 1), since=1)
+    text = {quantity: measurement_text(measured, 2, False, quantity) for quantity in POINTS_OF}
+    assert "**12.00 mm²**" in text["Area"] and "+6.00 since frame 0" in text["Area"]
+    assert "**2.00 mm**" in text["Path length"] and "2.00 without smoothing" in text["Path length"]
+    assert "**1.00 mm**" in text["Displacement"] and "since frame 1; 0.00 to 1.00" in text["Displacement"]
+    assert text["Stretch"].startswith("**1.100**")
+    assert "rel.²" in measurement_text(measured, 2, True, "Area")
+    assert len(measured.ends(2, "Area")) == 4 and len(measured.ends(2)) == 3
+    two = Measurement(0, paths[:, :2])
+    assert "one more point" in measurement_text(two, 0, False, "Area")
+    assert "Unknown" in measurement_text(two, 0, False, "Stretch")
+    crossed = Measurement(0, np.array([[[0.0, 0, 0], [2, 2, 0], [2, 0, 0], [0, 1, 0]]]))
+    assert "cross" in measurement_text(crossed, 0, False, "Area")

@@ -1,5 +1,6 @@
 """The viewer over its own protocol: images, clicks, malformed data, foreign pages; scenes, sequences, training."""
 
+import csv
 import hashlib
 import json
 import math
@@ -25,6 +26,7 @@ from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
 from endoprior.runs.training_run import train
 from endoprior.view import live
+from endoprior.view.measure import AREA, DISPLACEMENT, STRETCH
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT, POINTS
 from endoprior.view.server import Viewer
 from endoprior.view.tracks import DrawnTracks
@@ -91,7 +93,7 @@ def test_the_slider_changes_the_image(viewer, client, scene):
 def test_every_layer_is_a_different_image(viewer, client):
     client.set(viewer.panel.frame, 4)
     images = {"color": client.image()}
-    for layer in ("depth", "alpha", "motion", "prior"):
+    for layer in ("depth", "alpha", "displacement", "stretch", "prior"):
         client.set(viewer.panel.layer, LAYER_NAMES[layer])
         images[layer] = client.image()
     for a in images:
@@ -165,6 +167,49 @@ def test_a_track_fades_where_a_tool_hides_its_point_or_where_it_is_uncertain(sce
     assert tracks.lines(4, False).dots.any(), "seen again"
     tracks.picked = [replace(tracks.picked[0], confidence=np.zeros((NUM_FRAMES, 1)))]
     assert not tracks.lines(4, False).dots.any(), "not certain there any more"
+def test_every_quantity_is_measured_and_saved_as_a_table(viewer, client):
+    client.set(viewer.panel.measure, True)
+    client.set(viewer.panel.quantity, AREA)
+    time.sleep(0.3)
+    for at in ((0.3, 0.4), (0.7, 0.4), (0.7, 0.6), (0.3, 0.6)):
+        client.click(*at)
+    client.image()
+    assert viewer.measured.curve(AREA) == pytest.approx(np.full(NUM_FRAMES, 16 * 6.5), rel=0.02)  # canvas 64 x 52 px
+    assert "mm²" in viewer.panel.distance.content and viewer.panel.chart.visible
+    client.set(viewer.panel.since, 2)
+    client.set(viewer.panel.quantity, STRETCH)
+    client.image()
+    assert viewer.measured.curve(STRETCH) == pytest.approx(np.ones(NUM_FRAMES), abs=0.01)  # the wall slides as a whole
+    assert viewer.measured.curve(DISPLACEMENT)[2] == 0 < viewer.measured.curve(DISPLACEMENT)[4]
+    client.set(viewer.panel.table, True)
+    end = time.monotonic() + 10
+    while not list(viewer.out.glob("measures*.csv")) and time.monotonic() < end:
+        time.sleep(0.05)
+    rows = list(csv.DictReader((viewer.out / "measures_1.csv").read_text().splitlines()))
+    assert len(rows) == NUM_FRAMES and float(rows[1]["area_mm2"]) == pytest.approx(
+        viewer.measured.curve(AREA)[1], abs=1e-3
+    )
+    client.set(viewer.panel.clear, True)
+    client.set(viewer.panel.table, True)
+    time.sleep(0.3)
+    assert viewer.measured is None and len(list(viewer.out.iterdir())) == 1
+
+
+def test_displacement_and_stretch_are_since_the_reference_frame(scene):
+    viewable = ViewableScene(scene, "wall")
+    for layer in ("displacement", "stretch"):
+        settings = ViewSettings(frame=5, layer=layer, since=5)
+        assert "since frame 5: blue" in viewable.legend(settings)
+        assert np.ptp(viewable.picture(settings, CAMERA).reshape(-1, 3), 0).max() <= 4  # nothing has moved: one color
+    moved = viewable.picture(ViewSettings(frame=5, layer="displacement", since=0), CAMERA)
+    assert not close(moved, viewable.picture(ViewSettings(frame=5, layer="displacement", since=5), CAMERA))
+    # The wall goes on beyond the image of the reference frame: what its stretch is there is not known.
+    beside = replace(CAMERA, cx=-20.0)
+    alpha, stretch = (
+        viewable.picture(ViewSettings(frame=5, layer=layer, endoscope=False), beside) for layer in ("alpha", "stretch")
+    )
+    assert alpha[24, 2].min() > 200 and stretch[24, 2].any()
+    assert alpha[24, 23].min() > 200 and not stretch[24, 23].any()
 
 
 def test_play_advances_and_pauses(viewer, client):
@@ -317,7 +362,9 @@ def test_the_viewer_does_not_change_the_training(tiny_sequence, tmp_path, monkey
                         client = Client(on_step.viewer.port)
                         client.send_camera()
                         threading.Event().wait(0.3)
-                    client.set(on_step.viewer.panel.layer, LAYER_NAMES["motion" if report.iteration % 2 else "prior"])
+                    client.set(
+                        on_step.viewer.panel.layer, LAYER_NAMES["displacement" if report.iteration % 2 else "prior"]
+                    )
                     threading.Event().wait(0.05)
                     shown.append(on_step.viewer.panel.status.content)
 

@@ -34,6 +34,7 @@ FORMATS = (
     "slicer",
     "depth",
     "tracks",
+    "measures",
     "video",
     "scene",
     "html",

@@ -41,11 +41,16 @@ class ExportOptions:
     voxel_mm: float = 1.0
     """Edge of a voxel of the fusion, mm."""
     points: Path | None = None
-    """CSV with columns x, y, frame: pixels to track; default: a grid on the first frame (tracks)."""
+    """CSV with columns x, y, frame: pixels to track; default: a grid on the first frame (tracks).
+    For measures the rows are the corners of a polygon, and the first two the ends of a distance; default: none."""
     grid_px: int = 32
     """Pixels between the points of that grid."""
     data: Path | None = None
     """Sequence folder whose masks tell where tools hide a point (tracks). Default: the one of the run."""
+    from_frame: int = 0
+    """Frame that displacement and stretch refer to (measures)."""
+    to_frame: int | None = None
+    """Frame whose displacement and stretch the surface shows; default: the last (measures)."""
     title: str = ""
     """Title above the player (html)."""
     max_mb: float = 20.0

@@ -51,7 +51,7 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         else:
             first = render_surface(scene, times[0], cameras[0], options.min_alpha)
             queries = grid_query_points(first, options.grid_px)
-        starts = _back_projected(scene, queries, options.min_alpha)
+        starts = back_projected(scene, queries, options.min_alpha)
         carried = carry(scene, starts, queries.frames, times)
         pixels = np.empty((len(times), len(starts), 2), np.float32)
         visible = np.empty(pixels.shape[:2], bool)
@@ -128,7 +128,7 @@ def grid_query_points(surface: Surface, spacing: int) -> QueryPoints:
     return QueryPoints(pixels, np.zeros(len(pixels), np.intp))
 
 
-def _back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDArray[np.float64]:
+def back_projected(scene: Scene, queries: QueryPoints, min_alpha: float) -> NDArray[np.float64]:
     """(P, 3) world positions of the query points, mm."""
     positions = np.empty((len(queries.pixels), 3))
     for frame in np.unique(queries.frames):

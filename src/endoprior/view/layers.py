@@ -34,9 +34,14 @@ def depth_picture(depth: NDArray, span: tuple[float, float]) -> NDArray[np.uint8
     return colorize(depth, *span, depth > 0)
 
 
-def value_picture(value: NDArray, alpha: NDArray) -> NDArray[np.uint8]:
-    """Turbo colors of composited values in [0, 1]; black where there is no surface."""
-    return colorize(value / np.maximum(alpha, 1e-6), 0, 1, alpha > SOLID_ALPHA)
+def value_picture(value: NDArray, known: NDArray) -> NDArray[np.uint8]:
+    """Turbo colors of composited values in [0, 1].
+
+    Args:
+        value: (H, W) composited values of the Gaussians whose value is known.
+        known: (H, W) alpha of these alone; black where it is low: no surface, or nothing known of it.
+    """
+    return colorize(value / np.maximum(known, 1e-6), 0, 1, known > SOLID_ALPHA)
 
 
 def difference_picture(rendered: NDArray[np.uint8], original: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -8,9 +8,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.geometry import length_unit
 from .access_control import are_numbers
+from .measure import DISTANCE, POINTS_OF
 from .view_settings import Layer, ViewSettings
 from .viewable import Viewable
 
@@ -21,7 +23,8 @@ LAYER_NAMES: dict[Layer, str] = {
     "color": "Color",
     "depth": "Depth",
     "alpha": "Alpha",
-    "motion": "Motion",
+    "displacement": "Displacement",
+    "stretch": "Stretch",
     "prior": "Texture prior",
     "frame": "Original frame",
     "difference": "Difference",
@@ -46,6 +49,7 @@ class Panel:
     def __init__(self, gui: viser.GuiApi, viewable: Viewable, uplot: Any) -> None:
         """Build the controls that `viewable` supports. `uplot` is viser's module of chart types."""
         total, trained = len(viewable.cameras), "color" in viewable.layers
+        self._total = total
         self.status = gui.add_markdown("")
         self.frame = gui.add_slider("Frame", 0, max(total - 1, 1), 1, 0, disabled=total < 2)
         self.play = gui.add_button("Play", disabled=total < 2)
@@ -56,6 +60,8 @@ class Panel:
             self.camera = gui.add_dropdown("Camera", (ENDOSCOPE, ORBIT), initial_value=ENDOSCOPE)
             self.rendered_by = gui.add_dropdown("Rendered by", (SERVER, BROWSER), initial_value=SERVER, visible=trained)
             self.rendered_as = gui.add_dropdown("Rendered as", (SPLATS, POINTS), initial_value=SPLATS, visible=trained)
+            hint = "Displacement and stretch are measured since this frame."
+            self.since = gui.add_slider("Since frame", 0, max(total - 1, 1), 1, 0, visible=trained, hint=hint)
             self.tool = gui.add_checkbox("Tool overlay", False, visible=viewable.has_tool)
             self.tracks = gui.add_checkbox("Material tracks", False)
             self.clip_end = float(np.ceil(CLIP_MARGIN * viewable.span[1])) or 1.0
@@ -78,10 +84,12 @@ class Panel:
             self.clear_tracks = gui.add_button("Clear tracks")
         with gui.add_folder("Measure"):
             self.measure = gui.add_checkbox("Measure by clicking", False)
+            self.quantity = gui.add_dropdown("Quantity", tuple(POINTS_OF), initial_value=DISTANCE, visible=trained)
             self.clear = gui.add_button("Clear measurement")
+            self.table = gui.add_button("Save table (CSV)", hint="Every quantity of the points, in all frames.")
             self.distance = gui.add_markdown("")
             axis = np.arange(total, dtype=np.float64)
-            series = (uplot.Series(label="frame"), uplot.Series(label=unit, stroke="orange", width=2))
+            series = (uplot.Series(label="frame"), uplot.Series(label="measured", stroke="orange", width=2))
             scales = {"x": uplot.Scale(time=False)}
             self.chart = gui.add_uplot((axis, np.zeros(total)), series, scales=scales, height=160, visible=False)
         with gui.add_folder("Save"):
@@ -99,14 +107,15 @@ class Panel:
             found.update({control_id(handle): rule for handle in handles})
 
         last, end = self.frame.max, self.clip_end
+        allow(lambda value: are_numbers([value], 1, last) and value >= 0, self.since)
         allow(lambda value: are_numbers([value], 1, last) and value >= 0, self.frame)
         allow(lambda value: are_numbers(value, 2, end) and min(value) >= 0, self.clip)
         allow(lambda value: are_numbers([value], 1, self.radius.max) and value >= self.radius.min, self.radius)
-        buttons = self.play, self.clear, self.screenshot, self.keep, self.forget, self.video
+        buttons = self.play, self.clear, self.table, self.screenshot, self.keep, self.forget, self.video
         buttons += self.undo, self.carry, self.save_masks, self.clear_tracks
         switches = self.tool, self.tracks, self.follow, self.measure, self.correct, self.erase
         allow(lambda value: isinstance(value, bool), *switches, *buttons)
-        for handle in (self.speed, self.layer, self.camera, self.rendered_by, self.rendered_as):
+        for handle in (self.speed, self.layer, self.camera, self.rendered_by, self.rendered_as, self.quantity):
             allow(lambda value, names=handle.options: isinstance(value, str) and value in names, handle)
         return found
 
@@ -120,6 +129,12 @@ class Panel:
         """Playback speed relative to the recording."""
         return float(self.speed.value.removesuffix("x"))
 
+    def show_curve(self, values: NDArray) -> None:
+        """Show a quantity over the frames (T,), or hide the chart if it is known in fewer than two."""
+        self.chart.visible = bool(np.isfinite(values).sum() > 1)
+        if self.chart.visible:
+            self.chart.data = np.arange(len(values), dtype=np.float64), values
+
     def chosen(self, settings: ViewSettings) -> ViewSettings:
         """`settings` updated with the current values of the controls under Show."""
         layers = {name: layer for layer, name in LAYER_NAMES.items()}
@@ -132,6 +147,7 @@ class Panel:
             points=self.rendered_as.value == POINTS,
             tool=self.tool.value,
             correcting=self.correct.value,
+            since=min(int(self.since.value), self._total - 1),
             tracks=self.tracks.value,
             near=near,
             far=far if far < self.clip_end else float("inf"),

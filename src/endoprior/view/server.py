@@ -17,9 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from ..core.checks import InputError
 from . import panel, saving
@@ -27,9 +25,10 @@ from .access_control import check_address
 from .browsers import Browsers, camera_pose, picture_with_lines
 from .connections import ConnectionFilter
 from .job_queue import JobQueue
-from .line_overlay import Lines, concatenated, ruler
+from .line_overlay import Lines, concatenated
 from .mask_editor import MaskEditor, Spot
-from .measure import Measurement, measurement_text, pick
+from .measure import Measurement, pick
+from .measuring import Measuring
 from .tracks import DrawnTracks
 from .video_path import PathPoint, follow_frames, interpolate
 from .view_settings import IDLE_SECONDS, ViewSettings, frame_due
@@ -65,12 +64,9 @@ class Viewer:
         check_address(host, port)
         warnings.filterwarnings("ignore", "Queued a", UserWarning)  # from viser, when a browser disconnects
         self.viewable, self.settings, self.out, self.host = viewable, ViewSettings(layer=viewable.layers[0]), out, host
-        self.measured: Measurement | None = None
         self.jobs = JobQueue()
         self._playing: tuple[int, float] | None = None
         """Frame and time at the start of playback."""
-        self._picked: list[tuple[NDArray, int]] = []
-        """Picked points and their frames."""
         self.tracks = DrawnTracks(viewable)
         self.kept_views: list[PathPoint] = []
         self._version, self._moved_at = 0, clock.monotonic() - IDLE_SECONDS
@@ -85,6 +81,7 @@ class Viewer:
         start.fov = endoscope_viewport(viewable.cameras[0], 1.0).fov
         self._browsers = Browsers(self.server)
         self.panel = panel.Panel(self.server.gui, viewable, viser.uplot)
+        self._measuring = Measuring(self.panel)
         edits = viewable.mask_edits
         self._editor = edits and MaskEditor(
             edits, self.panel, self.server.scene, self.jobs, self._mask_spot, self._masks_changed
@@ -102,6 +99,11 @@ class Viewer:
         """Address for a browser on this machine."""
         host = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
+
+    @property
+    def measured(self) -> Measurement | None:
+        """What is measured of the points that were clicked."""
+        return self._measuring.measured
 
     @property
     def watched(self) -> bool:
@@ -176,12 +178,15 @@ class Viewer:
 
         on_change(lambda: self._go_to(controls.frame.value), controls.frame)
         shown = controls.layer, controls.camera, controls.rendered_by, controls.rendered_as
-        on_change(self.read_panel, *shown, controls.tool, controls.tracks, controls.clip, controls.correct)
+        on_change(
+            self.read_panel, *shown, controls.tool, controls.tracks, controls.clip, controls.correct, controls.since
+        )
         on_change(self._restart_clock, controls.speed)
-        on_change(self.read_clicking, controls.measure, controls.follow)
+        on_change(self.read_clicking, controls.measure, controls.follow, controls.quantity)
         on_press(controls.play, lambda _: self._toggle_play())
         on_press(controls.clear, lambda _: self._clear_measurement())
         on_press(controls.clear_tracks, lambda _: self.tracks.clear())
+        on_press(controls.table, self._save_table)
         on_press(controls.keep, self._keep_view)
         on_press(controls.forget, lambda _: self._forget_views())
         on_press(controls.screenshot, self._screenshot)
@@ -209,7 +214,9 @@ class Viewer:
         settings = self.panel.chosen(self.settings)
         if settings.endoscope and not self.settings.endoscope:
             self._browsers.return_to_endoscope()
-        self.settings = settings
+        moved_reference, self.settings = settings.since != self.settings.since, settings
+        if moved_reference:
+            self._measuring.update(self.viewable, settings)
         if self._editor:
             self._editor.listen(settings.correcting and settings.endoscope)
         self._update_panel()
@@ -249,24 +256,24 @@ class Viewer:
         self._browsers.draw(self.viewable, self._version, self.settings, lines, clock.monotonic() - self._moved_at)
 
     def _lines(self, settings: ViewSettings) -> Lines:
-        lines = self.tracks.lines(settings.frame, settings.tracks)
-        return concatenated(lines, ruler(self.measured.ends(settings.frame))) if self.measured else lines
+        return concatenated(self.tracks.lines(settings.frame, settings.tracks), self._measuring.lines(settings.frame))
 
     # Tracking and measuring.
 
     def read_clicking(self) -> None:
-        """Switch clicks on the tissue on or off, as the controls are set."""
+        """Switch clicks on the tissue on or off, and measure what is chosen, as the controls are set."""
         scene = self.server.scene
         scene.remove_click_callback(self._on_click)
         if self.panel.measure.value or self.panel.follow.value:
             scene.on_click()(self._on_click)
+        self._measuring.update(self.viewable, self.settings)
         self._update_panel()
 
     def _on_click(self, event: viser.SceneClickEvent) -> None:
         self.jobs.put(lambda: self._pick(event.client, event.screen_pos))
 
     def _pick(self, client: viser.ClientHandle, screen: tuple[float, float]) -> None:
-        """Track the point under a click, or measure from it: the first, the second, or the first of the next two."""
+        """Track the point under a click, or measure it."""
         viewport = self._browsers.viewport(client, self.viewable, self.settings)
         if viewport is None or self.settings.correcting:  # a click paints
             return
@@ -277,16 +284,12 @@ class Viewer:
             return
         if self.panel.follow.value:
             self.tracks.pick(point, self.settings.frame)
-        if not self.panel.measure.value:
-            return
-        before = self._picked if len(self._picked) < 2 else []
-        self._picked = [*before, (point, self.settings.frame)]
-        points, frames = zip(*self._picked, strict=True)
-        self.measured = Measurement(self.settings.frame, self.viewable.carry(np.stack(points), list(frames)))
+        if self.panel.measure.value:
+            self._measuring.add(point, self.viewable, self.settings)
         self._update_panel()
 
     def _clear_measurement(self) -> None:
-        self.measured, self._picked = None, []
+        self._measuring.clear()
         self._update_panel()
 
     # Correcting tool masks.
@@ -351,15 +354,16 @@ class Viewer:
         if self.out is not None:
             self._browsers.notify("Saved", str(saving.keep(self.out, name, content)))
 
+    def _save_table(self, client: viser.ClientHandle) -> None:
+        table = self._measuring.table(self.viewable, self.settings)
+        if table is None:
+            self._browsers.notify("Nothing measured", "Check Measure by clicking, and click points.")
+        else:
+            self._offer(client, "measures.csv", table.encode())
+
     # Text of the panel.
 
     def _update_panel(self) -> None:
         """Update the texts and the chart of the panel."""
-        controls, measuring = self.panel, self.measured or self.panel.measure.value
-        controls.status.content = panel.status(self.viewable, self.settings, len(self.kept_views))
-        text = measurement_text(self.measured, self.settings.frame, self.viewable.relative) if measuring else ""
-        controls.distance.content = text
-        distances = self.measured.distances if self.measured else np.zeros(0)
-        controls.chart.visible = bool(np.isfinite(distances).sum() > 1)
-        if controls.chart.visible:
-            controls.chart.data = np.arange(len(distances), dtype=np.float64), distances
+        self.panel.status.content = panel.status(self.viewable, self.settings, len(self.kept_views))
+        self._measuring.show(self.viewable, self.settings.frame)

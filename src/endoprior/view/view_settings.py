@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Layer = Literal["color", "depth", "alpha", "motion", "prior", "frame", "difference"]
-"""`color`, `depth` and `alpha` as rendered; `motion` since the first frame; `prior` the texture-prior score; `frame`
-the original; `difference` rendered minus original."""
+Layer = Literal["color", "depth", "alpha", "displacement", "stretch", "prior", "frame", "difference"]
+"""`color`, `depth` and `alpha` as rendered; `displacement` and `stretch` since a reference frame; `prior` the
+texture-prior score; `frame` the original; `difference` rendered minus original."""
 
 SLOW_MS = 60.0
 """If rendering at full size takes longer, images are rendered at half size while something moves."""
@@ -36,6 +36,8 @@ class ViewSettings:
     """Smallest depth to render, mm."""
     far: float = float("inf")
     """Largest depth to render, mm."""
+    since: int = 0
+    """Reference frame of displacement and stretch."""
     tracks: bool = False
     """Show tracks of material points over the previous frames."""
 

@@ -68,6 +68,10 @@ class Viewable(Protocol):
         """(T, K, 3) positions in every frame of points (K, 3), each picked in its frame of `frames`; NaN if unknown."""
         ...
 
+    def stretch(self, points: NDArray, since: int) -> NDArray[np.float64]:
+        """(T, K) largest principal stretch since a frame, around points (K, 3) of that frame; NaN where unknown."""
+        ...
+
     def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
         """The points of `carry` with their confidence."""
         ...

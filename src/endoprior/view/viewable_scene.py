@@ -16,17 +16,22 @@ from ..core.types import Camera, RenderOutput, Splats
 from ..data import FrameSequence
 from ..model.carry import CarriedPoints, carry
 from ..model.gaussians import SH_C0
+from ..model.measures import distance
 from ..model.playback import Playback
 from ..model.scene import Scene
 from ..model.surface import Surface, project_visible, shown_pixels
+from ..model.surface_motion import SurfaceMotion
 from ..visualization.image_tools import gray, to_u8
+from ..visualization.measures import displacement_span, stretch_span, value_colors
 from ..visualization.rendered_views import depth_span
 from . import layers
 from .view_settings import Layer, ViewSettings
 from .viewable import Cloud
 from .viewport import shrunk_camera
 
-BROWSER_LAYERS = ("color", "motion", "prior")
+VALUE_LAYERS = ("displacement", "stretch", "prior")
+"""Layers that are one value per Gaussian."""
+BROWSER_LAYERS = ("color", *VALUE_LAYERS)
 """Layers that are one color per Gaussian."""
 DOT_PX = 0.6
 """Standard deviation of a dot in the endoscope image, px."""
@@ -35,8 +40,10 @@ TRACK_COLUMNS = 16
 """Number of material points along a row of the image."""
 SEEN_WIDTH, SEEN_FRAMES = 160, 200
 """Least width of the depth that tells which points a frame shows, px, and how many frames of it are cached."""
+MAX_MEASURED = 256
+"""Largest number of frames whose displacement or stretch is kept."""
 MOTION_SAMPLES = 8
-"""Number of times used for the color scale of the motion layer."""
+"""Number of times used for the color scales of displacement and stretch."""
 
 
 class ViewableScene:
@@ -49,7 +56,7 @@ class ViewableScene:
             sequence: with as many frames as the scene has cameras; None disables input frames, difference and tool.
         """
         self.scene, self.title, self.sequence = scene, title, sequence
-        self.layers: tuple[Layer, ...] = ("color", "depth", "alpha", "motion", "prior")
+        self.layers: tuple[Layer, ...] = ("color", "depth", "alpha", *VALUE_LAYERS)
         if sequence is not None:
             self.layers += ("frame", "difference")
         self.cameras = scene.cameras
@@ -58,6 +65,9 @@ class ViewableScene:
         self.has_tool = sequence is not None
         self.mask_edits = None
         self._playback = Playback(scene)
+        self._motion: SurfaceMotion | None = None
+        self._measured = lru_cache(MAX_MEASURED)(self._measure)
+        self._value_span = lru_cache(MAX_MEASURED)(self._span_of)
         self._rasterize = render.load(scene.backend)
         self._seen = lru_cache(SEEN_FRAMES)(self._surface_and_mask)
 
@@ -79,14 +89,15 @@ class ViewableScene:
     def _layer(self, kind: Layer, settings: ViewSettings, camera: Camera) -> NDArray[np.uint8]:
         if kind == "frame":
             return layers.fitted(self.sequence.frame(settings.frame).rgb_u8, camera)
-        out = self._draw(settings, camera, None if kind not in ("motion", "prior") else self._values(settings))
+        out = self._draw(settings, camera, self._values(settings) if kind in VALUE_LAYERS else None)
         alpha = out.alpha.cpu().numpy()
         if kind == "depth":
             return layers.depth_picture(expected_depth(out.depth.cpu().numpy(), alpha), self.span)
         if kind == "alpha":
             return gray(alpha)
-        if kind in ("motion", "prior"):
-            return layers.value_picture(out.color[..., 0].cpu().numpy(), alpha)
+        if kind in VALUE_LAYERS:
+            value, known, _ = np.moveaxis(out.color.cpu().numpy(), -1, 0)
+            return layers.value_picture(value, known)
         color = to_u8(out.color.cpu().numpy())
         if kind == "difference":
             return layers.difference_picture(color, layers.fitted(self.sequence.frame(settings.frame).rgb_u8, camera))
@@ -99,10 +110,10 @@ class ViewableScene:
 
     @torch.no_grad()
     def _draw(self, settings: ViewSettings, camera: Camera, values: Tensor | None = None) -> RenderOutput:
-        """Render the selected Gaussians; `values` (N,) in [0, 1] replace their colors."""
+        """Render the selected Gaussians; `values` (N,) in [0, 1] become red, and green 1 where they are known."""
         splats = self._splats(settings)
         if values is not None:
-            splats = replace(splats, sh=_gray_sh(values))
+            splats = replace(splats, sh=_value_sh(values))
         return self._rasterize(
             _clipped(splats, camera, settings.near, settings.far), camera, background=splats.means.new_zeros(3)
         )
@@ -119,20 +130,33 @@ class ViewableScene:
         return DOT_PX * sum(self.span) / 2 / self.cameras[0].fy
 
     def _values(self, settings: ViewSettings) -> Tensor:
-        """(N,) value of the layer for each Gaussian, in [0, 1]."""
+        """(N,) value of the layer for each Gaussian, as a share of the color scale, in [0, 1]; NaN where unknown."""
         if settings.layer == "prior":
             return self.scene.prior_score.clamp(0, 1)
-        return (self._moved(settings.frame) / self.largest_motion).clamp(max=1)
+        low, high = self._value_span(settings.layer, settings.since)
+        values = self._measured(settings.layer, settings.since, settings.frame)
+        return ((torch.from_numpy(values).to(self.scene.prior_score) - low) / (high - low)).clamp(0, 1)
 
-    def _moved(self, frame: int) -> Tensor:
-        """(N,) distance of each center from its position in the first frame, mm."""
-        return (self._playback.splats(frame).means - self._playback.splats(0).means).norm(dim=-1)
+    def _measure(self, layer: Layer, since: int, frame: int) -> NDArray[np.float32]:
+        """(N,) displacement of each center since a frame, mm, or stretch of the surface there; NaN where unknown."""
+        before = self._playback.splats(since).means.cpu().numpy()
+        if layer == "displacement":
+            return distance(self._playback.splats(frame).means.cpu().numpy(), before).astype(np.float32)
+        return self._surface_motion(since).stretch(before, [frame])[0].astype(np.float32)
 
-    @cached_property
-    def largest_motion(self) -> float:
-        """98th percentile of the motion since the first frame, mm: the red end of the color scale."""
-        frames = np.linspace(0, len(self.cameras) - 1, min(MOTION_SAMPLES, len(self.cameras))).astype(int)
-        return max(*(float(np.percentile(self._moved(int(i)).cpu().numpy(), 98)) for i in frames), 1e-3)
+    def _surface_motion(self, since: int) -> SurfaceMotion:
+        """The surface in frame `since`, rendered once until another frame is asked for."""
+        if self._motion is None or self._motion.since != since:
+            self._motion = SurfaceMotion(self.scene, since)
+        return self._motion
+
+    def _span_of(self, layer: Layer, since: int) -> tuple[float, float]:
+        """Ends of the color scale of a layer, the same for all frames."""
+        frames = np.linspace(0, len(self.cameras) - 1, min(MOTION_SAMPLES, len(self.cameras))).astype(int).tolist()
+        if layer == "displacement":
+            return max(displacement_span(self._measured(layer, since, frame)) for frame in frames)
+        motion = self._surface_motion(since)
+        return max((stretch_span(each) for each in motion.stretch(motion.samples, frames)), key=lambda ends: ends[1])
 
     def renders_in_browser(self, settings: ViewSettings) -> bool:
         """See `Viewable.renders_in_browser`: layers that are not a color per Gaussian are rendered on the server."""
@@ -152,7 +176,7 @@ class ViewableScene:
                 settings.near,
                 settings.far,
             )
-            colors = layers.colorize(values.cpu().numpy()[None], 0, 1)[0]
+            colors = value_colors(values.cpu().numpy(), (0, 1))
         points = splats.means.cpu().numpy()
         if settings.points:
             return Cloud(points, colors, None, None, 3 * self._dot_mm)
@@ -161,6 +185,10 @@ class ViewableScene:
     def carry(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
         """See `Viewable.carry`: a point moves with the Gaussians around it."""
         return self.follow(points, frames).positions.astype(np.float64)
+
+    def stretch(self, points: NDArray, since: int) -> NDArray[np.float64]:
+        """See `Viewable.stretch`."""
+        return self._surface_motion(since).stretch(points, list(range(len(self.cameras))))
 
     def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
         """See `Viewable.follow`."""
@@ -197,18 +225,25 @@ class ViewableScene:
     def legend(self, settings: ViewSettings) -> str:
         """See `Viewable.legend`."""
         unit = length_unit(self.relative)
+        if settings.layer in ("displacement", "stretch"):
+            low, high = self._value_span(settings.layer, settings.since)
+            if settings.layer == "displacement":
+                return f"moved since frame {settings.since}: blue 0 to red {high:.1f} {unit}"
+            scale = f"blue {low:.2f} (shorter), green 1 (unchanged), red {high:.2f} (longer)"
+            return f"largest stretch since frame {settings.since}: {scale}; black: not seen then"
         return {
             "depth": f"blue {self.span[0]:.1f} to red {self.span[1]:.1f} {unit}",
             "alpha": "black 0 to white 1: coverage by the Gaussians",
-            "motion": f"moved since frame 0: blue 0 to red {self.largest_motion:.1f} {unit}",
             "prior": "texture-prior score of the Gaussians: blue 0 to red 1",
             "difference": f"rendered minus input: blue 0 to red {layers.LARGEST_DIFFERENCE:.0%}",
         }.get(settings.layer, "")
 
 
-def _gray_sh(values: Tensor) -> Tensor:
-    """(N, 1, 3) coefficients that render (N,) `values` as gray."""
-    return ((values - 0.5) / SH_C0)[:, None, None].expand(-1, 1, 3).contiguous()
+def _value_sh(values: Tensor) -> Tensor:
+    """(N, 1, 3) coefficients that render (N,) `values` as red and 1 as green; both 0 where a value is NaN."""
+    known = torch.isfinite(values)
+    colors = torch.stack([values.nan_to_num(), known.to(values), torch.zeros_like(values)], -1)
+    return ((colors - 0.5) / SH_C0)[:, None].contiguous()
 
 
 def _clipped(splats: Splats, camera: Camera, near: float, far: float) -> Splats:

@@ -107,6 +107,10 @@ class ViewableSequence:
             paths[frame, k] = points[k]
         return paths
 
+    def stretch(self, points: NDArray, since: int) -> NDArray[np.float64]:
+        """See `Viewable.stretch`: unknown before training."""
+        return np.full((len(self.cameras), len(points)), np.nan)
+
     def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
         """See `Viewable.follow`: certain where known."""
         return _certain(self.carry(points, frames))
