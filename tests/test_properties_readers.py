@@ -107,7 +107,7 @@ def test_polarity_stride_and_shrink_change_what_they_say(made, stride, shrink):
                 assert np.array_equal(frame.tissue_mask, tool) and np.array_equal(frame.rgb_u8, rgb)
 
 
-@examples(40)
+@examples(15)
 @given(recordings())
 def test_exactly_the_unusable_is_rejected(made):
     meta, frames, _ = made
