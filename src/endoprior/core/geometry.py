@@ -89,6 +89,12 @@ def bilinear(image: NDArray, pixels: NDArray) -> NDArray:
     return top * (1 - fy) + bottom * fy
 
 
+def cells_at(pixels: NDArray, width: int, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Column and row (P,) of the pixel in which each position (P, 2), px, lies, clamped to the image."""
+    x, y = np.clip(np.floor(pixels), 0, (width - 1, height - 1)).astype(np.intp).T
+    return x, y
+
+
 def quaternion_to_matrix(quats: NDArray) -> NDArray:
     """Rotation matrices of quaternions (w, x, y, z) of any non-zero length.
 

@@ -12,24 +12,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.geometry import back_project, bilinear, project
+from ..core.geometry import back_project, bilinear, cells_at, project
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
-from ..footage.optical_flow import (
-    FLOW_BYTES,
-    MIN_SIZE_PX,
-    RETURN_PX,
-    RETURN_SHARE,
-    fine_flow,
-    fine_shrink,
-    gray_for_flow,
-)
+from ..footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, gray_for_flow
 from ..model.carry import carry_points
 from ..model.scene import Scene
 from ..model.surface import project_visible, render_surface, shown_pixels
 from ..system.memory import workers
 from .metrics import ScoreUnavailable
 
+RETURN_PX, RETURN_SHARE = 1.0, 0.05
+"""Chained flow loses a point where flow and backward flow disagree by more than this, plus this share of the step."""
+FLOW_BYTES = 40
+"""Memory per pixel while the flow of a pair of frames is computed, bytes."""
 FLOW_CHUNK = 16
 """Number of frame pairs whose flow is computed together."""
 TOO_SMALL = f"frames are smaller than {MIN_SIZE_PX} px, the least for optical flow"
@@ -129,7 +125,7 @@ def by_chained_flow(true: TrueTracks, sequence: FrameSequence) -> PredictedTrack
         gap = np.linalg.norm(step + _flow_at(back, pixels[k + 1], frame), axis=-1)
         returns = gap <= RETURN_PX + RETURN_SHARE * np.linalg.norm(step, axis=-1)
         shown = shown_pixels(pixels[k + 1], frame.tissue_mask)
-        x, y = _cells(pixels[k + 1], frame)
+        x, y = cells_at(pixels[k + 1], frame.camera.width, frame.camera.height)
         depth = np.where(moving & shown & frame.depth_valid[y, x], frame.depth[y, x], depth)
         points[k + 1] = back_project(pixels[k + 1], depth, _at_origin(frame.camera))
         visible[k + 1] = moving & shown & returns
@@ -161,12 +157,6 @@ def _pixels(points: NDArray[np.floating], camera: Camera) -> NDArray[np.floating
     """(P, 2) pixels of points in camera axes; infinite behind the camera."""
     pixels, z = project(points, _at_origin(camera))
     return np.where((z > 0)[:, None], pixels, np.inf)
-
-
-def _cells(pixels: NDArray[np.floating], frame: Frame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Column and row of the pixel at each position, clamped to the image."""
-    x, y = np.clip(np.floor(pixels), 0, (frame.camera.width - 1, frame.camera.height - 1)).astype(np.intp).T
-    return x, y
 
 
 def _flow_at(flow: NDArray[np.float32], pixels: NDArray[np.floating], frame: Frame) -> NDArray[np.float64]:

@@ -14,10 +14,6 @@ HALVED_FROM_PX = 256
 """Flow of frames with at least this shorter side is computed at half size: four times faster, almost as accurate."""
 FINE_SIDE_PX = 256
 """Fine flow is computed on images shrunk by a whole number to at least this shorter side."""
-RETURN_PX, RETURN_SHARE = 1.0, 0.05
-"""A point is lost where forward and backward flow disagree by more than this, plus this share of the step."""
-FLOW_BYTES = 40
-"""Memory per pixel while the flow of a pair of frames is computed, bytes."""
 
 FlowPair = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Flow (h, w, 2) from a frame to the next and back, in px of the image it was computed on."""

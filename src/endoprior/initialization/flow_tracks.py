@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.config import BasisConfig
-from ..core.geometry import back_project, project
+from ..core.geometry import back_project, cells_at, project
 from ..core.types import Frame
 from ..footage.optical_flow import MIN_SIZE_PX, fine_shrink, gray_for_flow
 from ..model.basis import basis_weights
@@ -129,17 +129,11 @@ def lift(frames: Sequence[Frame], pixels: NDArray) -> NDArray[np.float32]:
     for position, frame in enumerate(frames):
         known = np.flatnonzero(np.isfinite(pixels[position, :, 0]))
         height, width = frame.tissue_mask.shape
-        x, y = _nearest(pixels[position, known], width, height)
+        x, y = cells_at(pixels[position, known], width, height)
         measured = has_surface(frame)[y, x]
         depth = frame.depth[y, x].astype(np.float64)[measured]
         found[position, known[measured]] = back_project(pixels[position, known[measured]], depth, frame.camera)
     return found
-
-
-def _nearest(pixels: NDArray, width: int, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Column and row of the pixel at each position, clamped to the image."""
-    x, y = np.floor(pixels).astype(np.intp).T
-    return np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
 
 
 def fit_basis(offsets: NDArray[np.floating], times: list[float], cfg: BasisConfig) -> NDArray[np.float32]:

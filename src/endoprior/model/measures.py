@@ -99,9 +99,8 @@ def polygon_triangles(corners: NDArray) -> NDArray[np.intp]:
     if len(corners) < 3 or not np.isfinite(corners).all():
         return none
     centered = corners - corners.mean(0)
-    normal = np.cross(centered, np.roll(centered, -1, 0)).sum(
-        0
-    )  # twice the area vector: the turn is positive around it
+    # Twice the area vector: the polygon turns positively around it.
+    normal = np.cross(centered, np.roll(centered, -1, 0)).sum(0)
     if np.linalg.norm(normal) <= 1e-9 * np.square(centered).sum():
         return none
     along = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.geometry import bilinear, expected_depth, project
+from ..core.geometry import bilinear, cells_at, expected_depth, project
 from ..core.types import Camera
 from .scene import Scene
 
@@ -48,9 +48,9 @@ def shown_pixels(pixels: NDArray, tissue_mask: NDArray[np.bool_]) -> NDArray[np.
     Args:
         tissue_mask: (H, W) False under tools.
     """
-    size = np.array(tissue_mask.shape[::-1])
-    x, y = np.clip(np.floor(pixels), 0, size - 1).astype(np.intp).T
-    return (pixels >= 0).all(1) & (pixels <= size).all(1) & tissue_mask[y, x]
+    height, width = tissue_mask.shape
+    x, y = cells_at(pixels, width, height)
+    return (pixels >= 0).all(1) & (pixels <= (width, height)).all(1) & tissue_mask[y, x]
 
 
 def project_visible(

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.geometry import cells_at
 from ...core.types import Camera, Frame
 from ...data import FrameSequence, nearest_end_errors
 from ...model.carry import carry_points
@@ -212,8 +213,7 @@ def near_tool(true: TrueTracks, sequence: FrameSequence) -> NDArray[np.bool_]:
     near = np.zeros_like(true.visible)
     for i, frame in enumerate(sequence.frames("video")):
         if not frame.tissue_mask.all():
-            x, y = np.floor(true.pixels[i, true.visible[i]]).astype(np.intp).T
-            columns, rows = np.minimum(x, frame.camera.width - 1), np.minimum(y, frame.camera.height - 1)
+            columns, rows = cells_at(true.pixels[i, true.visible[i]], frame.camera.width, frame.camera.height)
             near[i, true.visible[i]] = _near_tool(frame)[rows, columns]
     return near
 
