@@ -15,7 +15,7 @@ from endoprior.core.geometry import bilinear
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.phantom.generate import build_scene, visible_points
 from endoprior.phantom.instrument import JAW_MM, pack_tool, render_tools
-from endoprior.phantom.motion import ToolPose, build_motion, smooth_step
+from endoprior.phantom.motion import ToolPose
 from endoprior.phantom.noise import cells, fractal
 from endoprior.phantom.raster import FAR, rasterize, vertex_normals
 from endoprior.phantom.surface import build_anatomy, build_plane, organs_at
@@ -243,54 +243,6 @@ def test_values_out_of_range_are_input_errors(change):
     with pytest.raises(InputError, match="expected") as caught:
         PhantomConfig(**change)
     assert "\n" not in str(caught.value)
-
-
-# --- motion ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("change", [{"pull_mm": 15}, {"pull_mm": 30, "slide_mm": 12}], ids=["usual", "strong"])
-@pytest.mark.parametrize("seed", range(6))
-def test_motion_never_folds_the_tissue(seed, change):
-    cfg = PhantomConfig(seed=seed, breathing_mm=8, **change)
-    motion = build_motion(cfg, build_plane(cfg), build_anatomy(seed))
-    b, a = np.mgrid[-60:60:1.0, -70:70:1.0]
-    for phase in (0.0, 0.25, 0.4, 0.55, 0.7):
-        moved = motion.displacement(a, b, phase)
-        (ab, aa), (bb, ba) = np.gradient(a + moved[..., 0]), np.gradient(b + moved[..., 1])
-        assert (aa * bb - ab * ba).min() > 0.02  # area ratio of the map (a, b) -> moved (a, b); 1 is undeformed
-
-
-@pytest.mark.parametrize("change", [{}, {"pull_mm": 30, "slide_mm": 12}], ids=["usual", "strong"])
-def test_motion_and_tools_are_smooth(change):
-    cfg = PhantomConfig(frames=96, **change)  # two cycles, so that the hand-over between them is covered
-    motion = build_motion(cfg, build_plane(cfg), build_anatomy(0))
-    steps = 2000
-    phases = np.linspace(0, 1, steps)
-    center = motion.pulls[0].center
-    tissue = np.array([motion.displacement(*np.float64(center).reshape(2, 1), p)[0] for p in phases])
-    tips = np.array([motion.tools(p)[0].tip for p in phases])
-    hover = np.array([motion.tools(p)[1].tip for p in phases])
-    for path in (tissue, tips, hover):
-        velocity = np.diff(path, axis=0) * steps
-        # A jump in velocity would show at full size however fine the steps; smooth motion changes it by O(1 / steps).
-        assert np.abs(np.diff(velocity, axis=0)).max() < 0.03 * max(np.abs(velocity).max(), 1)
-
-
-@pytest.mark.parametrize("change", [{}, {"pull_mm": 30, "slide_mm": 12}], ids=["usual", "strong"])
-def test_the_grasper_holds_what_it_pulls(change):
-    cfg = PhantomConfig(seed=1, **change)
-    motion = build_motion(cfg, build_plane(cfg), build_anatomy(1))
-    pull = motion.pulls[0]
-    for phase in (0.3, 0.5, 0.6):
-        assert np.allclose(motion.tools(phase)[0].tip, motion.held(pull, phase), atol=1e-9)
-        assert motion.tools(phase)[0].opening < 0.1
-    assert motion.tools(0.0)[0].opening > 0.5
-    dragged = motion.held(pull, 0.55) - motion.held(pull, 0.0)
-    assert np.linalg.norm(dragged) > 0.7 * cfg.pull_mm and pull.strength(0.0) == 0 and pull.strength(1.0) == 0
-
-
-def test_smooth_step_closed_form():
-    assert [smooth_step(1, 3, x) for x in (0, 1, 2, 3, 4)] == [0, 0, 0.5, 1, 1]
 
 
 # --- geometry and noise ---------------------------------------------------------------------------------------------

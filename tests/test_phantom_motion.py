@@ -1,4 +1,4 @@
-"""The phantom with a strong pull, which slides out of the image and has smooth patches."""
+"""Motion of the phantom, up to a strong pull and tissue that slides out of the image; smooth patches."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import pytest
 
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.phantom.generate import build_scene
+from endoprior.phantom.motion import build_motion, smooth_step
 from endoprior.phantom.raster import FAR, rasterize
-from endoprior.phantom.surface import build_plane
+from endoprior.phantom.surface import build_anatomy, build_plane
 from endoprior.phantom.texture import smooth_patches
 
 STRONG = PhantomConfig(frames=12, width=96, height=80, seed=3, pull_mm=30, slide_mm=12, smooth_share=0.3)
@@ -70,3 +71,48 @@ def test_smooth_patches_cover_their_share_and_have_little_texture():
 
     assert detail(smooth, patches > 0.99) < 0.2 * detail(usual, patches > 0.99)
     assert np.array_equal(smooth[patches == 0][:, :3], usual[patches == 0][:, :3])
+
+
+@pytest.mark.parametrize("change", [{"pull_mm": 15}, {"pull_mm": 30, "slide_mm": 12}], ids=["usual", "strong"])
+@pytest.mark.parametrize("seed", range(6))
+def test_motion_never_folds_the_tissue(seed, change):
+    cfg = PhantomConfig(seed=seed, breathing_mm=8, **change)
+    motion = build_motion(cfg, build_plane(cfg), build_anatomy(seed))
+    b, a = np.mgrid[-60:60:1.0, -70:70:1.0]
+    for phase in (0.0, 0.25, 0.4, 0.55, 0.7):
+        moved = motion.displacement(a, b, phase)
+        (ab, aa), (bb, ba) = np.gradient(a + moved[..., 0]), np.gradient(b + moved[..., 1])
+        assert (aa * bb - ab * ba).min() > 0.02  # area ratio of the map (a, b) -> moved (a, b); 1 is undeformed
+
+
+@pytest.mark.parametrize("change", [{}, {"pull_mm": 30, "slide_mm": 12}], ids=["usual", "strong"])
+def test_motion_and_tools_are_smooth(change):
+    cfg = PhantomConfig(frames=96, **change)  # two cycles, so that the hand-over between them is covered
+    motion = build_motion(cfg, build_plane(cfg), build_anatomy(0))
+    steps = 2000
+    phases = np.linspace(0, 1, steps)
+    center = motion.pulls[0].center
+    tissue = np.array([motion.displacement(*np.float64(center).reshape(2, 1), p)[0] for p in phases])
+    tips = np.array([motion.tools(p)[0].tip for p in phases])
+    hover = np.array([motion.tools(p)[1].tip for p in phases])
+    for path in (tissue, tips, hover):
+        velocity = np.diff(path, axis=0) * steps
+        # A jump in velocity would show at full size however fine the steps; smooth motion changes it by O(1 / steps).
+        assert np.abs(np.diff(velocity, axis=0)).max() < 0.03 * max(np.abs(velocity).max(), 1)
+
+
+@pytest.mark.parametrize("change", [{}, {"pull_mm": 30, "slide_mm": 12}], ids=["usual", "strong"])
+def test_the_grasper_holds_what_it_pulls(change):
+    cfg = PhantomConfig(seed=1, **change)
+    motion = build_motion(cfg, build_plane(cfg), build_anatomy(1))
+    pull = motion.pulls[0]
+    for phase in (0.3, 0.5, 0.6):
+        assert np.allclose(motion.tools(phase)[0].tip, motion.held(pull, phase), atol=1e-9)
+        assert motion.tools(phase)[0].opening < 0.1
+    assert motion.tools(0.0)[0].opening > 0.5
+    dragged = motion.held(pull, 0.55) - motion.held(pull, 0.0)
+    assert np.linalg.norm(dragged) > 0.7 * cfg.pull_mm and pull.strength(0.0) == 0 and pull.strength(1.0) == 0
+
+
+def test_smooth_step_closed_form():
+    assert [smooth_step(1, 3, x) for x in (0, 1, 2, 3, 4)] == [0, 0, 0.5, 1, 1]
