@@ -203,10 +203,11 @@ def test_every_row_stays_together_through_a_plan(kind):
     stats = DensityStats(*(torch.arange(6.0) + k for k in range(5)))
     flags = torch.eye(6, dtype=torch.bool)
     planned = Plan(clone=flags[1], split=flags[2], remove=flags[4])
-    grown = apply_plan(optimizer, planned, stats, np.random.default_rng(0))
+    grown, returned = apply_plan(optimizer, planned, stats, np.random.default_rng(0))
     # The marks say which Gaussian each row was: the kept ones, the clone, two children, in an order of their own.
     parents = (model["opacity_logits"].detach()[:, None] - before["opacity_logits"]).abs().argmin(1)
     assert sorted(parents.tolist()) == [0, 1, 1, 2, 2, 3, 5]
+    assert torch.equal(returned, parents)
     assert np.array_equal(morton_order(model["means"].detach().numpy()), np.arange(7))
     old = optimizer.states["opacity_logits"].first > 0
     assert sorted(parents[old].tolist()) == [0, 1, 3, 5]

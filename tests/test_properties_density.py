@@ -95,7 +95,7 @@ def test_an_applied_plan_gives_the_planned_number_of_finite_gaussians(made, degr
     gaussians = create_gaussians(rng.normal(size=(num, 3)), rng.random((num, 3)), scales.amax(-1).log().numpy(), config)
     optimizer = Optimizer(gaussians, None, config, 1.0, NUMBA)
     planned = density.plan(stats, gaussians.scales, gaussians.opacities, extent, cfg)
-    new = apply_plan(optimizer, planned, stats, rng)
+    new, _ = apply_plan(optimizer, planned, stats, rng)
     after = num + int(planned.clone.sum()) + int(planned.split.sum()) - int(planned.remove.sum())
     assert len(gaussians) == after
     assert all(len(value) == after and torch.isfinite(value).all() for value in gaussians.tensors.values())

@@ -166,7 +166,7 @@ def test_initial_motion_is_finite_for_any_images(count, height, width, seed, kin
         mask = rng.random((height, width)) < 0.8
         found.append(Frame(i, i / count, camera, picture, mask, depth, depth > 0))
     cloud = initial_points(found, InitConfig(budget=50, erosion_px=1), seed=seed)
-    motion = initial_motion(found, cloud, BasisConfig(num_bases=5))
+    motion = initial_motion(found, cloud, BasisConfig(num_bases=5)).coefficients
     assert motion.shape == (len(cloud), 5, 3) and np.isfinite(motion).all()
     assert kind != "still" or count > 1 or (motion == 0).all()
 

@@ -73,7 +73,7 @@ def test_coefficients_move_the_points_with_the_plane():
     frames = moving_frames((2.0, -1.0))
     cloud = cloud_at([(80.5, 60.5)], 3, frames[0].camera)
     cfg = BasisConfig(num_bases=7)
-    motion = tracks.initial_motion(frames, cloud, cfg)
+    motion = tracks.initial_motion(frames, cloud, cfg).coefficients
     assert motion.shape == (1, 7, 3)
     for frame in frames:
         moved = cloud.points + np.tensordot(basis_weights(frame.time, cfg), motion, (0, 1))
@@ -84,7 +84,7 @@ def test_coefficients_move_the_points_with_the_plane():
 def test_static_points_get_no_motion_and_moving_points_do():
     frames = moving_frames((1.5, 0.0), moving=slice(80, None))
     cloud = cloud_at([(20.5, 60.5), (40.5, 30.5), (120.5, 64.5)], 0, frames[0].camera)
-    motion = tracks.initial_motion(frames, cloud, BasisConfig(num_bases=7))
+    motion = tracks.initial_motion(frames, cloud, BasisConfig(num_bases=7)).coefficients
     assert np.abs(motion[:2]).max() < 0.03  # mm
     assert np.abs(motion[2]).max() > 0.5
 
@@ -234,7 +234,9 @@ def test_frames_too_small_for_flow_get_no_motion(caplog):
         Frame(f.index, f.time, f.camera, f.rgb_u8[:16], f.tissue_mask[:16], f.depth[:16], f.depth_valid[:16])
         for f in frames
     ]
-    motion = tracks.initial_motion(small, cloud_at([(8.5, 8.5)], 0, frames[0].camera), BasisConfig(num_bases=4))
+    motion = tracks.initial_motion(
+        small, cloud_at([(8.5, 8.5)], 0, frames[0].camera), BasisConfig(num_bases=4)
+    ).coefficients
     assert motion.shape == (1, 4, 3)
     assert not motion.any()
     assert "too small" in caplog.text

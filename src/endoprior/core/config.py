@@ -212,6 +212,8 @@ class LossConfig(Checked):
     """Depth that is compared: sum of weight * z, or that divided by alpha."""
     min_depth_pixels: Count = 10
     """A frame with fewer measured tissue depths gets no depth loss."""
+    track_weight: Weight = 0.0
+    """Weight of the distance to the tracks of `init.motion flow`, where the flow found them; 0 switches it off."""
     trust_masks: bool = True
     """Tool masks are right. If not, and a program found them, what looks like a missed tool is left out."""
 

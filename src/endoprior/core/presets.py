@@ -94,7 +94,7 @@ def default() -> Config:
         init=replace(base.init, budget=30_000, motion="flow", opacity=0.3, variance_factor=0.4),
         deformation=replace(base.deformation, kind="basis", basis=replace(base.deformation.basis, num_bases=0)),
         render=replace(base.render, depth_grad_to_means=True),
-        loss=replace(base.loss, depth_weight=3.0, trust_masks=False),
+        loss=replace(base.loss, depth_weight=3.0, track_weight=0.01, trust_masks=False),
         temporal=replace(
             base.temporal, start_iteration=500, max_points=1024, min_valid=1, valid_at_both=False, gradient="current"
         ),

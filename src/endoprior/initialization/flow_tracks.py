@@ -16,6 +16,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,25 +43,36 @@ RIDGE = 1e-3
 log = logging.getLogger(__name__)
 
 
-def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig) -> NDArray[np.float32]:
+@dataclass(frozen=True)
+class InitialMotion:
+    """How N points move, and in which of T training frames the flow says so."""
+
+    coefficients: NDArray[np.float32]
+    """(N, B, 3) temporal coefficients of the centers, mm."""
+    followed: NDArray[np.bool_]
+    """(N, T) True where the flow found the point and returned to it; elsewhere its neighbors carried it."""
+
+
+def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig) -> InitialMotion:
     """Temporal coefficients that move every point of the cloud along its track.
 
     Args:
         frames: T training frames (never test frames), in order.
         cloud: points with their source frames.
     Returns:
-        (N, B, 3) coefficients of the centers, mm; 0 for frames too small for optical flow.
+        The motion; none at all for frames too small for optical flow.
     """
     height, width = frames[0].tissue_mask.shape
     if min(height, width) < MIN_SIZE_PX:
         log.warning("initial motion: frames of %d x %d px are too small for optical flow", width, height)
-        return np.zeros((len(cloud), cfg.num_bases, 3), np.float32)
+        nowhere = np.zeros((len(cloud), len(frames)), bool)
+        return InitialMotion(np.zeros((len(cloud), cfg.num_bases, 3), np.float32), nowhere)
     positions = lift(frames, track_points(frames, cloud.points.astype(np.float64), cloud.origins))
-    followed = np.isfinite(positions[..., 0]).mean()
-    log.info("initial motion: points are followed in %.0f %% of the frames", 100 * followed)
+    followed = np.isfinite(positions[..., 0]).T.copy()
+    log.info("initial motion: points are followed in %.0f %% of the frames", 100 * followed.mean())
     positions[cloud.origins, np.arange(len(cloud))] = cloud.points
     offsets = smooth_motion(fill_gaps(positions), cloud.origins)
-    return fit_basis(offsets, [frame.time for frame in frames], cfg)
+    return InitialMotion(fit_basis(offsets, [frame.time for frame in frames], cfg), followed)
 
 
 def track_points(frames: Sequence[Frame], points: NDArray, origins: NDArray[np.integer]) -> NDArray[np.float32]:

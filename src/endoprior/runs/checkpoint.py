@@ -88,7 +88,16 @@ def checkpoint_schema(cfg: Config) -> dict[str, ArraySpec]:
         optimizer[f"{name}.steps"] = ArraySpec("int64", (spec.shape[1] if name == "motion" else 1,))
     optimizer |= {f"plane_adam.{name}": spec for name, spec in planes.items()}
     stats = {f"stats.{field.name}": ArraySpec("float32", ("N",)) for field in fields(DensityStats)}
-    return model | {f"optimizer.{name}": spec for name, spec in optimizer.items()} | stats
+    return model | {f"optimizer.{name}": spec for name, spec in optimizer.items()} | stats | _track_specs(cfg)
+
+
+def _track_specs(cfg: Config) -> dict[str, ArraySpec]:
+    """The tracks to which motion is held, where it is; `P` tracks, `F` training frames."""
+    if not (cfg.loss.track_weight and cfg.init.motion == "flow"):
+        return {}
+    specs = {"coefficients": ArraySpec("float32", ("P", cfg.deformation.basis.num_bases, 3))}
+    specs |= {"followed": ArraySpec("float32", ("P", "F")), "rows": ArraySpec("int64", ("N",))}
+    return {f"tracks.{name}": spec for name, spec in specs.items()}
 
 
 def check_state(arrays: Mapping[str, Tensor], iteration: int) -> None:
@@ -102,6 +111,9 @@ def check_state(arrays: Mapping[str, Tensor], iteration: int) -> None:
             valid, expected = bool((value >= 0).all()), "no negative number"
         elif name.endswith(".steps"):
             valid, expected = bool(((value >= 0) & (value <= iteration)).all()), f"0 to {iteration} steps"
+        elif name == "tracks.rows":
+            num = len(arrays["tracks.coefficients"])
+            valid, expected = bool(((value >= 0) & (value < num)).all()), f"rows below {num}"
         elif name.endswith(".marks"):
             touched = len(arrays["optimizer.plane_adam.exp_avg"])
             valid = bool((value <= TOUCHED).all()) and int(value.count_nonzero()) == touched

@@ -16,14 +16,16 @@ from .divergence import ADVICE, Diverged
 from .optimizer import Optimizer
 
 
-def apply_plan(optimizer: Optimizer, plan: Plan, stats: DensityStats, rng: np.random.Generator) -> DensityStats:
+def apply_plan(
+    optimizer: Optimizer, plan: Plan, stats: DensityStats, rng: np.random.Generator
+) -> tuple[DensityStats, Tensor]:
     """Clone, split and remove as planned, in the parameters, Adam's moments and the statistics alike.
 
     Rows that stay keep everything; the gradient sums of all are cleared, as after each event. New rows start with
     zero moments and unobserved. All are then put in the order of `morton_order`.
 
     Returns:
-        The statistics of the new set.
+        The statistics of the new set, and for each new row the one that it was or comes from, (N',) int64.
     Raises:
         Diverged: a new Gaussian would not be finite; nothing was changed.
     """
@@ -42,7 +44,9 @@ def apply_plan(optimizer: Optimizer, plan: Plan, stats: DensityStats, rng: np.ra
         state.first, state.second = (_with_zeros(m, rows) for m in (state.first, state.second))
     grown = DensityStats(*(_with_zeros(value, rows) for value in stats.tensors().values()))
     grown.clear_gradient()
-    return grown
+    cloned, halved = (part.nonzero()[:, 0] for part in (plan.clone, plan.split))
+    parents = torch.cat([torch.arange(len(plan.split), device=rows.device), cloned, halved, halved])
+    return grown, parents[rows]
 
 
 def split_children(gaussians: Gaussians, split: Tensor, shrink: float, rng: np.random.Generator) -> dict[str, Tensor]:

@@ -14,6 +14,7 @@ from ..model.gaussians import Gaussians
 from .density import DensityStats
 from .divergence import Divergence
 from .optimizer import Optimizer
+from .track_loss import StartTracks
 
 
 class Stage(IntEnum):
@@ -34,12 +35,16 @@ class TrainState:
     field: HexPlaneField | None
     optimizer: Optimizer
     stats: DensityStats
+    tracks: StartTracks | None = None
+    """Where motion started from optical flow and is held to it."""
 
     def arrays(self) -> dict[str, Tensor]:
         """Every tensor by the name that it has in a checkpoint."""
         arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
         arrays |= {f"stats.{name}": value for name, value in self.stats.tensors().items()}
         arrays |= {f"optimizer.{name}": value for name, value in self.optimizer.state_arrays().items()}
+        if self.tracks is not None:
+            arrays |= {f"tracks.{name}": value for name, value in self.tracks.tensors().items()}
         if self.field is not None:
             arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
         return arrays

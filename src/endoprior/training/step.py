@@ -24,6 +24,7 @@ from .missed_tools import START
 from .ops import TrainingOps
 from .state import Stage, StepReport, TrainState
 from .temporal import temporal_terms
+from .track_loss import track_term
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class Batch:
     """The data of one iteration: one frame, and what the terms of the loss need beside it."""
 
     frame: TrainingFrame
+    position: int
+    """Its place among the training frames."""
     before: TrainingFrame | None
     """The frame before, where the temporal term takes part."""
     prior: Tensor | None
@@ -71,7 +74,7 @@ class TrainingStep:
         rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
         batch = self._batch(iteration, int(rng.integers(len(self.frames))) if fine else 0, fine)
 
-        splats, means_before = self._deform(state, batch, iteration)
+        splats, offsets, means_before = self._deform(state, batch, iteration)
         out = self.rasterize(
             splats, batch.frame.camera, background=self.background, depth_grad_to_means=cfg.render.depth_grad_to_means
         )
@@ -80,6 +83,8 @@ class TrainingStep:
         if self.doubt and fine and iteration > START * stage_length(cfg, Stage.FINE):
             counted = self.doubt.counted(counted, out.color)
         terms = supervised_terms(out, counted, cfg.loss, self.ops)
+        if offsets is not None and state.tracks is not None:
+            terms |= self._track_terms(state, batch, offsets)
         if batch.before is not None:
             terms |= temporal_terms(state, batch.frame, batch.before, splats.means, means_before, out, cfg, self.ops)
         sum(terms.values()).backward()
@@ -110,14 +115,15 @@ class TrainingStep:
         sampled = cfg.density.score_mode == "every" or density.due(iteration, False, cfg.density)
         prior, prior_mask = self.frames.prior(position) if sampled else (None, None)
         return Batch(
+            position=position,
             frame=self.frames.frame(position, half=fine and iteration <= cfg.schedule.half_resolution_iterations),
             before=self.frames.before(position) if compared else None,
             prior=prior,
             prior_mask=prior_mask,
         )
 
-    def _deform(self, state: TrainState, batch: Batch, iteration: int) -> tuple[Splats, Tensor | None]:
-        """The Gaussians at the frame and, where one call gives both, the centers (N, 3) at the frame before."""
+    def _deform(self, state: TrainState, batch: Batch, iteration: int) -> tuple[Splats, Offsets | None, Tensor | None]:
+        """The Gaussians at the frame, what moved them, and (N, 3) centers at the frame before if known already."""
         gaussians, field, time, before = state.gaussians, state.field, batch.frame.time, batch.before
         offsets: Offsets | None = None
         means_before = None
@@ -129,7 +135,12 @@ class TrainingStep:
                     gaussians["means"], time, before.time, self.ops.model
                 )
                 means_before = gaussians["means"] + displacement
-        return gaussians.splats(offsets, sh_degree(self.cfg, state.stage, iteration)), means_before
+        return gaussians.splats(offsets, sh_degree(self.cfg, state.stage, iteration)), offsets, means_before
+
+    def _track_terms(self, state: TrainState, batch: Batch, offsets: Offsets) -> dict[str, Tensor]:
+        means, basis = state.gaussians["means"], self.cfg.deformation.basis
+        term = track_term(means, offsets.means, state.tracks, batch.frame, batch.position, basis, self.ops)
+        return {"track": self.cfg.loss.track_weight * term}
 
     def _observe(self, state: TrainState, batch: Batch, out: RenderOutput) -> None:
         """Add to the running statistics: the gradient always, the prior's score where there is a prior."""
@@ -146,7 +157,8 @@ class TrainingStep:
         planned = density.plan(state.stats, gaussians.scales, gaussians.opacities, extent, cfg)
         if bool(planned.remove.all()):
             raise Diverged(f"expected Gaussians that explain the frames; all {len(planned.remove):,} faded. {ADVICE}")
-        state.stats = apply_plan(state.optimizer, planned, state.stats, rng)
+        state.stats, parents = apply_plan(state.optimizer, planned, state.stats, rng)
+        state.tracks = state.tracks and state.tracks.inherited(parents)
 
 
 def stage_length(cfg: Config, stage: Stage) -> int:

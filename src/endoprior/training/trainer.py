@@ -31,6 +31,7 @@ from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
 from .state import Stage, StepReport, TrainState
 from .step import TrainingStep, stage_length
+from .track_loss import StartTracks
 
 DEFAULT_FRAMES_PER_SECOND = 25.0
 """Playing speed of a sequence that does not state its own."""
@@ -79,32 +80,39 @@ class Trainer:
         cloud = initial_points(self.sequence.frames("train"), cfg.init, cfg.prior, cfg.seed)
         cloud = cloud.subset(morton_order(cloud.points))
         log_scales = initial_log_scales(cloud.points, cfg.init.variance_factor)
-        gaussians = create_gaussians(cloud.points, cloud.colors, log_scales, cfg)
+        gaussians, tracks = create_gaussians(cloud.points, cloud.colors, log_scales, cfg), None
         if cfg.init.motion == "flow" and cfg.deformation.kind == "basis":
             motion = initial_motion(self.sequence.frames("train"), cloud, cfg.deformation.basis)
-            gaussians["motion"].detach()[..., motion_layout(cfg.deformation)["means"]] = torch.from_numpy(motion)
+            coefficients = torch.from_numpy(motion.coefficients)
+            gaussians["motion"].detach()[..., motion_layout(cfg.deformation)["means"]] = coefficients
+            if cfg.loss.track_weight:
+                tracks = StartTracks.of_first(coefficients, torch.from_numpy(motion.followed).float()).to(self.device)
         field = None
         if cfg.deformation.kind == "hexplane":
             generator = torch.Generator().manual_seed(cfg.seed)
             field = HexPlaneField.from_points(gaussians["means"].detach(), cfg.deformation, generator)
         first = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
-        self._enter(first, gaussians.to(self.device), field and field.to(self.device))
+        self._enter(first, gaussians.to(self.device), field and field.to(self.device), tracks)
 
     def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
         """Continue from a state that `TrainState.arrays` gave, trusted to fit the config."""
         gaussians, field = Gaussians(part(arrays, "gaussians.")).to(self.device), None
         if self.cfg.deformation.kind == "hexplane":
             field = HexPlaneField.from_state_arrays(part(arrays, "field."), self.cfg.deformation).to(self.device)
-        self._enter(stage, gaussians, field)
+        held = {name: value.to(self.device) for name, value in part(arrays, "tracks.").items()}
+        self._enter(stage, gaussians, field, StartTracks(**held) if held else None)
         self.state.iteration = iteration
         self.state.optimizer.load_state_arrays(part(arrays, "optimizer."))
         self.state.stats = DensityStats(
             **{name: value.to(self.device) for name, value in part(arrays, "stats.").items()}
         )
 
-    def _enter(self, stage: Stage, gaussians: Gaussians, field: HexPlaneField | None) -> None:
+    def _enter(
+        self, stage: Stage, gaussians: Gaussians, field: HexPlaneField | None, tracks: StartTracks | None
+    ) -> None:
         optimizer = Optimizer(gaussians, field, self.cfg, self.spatial_scale, self.ops)
-        self.state = TrainState(stage, 0, gaussians, field, optimizer, DensityStats.zeros(len(gaussians), self.device))
+        stats = DensityStats.zeros(len(gaussians), self.device)
+        self.state = TrainState(stage, 0, gaussians, field, optimizer, stats, tracks)
 
     @property
     def finished(self) -> bool:
@@ -126,7 +134,7 @@ class Trainer:
         """
         state = self.state
         if state.stage is Stage.COARSE and state.iteration >= stage_length(self.cfg, Stage.COARSE):
-            self._enter(Stage.FINE, state.gaussians, state.field)
+            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks)
         report = self.step_once(self.state)
         if report.divergence is not None:
             raise Diverged(report.divergence.reason)
