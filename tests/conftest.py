@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -96,8 +96,19 @@ def write_tiny_sequence(
 
 
 @pytest.fixture(autouse=True, scope="session")
-def short_training_of_tool_masks():
-    """`prepare` trains a network for its masks: a few steps are enough where masks are not the subject."""
+def small_tool_network() -> Iterator[pytest.MonkeyPatch]:
+    """`prepare` trains a network for its masks: a tiny one and two steps are enough where masks are not the subject.
+
+    `undo()` of the value makes it as large as for a user, and `shrink_tool_network` small again.
+    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endoprior.tool_masks.model.STEPS", 2)
-        yield
+        shrink_tool_network(patch)
+        yield patch
+
+
+def shrink_tool_network(patch: pytest.MonkeyPatch) -> None:
+    """Fewer steps and weights, smaller images."""
+    patch.setattr("endoprior.tool_masks.model.STEPS", 2)
+    patch.setattr("endoprior.tool_masks.model.FEATURES_PX", 192)
+    patch.setattr("endoprior.tool_masks.network.CHANNELS", (4, 4, 4, 4))
+    patch.setattr("endoprior.tool_masks.network.LONG_SIDE_PX", 96)
