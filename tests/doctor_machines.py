@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import hypothesis_profiles
 from hypothesis import strategies as st
 
 from endoprior.doctor import Facts, toolchain
