@@ -98,7 +98,7 @@ def test_paler_and_darker_clips_give_similar_masks(phantom, model):
 
 
 def test_equal_samples_give_equal_masks_inside_the_view(phantom, monkeypatch):
-    monkeypatch.setattr("endoprior.tool_masks.model.STEPS", 3)
+    shrink_tool_network(monkeypatch)
     y, x = np.mgrid[:128, :160]
     view = (x - 80) ** 2 + (y - 64) ** 2 < 60**2
     black = [np.where(view[..., None], image, 0).astype(np.uint8) for image in phantom[0]]
