@@ -106,6 +106,14 @@ def small_tool_network() -> Iterator[pytest.MonkeyPatch]:
         yield patch
 
 
+@pytest.fixture(autouse=True, scope="session")
+def few_vessels() -> Iterator[None]:
+    """To grow the vessels of a phantom takes longer than all the rest of a small one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endoprior.phantom.vessels.TREES", 100)
+        yield
+
+
 def shrink_tool_network(patch: pytest.MonkeyPatch) -> None:
     """Fewer steps and weights, smaller images."""
     patch.setattr("endoprior.tool_masks.model.STEPS", 2)

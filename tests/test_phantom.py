@@ -25,6 +25,14 @@ DEFAULT_MEANS = [91.4352, 0.20586, 58.6039, 97.7305, 74.1917, 6.7050, -2.0577, 7
 """Of frame 1: image, mask, depth, true image and true depth; of all tracks x, y and z."""
 
 
+@pytest.fixture(autouse=True, scope="module")
+def all_vessels():
+    """As for a user, only in this file."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endoprior.phantom.vessels.TREES", 1000)
+        yield
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """One small stereo sequence, written once."""
