@@ -16,6 +16,7 @@ from endoprior.cli import main
 from endoprior.cli.run import resume_words
 from endoprior.cli.step_display import StepDisplay
 from endoprior.core.checks import InputError
+from endoprior.core.presets import preset
 from endoprior.model.scene import load_scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.pipeline import STEPS, make_job, notes_of, open_folder, problems, run_step
@@ -180,7 +181,9 @@ def test_the_command_ends_with_a_player(video, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_whole_run_says_first_how_long_it_takes(video, tmp_path, capsys):
+def test_the_whole_run_says_first_how_long_it_takes(video, tmp_path, capsys, monkeypatch):
+    quick = preset("default").replace({"gaussians": 300, "iterations": 60, "schedule.half_resolution_iterations": 20})
+    monkeypatch.setattr("endoprior.cli.run.preset", lambda name: quick)
     assert main(["run", str(video), str(tmp_path / "out")]) == 0
     lines = capsys.readouterr().out.splitlines()
     says = next(k for k, line in enumerate(lines) if line.startswith("This takes about"))
