@@ -4,7 +4,6 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-import hypothesis_profiles  # noqa: F401 - for its effect
 from hypothesis import strategies as st
 
 from endoprior.doctor import Facts, toolchain

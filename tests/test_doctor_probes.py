@@ -12,6 +12,7 @@ import pytest
 from doctor_machines import NO_TRITON, WORKING, bare_machine, program
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis_profiles import examples
 
 from endoprior.doctor import Facts, examine, fixes, read_facts, read_facts_quickly
 from endoprior.doctor import facts as facts_module
@@ -52,6 +53,7 @@ def test_banners_of_nvidia_smi(banner, read):
     assert read_banner(banner) == read
 
 
+@examples(100)
 @given(st.text(max_size=200))
 def test_no_text_breaks_the_readers(text):
     read_banner(text)
