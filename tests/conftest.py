@@ -23,8 +23,9 @@ LINUX_ONLY = (
 """Files that need limits of processes, /proc, signals or shell scripts."""
 collect_ignore = [] if sys.platform == "linux" else [*LINUX_ONLY]
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-FIRST = ("test_bad_inputs", "test_check", "test_phantom", "test_prepare")
-"""Files to begin with: one of two workers compiles the kernels of training, the other those of the phantom."""
+FIRST = ("test_bad_inputs", "test_check", "test_phantom", "test_prepare", "test_view_server")
+"""Files to begin with: one of two workers compiles the kernels of training, the other those of the phantom. The last one
+mostly waits: at the end of the run the other worker would have nothing left to do meanwhile."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -111,6 +112,14 @@ def few_vessels() -> Iterator[None]:
     """To grow the vessels of a phantom takes longer than all the rest of a small one."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("endoprior.phantom.vessels.TREES", 100)
+        yield
+
+
+@pytest.fixture(scope="module")
+def all_vessels() -> Iterator[None]:
+    """As many as for a user, in the files that use this fixture."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endoprior.phantom.vessels.TREES", 1000)
         yield
 
 

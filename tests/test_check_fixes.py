@@ -38,6 +38,8 @@ DECISIONS = {
 }
 """Problems that no command solves, with the reason."""
 
+pytestmark = pytest.mark.usefixtures("all_vessels")
+
 
 def written(folder: Path, stereo: bool) -> Path:
     """A phantom without its truth."""

@@ -21,12 +21,10 @@ VIEW = np.ones((128, 160), bool)
 
 
 @pytest.fixture(autouse=True, scope="module")
-def as_for_a_user(small_tool_network):
-    """The network as large and as long trained, the phantom with all its vessels, only in this file."""
+def whole_network(small_tool_network, all_vessels):
+    """As large and as long trained as for a user, only in this file."""
     small_tool_network.undo()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endoprior.phantom.vessels.TREES", 1000)
-        yield
+    yield
     shrink_tool_network(small_tool_network)
 
 
