@@ -24,8 +24,10 @@ LINUX_ONLY = (
 collect_ignore = [] if sys.platform == "linux" else [*LINUX_ONLY]
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 FIRST = ("test_bad_inputs", "test_check", "test_phantom", "test_prepare", "test_view_server")
-"""Files to begin with: one of two workers compiles the kernels of training, the other those of the phantom. The last one
-mostly waits: at the end of the run the other worker would have nothing left to do meanwhile."""
+"""Files to begin with: one of two workers compiles the kernels of training, the other those of the phantom.
+
+The last one mostly waits: at the end of the run the other worker would have nothing to do meanwhile.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
