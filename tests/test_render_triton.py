@@ -64,7 +64,7 @@ def test_agrees_on_needles_and_sheets():
 def test_agrees_where_pixels_fill_up():
     """Opaque layers: ALPHA_MAX binds, pixels stop, tiles are left early."""
     view = camera(16, 16, seed=2)
-    scene = splats(view, 150, degree=0, seed=4, widths=(2.0, 8.0))
+    scene = splats(view, 300, degree=0, seed=4, widths=(2.0, 8.0))
     scene = replace(scene, opacities=scene.opacities.clamp(min=0.6))
     (want, want_grads), (got, grads) = (
         render_with_grads("reference", scene, view),
