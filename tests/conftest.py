@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -23,8 +23,11 @@ LINUX_ONLY = (
 """Files that need limits of processes, /proc, signals or shell scripts."""
 collect_ignore = [] if sys.platform == "linux" else [*LINUX_ONLY]
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-FIRST = ("test_bad_inputs", "test_check", "test_phantom", "test_prepare")
-"""Files to begin with: one of two workers compiles the kernels of training, the other those of the phantom."""
+FIRST = ("test_bad_inputs", "test_check", "test_phantom", "test_prepare", "test_view_server")
+"""Files to begin with: one of two workers compiles the kernels of training, the other those of the phantom.
+
+The last one mostly waits: at the end of the run the other worker would have nothing to do meanwhile.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -96,8 +99,35 @@ def write_tiny_sequence(
 
 
 @pytest.fixture(autouse=True, scope="session")
-def short_training_of_tool_masks():
-    """`prepare` trains a network for its masks: a few steps are enough where masks are not the subject."""
+def small_tool_network() -> Iterator[pytest.MonkeyPatch]:
+    """`prepare` trains a network for its masks: a tiny one and two steps are enough where masks are not the subject.
+
+    `undo()` of the value makes it as large as for a user, and `shrink_tool_network` small again.
+    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endoprior.tool_masks.model.STEPS", 2)
+        shrink_tool_network(patch)
+        yield patch
+
+
+@pytest.fixture(autouse=True, scope="session")
+def few_vessels() -> Iterator[None]:
+    """To grow the vessels of a phantom takes longer than all the rest of a small one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endoprior.phantom.vessels.TREES", 100)
         yield
+
+
+@pytest.fixture(scope="module")
+def all_vessels() -> Iterator[None]:
+    """As many as for a user, in the files that use this fixture."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endoprior.phantom.vessels.TREES", 1000)
+        yield
+
+
+def shrink_tool_network(patch: pytest.MonkeyPatch) -> None:
+    """Fewer steps and weights, smaller images."""
+    patch.setattr("endoprior.tool_masks.model.STEPS", 2)
+    patch.setattr("endoprior.tool_masks.model.FEATURES_PX", 192)
+    patch.setattr("endoprior.tool_masks.network.CHANNELS", (4, 4, 4, 4))
+    patch.setattr("endoprior.tool_masks.network.LONG_SIDE_PX", 96)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from endoprior.cli import main
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Splats
 from endoprior.model.gaussians import create_gaussians
@@ -63,3 +65,14 @@ def moving_scene(sh_degree: int = 0, moving_camera: bool = False) -> Scene:
         gaussians["sh_rest"].copy_(torch.from_numpy(rng.normal(size=gaussians["sh_rest"].shape) * 0.1))
     cameras = tuple(plane_camera(shift=i if moving_camera else 0.0) for i in range(NUM_FRAMES))
     return Scene(gaussians, None, cfg, cameras, 25.0, torch.zeros(num), torch.zeros(num))
+
+
+def moving_run(folder: Path) -> Path:
+    """A run folder with a scene whose Gaussians and camera move."""
+    moving_scene(sh_degree=1, moving_camera=True).save(folder / "scene.safetensors")
+    return folder
+
+
+def export(run: Path, out: Path, *options: str) -> int:
+    """Exit status of `endoprior export RUN OUT --format ...`."""
+    return main(["export", str(run), str(out), "--format", *options])

@@ -53,7 +53,7 @@ def reject_held(*paths: Any) -> None:
     """Reject to rename or remove what is open or mapped, and folders that hold such files."""
     held = held_files()
     for path in map(os.path.realpath, paths):
-        if any(file == path or file.startswith(path + os.sep) for file in held if not os.path.isdir(file)):
+        if any((file == path or file.startswith(path + os.sep)) and not os.path.isdir(file) for file in held):
             raise refusal(errno.EACCES, IN_USE, path)
 
 

@@ -21,7 +21,7 @@ from endoprior.footage.border import Circle
 from endoprior.footage.units import guess_unit
 from endoprior.phantom import PhantomConfig, write_phantom
 
-FRAMES, WIDTH, HEIGHT = 16, 256, 192
+FRAMES, WIDTH, HEIGHT = 12, 256, 192
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_depth_in_metres(data):
     describe(data, depth_scale=1e-5)
     finding = only(data, "depth-metres")
     assert finding.severity == "error"
-    assert finding.what == "depth looks like m, not mm (the median is 0.07749, which in m is 77 mm away)"
+    assert finding.what == "depth looks like m, not mm (the median is 0.07772, which in m is 78 mm away)"
     assert finding.fix == (
         f'set "depth_scale": 0.01 in {data}/sequence.json, or `endoprior train {data} RUN --data.depth-unit-mm 0.01`'
     )
@@ -176,7 +176,7 @@ def test_duplicated_frames(data):
         shutil.copy(files[copy - 1], files[copy])
     finding = only(data, "duplicate-frames")
     assert finding.frames == (5, 6, 11)
-    assert finding.what == "3 of 16 frames repeat the one before: frames 5-6, 11"
+    assert finding.what == "3 of 12 frames repeat the one before: frames 5-6, 11"
     assert finding.fix == f"`endoprior train {data} RUN --data.skip-frames 5-6,11`"
 
 
@@ -336,7 +336,7 @@ def test_command_prints_and_writes_figure_and_json(data, capsys):
     text = capsys.readouterr().out.splitlines()
     assert text[0] == str(data) and text[-1] == f"figure: {out}"
     assert sum(line.startswith("error: depth-metres: ") for line in text) == 1
-    assert any(line.split()[:2] == ["frames", "16:"] for line in text)
+    assert any(line.split()[:2] == ["frames", "12:"] for line in text)
     assert cv2.imread(str(out)).shape == (1400, 1500, 3)
     stored = json.loads(facts.read_text())
     assert stored["facts"]["frames"] == FRAMES and len(stored["facts"]["masks"]["tool_fraction"]) == FRAMES

@@ -18,7 +18,7 @@ import pytest
 from sequence_edits import change_poses, describe, edit
 from video_files import write_video
 
-from endoprior.check import Finding, find, measure
+from endoprior.check import Facts, Finding, find, measure
 from endoprior.cli import main
 from endoprior.cli.check import Check
 from endoprior.cli.parsing import parse
@@ -38,27 +38,44 @@ DECISIONS = {
 }
 """Problems that no command solves, with the reason."""
 
+pytestmark = pytest.mark.usefixtures("all_vessels")
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> Path:
-    """A phantom of both cameras, left as it is."""
-    folder = tmp_path_factory.mktemp("fixes") / "phantom"
-    write_phantom(folder, PhantomConfig(frames=FRAMES, width=WIDTH, height=HEIGHT, stereo=True))
+
+def written(folder: Path, stereo: bool) -> Path:
+    """A phantom without its truth."""
+    write_phantom(folder, PhantomConfig(frames=FRAMES, width=WIDTH, height=HEIGHT, stereo=stereo))
     shutil.rmtree(folder / "truth")
     return folder
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A phantom of one camera, left as it is."""
+    return written(tmp_path_factory.mktemp("fixes") / "phantom", stereo=False)
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory) -> Path:
+    """A phantom of both cameras, left as it is."""
+    return written(tmp_path_factory.mktemp("fixes") / "both", stereo=True)
+
+
 @pytest.fixture
-def stereo(whole: Path, tmp_path: Path) -> Path:
+def data(whole: Path, tmp_path: Path) -> Path:
     """A copy of the phantom to break, in a folder whose name needs quotes."""
     return Path(shutil.copytree(whole, tmp_path / "my data"))
 
 
 @pytest.fixture
-def data(whole: Path, tmp_path: Path) -> Path:
-    """A copy of the phantom's left camera."""
-    ignored = shutil.ignore_patterns("right", "calibration.json")
-    return Path(shutil.copytree(whole, tmp_path / "my data", ignore=ignored))
+def stereo(both: Path, tmp_path: Path) -> Path:
+    """The same with both cameras."""
+    return Path(shutil.copytree(both, tmp_path / "my data"))
+
+
+@pytest.fixture(scope="module")
+def facts(whole: Path) -> Facts:
+    """What is measured of the phantom."""
+    return measure(load_sequence(whole))
 
 
 def check(folder: Path, *options: str) -> dict[str, Finding]:
@@ -283,8 +300,7 @@ def test_every_problem_has_a_test_or_a_reason():
 
 
 @pytest.mark.parametrize("code", ["few-frames", "relative-depth", "no-points", "reader"])
-def test_decisions_of_a_person_name_no_command(whole, code):
-    facts = measure(load_sequence(whole))
+def test_decisions_of_a_person_name_no_command(facts, code):
     changed = replace(facts, frames=5, notes=("odd",), cloud=None, depth=replace(facts.depth, relative=True))
     fix = {finding.code: finding.fix for finding in find(changed)}[code]
     assert "`" not in fix

@@ -1,5 +1,6 @@
 """The doctor's probes: programs that answer, hang, die or print garbage, and the facts of this machine."""
 
+import json
 import os
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import pytest
 from doctor_machines import NO_TRITON, WORKING, bare_machine, program
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis_profiles import examples
 
 from endoprior.doctor import Facts, examine, fixes, read_facts, read_facts_quickly
 from endoprior.doctor import facts as facts_module
@@ -18,6 +20,7 @@ from endoprior.doctor.choice import choose, choose_here
 from endoprior.doctor.driver import driver_answers, driver_files, read_banner, read_gpus
 from endoprior.doctor.probe_process import MOST_BYTES, clean, run_program
 from endoprior.doctor.records import Driver, Gpu, Gsplat, System, Torch, number
+from endoprior.doctor.report import as_json
 
 
 @pytest.fixture
@@ -50,6 +53,7 @@ def test_banners_of_nvidia_smi(banner, read):
     assert read_banner(banner) == read
 
 
+@examples(100)
 @given(st.text(max_size=200))
 def test_no_text_breaks_the_readers(text):
     read_banner(text)
@@ -228,6 +232,7 @@ def test_quick_facts_take_no_time_and_agree_with_all_facts():
     assert (facts.torch.version, facts.torch.cuda) == (quick.torch.version, quick.torch.cuda)
     assert facts.torch.error == "" and facts.packages.keys() == set(facts_module.PACKAGES)
     assert choose_here("auto").device == choose("auto", facts).device
+    assert json.loads(json.dumps(as_json(facts, examine(facts), "cpu", "numba", "")))["facts"]["system"]["cores"] >= 1
     assert choose_here("cpu").why == "CPU: as requested"
 
 

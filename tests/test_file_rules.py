@@ -147,12 +147,12 @@ def test_arrays_do_not_keep_their_file_in_use(windows, tmp_path):
 
 
 def test_training_saves_and_resumes(windows, tiny_sequence, tmp_path):
-    cfg, whole, parts = tiny_config("hexplane"), tmp_path / "whole", tmp_path / "parts"
+    cfg, whole, parts = tiny_config("hexplane", coarse=2, fine=10), tmp_path / "whole", tmp_path / "parts"
     (tmp_path / "whole").mkdir()
     train(load_sequence(tiny_sequence), cfg, whole, checkpoint_seconds=0)
 
     def stop(report, trainer):
-        if report.iteration == 9:
+        if report.iteration == 4:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -1,6 +1,7 @@
 """`endoprior masks DATA`: new masks in the folder, the originals beside them, a sheet, shares and confidence."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -17,10 +18,18 @@ from endoprior.visualization.mask_sheet import mask_sheet
 FRAMES = 4
 
 
+@pytest.fixture(scope="module")
+def phantom(tmp_path_factory):
+    """Left as it is."""
+    out = tmp_path_factory.mktemp("phantom") / "DATA"
+    write_phantom(out, PhantomConfig(frames=FRAMES, width=128, height=96, seed=4))
+    return out
+
+
 @pytest.fixture
-def folder(tmp_path):
-    write_phantom(tmp_path / "DATA", PhantomConfig(frames=FRAMES, width=128, height=96, seed=4))
-    return tmp_path / "DATA"
+def folder(phantom, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(phantom, tmp_path / "DATA")
 
 
 def masks_of(folder):

@@ -111,9 +111,9 @@ def test_pixels_of_a_missed_tool_do_not_count(phantom):
     assert MaskDoubt(sequence).counted(frame, frame.rgb) is frame
 
 
-def test_frames_of_half_and_full_resolution_share_what_is_surely_tissue(tmp_path):
-    write_phantom(tmp_path, PhantomConfig(frames=3, width=328, height=213))  # 104 and 103 rows of 160 px
-    sequence = load_sequence(tmp_path).training_view()
+def test_frames_of_half_and_full_resolution_share_what_is_surely_tissue(make_tiny_sequence):
+    data = make_tiny_sequence(num_frames=3, width=328, height=213)  # 104 and 103 rows of 160 px
+    sequence = load_sequence(data).training_view()
     frames, doubt = Trainer(sequence, tiny_config("basis")).step_once.frames, MaskDoubt(sequence)
     for half in (True, False):
         frame = frames.frame(0, half=half)

@@ -24,6 +24,8 @@ SMALL = PhantomConfig(frames=6, width=96, height=80, seed=3, stereo=True)
 DEFAULT_MEANS = [91.4352, 0.20586, 58.6039, 97.7305, 74.1917, 6.7050, -2.0577, 74.1212]
 """Of frame 1: image, mask, depth, true image and true depth; of all tracks x, y and z."""
 
+pytestmark = pytest.mark.usefixtures("all_vessels")
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):

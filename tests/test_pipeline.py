@@ -16,6 +16,7 @@ from endoprior.cli import main
 from endoprior.cli.run import resume_words
 from endoprior.cli.step_display import StepDisplay
 from endoprior.core.checks import InputError
+from endoprior.core.presets import preset
 from endoprior.model.scene import load_scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.pipeline import STEPS, make_job, notes_of, open_folder, problems, run_step
@@ -44,13 +45,17 @@ def job_of(video, out):
 
 
 @pytest.fixture(scope="module")
-def done(video, tmp_path_factory):
-    """A finished job."""
+def said(video, tmp_path_factory):
+    """A finished job, and the lines of its steps."""
     job = job_of(video, tmp_path_factory.mktemp("done") / "out")
-    open_folder(job)
-    for step in STEPS:
-        run_step(step, job, quiet)
-    return job
+    assert not open_folder(job)
+    return job, [line for step in STEPS for line in run_step(step, job, quiet)]
+
+
+@pytest.fixture(scope="module")
+def done(said):
+    """A finished job."""
+    return said[0]
 
 
 def test_every_step_leaves_its_result(done):
@@ -93,11 +98,9 @@ def test_an_interrupted_training_resumes_bit_identically(video, done, tmp_path):
     assert (job.run / "scene.safetensors").read_bytes() == (done.run / "scene.safetensors").read_bytes()
 
 
-def test_a_resumed_job_says_so_and_repeats_the_notes(video, tmp_path, capsys):
-    job = job_of(video, tmp_path / "out")
-    assert not open_folder(job)
-    lines = [line for step in STEPS[:2] for line in run_step(step, job, quiet)]
-    assert len(lines) > 2 and open_folder(job)
+def test_a_resumed_job_says_so_and_repeats_the_notes(said, capsys):
+    job, lines = said
+    assert len(lines) > 3 and open_folder(job)
     assert [line for step in STEPS for line in notes_of(step, job)] == lines
     assert resume_words(["a", "b", "c"], ["b", "c"]) == "Resuming at b; done before: a."
     assert resume_words(["a", "b"], ["a", "b"]) == "Resuming at a; done before: nothing."
@@ -178,7 +181,9 @@ def test_the_command_ends_with_a_player(video, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_whole_run_says_first_how_long_it_takes(video, tmp_path, capsys):
+def test_the_whole_run_says_first_how_long_it_takes(video, tmp_path, capsys, monkeypatch):
+    quick = preset("default").replace({"gaussians": 300, "iterations": 60, "schedule.half_resolution_iterations": 20})
+    monkeypatch.setattr("endoprior.cli.run.preset", lambda name: quick)
     assert main(["run", str(video), str(tmp_path / "out")]) == 0
     lines = capsys.readouterr().out.splitlines()
     says = next(k for k, line in enumerate(lines) if line.startswith("This takes about"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -25,19 +25,33 @@ DIFFERENT = {
 """Calls that must not be in the source."""
 
 
-def nodes(path: Path) -> Iterator[ast.AST]:
-    """Every node of a file's syntax tree."""
-    return ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """A file's syntax tree."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
+def nodes(path: Path) -> list[ast.AST]:
+    """Every node of it."""
+    return list(ast.walk(tree_of(path)))
+
+
+def last_name(function: ast.expr) -> str:
+    """`open` for `open`, `path.open` and `a[0].open`."""
+    return getattr(function, "attr", getattr(function, "id", ""))
 
 
 def is_text_without_encoding(call: ast.Call) -> bool:
     """Whether a call opens, reads or writes text in the system's encoding."""
     given = {keyword.arg: keyword.value for keyword in call.keywords}
-    function, name = ast.unparse(call.func), ast.unparse(call.func).split(".")[-1]
-    if "encoding" in given or function in ("av.open", "os.open", "archive.open"):  # the latter are binary
+    name = last_name(call.func)
+    if "encoding" in given:
+        return False
+    if name == "open" and ast.unparse(call.func) in ("av.open", "os.open", "archive.open"):  # they are binary
         return False
     if name in ("read_text", "write_text"):
-        return "." in function and len(call.args) <= (name == "write_text")
+        return isinstance(call.func, ast.Attribute) and len(call.args) <= (name == "write_text")
     if name in ("open", "fdopen", "TemporaryFile", "NamedTemporaryFile"):
         words = [value.value for value in (*call.args, *given.values()) if isinstance(value, ast.Constant)]
         modes = [word for word in words if isinstance(word, str) and re.fullmatch("[rwxabt+]+", word)]
@@ -78,25 +92,25 @@ def test_text_has_an_encoding():
 
 def test_modules_of_one_system_are_imported_where_they_are_used():
     for path in SOURCE:
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in tree_of(path).body:
             if isinstance(node, ast.Import | ast.ImportFrom):
                 names = {alias.name for alias in node.names} | {getattr(node, "module", None)}
                 assert not names & ONE_SYSTEM, f"{path}:{node.lineno}: import it in a function, in a `try`"
 
 
 def test_calls_that_differ_between_systems_are_not_used():
+    called = {name.split(".")[-1] for name in DIFFERENT}
     for path in SOURCE:
         for node in nodes(path):
-            if isinstance(node, ast.Attribute) and (name := ast.unparse(node)) in DIFFERENT:
+            if last_name(node) in called and (name := ast.unparse(node)) in DIFFERENT:
                 raise AssertionError(f"{path}:{node.lineno}: {name}: {DIFFERENT[name]}")
 
 
 def test_relative_paths_become_text_with_slashes():
     for path in SOURCE:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        used = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(".relative_to"):
+        used = {id(node.value) for node in nodes(path) if isinstance(node, ast.Attribute)}
+        for node in nodes(path):
+            if isinstance(node, ast.Call) and last_name(node.func) == "relative_to":
                 assert id(node) in used, f"{path}:{node.lineno}: add .as_posix() or .parts"
 
 

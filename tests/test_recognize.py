@@ -56,6 +56,7 @@ def test_every_command_that_takes_data_names_prepare_for_a_video(tmp_path, frame
 @pytest.mark.parametrize("kind", ["a video", "a folder of images", "a folder with a video"])
 def test_the_printed_commands_work(tmp_path, frames, capsys, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("endoprior.check.draw_check", lambda *_: None)
     given = tmp_path / "clip"
     if kind == "a folder of images":
         write_images(given, frames)

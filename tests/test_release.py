@@ -128,7 +128,7 @@ def test_the_wheel_works_outside_of_the_repository(endoprior, commit, tmp_path):
     assert "Quick look" in run("bench", "quick", "quick", "--report-only")
     images = [cv2.imread(str(file))[..., ::-1] for file in sorted((tmp_path / "data" / "images").glob("*.png"))]
     write_video(tmp_path / "clip.mp4", images)
-    assert "Open first/player.html in a browser." in run("run", "clip.mp4", "first", "--preview")
+    assert "Open first/player.html in a browser." in run("run", "clip.mp4", "first", "--preview", "--masks", "none")
     assert (tmp_path / "first" / "player.html").stat().st_size > 10_000
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(SPEC))
     run("bench", "tiny.yaml", "tiny", "--cores", "1")

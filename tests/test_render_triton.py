@@ -36,11 +36,12 @@ CPU = torch.device("cpu")
 NAN, INF = float("nan"), float("inf")
 
 
-@pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("depth_grad_to_means", [True, False])
+@pytest.mark.parametrize(
+    ("degree", "depth_grad_to_means"), [(0, True), (1, True), (2, True), (3, True), (0, False), (3, False)]
+)
 def test_agrees_with_reference(degree, depth_grad_to_means):
-    """Rotated camera, off-center principal point, every SH degree, many Gaussians outside the image."""
-    view = camera(33, 21, seed=degree)
+    """Rotated camera, off-center principal point, every SH degree, many Gaussians outside the image; 2x2 tiles."""
+    view = camera(23, 13, seed=degree)
     scene = splats(view, 40, degree=degree, seed=degree)
     want, grads = compare("triton", scene, view, depth_grad_to_means=depth_grad_to_means)
     assert want.alpha.max() > 0.7 and (want.radii == 0).any()
@@ -179,7 +180,7 @@ def test_tiles_are_those_the_footprint_touches(monkeypatch):
 
 
 def test_equal_input_gives_bit_identical_results():
-    view = camera(33, 21)
+    view = camera(23, 13)
     scene = splats(view, 40, degree=1)
     (first, first_grads), (second, second_grads) = (render_with_grads("triton", scene, view) for _ in range(2))
     assert all(torch.equal(getattr(first, n), getattr(second, n)) for n in ("color", "alpha", "depth", "means2d"))
@@ -188,7 +189,7 @@ def test_equal_input_gives_bit_identical_results():
 
 def test_gradients_reach_only_what_is_asked():
     """A loss whose cotangents are expanded, most inputs frozen, one of them not contiguous."""
-    view = camera(33, 21)
+    view = camera(23, 13)
     scene = splats(view, 40, degree=1)
     scene = replace(scene, sh=scene.sh.transpose(0, 1).contiguous().transpose(0, 1))
     assert not scene.sh.is_contiguous()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from conftest import shrink_tool_network
 
 from endoprior.data.images import read_color, read_depth, read_tool_mask
 from endoprior.phantom import PhantomConfig, write_phantom
@@ -20,11 +21,11 @@ VIEW = np.ones((128, 160), bool)
 
 
 @pytest.fixture(autouse=True, scope="module")
-def whole_training():
-    """As long as for a user; the other tests train for a few steps (conftest.py)."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endoprior.tool_masks.model.STEPS", 150)
-        yield
+def whole_network(small_tool_network, all_vessels):
+    """As large and as long trained as for a user, only in this file."""
+    small_tool_network.undo()
+    yield
+    shrink_tool_network(small_tool_network)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +98,7 @@ def test_paler_and_darker_clips_give_similar_masks(phantom, model):
 
 
 def test_equal_samples_give_equal_masks_inside_the_view(phantom, monkeypatch):
-    monkeypatch.setattr("endoprior.tool_masks.model.STEPS", 3)
+    shrink_tool_network(monkeypatch)
     y, x = np.mgrid[:128, :160]
     view = (x - 80) ** 2 + (y - 64) ** 2 < 60**2
     black = [np.where(view[..., None], image, 0).astype(np.uint8) for image in phantom[0]]

@@ -40,7 +40,8 @@ def preset(name: str = "default", **changes: Any) -> Config:
         raise InputError(
             f"preset: expected one of {', '.join(get_args(PresetName))}; got {name!r}. Choose one of them."
         )
-    return makers[name]().replace(changes)
+    made = makers[name]()
+    return made.replace(changes) if changes else made
 
 
 def paper() -> Config:

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from .surface import LIVER, Organs, Plane
 
+TREES = 1000
+"""Number of trees, over the whole tissue."""
 _STEP_MM = 0.7
 _SUBPIXEL_BITS = 4
 
@@ -39,7 +41,7 @@ def vessel_maps(
     trunks, twigs = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     low, high = np.array([a.min(), b.min()]), np.array([a.max(), b.max()])
     pending = []
-    for _ in range(1000):
+    for _ in range(TREES):
         start, heading = rng.uniform(low, high), rng.uniform(0, 2 * np.pi)
         caliber = 0.16 + 0.34 * rng.uniform() ** 4
         pending.append(_Branch(start, heading, caliber, rng.uniform(10, 26)))
