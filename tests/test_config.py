@@ -86,11 +86,11 @@ def test_only_tuples_lists_and_plain_values_are_configured():
 
 def test_basis_functions_follow_the_length_of_the_sequence():
     basis = BasisConfig(num_bases=0)
-    assert [basis.fitted(n).num_bases for n in (5, 24, 48, 63, 156)] == [4, 11, 22, 29, 71]
+    assert [basis.fitted(n).num_bases for n in (5, 24, 48, 63, 156)] == [4, 13, 27, 35, 87]
     assert BasisConfig(num_bases=31).fitted(24).num_bases == 31
     assert BasisConfig(num_bases=0, frames_per_basis=2.0).fitted(63).num_bases == 32
     fitted = preset("default").fitted(48)
-    assert fitted.deformation.basis.num_bases == 22 and fitted.fitted(99) == fitted
+    assert fitted.deformation.basis.num_bases == 27 and fitted.fitted(99) == fitted
     with pytest.raises(ValueError, match="num_bases: expected at least 2"):
         attribute_shapes(preset("default"))
 

@@ -157,9 +157,9 @@ class BasisConfig(Checked):
 
     num_bases: Annotated[int, Range(0, 1000)] = 31
     """B: basis functions over time, centered evenly on [0, 1]; 0 takes one for every `frames_per_basis` frames."""
-    frames_per_basis: Annotated[float, Range(0.5, 1000)] = 2.2
+    frames_per_basis: Annotated[float, Range(0.5, 1000)] = 1.8
     """Frames of the sequence for each basis function, where `num_bases` is 0; there are never fewer than 4."""
-    relative_width: Annotated[float, Range(1e-3, 1e3)] = 1.2
+    relative_width: Annotated[float, Range(1e-3, 1e3)] = 1.5
     """Standard deviation of a basis function in units of 1 / B."""
     deform_color: bool = True
     """Also let the view-independent color change with time."""

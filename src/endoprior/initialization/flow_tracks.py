@@ -37,7 +37,7 @@ CYCLE_PX = 0.25
 """A point is lost where forward and backward flow of its two steps disagree by more than this, px of the flow."""
 ANCHOR_BYTES = 8 * (2 * REACH + 1)
 """Memory per pixel of the flows of one anchor, bytes."""
-RIDGE = 1e-3
+RIDGE = 1e-5
 """Ridge term of the least-squares fit of coefficients to tracks; each frame has weight 1."""
 
 log = logging.getLogger(__name__)
