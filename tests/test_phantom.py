@@ -13,12 +13,13 @@ import pytest
 from endoprior.core.checks import InputError
 from endoprior.core.geometry import bilinear
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.phantom.generate import build_scene, visible_points
+from endoprior.phantom.generate import build_scene
 from endoprior.phantom.instrument import JAW_MM, pack_tool, render_tools
 from endoprior.phantom.motion import ToolPose
 from endoprior.phantom.noise import cells, fractal
 from endoprior.phantom.raster import FAR, rasterize, vertex_normals
 from endoprior.phantom.surface import build_anatomy, build_plane, organs_at
+from endoprior.phantom.visibility import visible_points
 
 SMALL = PhantomConfig(frames=6, width=96, height=80, seed=3, stereo=True)
 DEFAULT_MEANS = [91.4352, 0.20586, 58.6039, 97.7305, 74.1917, 6.7050, -2.0577, 74.1212]

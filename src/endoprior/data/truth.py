@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from .files import read_json
 from .images import read_color
 from .numpy_files import read_numpy
 
@@ -47,6 +48,36 @@ class Truth:
         """(H, W) exact z of the tissue of frame `index`, tool ignored, mm."""
         path = self.folder / "depth" / f"{self._names[index]}.npy"
         return np.asarray(read_numpy(path, *_FILE), np.float32) if path.parent.is_dir() else None
+
+    @cached_property
+    def side_poses(self) -> dict[str, NDArray[np.float64]]:
+        """Cameras beside the endoscope by name: (4, 4) rigid transforms from the frame's camera axes; empty without.
+
+        Raises:
+            InputError: the file holds something else.
+        """
+        path = self.folder / "side" / "world_to_camera.json"
+        if not path.exists():
+            return {}
+        stored = read_json(path)
+        try:
+            poses = {name: np.asarray(pose, np.float64) for name, pose in stored.items()}
+        except (TypeError, ValueError):
+            poses = {"": np.zeros(0)}
+        for pose in poses.values():
+            if pose.shape != (4, 4) or not np.isfinite(pose).all():
+                raise input_error(path, "finite poses of shape (4, 4)", "something else", "write the truth again.")
+        return poses
+
+    def side(self, name: str, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]] | None:
+        """(H, W, 3) picture, 0..255, and (H, W) z, mm, of a side camera in frame `index`; None without.
+
+        Both are 0 where the endoscope does not see the tissue.
+        """
+        path = self.folder / "side" / name / f"{self._names[index]}.npy"
+        if not path.exists():
+            return None
+        return read_color(path.with_suffix(".png")), np.asarray(read_numpy(path, *_FILE), np.float32)
 
     @cached_property
     def tracks(self) -> Tracks | None:

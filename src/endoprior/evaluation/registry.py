@@ -24,6 +24,7 @@ SCORERS = (
     "stability",
     "primitives",
     "behind_tool",
+    "sides",
     "tracks",
     "speed",
 )

@@ -34,6 +34,8 @@ class PhantomConfig:
     """Seed of anatomy, texture, motion and noise. The same seed gives the same bytes."""
     stereo: bool = False
     """Also write the images of the right camera (`right/`) and `calibration.json`."""
+    side_views: bool = True
+    """Also write what cameras beside the endoscope see of the tissue in test frames (`truth/side/`)."""
     baseline_mm: float = 4.2
     """Distance between the cameras, mm, 0.5..10. The error of `depth/` depends on it."""
     focal_per_width: float = 0.9

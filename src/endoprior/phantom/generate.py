@@ -10,20 +10,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.sequence import is_test_frame
 from ..data.writer import SequenceMeta, SequenceWriter
 from .config import PhantomConfig
+from .eye import Eye
 from .instrument import render_tools
 from .motion import Motion, build_motion
 from .raster import FAR, rasterize, vertex_normals
 from .sensor import develop, expose, exposure_gain, stereo_depth, vignette
 from .shading import shade
+from .side_views import side_eyes, side_picture
 from .surface import MARGIN, Plane, build_anatomy, build_plane, organs_at, soften
 from .texture import build_texture, smooth_patches
+from .visibility import visible_points
 
 SUPERSAMPLE = 2
 """Image samples per pixel along each axis."""
 _NOTE = "synthetic (endoprior phantom, seed {seed}); truth/tissue is free of tools and of sensor noise"
-_LEFT = np.zeros(3, np.float32)
+_LEFT = Eye.moved(0.0)
 
 
 @dataclass(frozen=True)
@@ -78,20 +82,42 @@ def build_scene(cfg: PhantomConfig) -> Scene:
     return Scene(cfg, plane, build_motion(cfg, plane, anatomy), a, b, height, texture)
 
 
-def render_view(scene: Scene, vertices: NDArray, phase: float, camera: NDArray[np.float32]) -> RenderedView:
+def render_view(scene: Scene, vertices: NDArray, phase: float, eye: Eye) -> RenderedView:
     """Render the mesh `vertices` (MH, MW, 3) and the tools at time `phase` from one camera."""
-    cfg, n = scene.cfg, SUPERSAMPLE
-    focal, center = n * cfg.focal, (n * cfg.center[0], n * cfg.center[1])
-    hits = rasterize(vertices - camera, focal, center, n * cfg.width, n * cfg.height)
-    assert hits[..., 2].max() < FAR, "the material ends inside the image"
-    tissue = shade(hits, vertex_normals(vertices), scene.texture, scene.plane, camera, focal, center, FAR)
-    color, depth = render_tools(scene.motion.tools(phase), np.ascontiguousarray(hits[..., 2]), camera, focal, center)
+    n = SUPERSAMPLE
+    tissue, z = _tissue_samples(scene, vertices, eye)
+    assert z.max() < FAR, "the material ends inside the image"
+    color, depth = render_tools(scene.motion.tools(phase), z, eye.center.astype(np.float32), *_sample_grid(scene.cfg))
     is_tool = depth < FAR
     image = np.where(is_tool[..., None], color, tissue)
-    size = (cfg.width, cfg.height)
-    pooled = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (tissue, image, is_tool.astype(np.float32))]
+    pooled = [_pooled(x, scene.cfg) for x in (tissue, image, is_tool.astype(np.float32))]
     nearest = np.minimum.reduce([depth[i::n, j::n] for i in range(n) for j in range(n)])
     return RenderedView(*pooled, nearest)
+
+
+def render_tissue(scene: Scene, vertices: NDArray, eye: Eye) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(H, W, 3) linear radiance of the tissue without tools, and its (H, W) z, mm, `FAR` where there is none."""
+    cfg = scene.cfg
+    z = rasterize(eye.sees(vertices), cfg.focal, cfg.center, cfg.width, cfg.height)[..., 2]
+    return _pooled(_tissue_samples(scene, vertices, eye)[0], cfg), z
+
+
+def _tissue_samples(scene: Scene, vertices: NDArray, eye: Eye) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(SH, SW, 3) radiance and (SH, SW) z of every sample."""
+    cfg, n = scene.cfg, SUPERSAMPLE
+    focal, center = _sample_grid(cfg)
+    hits = rasterize(eye.sees(vertices), focal, center, n * cfg.width, n * cfg.height)
+    radiance = shade(hits, vertex_normals(vertices), scene.texture, scene.plane, eye, focal, center, FAR)
+    return radiance, np.ascontiguousarray(hits[..., 2])
+
+
+def _sample_grid(cfg: PhantomConfig) -> tuple[float, tuple[float, float]]:
+    """Focal length and principal point, px of the samples."""
+    return SUPERSAMPLE * cfg.focal, (SUPERSAMPLE * cfg.center[0], SUPERSAMPLE * cfg.center[1])
+
+
+def _pooled(samples: NDArray[np.float32], cfg: PhantomConfig) -> NDArray[np.float32]:
+    return cv2.resize(samples, (cfg.width, cfg.height), interpolation=cv2.INTER_AREA)
 
 
 def choose_tracks(scene: Scene) -> NDArray[np.int64]:
@@ -123,31 +149,19 @@ def regions(scene: Scene, tracked: NDArray[np.int64]) -> NDArray[np.str_]:
     return names[tracked[:, 0], tracked[:, 1]]
 
 
-def visible_points(
-    points: NDArray, z: NDArray[np.float32], tool: NDArray[np.bool_], cfg: PhantomConfig
-) -> NDArray[np.bool_]:
-    """(...,) True where `points` (..., 3) are in the image and not occluded by tissue `z` (H, W) or `tool`."""
-    x = cfg.focal * points[..., 0] / points[..., 2] + cfg.center[0]
-    y = cfg.focal * points[..., 1] / points[..., 2] + cfg.center[1]
-    inside = (x >= 0) & (x < cfg.width) & (y >= 0) & (y < cfg.height)
-    # Depth of the four pixels around the point: on a slope the point may lie behind some of them, never behind all.
-    j = np.clip(np.floor(x - 0.5).astype(int), 0, cfg.width - 2)
-    i = np.clip(np.floor(y - 0.5).astype(int), 0, cfg.height - 2)
-    around = np.stack([z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]])
-    covered = tool[np.clip(y, 0, cfg.height - 1).astype(int), np.clip(x, 0, cfg.width - 1).astype(int)]
-    # Points next to a silhouette count as occluded: there the four depths differ by more than a slope of 4.
-    smooth = np.ptp(around, axis=0) < 0.3 + 4 * points[..., 2] / cfg.focal
-    return inside & smooth & (points[..., 2] <= around.max(0) + 0.15) & ~covered
-
-
 def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], None] | None = None) -> None:
     """Write a synthetic sequence folder with ground truth to `out`.
 
-    Beside the sequence (images, masks, depth, poses, `sequence.json`) it writes `truth/tissue/*.png` (the image
-    without tools and without sensor noise), `truth/depth/*.npy` ((H, W) float32 z of the tool-free tissue, mm) and
-    `truth/tracks.npz` (`points` (T, P, 3) float32 mm in camera axes, `visible` (T, P) bool; with `cfg.has_regions`
-    also `region` (P,)); with `cfg.stereo` also `right/*.png` and `calibration.json`. Tools cast no shadow, so outside
-    them an image is the truth plus noise.
+    Beside the sequence (images, masks, depth, poses, `sequence.json`) it writes
+
+    - `truth/tissue/*.png`, the image without tools and without sensor noise. Tools cast no shadow, so outside of them
+      an image is the truth plus noise;
+    - `truth/depth/*.npy`, (H, W) float32 z of the tool-free tissue, mm;
+    - `truth/tracks.npz`: `points` (T, P, 3) float32 mm in camera axes, `visible` (T, P) bool; with `cfg.has_regions`
+      also `region` (P,);
+    - with `cfg.side_views` `truth/side/NAME/*.png` and `*.npy`: picture and depth of the side cameras in test frames,
+      0 where the endoscope does not see the tissue; `truth/side/world_to_camera.json` has their poses (4, 4);
+    - with `cfg.stereo` `right/*.png` and `calibration.json`.
 
     Args:
         out: a new or empty folder; it appears when complete.
@@ -173,26 +187,30 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
         scene = build_scene(cfg)
         tracked = choose_tracks(scene)
         lens = vignette(cfg.width, cfg.height)
-        right_camera = np.array([cfg.baseline_mm, 0, 0], np.float32)
         # Masks cover the tool's blended rim and one pixel more, as annotators' outlines do.
         rim = np.ones((3, 3), np.uint8)
-        points, visible, gain = [], [], None
+        points, visible, gain, sides = [], [], None, {}
         for index in range(cfg.frames):
             phase = index / (cfg.frames - 1)
             vertices = scene.vertices(phase)
             view = render_view(scene, vertices, phase, _LEFT)
-            gain = exposure_gain(view.tissue) if gain is None else gain
+            z = rasterize(vertices, focal, cfg.center, cfg.width, cfg.height)[..., 2]
+            if gain is None:
+                gain, sides = exposure_gain(view.tissue), side_eyes(float(np.median(z))) if cfg.side_views else {}
             truth = develop(view.tissue, gain, lens)
             rng = np.random.default_rng([cfg.seed, 6, index])
             image = expose(develop(view.image, gain, lens), cfg.noise, rng)
             mask = cv2.dilate((view.tool_share > 0).astype(np.uint8), rim) > 0
-            z = rasterize(vertices, focal, cfg.center, cfg.width, cfg.height)[..., 2]
             measured = stereo_depth(np.minimum(z, view.tool_depth), image, cfg, rng)
             writer.write_image("truth/tissue", np.round(truth).astype(np.uint8))
             writer.write_array(f"truth/depth/{index:06d}.npy", z)
+            for name, eye in sides.items() if is_test_frame(index) else ():
+                seen = side_picture(*render_tissue(scene, vertices, eye), eye, z, mask, gain, cfg)
+                writer.write_image(f"truth/side/{name}", seen[0])
+                writer.write_array(f"truth/side/{name}/{index:06d}.npy", seen[1])
             right = None
             if cfg.stereo:
-                other = render_view(scene, vertices, phase, right_camera)
+                other = render_view(scene, vertices, phase, Eye.moved(cfg.baseline_mm))
                 right = expose(develop(other.image, gain, lens), cfg.noise, np.random.default_rng([cfg.seed, 7, index]))
             writer.add(image, mask, measured, right)
             followed = vertices[tracked[:, 0], tracked[:, 1]]
@@ -204,6 +222,9 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
         if cfg.has_regions:
             tracks["region"] = regions(scene, tracked)
         writer.write_arrays("truth/tracks.npz", **tracks)
+        if sides:
+            poses = {name: eye.world_to_camera.tolist() for name, eye in sides.items()}
+            writer.write_json("truth/side/world_to_camera.json", poses)
         if cfg.stereo:
             writer.write_json("calibration.json", _calibration(cfg))
 

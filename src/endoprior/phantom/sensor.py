@@ -21,10 +21,16 @@ def exposure_gain(radiance: NDArray[np.float32]) -> float:
 
 def vignette(width: int, height: int) -> NDArray[np.float32]:
     """(H, W, 1) transmission of the lens: 1 in the center, about a third in the corners."""
-    x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
-    y = ((np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1)[:, None]
+    x = (np.arange(width, dtype=np.float32) + 0.5) / width
+    y = ((np.arange(height, dtype=np.float32) + 0.5) / height)[:, None]
+    return vignette_at(x, y)[..., None]
+
+
+def vignette_at(x: NDArray, y: NDArray) -> NDArray:
+    """(...) transmission at positions x, y (...), as shares of width and height."""
+    x, y = x * 2 - 1, y * 2 - 1
     square = (x * x + 0.8 * y * y) / np.float32(1.8)
-    return (1 - np.float32(0.68) * square**1.3)[..., None]
+    return 1 - np.float32(0.68) * square**1.3
 
 
 def develop(radiance: NDArray[np.float32], gain: float, shading: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -11,6 +11,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
+from .eye import Eye
 from .surface import Plane
 
 LIGHTS_MM = np.array([[-3.6, -2.2, 0.0], [3.9, -1.8, 0.0]], np.float32)
@@ -30,7 +31,7 @@ def ggx(cosine, alpha):
 
 
 @njit(parallel=True, cache=True, fastmath=REORDERED)
-def _shade(hits, normals, texture, e_a, e_b, camera, lights, focal, cx, cy, far, out):
+def _shade(hits, normals, texture, e_a, e_b, camera, turn, lights, focal, cx, cy, far, out):
     # One task per row of samples. hits (SH, SW, 3) from `rasterize`; normals (MH, MW, 3); texture (TH, TW, 7); writes
     # out (SH, SW, 3) linear radiance. Both look-ups are bilinear; black where nothing was hit.
     mesh_h, mesh_w = normals.shape[:2]
@@ -60,9 +61,10 @@ def _shade(hits, normals, texture, e_a, e_b, camera, lights, focal, cx, cy, far,
                 low = texture[iy + 1, ix, k] * (one - fx) + texture[iy + 1, ix + 1, k] * fx
                 t[k] = top * (one - fy) + low * fy
             # Position in the left camera's axes, which also carry the lights.
-            px = (np.float32(j) + half - cx) / focal * z + camera[0]
-            py = (np.float32(i) + half - cy) / focal * z + camera[1]
-            pz = z + camera[2]
+            rx, ry = (np.float32(j) + half - cx) / focal * z, (np.float32(i) + half - cy) / focal * z
+            px = turn[0, 0] * rx + turn[0, 1] * ry + turn[0, 2] * z + camera[0]
+            py = turn[1, 0] * rx + turn[1, 1] * ry + turn[1, 2] * z + camera[1]
+            pz = turn[2, 0] * rx + turn[2, 1] * ry + turn[2, 2] * z + camera[2]
             # Bend the normal by the relief: tangents are the plane's axes laid onto the surface.
             da = n[0] * e_a[0] + n[1] * e_a[1] + n[2] * e_a[2]
             db = n[0] * e_b[0] + n[1] * e_b[1] + n[2] * e_b[2]
@@ -111,7 +113,7 @@ def shade(
     normals: NDArray[np.float32],
     texture: NDArray[np.float32],
     plane: Plane,
-    camera: NDArray[np.float32],
+    eye: Eye,
     focal: float,
     center: tuple[float, float],
     far: float,
@@ -119,15 +121,16 @@ def shade(
     """(SH, SW, 3) linear radiance of the tissue at every sample of `hits`.
 
     Args:
-        hits: (SH, SW, 3) from `raster.rasterize`, for a camera at `camera`.
+        hits: (SH, SW, 3) from `raster.rasterize`, as `eye` sees them.
         normals: (MH, MW, 3) unit vertex normals.
         texture: (TH, TW, 7) material maps.
-        camera: (3,) camera center in the left camera's axes, mm; the lights stay with the left camera.
+        eye: the camera; the lights stay with the left one.
         focal, center: of the sample grid, px.
         far: the depth that marks nothing hit.
     """
     out = np.empty_like(hits)
     e_a, e_b = plane.axes[:2].astype(np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))
-    _shade(hits, normals, texture, e_a, e_b, camera.astype(np.float32), LIGHTS_MM, f, cx, cy, np.float32(far), out)
+    center_mm, turn = eye.center.astype(np.float32), np.ascontiguousarray(eye.turn, np.float32)
+    _shade(hits, normals, texture, e_a, e_b, center_mm, turn, LIGHTS_MM, f, cx, cy, np.float32(far), out)
     return out
