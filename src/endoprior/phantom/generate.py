@@ -85,7 +85,7 @@ def build_scene(cfg: PhantomConfig) -> Scene:
 def render_view(scene: Scene, vertices: NDArray, phase: float, eye: Eye) -> RenderedView:
     """Render the mesh `vertices` (MH, MW, 3) and the tools at time `phase` from one camera."""
     n = SUPERSAMPLE
-    tissue, z = _tissue_samples(scene, vertices, eye)
+    tissue, z = _tissue_samples(scene, vertices, eye, eye.center)
     assert z.max() < FAR, "the material ends inside the image"
     color, depth = render_tools(scene.motion.tools(phase), z, eye.center.astype(np.float32), *_sample_grid(scene.cfg))
     is_tool = depth < FAR
@@ -96,18 +96,23 @@ def render_view(scene: Scene, vertices: NDArray, phase: float, eye: Eye) -> Rend
 
 
 def render_tissue(scene: Scene, vertices: NDArray, eye: Eye) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(H, W, 3) linear radiance of the tissue without tools, and its (H, W) z, mm, `FAR` where there is none."""
+    """What a side camera sees of the tissue: (H, W, 3) its radiance towards the endoscope, and (H, W) its z, mm.
+
+    z is `FAR` where there is no tissue.
+    """
     cfg = scene.cfg
     z = rasterize(eye.sees(vertices), cfg.focal, cfg.center, cfg.width, cfg.height)[..., 2]
-    return _pooled(_tissue_samples(scene, vertices, eye)[0], cfg), z
+    return _pooled(_tissue_samples(scene, vertices, eye, _LEFT.center)[0], cfg), z
 
 
-def _tissue_samples(scene: Scene, vertices: NDArray, eye: Eye) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _tissue_samples(
+    scene: Scene, vertices: NDArray, eye: Eye, viewer: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(SH, SW, 3) radiance and (SH, SW) z of every sample."""
     cfg, n = scene.cfg, SUPERSAMPLE
     focal, center = _sample_grid(cfg)
     hits = rasterize(eye.sees(vertices), focal, center, n * cfg.width, n * cfg.height)
-    radiance = shade(hits, vertex_normals(vertices), scene.texture, scene.plane, eye, focal, center, FAR)
+    radiance = shade(hits, vertex_normals(vertices), scene.texture, scene.plane, eye, viewer, focal, center, FAR)
     return radiance, np.ascontiguousarray(hits[..., 2])
 
 

@@ -31,7 +31,7 @@ def ggx(cosine, alpha):
 
 
 @njit(parallel=True, cache=True, fastmath=REORDERED)
-def _shade(hits, normals, texture, e_a, e_b, camera, turn, lights, focal, cx, cy, far, out):
+def _shade(hits, normals, texture, e_a, e_b, camera, turn, viewer, lights, focal, cx, cy, far, out):
     # One task per row of samples. hits (SH, SW, 3) from `rasterize`; normals (MH, MW, 3); texture (TH, TW, 7); writes
     # out (SH, SW, 3) linear radiance. Both look-ups are bilinear; black where nothing was hit.
     mesh_h, mesh_w = normals.shape[:2]
@@ -73,7 +73,7 @@ def _shade(hits, normals, texture, e_a, e_b, camera, turn, lights, focal, cx, cy
             bz = n[2] - t[3] * (e_a[2] - da * n[2]) - t[4] * (e_b[2] - db * n[2])
             norm = one / np.sqrt(bx * bx + by * by + bz * bz)
             bx, by, bz = bx * norm, by * norm, bz * norm
-            vx, vy, vz = camera[0] - px, camera[1] - py, camera[2] - pz
+            vx, vy, vz = viewer[0] - px, viewer[1] - py, viewer[2] - pz
             norm = one / np.sqrt(vx * vx + vy * vy + vz * vz)
             vx, vy, vz = vx * norm, vy * norm, vz * norm
             open_ = t[6]
@@ -114,6 +114,7 @@ def shade(
     texture: NDArray[np.float32],
     plane: Plane,
     eye: Eye,
+    viewer: NDArray[np.float64],
     focal: float,
     center: tuple[float, float],
     far: float,
@@ -125,6 +126,7 @@ def shade(
         normals: (MH, MW, 3) unit vertex normals.
         texture: (TH, TW, 7) material maps.
         eye: the camera; the lights stay with the left one.
+        viewer: (3,) mm, where the light goes to: the center of `eye`, or of another camera.
         focal, center: of the sample grid, px.
         far: the depth that marks nothing hit.
     """
@@ -132,5 +134,6 @@ def shade(
     e_a, e_b = plane.axes[:2].astype(np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))
     center_mm, turn = eye.center.astype(np.float32), np.ascontiguousarray(eye.turn, np.float32)
-    _shade(hits, normals, texture, e_a, e_b, center_mm, turn, LIGHTS_MM, f, cx, cy, np.float32(far), out)
+    seen_from = viewer.astype(np.float32)
+    _shade(hits, normals, texture, e_a, e_b, center_mm, turn, seen_from, LIGHTS_MM, f, cx, cy, np.float32(far), out)
     return out

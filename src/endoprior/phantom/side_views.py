@@ -1,7 +1,8 @@
 """Truth from other sides: pictures and depth of the tissue from cameras beside the endoscope.
 
-Only tissue that the endoscope sees in the same frame is kept. The light stays with the endoscope, and so does the
-shading of its lens: a model learned from its pictures can be right in every kept pixel, but for highlights that move.
+Only tissue that the endoscope sees in the same frame is kept, as bright as the endoscope sees it: light, highlights and
+the shading of the lens stay where they are on the tissue. A model learned from the endoscope's pictures, whose color
+does not depend on the direction, can then be right in every kept pixel; what a real camera would see, none can know.
 """
 
 from __future__ import annotations
