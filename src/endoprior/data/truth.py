@@ -60,13 +60,13 @@ class Truth:
         if not path.exists():
             return {}
         stored = read_json(path)
+        wrong = input_error(path, "finite poses of shape (4, 4)", "something else", "write the truth again.")
         try:
             poses = {name: np.asarray(pose, np.float64) for name, pose in stored.items()}
         except (TypeError, ValueError):
-            poses = {"": np.zeros(0)}
-        for pose in poses.values():
-            if pose.shape != (4, 4) or not np.isfinite(pose).all():
-                raise input_error(path, "finite poses of shape (4, 4)", "something else", "write the truth again.")
+            raise wrong from None
+        if not all(pose.shape == (4, 4) and np.isfinite(pose).all() for pose in poses.values()):
+            raise wrong
         return poses
 
     def side(self, name: str, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]] | None:

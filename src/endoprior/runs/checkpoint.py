@@ -64,6 +64,9 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
                 f"expected 0 to {length} as iteration of the {stage.name.lower()} stage; got {iteration!r:.80}."
             )
         check_state(arrays, iteration)
+        followed, num_frames = arrays.get("tracks.followed"), len(trainer.sequence.indices("train"))
+        if followed is not None and followed.shape[1] != num_frames:
+            raise InputError(f"expected {num_frames} training frames in tracks.followed; got {followed.shape[1]}.")
     trainer.restore(stage, iteration, arrays)
 
 

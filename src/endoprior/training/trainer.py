@@ -99,8 +99,8 @@ class Trainer:
         gaussians, field = Gaussians(part(arrays, "gaussians.")).to(self.device), None
         if self.cfg.deformation.kind == "hexplane":
             field = HexPlaneField.from_state_arrays(part(arrays, "field."), self.cfg.deformation).to(self.device)
-        held = {name: value.to(self.device) for name, value in part(arrays, "tracks.").items()}
-        self._enter(stage, gaussians, field, StartTracks(**held) if held else None)
+        held = part(arrays, "tracks.")
+        self._enter(stage, gaussians, field, StartTracks(**held).to(self.device) if held else None)
         self.state.iteration = iteration
         self.state.optimizer.load_state_arrays(part(arrays, "optimizer."))
         self.state.stats = DensityStats(

@@ -5,7 +5,7 @@ Only tissue that the endoscope sees in the same frame counts (`phantom/side_view
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...core.geometry import expected_depth
 from .. import metrics
-from ..context import EvaluationContext
+from ..context import NETWORKS_OFF, EvaluationContext
 from ..score import Score
 
 VEIL_SHARE = 0.05
@@ -62,6 +62,7 @@ class SidePair:
     surface: NDArray[np.float32]
     """(H, W) depth divided by the accumulated opacity, mm; 0 where nothing is rendered."""
     true_rgb: NDArray[np.float32]
+    """(H, W, 3) in [0, 1], 0 where the pixel does not count."""
     true_depth: NDArray[np.float32]
     """(H, W) mm, 0 where the pixel does not count."""
 
@@ -77,17 +78,30 @@ def compute(context: EvaluationContext) -> None:
     if truth is None or not truth.side_poses:
         return
     with context.skip_if_unavailable(*(score.name for score in SCORES)):
-        pairs = list(_pairs(context))
-        psnr = [metrics.psnr_tissue(pair.rgb, pair.true_rgb, pair.counted) for pair in pairs]
-        context.add_mean("side_psnr", psnr, NO_TISSUE)
-        turned = [value for pair, value in zip(pairs, psnr, strict=True) if pair.name.endswith(str(FARTHEST))]
-        context.add_mean("side_psnr_20", turned, NO_TISSUE)
-        depth = [metrics.depth_rmse(pair.depth, pair.true_depth, pair.counted) for pair in pairs]
-        context.add_mean("side_depth_rmse_mm", depth, NO_TISSUE)
-        context.add_mean("side_veil", [veil(pair) for pair in pairs], NO_TISSUE)
-        if context.networks:
-            distance = metrics.lpips_distance("squeeze", context.weights_dir, download=False)
-            context.add_mean("side_lpips", [distance(p.rgb, p.true_rgb, p.counted) for p in pairs], NO_TISSUE)
+        lpips = _lpips(context)
+        names = [score.name for score in SCORES if score.name != "side_lpips" or lpips is not None]
+        values: dict[str, list[float]] = {name: [] for name in names}
+        for pair in _pairs(context):  # one after the other: the pictures of a long sequence do not fit in memory
+            psnr = metrics.psnr_tissue(pair.rgb, pair.true_rgb, pair.counted)
+            values["side_psnr"].append(psnr)
+            if pair.name.endswith(str(FARTHEST)):
+                values["side_psnr_20"].append(psnr)
+            values["side_depth_rmse_mm"].append(metrics.depth_rmse(pair.depth, pair.true_depth, pair.counted))
+            values["side_veil"].append(veil(pair))
+            if lpips is not None:
+                values["side_lpips"].append(lpips(pair.rgb, pair.true_rgb, pair.counted))
+        for name, found in values.items():
+            context.add_mean(name, found, NO_TISSUE)
+
+
+def _lpips(context: EvaluationContext) -> Callable[..., float] | None:
+    """The distance by SqueezeNet; None, with the reason recorded, where it cannot be computed."""
+    if not context.networks:
+        context.skip("side_lpips", NETWORKS_OFF)
+        return None
+    with context.skip_if_unavailable("side_lpips"):
+        return metrics.lpips_distance("squeeze", context.weights_dir, download=False)
+    return None
 
 
 def veil(pair: SidePair) -> float:
