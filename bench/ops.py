@@ -10,7 +10,7 @@ import numpy as np
 import scenes
 import torch
 
-from endoprior.core.config import DeformationConfig
+from endoprior.core.config_deformation import DeformationConfig
 from endoprior.core.presets import preset
 from endoprior.model.attributes import attribute_shapes
 from endoprior.model.basis import RankOneGradient, basis_offsets

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from endoprior.core.config import HexPlaneConfig
+from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.model.hexplane import PlaneGrid
 from endoprior.model.hexplane_numba import hexplane_linear
 

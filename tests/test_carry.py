@@ -9,7 +9,7 @@ import pytest
 import torch
 from export_scenes import moving_scene
 
-from endoprior.core.config import HexPlaneConfig
+from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.core.presets import preset
 from endoprior.model.carry import NUM_CARRIERS, carry, carry_points, confidence_of
 from endoprior.model.deformation import HexPlaneField

@@ -11,7 +11,8 @@ from endoprior.cli.parsing import parse
 from endoprior.cli.train import HELP, Train
 from endoprior.core import config_io
 from endoprior.core.checks import InputError
-from endoprior.core.config import BasisConfig, Config, DensityConfig, HexPlaneConfig, RenderConfig
+from endoprior.core.config import Config, DensityConfig, RenderConfig
+from endoprior.core.config_deformation import BasisConfig, HexPlaneConfig
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.core.presets import preset
 from endoprior.experiments.spec import MethodSpec, SequenceSpec, Spec

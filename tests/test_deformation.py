@@ -15,7 +15,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import BasisConfig, Config, DeformationConfig, HexPlaneConfig
+from endoprior.core.config import Config
+from endoprior.core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
 from endoprior.model.attributes import attribute_shapes, motion_layout
 from endoprior.model.basis import basis_offsets, basis_weights
 from endoprior.model.deformation import HexPlaneField, Offsets, box_of_points

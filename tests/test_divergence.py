@@ -10,7 +10,7 @@ import torch
 from tiny_training import KINDS, tiny_config
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import HexPlaneConfig
+from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.data import load_sequence
 from endoprior.model.hexplane import FRESH, TOUCHED, PlaneGrid
 from endoprior.model.scene import load_scene

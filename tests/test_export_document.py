@@ -12,7 +12,7 @@ import pytest
 import torch
 from export_scenes import moving_scene, plane_camera
 
-from endoprior.core.config import HexPlaneConfig
+from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.core.presets import preset
 from endoprior.export.axes import ROTATIONS
 from endoprior.export.formats import FORMATS

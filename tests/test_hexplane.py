@@ -12,7 +12,7 @@ from hexplane_grids import SMALL, random_grid, random_layer, random_unit, sample
 from reference.hexplane import features
 from torch import Tensor
 
-from endoprior.core.config import HexPlaneConfig
+from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, TOUCHED, PlaneGrid, mapped_zeros
 from endoprior.model.hexplane_numba import CHUNK, hexplane_linear
 from endoprior.training.plane_adam import PlaneAdam

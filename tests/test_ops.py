@@ -11,7 +11,7 @@ from hexplane_grids import random_grid, random_layer, random_unit, sample
 from reference import adam
 from tiny_training import tiny_config
 
-from endoprior.core.config import HexPlaneConfig
+from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
 from endoprior.model.basis import RankOneGradient

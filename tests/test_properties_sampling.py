@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import BasisConfig, InitConfig, PriorConfig
+from endoprior.core.config import InitConfig, PriorConfig
+from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import project
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame

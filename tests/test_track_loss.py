@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from endoprior.core.config import BasisConfig
+from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera
 from endoprior.data import load_sequence

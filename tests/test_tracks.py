@@ -11,7 +11,8 @@ import torch
 from conftest import write_tiny_sequence
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import BasisConfig, Config, InitConfig
+from endoprior.core.config import Config, InitConfig
+from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, bilinear, project
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from endoprior.core.config import BasisConfig
+from endoprior.core.config_deformation import BasisConfig
 
 
 def weights(time: float, cfg: BasisConfig) -> list[float]:

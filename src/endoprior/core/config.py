@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 from .checks import InputError, check_range, read_ranges
+from .config_deformation import DeformationConfig
 from .config_io import from_dict, override, to_dict
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
@@ -116,78 +117,14 @@ class InitConfig(Checked):
     """`legacy` back-projects integer pixels, half a pixel up and left of their centers (EndoGaussian)."""
     variance_factor: Annotated[float, Range(1e-12, 1e6)] = 1.0
     """Initial variance = this times the mean squared distance to the 3 nearest points (released code: 0.4)."""
+    thickness: Annotated[float, Range(1e-3, 1)] = 1.0
+    """Initial scale along the normal of the surface relative to that along it; 1 starts with spheres."""
     opacity: Annotated[float, Range(1e-4, 0.9999)] = 0.1
     """Initial opacity."""
+    fill_unseen: bool = False
+    """Also start with points where no frame shows tissue: color and depth continue those around smoothly."""
     motion: Literal["rest", "flow"] = "rest"
     """Start of the temporal coefficients (`kind` basis): no motion, or along tracks of optical flow and depth."""
-
-
-@dataclass(frozen=True)
-class HexPlaneConfig(Checked):
-    """Space-time feature planes and the heads that read offsets from them."""
-
-    resolution: Annotated[tuple[int, int, int], Range(2, 10_000)] = (64, 64, 64)
-    """Base cells along x, y, z."""
-    time_resolution: Annotated[int, Range(2, 100_000)] = 100
-    """Cells along time, at every scale."""
-    channels: Annotated[int, Range(1, 256)] = 64
-    """Feature channels of each plane."""
-    multires: Annotated[tuple[int, ...], Range(1, 1000)] = (1, 2, 4, 8)
-    """Spatial scale multipliers; features of all scales are concatenated."""
-    width: Annotated[int, Range(1, 4096)] = 32
-    """Hidden width of the trunk and the heads."""
-    learn_box: bool = True
-    """Train the bounding box together with the planes, as EndoGaussian does without saying so."""
-    time_map: Literal["raw", "full"] = "raw"
-    """`raw` feeds t in [0, 1) into [-1, 1] and so uses half of each time plane; `full` maps it to the whole."""
-    bias_init: Literal["default", "zero"] = "default"
-    """Biases of trunk and heads: PyTorch's default, or zero (released code)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range("number of multires", len(self.multires), 1, 16)
-        x, y, z = self.resolution
-        cells = sum(m * (m * (x * y + x * z + y * z) + (x + y + z) * self.time_resolution) for m in self.multires)
-        check_range("numbers in all planes", cells * self.channels, 1, 1e9)  # training holds them four times
-
-
-@dataclass(frozen=True)
-class BasisConfig(Checked):
-    """One coefficient per Gaussian, temporal basis function and channel: a linear map, no network."""
-
-    num_bases: Annotated[int, Range(0, 1000)] = 31
-    """B: basis functions over time, centered evenly on [0, 1]; 0 takes one for every `frames_per_basis` frames."""
-    frames_per_basis: Annotated[float, Range(0.5, 1000)] = 1.8
-    """Frames of the sequence for each basis function, where `num_bases` is 0; there are never fewer than 4."""
-    relative_width: Annotated[float, Range(1e-3, 1e3)] = 1.5
-    """Standard deviation of a basis function in units of 1 / B."""
-    deform_color: bool = True
-    """Also let the view-independent color change with time."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range("num_bases", self.num_bases or 2, 2, 1000)
-
-    def fitted(self, num_frames: int) -> BasisConfig:
-        """This config with a number of basis functions, chosen for `num_frames` if there is none yet."""
-        chosen = min(max(round(num_frames / self.frames_per_basis), 4), 1000)
-        return self if self.num_bases else replace(self, num_bases=chosen)
-
-
-@dataclass(frozen=True)
-class DeformationConfig:
-    """How canonical Gaussians move."""
-
-    kind: Literal["hexplane", "basis"] = "hexplane"
-    """`hexplane`: the paper's field; `basis`: temporal coefficients per Gaussian."""
-    hexplane: HexPlaneConfig = field(default_factory=HexPlaneConfig)
-    basis: BasisConfig = field(default_factory=BasisConfig)
-    deform_scales: bool = True
-    """Let scales change with time."""
-    deform_quats: bool = True
-    """Let rotations change with time."""
-    deform_opacity: bool = False
-    """Render the deformed opacity (released code); EndoGaussian computes it and renders the canonical one."""
 
 
 @dataclass(frozen=True)
@@ -282,6 +219,8 @@ class DensityConfig(Checked):
     """Gaussians below this opacity are removed."""
     prune_max_scale_mm: Annotated[float, Range(0, 1e9)] = 0.0
     """Gaussians with a larger scale are removed; 0 switches the rule off (released code: 40)."""
+    max_scale_share: Weight = 0.0
+    """No Gaussian becomes larger than this share of its distance to the camera; 0 sets no limit."""
     prior_prune: bool = True
     """Also remove Gaussians of low prior: n >= n_min, score < tau_prior, mean opacity < tau_alpha."""
     min_valid: Count = 20

@@ -6,17 +6,8 @@ from dataclasses import replace
 from typing import Any, Literal, get_args
 
 from .checks import InputError
-from .config import (
-    Config,
-    DataConfig,
-    DeformationConfig,
-    DensityConfig,
-    HexPlaneConfig,
-    InitConfig,
-    OptimConfig,
-    SalienceConfig,
-    TemporalConfig,
-)
+from .config import Config, DataConfig, DensityConfig, InitConfig, OptimConfig, SalienceConfig, TemporalConfig
+from .config_deformation import DeformationConfig, HexPlaneConfig
 
 PresetName = Literal["default", "paper", "released", "endogaussian", "preview"]
 
@@ -92,14 +83,21 @@ def default() -> Config:
     base = Config()
     return replace(
         base,
-        init=replace(base.init, budget=30_000, motion="flow", opacity=0.3, variance_factor=0.4),
-        deformation=replace(base.deformation, kind="basis", basis=replace(base.deformation.basis, num_bases=0)),
+        init=replace(
+            base.init, budget=30_000, motion="flow", thickness=0.3, opacity=0.3, fill_unseen=True, variance_factor=0.4
+        ),
+        deformation=replace(
+            base.deformation,
+            kind="basis",
+            basis=replace(base.deformation.basis, num_bases=0),
+            max_scale_change=2.0,
+        ),
         render=replace(base.render, depth_grad_to_means=True),
         loss=replace(base.loss, depth_weight=3.0, track_weight=0.01, trust_masks=False),
         temporal=replace(
             base.temporal, start_iteration=500, max_points=1024, min_valid=1, valid_at_both=False, gradient="current"
         ),
-        density=replace(base.density, grow_threshold=1.5e-4),
+        density=replace(base.density, grow_threshold=1.5e-4, max_scale_share=0.02),
         optim=replace(
             base.optim,
             means_lr=5e-3,

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config import BasisConfig
+from ..core.config_deformation import BasisConfig
 from ..core.geometry import back_project, cells_at, project
 from ..core.types import Frame
 from ..footage.optical_flow import MIN_SIZE_PX, fine_shrink, gray_for_flow
@@ -51,6 +51,11 @@ class InitialMotion:
     """(N, B, 3) temporal coefficients of the centers, mm."""
     followed: NDArray[np.bool_]
     """(N, T) True where the flow found the point and returned to it; elsewhere its neighbors carried it."""
+
+    def joined(self, coefficients: NDArray[np.float32]) -> InitialMotion:
+        """This motion and that of further points, (M, B, 3) mm, which the flow never found."""
+        never = np.zeros((len(coefficients), self.followed.shape[1]), bool)
+        return InitialMotion(np.concatenate([self.coefficients, coefficients]), np.concatenate([self.followed, never]))
 
 
 def initial_motion(frames: Sequence[Frame], cloud: PointCloud, cfg: BasisConfig) -> InitialMotion:

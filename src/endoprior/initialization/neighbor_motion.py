@@ -54,7 +54,7 @@ def _swept(
         if not len(lost) or len(carriers) < CARRIERS:
             continue
         distances, nearest = cKDTree(carried[t, carriers]).query(carried[t, lost], k=CARRIERS)
-        ends = kernels.carry(carried, known, t, step, lost, carriers[nearest], _weights(distances), age)
+        ends = kernels.carry(carried, known, t, step, lost, carriers[nearest], weights_by_distance(distances), age)
         for end in np.unique(ends[ends >= 0]):
             waiting[int(end)].append(lost[ends == end])
     return carried, age
@@ -87,11 +87,11 @@ def smooth_motion(positions: NDArray[np.floating], origins: NDArray[np.integer])
         own = np.flatnonzero(origins == source)
         tree = cKDTree(positions[source])
         distances, nearest = tree.query(positions[source, own], k=np.arange(1, count + 1, COMPANION_STEP), workers=-1)
-        kernels.mean_displacement(positions, source, own, nearest, _weights(distances), offsets)
+        kernels.mean_displacement(positions, source, own, nearest, weights_by_distance(distances), offsets)
     return offsets
 
 
-def _weights(distances: NDArray[np.floating]) -> NDArray[np.floating]:
+def weights_by_distance(distances: NDArray[np.floating]) -> NDArray[np.floating]:
     """(P, k) a Gaussian of the distance (P, k) whose width is the mean of the row; of sum 1."""
     weights = np.exp(-0.5 * (distances / np.maximum(distances.mean(1, keepdims=True), 1e-6)) ** 2)
     return weights / weights.sum(1, keepdims=True)

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..core.checks import InputError
-from ..core.config import Config, DeformationConfig
+from ..core.config import Config
+from ..core.config_deformation import DeformationConfig
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..core.checks import check_shape
-from ..core.config import BasisConfig, DeformationConfig
+from ..core.config_deformation import BasisConfig, DeformationConfig
 from .attributes import motion_layout, offset_widths
 from .deformation import Offsets
 from .ops import ModelOps
@@ -61,7 +61,7 @@ def basis_offsets(
     layout = motion_layout(cfg)
     check_shape(f"motion:N,{cfg.basis.num_bases},{sum(offset_widths(cfg).values())}", motion=motion)
     total = _WeightedSum.apply(motion, basis_weights(time, cfg.basis), sink, ops)
-    return Offsets.from_channels({name: total[:, part] for name, part in layout.items()})
+    return Offsets.from_channels({name: total[:, part] for name, part in layout.items()}, cfg)
 
 
 class _WeightedSum(torch.autograd.Function):

@@ -5,6 +5,7 @@ Offsets are added to the raw parameters: centers (mm), log scales, quaternions b
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import InputError, check_shape
-from ..core.config import DeformationConfig
+from ..core.config_deformation import DeformationConfig
 from .attributes import offset_widths
 from .heads import OffsetHeads
 from .hexplane import PLANE_NAMES, PlaneGrid, plane_shapes
@@ -37,10 +38,13 @@ class Offsets:
     """(N, 3), added to the spherical-harmonic coefficient of degree 0."""
 
     @staticmethod
-    def from_channels(channels: dict[str, Tensor]) -> Offsets:
-        """Offsets from tensors (N, width) by name, as `attributes.offset_widths` names them."""
+    def from_channels(channels: dict[str, Tensor], cfg: DeformationConfig) -> Offsets:
+        """Offsets from tensors (N, width) by name, as `attributes.offset_widths` names them; scales within bounds."""
         if "opacity_logits" in channels:
             channels["opacity_logits"] = channels["opacity_logits"][:, 0]
+        if "log_scales" in channels and cfg.max_scale_change > 1:
+            limit = math.log(cfg.max_scale_change)
+            channels["log_scales"] = channels["log_scales"].clamp(-limit, limit)
         return Offsets(**channels)
 
 
@@ -109,14 +113,14 @@ class HexPlaneField:
             Offsets with a gradient path to `means`, the box and the network; the planes' gradient goes to `grid.grads`.
         """
         (trunk,) = self._trunk(means, (time,), ops)
-        return Offsets.from_channels(self.heads(trunk, ops))
+        return Offsets.from_channels(self.heads(trunk, ops), self.cfg)
 
     def offsets_and_displacement(
         self, means: Tensor, time: float, other: float, ops: ModelOps
     ) -> tuple[Offsets, Tensor]:
         """`offsets` at `time`, and those of the centers alone, (N, 3) mm, at an `other` time: faster than two calls."""
         here, there = self._trunk(means, (time, other), ops)
-        return Offsets.from_channels(self.heads(here, ops)), self.heads(there, ops, ("means",))["means"]
+        return Offsets.from_channels(self.heads(here, ops), self.cfg), self.heads(there, ops, ("means",))["means"]
 
     def _trunk(self, means: Tensor, times: tuple[float, ...], ops: ModelOps) -> tuple[Tensor, ...]:
         """Output of the trunk on the features, (N, W) per time."""

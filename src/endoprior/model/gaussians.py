@@ -78,20 +78,31 @@ def _moved(value: Tensor, offset: Tensor | None) -> Tensor:
     return value if offset is None else value + offset
 
 
-def create_gaussians(points: NDArray, colors: NDArray, log_scales: NDArray, cfg: Config) -> Gaussians:
-    """Gaussians at the initial points: isotropic, unrotated, of the points' color, nearly transparent.
+def create_gaussians(
+    points: NDArray,
+    colors: NDArray,
+    log_scales: NDArray,
+    cfg: Config,
+    quats: NDArray | None = None,
+    opacities: NDArray | None = None,
+) -> Gaussians:
+    """Gaussians at the initial points, of the points' color, at rest.
 
     Args:
-        points: (N, 3) mm. colors: (N, 3) in [0, 1]. log_scales: (N,) log of mm.
+        points: (N, 3) mm. colors: (N, 3) in [0, 1]. log_scales: (N,) for spheres or (N, 3), log of mm.
+        quats: (N, 4) wxyz; None: unrotated. opacities: (N,) in (0, 1); None: `cfg.init.opacity`.
     Raises:
         InputError: the config leaves the number of temporal basis functions open.
     """
-    num, opacity = len(points), cfg.init.opacity
+    num = len(points)
+    log_scales = np.broadcast_to(np.asarray(log_scales, np.float32).reshape(num, -1), (num, 3))
+    quats = np.tile([1.0, 0.0, 0.0, 0.0], (num, 1)) if quats is None else quats
+    chances = np.full(num, cfg.init.opacity) if opacities is None else np.asarray(opacities, np.float64)
     tensors = {
         "means": torch.from_numpy(np.ascontiguousarray(points, np.float32)),
-        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1),
-        "log_scales": torch.from_numpy(np.asarray(log_scales, np.float32))[:, None].repeat(1, 3),
-        "opacity_logits": torch.full((num,), float(np.log(opacity / (1 - opacity)))),
+        "quats": torch.from_numpy(np.array(quats, np.float32)),
+        "log_scales": torch.from_numpy(np.array(log_scales)),
+        "opacity_logits": torch.from_numpy(np.log(chances / (1 - chances)).astype(np.float32)),
         "sh_dc": (torch.from_numpy(np.asarray(colors, np.float32))[:, None, :] - 0.5) / SH_C0,
     }
     # Everything else starts at zero: color that does not depend on the view, and no motion.

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.config import HexPlaneConfig
+from ..core.config_deformation import HexPlaneConfig
 
 PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
 TOUCHED, FRESH = 1, 2

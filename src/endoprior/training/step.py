@@ -22,6 +22,7 @@ from .losses import supervised_terms
 from .mask_doubt import MaskDoubt
 from .missed_tools import START
 from .ops import TrainingOps
+from .scale_limit import limit_scales
 from .state import Stage, StepReport, TrainState
 from .temporal import temporal_terms
 from .track_loss import track_term
@@ -101,6 +102,9 @@ class TrainingStep:
             with torch.no_grad():
                 self._observe(state, batch, out)
                 state.optimizer.step(iteration, self.check.skip)
+                if cfg.density.max_scale_share:
+                    log_scales = state.gaussians["log_scales"].detach()
+                    limit_scales(log_scales, splats.means, batch.frame.camera, cfg.density.max_scale_share)
                 if densify:
                     self._densify(state, rng)
             state.iteration = iteration

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..core.config import BasisConfig
+from ..core.config_deformation import BasisConfig
 from ..core.types import Camera
 from ..model.basis import basis_weights
 from .frames import TrainingFrame

@@ -12,12 +12,10 @@ import torch
 from torch import Tensor
 
 from .. import render
-from ..compute.morton import morton_order
 from ..core.checks import InputError
 from ..core.config import Config
 from ..data import FrameSequence
-from ..initialization.flow_tracks import initial_motion
-from ..initialization.sampling import initial_log_scales, initial_points
+from ..initialization.first_gaussians import first_gaussians
 from ..model.attributes import motion_layout
 from ..model.deformation import HexPlaneField
 from ..model.gaussians import Gaussians, create_gaussians
@@ -77,12 +75,10 @@ class Trainer:
     def start(self) -> None:
         """Sample the initial points and build the state before the first iteration."""
         cfg = self.cfg
-        cloud = initial_points(self.sequence.frames("train"), cfg.init, cfg.prior, cfg.seed)
-        cloud = cloud.subset(morton_order(cloud.points))
-        log_scales = initial_log_scales(cloud.points, cfg.init.variance_factor)
-        gaussians, tracks = create_gaussians(cloud.points, cloud.colors, log_scales, cfg), None
-        if cfg.init.motion == "flow" and cfg.deformation.kind == "basis":
-            motion = initial_motion(self.sequence.frames("train"), cloud, cfg.deformation.basis)
+        first = first_gaussians(self.sequence.frames("train"), cfg)
+        cloud, motion, tracks = first.cloud, first.motion, None
+        gaussians = create_gaussians(cloud.points, cloud.colors, first.log_scales, cfg, first.quats, first.opacities)
+        if motion is not None:
             coefficients = torch.from_numpy(motion.coefficients)
             gaussians["motion"].detach()[..., motion_layout(cfg.deformation)["means"]] = coefficients
             if cfg.loss.track_weight:
@@ -91,8 +87,8 @@ class Trainer:
         if cfg.deformation.kind == "hexplane":
             generator = torch.Generator().manual_seed(cfg.seed)
             field = HexPlaneField.from_points(gaussians["means"].detach(), cfg.deformation, generator)
-        first = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
-        self._enter(first, gaussians.to(self.device), field and field.to(self.device), tracks)
+        stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
+        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks)
 
     def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
         """Continue from a state that `TrainState.arrays` gave, trusted to fit the config."""

@@ -1,0 +1,162 @@
+"""Points where no frame shows tissue: behind tools that stand still, and where depth is missing.
+
+Without them a scene has holes there, black from the front and open from the side. Each frame is cut into cells. A cell
+without measured tissue, into which no point of another frame has moved, gets a point: color and inverse depth continue
+those around it smoothly (Laplace's equation), and it moves as the points around it do. Cells beyond the convex hull of
+all tissue, such as the corners around a round picture, stay empty.
+
+Letters: `T` training frames, `N` points, `M` new ones, `B` basis functions, `R, C` rows and columns of cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
+
+from ..core.config_deformation import BasisConfig
+from ..core.geometry import back_project, cells_at, project
+from ..core.types import Frame
+from ..model.basis import basis_weights
+from .cleanup import PointCloud, concatenated
+from .neighbor_motion import CARRIERS, weights_by_distance
+from .sampling import eroded_mask, has_surface
+
+CELLS = 80
+"""Columns of cells: one for 8 px of an image 640 px wide."""
+RIM_PX = 9
+"""Width of the rim along tools, in px of an image 640 px wide, whose color and depth are not continued."""
+
+
+def unseen_points(
+    frames: Sequence[Frame], cloud: PointCloud, coefficients: NDArray[np.float32] | None, cfg: BasisConfig
+) -> tuple[PointCloud, NDArray[np.float32] | None]:
+    """New points, and their temporal coefficients (M, B, 3), mm.
+
+    Args:
+        frames: the T training frames that the cloud comes from.
+        coefficients: (N, B, 3) motion of its points, mm; None: nothing moves.
+    """
+    found, motions = [], []
+    within = _hull(frames)
+    for position, frame in enumerate(frames):
+        weights = basis_weights(frame.time, cfg) if coefficients is not None else np.zeros(0)
+        moved = _moved(cloud.points, coefficients, weights)
+        added = [_moved(part.points, motion, weights) for part, motion in zip(found, motions, strict=True)]
+        new, colors = _fill(frame, np.concatenate([moved, *added]), within)
+        if not len(new):
+            continue
+        motion = None
+        if coefficients is not None:
+            motion = _carried(moved, coefficients, new)
+            new = new - _moved(np.zeros_like(new), motion, weights)
+        origins = np.full(len(new), position, np.int32)
+        found.append(PointCloud(new.astype(np.float32), colors.astype(np.float32), origins))
+        motions.append(motion)
+    if coefficients is None:
+        return concatenated(found), None
+    return concatenated(found), np.concatenate([*motions, coefficients[:0]])
+
+
+def _moved(points: NDArray, coefficients: NDArray | None, weights: NDArray) -> NDArray:
+    """(N, 3) where points are at the time of the `weights` (B,)."""
+    return points if coefficients is None else points + np.tensordot(coefficients, weights, (1, 0))
+
+
+def _carried(points: NDArray, coefficients: NDArray, new: NDArray) -> NDArray[np.float32]:
+    """(M, B, 3) coefficients of `new` points (M, 3) from those of the nearest `points` (N, 3)."""
+    count = min(CARRIERS, len(points))
+    distances, nearest = cKDTree(points).query(new, k=np.arange(1, count + 1))
+    return np.einsum("mk,mkbc->mbc", weights_by_distance(distances), coefficients[nearest]).astype(np.float32)
+
+
+def _cell_size(frame: Frame) -> int:
+    """Side of a cell, px."""
+    return max(round(frame.camera.width / CELLS), 2)
+
+
+def _hull(frames: Sequence[Frame]) -> NDArray[np.bool_]:
+    """(R, C) cells in the convex hull of the tissue of all frames."""
+    size = _cell_size(frames[0])
+    tissue = np.any([_cell_sums(frame.tissue_mask, size) > 0 for frame in frames], axis=0)
+    inside = np.zeros(tissue.shape, np.uint8)
+    if tissue.any():
+        corners = cv2.convexHull(np.argwhere(tissue)[:, None, ::-1].astype(np.int32))
+        cv2.fillConvexPoly(inside, corners, 1)
+    return inside > 0
+
+
+def _fill(frame: Frame, points: NDArray, within: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
+    """New points (M, 3) and their colors (M, 3) for one frame.
+
+    They lie in the cells `within` (R, C) which neither measured tissue nor one of the `points` (N, 3) covers.
+    """
+    camera, size = frame.camera, _cell_size(frame)
+    measured = frame.tissue_mask & has_surface(frame)
+    rim = max(round(RIM_PX * camera.width / 640), 1)
+    shown = _cell_sums(measured, size) > 0
+    pixels, z = project(points.astype(np.float64), camera)
+    inside = (z > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    x, y = cells_at(pixels[inside], camera.width, camera.height)
+    covered = shown | ~within
+    covered[y // size, x // size] = True
+    if covered.all() or not shown.any():
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    trusted = eroded_mask(frame.tissue_mask, rim) & measured
+    inverse = np.divide(1.0, frame.depth, out=np.zeros(frame.depth.shape), where=trusted)
+    count = _cell_sums(trusted, size)
+    known = count > 0
+    values = np.concatenate([frame.rgb * trusted[..., None], inverse[..., None]], -1)
+    means = _cell_sums(values, size) / np.maximum(count, 1)[..., None]
+    filled = laplace_fill(means, known)
+    row, column = np.nonzero(~covered)
+    center = np.stack([column + 0.5, row + 0.5], -1) * size
+    center = np.minimum(center, (camera.width - 0.5, camera.height - 0.5))
+    return back_project(center, 1 / filled[row, column, 3], camera), filled[row, column, :3]
+
+
+def _cell_sums(image: NDArray, size: int) -> NDArray[np.float64]:
+    """(R, C) or (R, C, K): sums over cells of `size` x `size` pixels of (H, W) or (H, W, K); the last ones are cut."""
+    height, width = image.shape[:2]
+    pad = [(0, -height % size), (0, -width % size), *[(0, 0)] * (image.ndim - 2)]
+    padded = np.pad(image.astype(np.float64), pad)
+    blocks = padded.reshape(padded.shape[0] // size, size, padded.shape[1] // size, size, *image.shape[2:])
+    return blocks.sum((1, 3))
+
+
+def laplace_fill(values: NDArray, known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(R, C, K) `values` where `known` (R, C); elsewhere each is the mean of its neighbors, up to the image's border.
+
+    Raises:
+        ValueError: nothing is known.
+    """
+    if not known.any():
+        raise ValueError("laplace_fill: nothing is known")
+    filled = np.where(known[..., None], values, 0.0)
+    number = np.full(known.shape, -1)
+    open_rows, open_columns = np.nonzero(~known)
+    count = len(open_rows)
+    number[open_rows, open_columns] = np.arange(count)
+    right, entries, degree = np.zeros((count, values.shape[-1])), [], np.zeros(count)
+    for step_y, step_x in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        y, x = open_rows + step_y, open_columns + step_x
+        inside = (y >= 0) & (y < known.shape[0]) & (x >= 0) & (x < known.shape[1])
+        own, y, x = np.arange(count)[inside], y[inside], x[inside]
+        degree[own] += 1
+        border = known[y, x]
+        right[own[border]] += filled[y[border], x[border]]
+        entries.append((own[~border], number[y[~border], x[~border]]))
+    own, other = (np.concatenate(part) for part in zip(*entries, strict=True))
+    every = np.arange(count)
+    matrix = coo_matrix(
+        (np.concatenate([degree, -np.ones(len(own))]), (np.concatenate([every, own]), np.concatenate([every, other]))),
+        shape=(count, count),
+    )
+    if count:
+        filled[open_rows, open_columns] = spsolve(matrix.tocsc(), right).reshape(count, -1)
+    return filled
