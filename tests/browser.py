@@ -39,7 +39,8 @@ HOW_TO_INSTALL = (
 FLAGS = (
     "--headless=new --no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--disable-quic --no-first-run --disable-background-networking --disable-component-update --disable-sync "
-    "--disable-dev-shm-usage --hide-scrollbars --mute-audio --force-device-scale-factor=1 --remote-debugging-pipe"
+    "--disable-dev-shm-usage --hide-scrollbars --mute-audio --force-device-scale-factor=1 "
+    "--force-prefers-reduced-motion --remote-debugging-pipe"
 ).split()
 # Chromium reads commands from descriptor 3 and answers on 4; Popen cannot number them.
 LAUNCH = (

@@ -18,6 +18,7 @@ from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
 from ..system.atomic import whole_file
+from ..visualization.camera_paths import turned
 from ..visualization.carried_texture import PaintedTissue
 from ..visualization.image_tools import colorize, to_u8
 from ..visualization.rendered_views import depth_span
@@ -39,6 +40,8 @@ SHOWN_SCORES = (
     "fps_cached",
     "train_seconds",
 )
+TURNS_DEG = (-20, -12, 12, 20)
+"""Cameras beside the endoscope's, degrees; above 0 to its right."""
 ERROR_FULL_SCALE = 0.15
 """Color error, in [0, 1], at the end of the error map's color scale."""
 
@@ -46,14 +49,15 @@ ERROR_FULL_SCALE = 0.15
 def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, title: str = "") -> None:
     """Write the report of a finished run folder as one PNG.
 
-    Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; a grid
-    painted on the first frame and carried to the middle and the last one, beside the input; then the training curve,
-    the PSNR of each test frame, and the scores of `metrics.json`. A `title` stands above all.
+    Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; the second of
+    them from cameras to both sides; a grid painted on the first frame and carried to the middle and the last one,
+    beside the input; then the training curve, the PSNR of each test frame, and the scores of `metrics.json`. A `title`
+    stands above all.
     """
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     per_frame = json.loads((run / "per_frame.json").read_text(encoding="utf-8"))
     log = [json.loads(line) for line in (run / "log.jsonl").read_text(encoding="utf-8").splitlines()]
-    rows = [*_image_rows(scene, sequence), _texture_row(scene, sequence)]
+    rows = [*_image_rows(scene, sequence), _side_row(scene, sequence), _texture_row(scene, sequence)]
     # An own canvas: `pyplot` would choose a backend for the whole process.
     figure = Figure(figsize=(2.6 * len(rows[0]), 2.1 * len(rows) + 3.4), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
@@ -63,7 +67,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     for row, cells in zip(top.subplots(len(rows), len(rows[0])), rows, strict=True):
         for axis in row:
             axis.set_axis_off()
-        for axis, (title, image) in zip(row, cells, strict=False):  # the last row is shorter where tissue is known
+        for axis, (title, image) in zip(row, cells, strict=False):  # rows below the frames are shorter
             axis.imshow(image)
             axis.set_title(title, fontsize=8)
     loss_axis, psnr_axis, table_axis = bottom.subplots(1, 3, width_ratios=[1, 1, 1.1])
@@ -95,6 +99,19 @@ def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, N
         ]
         rows.append(cells)
     return rows
+
+
+def _side_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[np.uint8]]]:
+    frames = sequence.frames("test")
+    frame = frames[(len(frames) - 1) // 2]
+    depths = frame.depth[frame.depth_valid & frame.tissue_mask]
+    distance = float(np.median(depths)) if depths.size else float(np.mean(depth_span(scene)))
+    cells = []
+    for degrees in TURNS_DEG:
+        out = scene.render(frame.time, turned(frame.camera, degrees, distance))
+        side = "right" if degrees > 0 else "left"
+        cells.append((f"frame {frame.index} from {abs(degrees)} degrees {side}", to_u8(out.color.cpu().numpy())))
+    return cells
 
 
 def _texture_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[np.uint8]]]:

@@ -35,6 +35,13 @@ def sway_path(times: list[float], cameras: tuple[Camera, ...], distance_mm: floa
     return views
 
 
+def turned(camera: Camera, degrees: float, distance_mm: float) -> Camera:
+    """`camera`, turned about a vertical axis through the point `distance_mm` ahead; above 0 it moves to its right."""
+    angle = np.deg2rad(degrees)
+    position = distance_mm * np.array([np.sin(angle), 0, 1 - np.cos(angle)])
+    return replace(camera, world_to_camera=_looking(position, distance_mm) @ camera.world_to_camera)
+
+
 def _looking(position: NDArray, distance: float) -> NDArray:
     """(4, 4) transform from camera axes to those of a camera at `position` that points at (0, 0, distance)."""
     forward = np.array([0, 0, distance]) - position

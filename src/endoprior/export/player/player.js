@@ -6,6 +6,7 @@ const LONGEST_STEP = 0.25; // s that playing may jump when the browser was busy
 const BUDGET = 60; // ms for an image in motion: fewer pixels if it takes longer, all of them once it is static
 const COARSEST = 0.25; // of the full width
 const REST = 250; // ms after the last change
+const SWAY = { angle: 0.12, period: 6, turns: 2 }; // rad to both sides, s, how often: the start shows that it is a model
 
 const byId = (id) => document.getElementById(id);
 const stage = byId("stage");
@@ -14,6 +15,8 @@ const about = JSON.parse(byId("about").textContent);
 const numFrames = about.seconds.length;
 const state = { frame: 0, clock: 0, playing: false, speed: 1, loop: true, free: false, depth: false, base: 0 };
 const hand = new FreeCamera(about.focus);
+const swaying = new FreeCamera(about.focus); // until the first touch
+let swayedFor = window.matchMedia("(prefers-reduced-motion: reduce)").matches ? Infinity : 0; // s
 let painter = null;
 let sorter = null;
 let stale = true;
@@ -61,7 +64,9 @@ function fit() {
 function requestPicture(share) {
   stale = false;
   const { free, depth, frame } = state;
-  const view = free ? hand.view(recordedView(about, state.base), fit().size) : recordedView(about, frame);
+  const recorded = recordedView(about, free ? state.base : frame);
+  const beside = swayedFor < Infinity ? swaying.view(recorded, recorded.size) : recorded;
+  const view = free ? hand.view(recorded, fit().size) : beside;
   sorter.ask({ frame, weights: depthWeights(about, view), nearZ: NEAR_Z, view, depth, share });
 }
 
@@ -127,6 +132,27 @@ function tellWhere() {
 }
 
 // ---- view
+
+// One step of the sway at the start; it ends in the recorded view.
+function sway(seconds) {
+  if (swayedFor === Infinity) return;
+  swayedFor += Math.min(seconds, LONGEST_STEP);
+  if (swayedFor >= SWAY.turns * SWAY.period) {
+    endSway();
+    return;
+  }
+  document.body.dataset.sway = "on";
+  swaying.yaw = SWAY.angle * Math.sin((2 * Math.PI * swayedFor) / SWAY.period);
+  stale = true;
+}
+
+function endSway() {
+  if (swayedFor === Infinity) return;
+  swayedFor = Infinity;
+  swaying.reset();
+  document.body.dataset.sway = "ended";
+  changed();
+}
 
 function setFree(free) {
   if (free && !state.free) state.base = state.frame;
@@ -283,6 +309,7 @@ function connect() {
     stale = true;
   });
   document.addEventListener("keydown", onKey);
+  for (const name of ["pointerdown", "wheel", "keydown"]) document.addEventListener(name, endSway, { capture: true });
   new ResizeObserver(() => { stale = true; }).observe(stage);
 }
 
@@ -308,11 +335,12 @@ function run() {
   let before = performance.now();
   const tick = (now) => {
     if (state.playing) advance((now - before) / 1000);
+    sway((now - before) / 1000);
     before = now;
     const took = painter.finished();
     if (took > 0) learnFrom(took);
     if (!painter.busy && !sorter.asked) {
-      const share = state.playing || touching.size || now - changedAt < REST ? quality : 1;
+      const share = state.playing || swayedFor < Infinity || touching.size || now - changedAt < REST ? quality : 1;
       const fine = !stale && drawnQuality >= share;
       canvas.dataset.settled = fine && share === 1;
       if (!fine) requestPicture(share);
