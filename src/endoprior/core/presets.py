@@ -97,7 +97,7 @@ def default() -> Config:
         temporal=replace(
             base.temporal, start_iteration=500, max_points=1024, min_valid=1, valid_at_both=False, gradient="current"
         ),
-        density=replace(base.density, grow_threshold=1.5e-4, max_scale_share=0.02),
+        density=replace(base.density, grow_threshold=1.5e-4, max_scale_share=0.025),
         optim=replace(
             base.optim,
             means_lr=5e-3,
