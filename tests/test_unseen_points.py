@@ -73,7 +73,7 @@ def test_everything_and_nothing_known() -> None:
 def test_behind_a_tool_that_stands_still_the_tissue_goes_on() -> None:
     frames = [frame(k, with_tool(slice(120, 200))) for k in range(4)]
     found, motion = unseen_points(frames, cloud_of(frames), None, BASIS)
-    assert motion is None and len(found) == (80 // SIZE - 2) ** 2  # points beside the tool reach one cell farther
+    assert motion is None and len(found) == (80 // SIZE) ** 2
     pixels, z = project(found.points.astype(np.float64), CAMERA)
     np.testing.assert_allclose(z, 60 + 20 * pixels[:, 0] / WIDTH, rtol=0.01)
     np.testing.assert_allclose(found.colors, np.tile(COLOR / 255, (len(found), 1)), atol=1e-5)

@@ -1,7 +1,7 @@
 """Points where no frame shows tissue: behind tools that stand still, and where depth is missing.
 
 Without them a scene has holes there, black from the front and open from the side. Each frame is cut into cells. A cell
-without measured tissue, near which no point of another frame has moved, gets a point: color and inverse depth continue
+without measured tissue, into which no point of another frame has moved, gets a point: color and inverse depth continue
 those around it smoothly (Laplace's equation), and it moves as the points around it do. Cells beyond the convex hull of
 all tissue, such as the corners around a round picture, stay empty.
 
@@ -103,10 +103,8 @@ def _fill(frame: Frame, points: NDArray, within: NDArray[np.bool_]) -> tuple[NDA
     pixels, z = project(points.astype(np.float64), camera)
     inside = (z > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
     x, y = cells_at(pixels[inside], camera.width, camera.height)
-    reached = np.zeros(shown.shape, np.uint8)
-    reached[y // size, x // size] = 1
-    # What few frames show has few points; a guess between them would hide what they saw.
-    covered = shown | ~within | (cv2.dilate(reached, np.ones((3, 3), np.uint8)) > 0)
+    covered = shown | ~within
+    covered[y // size, x // size] = True
     if covered.all() or not shown.any():
         return np.zeros((0, 3)), np.zeros((0, 3))
     trusted = eroded_mask(frame.tissue_mask, rim) & measured
