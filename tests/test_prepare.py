@@ -80,6 +80,7 @@ def test_a_stereo_video_becomes_a_sequence(tmp_path, phantom, layout):
         if layout != "interlaced":
             assert np.abs(frame.rgb_u8.astype(int) - original.rgb_u8).mean() < 2  # H.264
     assert len(list((done.out / "right").glob("*.png"))) == FRAMES
+    assert sequence.right_eye.baseline_mm == pytest.approx(load_sequence(phantom).right_eye.baseline_mm)
     assert not sequence.depth_is_relative and "stereo" in sequence.sources["depth"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "v.mp4"]
 

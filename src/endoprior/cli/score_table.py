@@ -11,7 +11,7 @@ LINE = "  {group:<7} {label:<18} {value:>15} {arrow:1}  {hint}"
 
 
 def score_table(scores: Mapping[str, float], skipped: Mapping[str, str], relative: bool = False) -> list[str]:
-    """The lines of the table, at most 26 and as many as there are reasons for skipped scores.
+    """The lines of the table, at most 27 and as many as there are reasons for skipped scores.
 
     Args:
         scores: value by name.
@@ -38,7 +38,9 @@ def _summary(names: Mapping[str, object]) -> list[Score]:
 
 
 def _references(score: Score, scores: Mapping[str, float]) -> str:
-    """What chained optical flow and no motion score, for scores of tracks."""
+    """What chained optical flow and no motion score, for scores of tracks; what a warp does, for the right eye."""
+    if (warp := scores.get(f"{score.name}_warp")) is not None:
+        return f"left eye moved by depth {warp:,.{score.digits}f}"
     if f"{score.name}_still" not in scores:
         return ""
     known = {what: scores.get(f"{score.name}_{end}") for end, what in (("dis", "chained flow"), ("still", "no motion"))}

@@ -6,6 +6,7 @@ No torch here: images are NumPy arrays.
 from .depth import clean_depth
 from .depth_files import read_depth_file
 from .load import load_sequence
+from .right_eye import RightEye
 from .sequence import FrameList, FrameSequence, Split
 from .shrink import shrunk
 from .stir import nearest_end_errors, write_stir_tracks
@@ -14,6 +15,7 @@ from .truth import Truth
 __all__ = [
     "FrameList",
     "FrameSequence",
+    "RightEye",
     "Split",
     "Truth",
     "clean_depth",

@@ -13,6 +13,7 @@ from ..core.config import DataConfig
 from ..core.geometry import FARTHEST_MM
 from ..core.types import Camera, Frame
 from .depth import clean_depth
+from .right_eye import RightEye
 from .sequence import FrameSequence
 from .shrink import shrunk, shrunk_camera
 from .truth import Truth
@@ -49,6 +50,7 @@ def assemble(
     clip_depth: bool = True,
     frames_per_second: float | None = None,
     truth: Truth | None = None,
+    right_eye: RightEye | None = None,
     remarks: list[str] | None = None,
     mask_folder: str = "masks",
     mask_files: list[Path] | None = None,
@@ -67,7 +69,7 @@ def assemble(
         files: the other files of the sequence, for its fingerprint.
         clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where the extremes of depth are
             reliable, because it was measured or rendered.
-        frames_per_second, truth, remarks, mask_folder, depth_is_relative, sources: see `FrameSequence`.
+        frames_per_second, truth, right_eye, remarks, mask_folder, depth_is_relative, sources: see `FrameSequence`.
         mask_files, mask_tool_value: see `FrameSequence`; at full size.
     Raises:
         InputError: fewer than 2 frames or no pixel would be left, or a camera has impossible numbers.
@@ -97,8 +99,9 @@ def assemble(
         mask_files=mask_files if cfg.shrink == 1 else None,
         mask_tool_value=mask_tool_value,
         images=images,
-        files=[*images, *files],
+        files=[*images, *files, *(right_eye.files if right_eye else [])],
         truth=truth,
+        right_eye=right_eye,
         remarks=remarks,
         depth_is_relative=depth_is_relative,
         sources=sources,

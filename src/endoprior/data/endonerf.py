@@ -21,6 +21,7 @@ from .formats import Format
 from .images import read_color, read_depth, read_tool_mask
 from .numpy_files import read_numpy
 from .poses import demand_rotations, world_to_camera
+from .right_eye import open_right_eye
 from .sequence import FrameSequence
 from .truth import Truth
 
@@ -68,8 +69,10 @@ def load_endonerf(
     cameras = _cameras(poses, described, width, height, pose_axes, path, remarks)
     remarks += check_frames(path / "sequence.json", described, len(images))
     kept = kept_frames(len(images), cfg)
-    images, masks, depths = ([files[i] for i in kept] for files in (images, masks, depths))
     size, scale = (width, height), cfg.depth_unit_mm or described.get("depth_scale", 1.0)
+    relative = described.get("depth_relative", False)
+    right_eye = open_right_eye(path, images, kept, size, described, cfg.shrink, remarks, relative=relative)
+    images, masks, depths = ([files[i] for i in kept] for files in (images, masks, depths))
     tool_value = described.get("mask_tool_value", 255)
 
     def decode(index: int) -> Pixels:
@@ -93,11 +96,12 @@ def load_endonerf(
         files=[*masks, *depths, path / "poses_bounds.npy", *description, *(fact_files or [])],
         frames_per_second=float(rate) / (cfg.stride or 1) if rate is not None else None,
         truth=truth,
+        right_eye=right_eye,
         remarks=remarks,
         mask_folder=folders[1],
         mask_files=masks,
         mask_tool_value=tool_value,
-        depth_is_relative=described.get("depth_relative", False),
+        depth_is_relative=relative,
         sources=described.get("sources"),
     )
 

@@ -15,6 +15,7 @@ from .files import IMAGE_SUFFIXES, demand_count, list_files, unequal_names
 from .formats import Format
 from .images import read_color, read_tool_mask
 from .poses import identity_poses
+from .right_eye import open_right_eye
 from .sequence import FrameSequence
 
 ASSUMED_FOCAL = 0.9
@@ -59,8 +60,10 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
         remarks.append(f"{path}: no focal length given, {ASSUMED_FOCAL:g} image widths ({focal:g} px) are assumed")
     shape = (width, height, *intrinsics_of(path / "sequence.json", described, width, height, ASSUMED_FOCAL * width))
     kept = kept_frames(len(images), cfg)
-    images, masks, depths = ([files[i] for i in kept] if files else [] for files in (images, masks, depths))
     size, tool_value = (width, height), described.get("mask_tool_value", 255)
+    relative = described.get("depth_relative", not unit)
+    right_eye = open_right_eye(path, images, kept, size, described, cfg.shrink, remarks, relative=relative)
+    images, masks, depths = ([files[i] for i in kept] if files else [] for files in (images, masks, depths))
 
     def decode(index: int) -> Pixels:
         tool = read_tool_mask(masks[index], tool_value, size) if masks else np.zeros((height, width), bool)
@@ -77,11 +80,12 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
         images=images,
         files=[*masks, *depths, *([path / "sequence.json"] if described else [])],
         frames_per_second=float(rate) / (cfg.stride or 1) if rate is not None else None,
+        right_eye=right_eye,
         remarks=remarks,
         mask_folder=mask_folder,
         mask_files=masks,
         mask_tool_value=tool_value,
-        depth_is_relative=described.get("depth_relative", not unit),
+        depth_is_relative=relative,
         sources=described.get("sources"),
     )
 

@@ -20,6 +20,7 @@ from ..core.checks import input_error
 from ..core.types import Camera, Frame
 from ..system.memory import BoundedCache, cache_bytes, workers
 from .description import TOOLS_FOUND
+from .right_eye import RightEye
 from .truth import Truth
 
 Split = Literal["train", "test", "video"]
@@ -43,6 +44,7 @@ class FrameSequence:
         images: list[Path] | None = None,
         files: list[Path] | None = None,
         truth: Truth | None = None,
+        right_eye: RightEye | None = None,
         remarks: list[str] | None = None,
         mask_folder: str = "masks",
         mask_files: list[Path] | None = None,
@@ -60,6 +62,7 @@ class FrameSequence:
             images: the color image of each frame, None if frames are not files of their own.
             files: every file that makes up the sequence, for `fingerprint`.
             truth: ground truth of a synthetic sequence.
+            right_eye: pictures of the right camera, to score against.
             remarks: what is unusual but usable, one line each.
             mask_folder: name of the folder of the masks, for messages.
             mask_files: the PNG of each frame's mask at the size of the frame; None if there are no such files.
@@ -71,7 +74,7 @@ class FrameSequence:
         self.depth_is_relative = depth_is_relative
         self.sources = dict(sources or {})
         self.frames_per_second = frames_per_second
-        self.truth = truth
+        self.truth, self.right_eye = truth, right_eye
         self.image_names = [image.stem for image in images or []]
         """Name of each frame's color image, without its suffix; empty if frames are not files of their own."""
         self.mask_files, self.mask_tool_value = list(mask_files or []), mask_tool_value
@@ -133,9 +136,9 @@ class FrameSequence:
         return FrameList(self, self.indices(split))
 
     def training_view(self) -> FrameSequence:
-        """This sequence without ground truth, in which reading a test frame is an error: what a method trains on."""
+        """What a method trains on: no ground truth and no right eye, and reading a test frame is an error."""
         view = copy(self)
-        view.truth, view._holds_out = None, True
+        view.truth, view.right_eye, view._holds_out = None, None, True
         return view
 
     def without_masks(self) -> FrameSequence:

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from ..core.types import Camera, Frame
 
 
-def _steps(camera: Camera, factor: int) -> tuple[int, int]:
+def _steps(width: int, height: int, factor: int) -> tuple[int, int]:
     """Columns and rows of the blocks that become one pixel: `factor`, or the whole side if it is shorter."""
-    return min(factor, camera.width), min(factor, camera.height)
+    return min(factor, width), min(factor, height)
 
 
 def shrunk_camera(camera: Camera, factor: int) -> Camera:
     """The camera of images that are `factor` times smaller: sizes rounded down, at least 1 px."""
-    across, down = _steps(camera, factor)
+    across, down = _steps(camera.width, camera.height, factor)
     return replace(
         camera,
         width=camera.width // across,
@@ -30,6 +30,15 @@ def shrunk_camera(camera: Camera, factor: int) -> Camera:
     )
 
 
+def shrunk_color(rgb_u8: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """(H, W, 3) color at 1 / `factor` of its size, as `shrunk` has it: each pixel is the mean of its block."""
+    if factor == 1:
+        return rgb_u8
+    across, down = _steps(rgb_u8.shape[1], rgb_u8.shape[0], factor)
+    width, height = rgb_u8.shape[1] // across, rgb_u8.shape[0] // down
+    return cv2.resize(rgb_u8[: down * height, : across * width], (width, height), interpolation=cv2.INTER_AREA)
+
+
 def shrunk(frame: Frame, factor: int) -> Frame:
     """The frame at 1 / `factor` of its width and height, rounded down; a side shorter than `factor` becomes 1 px.
 
@@ -37,16 +46,15 @@ def shrunk(frame: Frame, factor: int) -> Frame:
     """
     if factor == 1:
         return frame
-    camera, steps = shrunk_camera(frame.camera, factor), _steps(frame.camera, factor)
-    width, height = camera.width, camera.height
+    camera = shrunk_camera(frame.camera, factor)
+    steps, width, height = _steps(frame.camera.width, frame.camera.height, factor), camera.width, camera.height
     with np.errstate(over="ignore"):  # a mean beyond float32 counts as missing
         depth = _blocks(frame.depth, width, height, steps).mean((1, 3), dtype=np.float32)
     valid = _blocks(frame.depth_valid, width, height, steps).all((1, 3)) & np.isfinite(depth)
-    rgb_u8 = frame.rgb_u8[: steps[1] * height, : steps[0] * width]
     return replace(
         frame,
         camera=camera,
-        rgb_u8=cv2.resize(rgb_u8, (width, height), interpolation=cv2.INTER_AREA),
+        rgb_u8=shrunk_color(frame.rgb_u8, factor),
         tissue_mask=_blocks(frame.tissue_mask, width, height, steps).all((1, 3)),
         depth=np.where(valid, depth, np.float32(0)),
         depth_valid=valid,

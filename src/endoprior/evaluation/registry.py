@@ -25,6 +25,7 @@ SCORERS = (
     "primitives",
     "behind_tool",
     "sides",
+    "right_eye",
     "tracks",
     "speed",
 )

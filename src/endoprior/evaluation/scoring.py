@@ -96,6 +96,7 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
         "depth": "sum of weight * z against measured depth on tissue, mean of per-frame RMSE; " + unit,
         "flow_error": "consecutive frames of the split; *_adjacent: all adjacent frames of the video",
         "track_*": "all frames of the video; *_dis: optical flow chained over them, held-out frames included",
+        "right_*": "tissue that both eyes see by measured depth; right pictures as they are, left mask",
         "depth_instability_mm": "all adjacent frames of the video",
         "data_fingerprint": sequence.fingerprint(),
     }

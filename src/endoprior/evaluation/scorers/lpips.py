@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from .. import metrics
 from ..context import NETWORKS_OFF, EvaluationContext
 from ..score import Score
@@ -32,3 +34,13 @@ def compute(context: EvaluationContext) -> None:
                 distance(context.rendered[frame.index].rgb, frame.rgb, frame.tissue_mask) for frame in context.frames
             ]
             context.add_mean(name, values, "no tissue in the split")
+
+
+def squeeze_distance(context: EvaluationContext, name: str) -> Callable[..., float] | None:
+    """The distance by SqueezeNet; None, with the reason recorded for the score `name`, where it cannot be computed."""
+    if not context.networks:
+        context.skip(name, NETWORKS_OFF)
+        return None
+    with context.skip_if_unavailable(name):
+        return metrics.lpips_distance("squeeze", context.weights_dir, download=False)
+    return None

@@ -5,7 +5,7 @@ Only tissue that the endoscope sees in the same frame counts (`phantom/side_view
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from ...core.geometry import expected_depth
 from .. import metrics
-from ..context import NETWORKS_OFF, EvaluationContext
+from ..context import EvaluationContext
 from ..score import Score
+from .lpips import squeeze_distance
 
 VEIL_SHARE = 0.05
 """Something hangs before the tissue where rendered depth is nearer than the true one by more than this share."""
@@ -78,7 +79,7 @@ def compute(context: EvaluationContext) -> None:
     if truth is None or not truth.side_poses:
         return
     with context.skip_if_unavailable(*(score.name for score in SCORES)):
-        lpips = _lpips(context)
+        lpips = squeeze_distance(context, "side_lpips")
         names = [score.name for score in SCORES if score.name != "side_lpips" or lpips is not None]
         values: dict[str, list[float]] = {name: [] for name in names}
         for pair in _pairs(context):  # one after the other: the pictures of a long sequence do not fit in memory
@@ -92,16 +93,6 @@ def compute(context: EvaluationContext) -> None:
                 values["side_lpips"].append(lpips(pair.rgb, pair.true_rgb, pair.counted))
         for name, found in values.items():
             context.add_mean(name, found, NO_TISSUE)
-
-
-def _lpips(context: EvaluationContext) -> Callable[..., float] | None:
-    """The distance by SqueezeNet; None, with the reason recorded, where it cannot be computed."""
-    if not context.networks:
-        context.skip("side_lpips", NETWORKS_OFF)
-        return None
-    with context.skip_if_unavailable("side_lpips"):
-        return metrics.lpips_distance("squeeze", context.weights_dir, download=False)
-    return None
 
 
 def veil(pair: SidePair) -> float:

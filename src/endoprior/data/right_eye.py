@@ -1,0 +1,94 @@
+"""The right eye of a stereo endoscope: pictures that are only scored against, never trained on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .description import LEAST, MOST
+from .files import IMAGE_SUFFIXES, files_with, unequal_names
+from .image_header import stored_size
+from .images import read_color
+from .reading import read_bytes
+from .shrink import shrunk_color
+
+FOLDER = "right"
+"""Name of the folder of the right images."""
+
+
+class RightEye:
+    """The right pictures of a rectified pair; each is decoded when it is used.
+
+    The right camera has the lens of the left one, turned like it, and stands `baseline_mm` along its +x axis.
+    """
+
+    def __init__(self, files: list[Path], baseline_mm: float, size: tuple[int, int], shrink: int = 1) -> None:
+        """Describe the pictures; nothing is decoded yet.
+
+        Args:
+            files: the right picture of each frame.
+            baseline_mm: distance of the cameras, > 0.
+            size: (width, height) of the files, px.
+            shrink: pictures are this many times smaller than the files.
+        """
+        self.files, self.baseline_mm = files, baseline_mm
+        self._size, self._shrink = size, shrink
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """(H, W, 3) right picture of frame `index` at the size of the left one, 0..255.
+
+        Raises:
+            InputError: the file cannot be used, or has another size than the left one.
+        """
+        return shrunk_color(read_color(self.files[index], self._size), self._shrink)
+
+
+def open_right_eye(
+    path: Path,
+    images: list[Path],
+    kept: list[int],
+    size: tuple[int, int],
+    described: dict[str, Any],
+    shrink: int,
+    remarks: list[str],
+    *,
+    relative: bool,
+) -> RightEye | None:
+    """The right eye of a sequence folder, if it has one that can be used; else a remark says why not.
+
+    Args:
+        path: the folder; nothing is said of one without `right/`.
+        images: the left picture of every frame in the folder.
+        kept: positions in `images` of the frames to read.
+        size: (width, height) of the left pictures, px.
+        described: contents of `sequence.json`, of which `baseline_mm` is used.
+        shrink: see `RightEye`.
+        remarks: gets the reason, or that the names of the files look wrong.
+        relative: whether the scale of depth is unknown: then a baseline in mm does not fit the scene.
+    Raises:
+        InputError: the folder or its first picture cannot be read.
+    """
+    folder = path / FOLDER
+    if not folder.is_dir():
+        return None
+    files, baseline = files_with(folder, IMAGE_SUFFIXES), described.get("baseline_mm")
+    reason = ""
+    if len(files) != len(images):
+        reason = f"it has {len(files)} images, and images/ has {len(images)}"
+    elif baseline is None:
+        reason = "sequence.json has no baseline_mm, the distance between the cameras"
+    elif isinstance(baseline, bool) or not isinstance(baseline, int | float) or not LEAST <= baseline <= MOST:
+        reason = f"baseline_mm in sequence.json is {repr(baseline)[:60]}, not a number in [{LEAST:g}, {MOST:g}]"
+    elif relative:
+        reason = "the scale of the depth is unknown, and the distance between the cameras is in mm"
+    elif (found := stored_size(read_bytes(files[0]).tobytes())) != size:
+        got = "no size that can be read" if found is None else f"{found[0]}x{found[1]} px"
+        reason = f"its first image has {got}, and the left one {size[0]}x{size[1]} px"
+    if reason:
+        remarks.append(f"{folder}: ignored, because {reason}")
+        return None
+    remarks += unequal_names(images, files)
+    return RightEye([files[i] for i in kept], float(baseline), size, shrink)

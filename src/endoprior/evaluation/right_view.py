@@ -1,0 +1,115 @@
+"""What the right eye sees of the left picture, by measured depth: pure functions of NumPy arrays.
+
+A point at column x of the left image is at column x - disparity of the right one; disparity is fx baseline / z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.geometry import bilinear, pixel_centers
+from ..core.types import Camera
+
+STEEPEST = 1.0
+"""Neighbors of a row lie on one surface where their disparities differ by less than this, px per px."""
+NEAREST = 0.5
+"""A tool without depth may be as near as this share of the smallest measured depth of the frame."""
+
+
+def right_camera(camera: Camera, baseline_mm: float) -> Camera:
+    """The camera that stands `baseline_mm` along the +x axis of `camera`, with its lens and turned like it."""
+    moved = np.eye(4)
+    moved[0, 3] = -baseline_mm
+    return replace(camera, world_to_camera=moved @ camera.world_to_camera)
+
+
+def warp_to_right(
+    rgb: NDArray[np.floating], disparity: NDArray[np.floating], tissue: NDArray[np.bool_]
+) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+    """The left picture as the right eye sees it, on tissue that both eyes see.
+
+    Args:
+        rgb: (H, W, 3) left picture.
+        disparity: (H, W) of the left image, px; 0 where no depth was measured.
+        tissue: (H, W) True on tissue of the left image. All else hides what is behind it.
+    Returns:
+        (H, W, 3) right picture, read bilinearly from the left one, 0 where the pixel does not count; and (H, W) True
+        where it counts: both eyes see tissue there and in the 8 pixels around, where its depth was measured.
+    """
+    seen = right_disparity(disparity, tissue)
+    # Pixels on a silhouette mix the colors of two surfaces.
+    counted = cv2.erode((seen > 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    pixels = pixel_centers(disparity.shape[1], disparity.shape[0]).astype(np.float64)
+    pixels[..., 0] += seen
+    return np.where(counted[..., None], bilinear(rgb, pixels), 0).astype(rgb.dtype), counted
+
+
+def right_disparity(disparity: NDArray[np.floating], tissue: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(H, W) disparity of the tissue that both eyes see, at the pixel centers of the right image, px; 0 elsewhere.
+
+    The left image's pixels are points of surfaces. Neighbors of a row on one surface are joined by a line, which is
+    exact on planes; a point that is not joined to both sides covers the one pixel in which it lies. The nearest wins.
+    Tools without depth hide all that they may hide. Arguments as `warp_to_right`.
+    """
+    height, width = disparity.shape
+    left = np.arange(width) + 0.5
+    near = disparity.astype(np.float64)
+    nearest, seen = np.zeros((height, width)), np.zeros((height, width), bool)
+    samples = _samples(left, near, tissue)
+    for rows, columns, values, _ in samples:
+        np.maximum.at(nearest, (rows, columns), values)
+    for is_tissue in (True, False):  # a tool at the same depth hides the tissue
+        for rows, columns, values, of_tissue in samples:
+            won = (values == nearest[rows, columns]) & (of_tissue == is_tissue)
+            seen[rows[won], columns[won]] = is_tissue
+    return np.where(seen & ~_maybe_hidden(near, tissue), nearest, 0)
+
+
+Samples = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64], NDArray[np.bool_]]
+
+
+def _samples(left: NDArray[np.float64], near: NDArray[np.float64], tissue: NDArray[np.bool_]) -> list[Samples]:
+    """Row, column, disparity, and whether it is tissue, of all that may be seen at pixels of the right image."""
+    width, known = len(left), near > 0
+    joined = known[:, :-1] & known[:, 1:] & (np.abs(np.diff(near, axis=1)) < STEEPEST)
+    both = np.pad(joined, ((0, 0), (1, 0))) & np.pad(joined, ((0, 0), (0, 1)))
+    rows, at = np.nonzero(known & ~both)
+    found = [(rows, np.floor(left[at] - near[rows, at]).astype(np.intp), near[rows, at], tissue[rows, at])]
+    rows, at = np.nonzero(joined)
+    begin, end = left[at] - near[rows, at], left[at + 1] - near[rows, at + 1]
+    first = np.ceil(begin - 0.5)
+    for step in (0, 1):  # a line is shorter than 2 px, and so passes at most two centers
+        center = first + step + 0.5
+        share = (center - begin) / (end - begin)
+        values = near[rows, at] * (1 - share) + near[rows, at + 1] * share
+        on = center <= end
+        whole = tissue[rows, at] & tissue[rows, at + 1]
+        found.append((rows[on], (first + step)[on].astype(np.intp), values[on], whole[on]))
+    inside = [(columns >= 0) & (columns < width) for _, columns, _, _ in found]
+    return [tuple(part[keep] for part in sample) for sample, keep in zip(found, inside, strict=True)]
+
+
+def _maybe_hidden(near: NDArray[np.float64], tissue: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H, W) True where the right eye may see a tool whose depth is unknown, in place of what is measured there.
+
+    Such are the tool's pixels without depth, and the part of a tool that goes on beyond the right border of the left
+    image. Each may lie anywhere between the farthest tissue of the frame and `NEAREST` of the smallest depth.
+    """
+    height, width = near.shape
+    measured = near[tissue & (near > 0)]
+    hidden = np.zeros((height, width), bool)
+    if not measured.size:
+        return hidden
+    least, most = measured.min(), near.max() / NEAREST
+    beyond = np.repeat(~tissue[:, -1:], int(min(np.ceil(most), width)), 1)
+    rows, at = np.nonzero(np.concatenate([~tissue & ~(near > 0), beyond], 1))
+    begin = np.clip(np.floor(at + 0.5 - most), 0, width).astype(np.intp)
+    end = np.clip(np.floor(at + 0.5 - least) + 1, 0, width).astype(np.intp)
+    marks = np.zeros((height, width + 1), np.int64)
+    np.add.at(marks, (rows, begin), 1)
+    np.add.at(marks, (rows, end), -1)
+    return np.cumsum(marks, 1)[:, :width] > 0

@@ -1,0 +1,71 @@
+"""The scene as the right eye of a stereo endoscope sees it, against its picture, which no method trains on.
+
+Only tissue that both eyes see counts, by measured depth (`evaluation/right_view.py`). The left picture, moved to the
+right eye by that depth, is scored beside the scene.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.types import Frame
+from .. import metrics
+from ..context import EvaluationContext
+from ..right_view import right_camera, warp_to_right
+from ..score import Score
+from .lpips import squeeze_distance
+
+SCORES = (
+    Score(
+        "right_psnr", "right eye PSNR", "dB", True, 2,
+        "PSNR of tissue seen by both eyes, from the right one, which was not trained on; stereo sequences only.",
+        "absolute", group="image", hint="a view never trained on",
+    ),
+    Score(
+        "right_lpips", "right eye LPIPS", "", False, 4,
+        "LPIPS by SqueezeNet of these pictures, where its weights are on this machine.",
+        group="image", in_summary=False,
+    ),
+    Score(
+        "right_psnr_warp", "right eye PSNR, warp", "dB", True, 2,
+        "PSNR of these pixels in the left picture, moved to the right eye by measured depth; no scene is needed.",
+        "absolute", group="image", in_summary=False,
+    ),
+)  # fmt: skip
+NO_TISSUE = "no tissue with measured depth that both eyes see"
+
+
+def compute(context: EvaluationContext) -> None:
+    """Score every frame of the split; nothing without a right eye."""
+    eye = context.sequence.right_eye
+    if eye is None:
+        return
+    scene = None
+    with context.skip_if_unavailable("right_psnr", "right_lpips"):  # rendered images: only the warp is scored
+        scene = context.scene
+    lpips = squeeze_distance(context, "right_lpips") if scene else None
+    rows: list[dict[str, float]] = []
+    for frame in context.frames:
+        true = eye.image(frame.index) / np.float32(255)
+        warped, counted = warp_to_right(frame.rgb, measured_disparity(frame, eye.baseline_mm), frame.tissue_mask)
+        row = {"right_psnr_warp": metrics.psnr_tissue(warped, true, counted)}
+        if scene:
+            view = scene.render(frame.time, right_camera(frame.camera, eye.baseline_mm)).color.cpu().numpy()
+            row["right_psnr"] = metrics.psnr_tissue(view, true, counted)
+            if lpips is not None:
+                row["right_lpips"] = lpips(view, true, counted)
+        rows.append(row)
+    context.add_frames(rows, NO_TISSUE)
+
+
+def measured_disparity(frame: Frame, baseline_mm: float) -> NDArray[np.float64]:
+    """(H, W) fx baseline / z, px; 0 without measured depth, and where depth was clipped when it was read.
+
+    Clipped depth is known by being the smallest or the largest of the frame. If all is equal, nothing was clipped.
+    """
+    depth = np.where(frame.depth_valid, frame.depth, 0).astype(np.float64)
+    measured = depth[depth > 0]
+    if measured.size and measured.min() < measured.max():
+        depth[(depth == measured.min()) | (depth == measured.max())] = 0
+    return np.divide(frame.camera.fx * baseline_mm, depth, out=np.zeros_like(depth), where=depth > 0)
