@@ -53,14 +53,25 @@ def test_total_variation_is_the_double_loop():
     assert losses_torch.total_variation(image).item() == pytest.approx(total / image.numel(), rel=1e-5)
 
 
+def test_total_variation_leaves_out_differences_between_two_such_pixels():
+    image = torch.tensor([[0.0, 1.0, 3.0], [7.0, 15.0, 31.0]])
+    left_out = torch.tensor([[True, True, False], [False, True, True]])
+    # right: 2 (1 -> 3), 8 (7 -> 15); down: 7 (0 -> 7), 28 (3 -> 31); left out: 0 -> 1, 15 -> 31, 1 -> 15.
+    assert losses_torch.total_variation(image, left_out).item() == pytest.approx((2 + 8 + 7 + 28) / 6)
+    everywhere = torch.ones_like(left_out)
+    assert losses_torch.total_variation(image, everywhere) == 0
+    assert losses_torch.total_variation(image, ~everywhere) == losses_torch.total_variation(image)
+
+
+@pytest.mark.parametrize("tv_on_tissue", [True, False])
 @pytest.mark.parametrize("seed", range(4))
-def test_fused_terms_and_gradients_agree_with_the_torch_implementation(seed):
+def test_fused_terms_and_gradients_agree_with_the_torch_implementation(seed, tv_on_tissue):
     color, depth, *rest = scene(seed)
     weights = (1.0, 0.7, 0.03)
     grads, values = [], []
     for function in (losses_torch.supervised_losses, supervised_losses):
         c, d = color.clone().requires_grad_(), depth.clone().requires_grad_()
-        terms = function(c, d, *rest, weights)
+        terms = function(c, d, *rest, weights, tv_on_tissue)
         terms.sum().backward()
         values.append(terms.detach())
         grads.append((c.grad, d.grad))

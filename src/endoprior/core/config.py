@@ -145,6 +145,8 @@ class LossConfig(Checked):
     """lambda_depth, of the L1 on inverse depth (1 / mm)."""
     tv_weight: Weight = 0.03
     """lambda_tv, of the total variation of color and inverse depth over the whole frame."""
+    tv_on_tissue: bool = True
+    """The total variation counts on visible tissue too; False: only where there is none, as behind tools."""
     depth_mode: Literal["accumulated", "expected"] = "accumulated"
     """Depth that is compared: sum of weight * z, or that divided by alpha."""
     min_depth_pixels: Count = 10

@@ -22,5 +22,6 @@ def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, o
         frame.tissue_mask,
         frame.measured,
         (1.0, depth_weight, cfg.tv_weight),
+        cfg.tv_on_tissue,
     )
     return dict(zip(("color", "depth", "tv"), terms, strict=True))

@@ -26,14 +26,19 @@ def supervised_losses(
     tissue_mask: Tensor,
     measured: Tensor,
     weights: tuple[float, float, float],
+    tv_on_tissue: bool = True,
 ) -> Tensor:
     """See `losses_torch.supervised_losses`. The terms must be summed, not scaled: their gradients are added already."""
-    return _SupervisedLosses.apply(color, depth, target_u8, target_inverse, tissue_mask, measured, weights)
+    return _SupervisedLosses.apply(
+        color, depth, target_u8, target_inverse, tissue_mask, measured, weights, tv_on_tissue
+    )
 
 
 class _SupervisedLosses(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, color, depth, target_u8, target_inverse, tissue_mask, measured, weights) -> Tensor:
+    def forward(
+        ctx: Any, color, depth, target_u8, target_inverse, tissue_mask, measured, weights, tv_on_tissue
+    ) -> Tensor:
         height, width = depth.shape
         arrays = [
             t.detach().contiguous().numpy() for t in (color, depth, target_u8, target_inverse, tissue_mask, measured)
@@ -48,7 +53,7 @@ class _SupervisedLosses(torch.autograd.Function):
         inverse = np.empty_like(arrays[1])
         sums = np.zeros((height, 4), np.float64)
         _invert(arrays[1], inverse)
-        _rows(*arrays, inverse, factors, v_color, v_depth, sums)
+        _rows(*arrays, tv_on_tissue, inverse, factors, v_color, v_depth, sums)
         ctx.grads = torch.from_numpy(v_color), torch.from_numpy(v_depth)
         totals = sums.sum(0) * factors
         return torch.tensor([totals[0], totals[1], totals[2] + totals[3]], dtype=torch.float32)
@@ -59,7 +64,7 @@ class _SupervisedLosses(torch.autograd.Function):
         # Gradients of the three terms are already added up: valid only if all are summed with weight one.
         if not bool((v_terms == 1).all()):
             raise ValueError("the terms of supervised_losses must be added, not scaled; pass `weights` instead")
-        return *ctx.grads, None, None, None, None, None
+        return *ctx.grads, None, None, None, None, None, None
 
 
 @njit(parallel=True, cache=True, fastmath=REORDERED)
@@ -76,7 +81,20 @@ def _sign(x):
 
 
 @njit(parallel=True, cache=True, fastmath=REORDERED)
-def _rows(color, depth, target_u8, target_inverse, tissue_mask, measured, inverse, factors, v_color, v_depth, sums):
+def _rows(
+    color,
+    depth,
+    target_u8,
+    target_inverse,
+    tissue_mask,
+    measured,
+    tv_on_tissue,
+    inverse,
+    factors,
+    v_color,
+    v_depth,
+    sums,
+):
     # One task per row y: writes v_color[y], v_depth[y] and sums[y], the unweighted (color, depth, two variations).
     # The variation's gradient is the signs of the differences to the four neighbors: no task writes another's row.
     # A row is one flat run of numbers, three per pixel for color: loops over it vectorize, loops over channels do not.
@@ -88,14 +106,24 @@ def _rows(color, depth, target_u8, target_inverse, tissue_mask, measured, invers
     for y in prange(height):
         up, down = max(y - 1, 0), min(y + 1, height - 1)
         weight = np.empty(3 * width, np.float32)
+        pairs = np.ones((3, 3 * width), np.float32)
+        if not tv_on_tissue:
+            for x in range(width):
+                for c in range(3 * x, 3 * x + 3):
+                    own = tissue_mask[y, x]
+                    pairs[0, c] = np.float32(not (own and tissue_mask[up, x]))
+                    pairs[1, c] = np.float32(not (own and tissue_mask[down, x]))
+                    pairs[2, c] = np.float32(not (own and tissue_mask[y, min(x + 1, width - 1)]))
         for x in range(width):
             weight[3 * x] = weight[3 * x + 1] = weight[3 * x + 2] = np.float32(tissue_mask[y, x])
         sums[y, 0] = _fidelity(colors[y], targets[y], scale, weight, f_color, v_colors[y])
-        sums[y, 2] = _variation(colors[up], colors[y], colors[down], 3, f_tv, v_colors[y])
+        sums[y, 2] = _variation(colors[up], colors[y], colors[down], 3, f_tv, pairs, v_colors[y])
         for x in range(width):
             weight[x] = np.float32(measured[y, x])
+            for k in range(3):
+                pairs[k, x] = pairs[k, 3 * x]
         sums[y, 1] = _fidelity(inverse[y], target_inverse[y], np.float32(1), weight[:width], f_depth, v_depth[y])
-        sums[y, 3] = _variation(inverse[up], inverse[y], inverse[down], 1, f_tvd, v_depth[y])
+        sums[y, 3] = _variation(inverse[up], inverse[y], inverse[down], 1, f_tvd, pairs, v_depth[y])
         for x in range(width):
             v_depth[y, x] *= -inverse[y, x] * inverse[y, x]
 
@@ -112,17 +140,17 @@ def _fidelity(row, target, scale, weight, factor, v_row):
 
 
 @njit(cache=True, inline="always")
-def _variation(above, row, below, step, factor, v_row):
+def _variation(above, row, below, step, factor, pairs, v_row):
     # Sum of |differences| to the next pixel, `step` numbers on, and to the row below; adds `factor` times the gradient
-    # of the whole image's variation to v_row.
+    # of the whole image's variation to v_row. pairs (3, .): weights of the differences up, down, and to the next pixel.
     total = np.float32(0)
     size = len(row)
     for i in range(size):
-        total += abs(below[i] - row[i])
-        v_row[i] += factor * (_sign(row[i] - above[i]) - _sign(below[i] - row[i]))
+        total += pairs[1, i] * abs(below[i] - row[i])
+        v_row[i] += factor * (pairs[0, i] * _sign(row[i] - above[i]) - pairs[1, i] * _sign(below[i] - row[i]))
     for i in range(size - step):
-        total += abs(row[i + step] - row[i])
-        v_row[i] -= factor * _sign(row[i + step] - row[i])
+        total += pairs[2, i] * abs(row[i + step] - row[i])
+        v_row[i] -= factor * pairs[2, i] * _sign(row[i + step] - row[i])
     for i in range(step, size):
-        v_row[i] += factor * _sign(row[i] - row[i - step])
+        v_row[i] += factor * pairs[2, i - step] * _sign(row[i] - row[i - step])
     return total

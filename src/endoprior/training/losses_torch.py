@@ -31,15 +31,19 @@ def inverse_depth_l1(inverse: Tensor, target: Tensor, measured: Tensor) -> Tenso
     return ((inverse - target).abs() * measured).sum() / measured.sum().clamp(min=1)
 
 
-def total_variation(image: Tensor) -> Tensor:
+def total_variation(image: Tensor, left_out: Tensor | None = None) -> Tensor:
     """Sum of absolute forward differences along both axes, divided by the number of values.
 
     Args:
         image: (H, W) or (H, W, C).
+        left_out: (H, W) bool; a difference between two such pixels does not count. None: all count.
     """
-    down = (image[1:] - image[:-1]).abs().sum()
-    right = (image[:, 1:] - image[:, :-1]).abs().sum()
-    return (down + right) / image.numel()
+    down, right = (image[1:] - image[:-1]).abs(), (image[:, 1:] - image[:, :-1]).abs()
+    if left_out is not None:
+        shape = (*left_out.shape, *[1] * (image.ndim - 2))
+        counted = ~left_out.reshape(shape)
+        down, right = down * (counted[1:] | counted[:-1]), right * (counted[:, 1:] | counted[:, :-1])
+    return (down.sum() + right.sum()) / image.numel()
 
 
 def supervised_losses(
@@ -50,6 +54,7 @@ def supervised_losses(
     tissue_mask: Tensor,
     measured: Tensor,
     weights: tuple[float, float, float],
+    tv_on_tissue: bool = True,
 ) -> Tensor:
     """Weighted color, depth and total-variation terms.
 
@@ -58,13 +63,14 @@ def supervised_losses(
         target_u8: (H, W, 3) uint8. target_inverse: (H, W) 1 / mm.
         tissue_mask, measured: (H, W) bool, True where color, respectively depth, is compared.
         weights: factors of the three terms; the depth term is 0 where its factor is.
+        tv_on_tissue: whether the total variation counts between two pixels of tissue.
     Returns:
         (3,) the weighted terms, differentiable in `color` and `depth`.
     """
-    inverse = inverse_depth(depth)
+    inverse, left_out = inverse_depth(depth), None if tv_on_tissue else tissue_mask
     terms = [
         color_l1(color, target_u8.float() / 255, tissue_mask),
         inverse_depth_l1(inverse, target_inverse, measured),
-        total_variation(color) + total_variation(inverse),
+        total_variation(color, left_out) + total_variation(inverse, left_out),
     ]
     return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)])
