@@ -146,6 +146,16 @@ def test_render_writes_frames_depth_and_a_video(run, tmp_path):
     assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == 2
 
 
+def test_render_of_what_was_seen(run, tmp_path):
+    _, folder = run
+    assert main(["render", str(folder), str(tmp_path / "out"), "--split", "test", "--layer", "support"]) == 0
+    folder = tmp_path / "out" / "support"
+    assert sorted(p.name for p in folder.iterdir()) == [f"{k:06d}.{end}" for k in (1, 9) for end in ("npy", "png")]
+    counts = np.load(folder / "000001.npy")
+    assert counts.shape == (40, 48, 2) and counts.dtype == np.float32 and np.nanmax(counts[..., 0]) > 1
+    assert (tmp_path / "out" / "support.mp4").exists()
+
+
 def test_render_of_chosen_times_and_a_camera_path(run, tmp_path, capsys):
     _, folder = run
     assert main(["render", str(folder), str(tmp_path / "a"), "--times", "0", "0.5", "--camera", "sway"]) == 0

@@ -13,6 +13,7 @@ from endoprior.core.geometry import back_project, pixel_centers, quaternion_to_m
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.initialization.cleanup import PointCloud
+from endoprior.initialization.first_gaussians import first_gaussians
 from endoprior.initialization.normals import flat_along, surface_normals
 from endoprior.model.basis import basis_offsets, basis_weights
 from endoprior.model.gaussians import create_gaussians
@@ -86,12 +87,29 @@ def test_the_third_axis_is_turned_to_the_normal() -> None:
     np.testing.assert_allclose(turned, normals, atol=1e-6)
 
 
-def test_a_flat_start() -> None:
-    cfg = preset("default", **{"init.thickness": 0.25, "deformation.basis.num_bases": 4})
-    quats = np.tile([0.5, 0.5, 0.5, 0.5], (3, 1))
-    made = create_gaussians(np.zeros((3, 3)), np.zeros((3, 3)), np.full(3, math.log(2.0)), cfg, quats)
-    np.testing.assert_allclose(made.scales.detach(), [[2, 2, 0.5]] * 3, rtol=1e-6)
-    assert made["quats"].tolist() == [[0.5] * 4] * 3
+def test_a_start_keeps_its_shapes_and_opacities() -> None:
+    cfg = preset("default", **{"init.opacity": 0.2, "deformation.basis.num_bases": 4})
+    zeros, quats = np.zeros((2, 3)), np.tile([0.5, 0.5, 0.5, 0.5], (2, 1))
+    made = create_gaussians(zeros, zeros, np.log([[2.0, 2, 0.5], [1, 3, 4]]), cfg, quats, np.array([0.9, 0.3]))
+    np.testing.assert_allclose(made.scales.detach(), [[2, 2, 0.5], [1, 3, 4]], rtol=1e-6)
+    np.testing.assert_allclose(made.opacities.detach(), [0.9, 0.3], rtol=1e-6)
+    assert made["quats"].tolist() == [[0.5] * 4] * 2
+    spheres = create_gaussians(zeros, zeros, np.log([2.0, 3]), cfg)
+    np.testing.assert_allclose(spheres.scales.detach(), [[2, 2, 2], [3, 3, 3]], rtol=1e-6)
+    np.testing.assert_allclose(spheres.opacities.detach(), [0.2, 0.2], rtol=1e-6)
+
+
+def test_the_first_gaussians_lie_flat_along_a_slanted_plane() -> None:
+    normal = np.array([0.4, -0.3, 0.9]) / np.linalg.norm([0.4, -0.3, 0.9])
+    cam = camera()
+    frames = [frame_of(plane_depth(normal, 60.0, cam), cam)] * 2
+    cfg = preset("default", **{"init.motion": "rest", "gaussians": 300, "init.thickness": 0.25}).fitted(2)
+    first = first_gaussians(frames, cfg)
+    turned = quaternion_to_matrix(first.quats)[:, :, 2]
+    np.testing.assert_allclose(turned, np.tile(normal, (len(turned), 1)), atol=5e-3)
+    thickness = np.exp(first.log_scales[:, 2] - first.log_scales[:, 0])
+    np.testing.assert_allclose(thickness, 0.25, rtol=1e-5)
+    assert (first.opacities == np.float32(cfg.init.opacity)).all() and first.motion is None
 
 
 def test_scales_over_time_stay_within_the_factor() -> None:

@@ -26,6 +26,9 @@ class Render:
 
     With `--layer texture` it writes texture/*.png and texture.mp4: a grid painted on the first frame, carried by the
     model's motion, beside the input. Where the grid slides on the tissue, the motion is wrong (docs/trust.md).
+
+    With `--layer support` it writes support/*.png and support.mp4: tissue that no frame saw is hatched, tissue from
+    another time is blue; support/*.npy says how many frames saw it and how many seconds away the nearest is.
     """
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
@@ -34,8 +37,8 @@ class Render:
     """Output folder. Default: RUN/renders for the frames and RUN/video.mp4 for the video."""
     split: Literal["video", "test", "train"] = "video"
     """Frames of the sequence to render."""
-    layer: Literal["color", "texture"] = "color"
-    """Color and depth, or a grid on the tissue that shows how the model moves."""
+    layer: Literal["color", "texture", "support"] = "color"
+    """Color and depth; a grid on the tissue that shows how the model moves; or what was seen and what is guessed."""
     times: tuple[float, ...] = ()
     """Times in [0, 1] to render instead of a split."""
     camera: Literal["sequence", "sway"] = "sequence"
@@ -54,6 +57,7 @@ HELP = Help(
         ("RUN", "OUT", "--split", "test"),
         ("RUN", "OUT", "--camera", "sway"),
         ("RUN", "OUT", "--layer", "texture"),
+        ("RUN", "OUT", "--layer", "support"),
     ),
 )
 
@@ -78,19 +82,21 @@ def render(scene: Scene, args: Render) -> None:
     from ..visualization.camera_paths import read_path, sway_path, times_path
     from ..visualization.carried_texture import write_texture_film
     from ..visualization.rendered_views import depth_span, write_views
+    from ..visualization.support_map import SupportMap, write_support_film
 
-    frames, total = None, len(scene.cameras)
+    frames, sequence, total = None, None, len(scene.cameras)
     if bad := [t for t in args.times if not 0 <= t <= 1]:
         raise input_error("--times", "times in [0, 1]", str(bad[0]), "Correct it; frame i of T is at i / T.")
+    if args.layer == "support" or not (args.camera_path or args.times):
+        sequence = load_sequence(args.data or sequence_of_run(args.run), scored_data(scene.config.data))
+        if len(sequence) != total:
+            fix = "`--data FOLDER` with the sequence of the run."
+            raise input_error(sequence.path, f"{total} frames", str(len(sequence)), fix)
     if args.camera_path:
         views = read_path(args.camera_path, scene.cameras)
     else:
         times = list(args.times)
         if not times:
-            sequence = load_sequence(args.data or sequence_of_run(args.run), scored_data(scene.config.data))
-            if len(sequence) != total:
-                fix = "`--data FOLDER` with the sequence of the run."
-                raise input_error(sequence.path, f"{total} frames", str(len(sequence)), fix)
             frames = sequence.frames(args.split)
             times = [index / total for index in sequence.indices(args.split)]
         if args.camera == "sway":
@@ -99,12 +105,16 @@ def render(scene: Scene, args: Render) -> None:
         else:
             views = times_path(times, scene.cameras)
     out = args.out or args.run / "renders"
-    video = (args.out or args.run) / ("video.mp4" if args.layer == "color" else "texture.mp4")
+    video = (args.out or args.run) / ("video.mp4" if args.layer == "color" else f"{args.layer}.mp4")
     if not args.out and out.is_symlink():  # in an untrusted run the link could point anywhere
         raise input_error(out, "a folder", "a link to one", "Remove the link, or pass OUT.")
     if args.layer == "color":
         write_views(scene, views, out, video, frames)
     else:
-        out = out / "texture"
-        write_texture_film(scene, views, out, video, frames)
+        out = out / args.layer
+        if args.layer == "texture":
+            write_texture_film(scene, views, out, video, frames)
+        else:
+            support = SupportMap(scene, sequence.frames("train"))
+            write_support_film(support, views, out, video, scene.frames_per_second, frames)
     say(f"{len(views)} frames: {out}\nvideo: {video}")

@@ -95,7 +95,8 @@ def create_gaussians(
         InputError: the config leaves the number of temporal basis functions open.
     """
     num = len(points)
-    log_scales = np.broadcast_to(np.asarray(log_scales, np.float32).reshape(num, -1), (num, 3))
+    log_scales = np.asarray(log_scales, np.float32)
+    log_scales = np.broadcast_to(log_scales[:, None] if log_scales.ndim == 1 else log_scales, (num, 3))
     quats = np.tile([1.0, 0.0, 0.0, 0.0], (num, 1)) if quats is None else quats
     chances = np.full(num, cfg.init.opacity) if opacities is None else np.asarray(opacities, np.float64)
     tensors = {

@@ -22,6 +22,7 @@ from ..visualization.camera_paths import turned
 from ..visualization.carried_texture import PaintedTissue
 from ..visualization.image_tools import colorize, to_u8
 from ..visualization.rendered_views import depth_span
+from ..visualization.support_map import SupportMap
 from .observers import LOG_EVERY
 
 SHOWN_SCORES = (
@@ -50,9 +51,9 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     """Write the report of a finished run folder as one PNG.
 
     Rows: three test frames as columns of input, rendering, true tissue if known, error, depth and prior; the second of
-    them from cameras to both sides; a grid painted on the first frame and carried to the middle and the last one,
-    beside the input; then the training curve, the PSNR of each test frame, and the scores of `metrics.json`. A `title`
-    stands above all.
+    them from cameras to both sides, and with all that no frame saw hatched; a grid painted on the first frame and
+    carried to the middle and the last one, beside the input; then the training curve, the PSNR of each test frame, and
+    the scores of `metrics.json`. A `title` stands above all.
     """
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     per_frame = json.loads((run / "per_frame.json").read_text(encoding="utf-8"))
@@ -111,7 +112,8 @@ def _side_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[
         out = scene.render(frame.time, turned(frame.camera, degrees, distance))
         side = "right" if degrees > 0 else "left"
         cells.append((f"frame {frame.index} from {abs(degrees)} degrees {side}", to_u8(out.color.cpu().numpy())))
-    return cells
+    marked = SupportMap(scene, sequence.frames("train")).render(frame.time, frame.camera)
+    return [*cells, ("hatched: guessed; blue: from another time", to_u8(marked.color))]
 
 
 def _texture_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[np.uint8]]]:

@@ -26,6 +26,7 @@ LAYER_NAMES: dict[Layer, str] = {
     "displacement": "Displacement",
     "stretch": "Stretch",
     "prior": "Texture prior",
+    "support": "Seen or guessed",
     "frame": "Original frame",
     "difference": "Difference",
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Layer = Literal["color", "depth", "alpha", "displacement", "stretch", "prior", "frame", "difference"]
+Layer = Literal["color", "depth", "alpha", "displacement", "stretch", "prior", "support", "frame", "difference"]
 """`color`, `depth` and `alpha` as rendered; `displacement` and `stretch` since a reference frame; `prior` the
 texture-prior score; `frame` the original; `difference` rendered minus original."""
 

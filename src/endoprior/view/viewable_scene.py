@@ -19,6 +19,7 @@ from ..model.gaussians import SH_C0
 from ..model.measures import distance
 from ..model.playback import Playback
 from ..model.scene import Scene
+from ..model.support import support_of
 from ..model.surface import Surface, project_visible, shown_pixels
 from ..model.surface_motion import SurfaceMotion
 from ..visualization.image_tools import gray, to_u8
@@ -29,7 +30,7 @@ from .view_settings import Layer, ViewSettings
 from .viewable import Cloud
 from .viewport import shrunk_camera
 
-VALUE_LAYERS = ("displacement", "stretch", "prior")
+VALUE_LAYERS = ("displacement", "stretch", "prior", "support")
 """Layers that are one value per Gaussian."""
 BROWSER_LAYERS = ("color", *VALUE_LAYERS)
 """Layers that are one color per Gaussian."""
@@ -56,9 +57,9 @@ class ViewableScene:
             sequence: with as many frames as the scene has cameras; None disables input frames, difference and tool.
         """
         self.scene, self.title, self.sequence = scene, title, sequence
-        self.layers: tuple[Layer, ...] = ("color", "depth", "alpha", *VALUE_LAYERS)
+        self.layers: tuple[Layer, ...] = ("color", "depth", "alpha", "displacement", "stretch", "prior")
         if sequence is not None:
-            self.layers += ("frame", "difference")
+            self.layers += ("support", "frame", "difference")
         self.cameras = scene.cameras
         self.frames_per_second = scene.frames_per_second
         self.relative = scene.lengths_are_relative
@@ -133,9 +134,18 @@ class ViewableScene:
         """(N,) value of the layer for each Gaussian, as a share of the color scale, in [0, 1]; NaN where unknown."""
         if settings.layer == "prior":
             return self.scene.prior_score.clamp(0, 1)
+        if settings.layer == "support":
+            return self._share_of_frames
         low, high = self._value_span(settings.layer, settings.since)
         values = self._measured(settings.layer, settings.since, settings.frame)
         return ((torch.from_numpy(values).to(self.scene.prior_score) - low) / (high - low)).clamp(0, 1)
+
+    @cached_property
+    def _share_of_frames(self) -> Tensor:
+        """(N,) share of the training frames that show each Gaussian."""
+        support = support_of(self.scene, self.sequence.frames("train"))
+        share = support.num_frames / max(len(support.times), 1)
+        return torch.from_numpy(share).to(self.scene.prior_score)
 
     def _measure(self, layer: Layer, since: int, frame: int) -> NDArray[np.float32]:
         """(N,) displacement of each center since a frame, mm, or stretch of the surface there; NaN where unknown."""
@@ -235,6 +245,7 @@ class ViewableScene:
             "depth": f"blue {self.span[0]:.1f} to red {self.span[1]:.1f} {unit}",
             "alpha": "black 0 to white 1: coverage by the Gaussians",
             "prior": "texture-prior score of the Gaussians: blue 0 to red 1",
+            "support": "share of the frames that show this tissue: blue none, a guess, to red all",
             "difference": f"rendered minus input: blue 0 to red {layers.LARGEST_DIFFERENCE:.0%}",
         }.get(settings.layer, "")
 
