@@ -1,10 +1,16 @@
 """Supervised terms: closed forms, and the fused kernel against the definition."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
+from endoprior.core.config import LossConfig
+from endoprior.core.types import RenderOutput
 from endoprior.training import losses_torch
+from endoprior.training.losses import supervised_terms
 from endoprior.training.losses_numba import supervised_losses
+from endoprior.training.ops import NUMBA
 
 
 def scene(seed: int, height: int = 13, width: int = 17):
@@ -100,3 +106,18 @@ def test_fused_terms_of_degenerate_images(shape):
     color, depth, *rest = scene(2, *shape)
     args = (color, depth, *rest, (1.0, 1.0, 1.0))
     torch.testing.assert_close(supervised_losses(*args), losses_torch.supervised_losses(*args), rtol=1e-5, atol=1e-7)
+
+
+def test_holes_cost_only_where_tissue_is_hidden():
+    color, depth, target, inverse, tissue, measured = scene(3)
+    alpha = torch.rand(tissue.shape, generator=torch.Generator().manual_seed(4)).requires_grad_()
+    hidden = ~tissue & (torch.arange(tissue.shape[1]) < 9)
+    frame = SimpleNamespace(
+        rgb_u8=target, inverse_depth=inverse, tissue_mask=tissue, hidden=hidden, measured=measured, num_measured=100
+    )
+    out = RenderOutput(color, alpha, depth, torch.zeros(0, 2), torch.zeros(0))
+    assert "cover" not in supervised_terms(out, frame, LossConfig(), NUMBA)
+    term = supervised_terms(out, frame, LossConfig(cover_weight=0.5), NUMBA)["cover"]
+    assert term.item() == pytest.approx(0.5 * (1 - alpha[hidden]).sum().item() / alpha.numel(), rel=1e-5)
+    term.backward()
+    assert (alpha.grad[hidden] < 0).all() and not alpha.grad[~hidden].any()

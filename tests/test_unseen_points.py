@@ -9,7 +9,7 @@ from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, pixel_centers, project
 from endoprior.core.types import Camera, Frame
 from endoprior.initialization.cleanup import PointCloud, concatenated
-from endoprior.initialization.unseen import CELLS, laplace_fill, unseen_points
+from endoprior.initialization.unseen import CELLS, convex_hull, laplace_fill, unseen_points
 from endoprior.model.basis import basis_weights
 
 WIDTH, HEIGHT = 320, 240
@@ -42,6 +42,20 @@ def cloud_of(frames: list[Frame]) -> PointCloud:
         points = back_project(np.stack([x, y], -1)[keep] + 0.5, each.depth[y, x][keep], CAMERA).astype(np.float32)
         parts.append(PointCloud(points, np.zeros_like(points), np.full(len(points), position, np.int32)))
     return concatenated(parts)
+
+
+def test_convex_hull() -> None:
+    mask = np.zeros((9, 12), bool)
+    assert not convex_hull(mask).any()
+    mask[2, 3] = mask[6, 3] = mask[2, 9] = mask[6, 9] = True
+    want = np.zeros_like(mask)
+    want[2:7, 3:10] = True
+    np.testing.assert_array_equal(convex_hull(mask), want)
+    y, x = np.mgrid[:101, :101]
+    disk = (x - 50) ** 2 + (y - 50) ** 2 <= 45**2
+    with_hole = disk & ((np.abs(x - 50) > 10) | (np.abs(y - 50) > 20))
+    assert (convex_hull(with_hole) ^ disk).mean() < 0.01
+    np.testing.assert_array_equal(convex_hull(np.ones((4, 5), bool)), np.ones((4, 5), bool))
 
 
 def test_between_known_values_it_is_linear() -> None:

@@ -147,6 +147,8 @@ class LossConfig(Checked):
     """lambda_tv, of the total variation of color and inverse depth over the whole frame."""
     tv_on_tissue: bool = True
     """The total variation counts on visible tissue too; False: only where there is none, as behind tools."""
+    cover_weight: Weight = 0.0
+    """Of 1 - alpha where something hides the tissue: no holes open behind tools."""
     depth_mode: Literal["accumulated", "expected"] = "accumulated"
     """Depth that is compared: sum of weight * z, or that divided by alpha."""
     min_depth_pixels: Count = 10

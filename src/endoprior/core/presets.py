@@ -93,7 +93,15 @@ def default() -> Config:
             max_scale_change=2.0,
         ),
         render=replace(base.render, depth_grad_to_means=True),
-        loss=replace(base.loss, depth_weight=3.0, track_weight=0.01, tv_on_tissue=False, trust_masks=False),
+        loss=replace(
+            base.loss,
+            depth_weight=3.0,
+            track_weight=0.01,
+            tv_weight=0.003,
+            tv_on_tissue=False,
+            cover_weight=0.01,
+            trust_masks=False,
+        ),
         temporal=replace(
             base.temporal, start_iteration=500, max_points=1024, min_valid=1, valid_at_both=False, gradient="current"
         ),

@@ -43,7 +43,8 @@ def unseen_points(
         coefficients: (N, B, 3) motion of its points, mm; None: nothing moves.
     """
     found, motions = [], []
-    within = _hull(frames)
+    size = _cell_size(frames[0])
+    within = convex_hull(np.any([_cell_sums(frame.tissue_mask, size) > 0 for frame in frames], axis=0))
     for position, frame in enumerate(frames):
         weights = basis_weights(frame.time, cfg) if coefficients is not None else np.zeros(0)
         moved = _moved(cloud.points, coefficients, weights)
@@ -80,14 +81,14 @@ def _cell_size(frame: Frame) -> int:
     return max(round(frame.camera.width / CELLS), 2)
 
 
-def _hull(frames: Sequence[Frame]) -> NDArray[np.bool_]:
-    """(R, C) cells in the convex hull of the tissue of all frames."""
-    size = _cell_size(frames[0])
-    tissue = np.any([_cell_sums(frame.tissue_mask, size) > 0 for frame in frames], axis=0)
-    inside = np.zeros(tissue.shape, np.uint8)
-    if tissue.any():
-        corners = cv2.convexHull(np.argwhere(tissue)[:, None, ::-1].astype(np.int32))
-        cv2.fillConvexPoly(inside, corners, 1)
+def convex_hull(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(R, C) True in the convex hull of the centers of all True pixels of `mask` (R, C)."""
+    inside = np.zeros(mask.shape, np.uint8)
+    rows = np.flatnonzero(mask.any(1))
+    if len(rows):
+        first, last = mask[rows].argmax(1), mask.shape[1] - 1 - mask[rows, ::-1].argmax(1)
+        ends = np.concatenate([np.stack([first, rows], -1), np.stack([last, rows], -1)])
+        cv2.fillConvexPoly(inside, cv2.convexHull(ends.astype(np.int32)), 1)
     return inside > 0
 
 

@@ -12,10 +12,11 @@ from ..core.config import PriorConfig
 from ..core.types import Camera, Frame
 from ..data import FrameSequence, shrunk
 from ..initialization.sampling import has_surface
+from ..initialization.unseen import convex_hull
 from ..priors import joint_texture_prior
 from ..system.memory import BoundedCache, cache_bytes
 
-TENSORS = ("rgb_u8", "tissue_mask", "inverse_depth", "measured")
+TENSORS = ("rgb_u8", "tissue_mask", "hidden", "inverse_depth", "measured")
 """Fields of a training frame that are copied to a device."""
 
 
@@ -31,6 +32,8 @@ class TrainingFrame:
     """(H, W, 3) uint8."""
     tissue_mask: Tensor
     """(H, W) bool, True on tissue."""
+    hidden: Tensor
+    """(H, W) bool, True where something hides tissue: within the convex hull of `tissue_mask`, and not on it."""
     inverse_depth: Tensor
     """(H, W) 1 / mm; 0 where there is no depth."""
     measured: Tensor
@@ -121,6 +124,7 @@ def _training_frame(frame: Frame) -> TrainingFrame:
         camera=frame.camera,
         rgb_u8=torch.from_numpy(frame.rgb_u8),
         tissue_mask=torch.from_numpy(frame.tissue_mask),
+        hidden=torch.from_numpy(convex_hull(frame.tissue_mask) & ~frame.tissue_mask),
         inverse_depth=torch.from_numpy(inverse),
         measured=torch.from_numpy(frame.tissue_mask & usable),
         num_measured=int(np.count_nonzero(frame.tissue_mask & usable)),

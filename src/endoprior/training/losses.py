@@ -11,10 +11,10 @@ from .ops import TrainingOps
 
 
 def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, ops: TrainingOps) -> dict[str, Tensor]:
-    """Weighted color, depth and total-variation terms, () each."""
+    """Weighted color, depth and total-variation terms, and that of what is hidden, () each."""
     depth = out.depth / out.alpha.clamp(min=1e-6) if cfg.depth_mode == "expected" else out.depth
     depth_weight = cfg.depth_weight if frame.num_measured >= cfg.min_depth_pixels else 0.0
-    terms = ops.supervised_losses(
+    fused = ops.supervised_losses(
         out.color,
         depth,
         frame.rgb_u8,
@@ -24,4 +24,7 @@ def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, o
         (1.0, depth_weight, cfg.tv_weight),
         cfg.tv_on_tissue,
     )
-    return dict(zip(("color", "depth", "tv"), terms, strict=True))
+    terms = dict(zip(("color", "depth", "tv"), fused, strict=True))
+    if cfg.cover_weight:
+        terms["cover"] = cfg.cover_weight * ((1 - out.alpha) * frame.hidden).mean()
+    return terms
