@@ -101,7 +101,13 @@ def test_truth_gives_its_scores_and_no_truth_gives_none(phantom, tiny_sequence):
         init=replace(cfg.init, budget=400),
         schedule=replace(cfg.schedule, coarse_iterations=0, fine_iterations=5),
     )
-    names = {"psnr_behind_tool", "depth_rmse_behind_tool_mm", "track_error_mm", "track_error_px"}
+    names = {
+        "psnr_behind_tool",
+        "psnr_behind_tool_guessed",
+        "depth_rmse_behind_tool_mm",
+        "track_error_mm",
+        "track_error_px",
+    }
     names |= {"track_fold_rate", "track_tear_rate", "track_average_jaccard_dis", "track_error_p90_px_still"}
     scores = evaluate(train(phantom, cfg), phantom, networks=False).scores
     assert names <= set(scores) and all(np.isfinite(scores[name]) for name in names)

@@ -49,6 +49,11 @@ class Truth:
         path = self.folder / "depth" / f"{self._names[index]}.npy"
         return np.asarray(read_numpy(path, *_FILE), np.float32) if path.parent.is_dir() else None
 
+    def seen(self, index: int) -> NDArray[np.bool_] | None:
+        """(H, W) True behind the tool of frame `index` where some training frame shows that tissue; None without."""
+        path = self.folder / "seen" / f"{self._names[index]}.npy"
+        return np.asarray(read_numpy(path, *_FILE), bool) if path.exists() else None
+
     @cached_property
     def side_poses(self) -> dict[str, NDArray[np.float64]]:
         """Cameras beside the endoscope by name: (4, 4) rigid transforms from the frame's camera axes; empty without.

@@ -22,7 +22,7 @@ from .shading import shade
 from .side_views import side_eyes, side_picture
 from .surface import MARGIN, Plane, build_anatomy, build_plane, organs_at, soften
 from .texture import build_texture, smooth_patches
-from .visibility import visible_points
+from .visibility import shown_elsewhere, visible_points
 
 SUPERSAMPLE = 2
 """Image samples per pixel along each axis."""
@@ -162,6 +162,7 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
     - `truth/tissue/*.png`, the image without tools and without sensor noise. Tools cast no shadow, so outside of them
       an image is the truth plus noise;
     - `truth/depth/*.npy`, (H, W) float32 z of the tool-free tissue, mm;
+    - `truth/seen/*.npy`, (H, W) bool in test frames: behind a tool, and some training frame shows that tissue;
     - `truth/tracks.npz`: `points` (T, P, 3) float32 mm in camera axes, `visible` (T, P) bool; with `cfg.has_regions`
       also `region` (P,);
     - with `cfg.side_views` `truth/side/NAME/*.png` and `*.npy`: picture and depth of the side cameras in test frames,
@@ -195,6 +196,7 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
         # Masks cover the tool's blended rim and one pixel more, as annotators' outlines do.
         rim = np.ones((3, 3), np.uint8)
         points, visible, gain, sides = [], [], None, {}
+        ever_seen, hidden = np.zeros(scene.a.shape, bool), {}
         for index in range(cfg.frames):
             phase = index / (cfg.frames - 1)
             vertices = scene.vertices(phase)
@@ -221,8 +223,16 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
             followed = vertices[tracked[:, 0], tracked[:, 1]]
             points.append(followed)
             visible.append(visible_points(followed, z, mask, cfg))
+            if is_test_frame(index):
+                hidden[index] = np.packbits(mask)
+            else:
+                ever_seen |= visible_points(vertices, z, mask, cfg)
             if progress is not None:
                 progress(index + 1, cfg.frames)
+        for index, packed in hidden.items():  # what is seen later is known only now
+            hits = rasterize(scene.vertices(index / (cfg.frames - 1)), focal, cfg.center, cfg.width, cfg.height)
+            tool = np.unpackbits(packed, count=hits[..., 0].size).reshape(hits.shape[:2]) > 0
+            writer.write_array(f"truth/seen/{index:06d}.npy", shown_elsewhere(hits, ever_seen, tool))
         tracks = {"points": np.stack(points).astype(np.float32), "visible": np.stack(visible)}
         if cfg.has_regions:
             tracks["region"] = regions(scene, tracked)

@@ -1,4 +1,4 @@
-"""Which points of the tissue the endoscope sees."""
+"""Which points of the tissue the endoscope sees, in a frame and ever."""
 
 from __future__ import annotations
 
@@ -23,3 +23,16 @@ def visible_points(
     # Points next to a silhouette count as occluded: there the four depths differ by more than a slope of 4.
     smooth = np.ptp(around, axis=0) < 0.3 + 4 * points[..., 2] / cfg.focal
     return inside & smooth & (points[..., 2] <= around.max(0) + 0.15) & ~covered
+
+
+def shown_elsewhere(hits: NDArray[np.float32], seen: NDArray[np.bool_], tool: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H, W) True behind the `tool` (H, W) where the tissue was seen at another time.
+
+    Args:
+        hits: (H, W, 3) material coordinates g_u, g_v of the tissue at each pixel, in [0, 1], and z (see `rasterize`).
+        seen: (MH, MW) mesh vertices that some training frame shows.
+    """
+    rows, columns = seen.shape
+    row = np.round(hits[..., 1] * (rows - 1)).astype(int)
+    column = np.round(hits[..., 0] * (columns - 1)).astype(int)
+    return tool & seen[row, column]

@@ -1,0 +1,72 @@
+"""Behind tools: where tissue is seen at another time, by the phantom, and what is scored there."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from endoprior.core.geometry import cells_at, project
+from endoprior.data import load_sequence
+from endoprior.evaluation.context import Evaluation, EvaluationContext
+from endoprior.evaluation.scorers import behind_tool
+from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.phantom.visibility import shown_elsewhere
+
+FRAMES = 20
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    """A phantom whose tools uncover some tissue and never uncover other."""
+    out = tmp_path_factory.mktemp("phantom") / "sequence"
+    write_phantom(out, PhantomConfig(frames=FRAMES, width=160, height=128, side_views=False))
+    return load_sequence(out)
+
+
+def test_a_pixel_is_that_of_the_nearest_vertex() -> None:
+    seen = np.zeros((3, 5), bool)
+    seen[1, 2] = True
+    hits = np.zeros((1, 4, 3), np.float32)
+    hits[0, :, :2] = [(0.5, 0.5), (0.55, 0.6), (0.8, 0.5), (0.5, 0.5)]
+    tool = np.array([[True, True, True, False]])
+    assert shown_elsewhere(hits, seen, tool).tolist() == [[True, True, False, False]]
+
+
+def test_the_phantom_agrees_with_its_own_tracks(sequence) -> None:
+    """A tracked point behind the tool that a training frame shows lies on a pixel that says so, and conversely."""
+    tracks, training = sequence.truth.tracks, sequence.indices("train")
+    ever, agreed, counted = tracks.visible[training].any(0), 0, 0
+    for index in sequence.indices("test"):
+        seen, frame = sequence.truth.seen(index), sequence.frame(index)
+        assert seen.any() and (~frame.tissue_mask & ~seen).any() and not (seen & frame.tissue_mask).any()
+        pixels, z = project(tracks.points[index].astype(np.float64), frame.camera)
+        x, y = cells_at(pixels, 160, 128)
+        hidden = ~frame.tissue_mask[y, x] & (np.abs(z - sequence.truth.depth(index)[y, x]) < 0.3)
+        agreed += (seen[y, x] == ever)[hidden].sum()
+        counted += hidden.sum()
+    assert counted > 20 and agreed / counted > 0.9
+
+
+def test_training_frames_have_none(sequence) -> None:
+    assert sequence.truth.seen(0) is None
+
+
+def test_what_is_seen_and_what_is_guessed_are_scored_apart(sequence) -> None:
+    """Off by 0.1 where it was seen (20 dB), by 0.01 where it was not (40 dB)."""
+    rendered = {}
+    for index in sequence.indices("test"):
+        error = np.where(sequence.truth.seen(index), 0.1, 0.01)[..., None]
+        rgb = sequence.truth.tissue(index) / 255 + error
+        rendered[index] = SimpleNamespace(rgb=rgb, depth=sequence.truth.depth(index))
+    context = SimpleNamespace(
+        sequence=sequence, frames=sequence.frames("test"), rendered=rendered, result=Evaluation({})
+    )
+    for name in ("add", "add_mean", "skip_if_unavailable"):
+        setattr(context, name, getattr(EvaluationContext, name).__get__(context))
+    behind_tool.compute(context)
+    scores = context.result.scores
+    assert scores["psnr_behind_tool_seen"] == pytest.approx(20, abs=0.01)
+    assert scores["psnr_behind_tool_guessed"] == pytest.approx(40, abs=0.01)
+    assert 20 < scores["psnr_behind_tool"] < 40
