@@ -133,3 +133,12 @@ def test_new_points_move_as_those_around() -> None:
 def test_a_frame_without_tissue_adds_nothing() -> None:
     frames = [frame(0, np.ones((HEIGHT, WIDTH), bool)), frame(1, np.zeros((HEIGHT, WIDTH), bool))]
     assert len(unseen_points(frames, cloud_of(frames), None, BASIS)[0]) == 0
+
+
+def test_depth_along_the_rim_alone_is_enough() -> None:
+    tissue = with_tool(slice(120, 200))
+    usual = frame(0, tissue)
+    depth = np.where(np.abs(pixel_centers(WIDTH, HEIGHT)[..., 0] - 160) < 41, usual.depth, 0)
+    bare = Frame(0, 0.0, CAMERA, usual.rgb_u8, tissue, depth, depth > 0)
+    found, _ = unseen_points([bare], cloud_of([bare]), None, BASIS)
+    assert len(found) and np.isfinite(found.points).all() and (found.points[:, 2] > 0).all()

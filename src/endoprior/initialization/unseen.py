@@ -109,6 +109,7 @@ def _fill(frame: Frame, points: NDArray, within: NDArray[np.bool_]) -> tuple[NDA
     if covered.all() or not shown.any():
         return np.zeros((0, 3)), np.zeros((0, 3))
     trusted = eroded_mask(frame.tissue_mask, rim) & measured
+    trusted = trusted if trusted.any() else measured
     inverse = np.divide(1.0, frame.depth, out=np.zeros(frame.depth.shape), where=trusted)
     count = _cell_sums(trusted, size)
     known = count > 0
