@@ -93,3 +93,20 @@ def test_moments_and_counts_that_cannot_be(run):
         spoiled.view(-1)[0] = value
         with pytest.raises(InputError, match=name):
             check_state(arrays | {name: spoiled}, stored.about["iteration"])
+
+
+def test_tracks_of_another_sequence(tmp_path):
+    """Tracks of fewer frames than the sequence has are named; those of all of them are taken over."""
+    from conftest import write_tiny_sequence
+    from tiny_training import tiny_config
+
+    sequence = load_sequence(write_tiny_sequence(tmp_path / "data"))
+    cfg = tiny_config("basis", coarse=0, fine=1).replace({"init.motion": "flow", "loss.track_weight": 0.01})
+    train(sequence, cfg, tmp_path / "run")
+    file = tmp_path / "run" / "checkpoint.safetensors"
+    taken = (Trainer(sequence, cfg), file, StateFile.read(file))
+    assert resume(taken).state.tracks.followed.shape[1] == len(sequence.indices("train"))
+    followed = taken[2].arrays["tracks.followed"]
+    StateFile(taken[2].about, taken[2].arrays | {"tracks.followed": followed[:, 1:]}).write(file)
+    with pytest.raises(InputError, match=r"training frames in tracks\.followed"):
+        resume(taken)
