@@ -33,7 +33,10 @@ SHOWN_SCORES = (
     "flow_error_dis",
     "color_share",
     "depth_instability_mm",
+    "side_psnr",
+    "right_psnr",
     "psnr_behind_tool",
+    "psnr_behind_tool_seen",
     "depth_rmse_behind_tool_mm",
     "track_error_mm",
     "num_gaussians",
@@ -151,6 +154,6 @@ def _plot_psnr(axis: Axes, per_frame: list[dict]) -> None:
 def _write_scores(axis: Axes, metrics: dict, relative: bool) -> None:
     scores = metrics["scores"]
     shown = [(all_scores()[name], scores[name]) for name in SHOWN_SCORES if name in scores]
-    lines = [f"{score.label:<20}{score.text(value, relative):>16}" for score, value in shown]
+    lines = [f"{score.label:<22}{score.text(value, relative):>14}" for score, value in shown]
     axis.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=axis.transAxes)
     axis.set_axis_off()
