@@ -106,24 +106,23 @@ def _rows(
     for y in prange(height):
         up, down = max(y - 1, 0), min(y + 1, height - 1)
         weight = np.empty(3 * width, np.float32)
-        pairs = np.ones((3, 3 * width), np.float32)
+        # 1 on tissue in this row, the one above, the one below, and at the next pixel; 0 where all differences count.
+        left_out = np.zeros((4, 3 * width), np.float32)
         if not tv_on_tissue:
-            for x in range(width):
-                for c in range(3 * x, 3 * x + 3):
-                    own = tissue_mask[y, x]
-                    pairs[0, c] = np.float32(not (own and tissue_mask[up, x]))
-                    pairs[1, c] = np.float32(not (own and tissue_mask[down, x]))
-                    pairs[2, c] = np.float32(not (own and tissue_mask[y, min(x + 1, width - 1)]))
+            _fill_colors(tissue_mask[y], left_out[0])
+            _fill_colors(tissue_mask[up], left_out[1])
+            _fill_colors(tissue_mask[down], left_out[2])
+            left_out[3, :-3] = left_out[0, 3:]
         for x in range(width):
             weight[3 * x] = weight[3 * x + 1] = weight[3 * x + 2] = np.float32(tissue_mask[y, x])
         sums[y, 0] = _fidelity(colors[y], targets[y], scale, weight, f_color, v_colors[y])
-        sums[y, 2] = _variation(colors[up], colors[y], colors[down], 3, f_tv, pairs, v_colors[y])
+        sums[y, 2] = _variation(colors[up], colors[y], colors[down], 3, f_tv, left_out, v_colors[y])
         for x in range(width):
             weight[x] = np.float32(measured[y, x])
-            for k in range(3):
-                pairs[k, x] = pairs[k, 3 * x]
+            for k in range(4):
+                left_out[k, x] = left_out[k, 3 * x]
         sums[y, 1] = _fidelity(inverse[y], target_inverse[y], np.float32(1), weight[:width], f_depth, v_depth[y])
-        sums[y, 3] = _variation(inverse[up], inverse[y], inverse[down], 1, f_tvd, pairs, v_depth[y])
+        sums[y, 3] = _variation(inverse[up], inverse[y], inverse[down], 1, f_tvd, left_out, v_depth[y])
         for x in range(width):
             v_depth[y, x] *= -inverse[y, x] * inverse[y, x]
 
@@ -140,17 +139,27 @@ def _fidelity(row, target, scale, weight, factor, v_row):
 
 
 @njit(cache=True, inline="always")
-def _variation(above, row, below, step, factor, pairs, v_row):
+def _fill_colors(mask, values):
+    # Writes a mask (W,) as 0 and 1, three numbers per pixel.
+    for x in range(len(mask)):
+        values[3 * x] = values[3 * x + 1] = values[3 * x + 2] = np.float32(mask[x])
+
+
+@njit(cache=True, inline="always")
+def _variation(above, row, below, step, factor, left_out, v_row):
     # Sum of |differences| to the next pixel, `step` numbers on, and to the row below; adds `factor` times the gradient
-    # of the whole image's variation to v_row. pairs (3, .): weights of the differences up, down, and to the next pixel.
-    total = np.float32(0)
+    # of the whole image's variation to v_row. A difference counts unless both its ends are 1 in left_out (4, .).
+    total, one = np.float32(0), np.float32(1)
     size = len(row)
     for i in range(size):
-        total += pairs[1, i] * abs(below[i] - row[i])
-        v_row[i] += factor * (pairs[0, i] * _sign(row[i] - above[i]) - pairs[1, i] * _sign(below[i] - row[i]))
+        to_above, to_below = one - left_out[0, i] * left_out[1, i], one - left_out[0, i] * left_out[2, i]
+        total += to_below * abs(below[i] - row[i])
+        v_row[i] += factor * (to_above * _sign(row[i] - above[i]) - to_below * _sign(below[i] - row[i]))
     for i in range(size - step):
-        total += pairs[2, i] * abs(row[i + step] - row[i])
-        v_row[i] -= factor * pairs[2, i] * _sign(row[i + step] - row[i])
+        to_next = one - left_out[0, i] * left_out[3, i]
+        total += to_next * abs(row[i + step] - row[i])
+        v_row[i] -= factor * to_next * _sign(row[i + step] - row[i])
     for i in range(step, size):
-        v_row[i] += factor * pairs[2, i - step] * _sign(row[i] - row[i - step])
+        before = i - step
+        v_row[i] += factor * (one - left_out[0, before] * left_out[3, before]) * _sign(row[i] - row[before])
     return total
