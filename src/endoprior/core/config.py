@@ -1,5 +1,7 @@
 """Every number of the method, one frozen dataclass per concern: schema, defaults, command line and manual.
 
+Those of the deformation are in `config_deformation.py`.
+
 Defaults are the paper's; where it is silent, EndoGaussian's. `presets.py` says how the other presets differ. "mm" below
 means the unit of the sequence's depth.
 
@@ -224,7 +226,7 @@ class DensityConfig(Checked):
     prune_max_scale_mm: Annotated[float, Range(0, 1e9)] = 0.0
     """Gaussians with a larger scale are removed; 0 switches the rule off (released code: 40)."""
     max_scale_share: Weight = 0.0
-    """No Gaussian becomes larger than this share of its distance to the camera; 0 sets no limit."""
+    """No canonical scale becomes larger than this share of its distance to the camera; 0 sets no limit."""
     prior_prune: bool = True
     """Also remove Gaussians of low prior: n >= n_min, score < tau_prior, mean opacity < tau_alpha."""
     min_valid: Count = 20

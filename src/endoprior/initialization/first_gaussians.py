@@ -18,7 +18,7 @@ from .sampling import initial_log_scales, initial_points
 from .unseen import unseen_points
 
 UNSEEN_OPACITY = 0.9
-"""Initial opacity of what no frame shows: nothing will make it opaque."""
+"""Initial opacity of what no frame shows: no color asks for it."""
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Camera
-from ..visualization.image_tools import colorize
+from ..visualization.image_tools import SOLID_ALPHA, colorize
 
 LARGEST_DIFFERENCE = 0.25
 """Mean absolute color difference that is shown in red."""
-SOLID_ALPHA = 0.5
-"""There is no surface where alpha is lower."""
 OUTLINE = (0, 255, 255)
 MASK_SHARE = 0.4
 """Share of the overlay's color over a mask."""

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from ..data.images import save_png
 from ..system.atomic import whole_file
 
+SOLID_ALPHA = 0.5
+"""There is no surface where alpha is lower."""
+
 
 def write_png(path: Path, rgb_u8: NDArray[np.uint8]) -> None:
     """Write an (H, W, 3) RGB or (H, W) gray 8-bit image, atomically."""

@@ -18,11 +18,9 @@ from ..model.scene import Scene
 from ..model.support import support_of
 from ..system.atomic import whole_file
 from .camera_paths import View
-from .image_tools import label, tile, to_u8, write_png
+from .image_tools import SOLID_ALPHA, label, tile, to_u8, write_png
 from .video import write_video
 
-SOLID_ALPHA = 0.5
-"""There is no surface where alpha is lower."""
 STRIPES = 80
 """Stripes of the hatching along the width of the image."""
 HATCHING, TINT = np.array((1.0, 1.0, 1.0)), np.array((0.2, 0.5, 1.0))
