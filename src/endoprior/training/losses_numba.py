@@ -82,19 +82,9 @@ def _sign(x):
 
 @njit(parallel=True, cache=True, fastmath=REORDERED)
 def _rows(
-    color,
-    depth,
-    target_u8,
-    target_inverse,
-    tissue_mask,
-    measured,
-    tv_on_tissue,
-    inverse,
-    factors,
-    v_color,
-    v_depth,
-    sums,
-):
+    color, depth, target_u8, target_inverse, tissue_mask, measured, tv_on_tissue, inverse, factors,
+    v_color, v_depth, sums,
+):  # fmt: skip
     # One task per row y: writes v_color[y], v_depth[y] and sums[y], the unweighted (color, depth, two variations).
     # The variation's gradient is the signs of the differences to the four neighbors: no task writes another's row.
     # A row is one flat run of numbers, three per pixel for color: loops over it vectorize, loops over channels do not.

@@ -7,7 +7,8 @@ from typing import Literal
 
 Layer = Literal["color", "depth", "alpha", "displacement", "stretch", "prior", "support", "frame", "difference"]
 """`color`, `depth` and `alpha` as rendered; `displacement` and `stretch` since a reference frame; `prior` the
-texture-prior score; `support` the share of the training frames that show the tissue; `frame` the original; `difference` rendered minus original."""
+texture-prior score; `support` the share of the training frames that show the tissue; `frame` the original;
+`difference` rendered minus original."""
 
 SLOW_MS = 60.0
 """If rendering at full size takes longer, images are rendered at half size while something moves."""
