@@ -18,7 +18,7 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     measured = []
     for size in sizes:
         splats, camera = scenes.splats(size)
-        inputs = (splats.means, splats.quats, splats.scales, splats.sh)
+        inputs = (splats.means, splats.quats, splats.scales, splats.sh, splats.color_slopes)
         *projected, radii = KERNELS.project_forward(inputs, splats.opacities, camera)
         gaussians = (*projected, splats.opacities)
         seen, image = project(splats, camera), (size.width, size.height)

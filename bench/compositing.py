@@ -35,10 +35,11 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
 
 def our_steps(splats: Splats, camera: Camera, cotangents: Tensor) -> common.Steps:
     """The kernels on Gaussians that are already in the image and sorted into tiles."""
-    inputs, size = (splats.means, splats.quats, splats.scales, splats.sh), (camera.width, camera.height)
+    inputs = (splats.means, splats.quats, splats.scales, splats.sh, splats.color_slopes)
+    size = (camera.width, camera.height)
     *projected, radii = KERNELS.project_forward(inputs, splats.opacities, camera)
     tiles = KERNELS.bin_tiles((*projected, splats.opacities), radii, size)
-    shape = (projected[1], splats.opacities)
+    shape = (projected[1], projected[4], splats.opacities)
     given = tuple(part.contiguous() for part in by_image(cotangents))
     return {
         "forward": lambda _: KERNELS.composite_forward(tiles, torch.zeros(3), size),
@@ -52,11 +53,11 @@ def by_image(cotangents: Tensor) -> tuple[Tensor, ...]:
 
 
 def torch_steps(splats: Splats, camera: Camera, cotangents: Tensor) -> common.Steps:
-    """The same in plain torch."""
+    """The same in plain torch, one color per Gaussian."""
     seen, opacities = project(splats, camera), splats.opacities.clone().requires_grad_()
     bins = plain.bin_tiles(seen, opacities, camera.width, camera.height)
     inputs = [t.clone().requires_grad_() for t in (seen.means2d, seen.cov2d, seen.z, seen.colors)]
-    given, background = Projected(*inputs, seen.radii), torch.zeros(3)
+    given, background = Projected(*inputs, seen.color_slopes2d, seen.radii), torch.zeros(3)
     v_color, v_depth, v_alpha = by_image(cotangents)
     return {
         "forward": lambda _: plain.composite(given, opacities, bins, background, camera.width, camera.height),

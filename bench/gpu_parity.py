@@ -15,7 +15,6 @@ from endoprior import render
 from endoprior.core.types import Camera, Splats
 from endoprior.model.scene import load_scene
 from endoprior.render.constants import ALPHA_MAX
-from endoprior.render.projection import FIELDS
 
 SCENES, FRAMES = 20, 3
 IMAGE_LIMIT, GRADIENT_LIMIT = 1e-3, 0.01
@@ -96,6 +95,7 @@ def random_case(seed: int) -> Case:
         np.exp(rng.uniform(np.log(0.2), np.log(6.0), (num, 3))) * (z / view.fx)[:, None],
         rng.uniform(0.01, LARGEST_OPACITY, num),
         rng.normal(size=(num, (degree + 1) ** 2, 3)) * 0.3,
+        rng.normal(size=(num, 2, 3)) * 0.1,
     )
     splats = Splats(*(torch.tensor(v, dtype=torch.float32) for v in values))
     return Case("random", f"random {seed}", splats, view, seed % 2 == 0)
@@ -123,7 +123,8 @@ def cropped(view: Camera) -> Camera:
 def rendered(backend: render.Backend, device: torch.device, case: Case) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Images, and gradients under seeded random cotangents, as float64 on the CPU. The reference computes in it."""
     dtype = torch.float64 if backend == "reference" else torch.float32
-    leaves = {n: getattr(case.splats, n).detach().to(device, dtype).clone().requires_grad_() for n in FIELDS}
+    given = case.splats.tensors.items()
+    leaves = {name: value.detach().to(device, dtype).clone().requires_grad_() for name, value in given}
     background = torch.tensor([0.1, 0.2, 0.3], dtype=dtype, device=device)
     rasterize = render.load(backend)
     out = rasterize(Splats(**leaves), case.camera, background=background, depth_grad_to_means=case.depth_grad_to_means)

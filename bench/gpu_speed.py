@@ -20,7 +20,6 @@ from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Splats
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.scene import Scene
-from endoprior.render.projection import FIELDS
 
 SIZES = (common.Size(20_000, 640, 512), common.Size(40_000, 640, 512), common.Size(100_000, 640, 512))
 REPEATS, WARM_UP = 50, 5
@@ -71,7 +70,7 @@ def speed(target: Target, sizes: tuple[common.Size, ...], repeats: int) -> list[
     found = []
     for size in sizes:
         splats, camera = scenes.splats(size)
-        on_device = Splats(**{name: getattr(splats, name).to(target.device) for name in FIELDS})
+        on_device = Splats(**{name: value.to(target.device) for name, value in splats.tensors.items()})
         background = torch.zeros(3, device=target.device)
         rasterize = partial(render.load(target.backend), camera=camera, background=background)
         steps = {
@@ -111,11 +110,11 @@ def forward(rasterize: Callable[..., Any], splats: Splats | list[Splats]) -> Non
 
 def both_ways(rasterize: Callable[..., Any], splats: Splats) -> Callable[[], None]:
     """Forward, and backward to every input and to `means2d`, as training does."""
-    leaves = Splats(**{name: getattr(splats, name).clone().requires_grad_() for name in FIELDS})
+    leaves = Splats(**{name: value.clone().requires_grad_() for name, value in splats.tensors.items()})
 
     def step() -> None:
-        for name in FIELDS:
-            getattr(leaves, name).grad = None
+        for leaf in leaves.tensors.values():
+            leaf.grad = None
         out = rasterize(leaves, depth_grad_to_means=False)
         out.means2d.retain_grad()
         (out.color.square().mean() + 1e-4 * out.depth.mean()).backward()

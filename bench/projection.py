@@ -22,13 +22,13 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     measured = []
     for num in common.nums(sizes):
         splats, camera = scenes.splats(common.Size(num, *IMAGE))
-        inputs = [t.requires_grad_() for t in (splats.means, splats.quats, splats.scales, splats.sh)]
-        cotangents = [torch.randn(shape) for shape in ((num, 2), (num, 3), (num,), (num, 3))]
+        inputs = [getattr(splats, name).requires_grad_() for name in ("means", "quats", "scales", "sh", "color_slopes")]
+        cotangents = [torch.randn(shape) for shape in ((num, 2), (num, 3), (num,), (num, 3), (num, 2, 3))]
         ours = {
-            "forward": lambda _, i=inputs, s=splats, c=camera: Project.apply(KERNELS, c, s.opacities, *i)[:4],
+            "forward": lambda _, i=inputs, s=splats, c=camera: Project.apply(KERNELS, c, s.opacities, *i)[:5],
             "backward": lambda out, i=inputs, v=cotangents: torch.autograd.grad(out, i, v),
         }
-        theirs = ours | {"forward": lambda _, s=splats, c=camera: list(vars(project(s, c)).values())[:4]}
+        theirs = ours | {"forward": lambda _, s=splats, c=camera: list(vars(project(s, c)).values())[:5]}
         measured += common.rows("projection + SH", common.race(ours, theirs), num)
     return measured
 

@@ -40,6 +40,7 @@ def splats(size: common.Size, seed: int = 0) -> tuple[Splats, Camera]:
         scales,
         rng.uniform(0.2, 0.95, size.num),
         rng.normal(size=(size.num, 16, 3)) * 0.2,
+        np.zeros((size.num, 2, 3)),
     )
     return Splats(*(torch.tensor(v, dtype=torch.float32) for v in values)), view
 
@@ -55,6 +56,8 @@ def gaussians(drawn: Splats, cfg: Config) -> Gaussians:
         "sh_dc": drawn.sh[:, :1],
         "sh_rest": drawn.sh[:, 1 : 1 + num_rest],
     }
+    if cfg.render.color_slopes:
+        tensors["color_slopes"] = drawn.color_slopes
     if cfg.deformation.kind == "basis":
         tensors["motion"] = torch.zeros(len(drawn), *attribute_shapes(cfg)["motion"])
     return Gaussians({name: value.clone() for name, value in tensors.items()})

@@ -63,6 +63,7 @@ def moving_scene(sh_degree: int = 0, moving_camera: bool = False) -> Scene:
         gaussians["opacity_logits"].fill_(4.0)
         gaussians["motion"].copy_(torch.from_numpy(rng.normal(size=gaussians["motion"].shape) * 0.05))
         gaussians["sh_rest"].copy_(torch.from_numpy(rng.normal(size=gaussians["sh_rest"].shape) * 0.1))
+        gaussians["color_slopes"].copy_(torch.from_numpy(rng.normal(size=gaussians["color_slopes"].shape) * 0.1))
     cameras = tuple(plane_camera(shift=i if moving_camera else 0.0) for i in range(NUM_FRAMES))
     return Scene(gaussians, None, cfg, cameras, 25.0, torch.zeros(num), torch.zeros(num))
 

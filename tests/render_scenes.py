@@ -41,6 +41,7 @@ def splats(
         scales,
         rng.uniform(0.01, 0.999, num),
         rng.normal(size=(num, (degree + 1) ** 2, 3)) * 0.3,
+        rng.normal(size=(num, 2, 3)) * 0.1,
     )
     return Splats(*(torch.tensor(v, dtype=torch.float32) for v in values))
 
@@ -54,13 +55,15 @@ def one(view: Camera, x: float, y: float, z: float, **changes: Tensor) -> Splats
         "scales": torch.full((1, 3), z / view.fx),
         "opacities": torch.tensor([0.6]),
         "sh": torch.zeros(1, 1, 3),
+        "color_slopes": torch.zeros(1, 2, 3),
     }
     return Splats(**(values | changes))
 
 
 def cast(scene: Splats, dtype: torch.dtype) -> Splats:
     """The same numbers as fresh leaves that require gradients."""
-    return Splats(*(getattr(scene, name).detach().to(dtype).clone().requires_grad_() for name in NAMES))
+    tensors = scene.tensors.items()
+    return Splats(**{name: value.detach().to(dtype).clone().requires_grad_() for name, value in tensors})
 
 
 def pick(scene: Splats, rows: Tensor) -> Splats:
@@ -100,7 +103,7 @@ def render_with_grads(
     for image in (out.color, out.depth, out.alpha):
         pulled = pulled + (torch.randn(image.shape, generator=generator).to(dtype) * image).sum()
     pulled.backward()
-    grads = {name: getattr(scene, name).grad for name in NAMES}
+    grads = {name: value.grad for name, value in scene.tensors.items()}
     return out, grads | {"means2d": out.means2d.grad, "background": behind.grad}
 
 
@@ -111,7 +114,7 @@ def agree(got, want, relative, name):
     assert gap <= relative, f"{name} differs by {gap:.1e} of its largest value"
 
 
-def compare(backend, scene, view, image=2e-6, gradient=1e-5, **options):
+def compare(backend, scene, view, image=2e-6, gradient=2e-5, **options):
     """Color, alpha and depth within a few float32 roundings per layer; gradients sum more of them."""
     want, want_grads = render_with_grads("reference", scene, view, **options)
     got, grads = render_with_grads(backend, scene, view, **options)

@@ -204,7 +204,9 @@ def test_the_command_says_what_it_wrote(run, tmp_path, capsys, name, options, wo
     out = tmp_path / name
     assert main(["export", str(run), str(out), "--times", "0.5", *options]) == 0
     count = f"{len(load_scene(run)):,}"
-    assert f"{out}: {words.format(count=count)}\n" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"{out}: {words.format(count=count)}\n" in said
+    assert ("one color for each Gaussian" in said) == ("Gaussians" in words)  # their colors have slopes
 
 
 def test_an_existing_file_is_kept_unless_it_may_be_overwritten(run, tmp_path, capsys):

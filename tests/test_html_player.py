@@ -47,6 +47,7 @@ def random_scene(num: int, num_frames: int, seed: int = 0) -> Scene:
         gaussians["log_scales"].copy_(torch.from_numpy(np.log(size * rng.uniform(0.3, 1.5, (num, 3)))))
         gaussians["opacity_logits"].copy_(torch.from_numpy(rng.uniform(-3, 4, num)))
         gaussians["sh_rest"].copy_(torch.from_numpy(rng.normal(size=gaussians["sh_rest"].shape) * 0.1))
+        gaussians["color_slopes"].copy_(torch.from_numpy(rng.normal(size=(num, 2, 3)) * 0.1))
         gaussians["motion"].copy_(torch.from_numpy(rng.normal(size=gaussians["motion"].shape) * 0.15))
     cameras = []
     for i in range(num_frames):
@@ -105,7 +106,7 @@ def unpack(page: Path) -> tuple[dict, NDArray[np.float64]]:
 def test_what_is_stored_is_the_scene_within_the_stated_bounds(scene, player):
     about, stored = unpack(player)
     kept = np.setdiff1d(np.arange(len(scene)), [FAINT, BROKEN, LOST])
-    assert about["gaussians"] == len(kept) and stored.shape == (14, NUM_FRAMES, len(kept))
+    assert about["gaussians"] == len(kept) and stored.shape == (20, NUM_FRAMES, len(kept))
     assert np.allclose(about["seconds"], np.arange(NUM_FRAMES) / RATE)
     for t, camera in enumerate(scene.cameras):
         splats = scene.at(t / NUM_FRAMES)
@@ -125,7 +126,9 @@ def test_what_is_stored_is_the_scene_within_the_stated_bounds(scene, player):
         towards = means - camera.center
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         colors = sh.colors(splats.sh[kept], torch.from_numpy(towards).float()).numpy()
-        assert np.abs(stored[11:, t].T - colors)[visible].max() <= 0.5 / 255 + 1e-6
+        assert np.abs(stored[11:14, t].T - colors)[visible].max() <= 0.5 / 255 + 1e-6
+        slopes = splats.color_slopes[kept].flatten(1).numpy()
+        assert np.abs(stored[14:, t].T - slopes)[visible].max() <= 0.25 / 255 + 1e-5
         assert np.allclose(about["cameras"][t], [300, 310, 150, 137, *camera.world_to_camera.ravel()])
 
 
@@ -233,7 +236,7 @@ def test_draws_what_the_renderer_draws(scene, page, kept):
         error = np.abs(got - want)
         print(f"frame {frame}: mean difference {error.mean():.3f} levels, largest {error.max():.0f}")
         # 0.25 is the screenshot's own rounding, the rest rounded numbers. Measured when wrong: no blur 0.78, half a
-        # pixel aside 2.4, rotations transposed 5, unsorted 12.
+        # pixel aside 2.4, rotations transposed 5, unsorted 12, without slopes 4.5.
         assert error.mean() < 0.65 and want.std() > 20
     assert not page.problems
     assert all(address.startswith(("file://", "blob:")) for address in page.requests)

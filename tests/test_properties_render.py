@@ -203,6 +203,7 @@ def test_a_hundred_thousand_gaussians_on_one_pixel(opacity):
         torch.full((num, 3), 0.5),
         torch.full((num,), opacity),
         torch.zeros(num, 1, 3),
+        torch.zeros(num, 2, 3),
     )
     out, grads = render_with_grads("numba", scene, view)
     assert_sound(out, grads, scene, view)

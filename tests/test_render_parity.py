@@ -36,7 +36,7 @@ def test_agrees_at_any_size(backend, width, height):
     """Images smaller than a tile, of exactly one, and not a multiple of one."""
     view = camera(width, height, seed=1)
     scene = splats(view, 40, degree=1, seed=2, widths=(0.5, 6.0))
-    compare(backend, scene, view)
+    compare(backend, scene, view, gradient=5e-5)  # of one pixel, large sums cancel
 
 
 @pytest.mark.parametrize("backend", FAST)

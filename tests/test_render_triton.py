@@ -153,7 +153,7 @@ def test_without_visible_gaussians_the_image_is_the_background(num):
 
 def tiles_of(scene, view):
     """(L, N) how often each tile lists each Gaussian."""
-    inputs = (scene.means, scene.quats, scene.scales, scene.sh)
+    inputs = (scene.means, scene.quats, scene.scales, scene.sh, scene.color_slopes)
     *projected, radii = backend.KERNELS.project_forward(inputs, scene.opacities, view)
     lists = backend.KERNELS.bin_tiles((*projected, scene.opacities), radii, (view.width, view.height))
     listed = torch.zeros(len(lists.tile_starts) - 1, len(scene), dtype=torch.int64)

@@ -63,6 +63,8 @@ def run(argv: list[str]) -> None:
         written = export(scene, args.out, options, partial(progress, "exporting"))
     for path in written:
         say(f"{path}: {_words(scene, path, options)}")
+    if scene.config.render.color_slopes and _holds(args.out, options) == "Gaussians":
+        say("note: this format knows one color for each Gaussian, so its pictures are less sharp (docs/export.md).")
     if scene.lengths_are_relative:
         say("note: the scale of this scene is assumed. Its lengths are not millimeters.")
 
@@ -79,13 +81,21 @@ def _with_data(scene: Scene, run: Path, out: Path, options: ExportOptions) -> Ex
     return replace(options, data=sequence and sequence.path)
 
 
+def _holds(out: Path, options: ExportOptions) -> str:
+    """What the format holds, in plain words."""
+    from ..export.exporting import format_name
+    from ..export.formats import load_format
+
+    name = format_name(out, options)
+    return load_format(name).holds or name
+
+
 def _words(scene: Scene, out: Path, options: ExportOptions) -> str:
     """What was written; without --format also what else a file of this suffix can hold, and how to get that."""
     from ..export.exporting import format_name
     from ..export.formats import formats_of, load_format
 
-    name = format_name(out, options)
-    holds, count = load_format(name).holds or name, f"{len(scene):,} "
+    name, holds, count = format_name(out, options), _holds(out, options), f"{len(scene):,} "
     words = f"{count if holds == 'Gaussians' else ''}{holds}"
     if out.is_dir():
         words += ", one file for each time step" if load_format(name).files else ""

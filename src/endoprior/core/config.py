@@ -137,6 +137,8 @@ class RenderConfig:
     """`numba`: the CPU; `triton`, `gsplat`: an NVIDIA GPU, by our own kernels or gsplat's; `reference`: PyTorch."""
     depth_grad_to_means: bool = False
     """Let the gradient of rendered depth reach the composited z; EndoGaussian's rasterizer drops it."""
+    color_slopes: bool = False
+    """The color of a Gaussian changes linearly along its first two axes."""
 
 
 @dataclass(frozen=True)
@@ -273,11 +275,14 @@ class OptimConfig(Checked):
     """Iterations, counted in each stage, over which the rates above decay."""
     sh_dc_lr: Rate = 2.5e-3
     sh_rest_lr: Rate = 1.25e-4
+    color_slopes_lr: Rate = 2.5e-3
     opacity_lr: Rate = 5e-2
     scales_lr: Rate = 5e-3
     quats_lr: Rate = 1e-3
     epsilon: Annotated[float, Range(1e-30, 1)] = 1e-15
     """Adam's epsilon."""
+    basis_epsilon: Annotated[float, Range(1e-30, 1)] = 1e-15
+    """Adam's epsilon for the temporal coefficients: gradients well below it hardly move them."""
     still_camera_scale: Weight = 10.0
     """Spatial scale of a sequence with a static camera."""
 

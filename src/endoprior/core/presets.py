@@ -92,7 +92,7 @@ def default() -> Config:
             basis=replace(base.deformation.basis, num_bases=0),
             max_scale_change=2.0,
         ),
-        render=replace(base.render, depth_grad_to_means=True),
+        render=replace(base.render, depth_grad_to_means=True, color_slopes=True),
         loss=replace(
             base.loss,
             depth_weight=3.0,
@@ -116,6 +116,7 @@ def default() -> Config:
             basis_quats_lr=1e-2,
             basis_log_scales_lr=1e-2,
             basis_color_lr=1e-2,
+            basis_epsilon=1e-7,
             decay_iterations=1500,
         ),
         schedule=replace(

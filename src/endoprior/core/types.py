@@ -80,9 +80,17 @@ class Splats:
     """(N,) in (0, 1)."""
     sh: Tensor
     """(N, (D+1)**2, 3) spherical-harmonic color coefficients of degree D in 0..3."""
+    color_slopes: Tensor | None = None
+    """(N, 2, 3) change of the color per standard deviation along the first and the second local axis; None: one color
+    each."""
 
     def __len__(self) -> int:
         return len(self.means)
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors that are there, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,7 @@ def rotated(splats: Splats, rotation: NDArray[np.float64]) -> Splats:
         scales=splats.scales,
         opacities=splats.opacities,
         sh=rotated_sh(splats.sh, rotation),
+        color_slopes=splats.color_slopes,
     )
 
 

@@ -27,7 +27,7 @@ _POINTS = 0
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The .glb file of one time step."""
     extras = {"unit": length_unit(scene.lengths_are_relative), "axes": options.frame, "time": step.time}
-    return {".glb": encode_glb(step.splats(scene, options.frame), extras)}
+    return {".glb": encode_glb(step.plain_splats(scene, options.frame), extras)}
 
 
 def encode_glb(splats: Splats, extras: dict[str, Any] | None = None) -> bytes:

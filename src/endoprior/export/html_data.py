@@ -1,10 +1,11 @@
 """The moving Gaussians of a scene as small integers, coded over time: the data of the HTML player.
 
-Every Gaussian has 14 channels, each `low + step * q` with q a 16-bit integer: center x, y, z (mm), quaternion w, x, y,
-z, the logarithms of the three scales (mm), opacity, red, green, blue. A channel that never changes is stored once. The
+Every Gaussian has 20 channels, each `low + step * q` with q a 16-bit integer: center x, y, z (mm), quaternion w, x, y,
+z, the logarithms of the three scales (mm), opacity, red, green, blue, and the change of these three per standard
+deviation along the first and the second local axis. A channel that never changes is stored once. The
 others store frame 0 and then the residual of a prediction from one frame before (q[t-1]) or two (2 q[t-1] - q[t-2]),
 whichever leaves less. Arithmetic is modulo 2**16, so that unpacking is exact. Shared letters: `T` frames, `N`
-Gaussians, `C = 14` channels.
+Gaussians, `C = 20` channels.
 """
 
 from __future__ import annotations
@@ -20,9 +21,11 @@ from ..core.checks import InputError
 from ..core.types import Camera, Splats
 from ..model.scene import Scene
 from ..render.constants import ALPHA_MIN, NEAR_Z
+from ..render.projection import color_slopes
 from ..render.sh import colors
 
 CHANNELS = ("x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz", "opacity", "r", "g", "b")
+CHANNELS += ("r1", "g1", "b1", "r2", "g2", "b2")
 LARGEST = 65535
 """Largest stored integer."""
 MAX_STEP_MM = 0.1
@@ -37,6 +40,9 @@ SMALLEST_SCALE_PX = 0.02
 """Scales below this at the working distance are stored as this: the renderer's blur is 27 times wider."""
 OPACITY_STEP = 1 / 1020
 COLOR_STEP = 1 / 255
+SLOPE_STEP = 1 / 510
+LARGEST_SLOPE = 8
+"""Any more would change a color by its whole range within an eighth of a standard deviation."""
 NOTHING_VISIBLE = "scene: expected Gaussians in front of the camera, got none that is visible. Fix: Train it again."
 
 
@@ -85,6 +91,7 @@ def quantize(scene: Scene, times: list[float]) -> Quantized:
         + [LOG_SCALE_STEP] * 3
         + [OPACITY_STEP]
         + [COLOR_STEP] * 3
+        + [SLOPE_STEP] * 6
     )
     raw[:, ~finite] = 0
     centers = raw[:3].reshape(3, -1)
@@ -100,6 +107,7 @@ def quantize(scene: Scene, times: list[float]) -> Quantized:
     low[:3] = np.where(visible, raw[:3], np.inf).min((1, 2))
     low[3:7] = -1
     low[7:10] = np.log(SMALLEST_SCALE_PX * near / focal)
+    low[14:] = -LARGEST_SLOPE
     raw[CHANNELS.index("opacity")] *= visible
     values = np.empty(raw.shape, np.uint16)
     for c in range(len(CHANNELS)):
@@ -167,6 +175,7 @@ def _channels(splats: Splats, camera: Camera) -> tuple[NDArray, NDArray]:
         splats.scales.clamp(min=1e-30).log(),
         splats.opacities[:, None],
         colors(splats.sh, towards),
+        color_slopes(splats).flatten(1),
     ]
     return torch.cat(parts, 1).T.numpy(), (splats.means @ pose[2, :3] + pose[2, 3]).numpy()
 

@@ -24,7 +24,7 @@ _TYPES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The PLY file of one time step."""
     unit = length_unit(scene.lengths_are_relative)
-    return {".ply": encode_ply(step.splats(scene, options.frame), options.frame, unit)}
+    return {".ply": encode_ply(step.plain_splats(scene, options.frame), options.frame, unit)}
 
 
 def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm") -> bytes:

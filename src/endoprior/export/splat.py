@@ -20,7 +20,7 @@ RECORD = np.dtype([("center", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4),
 
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The .splat file of one time step."""
-    return {".splat": encode_splat(step.splats(scene, options.frame))}
+    return {".splat": encode_splat(step.plain_splats(scene, options.frame))}
 
 
 def encode_splat(splats: Splats) -> bytes:

@@ -29,7 +29,7 @@ _LARGEST = 2**23 - 1
 
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The SPZ file of one time step."""
-    return {".spz": encode_spz(step.splats(scene, options.frame))}
+    return {".spz": encode_spz(step.plain_splats(scene, options.frame))}
 
 
 def encode_spz(splats: Splats) -> bytes:

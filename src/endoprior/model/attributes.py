@@ -35,6 +35,7 @@ ATTRIBUTES = (
     Attribute("opacity_logits", 1, "opacity_lr", "basis_opacity_lr", "deform_opacity"),
     Attribute("sh_dc", 3, "sh_dc_lr", "basis_color_lr"),
     Attribute("sh_rest", 3, "sh_rest_lr"),
+    Attribute("color_slopes", 3, "color_slopes_lr"),
 )
 """Every attribute but `motion`, the temporal coefficients of the others. The channels of `motion` and the heads of a
 HexPlane field follow this order."""
@@ -62,9 +63,11 @@ def attribute_shapes(cfg: Config) -> dict[str, tuple[int, ...]]:
     Raises:
         InputError: the config leaves the number of temporal basis functions open.
     """
-    shapes: dict[str, tuple[int, ...]] = {a.name: (a.width,) for a in ATTRIBUTES}
+    shapes: dict[str, tuple[int, ...]] = {a.name: (a.width,) for a in ATTRIBUTES if a.name != "color_slopes"}
     shapes["opacity_logits"] = ()
     shapes["sh_dc"], shapes["sh_rest"] = (1, 3), ((cfg.schedule.sh_degree + 1) ** 2 - 1, 3)
+    if cfg.render.color_slopes:
+        shapes["color_slopes"] = (2, 3)
     if cfg.deformation.kind == "basis":
         num_bases = cfg.deformation.basis.num_bases
         if num_bases == 0:

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -71,11 +72,18 @@ class Gaussians:
             scales=_moved(t["log_scales"], offsets and offsets.log_scales).exp(),
             opacities=_moved(t["opacity_logits"], offsets and offsets.opacity_logits).sigmoid(),
             sh=torch.cat([sh_dc, t["sh_rest"][:, :num_rest]], 1) if num_rest else sh_dc,
+            color_slopes=t.get("color_slopes"),
         )
 
 
 def _moved(value: Tensor, offset: Tensor | None) -> Tensor:
     return value if offset is None else value + offset
+
+
+def with_colors(splats: Splats, colors: NDArray | Tensor) -> Splats:
+    """The same Gaussians, each of one color, (N, 3): numbers to blend in its place, for example."""
+    sh = (torch.as_tensor(colors).to(splats.sh)[:, None] - 0.5) / SH_C0
+    return replace(splats, sh=sh.contiguous(), color_slopes=None)
 
 
 def create_gaussians(
@@ -106,6 +114,7 @@ def create_gaussians(
         "opacity_logits": torch.from_numpy(np.log(chances / (1 - chances)).astype(np.float32)),
         "sh_dc": (torch.from_numpy(np.asarray(colors, np.float32))[:, None, :] - 0.5) / SH_C0,
     }
-    # Everything else starts at zero: color that does not depend on the view, and no motion.
+    # Everything else starts at zero: color that does not depend on the view or change
+    # within a Gaussian, and no motion.
     zeros = {name: torch.zeros(num, *shape) for name, shape in attribute_shapes(cfg).items() if name not in tensors}
     return Gaussians(tensors | zeros)

@@ -66,5 +66,4 @@ class Playback:
 
 
 def _num_bytes(splats: Splats) -> int:
-    tensors = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+    return sum(tensor.numel() * tensor.element_size() for tensor in splats.tensors.values())

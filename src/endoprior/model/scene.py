@@ -100,7 +100,7 @@ class Scene:
     def _splats(self, offsets: Offsets | None) -> Splats:
         found = self.gaussians.splats(offsets, self.config.schedule.sh_degree)
         # A tensor that no deformation changes is the trained tensor itself, with its gradient.
-        return Splats(**{name: value.detach() for name, value in vars(found).items()})
+        return Splats(**{name: value.detach() for name, value in found.tensors.items()})
 
     @torch.no_grad()
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..core.types import Camera, RenderOutput, Splats
+from .projection import color_slopes
 
 Tensors = tuple[Tensor, ...]
 
@@ -26,9 +27,9 @@ Tensors = tuple[Tensor, ...]
 class Kernels:
     """What a backend computes. All tensors are float32, contiguous, on one device, and trusted.
 
-    3D Gaussians are means, quats, scales, sh; 2D ones means2d (N, 2), conic_ldl (N, 3), z (N,), colors (N, 3),
-    opacities (N,). Images are color (H, W, 3), depth and transmittance (H, W); their cotangents those of color, depth
-    and alpha. A size is (width, height), px.
+    3D Gaussians are means, quats, scales, sh, color_slopes; 2D ones means2d (N, 2), conic_ldl (N, 3), z (N,),
+    colors (N, 3), color_slopes2d (N, 2, 3), opacities (N,). Images are color (H, W, 3), depth and transmittance (H, W);
+    their cotangents those of color, depth and alpha. A size is (width, height), px.
     """
 
     project_forward: Callable[[Tensors, Tensor, Camera], Tensors]
@@ -39,8 +40,9 @@ class Kernels:
     """2D Gaussians, radii, size -> the Gaussians that touch each tile, near to far, as the next two take them."""
     composite_forward: Callable[[Any, Tensor, tuple[int, int]], tuple[Tensor, Tensor, Tensor, Any]]
     """Tiles, background (3,), size -> images, and where each tile's list was left."""
-    composite_backward: Callable[[Any, Any, Tensor, Tensor, Tensors, Tensors], Tensors]
-    """Tiles, where their lists were left, conic_ldl, opacities, images, cotangents -> gradients of 2D Gaussians."""
+    composite_backward: Callable[[Any, Any, Tensor, Tensor, Tensor, Tensors, Tensors], Tensors]
+    """Tiles, where their lists were left, conic_ldl, color_slopes2d, opacities, images, cotangents -> gradients of 2D
+    Gaussians."""
 
 
 def empty(like: Tensor, *shapes: tuple[int, ...]) -> Tensors:
@@ -52,17 +54,19 @@ def rasterize_with(
     kernels: Kernels, splats: Splats, camera: Camera, background: Tensor, depth_grad_to_means: bool
 ) -> RenderOutput:
     """Render checked Gaussians with a backend's kernels. See `render.Rasterizer`."""
-    gaussians = (splats.means, splats.quats, splats.scales, splats.sh)
-    means2d, conic_ldl, z, colors, radii = Project.apply(kernels, camera, splats.opacities.detach(), *gaussians)
+    gaussians = (splats.means, splats.quats, splats.scales, splats.sh, color_slopes(splats))
+    means2d, conic_ldl, z, colors, color_slopes2d, radii = Project.apply(
+        kernels, camera, splats.opacities.detach(), *gaussians
+    )
     z = z if depth_grad_to_means else z.detach()
     size = (camera.width, camera.height)
-    gaussians = (means2d, conic_ldl, z, colors, splats.opacities)
+    gaussians = (means2d, conic_ldl, z, colors, color_slopes2d, splats.opacities)
     color, alpha, depth = Composite.apply(kernels, size, radii, background, *gaussians)
     return RenderOutput(color, alpha, depth, means2d, radii)
 
 
 class Project(torch.autograd.Function):
-    """3D Gaussians -> means2d, conic_ldl, z, colors, radii. Opacities only decide what is visible."""
+    """3D Gaussians -> means2d, conic_ldl, z, colors, color_slopes2d, radii. Opacities only decide what is visible."""
 
     @staticmethod
     def forward(ctx: Any, kernels: Kernels, camera: Camera, opacities: Tensor, *gaussians: Tensor) -> Tensors:
@@ -94,7 +98,7 @@ class Composite(torch.autograd.Function):
         gaussians = tuple(tensor.contiguous() for tensor in gaussians)
         tiles = kernels.bin_tiles(gaussians, radii, size)
         color, depth, transmittance, tile_ends = kernels.composite_forward(tiles, background.contiguous(), size)
-        ctx.save_for_backward(gaussians[1], gaussians[4], color, depth, transmittance)
+        ctx.save_for_backward(gaussians[1], gaussians[4], gaussians[5], color, depth, transmittance)
         ctx.kernels, ctx.tiles, ctx.tile_ends = kernels, tiles, tile_ends
         return color, 1 - transmittance, depth
 
@@ -102,9 +106,9 @@ class Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_color: Tensor, v_alpha: Tensor, v_depth: Tensor) -> tuple[Tensor | None, ...]:
         """Chain rule through the blending."""
-        conic_ldl, opacities, *images = ctx.saved_tensors
+        conic_ldl, color_slopes2d, opacities, *images = ctx.saved_tensors
         cotangents = tuple(v.contiguous() for v in (v_color, v_depth, v_alpha))
         lists = (ctx.tiles, ctx.tile_ends)
-        grads = ctx.kernels.composite_backward(*lists, conic_ldl, opacities, tuple(images), cotangents)
+        grads = ctx.kernels.composite_backward(*lists, conic_ldl, color_slopes2d, opacities, tuple(images), cotangents)
         v_background = (v_color * images[2][..., None]).sum((0, 1)) if ctx.needs_input_grad[3] else None
         return None, None, None, v_background, *grads

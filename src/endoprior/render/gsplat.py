@@ -1,8 +1,8 @@
 """The backend that calls gsplat (Apache-2.0, an extra), float32 on one CUDA device.
 
 gsplat's separate steps are used and not its `rasterization`: color and z are composited in one pass of four channels,
-the gradient of z can be stopped, and `means2d` is the tensor whose gradient is kept. Once per call the host waits for
-the device, to count the tiles.
+ten where colors have slopes, the gradient of z can be stopped, and `means2d` is the tensor whose gradient is kept. Once
+per call the host waits for the device, to count the tiles.
 
 Where gsplat 1.5.3 differs from `reference`, read from its sources, and what that means for "agrees within 1e-3":
 
@@ -40,7 +40,7 @@ from ..core.checks import InputError
 from ..core.extras import install_command
 from ..core.types import Camera, RenderOutput, Splats
 from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
-from .projection import FIELDS, check, check_device, jacobian_limits
+from .projection import FIELDS, check, check_device, color_slopes, jacobian_limits, project
 
 NEXT_STEP = f"Run `{install_command('cuda')}`; `endoprior doctor` tells what is missing."
 
@@ -125,7 +125,8 @@ def _render(
     """`B` time steps of `N` Gaussians, seen by one camera each."""
     steps, width, height = len(splats), cameras[0].width, cameras[0].height
     all_means, quats, scales, opacities, coefficients = (torch.stack([getattr(s, n) for s in splats]) for n in FIELDS)
-    together = Splats(all_means, quats, scales, opacities, coefficients)
+    slopes = torch.stack([color_slopes(each) for each in splats])
+    together = Splats(all_means, quats, scales, opacities, coefficients, slopes)
     lens = _together([lens_of(camera, background.device) for camera in cameras])
     means = torch.where(_usable(together, lens)[..., None], all_means, lens.behind)
     found = gsplat.fully_fused_projection(
@@ -150,6 +151,9 @@ def _render(
     sh = gsplat.spherical_harmonics(degree, means - lens.center, coefficients, masks=kept)
     z = depths if depth_grad_to_means else depths.detach()
     channels = torch.cat([(sh + 0.5).clamp(min=0), z[..., None]], -1)
+    sloped = splats[0].color_slopes is not None
+    if sloped:
+        channels = _sloped(channels, centers, splats, cameras)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     _, pairs, pair_ids = gsplat.isect_tiles(centers, boxes, depths, TILE, tiles_x, tiles_y)
     blended, alpha = gsplat.rasterize_to_pixels(
@@ -163,10 +167,29 @@ def _render(
         gsplat.isect_offset_encode(pairs, steps, tiles_x, tiles_y),
         pair_ids,
     )
+    if sloped:
+        blended = _at_pixels(blended)
     color, depth = blended.split([3, 1], -1)
     color = color + (1 - alpha) * background  # given to gsplat, its backward pass reads it at every Gaussian of a pixel
     radii = _radii(centers, conics, opacities, kept, lens)
     return [RenderOutput(*image) for image in zip(color, alpha[..., 0], depth[..., 0], means2d, radii, strict=True)]
+
+
+def _sloped(channels: Tensor, centers: Tensor, splats: list[Splats], cameras: list[Camera]) -> Tensor:
+    """(B, N, 10) channels of colors that change within a Gaussian: gsplat blends what is constant in each.
+
+    Slopes s and a color c at center m: sum w (c + s . (p - m)) = sum w (c - s . m) + p . sum w s at pixel p.
+    """
+    slopes = torch.stack([project(each, camera).color_slopes2d for each, camera in zip(splats, cameras, strict=True)])
+    color, z = channels.split([3, 1], -1)
+    return torch.cat([color - (centers[..., None] * slopes).sum(-2), z, slopes.flatten(-2)], -1)
+
+
+def _at_pixels(blended: Tensor) -> Tensor:
+    """(B, H, W, 4) color and depth from the blended channels of `_sloped`."""
+    color, z, along_x, along_y = blended.split([3, 1, 3, 3], -1)
+    y, x = (torch.arange(length, device=blended.device) + 0.5 for length in blended.shape[1:3])
+    return torch.cat([color + x[:, None] * along_x + y[:, None, None] * along_y, z], -1)
 
 
 def lens_of(camera: Camera, device: torch.device) -> Lens:
@@ -222,7 +245,7 @@ def _build_kernels() -> None:
 def _nothing(splats: Splats, camera: Camera, background: Tensor) -> RenderOutput:
     """The image without Gaussians, by whose number gsplat divides; tied to its inputs as any other is."""
     means2d = splats.means[:, :2]
-    zero = means2d.sum() + sum(getattr(splats, name).sum() for name in FIELDS)
+    zero = means2d.sum() + sum(getattr(splats, name).sum() for name in FIELDS) + color_slopes(splats).sum()
     color = background.expand(camera.height, camera.width, 3) + zero
     empty = zero.expand(camera.height, camera.width)
     radii = torch.empty(0, dtype=torch.int32, device=background.device)
@@ -237,6 +260,7 @@ def _usable(splats: Splats, lens: Lens) -> Tensor:
     return (
         (numbers.abs() < LARGEST).all(-1)
         & (splats.sh.abs() < LARGEST_SH).flatten(2).all(-1)
+        & (splats.color_slopes.abs() < LARGEST_SH).flatten(2).all(-1)
         & (splats.quats.norm(dim=-1) >= MIN_QUAT)
         & (splats.scales.amax(-1) < lens.widest * z)
     )

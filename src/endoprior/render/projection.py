@@ -32,6 +32,8 @@ class Projected:
     """(N,) camera-space z of the centers, mm."""
     colors: Tensor
     """(N, 3) color seen from the camera, >= 0."""
+    color_slopes2d: Tensor
+    """(N, 2, 3) change of the color per px along x, then y."""
     radii: Tensor
     """(N,) int32 ceil(3 sigma) along the long axis, px; 0 where nothing of it can reach a pixel."""
     det: Tensor | None = None
@@ -48,7 +50,11 @@ def check(splats: Splats, background: Tensor) -> int:
         "means:N,3 quats:N,4 scales:N,3 opacities:N sh:N,K,3", **{n: getattr(splats, n) for n in FIELDS}
     )
     check_shape("background:3", background=background)
-    dtypes = {getattr(splats, name).dtype for name in FIELDS} | {background.dtype}
+    tensors = [background, *(getattr(splats, name) for name in FIELDS)]
+    if splats.color_slopes is not None:
+        check_shape(f"color_slopes:{sizes['N']},2,3", color_slopes=splats.color_slopes)
+        tensors.append(splats.color_slopes)
+    dtypes = {tensor.dtype for tensor in tensors}
     if len(dtypes) > 1:
         raise ValueError(f"splats and background must share one dtype; got {sorted(map(str, dtypes))}")
     return sh.degree_of(sizes["K"])
@@ -101,17 +107,19 @@ def project(splats: Splats, camera: Camera) -> Projected:
         usable = _usable(splats, camera)
     placeholder = _placeholder(splats, camera)
     safe = {}
-    for name in FIELDS:
-        values = getattr(splats, name)
+    for name in (*FIELDS, "color_slopes"):
+        values = getattr(splats, name) if name in FIELDS else color_slopes(splats)
         keep = usable.reshape(-1, *(1,) * (values.dim() - 1))
         safe[name] = torch.where(keep, values, placeholder[name])
-    means2d, cov2d, det, z, colors = _project(Splats(**safe), camera)
-    return Projected(means2d, cov2d, z, colors, _radii(means2d, cov2d, safe["opacities"], usable, camera), det)
+    means2d, cov2d, det, z, colors, slopes2d = _project(Splats(**safe), camera)
+    radii = _radii(means2d, cov2d, safe["opacities"], usable, camera)
+    return Projected(means2d, cov2d, z, colors, slopes2d, radii, det)
 
 
-def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Means, covariances and their determinants, z and colors of Gaussians trusted to be in front of the camera."""
-    view = torch.as_tensor(camera.world_to_camera, dtype=splats.means.dtype)
+def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Means, covariances and their determinants, z, colors and their slopes of Gaussians trusted to be in front of the
+    camera."""
+    view = torch.as_tensor(camera.world_to_camera, dtype=splats.means.dtype, device=splats.means.device)
     x, y, z = (splats.means @ view[:3, :3].T + view[:3, 3]).unbind(-1)
     left, right, top, bottom = jacobian_limits(camera)
     slope_x, slope_y = (x / z).clamp(left, right), (y / z).clamp(top, bottom)
@@ -122,9 +130,26 @@ def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Te
     cov2d = torch.stack([xx + BLUR_PX2, xy, yy + BLUR_PX2], -1)
     # Of the blurred product B B^T + b I of a 2x3 matrix with rows r1, r2: |r1 x r2|^2 + b (|r1|^2 + |r2|^2) + b^2.
     det = torch.linalg.cross(spread_x, spread_y).square().sum(-1) + BLUR_PX2 * (xx + yy) + BLUR_PX2**2
+    per_px = _local_per_px(cov2d, det, torch.stack([spread_x[:, :2], spread_y[:, :2]], 1))
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
-    towards = splats.means - torch.as_tensor(camera.center, dtype=splats.means.dtype)
-    return means2d, cov2d, det, z, sh.colors(splats.sh, _unit(towards))
+    towards = splats.means - torch.as_tensor(camera.center, dtype=splats.means.dtype, device=splats.means.device)
+    return means2d, cov2d, det, z, sh.colors(splats.sh, _unit(towards)), per_px @ color_slopes(splats)
+
+
+def _local_per_px(cov2d: Tensor, det: Tensor, spread: Tensor) -> Tensor:
+    """(N, 2, 2) change of the first two local coordinates, in standard deviations, per px along x, then y.
+
+    A Gaussian at local coordinates q ~ N(0, I) projects to B q plus the blur, with B = `spread` for the first two axes.
+    Of what is seen at offset d from its center the mean of q is B^T cov2d^-1 d: that is where on it the pixel lies.
+    """
+    xx, xy, yy = cov2d.unbind(-1)
+    inverse = torch.stack([torch.stack([yy, -xy], -1), torch.stack([-xy, xx], -1)], 1) / det[:, None, None]
+    return inverse @ spread
+
+
+def color_slopes(splats: Splats) -> Tensor:
+    """(N, 2, 3) the slopes; zeros where there are none."""
+    return splats.means.new_zeros(len(splats), 2, 3) if splats.color_slopes is None else splats.color_slopes
 
 
 def _unit(vectors: Tensor) -> Tensor:
@@ -136,23 +161,27 @@ def _unit(vectors: Tensor) -> Tensor:
 def _usable(splats: Splats, camera: Camera) -> Tensor:
     """(N,) True where the Gaussian is finite, in front of the camera, and stays finite when projected."""
     per_gaussian = [splats.means, splats.quats, splats.scales, splats.opacities[:, None], splats.sh.flatten(1)]
+    per_gaussian.append(color_slopes(splats).flatten(1))
     usable = torch.cat(per_gaussian, -1).isfinite().all(-1)
-    means2d, cov2d, _, z, colors = _project(splats, camera)
-    largest = torch.cat([means2d, z[:, None], (cov2d[:, :1] * cov2d[:, 2:]), colors], -1).abs().sum(-1)
+    means2d, cov2d, _, z, colors, _ = _project(splats, camera)
+    slopes = color_slopes(splats).flatten(1)
+    sizes = [means2d, z[:, None], (cov2d[:, :1] * cov2d[:, 2:]), colors, slopes]
+    largest = torch.cat(sizes, -1).abs().sum(-1)
     length = splats.quats.norm(dim=-1)
     return usable & (z > NEAR_Z) & (length >= MIN_QUAT) & (largest < OVERFLOW)  # False for NaN
 
 
 def _placeholder(splats: Splats, camera: Camera) -> dict[str, Tensor]:
     """One harmless Gaussian, 1 mm small and 1 mm beyond the near plane, to stand in for the culled ones."""
-    rotation = torch.as_tensor(camera.world_to_camera[:3, :3], dtype=splats.means.dtype)
-    center = torch.as_tensor(camera.center, dtype=splats.means.dtype)
+    like = {"dtype": splats.means.dtype, "device": splats.means.device}
+    rotation, center = torch.as_tensor(camera.world_to_camera[:3, :3], **like), torch.as_tensor(camera.center, **like)
     return {
         "means": center + (NEAR_Z + 1) * rotation[2],
         "quats": splats.quats.new_tensor([1.0, 0.0, 0.0, 0.0]),
         "scales": splats.scales.new_ones(3),
         "opacities": splats.opacities.new_tensor(0.0),
         "sh": splats.sh.new_zeros(splats.sh.shape[1:]),
+        "color_slopes": splats.sh.new_zeros(2, 3),
     }
 
 

@@ -25,11 +25,14 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
     order = order[seen.radii[order] > 0]
     alpha = _alpha(seen.means2d[order], seen.cov2d[order], seen.det[order], splats.opacities[order], camera)
     alpha = alpha * _counts(alpha)
+    colors = seen.colors[order] + torch.einsum(
+        "hwni,nic->hwnc", _offsets(seen.means2d[order], camera), seen.color_slopes2d[order]
+    )
     behind = torch.cumprod(torch.cat([alpha.new_ones((*alpha.shape[:2], 1)), 1 - alpha], -1), -1)
     weights, transmittance = alpha * behind[..., :-1], behind[..., -1]
     z = seen.z if depth_grad_to_means else seen.z.detach()
     return RenderOutput(
-        color=weights @ seen.colors[order] + transmittance[..., None] * background,
+        color=(weights[..., None] * colors).sum(2) + transmittance[..., None] * background,
         alpha=1 - transmittance,
         depth=weights @ z[order],
         means2d=seen.means2d,
@@ -39,13 +42,18 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
 
 def _alpha(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, camera: Camera) -> Tensor:
     """(H, W, N) opacity times the 2D Gaussian, at most ALPHA_MAX, exactly 0 below ALPHA_MIN."""
-    pixels = torch.as_tensor(pixel_centers(camera.width, camera.height), dtype=means2d.dtype)
-    dx, dy = (pixels[:, :, None] - means2d).unbind(-1)
+    dx, dy = _offsets(means2d, camera).unbind(-1)
     _, xy, yy = cov2d.unbind(-1)
     # Mahalanobis: (yy dx^2 - 2 xy dx dy + xx dy^2) / det, as a sum of squares, which nothing can make negative.
     squared_distance = (dx - xy / yy * dy).square() * (yy / det) + dy * dy / yy
     alpha = (opacities * torch.exp(-0.5 * squared_distance)).clamp(max=ALPHA_MAX)
     return torch.where(alpha >= ALPHA_MIN, alpha, 0)
+
+
+def _offsets(means2d: Tensor, camera: Camera) -> Tensor:
+    """(H, W, N, 2) of each pixel's center from each Gaussian's, px."""
+    pixels = torch.as_tensor(pixel_centers(camera.width, camera.height), dtype=means2d.dtype)
+    return pixels[:, :, None] - means2d
 
 
 @torch.no_grad()

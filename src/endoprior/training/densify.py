@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..compute.morton import morton_order
 from ..core.geometry import quaternion_to_matrix
-from ..model.gaussians import Gaussians
+from ..model.gaussians import SH_C0, Gaussians
 from .density import DensityStats, Plan
 from .divergence import ADVICE, Diverged
 from .optimizer import Optimizer
@@ -54,10 +54,16 @@ def split_children(gaussians: Gaussians, split: Tensor, shrink: float, rng: np.r
     tensors = {name: value.detach()[split] for name, value in gaussians.tensors.items()}
     children = {name: torch.cat([value, value]) for name, value in tensors.items()}
     scales, quats = children["log_scales"].exp().cpu().numpy(), children["quats"].cpu().numpy()
-    offsets = rng.normal(size=scales.shape) * scales
+    local = rng.normal(size=scales.shape)
+    offsets = local * scales
     turned = np.einsum("nij,nj->ni", quaternion_to_matrix(quats.astype(np.float64)), offsets)
     children["means"] = children["means"] + torch.from_numpy(turned.astype(np.float32)).to(children["means"].device)
     children["log_scales"] = children["log_scales"] - math.log(shrink)
+    slopes = children.get("color_slopes")
+    if slopes is not None:  # each child has the color of the place where it lies
+        places = torch.from_numpy(local[:, :2].astype(np.float32)).to(slopes.device)
+        children["sh_dc"] = children["sh_dc"] + torch.einsum("ni,nic->nc", places, slopes)[:, None] / SH_C0
+        children["color_slopes"] = slopes / shrink
     return children
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.config import Config, OptimConfig
-from ..model.attributes import ATTRIBUTES, motion_layout
+from ..model.attributes import ATTRIBUTES, attribute_shapes, motion_layout
 from ..model.deformation import HexPlaneField
 from ..model.gaussians import Gaussians
 from .adam import AdamState
@@ -59,8 +59,8 @@ class Optimizer:
                 self._ops.adam_step(states, [params[name] for name in names], group.rate(iteration), epsilon, skip)
         gradients = self.gaussians.motion_gradients
         if gradients and self.gaussians["motion"].numel():
-            rates = motion_rates(self.cfg, iteration)
-            self._ops.adam_basis_step(self.states["motion"], self.gaussians["motion"], gradients, rates, epsilon, skip)
+            rates, tiny = motion_rates(self.cfg, iteration), self.cfg.optim.basis_epsilon
+            self._ops.adam_basis_step(self.states["motion"], self.gaussians["motion"], gradients, rates, tiny, skip)
         if self.planes and any(param.grad is not None for param in _field_parameters(self.field).values()):
             self._ops.adam_planes_step(self.planes, self._planes_rate(iteration), skip)
         self._clear_dense()
@@ -119,7 +119,8 @@ def gaussian_groups(cfg: Config, spatial_scale: float) -> tuple[ParameterGroup, 
             return lambda iteration: start
         return lambda iteration: spatial_scale * log_linear(start, end, iteration, cfg.optim.decay_iterations)
 
-    return tuple(ParameterGroup((a.name,), rate_of(a.rate)) for a in ATTRIBUTES)
+    present = attribute_shapes(cfg)
+    return tuple(ParameterGroup((a.name,), rate_of(a.rate)) for a in ATTRIBUTES if a.name in present)
 
 
 def field_groups(field: HexPlaneField, cfg: Config, spatial_scale: float) -> tuple[ParameterGroup, ...]:

@@ -15,8 +15,9 @@ from ..core.geometry import back_project, expected_depth, length_unit, project, 
 from ..core.types import Camera, RenderOutput, Splats
 from ..data import FrameSequence
 from ..model.carry import CarriedPoints, carry
-from ..model.gaussians import SH_C0
+from ..model.gaussians import SH_C0, with_colors
 from ..model.measures import distance
+from ..model.one_color import FEW_ITERATIONS, one_color
 from ..model.playback import Playback
 from ..model.scene import Scene
 from ..model.support import support_of
@@ -41,6 +42,8 @@ TRACK_COLUMNS = 16
 """Number of material points along a row of the image."""
 SEEN_WIDTH, SEEN_FRAMES = 160, 200
 """Least width of the depth that tells which points a frame shows, px, and how many frames of it are cached."""
+PLAIN_FRAMES = 64
+"""Number of frames whose Gaussians of one color each are cached for the browser."""
 MAX_MEASURED = 256
 """Largest number of frames whose displacement or stretch is kept."""
 MOTION_SAMPLES = 8
@@ -71,6 +74,7 @@ class ViewableScene:
         self._value_span = lru_cache(MAX_MEASURED)(self._span_of)
         self._rasterize = render.load(scene.backend)
         self._seen = lru_cache(SEEN_FRAMES)(self._surface_and_mask)
+        self._plain = lru_cache(PLAIN_FRAMES)(self._one_color)
 
     @cached_property
     def span(self) -> tuple[float, float]:
@@ -114,7 +118,7 @@ class ViewableScene:
         """Render the selected Gaussians; `values` (N,) in [0, 1] become red, and green 1 where they are known."""
         splats = self._splats(settings)
         if values is not None:
-            splats = replace(splats, sh=_value_sh(values))
+            splats = with_colors(splats, _value_colors(values))
         return self._rasterize(
             _clipped(splats, camera, settings.near, settings.far), camera, background=splats.means.new_zeros(3)
         )
@@ -174,23 +178,23 @@ class ViewableScene:
 
     @torch.no_grad()
     def cloud(self, settings: ViewSettings) -> Cloud:
-        """See `Viewable.cloud`: without view-dependent color."""
-        splats = _clipped(self._splats(settings), self.cameras[settings.frame], settings.near, settings.far)
-        if settings.layer == "color":
+        """See `Viewable.cloud`: one color each, without what depends on the view."""
+        in_color = settings.layer == "color"
+        drawn = self._plain(settings.frame) if in_color and not settings.points else self._splats(settings)
+        within = (self.cameras[settings.frame], settings.near, settings.far)
+        splats = _clipped(drawn, *within)
+        if in_color:
             colors = to_u8((splats.sh[:, 0] * SH_C0 + 0.5).cpu().numpy())
         else:
-            values = _rows(
-                self._values(settings),
-                self._splats(settings),
-                self.cameras[settings.frame],
-                settings.near,
-                settings.far,
-            )
-            colors = value_colors(values.cpu().numpy(), (0, 1))
+            colors = value_colors(_rows(self._values(settings), drawn, *within).cpu().numpy(), (0, 1))
         points = splats.means.cpu().numpy()
         if settings.points:
             return Cloud(points, colors, None, None, 3 * self._dot_mm)
         return Cloud(points, colors, _covariances(splats), splats.opacities.cpu().numpy(), 0.0)
+
+    @torch.enable_grad()
+    def _one_color(self, frame: int) -> Splats:
+        return one_color(self._playback.splats(frame), self.cameras[frame], FEW_ITERATIONS, self.scene.backend)
 
     def carry(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
         """See `Viewable.carry`: a point moves with the Gaussians around it."""
@@ -250,19 +254,17 @@ class ViewableScene:
         }.get(settings.layer, "")
 
 
-def _value_sh(values: Tensor) -> Tensor:
-    """(N, 1, 3) coefficients that render (N,) `values` as red and 1 as green; both 0 where a value is NaN."""
+def _value_colors(values: Tensor) -> Tensor:
+    """(N, 3) colors that render (N,) `values` as red and 1 as green; both 0 where a value is NaN."""
     known = torch.isfinite(values)
-    colors = torch.stack([values.nan_to_num(), known.to(values), torch.zeros_like(values)], -1)
-    return ((colors - 0.5) / SH_C0)[:, None].contiguous()
+    return torch.stack([values.nan_to_num(), known.to(values), torch.zeros_like(values)], -1)
 
 
 def _clipped(splats: Splats, camera: Camera, near: float, far: float) -> Splats:
     """The Gaussians whose centers lie between two depths of `camera`, mm."""
     if near <= 0 and far == float("inf"):
         return splats
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return Splats(*(_rows(getattr(splats, name), splats, camera, near, far) for name in names))
+    return Splats(**{name: _rows(value, splats, camera, near, far) for name, value in splats.tensors.items()})
 
 
 def _rows(values: Tensor, splats: Splats, camera: Camera, near: float, far: float) -> Tensor:

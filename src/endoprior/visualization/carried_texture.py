@@ -7,7 +7,6 @@ it: what is blended is how far each has moved in the image, and each pixel looks
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from .. import render
 from ..core.geometry import pixel_centers, project
 from ..core.types import Camera, Frame
 from ..model.fixed_color import with_fixed_color
-from ..model.gaussians import SH_C0
+from ..model.gaussians import with_colors
 from ..model.scene import Scene
 from ..model.surface import project_visible, render_surface
 from .camera_paths import View
@@ -65,8 +64,8 @@ class PaintedTissue:
         pixels, _ = project(splats.means.cpu().numpy().astype(np.float64), camera)
         span = 2 * FARTHEST * camera.width
         back = np.clip((self._pixels - pixels) / span + 0.5, 0, 1)
-        numbers = torch.from_numpy(np.column_stack([back, self._painted])).to(splats.sh)
-        carried = self._rasterize(replace(splats, sh=(numbers[:, None] - 0.5) / SH_C0), camera, background=black)
+        numbers = np.column_stack([back, self._painted])
+        carried = self._rasterize(with_colors(splats, numbers), camera, background=black)
         blended, alpha = carried.color.cpu().numpy(), carried.alpha.cpu().numpy()[..., None]
         back = (blended[..., :2] / np.maximum(alpha, 1e-6) - 0.5) * span
         lines = _grid(pixel_centers(camera.width, camera.height) + back, self._square)

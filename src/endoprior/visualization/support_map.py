@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .. import render
 from ..core.geometry import pixel_centers
 from ..core.types import Camera, Frame
-from ..model.gaussians import SH_C0
+from ..model.gaussians import with_colors
 from ..model.scene import Scene
 from ..model.support import support_of
 from ..system.atomic import whole_file
@@ -61,8 +61,7 @@ class SupportMap:
         guessed = ~np.isfinite(gap)
         # Three numbers for each Gaussian, blended as if they were its color, in [0, 1].
         numbers = np.column_stack([self._support.num_frames / total, np.where(guessed, 0, gap), guessed])
-        numbers = torch.from_numpy(numbers).to(splats.sh)
-        out = self._rasterize(replace(splats, sh=(numbers[:, None] - 0.5) / SH_C0), camera, background=black)
+        out = self._rasterize(with_colors(splats, numbers), camera, background=black)
         blended, alpha = out.color.cpu().numpy(), out.alpha.cpu().numpy()
         solid = alpha > SOLID_ALPHA
         share, gap, guess = np.moveaxis(blended / np.where(solid, alpha, 1)[..., None], -1, 0)

@@ -152,7 +152,7 @@ class Painter {
     const { gl, about } = this;
     const at = this.splats.places;
     const { rotation: r, focal, center, size } = view;
-    const [low, stepSize] = [new Float32Array(16), new Float32Array(16)];
+    const [low, stepSize] = [new Float32Array(4 * GAUSSIAN_TEXELS), new Float32Array(4 * GAUSSIAN_TEXELS)];
     CHANNEL_SLOTS.forEach((slot, c) => {
       low[slot] = about.channels[c].low;
       stepSize[slot] = about.channels[c].step;
@@ -174,5 +174,5 @@ class Painter {
   }
 }
 
-// Position of each channel among the 16 numbers of a Gaussian's texels, in the order of `about.channels`.
-const CHANNEL_SLOTS = [0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 3, 12, 13, 14];
+// Position of each channel among the 20 numbers of a Gaussian's texels, in the order of `about.channels`.
+const CHANNEL_SLOTS = [0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 3, 12, 13, 14, 11, 15, 16, 17, 18, 19];

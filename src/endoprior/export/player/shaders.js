@@ -1,7 +1,8 @@
 // Gaussians to pixels, as in render/projection.py and render/constants.py. Pixels are those of the recording, so that
 // the blur means the same in a window of any size.
 
-const GAUSSIAN_TEXELS = 4; // (x, y, z, opacity) (qw, qx, qy, qz) (sx, sy, sz, -) (r, g, b, -)
+// (x, y, z, opacity) (qw, qx, qy, qz) (sx, sy, sz, r1) (r, g, b, g1) (b1, r2, g2, b2)
+const GAUSSIAN_TEXELS = 5;
 const GAUSSIANS_PER_ROW = 512;
 const ORDER_WIDTH = 1024;
 
@@ -10,7 +11,7 @@ precision highp float;
 precision highp int;
 precision highp usampler2D;
 uniform usampler2D gaussians, order;
-uniform vec4 low[4], stepSize[4];
+uniform vec4 low[${GAUSSIAN_TEXELS}], stepSize[${GAUSSIAN_TEXELS}];
 uniform mat3 toCamera;
 uniform vec3 origin;
 uniform vec2 focal, center, size;
@@ -18,6 +19,8 @@ uniform vec2 depthRange;   // mm; y > x: draw depth
 uniform vec4 slopeLimits;  // smallest x/z, y/z, then largest
 out vec2 fromCenter;       // standard deviations
 flat out vec4 paint;       // color or depth, and opacity
+flat out vec3 change1;     // of the color, per standard deviation along each axis of the ellipse
+flat out vec3 change2;
 
 const float BLUR = 0.3;
 const float NEAR = 0.2;
@@ -41,6 +44,7 @@ void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
   fromCenter = vec2(0.0);
   paint = vec4(0.0);
+  change1 = change2 = vec3(0.0);
   int turn = gl_VertexID >> 2;
   int i = int(texelFetch(order, ivec2(turn % ${ORDER_WIDTH}, turn / ${ORDER_WIDTH}), 0).r);
   vec4 place = part(i, 0);
@@ -48,7 +52,8 @@ void main() {
   vec3 p = toCamera * place.xyz + origin;
   if (opacity < ALPHA_MIN || p.z <= NEAR) return;
 
-  vec3 scales = exp(part(i, 2).xyz);
+  vec4 shape = part(i, 2);
+  vec3 scales = exp(shape.xyz);
   mat3 axes = toCamera * rotation(part(i, 1));
   axes = mat3(axes[0] * scales.x, axes[1] * scales.y, axes[2] * scales.z);
   vec2 slope = clamp(p.xy / p.z, slopeLimits.xy, slopeLimits.zw);
@@ -69,19 +74,32 @@ void main() {
   gl_Position = vec4(pixel / size * vec2(2.0, -2.0) + vec2(-1.0, 1.0), 0.0, 1.0);
 
   bool depth = depthRange.y > depthRange.x;
-  vec3 seen = depth ? vec3((p.z - depthRange.x) / (depthRange.y - depthRange.x), 0.0, 0.0) : part(i, 3).xyz;
-  paint = vec4(seen, opacity);
+  if (depth) {
+    paint = vec4((p.z - depthRange.x) / (depthRange.y - depthRange.x), 0.0, 0.0, opacity);
+    return;
+  }
+  vec4 color = part(i, 3), rest = part(i, 4);
+  paint = vec4(color.xyz, opacity);
+  // Change of the color per px: through the mean of the local coordinates of what is seen there.
+  vec3 normal = cross(alongX, alongY);
+  float det = dot(normal, normal) + BLUR * (xx + yy - BLUR);
+  vec2 localX = (yy * alongX.xy - xy * alongY.xy) / det, localY = (xx * alongY.xy - xy * alongX.xy) / det;
+  vec3 first = vec3(shape.w, color.w, rest.x), second = rest.yzw;
+  vec3 perX = localX.x * first + localX.y * second, perY = localY.x * first + localY.y * second;
+  change1 = sigma.x * (axis.x * perX + axis.y * perY);
+  change2 = sigma.y * (axis.x * perY - axis.y * perX);
 }`;
 
 const SPLAT_FRAGMENT = `#version 300 es
 precision highp float;
 in vec2 fromCenter;
 flat in vec4 paint;
+flat in vec3 change1, change2;
 out vec4 painted;
 void main() {
   float alpha = min(0.99, paint.a * exp(-0.5 * dot(fromCenter, fromCenter)));
   if (alpha < 1.0 / 255.0) discard;
-  painted = vec4(paint.rgb * alpha, alpha);
+  painted = vec4((paint.rgb + fromCenter.x * change1 + fromCenter.y * change2) * alpha, alpha);
 }`;
 
 const SCREEN_VERTEX = `#version 300 es

@@ -43,10 +43,11 @@ def _arrays(*tensors: Tensor) -> list[NDArray]:
 
 
 def _project_forward(gaussians: Tensors, opacities: Tensor, camera: Camera) -> Tensors:
-    means, quats, scales, sh = gaussians
+    means, quats, scales, sh, color_slopes = gaussians
     num = len(means)
-    outputs = (*empty(means, (num, 2), (num, 3), (num,), (num, 3)), means.new_empty(num, dtype=torch.int32))
-    inputs = _arrays(means, quats, scales, opacities, sh)
+    shapes = ((num, 2), (num, 3), (num,), (num, 3), (num, 2, 3))
+    outputs = (*empty(means, *shapes), means.new_empty(num, dtype=torch.int32))
+    inputs = _arrays(means, quats, scales, opacities, sh, color_slopes)
     project_forward(*inputs, *camera_arrays(camera), camera.width, camera.height, *_arrays(*outputs))
     return outputs
 
@@ -76,6 +77,7 @@ def _composite_backward(
     lists: tiles.Tiles,
     tile_ends: NDArray[np.int64],
     conic_ldl: Tensor,
+    color_slopes2d: Tensor,
     opacities: Tensor,
     images: Tensors,
     cotangents: Tensors,
@@ -84,8 +86,8 @@ def _composite_backward(
     work = (lists.records, lists.pairs, lists.tile_starts, tile_ends, lists.by_cost, numba.get_num_threads())
     composite_backward(*work, *_arrays(*images, *cotangents), sums)
     num = len(opacities)
-    grads = empty(opacities, (num, 2), (num, 3), (num,), (num, 3), (num,))
-    gather(sums, lists.slot_starts, *_arrays(conic_ldl, opacities, *grads))
+    grads = empty(opacities, (num, 2), (num, 3), (num,), (num, 3), (num, 2, 3), (num,))
+    gather(sums, lists.slot_starts, *_arrays(conic_ldl, color_slopes2d, opacities, *grads))
     return grads
 
 

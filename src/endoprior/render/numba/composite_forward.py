@@ -13,7 +13,7 @@ from numba import njit, prange
 from ...compute.simd import LANES, fma, lane_numbers, larger, load, splat, store
 from . import tiles
 from .pixels import STOP, blend, log2_alpha
-from .tiles import FIRST_ROWS, ID, STRIPS, TILE_HEIGHT, TILE_WIDTH
+from .tiles import FIRST_ROWS, ID, SLOPES, STRIPS, TILE_HEIGHT, TILE_WIDTH
 
 PLANES = 5
 """Transmittance; red, green, blue, depth so far."""
@@ -43,18 +43,24 @@ def _blend_pair(record, pair, left, top, state):
     root_k, log2_opacity = splat(root * record[tiles.K]), splat(record[tiles.LOG2_OPACITY])
     red, green, blue = splat(record[tiles.RED]), splat(record[tiles.GREEN]), splat(record[tiles.BLUE])
     z, center_y = splat(record[tiles.Z]), splat(record[tiles.Y] - top)
+    red_x, green_x, blue_x = splat(record[SLOPES]), splat(record[SLOPES + 1]), splat(record[SLOPES + 2])
+    red_y, green_y, blue_y = splat(record[SLOPES + 3]), splat(record[SLOPES + 4]), splat(record[SLOPES + 5])
     for strip in range(STRIPS):
         first, end = pair[FIRST_ROWS + 2 * strip], pair[FIRST_ROWS + 2 * strip + 1]
-        base = splat(root) * (lane_numbers() - splat(record[tiles.X] - left - f4(strip * LANES)))
+        dx = lane_numbers() - splat(record[tiles.X] - left - f4(strip * LANES))
+        base = splat(root) * dx
+        column_red, column_green, column_blue = fma(red_x, dx, red), fma(green_x, dx, green), fma(blue_x, dx, blue)
         y = splat(f4(first))
         place = strip * STRIP_SIZE + first * ROW
         for _ in range(first, end):
-            exponent = log2_alpha(base, root_k, m_log2, log2_opacity, y - center_y)
-            _, weight, behind = blend(exponent, load(state, place))
+            dy = y - center_y
+            _, weight, behind = blend(log2_alpha(base, root_k, m_log2, log2_opacity, dy), load(state, place))
             store(state, place, behind)
-            store(state, place + LANES, fma(weight, red, load(state, place + LANES)))
-            store(state, place + 2 * LANES, fma(weight, green, load(state, place + 2 * LANES)))
-            store(state, place + 3 * LANES, fma(weight, blue, load(state, place + 3 * LANES)))
+            shown_red, shown_green = fma(red_y, dy, column_red), fma(green_y, dy, column_green)
+            shown_blue = fma(blue_y, dy, column_blue)
+            store(state, place + LANES, fma(weight, shown_red, load(state, place + LANES)))
+            store(state, place + 2 * LANES, fma(weight, shown_green, load(state, place + 2 * LANES)))
+            store(state, place + 3 * LANES, fma(weight, shown_blue, load(state, place + 3 * LANES)))
             store(state, place + 4 * LANES, fma(weight, z, load(state, place + 4 * LANES)))
             place += ROW
             y = y + splat(f4(1.0))

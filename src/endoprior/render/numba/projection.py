@@ -60,17 +60,28 @@ def _covariance(b0, b1, b2, c0, c1, c2):
     return bb + BLUR_PX2, bc, cc + BLUR_PX2, det
 
 
+@njit(inline="always")
+def _local_per_px(xx, xy, yy, det, b0, b1, c0, c1):
+    # Change of the first two local coordinates, in standard deviations, per px along x, then y: see `_local_per_px` of
+    # `render.projection`.
+    return (
+        (yy * b0 - xy * c0) / det, (yy * b1 - xy * c1) / det,
+        (xx * c0 - xy * b0) / det, (xx * c1 - xy * b1) / det,
+    )  # fmt: skip
+
+
 @njit(parallel=True, cache=True, error_model="numpy")
 def project_forward(
-    means, quats, scales, opacities, sh, view, center, lens, width, height,
-    means2d, conic_ldl, z_out, colors, radii,
+    means, quats, scales, opacities, sh, color_slopes, view, center, lens, width, height,
+    means2d, conic_ldl, z_out, colors, color_slopes2d, radii,
 ):  # fmt: skip
-    # One task per BLOCK Gaussians. Writes one row each of means2d, conic_ldl, z_out, colors, radii; culled: all zeros.
+    # One task per BLOCK Gaussians. Writes one row of each output; culled: all zeros.
     num, num_sh = len(means), sh.shape[1]
     for block in prange((num + BLOCK - 1) // BLOCK):
         axes, values = np.empty((3, 3)), np.empty(16, f4)
         for g in range(block * BLOCK, min(num, (block + 1) * BLOCK)):
             means2d[g] = conic_ldl[g] = colors[g] = f4(0)
+            color_slopes2d[g] = f4(0)
             z_out[g] = f4(0)
             radii[g] = 0
             wx, wy, wz = np.float64(means[g, 0]), np.float64(means[g, 1]), np.float64(means[g, 2])
@@ -94,11 +105,17 @@ def project_forward(
                 blue += values[i] * sh[g, i, 2]
             # One sum notices every NaN and infinity.
             size = abs(px) + abs(py) + z + xx * yy + abs(red) + abs(green) + abs(blue) + abs(opacities[g])
+            for i in range(3):
+                size += abs(color_slopes[g, 0, i]) + abs(color_slopes[g, 1, i])  # a pixel adds at most 0.92 of it
             if not (size < OVERFLOW and length >= MIN_QUAT):
                 continue
             means2d[g, 0], means2d[g, 1], z_out[g] = px, py, z
             conic_ldl[g, 0], conic_ldl[g, 1], conic_ldl[g, 2] = yy / det, -xy / yy, 1.0 / yy
             colors[g, 0], colors[g, 1], colors[g, 2] = max(red, f4(0)), max(green, f4(0)), max(blue, f4(0))
+            x0, x1, y0, y1 = _local_per_px(xx, xy, yy, det, b0, b1, c0, c1)
+            for i in range(3):
+                color_slopes2d[g, 0, i] = x0 * color_slopes[g, 0, i] + x1 * color_slopes[g, 1, i]
+                color_slopes2d[g, 1, i] = y0 * color_slopes[g, 0, i] + y1 * color_slopes[g, 1, i]
             if opacities[g] >= f4(ALPHA_MIN):
                 level = 2.0 * np.log(opacities[g] / ALPHA_MIN)  # squared reach of the footprint, in sigmas
                 reach_x, reach_y = np.sqrt(level * xx), np.sqrt(level * yy)
@@ -113,10 +130,10 @@ def project_forward(
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def project_backward(
-    means, quats, scales, sh, view, center, lens, radii,
-    v_means2d, v_conic_ldl, v_z, v_colors, v_means, v_quats, v_scales, v_sh,
+    means, quats, scales, sh, color_slopes, view, center, lens, radii,
+    v_means2d, v_conic_ldl, v_z, v_colors, v_color_slopes2d, v_means, v_quats, v_scales, v_sh, v_color_slopes,
 ):  # fmt: skip
-    # One task per BLOCK Gaussians. Writes one row each of v_means, v_quats, v_scales, v_sh; zeros where radii is 0.
+    # One task per BLOCK Gaussians. Writes one row of each of the last five; zeros where radii is 0.
     num, num_sh = len(means), sh.shape[1]
     for block in prange((num + BLOCK - 1) // BLOCK):
         axes, values, v_values = np.empty((3, 3)), np.empty(16, f4), np.empty(16, f4)
@@ -124,7 +141,7 @@ def project_backward(
         for g in range(block * BLOCK, min(num, (block + 1) * BLOCK)):
             if radii[g] == 0:
                 v_means[g] = v_quats[g] = v_scales[g] = f4(0)
-                v_sh[g] = f4(0)
+                v_sh[g] = v_color_slopes[g] = f4(0)
                 continue
             wx, wy, wz = np.float64(means[g, 0]), np.float64(means[g, 1]), np.float64(means[g, 2])
             x = view[0, 0] * wx + view[0, 1] * wy + view[0, 2] * wz + view[0, 3]
@@ -132,7 +149,7 @@ def project_backward(
             z = view[2, 0] * wx + view[2, 1] * wy + view[2, 2] * wz + view[2, 3]
             length = _axes(view, quats[g], scales[g], axes)
             slope_x, slope_y, b0, b1, b2, c0, c1, c2 = _spread(lens, x, y, z, axes)
-            _, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
+            xx, xy, yy, det = _covariance(b0, b1, b2, c0, c1, c2)
 
             # LDL^T factors -> covariance -> rows of J times the axes.
             v_a, v_k = np.float64(v_conic_ldl[g, 0]), np.float64(v_conic_ldl[g, 1])
@@ -140,8 +157,25 @@ def project_backward(
             v_xx = v_det * yy
             v_xy = -2.0 * v_det * xy - v_k / yy
             v_yy = -v_a * (xy / det) ** 2 + (v_k * xy - v_conic_ldl[g, 2]) / (yy * yy)
+
+            # Slopes of the color, P^T times color_slopes with P = inverse covariance times b, c of two axes.
+            x0, x1, y0, y1 = _local_per_px(xx, xy, yy, det, b0, b1, c0, c1)
+            v_x0 = v_x1 = v_y0 = v_y1 = 0.0
+            for i in range(3):
+                along_x, along_y = np.float64(v_color_slopes2d[g, 0, i]), np.float64(v_color_slopes2d[g, 1, i])
+                v_color_slopes[g, 0, i] = x0 * along_x + y0 * along_y
+                v_color_slopes[g, 1, i] = x1 * along_x + y1 * along_y
+                v_x0, v_x1 = v_x0 + along_x * color_slopes[g, 0, i], v_x1 + along_x * color_slopes[g, 1, i]
+                v_y0, v_y1 = v_y0 + along_y * color_slopes[g, 0, i], v_y1 + along_y * color_slopes[g, 1, i]
+            t_b0, t_c0 = (yy * v_x0 - xy * v_y0) / det, (xx * v_y0 - xy * v_x0) / det
+            t_b1, t_c1 = (yy * v_x1 - xy * v_y1) / det, (xx * v_y1 - xy * v_x1) / det
+            v_xx -= t_b0 * x0 + t_b1 * x1
+            v_yy -= t_c0 * y0 + t_c1 * y1
+            v_xy -= t_b0 * y0 + t_b1 * y1 + t_c0 * x0 + t_c1 * x1
+
             vb0, vb1, vb2 = 2 * v_xx * b0 + v_xy * c0, 2 * v_xx * b1 + v_xy * c1, 2 * v_xx * b2 + v_xy * c2
             vc0, vc1, vc2 = 2 * v_yy * c0 + v_xy * b0, 2 * v_yy * c1 + v_xy * b1, 2 * v_yy * c2 + v_xy * b2
+            vb0, vb1, vc0, vc1 = vb0 + t_b0, vb1 + t_b1, vc0 + t_c0, vc1 + t_c1
 
             # Rows of J -> axes, slopes and depth.
             gx, gy = lens[0] / z, lens[1] / z

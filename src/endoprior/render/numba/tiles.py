@@ -25,8 +25,9 @@ CHUNKS = 8
 """Runs of the depth order that are counted side by side; the result does not depend on it."""
 
 # Columns of a record: all that compositing reads of one Gaussian, side by side in memory.
-X, Y, ROOT, K, M_LOG2, LOG2_OPACITY, RED, GREEN, BLUE, Z = range(10)
-RECORD_SIZE = 12
+X, Y, ROOT, K, M_LOG2, LOG2_OPACITY, RED, GREEN, BLUE, Z, SLOPES = range(11)
+RECORD_SIZE = 16
+"""One cache line. From SLOPES on: the change of red, green, blue per px along x, then along y."""
 HALF_LOG2_E = np.float32(0.5 * log2(np.e))
 LOG2_ALPHA_MIN = log2(ALPHA_MIN)
 LAST = np.iinfo(np.int64).max
@@ -60,6 +61,7 @@ def build(
     conic_ldl: NDArray[np.float32],
     z: NDArray[np.float32],
     colors: NDArray[np.float32],
+    color_slopes2d: NDArray[np.float32],
     opacities: NDArray[np.float32],
     radii: NDArray[np.int32],
     width: int,
@@ -69,7 +71,7 @@ def build(
     num, num_visible = len(z), np.count_nonzero(radii)
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     records, keys = np.empty((num, RECORD_SIZE), np.float32), np.empty(num, np.int64)
-    gaussians = (means2d, conic_ldl, z, z.view(np.int32), colors, opacities, radii)
+    gaussians = (means2d, conic_ldl, z, z.view(np.int32), colors, color_slopes2d, opacities, radii)
     box_starts = np.zeros(num + 1, np.int64)
     _write_records(*gaussians, width, height, records, keys, box_starts)
     near_to_far = np.sort(keys)[:num_visible] & 0xFFFFFFFF
@@ -111,7 +113,10 @@ def _pixels(center, before, after, size):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _write_records(means2d, conic_ldl, z, z_bits, colors, opacities, radii, width, height, records, keys, box_starts):
+def _write_records(
+    means2d, conic_ldl, z, z_bits, colors, color_slopes2d, opacities, radii, width, height,
+    records, keys, box_starts,
+):  # fmt: skip
     # One iteration per Gaussian. Writes its sort key: the bits of z (monotone, as z is > 0), then its index; and if it
     # is visible its record and, at g + 1, how many tiles the box around it touches: room enough for its pairs.
     for g in prange(z.size):
@@ -124,6 +129,9 @@ def _write_records(means2d, conic_ldl, z, z_bits, colors, opacities, radii, widt
             records[g, LOG2_OPACITY] = np.log2(opacities[g])
             records[g, RED], records[g, GREEN], records[g, BLUE] = colors[g, 0], colors[g, 1], colors[g, 2]
             records[g, Z] = z[g]
+            for i in range(3):
+                records[g, SLOPES + i] = color_slopes2d[g, 0, i]
+                records[g, SLOPES + 3 + i] = color_slopes2d[g, 1, i]
             keys[g] = (np.int64(z_bits[g]) << 32) | g
             _, _, _, _, tip, reach = _footprint(records[g])
             left, right = _pixels(records[g, X], -reach, reach, width)

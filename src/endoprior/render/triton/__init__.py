@@ -71,10 +71,11 @@ def _start_driver() -> None:
 
 
 def _project_forward(gaussians: Tensors, opacities: Tensor, camera: Camera) -> Tensors:
-    means, quats, scales, sh = gaussians
+    means, quats, scales, sh, color_slopes = gaussians
     num, lens = len(means), lens_of(camera, means.device)
-    outputs = (*empty(means, (num, 2), (num, 3), (num,), (num, 3)), means.new_empty(num, dtype=torch.int32))
-    inputs = (means, quats, scales, opacities, sh, lens, num, camera.width, camera.height)
+    shapes = ((num, 2), (num, 3), (num,), (num, 3), (num, 2, 3))
+    outputs = (*empty(means, *shapes), means.new_empty(num, dtype=torch.int32))
+    inputs = (means, quats, scales, opacities, sh, color_slopes, lens, num, camera.width, camera.height)
     options = {"DEGREE": degree_of(sh.shape[1]), "BLOCK": BLOCK, **WARPS}
     launch(project_forward, triton.cdiv(num, BLOCK), *inputs, *outputs, **options)
     return outputs
@@ -100,15 +101,21 @@ def _composite_forward(
 
 
 def _composite_backward(
-    lists: tiles.Tiles, tile_ends: Tensor, conic_ldl: Tensor, opacities: Tensor, images: Tensors, cotangents: Tensors
+    lists: tiles.Tiles,
+    tile_ends: Tensor,
+    conic_ldl: Tensor,
+    color_slopes2d: Tensor,
+    opacities: Tensor,
+    images: Tensors,
+    cotangents: Tensors,
 ) -> Tensors:
     num, (height, width) = len(opacities), images[1].shape
     sums = opacities.new_empty((len(lists.slots), NUM_SUMS.value))
     work = (lists.records, lists.ranks, lists.slots, lists.tile_starts, tile_ends)
     arguments = (*work, width, height, tiles.columns(width), *images, *cotangents, sums)
     launch(composite_backward, len(tile_ends), *arguments, ROWS=tiles.ROWS_PER_LANE, **WARP)
-    grads = empty(opacities, (num, 2), (num, 3), (num,), (num, 3), (num,))
-    arguments = (sums, lists.slot_ends, lists.order, conic_ldl, opacities, num, *grads)
+    grads = empty(opacities, (num, 2), (num, 3), (num,), (num, 3), (num, 2, 3), (num,))
+    arguments = (sums, lists.slot_ends, lists.order, conic_ldl, color_slopes2d, opacities, num, *grads)
     launch(gather, triton.cdiv(num, GATHERED), *arguments, BLOCK=GATHERED, SIDE_BY_SIDE=SIDE_BY_SIDE, **WARP)
     return grads
 

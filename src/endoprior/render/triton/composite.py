@@ -21,10 +21,11 @@ import triton
 import triton.language as tl
 
 from ..constants import ALPHA_MAX, STOP_TRANSMITTANCE
-from .tiles import BLUE, HALF_LOG2_E, LOG2_ALPHA_MIN, M_LOG2, RECORD, RED, ROOT, TILE_WIDTH, X
+from .tiles import BLUE, HALF_LOG2_E, LOG2_ALPHA_MIN, M_LOG2, RECORD, RED, ROOT, SLOPES, TILE_WIDTH, X
 
-NUM_SUMS = tl.constexpr(10)
-"""Sums over a pair's pixels of dp times 1, dx, dx^2, u, u^2, u dx, and of the weight times the four cotangents."""
+NUM_SUMS = tl.constexpr(16)
+"""Sums over a pair's pixels of dp times 1, dx, dx^2, u, u^2, u dx; of the weight times the four cotangents; and of the
+weight times those of red, green, blue times dx, then times dy."""
 SIZES = ["width", "height", "tiles_x"]
 """Arguments that may be any number without another version being compiled."""
 _ALPHA_MAX, _STOP = tl.constexpr(ALPHA_MAX), tl.constexpr(STOP_TRANSMITTANCE)
@@ -58,27 +59,46 @@ def _two(row, i: tl.constexpr, known):
 
 @triton.jit
 def _row(records, rank, known):
-    # Center (x, y), root, root_k, m_log2, log2_opacity, red, green, blue and z of the Gaussian of a rank.
+    # Center (x, y), root, root_k, m_log2, log2_opacity, red, green, blue, z and the six slopes of a rank's Gaussian.
     row = records + rank * RECORD
     x, y = _two(row, X, known)
     root, root_k = _two(row, ROOT, known)
     m_log2, log2_opacity = _two(row, M_LOG2, known)
     red, green = _two(row, RED, known)
     blue, z = _two(row, BLUE, known)
-    return x, y, root, root_k, m_log2, log2_opacity, red, green, blue, z
+    red_x, green_x = _two(row, SLOPES, known)
+    blue_x, red_y = _two(row, SLOPES + 2, known)
+    green_y, blue_y = _two(row, SLOPES + 4, known)
+    geometry = x, y, root, root_k, m_log2, log2_opacity
+    return geometry, (red, green, blue, z), (red_x, green_x, blue_x), (red_y, green_y, blue_y)
 
 
 @triton.jit
-def _blend(gx, gy, root, root_k, m_log2, log2_opacity, x, y, step, transmittance):
-    # Alpha of a Gaussian, the transmittance behind it, and dx and u, which the gradients need. Fused operations are
+def _shades(color, along_x, along_y, dx, dy, step):
+    # Red, green, blue and z at the pixels; dy is that of each lane's first row.
+    red, green, blue, z = color
+    red_x, green_x, blue_x = along_x
+    red_y, green_y, blue_y = along_y
+    return (
+        tl.fma(step, red_y, red + red_x * dx + red_y * dy),
+        tl.fma(step, green_y, green + green_x * dx + green_y * dy),
+        tl.fma(step, blue_y, blue + blue_x * dx + blue_y * dy),
+        z,
+    )
+
+
+@triton.jit
+def _blend(geometry, x, y, step, transmittance):
+    # Alpha of a Gaussian, the transmittance behind it, dx, dy of the lane's first row, and u. Fused operations are
     # named, so that no compiler chooses them and both passes come to the same bits. Times -1 costs nothing; a minus is
     # a subtraction from 0 in Triton 3.7.
-    dx = x - gx
-    u = tl.fma(step, root, tl.fma(root, y - gy, root_k * dx))
+    gx, gy, root, root_k, m_log2, log2_opacity = geometry
+    dx, dy = x - gx, y - gy
+    u = tl.fma(step, root, tl.fma(root, dy, root_k * dx))
     exponent = tl.fma(u * -1.0, u, tl.fma(m_log2 * dx * -1.0, dx, log2_opacity))
     alpha = tl.minimum(tl.exp2(exponent), _ALPHA_MAX)
     alpha = tl.where(exponent >= LOG2_ALPHA_MIN, alpha, 0.0)
-    return alpha, tl.fma(transmittance * -1.0, alpha, transmittance), dx, u
+    return alpha, tl.fma(transmittance * -1.0, alpha, transmittance), dx, dy, u
 
 
 @triton.jit(do_not_specialize=SIZES)
@@ -94,21 +114,22 @@ def composite_forward(
     t = tl.where(inside, 1.0, -1.0)  # negative: full; its magnitude stays what it was
     red, green, blue, z = tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t)
     # Loads run ahead: the record one pair, its rank two, so that few warps suffice to hide how long they take.
-    gx, gy, root, root_k, m, opacity, r, g, b, gz = _record(records, ranks, pair, end)
+    geometry, shade, along_x, along_y = _record(records, ranks, pair, end)
     rank = tl.load(ranks + pair + 1, pair + 1 < end, 0)
     while (pair < end) & (tl.max(tl.max(t, 0), 0) > 0):
         chunk_end = tl.minimum(pair + _CHECK_EVERY, end)
         for p in tl.range(pair, chunk_end, loop_unroll_factor=2):
-            n0, n1, n2, n3, n4, n5, n6, n7, n8, n9 = _row(records, rank, True)
+            next_geometry, next_shade, next_x, next_y = _row(records, rank, True)
             rank = tl.load(ranks + p + 2, p + 2 < end, 0)
-            alpha, behind, _, _ = _blend(gx, gy, root, root_k, m, opacity, x, y, step, t)
+            alpha, behind, dx, dy, _ = _blend(geometry, x, y, step, t)
+            r, g, b, gz = _shades(shade, along_x, along_y, dx, dy, step)
             weight = tl.where(behind >= _STOP, t * alpha, 0.0)
             t = tl.where(behind >= _STOP, behind, tl.abs(t) * -1.0)
             red += weight * r
             green += weight * g
             blue += weight * b
             z += weight * gz
-            gx, gy, root, root_k, m, opacity, r, g, b, gz = n0, n1, n2, n3, n4, n5, n6, n7, n8, n9
+            geometry, shade, along_x, along_y = next_geometry, next_shade, next_x, next_y
         pair = chunk_end
     tl.store(tile_ends + tile, pair)
     t = tl.abs(t)
@@ -127,22 +148,23 @@ def _exchange(a, b, lane, BIT: tl.constexpr):
 
 
 @triton.jit
-def _totals(v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, lane):
-    # Sums of ten values over all lanes, one sum per lane: see `_number` for which. Twelve shuffles instead of fifty.
+def _totals(v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15, lane):
+    # Sums of sixteen values over all lanes, one sum per lane: see `_number` for which. 16 shuffles instead of 80.
     v0, v2, v4 = _exchange(v0, v1, lane, 16), _exchange(v2, v3, lane, 16), _exchange(v4, v5, lane, 16)
-    v6, v8 = _exchange(v6, v7, lane, 16), _exchange(v8, v9, lane, 16)
-    v0, v4, v8 = _exchange(v0, v2, lane, 8), _exchange(v4, v6, lane, 8), _exchange(v8, v8, lane, 8)
-    v0, v8 = _exchange(v0, v4, lane, 4), _exchange(v8, v8, lane, 4)
+    v6, v8, v10 = _exchange(v6, v7, lane, 16), _exchange(v8, v9, lane, 16), _exchange(v10, v11, lane, 16)
+    v12, v14 = _exchange(v12, v13, lane, 16), _exchange(v14, v15, lane, 16)
+    v0, v4 = _exchange(v0, v2, lane, 8), _exchange(v4, v6, lane, 8)
+    v8, v12 = _exchange(v8, v10, lane, 8), _exchange(v12, v14, lane, 8)
+    v0, v8 = _exchange(v0, v4, lane, 4), _exchange(v8, v12, lane, 4)
     v0 = _exchange(v0, v8, lane, 2)
     return _exchange(v0, v0, lane, 1)
 
 
 @triton.jit
 def _number(lane):
-    # Which of the ten sums a lane has after `_totals`, and whether it is the one to write it.
-    last = (lane & 2) != 0
-    number = tl.where(last, 8, (lane & 4) + ((lane & 8) >> 2)) + (lane >> 4)
-    return number, ((lane & 1) == 0) & ((~last) | ((lane & 12) == 0))
+    # Which of the sixteen sums a lane has after `_totals`, and whether it is the one to write it.
+    number = (lane >> 4) + ((lane & 8) >> 2) + (lane & 4) + ((lane & 2) << 2)
+    return number, (lane & 1) == 0
 
 
 @triton.jit(do_not_specialize=SIZES)
@@ -166,14 +188,15 @@ def composite_backward(
     lane = tl.arange(0, 32)
     number, writes = _number(lane)
     start, needed, end = tl.load(tile_starts + tile), tl.load(tile_ends + tile), tl.load(tile_starts + tile + 1)
-    gx, gy, root, root_k, m, opacity, r, g, b, gz = _record(records, ranks, start, needed)
+    geometry, shade, along_x, along_y = _record(records, ranks, start, needed)
     rank = tl.load(ranks + start + 1, start + 1 < needed, 0)
     slot = tl.load(slots + start, start < needed, 0)
     for p in tl.range(start, needed, loop_unroll_factor=2):
-        n0, n1, n2, n3, n4, n5, n6, n7, n8, n9 = _row(records, rank, True)
+        next_geometry, next_shade, next_x, next_y = _row(records, rank, True)
         rank = tl.load(ranks + p + 2, p + 2 < needed, 0)
         next_slot = tl.load(slots + p + 1, p + 1 < needed, 0)
-        alpha, behind, dx, u = _blend(gx, gy, root, root_k, m, opacity, x, y, step, t)
+        alpha, behind, dx, dy, u = _blend(geometry, x, y, step, t)
+        r, g, b, gz = _shades(shade, along_x, along_y, dx, dy, step)
         weight = tl.where(behind >= _STOP, t * alpha, 0.0)
         gain = weight * (r * v_red + g * v_green + b * v_blue + gz * v_z)
         rest -= gain
@@ -183,25 +206,39 @@ def composite_backward(
         pulled = gain - rest * weight * (inverse_root * inverse_root)
         dp = tl.where((behind >= _STOP) & (alpha < _ALPHA_MAX), pulled, 0.0)
         t = tl.where(behind >= _STOP, behind, tl.abs(t) * -1.0)
-        # Sums over the lane's pixels first: dx is the same for all of them.
+        # Sums over the lane's pixels first: dx is the same for all of them, dy the first row's plus the step.
         dp_u = dp * u
-        dx = tl.sum(dx, 0)
+        dx, dy = tl.sum(dx, 0), tl.sum(dy, 0)
+        w_red, w_green, w_blue = weight * v_red, weight * v_green, weight * v_blue
         s_1, s_u, s_uu = tl.sum(dp, 0), tl.sum(dp_u, 0), tl.sum(dp_u * u, 0)
-        s_red, s_green = tl.sum(weight * v_red, 0), tl.sum(weight * v_green, 0)
-        s_blue, s_z = tl.sum(weight * v_blue, 0), tl.sum(weight * v_z, 0)
+        s_red, s_green = tl.sum(w_red, 0), tl.sum(w_green, 0)
+        s_blue, s_z = tl.sum(w_blue, 0), tl.sum(weight * v_z, 0)
         s_x = s_1 * dx
-        totals = _totals(s_1, s_x, s_x * dx, s_u, s_uu, s_u * dx, s_red, s_green, s_blue, s_z, lane)
+        totals = _totals(
+            s_1, s_x, s_x * dx, s_u, s_uu, s_u * dx, s_red, s_green, s_blue, s_z,
+            s_red * dx, s_green * dx, s_blue * dx,
+            tl.sum(w_red * step, 0) + s_red * dy, tl.sum(w_green * step, 0) + s_green * dy,
+            tl.sum(w_blue * step, 0) + s_blue * dy, lane,
+        )  # fmt: skip
         tl.store(sums + slot * NUM_SUMS + number, totals, writes)
         slot = next_slot
-        gx, gy, root, root_k, m, opacity, r, g, b, gz = n0, n1, n2, n3, n4, n5, n6, n7, n8, n9
+        geometry, shade, along_x, along_y = next_geometry, next_shade, next_x, next_y
     for p in range(needed, end):
         tl.store(sums + tl.load(slots + p) * NUM_SUMS + number, tl.zeros_like(number), writes)
 
 
+@triton.jit
+def _shift(slopes, red, green, blue, some):
+    # Change of the color where the center moves by 1 px, times the cotangents of the color.
+    along = tl.load(slopes, some, 0.0) * red + tl.load(slopes + 1, some, 0.0) * green
+    return along + tl.load(slopes + 2, some, 0.0) * blue
+
+
 @triton.jit(do_not_specialize=["num"])
 def gather(
-    sums, slot_ends, order, conic_ldl, opacities, num,
-    v_means2d, v_conic_ldl, v_z, v_colors, v_opacities, BLOCK: tl.constexpr, SIDE_BY_SIDE: tl.constexpr,
+    sums, slot_ends, order, conic_ldl, color_slopes2d, opacities, num,
+    v_means2d, v_conic_ldl, v_z, v_colors, v_color_slopes2d, v_opacities,
+    BLOCK: tl.constexpr, SIDE_BY_SIDE: tl.constexpr,
 ):  # fmt: skip
     """One program per BLOCK ranks. Adds up the slots of each, SIDE_BY_SIDE at a time, and writes one row of each v_*.
 
@@ -215,6 +252,7 @@ def gather(
     end = tl.load(slot_ends + rank, known, 0)
     s_1 = tl.zeros((BLOCK, SIDE_BY_SIDE), tl.float32)
     s_x, s_xx, s_u, s_uu, s_ux, s_red, s_green, s_blue, s_z = s_1, s_1, s_1, s_1, s_1, s_1, s_1, s_1, s_1
+    s_red_x, s_green_x, s_blue_x, s_red_y, s_green_y, s_blue_y = s_1, s_1, s_1, s_1, s_1, s_1
     for i in range(0, tl.max(end - start, 0).to(tl.int32), SIDE_BY_SIDE):
         slot = start[:, None] + i + tl.arange(0, SIDE_BY_SIDE)[None, :]
         taken = slot < end[:, None]
@@ -229,18 +267,33 @@ def gather(
         s_green += tl.load(row + 7, taken, 0.0)
         s_blue += tl.load(row + 8, taken, 0.0)
         s_z += tl.load(row + 9, taken, 0.0)
+        s_red_x += tl.load(row + 10, taken, 0.0)
+        s_green_x += tl.load(row + 11, taken, 0.0)
+        s_blue_x += tl.load(row + 12, taken, 0.0)
+        s_red_y += tl.load(row + 13, taken, 0.0)
+        s_green_y += tl.load(row + 14, taken, 0.0)
+        s_blue_y += tl.load(row + 15, taken, 0.0)
     some = known & (end > start)
     a, k = tl.load(conic_ldl + 3 * g, some, 1.0), tl.load(conic_ldl + 3 * g + 1, some, 0.0)
     inverse_root = 1.0 / tl.sqrt(a * HALF_LOG2_E)
     u_1, u_x = tl.sum(s_u, 1) * inverse_root, tl.sum(s_ux, 1) * inverse_root
     v_y = a * u_1
-    tl.store(v_means2d + 2 * g, k * v_y + tl.load(conic_ldl + 3 * g + 2, some, 0.0) * tl.sum(s_x, 1), known)
-    tl.store(v_means2d + 2 * g + 1, v_y, known)
+    v_x = k * v_y + tl.load(conic_ldl + 3 * g + 2, some, 0.0) * tl.sum(s_x, 1)
+    red, green, blue = tl.sum(s_red, 1), tl.sum(s_green, 1), tl.sum(s_blue, 1)
+    slopes, v_slopes = color_slopes2d + 6 * g, v_color_slopes2d + 6 * g
+    tl.store(v_means2d + 2 * g, v_x - _shift(slopes, red, green, blue, some), known)
+    tl.store(v_means2d + 2 * g + 1, v_y - _shift(slopes + 3, red, green, blue, some), known)
+    tl.store(v_slopes, tl.sum(s_red_x, 1), known)
+    tl.store(v_slopes + 1, tl.sum(s_green_x, 1), known)
+    tl.store(v_slopes + 2, tl.sum(s_blue_x, 1), known)
+    tl.store(v_slopes + 3, tl.sum(s_red_y, 1), known)
+    tl.store(v_slopes + 4, tl.sum(s_green_y, 1), known)
+    tl.store(v_slopes + 5, tl.sum(s_blue_y, 1), known)
     tl.store(v_conic_ldl + 3 * g, -0.5 * tl.sum(s_uu, 1) * inverse_root * inverse_root, known)
     tl.store(v_conic_ldl + 3 * g + 1, -a * u_x, known)
     tl.store(v_conic_ldl + 3 * g + 2, -0.5 * tl.sum(s_xx, 1), known)
     tl.store(v_opacities + g, tl.sum(s_1, 1) / tl.load(opacities + g, some, 1.0), known)
-    tl.store(v_colors + 3 * g, tl.sum(s_red, 1), known)
-    tl.store(v_colors + 3 * g + 1, tl.sum(s_green, 1), known)
-    tl.store(v_colors + 3 * g + 2, tl.sum(s_blue, 1), known)
+    tl.store(v_colors + 3 * g, red, known)
+    tl.store(v_colors + 3 * g + 1, green, known)
+    tl.store(v_colors + 3 * g + 2, blue, known)
     tl.store(v_z + g, tl.sum(s_z, 1), known)

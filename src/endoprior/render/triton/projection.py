@@ -139,17 +139,26 @@ def _direction(world, lens):
     return x * inverse, y * inverse, z * inverse, inverse
 
 
+@triton.jit
+def _local_per_px(spread, cov):
+    # Change of the first two local coordinates, in standard deviations, per px along x, then y: see `_local_per_px` of
+    # `render.projection`.
+    b0, b1, _, c0, c1, _ = spread
+    xx, xy, yy, det = cov
+    return (yy * b0 - xy * c0) / det, (yy * b1 - xy * c1) / det, (xx * c0 - xy * b0) / det, (xx * c1 - xy * b1) / det
+
+
 @triton.jit(do_not_specialize=["num", "width", "height"])
 def project_forward(
-    means, quats, scales, opacities, sh, lens, num, width, height,
-    means2d, conic_ldl, z_out, colors, radii,
+    means, quats, scales, opacities, sh, color_slopes, lens, num, width, height,
+    means2d, conic_ldl, z_out, colors, color_slopes2d, radii,
     DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """One program per BLOCK Gaussians. Writes one row each of means2d (N, 2), conic_ldl (N, 3), z_out (N,),
-    colors (N, 3) and radii (N,). Culled: all zeros."""
+    colors (N, 3), color_slopes2d (N, 2, 3) and radii (N,). Culled: all zeros."""
     g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = g < num
-    world, center, _, length, _, _, _, _, cov = _project(means, quats, scales, lens, g, mask)
+    world, center, _, length, _, _, spread, _, cov = _project(means, quats, scales, lens, g, mask)
     x, y, z = center
     xx, xy, yy, det = cov
     px, py = (
@@ -165,6 +174,8 @@ def project_forward(
     # One sum notices every NaN and infinity.
     shades = tl.abs(red).to(tl.float64) + tl.abs(green).to(tl.float64) + tl.abs(blue).to(tl.float64)
     size = tl.abs(px) + tl.abs(py) + z + xx * yy + shades + tl.abs(opacity).to(tl.float64)
+    for i in tl.static_range(6):
+        size += tl.abs(tl.load(color_slopes + 6 * g + i, mask, 0.0)).to(tl.float64)  # a pixel adds at most 0.92 of it
     usable = ahead & (size < _double(_OVERFLOW)) & (length >= _double(_MIN_QUAT))  # False for NaN
 
     level = 2.0 * tl.log(tl.maximum(opacity / _ALPHA_MIN, 1.0)).to(tl.float64)  # squared reach, in sigmas
@@ -184,6 +195,13 @@ def project_forward(
     tl.store(colors + 3 * g, tl.where(usable, tl.maximum(red, 0.0), 0.0), mask)
     tl.store(colors + 3 * g + 1, tl.where(usable, tl.maximum(green, 0.0), 0.0), mask)
     tl.store(colors + 3 * g + 2, tl.where(usable, tl.maximum(blue, 0.0), 0.0), mask)
+    x0, x1, y0, y1 = _local_per_px(spread, cov)
+    for i in tl.static_range(3):
+        first = tl.load(color_slopes + 6 * g + i, mask, 0.0).to(tl.float64)
+        second = tl.load(color_slopes + 6 * g + 3 + i, mask, 0.0).to(tl.float64)
+        row = color_slopes2d + 6 * g + i
+        tl.store(row, tl.where(usable, x0 * first + x1 * second, 0.0).to(tl.float32), mask)
+        tl.store(row + 3, tl.where(usable, y0 * first + y1 * second, 0.0).to(tl.float32), mask)
     tl.store(radii + g, radius.to(tl.int32), mask)
 
 
@@ -200,11 +218,11 @@ def _store_axis(row, v_row, lens, j: tl.constexpr, r0, r1, r2, vb, vc, vz, gx, g
 
 @triton.jit(do_not_specialize=["num"])
 def project_backward(
-    means, quats, scales, sh, lens, num, radii, v_means2d, v_conic_ldl, v_z, v_colors, v_means, v_quats, v_scales, v_sh,
+    means, quats, scales, sh, color_slopes, lens, num, radii, v_means2d, v_conic_ldl, v_z, v_colors, v_color_slopes2d,
+    v_means, v_quats, v_scales, v_sh, v_color_slopes,
     DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One program per BLOCK Gaussians. Writes one row each of v_means, v_quats, v_scales, v_sh; zeros where radii is
-    0."""
+    """One program per BLOCK Gaussians. Writes one row of each of the last five tensors; zeros where radii is 0."""
     g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     written = g < num
     mask = tl.load(radii + g, written, 0) > 0
@@ -215,18 +233,39 @@ def project_backward(
     gx, gy = gains
     b0, b1, b2, c0, c1, c2 = spread
     z0, z1, z2 = axes_z
-    xx, xy, _, det = cov
+    xx, xy, yy, det = cov
+
+    # Slopes of the color, P^T times color_slopes with P = inverse covariance times b, c of two axes.
+    x0, x1, y0, y1 = _local_per_px(spread, cov)
+    v_x0, v_x1, v_y0, v_y1 = tl.zeros_like(x0), tl.zeros_like(x0), tl.zeros_like(x0), tl.zeros_like(x0)
+    for i in tl.static_range(3):
+        along_x = tl.load(v_color_slopes2d + 6 * g + i, mask, 0.0).to(tl.float64)
+        along_y = tl.load(v_color_slopes2d + 6 * g + 3 + i, mask, 0.0).to(tl.float64)
+        first = tl.load(color_slopes + 6 * g + i, mask, 0.0).to(tl.float64)
+        second = tl.load(color_slopes + 6 * g + 3 + i, mask, 0.0).to(tl.float64)
+        v_x0, v_x1 = v_x0 + along_x * first, v_x1 + along_x * second
+        v_y0, v_y1 = v_y0 + along_y * first, v_y1 + along_y * second
+        v_first = tl.where(mask, x0 * along_x + y0 * along_y, 0.0).to(tl.float32)
+        v_second = tl.where(mask, x1 * along_x + y1 * along_y, 0.0).to(tl.float32)
+        tl.store(v_color_slopes + 6 * g + i, v_first, written)
+        tl.store(v_color_slopes + 6 * g + 3 + i, v_second, written)
+    t_b0, t_c0 = (yy * v_x0 - xy * v_y0) / det, (xx * v_y0 - xy * v_x0) / det
+    t_b1, t_c1 = (yy * v_x1 - xy * v_y1) / det, (xx * v_y1 - xy * v_x1) / det
+    v_xx = -t_b0 * x0 - t_b1 * x1
+    v_yy = -t_c0 * y0 - t_c1 * y1
+    v_xy = -t_b0 * y0 - t_b1 * y1 - t_c0 * x0 - t_c1 * x1
 
     # LDL^T factors -> covariance -> rows of J times the axes.
     v_a = tl.load(v_conic_ldl + 3 * g, mask, 0.0).to(tl.float64)
     v_k = tl.load(v_conic_ldl + 3 * g + 1, mask, 0.0).to(tl.float64)
     v_m = tl.load(v_conic_ldl + 3 * g + 2, mask, 0.0).to(tl.float64)
     v_det = -v_a * xx / (det * det)
-    v_yy = v_det * xx
-    v_xy = -2.0 * v_det * xy - v_k / xx
-    v_xx = -v_a * (xy / det) * (xy / det) + (v_k * xy - v_m) / (xx * xx)
+    v_yy += v_det * xx
+    v_xy += -2.0 * v_det * xy - v_k / xx
+    v_xx += -v_a * (xy / det) * (xy / det) + (v_k * xy - v_m) / (xx * xx)
     vb0, vb1, vb2 = 2 * v_xx * b0 + v_xy * c0, 2 * v_xx * b1 + v_xy * c1, 2 * v_xx * b2 + v_xy * c2
     vc0, vc1, vc2 = 2 * v_yy * c0 + v_xy * b0, 2 * v_yy * c1 + v_xy * b1, 2 * v_yy * c2 + v_xy * b2
+    vb0, vb1, vc0, vc1 = vb0 + t_b0, vb1 + t_b1, vc0 + t_c0, vc1 + t_c1
 
     # Rows of J times the axes, and the center in the image -> center in the camera frame.
     v_x = tl.load(v_means2d + 2 * g, mask, 0.0).to(tl.float64) * gx

@@ -32,9 +32,10 @@ PAIR_BLOCK = 256
 FEW_TILES = 1 << 15
 """Fewer tiles are numbered in 16 bits: half the passes of the sort."""
 
-# Columns of a record: all that compositing reads of one Gaussian, 48 bytes side by side. root = sqrt(a log2(e) / 2).
-X, Y, ROOT, ROOT_K, M_LOG2, LOG2_OPACITY, RED, GREEN, BLUE, Z = (tl.constexpr(i) for i in range(10))
-RECORD = tl.constexpr(12)
+# Columns of a record: all that compositing reads of one Gaussian, 64 bytes side by side. root = sqrt(a log2(e) / 2);
+# from SLOPES on: the change of red, green, blue per px along x, then along y.
+X, Y, ROOT, ROOT_K, M_LOG2, LOG2_OPACITY, RED, GREEN, BLUE, Z, SLOPES = (tl.constexpr(i) for i in range(11))
+RECORD = tl.constexpr(16)
 HALF_LOG2_E = tl.constexpr(0.5 / log(2))
 LOG2_ALPHA_MIN = tl.constexpr(log2(ALPHA_MIN))
 _WIDTH, _HEIGHT = tl.constexpr(TILE_WIDTH), tl.constexpr(TILE_HEIGHT)
@@ -105,8 +106,9 @@ def _columns(ellipse, tile_row, width, height):
 
 @triton.jit(do_not_specialize=["num", "width", "height"])
 def count_pairs(
-    means2d, conic_ldl, z, colors, opacities, radii, order, num, width, height, records, counts, BLOCK: tl.constexpr
-):
+    means2d, conic_ldl, z, colors, color_slopes2d, opacities, radii, order, num, width, height, records, counts,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
     """One program per BLOCK ranks. Writes records (N, RECORD) of the visible Gaussians, and counts (N,) of their
     tiles."""
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -129,6 +131,8 @@ def count_pairs(
     tl.store(row + GREEN, tl.load(colors + 3 * g + 1, visible, 0.0), visible)
     tl.store(row + BLUE, tl.load(colors + 3 * g + 2, visible, 0.0), visible)
     tl.store(row + Z, tl.load(z + g, visible, 0.0), visible)
+    for i in tl.static_range(6):
+        tl.store(row + SLOPES + i, tl.load(color_slopes2d + 6 * g + i, visible, 0.0), visible)
     ellipse = _ellipse(x, y, root, root_k, m, log2_opacity)
     first, last = _pixels(ellipse[1], -ellipse[7], ellipse[7], height)
     first_row, num_rows = _tiles(first, last, _HEIGHT)
