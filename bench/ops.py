@@ -118,7 +118,7 @@ def losses(width: int, height: int, ops: TrainingOps) -> common.Steps:
     target = torch.randint(0, 256, (height, width, 3), generator=generator, dtype=torch.uint8)
     inverse = 1 / (torch.rand(height, width, generator=generator) * 60 + 40)
     mask = torch.rand(height, width, generator=generator) < 0.9
-    given = (target, inverse, mask, mask, (1.0, 1.0, 0.03))
+    given = (target, inverse, mask, mask, (1.0, 1.0, 0.03, 0.5))
     return {"": lambda _: torch.autograd.grad(ops.supervised_losses(color, depth, *given).sum(), (color, depth))}
 
 

@@ -34,6 +34,17 @@ def test_color_l1_of_a_constant_offset_is_the_offset():
     assert losses_torch.color_l1(color, target, mask).item() == pytest.approx(0.25, abs=1e-6)
 
 
+def test_edges_are_differences_of_the_error_between_two_pixels_of_tissue():
+    """An even error costs nothing, a step of it counts where both of its sides are tissue."""
+    target, mask = torch.rand(4, 5, 3), torch.ones(4, 5, dtype=torch.bool)
+    assert losses_torch.edge_l1(target + 0.25, target, mask).item() == pytest.approx(0, abs=1e-6)
+    error = torch.zeros(4, 5, 3)
+    error[:, 2:] = 0.5  # a step in each of 4 rows
+    assert losses_torch.edge_l1(target + error, target, mask).item() == pytest.approx(4 * 0.5 / 20, abs=1e-6)
+    mask[0, 2] = mask[1, 1] = False  # two of the steps end beside tissue
+    assert losses_torch.edge_l1(target + error, target, mask).item() == pytest.approx(2 * 0.5 / 18, abs=1e-6)
+
+
 def test_inverse_depth_keeps_zero_where_nothing_is_drawn():
     depth = torch.tensor([[0.0, 2.0]], requires_grad=True)
     inverse = losses_torch.inverse_depth(depth)
@@ -73,7 +84,7 @@ def test_total_variation_leaves_out_differences_between_two_such_pixels():
 @pytest.mark.parametrize("seed", range(4))
 def test_fused_terms_and_gradients_agree_with_the_torch_implementation(seed, tv_on_tissue):
     color, depth, *rest = scene(seed)
-    weights = (1.0, 0.7, 0.03)
+    weights = (1.0, 0.7, 0.03, 0.4)
     grads, values = [], []
     for function in (losses_torch.supervised_losses, supervised_losses):
         c, d = color.clone().requires_grad_(), depth.clone().requires_grad_()
@@ -89,7 +100,7 @@ def test_fused_terms_and_gradients_agree_with_the_torch_implementation(seed, tv_
 
 def test_fused_terms_refuse_to_be_scaled():
     color, depth, *rest = scene(0)
-    terms = supervised_losses(color.requires_grad_(), depth, *rest, (1.0, 1.0, 1.0))
+    terms = supervised_losses(color.requires_grad_(), depth, *rest, (1.0, 1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="must be added"):
         (2 * terms).sum().backward()
 
@@ -97,14 +108,14 @@ def test_fused_terms_refuse_to_be_scaled():
 def test_fused_terms_of_a_frame_without_tissue_are_finite():
     color, depth, target, inverse, tissue, measured = scene(1)
     nothing = torch.zeros_like(tissue)
-    terms = supervised_losses(color, depth, target, inverse, nothing, nothing & measured, (1.0, 1.0, 0.0))
-    assert terms.tolist() == [0, 0, 0]
+    terms = supervised_losses(color, depth, target, inverse, nothing, nothing & measured, (1.0, 1.0, 0.0, 1.0))
+    assert terms.tolist() == [0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1)])
 def test_fused_terms_of_degenerate_images(shape):
     color, depth, *rest = scene(2, *shape)
-    args = (color, depth, *rest, (1.0, 1.0, 1.0))
+    args = (color, depth, *rest, (1.0, 1.0, 1.0, 1.0))
     torch.testing.assert_close(supervised_losses(*args), losses_torch.supervised_losses(*args), rtol=1e-5, atol=1e-7)
 
 

@@ -38,7 +38,7 @@ def comparisons(draw):
     return [torch.from_numpy(a) for a in (color, depth, target, inverse, mask, known & mask)]
 
 
-@given(comparisons(), st.sampled_from([(1.0, 1.0, 0.03), (1.0, 0.0, 0.0), (0.0, 1.0, 1.0)]))
+@given(comparisons(), st.sampled_from([(1.0, 1.0, 0.03, 0.0), (1.0, 0.0, 0.0, 0.5), (0.0, 1.0, 1.0, 1.0)]))
 def test_supervised_terms_are_finite_and_those_of_the_definition(made, weights):
     color, depth, target, inverse, mask, measured = made
     color.requires_grad_(), depth.requires_grad_()
@@ -52,6 +52,7 @@ def test_supervised_terms_are_finite_and_those_of_the_definition(made, weights):
         weights[0] * losses_torch.color_l1(c, target.double() / 255, mask),
         weights[1] * losses_torch.inverse_depth_l1(shown, inverse.double(), measured),
         weights[2] * (losses_torch.total_variation(c) + losses_torch.total_variation(shown)),
+        weights[3] * losses_torch.edge_l1(c, target.double() / 255, mask),
     ])  # fmt: skip
     want.sum().backward()
     # Each row is summed in float32.
@@ -70,7 +71,7 @@ def test_a_perfect_picture_of_one_color_costs_nothing(made):
     color = torch.full(target.shape, 0.2)
     depth = torch.full(mask.shape, 50.0)
     same = torch.full(target.shape, 51, dtype=torch.uint8)
-    terms = supervised_losses(color, depth, same, 1 / depth, mask, mask, (1.0, 1.0, 0.03))
+    terms = supervised_losses(color, depth, same, 1 / depth, mask, mask, (1.0, 1.0, 0.03, 0.5))
     assert terms.abs().max() < 1e-6
 
 

@@ -45,6 +45,8 @@ class Render:
     """The sequence's own camera, or one that sways around it."""
     camera_path: Path | None = None
     """JSON list of {"time", "world_to_camera"} to render instead of a split."""
+    highlights: bool = True
+    """`--no-highlights` shows the tissue below them, as other frames show it."""
     data: Path | None = None
     """Sequence folder with the input frames. Default: the one the run was trained on."""
     device: Wanted = "auto"
@@ -58,6 +60,7 @@ HELP = Help(
         ("RUN", "OUT", "--camera", "sway"),
         ("RUN", "OUT", "--layer", "texture"),
         ("RUN", "OUT", "--layer", "support"),
+        ("RUN", "OUT", "--no-highlights"),
     ),
 )
 
@@ -78,6 +81,7 @@ def render(scene: Scene, args: Render) -> None:
     scene = on_device(scene, args.device, fp16_planes=True)
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
+    from ..model.highlights import without_highlights
     from ..runs.stored_run import sequence_of_run
     from ..visualization.camera_paths import read_path, sway_path, times_path
     from ..visualization.carried_texture import write_texture_film
@@ -87,11 +91,13 @@ def render(scene: Scene, args: Render) -> None:
     frames, sequence, total = None, None, len(scene.cameras)
     if bad := [t for t in args.times if not 0 <= t <= 1]:
         raise input_error("--times", "times in [0, 1]", str(bad[0]), "Correct it; frame i of T is at i / T.")
-    if args.layer == "support" or not (args.camera_path or args.times):
+    if args.layer == "support" or not args.highlights or not (args.camera_path or args.times):
         sequence = load_sequence(args.data or sequence_of_run(args.run), scored_data(scene.config.data))
         if len(sequence) != total:
             fix = "`--data FOLDER` with the sequence of the run."
             raise input_error(sequence.path, f"{total} frames", str(len(sequence)), fix)
+    if not args.highlights:
+        scene = without_highlights(scene, sequence.frames("train"))
     if args.camera_path:
         views = read_path(args.camera_path, scene.cameras)
     else:

@@ -37,6 +37,8 @@ class View:
     """Run folder, or sequence folder."""
     data: Path | None = None
     """Sequence folder with the input frames of a run. Default: the one it was trained on."""
+    highlights: bool = True
+    """`--no-highlights` shows the tissue below the highlights of a run, as other frames show it."""
     host: str = "127.0.0.1"
     """Address to listen on. Everyone who can reach it sees the scene; there is no password."""
     port: int = DEFAULT_PORT
@@ -54,7 +56,7 @@ def run(argv: list[str]) -> None:
     from ..view.access_control import check_address
 
     check_address(args.host, args.port)
-    viewable, out = open_viewable(args.path, args.data, args.device)
+    viewable, out = open_viewable(args.path, args.data, args.device, highlights=args.highlights)
     viewer = import_viewer()(viewable, host=args.host, port=args.port, out=out)
     say(f"{viewable.title}: {viewer.url}  (Ctrl-C stops)")
     try:
@@ -100,14 +102,17 @@ def live_view(port: int | None) -> Iterator[Callable[[StepReport, Trainer], None
         view.close()
 
 
-def open_viewable(path: Path, data: Path | None, device: Wanted = "cpu") -> tuple[Viewable, Path | None]:
+def open_viewable(
+    path: Path, data: Path | None, device: Wanted = "cpu", *, highlights: bool = True
+) -> tuple[Viewable, Path | None]:
     """Open the run or sequence at `path`. Also returns the folder for its screenshots: None for a sequence.
 
     Args:
         data: sequence folder of a run.
         device: device that renders a run.
+        highlights: False shows a run without them.
     Raises:
-        InputError: neither a run nor a sequence.
+        InputError: neither a run nor a sequence; or highlights cannot be taken out of it.
     """
     from ..data import load_sequence
     from ..view.viewable_sequence import ViewableSequence
@@ -118,10 +123,20 @@ def open_viewable(path: Path, data: Path | None, device: Wanted = "cpu") -> tupl
             again = command("train", "--resume", folder, "--view")
             fix = f"Wait until training is done. To see it before, stop it and run `{again}`."
             raise input_error(folder / "scene.safetensors", "a trained scene", "none yet", fix)
+        if not highlights:
+            raise input_error("--no-highlights", "a run folder", f"{path}, a sequence", "Leave it out.")
         return ViewableSequence(load_sequence(path)), None
     from ..model.scene import load_scene
     from ..view.viewable_scene import ViewableScene
 
     scene = load_scene(folder)
     originals = sequence_of(scene, folder, data, "there are no differences and tools to show")
-    return ViewableScene(on_device(scene, device, fp16_planes=True), str(folder), originals), folder / "view"
+    scene = on_device(scene, device, fp16_planes=True)
+    if not highlights:
+        from ..model.highlights import without_highlights
+
+        if originals is None:
+            fix = "Name it: `--data FOLDER`."
+            raise input_error("--no-highlights", "the sequence of the run", "none", fix)
+        scene = without_highlights(scene, originals.frames("train"))
+    return ViewableScene(scene, str(folder), originals), folder / "view"

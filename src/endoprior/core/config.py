@@ -147,6 +147,8 @@ class LossConfig(Checked):
 
     depth_weight: Weight = 1.0
     """lambda_depth, of the L1 on inverse depth (1 / mm)."""
+    edge_weight: Weight = 0.0
+    """Of the L1 on differences between neighboring pixels, both on tissue."""
     tv_weight: Weight = 0.03
     """lambda_tv, of the total variation of color and inverse depth over the whole frame."""
     tv_on_tissue: bool = True

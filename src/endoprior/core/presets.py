@@ -95,8 +95,9 @@ def default() -> Config:
         render=replace(base.render, depth_grad_to_means=True, color_slopes=True),
         loss=replace(
             base.loss,
-            depth_weight=3.0,
-            track_weight=0.01,
+            depth_weight=6.0,
+            edge_weight=0.5,
+            track_weight=0.02,
             tv_weight=0.003,
             tv_on_tissue=False,
             cover_weight=0.01,
@@ -105,7 +106,7 @@ def default() -> Config:
         temporal=replace(
             base.temporal, start_iteration=500, max_points=1024, min_valid=1, valid_at_both=False, gradient="current"
         ),
-        density=replace(base.density, grow_threshold=1.5e-4, max_scale_share=0.025),
+        density=replace(base.density, grow_threshold=3e-4, max_scale_share=0.025),
         optim=replace(
             base.optim,
             means_lr=5e-3,

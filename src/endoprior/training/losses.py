@@ -11,7 +11,7 @@ from .ops import TrainingOps
 
 
 def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, ops: TrainingOps) -> dict[str, Tensor]:
-    """Weighted color, depth and total-variation terms, and that of what is hidden, () each."""
+    """Weighted color, depth, total-variation and edge terms, and that of what is hidden, () each."""
     depth = out.depth / out.alpha.clamp(min=1e-6) if cfg.depth_mode == "expected" else out.depth
     depth_weight = cfg.depth_weight if frame.num_measured >= cfg.min_depth_pixels else 0.0
     fused = ops.supervised_losses(
@@ -21,10 +21,10 @@ def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, o
         frame.inverse_depth,
         frame.tissue_mask,
         frame.measured,
-        (1.0, depth_weight, cfg.tv_weight),
+        (1.0, depth_weight, cfg.tv_weight, cfg.edge_weight),
         cfg.tv_on_tissue,
     )
-    terms = dict(zip(("color", "depth", "tv"), fused, strict=True))
+    terms = dict(zip(("color", "depth", "tv", "edges"), fused, strict=True))
     if cfg.cover_weight:
         terms["cover"] = cfg.cover_weight * ((1 - out.alpha) * frame.hidden).mean()
     return terms

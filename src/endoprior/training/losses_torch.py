@@ -1,4 +1,4 @@
-"""Supervised terms of Eq. (12) in PyTorch: masked color, inverse depth, total variation. `H, W` is the image."""
+"""Supervised terms of Eq. (12) in PyTorch: masked color, inverse depth, total variation; and edges. `H, W`: image."""
 
 from __future__ import annotations
 
@@ -14,6 +14,21 @@ def color_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
     """
     count = (tissue_mask.sum() * color.shape[-1]).clamp(min=1)
     return ((color - target).abs() * tissue_mask[..., None]).sum() / count
+
+
+def edge_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
+    """L_edge: absolute difference of image gradients, summed over both axes, mean over tissue pixels and channels.
+
+    Gradients are forward differences between two pixels of tissue, as in the gradient difference loss of Mathieu
+    et al. 2016, but of gradients with their signs.
+
+    Args:
+        color, target: (H, W, 3). tissue_mask: (H, W) bool, True on tissue.
+    """
+    error = color - target
+    down = (error[1:] - error[:-1]).abs() * (tissue_mask[1:] & tissue_mask[:-1])[..., None]
+    right = (error[:, 1:] - error[:, :-1]).abs() * (tissue_mask[:, 1:] & tissue_mask[:, :-1])[..., None]
+    return (down.sum() + right.sum()) / (tissue_mask.sum() * color.shape[-1]).clamp(min=1)
 
 
 def inverse_depth(depth: Tensor) -> Tensor:
@@ -53,24 +68,26 @@ def supervised_losses(
     target_inverse: Tensor,
     tissue_mask: Tensor,
     measured: Tensor,
-    weights: tuple[float, float, float],
+    weights: tuple[float, float, float, float],
     tv_on_tissue: bool = True,
 ) -> Tensor:
-    """Weighted color, depth and total-variation terms.
+    """Weighted color, depth, total-variation and edge terms.
 
     Args:
         color: (H, W, 3) float32. depth: (H, W) float32 mm, 0 where nothing is rendered.
         target_u8: (H, W, 3) uint8. target_inverse: (H, W) 1 / mm.
         tissue_mask, measured: (H, W) bool, True where color, respectively depth, is compared.
-        weights: factors of the three terms; the depth term is 0 where its factor is.
+        weights: factors of the four terms; the depth term is 0 where its factor is.
         tv_on_tissue: whether the total variation counts between two pixels of tissue.
     Returns:
-        (3,) the weighted terms, differentiable in `color` and `depth`.
+        (4,) the weighted terms, differentiable in `color` and `depth`.
     """
     inverse, left_out = inverse_depth(depth), None if tv_on_tissue else tissue_mask
+    target = target_u8.float() / 255
     terms = [
-        color_l1(color, target_u8.float() / 255, tissue_mask),
+        color_l1(color, target, tissue_mask),
         inverse_depth_l1(inverse, target_inverse, measured),
         total_variation(color, left_out) + total_variation(inverse, left_out),
+        edge_l1(color, target, tissue_mask),
     ]
     return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)])
