@@ -1,13 +1,16 @@
 """The right eye: which folders have one, what both eyes see by depth, and how a scene is scored from there."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from tiny_training import losses_of, tiny_config
 
+from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.core.geometry import back_project, project
@@ -15,8 +18,8 @@ from endoprior.core.types import Camera, RenderedView
 from endoprior.data import load_sequence
 from endoprior.evaluation.context import NO_SCENE, Evaluation, EvaluationContext
 from endoprior.evaluation.rendered import SceneFrames
-from endoprior.evaluation.right_view import NEAREST, right_camera, right_disparity, warp_to_right
 from endoprior.evaluation.scorers import right_eye
+from endoprior.footage.right_view import NEAREST, measured_disparity, right_camera, right_disparity, warp_to_right
 from endoprior.phantom import PhantomConfig, write_phantom
 
 BASELINE = 4.0
@@ -277,7 +280,7 @@ def test_what_counts_is_what_both_eyes_truly_see(stereo):
     """The warp of the tool-free truth by exact depth is the right picture, but for noise and moving highlights."""
     sequence = load_sequence(stereo)
     frame, eye = sequence.frame(1), sequence.right_eye
-    measured = right_eye.measured_disparity(frame, eye.baseline_mm)
+    measured = measured_disparity(frame, eye.baseline_mm)
     warped, counted = warp_to_right(frame.rgb, measured, frame.tissue_mask)
     error = np.abs(warped - eye.image(1) / np.float32(255)).max(-1)
     assert 0.4 < counted.mean() < frame.tissue_mask.mean() and np.quantile(error[counted], 0.99) < 0.15
@@ -285,7 +288,7 @@ def test_what_counts_is_what_both_eyes_truly_see(stereo):
 
 def test_clipped_depth_does_not_count(pair):
     frame = load_sequence(pair).frame(1)
-    found = right_eye.measured_disparity(frame, BASELINE)
+    found = measured_disparity(frame, BASELINE)
     clipped = np.isin(frame.depth, [frame.depth[frame.depth > 0].min(), frame.depth.max()]) | ~frame.depth_valid
     assert 20 < clipped.sum() < 0.1 * clipped.size and ((found == 0) == clipped).all()
     assert np.allclose(found[~clipped], frame.camera.fx * BASELINE / frame.depth[~clipped])
@@ -304,3 +307,32 @@ def test_a_frame_without_tissue_has_a_reason(pair):
         assert cv2.imwrite(str(mask), np.full((40, 48), 255, np.uint8))
     result = scored(load_sequence(pair))
     assert result.scores == {} and result.skipped["right_psnr_warp"] == right_eye.NO_TISSUE
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_right_frame_has_the_depth_of_the_left_one(pair):
+    sequence = load_sequence(pair)
+    left, right = sequence.frame(3), sequence.right_frame(3)
+    assert (right.rgb_u8 == sequence.right_eye.image(3)).all() and right.time == left.time
+    assert np.allclose(right.camera.center - left.camera.center, [BASELINE, 0, 0])
+    assert right.tissue_mask.any() and (right.depth_valid == right.tissue_mask).all()
+    y, x = (index[len(index) // 2] for index in np.nonzero(right.tissue_mask))
+    point = back_project(np.array([x + 0.5, y + 0.5]), right.depth[y, x], right.camera)
+    (u, v), z = project(point, left.camera)
+    assert abs(left.depth[int(v), int(u)] - z) < 0.05 * z  # the surface is not flat
+
+
+def test_both_eyes_are_trained_on_in_turn_and_equal_runs_are_equal(pair):
+    left = tiny_config("basis")
+    both = replace(left, data=replace(left.data, eyes="both"))
+    first, second, without = losses_of(pair, both), losses_of(pair, both), losses_of(pair, left)
+    assert first == second and first != without
+
+
+def test_both_eyes_need_a_right_one(tiny_sequence, tmp_path, capsys):
+    assert main(["train", str(tiny_sequence), str(tmp_path / "run"), "--eyes", "both"]) == 2
+    error = capsys.readouterr().err
+    assert "expected right/ and baseline_mm for --eyes both, got no right eye" in error and error.count("\n") == 1
+    assert not (tmp_path / "run").exists()

@@ -48,6 +48,8 @@ class DataConfig(Checked):
     """Keep every n-th frame of the folder; 0 takes what is published for the dataset."""
     depth_unit_mm: Weight = 0.0
     """mm per unit of the stored depth; 0 takes what the folder or its format says."""
+    eyes: Literal["left", "both"] = "left"
+    """Eyes whose pictures are trained on, in turn at random; `both` needs the right ones (docs/scores.md)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -23,6 +23,7 @@ SHORT_NAMES = {
     "gaussians": "init.budget",
     "init_budget": "init.budget",
     "trust_masks": "loss.trust_masks",
+    "eyes": "data.eyes",
 }
 """Short name of a config field -> its dotted name; in Python, in specs and, with dashes, on the command line."""
 FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..core.checks import input_error
 from ..core.types import Camera, Frame
+from ..footage.right_view import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
 from .description import TOOLS_FOUND
 from .right_eye import RightEye
@@ -140,6 +141,11 @@ class FrameSequence:
         view = copy(self)
         view.truth, view.right_eye, view._holds_out = None, None, True
         return view
+
+    def right_frame(self, index: int) -> Frame:
+        """Frame `index` as the right eye sees it: tissue is what both eyes see. There must be a right eye."""
+        left = self.frame(index)
+        return right_frame(left, self.right_eye.image(index), self.right_eye.baseline_mm)
 
     def without_masks(self) -> FrameSequence:
         """This sequence with its masks hidden: every pixel counts as tissue."""

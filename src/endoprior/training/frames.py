@@ -70,13 +70,14 @@ class TrainingFrames:
     def __len__(self) -> int:
         return len(self.indices)
 
-    def frame(self, position: int, *, half: bool = False) -> TrainingFrame:
-        """Training frame number `position`, at full or at half width and height."""
+    def frame(self, position: int, *, half: bool = False, right: bool = False) -> TrainingFrame:
+        """Training frame number `position`, at full or at half width and height, of the left or the right eye."""
 
         def build() -> TrainingFrame:
-            return _training_frame(shrunk(self.sequence.frame(self.indices[position]), 2 if half else 1))
+            read = self.sequence.right_frame if right else self.sequence.frame
+            return _training_frame(shrunk(read(self.indices[position]), 2 if half else 1))
 
-        key = (position, half)
+        key = (position, half, right)
         if self.device.type == "cpu":
             return self._frames.get(key, build)
         return self._device_frames.get(key, lambda: _moved(self._frames.get(key, build), self.device))

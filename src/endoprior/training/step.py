@@ -73,7 +73,9 @@ class TrainingStep:
         began = clock.perf_counter()
         cfg, iteration, fine = self.cfg, state.iteration + 1, state.stage is Stage.FINE
         rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
-        batch = self._batch(iteration, int(rng.integers(len(self.frames))) if fine else 0, fine)
+        position = int(rng.integers(len(self.frames))) if fine else 0
+        right = fine and cfg.data.eyes == "both" and rng.random() < 0.5
+        batch = self._right_batch(iteration, position) if right else self._batch(iteration, position, fine)
 
         splats, offsets, means_before = self._deform(state, batch, iteration)
         out = self.rasterize(
@@ -81,7 +83,7 @@ class TrainingStep:
         )
         out.means2d.retain_grad()
         counted = batch.frame
-        if self.doubt and fine and iteration > START * stage_length(cfg, Stage.FINE):
+        if self.doubt and fine and not right and iteration > START * stage_length(cfg, Stage.FINE):
             counted = self.doubt.counted(counted, out.color)
         terms = supervised_terms(out, counted, cfg.loss, self.ops)
         if offsets is not None and state.tracks is not None:
@@ -125,6 +127,11 @@ class TrainingStep:
             prior=prior,
             prior_mask=prior_mask,
         )
+
+    def _right_batch(self, iteration: int, position: int) -> Batch:
+        """The right eye of training frame number `position`: only its picture and depth are compared."""
+        half = iteration <= self.cfg.schedule.half_resolution_iterations
+        return Batch(self.frames.frame(position, half=half, right=True), position, None, None, None)
 
     def _deform(self, state: TrainState, batch: Batch, iteration: int) -> tuple[Splats, Offsets | None, Tensor | None]:
         """The Gaussians at the frame, what moved them, and (N, 3) centers at the frame before if known already."""

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from .. import render
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..core.config import Config
+from ..core.shell import command
 from ..data import FrameSequence
 from ..initialization.first_gaussians import first_gaussians
 from ..model.attributes import motion_layout
@@ -47,8 +48,12 @@ class Trainer:
         Args:
             ops: implementation of the operations; None takes the one that suits the device.
         Raises:
-            InputError: the cameras cannot be used, or the backend has no device here.
+            InputError: the cameras cannot be used, the backend has no device here, or there is no right eye to train
+                on.
         """
+        if cfg.data.eyes == "both" and sequence.right_eye is None:
+            fix = f"`{command('prepare', 'VIDEO', sequence.path)} --keep-right`, or leave --eyes out."
+            raise input_error(sequence.path, "right/ and baseline_mm for --eyes both", "no right eye", fix)
         self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
         self.device = device_for(cfg.render.backend)
         self.ops = ops or ops_for(self.device)

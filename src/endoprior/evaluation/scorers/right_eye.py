@@ -1,25 +1,23 @@
 """The scene as the right eye of a stereo endoscope sees it, against its picture, which no method trains on.
 
-Only tissue that both eyes see counts, by measured depth (`evaluation/right_view.py`). The left picture, moved to the
+Only tissue that both eyes see counts, by measured depth (`footage/right_view.py`). The left picture, moved to the
 right eye by that depth, is scored beside the scene.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...core.types import Frame
+from ...footage.right_view import measured_disparity, right_camera, warp_to_right
 from .. import metrics
 from ..context import EvaluationContext
-from ..right_view import right_camera, warp_to_right
 from ..score import Score
 from .lpips import squeeze_distance
 
 SCORES = (
     Score(
         "right_psnr", "right eye PSNR", "dB", True, 2,
-        "PSNR of tissue seen by both eyes, from the right one, which was not trained on; stereo sequences only.",
+        "PSNR of tissue seen by both eyes, from the right one, not trained on but with --eyes both; stereo only.",
         "absolute", group="image", hint="a view never trained on",
     ),
     Score(
@@ -57,15 +55,3 @@ def compute(context: EvaluationContext) -> None:
                 row["right_lpips"] = lpips(view, true, counted)
         rows.append(row)
     context.add_frames(rows, NO_TISSUE)
-
-
-def measured_disparity(frame: Frame, baseline_mm: float) -> NDArray[np.float64]:
-    """(H, W) fx baseline / z, px; 0 without measured depth, and where depth was clipped when it was read.
-
-    Clipped depth is known by being the smallest or the largest of the frame. If all is equal, nothing was clipped.
-    """
-    depth = np.where(frame.depth_valid, frame.depth, 0).astype(np.float64)
-    measured = depth[depth > 0]
-    if measured.size and measured.min() < measured.max():
-        depth[(depth == measured.min()) | (depth == measured.max())] = 0
-    return np.divide(frame.camera.fx * baseline_mm, depth, out=np.zeros_like(depth), where=depth > 0)

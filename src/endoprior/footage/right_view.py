@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.geometry import bilinear, pixel_centers
-from ..core.types import Camera
+from ..core.types import Camera, Frame
 
 STEEPEST = 1.0
 """Neighbors of a row lie on one surface where their disparities differ by less than this, px per px."""
@@ -40,12 +40,47 @@ def warp_to_right(
         (H, W, 3) right picture, read bilinearly from the left one, 0 where the pixel does not count; and (H, W) True
         where it counts: both eyes see tissue there and in the 8 pixels around, where its depth was measured.
     """
-    seen = right_disparity(disparity, tissue)
-    # Pixels on a silhouette mix the colors of two surfaces.
-    counted = cv2.erode((seen > 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    seen, counted = seen_by_both(disparity, tissue)
     pixels = pixel_centers(disparity.shape[1], disparity.shape[0]).astype(np.float64)
     pixels[..., 0] += seen
     return np.where(counted[..., None], bilinear(rgb, pixels), 0).astype(rgb.dtype), counted
+
+
+def seen_by_both(
+    disparity: NDArray[np.floating], tissue: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """`right_disparity`, and (H, W) which of its pixels count: both eyes see tissue there and in the 8 pixels around.
+
+    Pixels on a silhouette mix the colors of two surfaces.
+    """
+    seen = right_disparity(disparity, tissue)
+    return seen, cv2.erode((seen > 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+
+
+def measured_disparity(frame: Frame, baseline_mm: float) -> NDArray[np.float64]:
+    """(H, W) fx baseline / z, px; 0 without measured depth, and where depth was clipped when it was read.
+
+    Clipped depth is known by being the smallest or the largest of the frame. If all is equal, nothing was clipped.
+    """
+    depth = np.where(frame.depth_valid, frame.depth, 0).astype(np.float64)
+    measured = depth[depth > 0]
+    if measured.size and measured.min() < measured.max():
+        depth[(depth == measured.min()) | (depth == measured.max())] = 0
+    return np.divide(frame.camera.fx * baseline_mm, depth, out=np.zeros_like(depth), where=depth > 0)
+
+
+def right_frame(frame: Frame, image_u8: NDArray[np.uint8], baseline_mm: float) -> Frame:
+    """The frame of the right eye: its picture, and as its tissue with depth what both eyes see.
+
+    Args:
+        image_u8: (H, W, 3) right picture.
+    """
+    seen, counted = seen_by_both(measured_disparity(frame, baseline_mm), frame.tissue_mask)
+    depth = np.divide(frame.camera.fx * baseline_mm, seen, out=np.zeros_like(seen), where=counted)
+    camera = right_camera(frame.camera, baseline_mm)
+    return replace(
+        frame, camera=camera, rgb_u8=image_u8, tissue_mask=counted, depth=depth.astype(np.float32), depth_valid=counted
+    )
 
 
 def right_disparity(disparity: NDArray[np.floating], tissue: NDArray[np.bool_]) -> NDArray[np.float64]:
