@@ -22,7 +22,7 @@ def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, byt
     Raises:
         InputError: no Gaussian is that opaque.
     """
-    splats = step.splats(scene)
+    splats = step.splats(scene, "opencv")
     opaque = splats.opacities >= options.min_opacity
     if not opaque.any():
         most = float(splats.opacities.max())

@@ -27,13 +27,13 @@ class TimeStep:
     frame: int | None = None
     """Index of the frame in the sequence, if it is one."""
 
-    def splats(self, scene: Scene) -> Splats:
-        """The Gaussians, activated."""
-        return scene.canonical() if self.time is None else scene.at(self.time)
+    def splats(self, scene: Scene, axes: Axes) -> Splats:
+        """The Gaussians, activated, in `axes`."""
+        return splats_in_axes(scene.canonical() if self.time is None else scene.at(self.time), axes)
 
     def plain_splats(self, scene: Scene, axes: Axes) -> Splats:
         """The Gaussians in `axes`, as other programs know them: one color each, fitted to what the camera sees."""
-        return splats_in_axes(one_color(self.splats(scene), self.camera(scene)), axes)
+        return splats_in_axes(one_color(self.splats(scene, "opencv"), self.camera(scene)), axes)
 
     def camera(self, scene: Scene) -> Camera:
         """The sequence's camera at this time; the first one for the canonical state."""
