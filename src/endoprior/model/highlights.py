@@ -44,8 +44,8 @@ ROUNDS, BRIGHTER = 4, 0.05
 """Rounds of weighting, and by how much a color must be brighter, of 1, to count half."""
 RIDGE = 0.05
 """Pulls the change over time to 0 where nothing is known: weight of a frame to each coefficient squared."""
-CHUNK = 512
-"""Gaussians solved for at a time."""
+LARGEST_CHUNK = 2**24
+"""Numbers of one array of what is solved at a time."""
 
 
 def without_highlights(scene: Scene, frames: Iterable[Frame]) -> Scene:
@@ -69,17 +69,19 @@ def without_highlights(scene: Scene, frames: Iterable[Frame]) -> Scene:
     basis = torch.as_tensor(np.stack([basis_weights(t, cfg.basis) for t in times])).to(motion)
     weights = torch.as_tensor(np.where(np.isnan(free), UNSEEN, free)).to(motion)
     touched = np.nanmin(free, axis=1, initial=1) < 1 - UNTOUCHED
-    for some in torch.from_numpy(np.flatnonzero(touched)).to(motion.device).split(CHUNK):
+    chunk = max(LARGEST_CHUNK // (max(basis.shape) * basis.shape[1]), 1)
+    for some in torch.from_numpy(np.flatnonzero(touched)).to(motion.device).split(chunk):
         sh_dc[some, 0], motion[some, :, part] = _refitted(
             sh_dc[some, 0], motion[some][:, :, part], basis, weights[some]
         )
     means, known = tensors["means"].detach().cpu().numpy(), np.nansum(free, axis=1) >= LEAST_FRAMES
     never_seen = np.isnan(free).all(1)
+    unseen = torch.from_numpy(never_seen).to(motion.device)
     for new, old in ((sh_dc, tensors["sh_dc"]), (motion[:, :, part], tensors["motion"][:, :, part])):
         _take_from_neighbors(means, known, touched & ~known, new)
         taken = new - old.detach()
         _take_from_neighbors(means, ~never_seen, never_seen, taken)
-        new[torch.from_numpy(never_seen)] += taken[torch.from_numpy(never_seen)]
+        new[unseen] += taken[unseen]
     return replace(scene, gaussians=Gaussians(tensors | {"sh_dc": sh_dc, "motion": motion}))
 
 
@@ -109,7 +111,6 @@ def _refitted(sh_dc: Tensor, coefficients: Tensor, basis: Tensor, weights: Tenso
 
     A time at which a Gaussian is brighter than its mean counts less, in a few rounds: light adds to a color, so the rim
     of a highlight is known by it.
-
 
     Args:
         basis: (F, B). weights: (n, F).
