@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from endoprior.core.config import Config
+from endoprior.core.config import Config, OptimConfig
 from endoprior.core.presets import preset
 from endoprior.model.attributes import motion_layout
 from endoprior.model.basis import RankOneGradient
@@ -12,7 +12,7 @@ from endoprior.model.gaussians import create_gaussians
 from endoprior.training import adam_numba
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA
-from endoprior.training.optimizer import Optimizer, log_linear, motion_rates
+from endoprior.training.optimizer import Optimizer, late_share, log_linear, motion_rates
 
 
 def test_update_is_torchs_adam():
@@ -52,6 +52,13 @@ def test_basis_functions_without_weight_stay_unchanged():
     torch.testing.assert_close(motion.detach()[..., :2], torch.full((2, 4, 2), -1e-2))
     assert not motion.detach()[..., 2].any()
     assert state.steps.tolist() == [1, 1, 1, 1]
+
+
+def test_rates_without_a_final_value_fall_late():
+    optim = OptimConfig(late_decay=0.1, decay_iterations=1000)
+    shares = [late_share(optim, iteration) for iteration in (1, 750, 875, 1000, 3000)]
+    assert shares == pytest.approx([1, 1, 0.1**0.5, 0.1, 0.1])
+    assert late_share(OptimConfig(decay_iterations=1), 1) == late_share(OptimConfig(), 4000) == 1
 
 
 def test_without_a_gradient_nothing_moves():

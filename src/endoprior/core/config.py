@@ -277,6 +277,9 @@ class OptimConfig(Checked):
     """Share of these four rates left at `decay_iterations`; log-linear."""
     decay_iterations: Positive = 4000
     """Iterations, counted in each stage, over which the rates above decay."""
+    late_decay: DecayedRate = 1.0
+    """Share left at `decay_iterations` of the rates below: they stay constant for its first three quarters, then fall
+    log-linearly."""
     sh_dc_lr: Rate = 2.5e-3
     sh_rest_lr: Rate = 1.25e-4
     color_slopes_lr: Rate = 2.5e-3

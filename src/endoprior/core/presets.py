@@ -118,6 +118,7 @@ def default() -> Config:
             basis_log_scales_lr=1e-2,
             basis_color_lr=1e-2,
             basis_epsilon=1e-7,
+            late_decay=0.1,
             decay_iterations=1500,
         ),
         schedule=replace(

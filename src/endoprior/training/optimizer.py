@@ -19,6 +19,9 @@ from .divergence import LARGEST_GRADIENT
 from .ops import TrainingOps
 from .plane_adam import PlaneAdam
 
+LATE = 0.75
+"""Share of `decay_iterations` after which the rates without a final value begin to fall."""
+
 
 @dataclass(frozen=True)
 class ParameterGroup:
@@ -110,13 +113,22 @@ def log_linear(start: float, end: float, iteration: int, steps: int) -> float:
     return math.exp(math.log(start) * (1 - share) + math.log(end) * share)
 
 
+def late_share(optim: OptimConfig, iteration: int) -> float:
+    """Share of a rate without a final value that is left at an iteration: see `OptimConfig.late_decay`."""
+    begin = round(LATE * optim.decay_iterations)
+    return log_linear(1.0, optim.late_decay, iteration - begin, max(optim.decay_iterations - begin, 1))
+
+
 def gaussian_groups(cfg: Config, spatial_scale: float) -> tuple[ParameterGroup, ...]:
-    """One group per attribute of the Gaussians but `motion`; a rate with a final value decays and is a length."""
+    """One group per attribute of the Gaussians but `motion`.
+
+    A rate with a final value is a length and decays all along; the others decay late.
+    """
 
     def rate_of(field: str) -> Callable[[int], float]:
         start, end = getattr(cfg.optim, field), getattr(cfg.optim, f"{field}_final", None)
         if end is None:
-            return lambda iteration: start
+            return lambda iteration: start * late_share(cfg.optim, iteration)
         return lambda iteration: spatial_scale * log_linear(start, end, iteration, cfg.optim.decay_iterations)
 
     present = attribute_shapes(cfg)
