@@ -2,10 +2,10 @@
 
 Every Gaussian has 20 channels, each `low + step * q` with q a 16-bit integer: center x, y, z (mm), quaternion w, x, y,
 z, the logarithms of the three scales (mm), opacity, red, green, blue, and the change of these three per standard
-deviation along the first and the second local axis. A channel that never changes is stored once. The
-others store frame 0 and then the residual of a prediction from one frame before (q[t-1]) or two (2 q[t-1] - q[t-2]),
-whichever leaves less. Arithmetic is modulo 2**16, so that unpacking is exact. Shared letters: `T` frames, `N`
-Gaussians, `C = 20` channels.
+deviation along the first and the second local axis. A channel that never changes is stored once. The others store frame
+0 and then the residual of a prediction from one frame before (q[t-1]) or two (2 q[t-1] - q[t-2]), whichever leaves
+less. Arithmetic is modulo 2**16, so that unpacking is exact. Shared letters: `T` frames, `N` Gaussians, `C = 20`
+channels.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from ..render.constants import ALPHA_MIN, NEAR_Z
 from ..render.projection import color_slopes
 from ..render.sh import colors
 
-CHANNELS = ("x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz", "opacity", "r", "g", "b")
-CHANNELS += ("r1", "g1", "b1", "r2", "g2", "b2")
+CHANNELS = (
+    *("x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz", "opacity"),
+    *("r", "g", "b", "r1", "g1", "b1", "r2", "g2", "b2"),
+)
 LARGEST = 65535
 """Largest stored integer."""
 MAX_STEP_MM = 0.1
@@ -42,7 +44,7 @@ OPACITY_STEP = 1 / 1020
 COLOR_STEP = 1 / 255
 SLOPE_STEP = 1 / 510
 LARGEST_SLOPE = 8
-"""Any more would change a color by its whole range within an eighth of a standard deviation."""
+"""A color would change by its whole range within an eighth of a standard deviation."""
 NOTHING_VISIBLE = "scene: expected Gaussians in front of the camera, got none that is visible. Fix: Train it again."
 
 

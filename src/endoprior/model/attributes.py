@@ -63,11 +63,12 @@ def attribute_shapes(cfg: Config) -> dict[str, tuple[int, ...]]:
     Raises:
         InputError: the config leaves the number of temporal basis functions open.
     """
-    shapes: dict[str, tuple[int, ...]] = {a.name: (a.width,) for a in ATTRIBUTES if a.name != "color_slopes"}
+    shapes: dict[str, tuple[int, ...]] = {a.name: (a.width,) for a in ATTRIBUTES}
     shapes["opacity_logits"] = ()
     shapes["sh_dc"], shapes["sh_rest"] = (1, 3), ((cfg.schedule.sh_degree + 1) ** 2 - 1, 3)
-    if cfg.render.color_slopes:
-        shapes["color_slopes"] = (2, 3)
+    shapes["color_slopes"] = (2, 3)
+    if not cfg.render.color_slopes:
+        del shapes["color_slopes"]
     if cfg.deformation.kind == "basis":
         num_bases = cfg.deformation.basis.num_bases
         if num_bases == 0:

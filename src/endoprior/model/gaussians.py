@@ -114,7 +114,6 @@ def create_gaussians(
         "opacity_logits": torch.from_numpy(np.log(chances / (1 - chances)).astype(np.float32)),
         "sh_dc": (torch.from_numpy(np.asarray(colors, np.float32))[:, None, :] - 0.5) / SH_C0,
     }
-    # Everything else starts at zero: color that does not depend on the view or change
-    # within a Gaussian, and no motion.
+    # Everything else starts at zero: color that does not depend on the view, one in each Gaussian, and no motion.
     zeros = {name: torch.zeros(num, *shape) for name, shape in attribute_shapes(cfg).items() if name not in tensors}
     return Gaussians(tensors | zeros)

@@ -50,11 +50,8 @@ def check(splats: Splats, background: Tensor) -> int:
         "means:N,3 quats:N,4 scales:N,3 opacities:N sh:N,K,3", **{n: getattr(splats, n) for n in FIELDS}
     )
     check_shape("background:3", background=background)
-    tensors = [background, *(getattr(splats, name) for name in FIELDS)]
-    if splats.color_slopes is not None:
-        check_shape(f"color_slopes:{sizes['N']},2,3", color_slopes=splats.color_slopes)
-        tensors.append(splats.color_slopes)
-    dtypes = {tensor.dtype for tensor in tensors}
+    check_shape(f"color_slopes:{sizes['N']},2,3", color_slopes=color_slopes(splats))
+    dtypes = {tensor.dtype for tensor in splats.tensors.values()} | {background.dtype}
     if len(dtypes) > 1:
         raise ValueError(f"splats and background must share one dtype; got {sorted(map(str, dtypes))}")
     return sh.degree_of(sizes["K"])
@@ -66,7 +63,7 @@ def check_device(splats: Splats, background: Tensor, device_type: str) -> None:
     Raises:
         ValueError: something is not float32, or not on one device of that type.
     """
-    devices = {getattr(splats, name).device for name in FIELDS} | {background.device}
+    devices = {tensor.device for tensor in splats.tensors.values()} | {background.device}
     if splats.means.dtype != torch.float32 or len(devices) > 1 or splats.means.device.type != device_type:
         found = sorted(map(str, devices))
         raise ValueError(
@@ -161,10 +158,9 @@ def _unit(vectors: Tensor) -> Tensor:
 def _usable(splats: Splats, camera: Camera) -> Tensor:
     """(N,) True where the Gaussian is finite, in front of the camera, and stays finite when projected."""
     per_gaussian = [splats.means, splats.quats, splats.scales, splats.opacities[:, None], splats.sh.flatten(1)]
-    per_gaussian.append(color_slopes(splats).flatten(1))
-    usable = torch.cat(per_gaussian, -1).isfinite().all(-1)
-    means2d, cov2d, _, z, colors, _ = _project(splats, camera)
     slopes = color_slopes(splats).flatten(1)
+    usable = torch.cat([*per_gaussian, slopes], -1).isfinite().all(-1)
+    means2d, cov2d, _, z, colors, _ = _project(splats, camera)
     sizes = [means2d, z[:, None], (cov2d[:, :1] * cov2d[:, 2:]), colors, slopes]
     largest = torch.cat(sizes, -1).abs().sum(-1)
     length = splats.quats.norm(dim=-1)
