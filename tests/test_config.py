@@ -21,7 +21,7 @@ from endoprior.model.scene import SceneFacts
 from endoprior.runs.identity import reject_other_run
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
-PRESETS = ("default", "paper", "released", "endogaussian")
+PRESETS = ("default", "best", "paper", "released", "endogaussian")
 
 
 @pytest.mark.parametrize("field", sorted(PAPER_VALUES))
