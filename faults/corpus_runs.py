@@ -184,7 +184,7 @@ SPECS = [
         changed("{path: data}", "{phantom: {frames: 1000000000}}"),
         ("spec.yaml", "frames"),
     ),
-    Case("a preset nobody knows", changed("{ours: {}}", "{ours: {preset: best}}"), ("spec.yaml", "best")),
+    Case("a preset nobody knows", changed("{ours: {}}", "{ours: {preset: finest}}"), ("spec.yaml", "finest")),
     Case("a spec that extends itself", spec(SOUND + "extends: [spec.yaml]"), ("spec.yaml", "extend itself")),
     Case("a spec that extends a device", spec(SOUND + "extends: [/dev/zero]"), ("/dev/zero",)),
     Case("a field nobody knows", spec(SOUND + "colour: red"), ("spec.yaml", "colour")),

@@ -58,7 +58,7 @@ def test_every_command_explains_itself(command, capsys):
         (["train"], "expected DATA OUT, got no DATA"),
         (["train", "nowhere", "out"], "nowhere"),
         (["train", "nowhere", "out", "--sed", "1"], "--sed"),
-        (["train", "nowhere", "out", "--preset", "best"], "--preset"),
+        (["train", "nowhere", "out", "--preset", "finest"], "--preset"),
         (["train", "nowhere", "out", "--seed", "one"], "one"),
         (
             ["train", "nowhere", "out", "--density.min-densify-weight", "2"],

@@ -67,7 +67,7 @@ def test_bad_configs_are_named(values, names):
 
 def test_unknown_preset():
     with pytest.raises(InputError, match="preset: expected one of default, paper"):
-        preset("best")
+        preset("finest")
 
 
 def test_paper_preset_is_the_defaults():
