@@ -66,7 +66,7 @@ def test_bad_configs_are_named(values, names):
 
 
 def test_unknown_preset():
-    with pytest.raises(InputError, match="preset: expected one of default, paper"):
+    with pytest.raises(InputError, match="preset: expected one of default, best, paper"):
         preset("finest")
 
 
