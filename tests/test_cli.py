@@ -146,6 +146,15 @@ def test_render_writes_frames_depth_and_a_video(run, tmp_path):
     assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == 2
 
 
+def test_pictures_without_highlights_stay_beside_those_with_them(run, tmp_path):
+    folder = shutil.copytree(run[1], tmp_path / "copy")
+    (folder / "video.mp4").write_bytes(b"with")
+    assert main(["render", str(folder), "--split", "test", "--no-highlights"]) == 0
+    names = [path.name for path in sorted((folder / "renders" / "no_highlights" / "rgb").iterdir())]
+    assert names == ["000001.png", "000009.png"] and (folder / "video.mp4").read_bytes() == b"with"
+    assert (folder / "video_no_highlights.mp4").exists()
+
+
 def test_render_of_what_was_seen(run, tmp_path):
     _, folder = run
     assert main(["render", str(folder), str(tmp_path / "out"), "--split", "test", "--layer", "support"]) == 0

@@ -46,7 +46,7 @@ class Render:
     camera_path: Path | None = None
     """JSON list of {"time", "world_to_camera"} to render instead of a split."""
     highlights: bool = True
-    """`--no-highlights` shows the tissue below them, as other frames show it."""
+    """`--no-highlights` shows the tissue below them, as other frames show it. Default: RUN/renders/no_highlights."""
     data: Path | None = None
     """Sequence folder with the input frames. Default: the one the run was trained on."""
     device: Wanted = "auto"
@@ -110,10 +110,13 @@ def render(scene: Scene, args: Render) -> None:
             views = sway_path(times, scene.cameras, sum(depth_span(scene)) / 2)
         else:
             views = times_path(times, scene.cameras)
+    beside = not args.highlights and not args.out  # what is there with highlights is kept
     out = args.out or args.run / "renders"
     video = (args.out or args.run) / ("video.mp4" if args.layer == "color" else f"{args.layer}.mp4")
     if not args.out and out.is_symlink():  # in an untrusted run the link could point anywhere
         raise input_error(out, "a folder", "a link to one", "Remove the link, or pass OUT.")
+    if beside:
+        out, video = out / "no_highlights", video.with_stem(f"{video.stem}_no_highlights")
     if args.layer == "color":
         write_views(scene, views, out, video, frames)
     else:

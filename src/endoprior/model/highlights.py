@@ -136,6 +136,7 @@ def _take_from_neighbors(
     if not unknown.any() or not known.any():
         return
     rows = np.flatnonzero(known)
+    # A list, so that one neighbor has an axis of its own too.
     _, nearest = cKDTree(means[rows]).query(means[unknown], [*range(1, min(NEIGHBORS, len(rows)) + 1)])
     nearest = torch.from_numpy(rows[nearest]).to(values.device)
     values[torch.from_numpy(unknown).to(values.device)] = values[nearest].mean(1)
