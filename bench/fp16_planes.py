@@ -16,7 +16,8 @@ from endoprior.data import FrameSequence, load_sequence
 from endoprior.evaluation import metrics
 from endoprior.evaluation.scoring import scored_data
 from endoprior.model.ops import TORCH
-from endoprior.model.scene import Scene, load_scene
+from endoprior.model.scene import Scene
+from endoprior.model.scene_file import load_scene
 
 
 def scores(scene: Scene, sequence: FrameSequence) -> np.ndarray:

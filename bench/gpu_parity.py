@@ -13,7 +13,7 @@ from torch import Tensor
 
 from endoprior import render
 from endoprior.core.types import Camera, Splats
-from endoprior.model.scene import load_scene
+from endoprior.model.scene_file import load_scene
 from endoprior.render.constants import ALPHA_MAX
 
 SCENES, FRAMES = 20, 3

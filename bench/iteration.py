@@ -19,7 +19,7 @@ import torch
 from endoprior.core.config import Config
 from endoprior.core.presets import preset
 from endoprior.data import FrameSequence, load_sequence
-from endoprior.model import scene as scene_module
+from endoprior.model import single_scene as scene_module
 from endoprior.model.deformation import HexPlaneField
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.render import numba as numba_backend

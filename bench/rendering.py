@@ -13,10 +13,11 @@ import torch
 from endoprior.core.config import Config
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, RenderOutput, Splats
-from endoprior.model import scene as scene_module
+from endoprior.model import single_scene as scene_module
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.playback import Playback
 from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 from endoprior.render import numba as numba_backend
 
 PRESETS = ("default", "paper")
@@ -54,7 +55,7 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
 def make_scene(splats: Splats, camera: Camera, cfg: Config, field: HexPlaneField | None) -> Scene:
     """A scene of one frame."""
     nothing = torch.zeros(len(splats))
-    return Scene(scenes.gaussians(splats, cfg), field, cfg, (camera,), 25.0, nothing, nothing)
+    return SingleScene(scenes.gaussians(splats, cfg), field, cfg, (camera,), 25.0, nothing, nothing)
 
 
 def kept_rows(size: common.Size) -> list[common.Row]:

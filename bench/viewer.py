@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 
 import endoprior.view.server as server_module
 from endoprior.core.presets import preset
-from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 from endoprior.view import browsers
 from endoprior.view.panel import control_id
 from endoprior.view.view_settings import IDLE_SECONDS, ViewSettings
@@ -128,7 +128,7 @@ def make_viewable(size: common.Size) -> ViewableScene:
     splats, camera = scenes.splats(size)
     cfg = preset("default").fitted(68)
     nothing = torch.zeros(len(splats))
-    scene = Scene(scenes.gaussians(splats, cfg), None, cfg, (camera,) * FRAMES, 25.0, nothing, nothing)
+    scene = SingleScene(scenes.gaussians(splats, cfg), None, cfg, (camera,) * FRAMES, 25.0, nothing, nothing)
     return ViewableScene(scene, "bench")
 
 

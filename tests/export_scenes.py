@@ -13,6 +13,7 @@ from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Splats
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 
 NUM_FRAMES = 10
 
@@ -65,7 +66,7 @@ def moving_scene(sh_degree: int = 0, moving_camera: bool = False) -> Scene:
         gaussians["sh_rest"].copy_(torch.from_numpy(rng.normal(size=gaussians["sh_rest"].shape) * 0.1))
         gaussians["color_slopes"].copy_(torch.from_numpy(rng.normal(size=gaussians["color_slopes"].shape) * 0.1))
     cameras = tuple(plane_camera(shift=i if moving_camera else 0.0) for i in range(NUM_FRAMES))
-    return Scene(gaussians, None, cfg, cameras, 25.0, torch.zeros(num), torch.zeros(num))
+    return SingleScene(gaussians, None, cfg, cameras, 25.0, torch.zeros(num), torch.zeros(num))
 
 
 def moving_run(folder: Path) -> Path:

@@ -27,7 +27,7 @@ from endoprior.experiments.report import write_report
 from endoprior.experiments.results import Results
 from endoprior.experiments.spec import Cell, load_spec
 from endoprior.experiments.worker import Job, work
-from endoprior.model.scene import load_scene
+from endoprior.model.scene_file import load_scene
 from endoprior.tool_masks import FoundTools
 
 OWN, FOUND = Cell("tiny", "m", None, 0), Cell("tiny_found", "m", None, 0)

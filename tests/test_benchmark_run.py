@@ -173,7 +173,7 @@ def test_an_interrupted_cell_goes_on_to_the_same_scene(tmp_path):
     from endoprior.data import load_sequence
     from endoprior.experiments.matrix import run_matrix
     from endoprior.experiments.spec import load_spec
-    from endoprior.runs.training_run import train
+    from endoprior.runs.train import train
 
     write_tiny_sequence(tmp_path / "tiny")
     sequences = {"tiny": {"path": "tiny"}}

@@ -14,7 +14,7 @@ from endoprior.core.presets import preset
 from endoprior.model.carry import NUM_CARRIERS, carry, carry_points, confidence_of
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.gaussians import create_gaussians
-from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 from endoprior.model.surface import project_visible, render_surface, shown_pixels
 
 TIMES = [i / 10 for i in range(10)]
@@ -134,7 +134,7 @@ def test_a_hexplane_scene_carries_points_with_its_gaussians():
     field.grid.values.uniform_(0.5, 1.5, generator=torch.Generator().manual_seed(4))
     for parameter in field.heads.parameters.values():
         parameter.data.normal_(generator=torch.Generator().manual_seed(5))
-    scene = Scene(gaussians, field, cfg, moving_scene().cameras, 25.0, torch.zeros(40), torch.zeros(40))
+    scene = SingleScene(gaussians, field, cfg, moving_scene().cameras, 25.0, torch.zeros(40), torch.zeros(40))
     lone = scene.at(0.2).means[:1].numpy().astype(np.float64)
     carried = carry(scene, lone, np.array([2]), TIMES)
     spread = np.ptp([scene.at(time).means.numpy() for time in TIMES], axis=0).max()

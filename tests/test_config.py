@@ -17,7 +17,7 @@ from endoprior.core.config_io import from_dict, to_dict
 from endoprior.core.presets import preset
 from endoprior.experiments.spec import MethodSpec, SequenceSpec, Spec
 from endoprior.model.attributes import attribute_shapes
-from endoprior.model.scene import SceneFacts
+from endoprior.model.scene_file import SceneFacts
 from endoprior.runs.identity import reject_other_run
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())

@@ -13,8 +13,8 @@ from endoprior.core.checks import InputError
 from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.data import load_sequence
 from endoprior.model.hexplane import FRESH, TOUCHED, PlaneGrid
-from endoprior.model.scene import load_scene
-from endoprior.runs.training_run import train
+from endoprior.model.scene_file import load_scene
+from endoprior.runs.train import train
 from endoprior.training.divergence import (
     CHECK_EVERY,
     LARGEST_GRADIENT,

@@ -17,7 +17,7 @@ from endoprior.evaluation.scorers.tracks import parts_of, track_end_error_mm, tr
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.carry import carry_points
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.runs.training_run import train
+from endoprior.runs.train import train
 from endoprior.training.trainer import Trainer
 
 

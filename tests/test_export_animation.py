@@ -16,7 +16,8 @@ from endoprior.cli import main
 from endoprior.export.axes import points_in_axes
 from endoprior.export.mesh import Mesh, depth_grid
 from endoprior.model.carry import carry_points
-from endoprior.model.scene import Scene, load_scene
+from endoprior.model.scene import Scene
+from endoprior.model.scene_file import load_scene
 from endoprior.model.surface import render_surface
 
 TIMES = (0.1, 0.2, 0.6, 0.9)

@@ -19,7 +19,7 @@ from endoprior.cli import main
 from endoprior.export.axes import points_in_axes
 from endoprior.export.depth import depth_png
 from endoprior.export.formats import FORMATS, formats_of, load_format
-from endoprior.model.scene import load_scene
+from endoprior.model.scene_file import load_scene
 from endoprior.render import sh
 
 

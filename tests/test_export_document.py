@@ -19,6 +19,7 @@ from endoprior.export.formats import FORMATS
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 
 DOCS = Path(__file__).parents[1] / "docs"
 TIMES = (0.0, 0.13, 0.5, 0.99, 1.0)
@@ -89,7 +90,7 @@ def random_scene(cfg) -> Scene:
         for name, tensor in gaussians.tensors.items():
             if name != "means":
                 tensor.add_(torch.from_numpy(rng.normal(size=tensor.shape).astype(np.float32)) * 0.3)
-    return Scene(gaussians, None, cfg, (plane_camera(),) * 10, 25.0, torch.zeros(40), torch.zeros(40))
+    return SingleScene(gaussians, None, cfg, (plane_camera(),) * 10, 25.0, torch.zeros(40), torch.zeros(40))
 
 
 def test_document_names_every_tensor_of_the_file(reader, tmp_path):

@@ -13,7 +13,7 @@ from slicer_reader import Bundle, sequence_index, vector
 
 from endoprior.cli import main
 from endoprior.export.axes import points_in_axes
-from endoprior.model.scene import load_scene
+from endoprior.model.scene_file import load_scene
 
 TIMES = ("0.1", "0.2", "0.6")
 SECONDS = (0.04, 0.08, 0.24)  # ten frames at 25 per second

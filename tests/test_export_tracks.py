@@ -14,7 +14,7 @@ from endoprior.core.geometry import project
 from endoprior.data import load_sequence
 from endoprior.export.tracks import grid_query_points
 from endoprior.model.carry import carry_points
-from endoprior.model.scene import load_scene
+from endoprior.model.scene_file import load_scene
 from endoprior.model.surface import Surface, project_visible, render_surface
 
 

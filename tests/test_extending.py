@@ -19,6 +19,7 @@ from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 
 PACKAGE, DOCS = Path(endoprior.__file__).parent, Path(__file__).parents[1] / "docs"
 EVALUATE = """
@@ -97,7 +98,7 @@ def tiny_scene(folder: Path) -> Scene:
     points = np.random.default_rng(0).uniform([-10, -8, 55], [10, 8, 65], (20, 3)).astype(np.float32)
     gaussians = create_gaussians(points, np.full((20, 3), 0.5, np.float32), np.zeros(20, np.float32), cfg)
     cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
-    return Scene(gaussians, None, cfg, cameras, 15.0, torch.zeros(20), torch.zeros(20))
+    return SingleScene(gaussians, None, cfg, cameras, 15.0, torch.zeros(20), torch.zeros(20))
 
 
 def test_a_new_score_is_computed_and_stands_in_tables(extend, tmp_path, make_tiny_sequence):

@@ -17,7 +17,7 @@ from tiny_training import tiny_config
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.runs.interrupt import deferred_interrupt
-from endoprior.runs.training_run import train
+from endoprior.runs.train import train
 from endoprior.system import atomic
 from endoprior.system.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder
 from endoprior.training.trainer import Trainer

@@ -23,7 +23,7 @@ from endoprior.export import export
 from endoprior.export.options import ExportOptions
 from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.work_folder import work_folder
-from endoprior.runs.training_run import train
+from endoprior.runs.train import train
 from endoprior.system.arrays_file import ArraySpec, load_arrays, save_arrays
 from endoprior.system.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder, write_json, write_text
 from endoprior.system.paths import lies_in
@@ -141,7 +141,7 @@ def test_leftovers_are_found_without_ending_their_owner(windows, tmp_path):
 def test_arrays_do_not_keep_their_file_in_use(windows, tmp_path):
     path, arrays = tmp_path / "a.safetensors", {"a": torch.arange(5000.0)}
     save_arrays(path, arrays, {}, "test-1")
-    loaded, _ = load_arrays(path, "test-1", lambda about: {"a": ArraySpec("float32", (5000,))}, "Write it again.")
+    loaded, _ = load_arrays(path, {"test-1": lambda about: {"a": ArraySpec("float32", (5000,))}}, "Write it again.")
     save_arrays(path, {"a": loaded["a"] + 1}, {}, "test-1")
     assert torch.equal(loaded["a"], arrays["a"])
 

@@ -20,6 +20,7 @@ from endoprior.model.basis import basis_weights
 from endoprior.model.fixed_color import with_fixed_color
 from endoprior.model.gaussians import Gaussians, create_gaussians
 from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 from endoprior.visualization.carried_texture import SQUARES, PaintedTissue
 
 WIDTH, HEIGHT, FOCAL, DEPTH, NUM_FRAMES = 160, 96, 200.0, 60.0, 10
@@ -49,7 +50,7 @@ def wall(shift_mm: float = 0.0, shade: float = 0.0) -> Scene:
         shades = torch.from_numpy(shade * rng.uniform(0, 1, (len(points), 1)) / weight)
         gaussians["motion"][:, 4, layout["sh_dc"]] = shades.float()
     num = len(points)
-    return Scene(gaussians, None, cfg, (CAMERA,) * NUM_FRAMES, 25.0, torch.zeros(num), torch.zeros(num))
+    return SingleScene(gaussians, None, cfg, (CAMERA,) * NUM_FRAMES, 25.0, torch.zeros(num), torch.zeros(num))
 
 
 def seen(scene: Scene, frame: int) -> np.ndarray:

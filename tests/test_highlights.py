@@ -18,6 +18,7 @@ from endoprior.model.attributes import motion_layout
 from endoprior.model.gaussians import SH_C0, create_gaussians
 from endoprior.model.highlights import without_highlights
 from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 
 WIDTH, HEIGHT, NUM_FRAMES, NUM_BASES = 96, 64, 24, 17
 CAMERA = Camera(WIDTH, HEIGHT, 120.0, 120.0, WIDTH / 2, HEIGHT / 2, np.eye(4))
@@ -38,7 +39,7 @@ def wall(shine: Callable[[np.ndarray], np.ndarray]) -> Scene:
         white = torch.from_numpy((1.05 - TISSUE) / SH_C0)
         gaussians["motion"][:, :, part] = torch.from_numpy(shine(pixels)).float()[..., None] * white
     num = len(points)
-    return Scene(gaussians, None, cfg, (CAMERA,) * NUM_FRAMES, 25.0, torch.zeros(num), torch.zeros(num))
+    return SingleScene(gaussians, None, cfg, (CAMERA,) * NUM_FRAMES, 25.0, torch.zeros(num), torch.zeros(num))
 
 
 def frames_of(scene: Scene, hidden: slice | None = None) -> list[Frame]:

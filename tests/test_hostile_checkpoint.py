@@ -8,7 +8,7 @@ from state_files import StateFile
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.runs.checkpoint import check_state, checkpoint_schema, load_checkpoint
-from endoprior.runs.training_run import train
+from endoprior.runs.train import train
 from endoprior.training.trainer import Trainer
 
 

@@ -25,7 +25,7 @@ from endoprior.core.presets import preset
 from endoprior.export.html import write_html
 from endoprior.model import hexplane
 from endoprior.model.deformation import HexPlaneField, state_shapes
-from endoprior.model.scene import load_scene
+from endoprior.model.scene_file import load_scene
 from endoprior.system.arrays_file import LARGEST_HEADER
 
 

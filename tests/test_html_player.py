@@ -25,6 +25,7 @@ from endoprior.export.html import write_html
 from endoprior.export.html_data import CHANNELS
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 from endoprior.render import sh
 
 WIDTH, HEIGHT, NUM_FRAMES, RATE = 320, 256, 6, 10.0
@@ -55,7 +56,7 @@ def random_scene(num: int, num_frames: int, seed: int = 0) -> Scene:
         pose[:3, :3] = Rotation.from_rotvec([0.004 * i, 0.2 - 0.006 * i, 0.1]).as_matrix()
         pose[:3, 3] = [-12, 0.3 * i, 2]
         cameras.append(Camera(WIDTH, HEIGHT, 300.0, 310.0, 150.0, 137.0, pose))
-    return Scene(gaussians, None, cfg, tuple(cameras), RATE, torch.zeros(num), torch.zeros(num))
+    return SingleScene(gaussians, None, cfg, tuple(cameras), RATE, torch.zeros(num), torch.zeros(num))
 
 
 @pytest.fixture(scope="module")

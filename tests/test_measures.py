@@ -24,6 +24,7 @@ from endoprior.model.measures import (
     smoothed,
 )
 from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 from endoprior.model.surface_motion import SurfaceMotion
 from endoprior.visualization.measures import displacement_span, measures_csv, stretch_span, value_colors
 
@@ -136,7 +137,9 @@ def growing_scene(by: float) -> Scene:
         gaussians["opacity_logits"].fill_(4.0)
         share = torch.linspace(0, 1, gaussians["motion"].shape[1])
         gaussians["motion"][:, :, 0] = torch.from_numpy(points[:, :1]) * share * (by - 1)
-    return Scene(gaussians, None, cfg, (plane_camera(),) * 10, 25.0, torch.zeros(len(points)), torch.zeros(len(points)))
+    return SingleScene(
+        gaussians, None, cfg, (plane_camera(),) * 10, 25.0, torch.zeros(len(points)), torch.zeros(len(points))
+    )
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from endoprior.data import load_sequence
-from endoprior.runs.training_run import train
+from endoprior.runs.train import train
 from endoprior.system.memory import LEAST_CACHE, BoundedCache, available_bytes, cache_bytes
 
 

@@ -15,7 +15,7 @@ from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
 from endoprior.model.basis import RankOneGradient
-from endoprior.model.scene import load_scene
+from endoprior.model.scene_file import load_scene
 from endoprior.training.adam import AdamState
 from endoprior.training.density import DensityStats
 from endoprior.training.ops import NUMBA, TORCH

@@ -14,6 +14,7 @@ from endoprior.core.types import Camera
 from endoprior.model.gaussians import Gaussians, create_gaussians
 from endoprior.model.playback import Playback
 from endoprior.model.scene import Scene
+from endoprior.model.single_scene import SingleScene
 
 NUM_FRAMES = 5
 
@@ -28,7 +29,7 @@ def scene() -> Scene:
     with torch.no_grad():
         gaussians["motion"].copy_(torch.from_numpy(rng.normal(size=gaussians["motion"].shape) * 0.3))
     camera = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
-    return Scene(gaussians, None, cfg, (camera,) * NUM_FRAMES, 25.0, torch.zeros(100), torch.zeros(100))
+    return SingleScene(gaussians, None, cfg, (camera,) * NUM_FRAMES, 25.0, torch.zeros(100), torch.zeros(100))
 
 
 def pictures_equal(a, b) -> bool:
@@ -64,8 +65,8 @@ def test_several_frames_at_once_are_the_frames(scene):
 
 def test_a_frame_is_deformed_once(scene, monkeypatch):
     asked = []
-    original = Scene.at
-    monkeypatch.setattr(Scene, "at", lambda self, time: asked.append(time) or original(self, time))
+    original = SingleScene.at
+    monkeypatch.setattr(SingleScene, "at", lambda self, time: asked.append(time) or original(self, time))
     playback = Playback(scene)
     for i in (0, 1, 0, 1, 1):
         playback.render(i)
@@ -74,8 +75,10 @@ def test_a_frame_is_deformed_once(scene, monkeypatch):
 
 def test_the_frame_not_drawn_for_longest_goes_first(scene, monkeypatch):
     asked = []
-    original = Scene.at
-    monkeypatch.setattr(Scene, "at", lambda self, time: asked.append(round(time * NUM_FRAMES)) or original(self, time))
+    original = SingleScene.at
+    monkeypatch.setattr(
+        SingleScene, "at", lambda self, time: asked.append(round(time * NUM_FRAMES)) or original(self, time)
+    )
     one = Playback(scene)
     one.splats(0)
     size = sum(t.numel() * 4 for t in vars(one.splats(0)).values())

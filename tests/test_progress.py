@@ -10,7 +10,7 @@ import pytest
 from tiny_training import tiny_config
 
 from endoprior.data import load_sequence
-from endoprior.runs.training_run import train
+from endoprior.runs.train import train
 
 
 class Terminal(io.StringIO):

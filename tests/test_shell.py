@@ -14,7 +14,7 @@ import pytest
 from endoprior.cli import main
 from endoprior.core import shell
 from endoprior.core.checks import InputError
-from endoprior.model.scene import load_scene
+from endoprior.model.scene_file import load_scene
 
 HARD = ["Übung Fall 7/Daten ä", "it's", "a&b", "$HOME", "plain", "", "two  spaces", 'quote"', "semi;colon", "*"]
 

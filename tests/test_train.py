@@ -20,8 +20,8 @@ from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.export import export
 from endoprior.export.options import ExportOptions
-from endoprior.model.scene import load_scene
-from endoprior.runs.training_run import train
+from endoprior.model.scene_file import load_scene
+from endoprior.runs.train import train
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import log_linear
 from endoprior.training.state import Stage

@@ -17,7 +17,7 @@ from endoprior.core.geometry import back_project
 from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.runs.training_run import train
+from endoprior.runs.train import train
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT
 from endoprior.view.server import Viewer
 from endoprior.view.viewable_scene import ViewableScene

@@ -23,7 +23,8 @@ from endoprior.core.types import Camera
 from endoprior.data import load_sequence
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
-from endoprior.runs.training_run import train
+from endoprior.model.single_scene import SingleScene
+from endoprior.runs.train import train
 from endoprior.view import live
 from endoprior.view.measure import AREA, DISPLACEMENT, STRETCH
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT, POINTS
@@ -50,7 +51,7 @@ def scene() -> Scene:
         gaussians["opacity_logits"].fill_(3.0)
         gaussians["motion"][:, :, 0] = torch.linspace(0, 2, gaussians["motion"].shape[1])
     score = torch.linspace(0, 1, len(points))
-    return Scene(gaussians, None, cfg, (CAMERA,) * NUM_FRAMES, 25.0, score, torch.ones(len(points)))
+    return SingleScene(gaussians, None, cfg, (CAMERA,) * NUM_FRAMES, 25.0, score, torch.ones(len(points)))
 
 
 @pytest.fixture

@@ -12,9 +12,10 @@ if TYPE_CHECKING:
     from .core.presets import preset
     from .data import load_sequence
     from .evaluation.scoring import evaluate
-    from .model.scene import Scene, load_scene
+    from .model.scene import Scene
+    from .model.scene_file import load_scene
     from .priors import joint_texture_prior
-    from .runs.training_run import train
+    from .runs.train import train
 
 HOMES = {
     "Config": "core.config",
@@ -22,10 +23,10 @@ HOMES = {
     "Scene": "model.scene",
     "evaluate": "evaluation.scoring",
     "joint_texture_prior": "priors",
-    "load_scene": "model.scene",
+    "load_scene": "model.scene_file",
     "load_sequence": "data",
     "preset": "core.presets",
-    "train": "runs.training_run",
+    "train": "runs.train",
 }
 """Module of each public name. No module or package directly below this one has such a name: it would replace it."""
 

@@ -38,7 +38,7 @@ def run(argv: list[str]) -> None:
     from dataclasses import replace
 
     from ..data import load_sequence
-    from ..model.scene import load_scene
+    from ..model.scene_file import load_scene
     from ..phantom import PhantomConfig, write_phantom
     from ..runs.folder import prepare_run_folder
     from ..runs.report import write_report

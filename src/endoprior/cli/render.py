@@ -97,7 +97,7 @@ def render(scene: Scene, args: Render) -> None:
             fix = "`--data FOLDER` with the sequence of the run."
             raise input_error(sequence.path, f"{total} frames", str(len(sequence)), fix)
     if not args.highlights:
-        scene = without_highlights(scene, sequence.frames("train"))
+        scene = without_highlights(scene, sequence.training_part)
     if args.camera_path:
         views = read_path(args.camera_path, scene.cameras)
     else:
@@ -124,6 +124,6 @@ def render(scene: Scene, args: Render) -> None:
         if args.layer == "texture":
             write_texture_film(scene, views, out, video, frames)
         else:
-            support = SupportMap(scene, sequence.frames("train"))
+            support = SupportMap(scene, sequence.training_part)
             write_support_film(support, views, out, video, scene.frames_per_second, frames)
     say(f"{len(views)} frames: {out}\nvideo: {video}")

@@ -104,11 +104,11 @@ def train_and_evaluate(
         resume, checkpoint_seconds: as in `runs.training_run.train`.
     """
     from ..data import load_sequence
-    from ..runs.training_run import TrainingRun
+    from ..runs.train import start_run
     from ..training.trainer import device_for
     from .evaluate import evaluate_run
 
-    training = TrainingRun(load_sequence(data, cfg.data), cfg, out, resume=resume, say=say)
+    training = start_run(load_sequence(data, cfg.data), cfg, out, resume=resume, say=say)
     began = clock.perf_counter()
     try:
         with training_progress() as show_progress, live_view(view_port) as show_scene:

@@ -20,7 +20,7 @@ def open_scene(run: Path) -> Scene:
         InputError: there is no scene that can be read.
     """
     from ..data.recognize import not_a_run
-    from ..model.scene import load_scene
+    from ..model.scene_file import load_scene
 
     try:
         return load_scene(run)

@@ -126,7 +126,7 @@ def open_viewable(
         if not highlights:
             raise input_error("--no-highlights", "a run folder", f"{path}, a sequence", "Leave it out.")
         return ViewableSequence(load_sequence(path)), None
-    from ..model.scene import load_scene
+    from ..model.scene_file import load_scene
     from ..view.viewable_scene import ViewableScene
 
     scene = load_scene(folder)
@@ -138,5 +138,5 @@ def open_viewable(
         if originals is None:
             fix = "Name it: `--data FOLDER`."
             raise input_error("--no-highlights", "the sequence of the run", "none", fix)
-        scene = without_highlights(scene, originals.frames("train"))
+        scene = without_highlights(scene, originals.training_part)
     return ViewableScene(scene, str(folder), originals), folder / "view"

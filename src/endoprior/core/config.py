@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 from .checks import InputError, check_range, read_ranges
 from .config_deformation import DeformationConfig
 from .config_io import from_dict, override, to_dict
+from .config_windows import WindowConfig
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
 Backend = Literal["reference", "numba", "triton", "gsplat"]
@@ -42,6 +43,8 @@ class DataConfig(Checked):
     """Read only the first frames; 0 reads all."""
     skip_frames: str = ""
     """Frames to leave out, such as `0-9,15`. Numbers of `endoprior check`, after `stride` and `first_frames`."""
+    window: str = ""
+    """The frames to train on, such as `60-129`: a window of a long sequence, whose held-out frames stay held out."""
     format: str = "auto"
     """Layout of the folder: a name in docs/datasets.md, such as `endonerf`; `auto` recognizes it."""
     stride: Annotated[int, Range(0, 10_000)] = 0
@@ -326,6 +329,7 @@ class Config(Checked):
     density: DensityConfig = field(default_factory=DensityConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    windows: WindowConfig = field(default_factory=WindowConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -125,6 +125,7 @@ def default() -> Config:
         schedule=replace(
             base.schedule, coarse_iterations=0, fine_iterations=1500, half_resolution_iterations=500, sh_degree=0
         ),
+        windows=replace(base.windows, enabled=True),
     )
 
 

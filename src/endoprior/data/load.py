@@ -39,10 +39,23 @@ def load_sequence(
         raise input_error(path, "a sequence folder", got, "pass the folder that holds images/, masks/ and depth/.")
     name = find_format(path, cfg)
     if pose_axes == "opencv":
-        return REGISTRY.load(name).load(path, cfg)
+        return _window_of(REGISTRY.load(name).load(path, cfg), cfg.window)
     if name != "endonerf":
         raise ValueError(f"pose_axes must be opencv for the {name} layout, which defines it; got {pose_axes!r}")
-    return load_endonerf(path, cfg, pose_axes=pose_axes)
+    return _window_of(load_endonerf(path, cfg, pose_axes=pose_axes), cfg.window)
+
+
+def _window_of(sequence: FrameSequence, window: str) -> FrameSequence:
+    """The frames of `sequence` that `DataConfig.window` names; all of them if it names none."""
+    if not window:
+        return sequence
+    ends = window.split("-")
+    if len(ends) == 2 and all(end.isdecimal() for end in ends):
+        start, stop = int(ends[0]), int(ends[1]) + 1
+        if start + 1 < stop <= len(sequence):
+            return sequence.part(start, stop)
+    expected = f"two frames within 0 to {len(sequence) - 1}, such as 0-{len(sequence) // 2}"
+    raise input_error("data.window", expected, window, "correct it, or leave it out for all frames.")
 
 
 def find_format(path: Path, cfg: DataConfig) -> str:

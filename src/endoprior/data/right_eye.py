@@ -37,6 +37,10 @@ class RightEye:
         self.files, self.baseline_mm = files, baseline_mm
         self._size, self._shrink = size, shrink
 
+    def part(self, start: int, stop: int) -> RightEye:
+        """The pictures of frames `start` to `stop` - 1."""
+        return RightEye(self.files[start:stop], self.baseline_mm, self._size, self._shrink)
+
     def image(self, index: int) -> NDArray[np.uint8]:
         """(H, W, 3) right picture of frame `index` at the size of the left one, 0..255.
 

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, overload
+from typing import Literal, Protocol, overload
 
 import numpy as np
 
@@ -30,6 +30,15 @@ DECODING_BYTES = 40
 """Memory per pixel while a frame is read."""
 TOOL_FRACTION_WARNING = 0.6
 """With a larger share of tool pixels, the mask is probably inverted."""
+
+
+class Span(Protocol):
+    """Some successive frames: a window of a scene, for example."""
+
+    @property
+    def start(self) -> int: ...
+    @property
+    def stop(self) -> int: ...
 
 
 class FrameSequence:
@@ -86,7 +95,7 @@ class FrameSequence:
         self._remarks = remarks or []
         self._masks = path / mask_folder
         self._cache: BoundedCache[Frame] = BoundedCache(cache_bytes(), _frame_bytes)
-        self._holds_out = False
+        self._holds_out, self._first = False, 0
 
     @property
     def remarks(self) -> list[str]:
@@ -113,7 +122,7 @@ class FrameSequence:
             InputError: one of its files cannot be used.
             ValueError: it is a test frame, and this is a `training_view`.
         """
-        if self._holds_out and is_test_frame(index):
+        if self._holds_out and self._is_test(index):
             raise ValueError(f"frame must be a training frame; got {index}, which is held out")
         return self._decoded(index)
 
@@ -130,7 +139,10 @@ class FrameSequence:
         """
         if split not in ("train", "test", "video"):
             raise ValueError(f"split must be train, test or video; got {split!r}")
-        return [i for i in range(len(self)) if split == "video" or is_test_frame(i) == (split == "test")]
+        return [i for i in range(len(self)) if split == "video" or self._is_test(i) == (split == "test")]
+
+    def _is_test(self, index: int) -> bool:
+        return is_test_frame(self._first + index)
 
     def frames(self, split: Split) -> FrameList:
         """The frames of a split, decoded one by one as they are used."""
@@ -141,6 +153,23 @@ class FrameSequence:
         view = copy(self)
         view.truth, view.right_eye, view._holds_out = None, None, True
         return view
+
+    def part(self, start: int, stop: int) -> FrameSequence:
+        """Frames `start` to `stop` - 1 as a sequence of its own, without ground truth; held-out frames stay held out.
+
+        Indices and times of its frames count from its start.
+        """
+        view, num = copy(self), stop - start
+        view._cameras, view._first = self._cameras[start:stop], self._first + start
+        view._read_frame = lambda index: replace(self._read_frame(start + index), index=index, time=index / num)
+        view._cache = BoundedCache(cache_bytes(), _frame_bytes)
+        view.image_names, view.mask_files = self.image_names[start:stop], self.mask_files[start:stop]
+        view.truth, view.right_eye = None, self.right_eye and self.right_eye.part(start, stop)
+        return view
+
+    def training_part(self, span: Span) -> FrameList:
+        """The training frames of a part of the sequence; see `part`."""
+        return self.part(span.start, span.stop).frames("train")
 
     def right_frame(self, index: int) -> Frame:
         """Frame `index` as the right eye sees it: tissue is what both eyes see. There must be a right eye."""

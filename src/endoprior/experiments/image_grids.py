@@ -17,7 +17,8 @@ from ..core.config import DataConfig, PriorConfig
 from ..core.geometry import length_unit, project
 from ..core.types import Frame
 from ..data import FrameSequence, load_sequence
-from ..model.scene import Scene, load_scene
+from ..model.scene import Scene
+from ..model.scene_file import load_scene
 from ..priors import joint_texture_prior, specular_likelihood
 from ..visualization.image_tools import colorize, label, tile, to_u8, write_png
 from .matrix import Matrix

@@ -19,7 +19,7 @@ class PresetMethod:
 
     def train(self, sequence: FrameSequence, options: Config, *, seed: int, out: Path) -> Scene:
         """Train, or resume from the checkpoint in `out`; the scene is on the device that trained it."""
-        from ..runs.training_run import train
+        from ..runs.train import train
         from ..training.trainer import device_for
 
         resume = (out / "checkpoint.safetensors").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -13,7 +14,8 @@ from torch import Tensor
 from ..core.types import Camera
 from .gaussians import Gaussians
 from .ops import ops_for
-from .scene import Scene, offsets_at
+from .scene import Scene, Window
+from .single_scene import SingleScene, offsets_at
 
 NUM_CARRIERS = 8
 """Gaussians that carry a point."""
@@ -31,7 +33,7 @@ class CarriedPoints:
     positions: NDArray[np.float32]
     """(T, P, 3) world, mm."""
     confidence: NDArray[np.float32]
-    """(T, P) in [0, 1]: by `confidence_of`; greatest in the point's own frame."""
+    """(T, P) in [0, 1]: by `confidence_of`; greatest in the point's own frame, less in each window further on."""
 
 
 def carry_points(
@@ -46,16 +48,54 @@ def carry(scene: Scene, points: NDArray, from_frame: NDArray[np.intp], times: li
 
     A point is tied, at the time of its frame, to the 8 nearest Gaussians; it then moves by the mean of their
     displacements, weighted by opacity and by a Gaussian of the distance whose width is the mean distance of the eight.
+    In the middle of the overlap of two windows it is tied anew, to Gaussians of the other one.
 
     Args:
         points: (P, 3) world positions, mm.
         from_frame: (P,) position in `times` at which each point is where `points` says.
         times: T times in [0, 1]; each is seen by the camera of the nearest frame.
     """
+    windows, num_frames = scene.windows, len(scene.cameras)
+    at = np.asarray(times) * num_frames  # in frames
+    borders = [(later.start + earlier.stop - 1) / 2 for earlier, later in pairwise(windows)]
+    home = np.searchsorted(borders, at, side="right")  # the window of each time, and of each point
+    own = home[from_frame]
+    positions = np.empty((len(times), *points.shape), np.float32)
+    variance = np.empty(positions.shape[:2])
+    for onwards in (True, False) if len(windows) > 1 else (True,):
+        here, doubt = np.array(points, np.float64), np.zeros(len(points))
+        for k in range(home.max() + 1) if onwards else range(len(windows) - 1, home.min() - 1, -1):
+            moved = np.flatnonzero(own <= k if onwards else own >= k)
+            if not len(moved):
+                continue
+            asked, ends = np.flatnonzero(home == k), borders[max(k - 1, 0) : k + 1]
+            stops = [*at[asked], *ends]  # times within this window, in frames
+            enters = len(asked) + (0 if onwards else len(ends) - 1)
+            since = np.where(own[moved] == k, np.searchsorted(asked, from_frame[moved]), enters)
+            found, added = _carry_in(windows[k], here[moved], since, stops)
+            positions[np.ix_(asked, moved)] = found[: len(asked)]
+            variance[np.ix_(asked, moved)] = doubt[moved] + added[: len(asked)]
+            leaves = len(asked) + (len(ends) - 1 if onwards else 0)
+            if leaves < len(stops):
+                here[moved], doubt[moved] = found[leaves], doubt[moved] + added[leaves]
+    return CarriedPoints(positions, _probability(variance))
+
+
+def _carry_in(
+    window: Window, points: NDArray, from_stop: NDArray[np.intp], stops: list[float]
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """(T, P, 3) positions and (T, P) variance of their error, px squared, within one window.
+
+    Args:
+        from_stop: (P,) position in `stops` at which each point is where `points` says.
+        stops: T times, in frames of the sequence.
+    """
+    scene, length = window.scene, window.stop - window.start
+    times = [min(max((stop - window.start) / length, 0.0), 1.0) for stop in stops]
     k = min(NUM_CARRIERS, len(scene))
     carriers, distances = np.empty((len(points), k), np.intp), np.empty((len(points), k))
-    for start in np.unique(from_frame):
-        tied = from_frame == start
+    for start in np.unique(from_stop):
+        tied = from_stop == start
         centers = _centers(scene, scene.gaussians, times[start])
         found = cKDTree(centers).query(points[tied], k=k, workers=1)
         distances[tied], carriers[tied] = (part.reshape(-1, k) for part in found)
@@ -67,18 +107,26 @@ def carry(scene: Scene, points: NDArray, from_frame: NDArray[np.intp], times: li
     own = own.reshape(carriers.shape)
     chosen = _taken(scene.gaussians, torch.from_numpy(rows).to(scene.device))
     at_start = np.empty((len(points), k, 3), np.float32)
-    for start in np.unique(from_frame):
-        tied = from_frame == start
+    for start in np.unique(from_stop):
+        tied = from_stop == start
         at_start[tied] = _centers(scene, chosen, times[start])[own[tied]]
     positions = np.empty((len(times), *points.shape), np.float32)
-    confidence = np.empty(positions.shape[:2], np.float32)
+    variance = np.empty(positions.shape[:2])
     for i, time in enumerate(times):  # one time after the other: many points at many times fit in memory
         displacements = _centers(scene, chosen, time)[own] - at_start
         mean = np.einsum("pkc,pk->pc", displacements, weights)
         positions[i] = points + mean
         spread = _spread_px(displacements - mean[:, None], weights, positions[i], scene.camera_at(time))
-        confidence[i] = confidence_of(spread)
-    return CarriedPoints(positions, confidence)
+        variance[i] = _variance(spread)
+    return positions, variance
+
+
+def centers_then(scene: Scene, time: float, then: float) -> NDArray[np.float32]:
+    """(N, 3) where the Gaussians that `scene` shows at `time` are at the time `then`, world axes, mm."""
+    if len(scene.windows) == 1:
+        return scene.at(then).means.cpu().numpy()
+    centers = scene.at(time).means.cpu().numpy()
+    return carry_points(scene, centers, np.zeros(len(centers), np.intp), [time, then])[1]
 
 
 def confidence_of(spread_px: NDArray) -> NDArray:
@@ -87,7 +135,15 @@ def confidence_of(spread_px: NDArray) -> NDArray:
     Args:
         spread_px: (...) by how much its carriers disagree about its motion, px of an image 640 px wide.
     """
-    variance = LEAST_ERROR_PX**2 + (ERROR_PER_SPREAD * spread_px) ** 2
+    return _probability(_variance(spread_px))
+
+
+def _variance(spread_px: NDArray) -> NDArray:
+    """Of the error of a carried point, px squared of an image 640 px wide."""
+    return LEAST_ERROR_PX**2 + (ERROR_PER_SPREAD * spread_px) ** 2
+
+
+def _probability(variance: NDArray) -> NDArray:
     return 1 - np.exp(-0.5 * NEAR_PX**2 / variance)
 
 
@@ -105,7 +161,7 @@ def _taken(gaussians: Gaussians, rows: Tensor) -> Gaussians:
 
 
 @torch.no_grad()
-def _centers(scene: Scene, gaussians: Gaussians, time: float) -> NDArray[np.float32]:
+def _centers(scene: SingleScene, gaussians: Gaussians, time: float) -> NDArray[np.float32]:
     """(N, 3) centers of some Gaussians of the scene at a time, mm."""
     offsets = offsets_at(gaussians, scene.field, time, scene.config, ops_for(scene.device))
     return (gaussians["means"] + offsets.means).cpu().numpy()

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from .attributes import motion_layout
 from .basis import basis_weights
 from .gaussians import Gaussians
-from .scene import Scene
+from .scene import Scene, Window
+from .single_scene import SingleScene
 
 
 def changes_color(scene: Scene) -> bool:
@@ -20,9 +22,22 @@ def changes_color(scene: Scene) -> bool:
 
 
 def with_fixed_color(scene: Scene, times: Sequence[float]) -> Scene:
-    """`scene` with the color of each Gaussian fixed to its mean over `times`, in [0, 1]; itself if none changes."""
+    """`scene` with the color of each Gaussian fixed to its mean over `times`, in [0, 1]; itself if none changes.
+
+    Of several windows, each takes the mean over those times that are its own; where there is none, over its middle.
+    """
     if not changes_color(scene):
         return scene
+    frames = np.asarray(times) * len(scene.cameras)
+
+    def fixed(part: SingleScene, window: Window) -> SingleScene:
+        own = frames[(frames >= window.start) & (frames < window.stop)] - window.start
+        return _fixed(part, own / len(part.cameras) if len(own) else np.array([0.5]))
+
+    return scene.changed(fixed)
+
+
+def _fixed(scene: SingleScene, times: NDArray[np.float64]) -> SingleScene:
     cfg, tensors = scene.config.deformation, dict(scene.gaussians.tensors)
     weights = np.mean([basis_weights(time, cfg.basis) for time in times], axis=0)
     motion = tensors["motion"].detach().clone()

@@ -26,6 +26,8 @@ from .basis import basis_weights
 from .fixed_color import changes_color
 from .gaussians import SH_C0, Gaussians
 from .scene import Scene
+from .single_scene import SingleScene
+from .support import FramesOf
 from .surface import project_visible, render_surface
 
 REACH_PX = 11
@@ -48,11 +50,11 @@ LARGEST_CHUNK = 2**24
 """Numbers of one array of what is solved at a time."""
 
 
-def without_highlights(scene: Scene, frames: Iterable[Frame]) -> Scene:
+def without_highlights(scene: Scene, frames_of: FramesOf) -> Scene:
     """`scene` with highlights taken out of the colors of its Gaussians.
 
     Args:
-        frames: those it was trained on; they say where highlights are.
+        frames_of: what each window was trained on; it says where highlights are.
     Raises:
         InputError: its colors do not change with time, so that a highlight cannot be told from tissue.
     """
@@ -62,6 +64,11 @@ def without_highlights(scene: Scene, frames: Iterable[Frame]) -> Scene:
             f"highlights: expected a scene whose colors change with time; got deformation.kind {kind} without "
             "basis.deform_color. Train it with --preset default."
         )
+    return scene.changed(lambda part, window: _refitted_scene(part, frames_of(window)))
+
+
+def _refitted_scene(scene: SingleScene, frames: Iterable[Frame]) -> SingleScene:
+    """Args: frames: those it was trained on."""
     free, times = _free_of_highlights(scene, frames)
     cfg, tensors = scene.config.deformation, dict(scene.gaussians.tensors)
     part = motion_layout(cfg)["sh_dc"]
@@ -85,7 +92,7 @@ def without_highlights(scene: Scene, frames: Iterable[Frame]) -> Scene:
     return replace(scene, gaussians=Gaussians(tensors | {"sh_dc": sh_dc, "motion": motion}))
 
 
-def _free_of_highlights(scene: Scene, frames: Iterable[Frame]) -> tuple[NDArray[np.float32], list[float]]:
+def _free_of_highlights(scene: SingleScene, frames: Iterable[Frame]) -> tuple[NDArray[np.float32], list[float]]:
     """(N, F) how surely each frame shows each Gaussian free of highlights, in [0, 1], NaN where it does not show it.
 
     Also the F times.

@@ -30,7 +30,7 @@ class Playback:
         self.scene, self.max_bytes = scene, max_bytes
         self._kept: OrderedDict[int, Splats] = OrderedDict()
         self._rasterize = render.load(scene.backend)
-        self._background = scene.gaussians["means"].detach().new_zeros(3)
+        self._background = torch.zeros(3, device=scene.device)
 
     def __len__(self) -> int:
         return len(self.scene.cameras)

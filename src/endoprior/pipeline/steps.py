@@ -19,11 +19,12 @@ from ..data.files import read_json
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
 from ..export.html import PageTooLarge, write_html
-from ..model.scene import load_scene
+from ..model.scene_file import load_scene
 from ..prepare import prepare
 from ..prepare.pipeline import Progress
+from ..runs.folder import CHECKPOINT
 from ..runs.report import write_report
-from ..runs.training_run import CHECKPOINT, TrainingRun
+from ..runs.train import start_run
 from ..system.atomic import write_json
 from ..visualization.image_tools import colorize, label, tile, to_u8
 from ..visualization.rendered_views import depth_span
@@ -103,7 +104,7 @@ def _train(job: Job, progress: Progress) -> list[str]:
         sequence = load_sequence(job.data, cfg.data)
         notes = [f"note: the camera is lost, or the scene changes, at frame {usable}: training uses the frames before"]
     begun = (job.run / CHECKPOINT).is_file() or (job.run / "config.json").is_file()
-    run = TrainingRun(sequence, cfg, job.run, resume=begun, say=lambda text: None)
+    run = start_run(sequence, cfg, job.run, resume=begun, say=lambda text: None)
     scene = run.complete(lambda report, trainer: progress("training", *trainer.progress()))
     return [*notes, f"{len(scene.gaussians):,} Gaussians"]
 

@@ -55,7 +55,7 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
         reject_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, trainer.sequence.path)
         return checkpoint_schema(cfg)
 
-    arrays, about = load_arrays(path, FORMAT, schema, next_step)
+    arrays, about = load_arrays(path, {FORMAT: schema}, next_step)
     with rejecting(path, "a training state", next_step):
         stage, iteration = Stage(about["stage"]), about["iteration"]
         length = stage_length(cfg, stage)

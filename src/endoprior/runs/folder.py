@@ -11,6 +11,8 @@ from ..system.atomic import reject_occupied, remove_leftovers
 
 LOCK = ".lock"
 """File that a process holds while it trains in a folder."""
+CONFIG, LOG, CHECKPOINT, SCENE = "config.json", "log.jsonl", "checkpoint.safetensors", "scene.safetensors"
+"""Names of its files."""
 
 
 def reject_unusable_folder(out: Path, *, resume: bool) -> None:
@@ -23,7 +25,7 @@ def reject_unusable_folder(out: Path, *, resume: bool) -> None:
     if exists:
         remove_leftovers(out)
     if not (resume and exists):
-        is_run = exists and (out / "config.json").is_file()
+        is_run = exists and (out / CONFIG).is_file()
         resume_it = f", or resume the run in it: `{command('train', '--resume', out)}`" if is_run else ""
         reject_occupied(out, resume_it, ignore=LOCK)
 

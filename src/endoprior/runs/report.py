@@ -115,7 +115,7 @@ def _side_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[
         out = scene.render(frame.time, turned(frame.camera, degrees, distance))
         side = "right" if degrees > 0 else "left"
         cells.append((f"frame {frame.index} from {abs(degrees)} degrees {side}", to_u8(out.color.cpu().numpy())))
-    marked = SupportMap(scene, sequence.frames("train")).render(frame.time, frame.camera)
+    marked = SupportMap(scene, sequence.training_part).render(frame.time, frame.camera)
     return [*cells, ("hatched: guessed; blue: from another time", to_u8(marked.color))]
 
 

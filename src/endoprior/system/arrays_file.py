@@ -69,29 +69,30 @@ def save_arrays(path: Path, arrays: Mapping[str, Tensor], about: Mapping[str, An
             shutil.rmtree(staging, ignore_errors=True)
 
 
-def load_arrays(path: Path, file_format: str, schema: Schema, fix: str) -> tuple[dict[str, Tensor], dict]:
+def load_arrays(path: Path, formats: Mapping[str, Schema], fix: str) -> tuple[dict[str, Tensor], dict]:
     """Read a file written by `save_arrays`.
 
     Args:
-        schema: required arrays.
+        formats: the formats that can be used, and the arrays that each requires.
         fix: what to do if the file cannot be used; ends the error message.
     Returns:
-        The arrays, which match the schema and are finite; and the metadata.
+        The arrays, which match the schema and are finite; and the metadata, with the `format` in it.
     Raises:
         InputError: not a safetensors file, another format, or arrays that do not match the schema.
     """
     from safetensors import SafetensorError, safe_open
 
-    with rejecting(path, f"a file of format {file_format}", fix, SafetensorError):
+    expected = " or ".join(formats)
+    with rejecting(path, f"a file of format {expected}", fix, SafetensorError):
         _check_size(path)
         with safe_open(path, "pt") as opened:
             about = _strict_json((opened.metadata() or {})[KEY])
             found = about["format"]
-            if found != file_format:
-                raise input_error(path, f"format {file_format}", f"{found!r:.80}", fix)
+            if not isinstance(found, str) or found not in formats:
+                raise input_error(path, f"format {expected}", f"{found!r:.80}", fix)
             headers = {name: opened.get_slice(name) for name in opened.keys()}
             stored = {name: (header.get_dtype(), tuple(header.get_shape())) for name, header in headers.items()}
-            _match(stored, schema(about))
+            _match(stored, formats[found](about))
             # Copies: the library's tensors lie in the mapped file, and Windows does not replace a mapped file.
             arrays = {name: opened.get_tensor(name).clone() for name in stored}
         for name, value in arrays.items():

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..core.config import Config
 from ..core.types import RenderOutput, Splats
 from ..model.deformation import Offsets
-from ..model.scene import offsets_at
+from ..model.single_scene import offsets_at
 from ..render import Rasterizer
 from . import density
 from .densify import apply_plan

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..core.config import Config, TemporalConfig
 from ..core.geometry import project
 from ..core.types import RenderOutput
-from ..model.scene import offsets_at
+from ..model.single_scene import offsets_at
 from .frames import TrainingFrame
 from .ops import TrainingOps
 from .state import TrainState

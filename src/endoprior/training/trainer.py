@@ -20,7 +20,8 @@ from ..initialization.first_gaussians import first_gaussians
 from ..model.attributes import motion_layout
 from ..model.deformation import HexPlaneField
 from ..model.gaussians import Gaussians, create_gaussians
-from ..model.scene import Scene, check_cameras
+from ..model.scene_file import check_cameras
+from ..model.single_scene import SingleScene
 from ..system.arrays_file import part
 from .density import DensityStats
 from .divergence import Diverged, DivergenceCheck
@@ -163,10 +164,10 @@ class Trainer:
             self.state.iteration = divergence.last_good
             raise Diverged(divergence.reason)
 
-    def scene(self) -> Scene:
+    def scene(self) -> SingleScene:
         """The scene as it is now, on the CPU."""
         state = self.state
-        return Scene(
+        return SingleScene(
             gaussians=state.gaussians.to("cpu"),
             field=state.field and state.field.to("cpu"),
             config=self.cfg,

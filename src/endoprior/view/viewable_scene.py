@@ -14,13 +14,13 @@ from .. import render
 from ..core.geometry import back_project, expected_depth, length_unit, project, quaternion_to_matrix
 from ..core.types import Camera, RenderOutput, Splats
 from ..data import FrameSequence
-from ..model.carry import CarriedPoints, carry
+from ..model.carry import CarriedPoints, carry, centers_then
 from ..model.gaussians import SH_C0, with_colors
 from ..model.measures import distance
 from ..model.one_color import FEW_ITERATIONS, one_color
 from ..model.playback import Playback
 from ..model.scene import Scene
-from ..model.support import support_of
+from ..model.support import Support
 from ..model.surface import Surface, project_visible, shown_pixels
 from ..model.surface_motion import SurfaceMotion
 from ..visualization.image_tools import gray, to_u8
@@ -136,24 +136,26 @@ class ViewableScene:
 
     def _values(self, settings: ViewSettings) -> Tensor:
         """(N,) value of the layer for each Gaussian, as a share of the color scale, in [0, 1]; NaN where unknown."""
+        time = settings.frame / len(self.cameras)
         if settings.layer == "prior":
-            return self.scene.prior_score.clamp(0, 1)
+            return torch.cat([shown.window.scene.prior_score for shown in self.scene.shown_at(time)]).clamp(0, 1)
         if settings.layer == "support":
-            return self._share_of_frames
+            return self._numbers(self._support.share(time))
         low, high = self._value_span(settings.layer, settings.since)
         values = self._measured(settings.layer, settings.since, settings.frame)
-        return ((torch.from_numpy(values).to(self.scene.prior_score) - low) / (high - low)).clamp(0, 1)
+        return ((self._numbers(values) - low) / (high - low)).clamp(0, 1)
+
+    def _numbers(self, values: NDArray) -> Tensor:
+        return torch.from_numpy(values).to(self.scene.device, torch.float32)
 
     @cached_property
-    def _share_of_frames(self) -> Tensor:
-        """(N,) share of the training frames that show each Gaussian."""
-        support = support_of(self.scene, self.sequence.frames("train"))
-        share = support.num_frames / max(len(support.times), 1)
-        return torch.from_numpy(share).to(self.scene.prior_score)
+    def _support(self) -> Support:
+        return Support(self.scene, self.sequence.training_part)
 
     def _measure(self, layer: Layer, since: int, frame: int) -> NDArray[np.float32]:
         """(N,) displacement of each center since a frame, mm, or stretch of the surface there; NaN where unknown."""
-        before = self._playback.splats(since).means.cpu().numpy()
+        num = len(self.cameras)
+        before = centers_then(self.scene, frame / num, since / num)
         if layer == "displacement":
             return distance(self._playback.splats(frame).means.cpu().numpy(), before).astype(np.float32)
         return self._surface_motion(since).stretch(before, [frame])[0].astype(np.float32)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from .. import render
 from ..core.geometry import pixel_centers, project
 from ..core.types import Camera, Frame
+from ..model.carry import centers_then
 from ..model.fixed_color import with_fixed_color
 from ..model.gaussians import with_colors
 from ..model.scene import Scene
@@ -48,8 +49,7 @@ class PaintedTissue:
         num, camera = len(scene.cameras), scene.camera_at(time)
         self._scene = with_fixed_color(scene, [i / num for i in range(num)])
         self._rasterize = render.load(scene.backend)
-        means = scene.at(time).means.cpu().numpy()
-        self._pixels, self._painted = project_visible(means, render_surface(scene, time, camera))
+        self._painted_at, self._surface = time, render_surface(scene, time, camera)
         self._square = camera.width / SQUARES
 
     @torch.no_grad()
@@ -61,10 +61,11 @@ class PaintedTissue:
 
         # Three numbers for each Gaussian, blended as if they were its color, in [0, 1]: the way back to where it was
         # when it was painted, and whether it was.
+        before, painted = project_visible(centers_then(self._scene, time, self._painted_at), self._surface)
         pixels, _ = project(splats.means.cpu().numpy().astype(np.float64), camera)
         span = 2 * FARTHEST * camera.width
-        back = np.clip((self._pixels - pixels) / span + 0.5, 0, 1)
-        numbers = np.column_stack([back, self._painted])
+        back = np.clip((before - pixels) / span + 0.5, 0, 1)
+        numbers = np.column_stack([back, painted])
         carried = self._rasterize(with_colors(splats, numbers), camera, background=black)
         blended, alpha = carried.color.cpu().numpy(), carried.alpha.cpu().numpy()[..., None]
         back = (blended[..., :2] / np.maximum(alpha, 1e-6) - 0.5) * span

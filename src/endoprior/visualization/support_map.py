@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from ..core.geometry import pixel_centers
 from ..core.types import Camera, Frame
 from ..model.gaussians import with_colors
 from ..model.scene import Scene
-from ..model.support import support_of
+from ..model.support import FramesOf, Support
 from ..system.atomic import whole_file
 from .camera_paths import View
 from .image_tools import SOLID_ALPHA, label, tile, to_u8, write_png
@@ -46,10 +46,11 @@ class SupportPicture:
 class SupportMap:
     """Renders a scene with what its training frames saw of it."""
 
-    def __init__(self, scene: Scene, frames: Iterable[Frame]) -> None:
-        """Find out which of the training `frames` show each Gaussian."""
-        self._scene, self._support = scene, support_of(scene, frames)
+    def __init__(self, scene: Scene, frames_of: FramesOf) -> None:
+        """Args: frames_of: the frames that each window was trained on."""
+        self._scene, self._support = scene, Support(scene, frames_of)
         self._rasterize = render.load(scene.backend)
+        self._longest = len(scene.cameras) / scene.frames_per_second
 
     @torch.no_grad()
     def render(self, time: float, camera: Camera) -> SupportPicture:
@@ -57,19 +58,19 @@ class SupportMap:
         splats = self._scene.at(time)
         black = splats.means.new_zeros(3)
         color = self._rasterize(splats, camera, background=black).view.color.cpu().numpy()
-        total, gap = max(len(self._support.times), 1), self._support.gap(time)
-        guessed = ~np.isfinite(gap)
+        frames, gap = self._support.num_frames(time), self._support.gap(time)
+        guessed, most, longest = ~np.isfinite(gap), max(frames.max(initial=0), 1), self._longest
         # Three numbers for each Gaussian, blended as if they were its color, in [0, 1].
-        numbers = np.column_stack([self._support.num_frames / total, np.where(guessed, 0, gap), guessed])
+        numbers = np.column_stack([frames / most, np.where(guessed, 0, gap / longest), guessed])
         out = self._rasterize(with_colors(splats, numbers), camera, background=black)
         blended, alpha = out.color.cpu().numpy(), out.alpha.cpu().numpy()
         solid = alpha > SOLID_ALPHA
         share, gap, guess = np.moveaxis(blended / np.where(solid, alpha, 1)[..., None], -1, 0)
-        seconds = gap / np.maximum(1 - guess, 1e-6) * len(self._scene.cameras) / self._scene.frames_per_second
+        seconds = gap / np.maximum(1 - guess, 1e-6) * longest
         is_guess = guess > 0.5
         return SupportPicture(
             _marked(color, solid & is_guess, np.where(solid & ~is_guess, seconds, 0)),
-            np.where(solid, np.where(is_guess, 0, share * total), np.nan).astype(np.float32),
+            np.where(solid, np.where(is_guess, 0, share * most), np.nan).astype(np.float32),
             np.where(solid, np.where(is_guess, np.inf, seconds), np.nan).astype(np.float32),
         )
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
+from ...model.single_scene import SingleScene
 from ..context import EvaluationContext
 from ..score import Score
 
@@ -10,7 +13,7 @@ LOW_PRIOR, LOW_PRIOR_OBSERVATIONS, LOW_OPACITY, LARGE_SCALE_MM = 0.2, 20, 0.01, 
 SCORES = (
     Score(
         "num_gaussians", "Gaussians", "", None, 0,
-        "Gaussians of the scene.",
+        "Gaussians of the scene, in all its windows.",
         group="model", hint="more are finer and slower",
     ),
     Score(
@@ -33,13 +36,18 @@ SCORES = (
 
 def compute(context: EvaluationContext) -> None:
     """Count; no frame is needed."""
-    scene = context.scene
+    counts: Counter[str] = Counter()
+    for window in context.scene.windows:
+        counts.update(_counts(window.scene))
+    for name, count in counts.items():
+        context.add(name, count)
+
+
+def _counts(scene: SingleScene) -> dict[str, int]:
     seen = scene.num_valid >= LOW_PRIOR_OBSERVATIONS
-    counts = {
+    return {
         "num_gaussians": len(scene),
         "num_low_prior": int((seen & (scene.prior_score < LOW_PRIOR)).sum()),
         "num_low_opacity": int((scene.gaussians.opacities < LOW_OPACITY).sum()),
         "num_large_scale": int((scene.gaussians.scales.amax(-1) > LARGE_SCALE_MM).sum()),
     }
-    for name, count in counts.items():
-        context.add(name, count)

@@ -1,0 +1,143 @@
+"""A scene of one window: Gaussians, how they move, and the cameras that saw them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .. import render
+from ..core.config import Config
+from ..core.config_io import to_dict
+from ..core.types import Camera, Splats
+from ..system.arrays_file import save_arrays
+from .basis import basis_offsets
+from .deformation import HexPlaneField, Offsets
+from .gaussians import Gaussians
+from .ops import ModelOps, ops_for
+from .scene import Scene, Window
+
+FORMAT = "endoprior-scene-1"
+"""Name and version of the file format, in the file's metadata."""
+
+
+def offsets_at(
+    gaussians: Gaussians,
+    field: HexPlaneField | None,
+    time: float,
+    cfg: Config,
+    ops: ModelOps,
+    chosen: Tensor | None = None,
+) -> Offsets:
+    """Deformation of the Gaussians (of the `chosen` (P,) ones only, if given) at `time` in [0, 1].
+
+    Unless some are chosen, the gradient of temporal coefficients goes to `gaussians.motion_gradients`.
+    """
+    rows = slice(None) if chosen is None else chosen
+    if field is not None:
+        return field.offsets(gaussians["means"][rows], time, ops)
+    sink = gaussians.motion_gradients if chosen is None else None
+    return basis_offsets(gaussians["motion"][rows], time, cfg.deformation, ops, sink)
+
+
+@dataclass(frozen=True)
+class SingleScene(Scene):
+    """A scene of one window: canonical Gaussians, their motion and the cameras of the sequence."""
+
+    gaussians: Gaussians
+    field: HexPlaneField | None
+    """The HexPlane deformation; None when the Gaussians carry temporal coefficients."""
+    config: Config
+    cameras: tuple[Camera, ...]
+    """Camera of each frame of the sequence; frame i was taken at time i / T."""
+    frames_per_second: float
+    prior_score: Tensor
+    """(N,) texture-prior score of each Gaussian."""
+    num_valid: Tensor
+    """(N,) projections that score was averaged over."""
+    lengths_are_relative: bool = False
+    """Whether the scale of the sequence's depth was assumed: lengths are then not in mm."""
+    rendered_by: render.Backend | None = None
+    """Rendering backend; None: the one it was trained with, where it can be used."""
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    @property
+    def windows(self) -> tuple[Window]:
+        """The scene itself is its only window."""
+        return (Window(0, len(self.cameras), lambda: self),)
+
+    @torch.no_grad()
+    def at(self, time: float) -> Splats:
+        """See `Scene.at`."""
+        if not 0 <= time <= 1:
+            raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
+        return self._splats(offsets_at(self.gaussians, self.field, time, self.config, ops_for(self.device)))
+
+    @torch.no_grad()
+    def canonical(self) -> Splats:
+        """The Gaussians as they are stored, before any motion, activated."""
+        return self._splats(None)
+
+    def _splats(self, offsets: Offsets | None) -> Splats:
+        found = self.gaussians.splats(offsets, self.config.schedule.sh_degree)
+        # A tensor that no deformation changes is the trained tensor itself, with its gradient.
+        return Splats(**{name: value.detach() for name, value in found.tensors.items()})
+
+    @property
+    def device(self) -> torch.device:
+        """See `Scene.device`."""
+        return self.gaussians["means"].device
+
+    def to(
+        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
+    ) -> SingleScene:
+        """See `Scene.to`."""
+        gaussians = self.gaussians.to(device)
+        field = self.field and self.field.to(device, fp16_planes=fp16_planes)
+        if gaussians is self.gaussians and field is self.field and backend in (None, self.rendered_by):
+            return self
+        return replace(
+            self,
+            rendered_by=backend,
+            gaussians=gaussians,
+            field=field,
+            prior_score=self.prior_score.to(device),
+            num_valid=self.num_valid.to(device),
+        )
+
+    def changed(self, change: Callable[[SingleScene, Window], SingleScene]) -> SingleScene:
+        """See `Scene.changed`."""
+        return change(self, self.windows[0])
+
+    def save(self, path: Path) -> None:
+        """Write the scene as one safetensors file, completely or not at all.
+
+        Raises:
+            ValueError: its planes are in half precision.
+        """
+        if self.field is not None and self.field.grid.values.dtype != torch.float32:
+            raise ValueError("save the scene itself, not a copy with fp16 planes")
+        intrinsics, poses = camera_arrays(self.cameras)
+        arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
+        arrays |= {"prior_score": self.prior_score, "num_valid": self.num_valid}
+        arrays |= {"camera.intrinsics": torch.from_numpy(intrinsics), "camera.world_to_camera": torch.from_numpy(poses)}
+        if self.field is not None:
+            arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
+        first = self.cameras[0]
+        about = {"config": to_dict(self.config), "frames_per_second": self.frames_per_second}
+        about |= {"lengths_are_relative": self.lengths_are_relative}
+        about |= {"width": first.width, "height": first.height}
+        save_arrays(path, arrays, about, FORMAT)
+
+
+def camera_arrays(cameras: tuple[Camera, ...]) -> tuple[NDArray, NDArray]:
+    """(T, 4) fx, fy, cx, cy in px, and (T, 4, 4) world-to-camera."""
+    intrinsics = np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras])
+    return intrinsics, np.stack([c.world_to_camera for c in cameras])

@@ -1,0 +1,122 @@
+"""A scene of several windows, each in a file of its own; few of them are in memory at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+
+from .. import render
+from ..core.config import Config
+from ..core.config_io import to_dict
+from ..core.types import Camera
+from ..system.arrays_file import save_arrays
+from ..system.memory import BoundedCache
+from .scene import Scene, Window
+from .single_scene import SingleScene, camera_arrays
+
+FORMAT = "endoprior-windows-1"
+"""Name and version of the file that lists the windows, in its metadata."""
+CACHE_BYTES = 2**29
+"""Memory of the windows that are kept; a window of 30,000 Gaussians and 70 frames has about 65 MB."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """Where a window is, and how large."""
+
+    start: int
+    stop: int
+    num_gaussians: int
+
+
+@dataclass(frozen=True)
+class WindowedScene(Scene):
+    """A scene of several windows."""
+
+    config: Config
+    cameras: tuple[Camera, ...]
+    frames_per_second: float
+    spans: tuple[Span, ...]
+    """In order; each starts after the one before, ends after it, and overlaps the next one only."""
+    read: Callable[[int], SingleScene]
+    """Reads the scene of window k."""
+    lengths_are_relative: bool = False
+    rendered_by: render.Backend | None = None
+    device_name: str = "cpu"
+    """Device that windows are moved to when they are read."""
+    fp16_planes: bool = False
+
+    def __len__(self) -> int:
+        return sum(span.num_gaussians for span in self.spans)
+
+    @cached_property
+    def _scenes(self) -> BoundedCache[SingleScene]:
+        return BoundedCache(CACHE_BYTES, _num_bytes)
+
+    @cached_property
+    def windows(self) -> Sequence[Window]:
+        """See `Scene.windows`."""
+        return [Window(span.start, span.stop, self._reader(k)) for k, span in enumerate(self.spans)]
+
+    def _reader(self, k: int) -> Callable[[], SingleScene]:
+        def read() -> SingleScene:
+            return self.read(k).to(self.device, backend=self.rendered_by, fp16_planes=self.fp16_planes)
+
+        return lambda: self._scenes.get(k, read)
+
+    @property
+    def device(self) -> torch.device:
+        """See `Scene.device`."""
+        return torch.device(self.device_name)
+
+    def to(
+        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
+    ) -> WindowedScene:
+        """See `Scene.to`."""
+        return replace(self, device_name=str(device), rendered_by=backend, fp16_planes=fp16_planes)
+
+    def changed(self, change: Callable[[SingleScene, Window], SingleScene]) -> WindowedScene:
+        """See `Scene.changed`: each window is changed when it is read."""
+        windows = self.windows
+        return replace(self, read=lambda k: change(windows[k].scene, windows[k]))
+
+    def save(self, path: Path) -> None:
+        """Write the list of windows to `path`, and the windows below `windows/` beside it."""
+        for k, window in enumerate(self.windows):
+            file = window_file(path, k)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            window.scene.save(file)
+        save_index(path, self)
+
+
+def window_file(path: Path, k: int) -> Path:
+    """The file of window k of the scene whose list of windows is at `path`."""
+    return path.parent / "windows" / f"{k:03d}" / "scene.safetensors"
+
+
+def save_index(path: Path, scene: WindowedScene) -> None:
+    """Write the list of windows only; the windows are in place."""
+    intrinsics, poses = camera_arrays(scene.cameras)
+    spans = [[span.start, span.stop, span.num_gaussians] for span in scene.spans]
+    arrays = {
+        "camera.intrinsics": torch.from_numpy(intrinsics),
+        "camera.world_to_camera": torch.from_numpy(poses),
+        "windows": torch.tensor(spans, dtype=torch.int64),
+    }
+    first = scene.cameras[0]
+    about = {
+        "config": to_dict(scene.config),
+        "frames_per_second": scene.frames_per_second,
+        "lengths_are_relative": scene.lengths_are_relative,
+        "width": first.width,
+        "height": first.height,
+    }
+    save_arrays(path, arrays, about, FORMAT)
+
+
+def _num_bytes(scene: SingleScene) -> int:
+    return sum(value.numel() * value.element_size() for value in scene.gaussians.tensors.values())

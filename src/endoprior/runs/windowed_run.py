@@ -1,0 +1,121 @@
+"""A training whose sequence is cut into windows: each is a run of its own, below `windows/` in the run folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ..core.checks import InputError
+from ..core.config import Config
+from ..data import FrameSequence
+from ..data.files import read_json
+from ..model.scene_file import load_scene
+from ..model.single_scene import SingleScene
+from ..model.windowed_scene import Span, WindowedScene, save_index, window_file
+from ..system.atomic import write_json, write_text
+from ..system.file_lock import locked
+from ..training.trainer import DEFAULT_FRAMES_PER_SECOND, Observer
+from .folder import CONFIG, LOCK, LOG, SCENE, prepare_run_folder, reject_unusable_folder
+from .identity import reject_other_run
+from .observers import CHECKPOINT_SECONDS
+from .provenance import run_facts
+from .training_run import TrainingRun
+
+
+def window_config(cfg: Config, start: int, stop: int) -> Config:
+    """The config of the run of one window: an ordinary training on these frames."""
+    return replace(
+        cfg, data=replace(cfg.data, window=f"{start}-{stop - 1}"), windows=replace(cfg.windows, enabled=False)
+    )
+
+
+class WindowedRun:
+    """A run of several windows, trained one after the other; see `TrainingRun`."""
+
+    def __init__(
+        self,
+        sequence: FrameSequence,
+        cfg: Config,
+        plan: list[tuple[int, int]],
+        out: str | Path | None,
+        *,
+        resume: bool,
+        say: Callable[[str], None],
+    ) -> None:
+        """Check the folder; every window is checked when it begins.
+
+        Args:
+            plan: first frame of each window, and the frame after its last.
+        """
+        self.sequence, self.cfg, self.plan, self.say = sequence, cfg, plan, say
+        self.out, self.resume = Path(out) if out is not None else None, resume
+        if self.out:
+            reject_unusable_folder(self.out, resume=resume)
+        say(f"{sequence.path}: {len(sequence)} frames in {len(plan)} windows")
+
+    def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> WindowedScene:
+        """Train every window that is not trained yet. See `TrainingRun.complete`."""
+        if self.out is None:
+            scenes = [self._train(k, None, observers, checkpoint_seconds) for k in range(len(self.plan))]
+            return self._scene([len(scene) for scene in scenes], scenes.__getitem__)
+        created, began = prepare_run_folder(self.out, resume=self.resume), False
+        try:
+            with locked(self.out, self.out / LOCK):
+                self._begin(self.out)
+                began = True
+                return self._train_in(self.out, observers, checkpoint_seconds)
+        except InputError:
+            if created and not began:
+                shutil.rmtree(self.out, ignore_errors=True)
+            raise
+
+    def _begin(self, out: Path) -> None:
+        fingerprint, about = self.sequence.fingerprint(), out / CONFIG
+        if self.resume and about.is_file():
+            stored = read_json(about)
+            data = stored.get("data")
+            known = data.get("fingerprint") if isinstance(data, dict) else None
+            reject_other_run(about, stored.get("config"), known, self.cfg, fingerprint, self.sequence.path)
+        elif self.resume:
+            raise InputError(f"{about}: expected a run to resume; found none. Start without --resume.")
+        write_json(about, run_facts(self.sequence, self.cfg, fingerprint) | {"windows": self.plan})
+
+    def _train_in(self, out: Path, observers: Sequence[Observer], checkpoint_seconds: float) -> WindowedScene:
+        """Train all windows into their folders; one at a time is in memory."""
+        scene_file, sizes, lines = out / SCENE, [], []
+        for k in range(len(self.plan)):
+            file = window_file(scene_file, k)
+            done = self.resume and file.is_file()
+            sizes.append(len(load_scene(file) if done else self._train(k, file.parent, observers, checkpoint_seconds)))
+            lines += [
+                json.dumps({"window": k} | json.loads(line)) + "\n"
+                for line in (file.parent / LOG).read_text(encoding="utf-8").splitlines()
+            ]
+        write_text(out / LOG, "".join(lines))
+        scene = self._scene(sizes, lambda k: load_scene(window_file(scene_file, k)))
+        save_index(scene_file, scene)
+        return scene
+
+    def _train(
+        self, k: int, folder: Path | None, observers: Sequence[Observer], checkpoint_seconds: float
+    ) -> SingleScene:
+        start, stop = self.plan[k]
+        self.say(f"window {k + 1} of {len(self.plan)}: frames {start} to {stop - 1}")
+        part, cfg = self.sequence.part(start, stop), window_config(self.cfg, start, stop)
+        resume = self.resume and folder is not None and (folder / CONFIG).is_file()
+        run = TrainingRun(part, cfg, folder, resume=resume, say=self.say)
+        return run.complete(*observers, checkpoint_seconds=checkpoint_seconds)
+
+    def _scene(self, sizes: list[int], read: Callable[[int], SingleScene]) -> WindowedScene:
+        sequence = self.sequence
+        return WindowedScene(
+            config=self.cfg,
+            cameras=tuple(sequence.camera(i) for i in range(len(sequence))),
+            frames_per_second=sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
+            spans=tuple(Span(*ends, size) for ends, size in zip(self.plan, sizes, strict=True)),
+            read=read,
+            lengths_are_relative=sequence.depth_is_relative,
+        )
