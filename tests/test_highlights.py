@@ -71,7 +71,7 @@ def resting(pixels: np.ndarray) -> np.ndarray:
 def test_the_tissue_below_comes_back(light):
     """A moving light: from other frames. One that rests: from the tissue around it."""
     lit, plain = wall(light), wall(lambda pixels: np.zeros((len(pixels), NUM_BASES), np.float32))
-    found = without_highlights(lit, frames_of(lit))
+    found = without_highlights(lit, lambda window: frames_of(lit))
     for i in range(NUM_FRAMES):
         want = plain.render(i / NUM_FRAMES).color
         before = (lit.render(i / NUM_FRAMES).color - want).abs()
@@ -82,20 +82,20 @@ def test_the_tissue_below_comes_back(light):
 def test_all_else_stays_as_it_is():
     """Geometry and motion to the last bit; colors where no frame shows a highlight."""
     lit = wall(moving)
-    found = without_highlights(lit, frames_of(lit))
+    found = without_highlights(lit, lambda window: frames_of(lit))
     for name in ("means", "quats", "log_scales", "opacity_logits", "color_slopes"):
         assert torch.equal(found.gaussians[name], lit.gaussians[name])
     part = motion_layout(lit.config.deformation)["sh_dc"]
     assert torch.equal(found.gaussians["motion"][:, :, : part.start], lit.gaussians["motion"][:, :, : part.start])
     dull = wall(lambda pixels: 0.1 * moving(pixels))
-    same = without_highlights(dull, frames_of(dull))
+    same = without_highlights(dull, lambda window: frames_of(dull))
     assert torch.equal(same.gaussians["motion"], dull.gaussians["motion"])
     assert torch.equal(same.gaussians["sh_dc"], dull.gaussians["sh_dc"])
 
 
 def test_what_no_frame_shows_is_left_alone():
     lit = wall(moving)
-    found = without_highlights(lit, frames_of(lit, hidden=slice(0, WIDTH)))
+    found = without_highlights(lit, lambda window: frames_of(lit, hidden=slice(0, WIDTH)))
     assert torch.equal(found.gaussians["motion"], lit.gaussians["motion"])
 
 
@@ -104,7 +104,7 @@ def test_colors_that_never_change_have_no_highlights_to_find():
     basis = replace(lit.config.deformation.basis, deform_color=False)
     cfg = replace(lit.config, deformation=replace(lit.config.deformation, basis=basis))
     with pytest.raises(InputError, match="expected a scene whose colors change with time"):
-        without_highlights(replace(lit, config=cfg), [])
+        without_highlights(replace(lit, config=cfg), lambda window: [])
 
 
 def test_a_sequence_has_no_highlights_to_hide(tmp_path, capsys):

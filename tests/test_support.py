@@ -11,7 +11,7 @@ from export_scenes import moving_scene
 from endoprior.core.geometry import project
 from endoprior.core.types import Camera, Frame
 from endoprior.model.scene import Scene
-from endoprior.model.support import Support, support_of
+from endoprior.model.support import WindowSupport, window_support
 from endoprior.visualization.support_map import SupportMap
 
 
@@ -44,9 +44,9 @@ def scene() -> Scene:
 
 def test_a_gaussian_is_seen_where_a_frame_shows_tissue_at_its_pixel(scene: Scene) -> None:
     camera = scene.cameras[0]
-    everywhere = support_of(scene, frames_of(scene, masks_of(camera, None)))
+    everywhere = window_support(scene, frames_of(scene, masks_of(camera, None)))
     left_half = slice(0, camera.width // 2)
-    found = support_of(scene, frames_of(scene, masks_of(camera, left_half)))
+    found = window_support(scene, frames_of(scene, masks_of(camera, left_half)))
     x = project(scene.at(0.0).means.numpy().astype(np.float64), camera)[0][:, 0]
     assert everywhere.seen.any()
     np.testing.assert_array_equal(found.seen[:, 0], everywhere.seen[:, 0] & (x >= camera.width // 2))
@@ -54,26 +54,26 @@ def test_a_gaussian_is_seen_where_a_frame_shows_tissue_at_its_pixel(scene: Scene
 
 def test_what_lies_behind_other_tissue_is_not_seen(scene: Scene) -> None:
     frames = frames_of(scene, masks_of(scene.cameras[0], None))
-    seen = np.flatnonzero(support_of(scene, frames).seen[:, 0])
+    seen = np.flatnonzero(window_support(scene, frames).seen[:, 0])
     moved = moving_scene()
     one = int(seen[len(seen) // 2])
     moved.gaussians["means"].detach()[one] *= 1.5  # along its ray: the camera of the first frame is at the origin
-    assert not support_of(moved, frames).seen[one, 0]
+    assert not window_support(moved, frames).seen[one, 0]
 
 
-def test_the_gap_is_the_time_to_the_nearest_frame_that_saw_it() -> None:
+def test_the_gap_is_counted_to_the_nearest_frame_that_saw_it() -> None:
     seen = np.array([[True, False, False], [False, True, True], [False, False, False]])
-    support = Support(seen, np.array([0.0, 0.25, 0.5]))
-    np.testing.assert_allclose(support.gap(0.3), [0.3, 0.05, np.inf])
+    support = WindowSupport(seen, np.array([0.0, 5.0, 10.0]))
+    np.testing.assert_allclose(support.gap(6.0), [6.0, 1.0, np.inf])
     np.testing.assert_array_equal(support.num_frames, [1, 2, 0])
-    assert np.isinf(Support(np.zeros((2, 0), bool), np.zeros(0)).gap(0.1)).all()
+    assert np.isinf(WindowSupport(np.zeros((2, 0), bool), np.zeros(0)).gap(0.1)).all()
 
 
 def test_the_picture_counts_frames_and_hatches_what_none_saw(scene: Scene) -> None:
     camera, width = scene.cameras[0], scene.cameras[0].width
     right_half = slice(width // 2, width)
     masks = masks_of(camera, right_half, right_half, right_half)
-    shown = SupportMap(scene, frames_of(scene, masks)).render(0.0, camera)
+    shown = SupportMap(scene, lambda window: frames_of(scene, masks)).render(0.0, camera)
     plain = scene.render(0.0, camera).color.numpy()
     solid = np.isfinite(shown.num_frames)
     left, right = solid.copy(), solid.copy()
@@ -91,7 +91,7 @@ def test_tissue_from_another_time_is_tinted(scene: Scene) -> None:
     slow = replace(scene, frames_per_second=0.1)
     camera = slow.cameras[0]
     frames = frames_of(slow, masks_of(camera, None, None, None))[2:]
-    shown = SupportMap(slow, frames).render(0.0, camera)
+    shown = SupportMap(slow, lambda window: frames).render(0.0, camera)
     solid = np.isfinite(shown.gap_seconds)
     assert np.median(shown.gap_seconds[solid]) == pytest.approx(2 / 0.1, rel=0.05)
     bluer = (
