@@ -165,6 +165,21 @@ def test_a_path_that_stands_still_has_the_extent_as_error(with_scale):
     np.testing.assert_allclose(errors, [np.sqrt(200), 20, 0, 0, 1], atol=1e-6)
 
 
+def test_rounding_is_no_motion():
+    """The mean of equal centers differs from them in the last bit."""
+    at_rest = np.full((7, 3), 0.1)
+    assert (at_rest != at_rest.mean(0)).any()
+    errors = trajectory_errors(poses(at_rest), random_path(frames=7), True)
+    aligned_by_axes = trajectory_errors(poses(np.zeros((7, 3))), random_path(frames=7), True)
+    np.testing.assert_allclose(errors, aligned_by_axes, atol=1e-9)
+
+
+def test_a_scale_is_not_negative():
+    """Two paths of 3 um in opposite directions: their axes, which agree, decide the rotation."""
+    there = poses(np.outer([0, 1, 2, 3], [1.1e-3, 0, 0]))
+    assert align_paths(poses(-1000 * there[:, :3, 3]), there, True).scale == 0
+
+
 @pytest.mark.parametrize("with_scale", [False, True])
 def test_motion_of_a_camera_at_rest_is_not_scaled_away(with_scale):
     errors = trajectory_errors(poses(SQUARE), poses(np.zeros((4, 3))), with_scale)

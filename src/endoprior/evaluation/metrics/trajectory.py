@@ -1,8 +1,10 @@
 """Errors of an estimated camera path against the true one: where the camera was, and how it turned. NumPy only.
 
 The two paths may lie in different world axes: the estimated one is aligned first. `T` frames; poses are
-camera-to-world, OpenCV axes. Alignment: Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
-PAMI 1991. Absolute and relative error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
+camera-to-world, OpenCV axes.
+
+Alignment: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
+Absolute and relative error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
 """
 
 from __future__ import annotations
