@@ -22,6 +22,7 @@ from endoprior.evaluation.scorers.tracks import parts_of, track_end_error_mm, tr
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.attributes import motion_layout
 from endoprior.model.gaussians import Gaussians
+from endoprior.model.scene import Scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.training.trainer import Trainer
 
@@ -119,6 +120,7 @@ def test_points_at_rest_are_followed_by_a_scene_at_rest(phantom, scene, monkeypa
     world = np.linalg.inv(path()[0]) @ np.vstack([first.T, np.ones(len(first))])
     points = np.stack([(pose @ world)[:3].T for pose in path()]).astype(np.float32)
     visible = np.ones(points.shape[:2], bool)
+    visible[:4, ::2] = False  # half of the points start in a later frame
     set_tracks(monkeypatch, phantom, Tracks(points, visible))
     true = true_tracks(sequence)
     for predicted in (by_scene(resting, true, sequence), without_motion(true, sequence)):
@@ -127,7 +129,7 @@ def test_points_at_rest_are_followed_by_a_scene_at_rest(phantom, scene, monkeypa
     still = without_motion(true, phantom)  # poses that do not move: now the points do
     assert track_scores(still, true, parts_of(true, phantom), phantom.camera(0))["track_error_mm"] > 1
 
-    visible[1:-1] = False
+    visible[0], visible[1:-1] = True, False
     set_tracks(monkeypatch, phantom, Tracks(points, visible, paired=False))
     assert track_end_error_mm(resting, phantom) < 1e-3
 
@@ -147,6 +149,24 @@ def test_the_poses_of_the_scene_count_and_not_those_of_the_sequence(phantom, sce
     other = scores_of(replace(scene, cameras=elsewhere), phantom)
     for name in ("psnr_tissue", "side_psnr", "right_psnr", "track_error_mm", "flow_error_dis", *OF_THE_PATH):
         assert other[name] != pytest.approx(known[name], rel=1e-3, abs=1e-3), name
+
+
+def test_every_frame_is_rendered_from_its_own_camera(phantom, scene, monkeypatch):
+    """Moved by nothing, to a side or to the right eye; never from the camera of another frame."""
+    render, seen = Scene.render, []
+
+    def recorded(self, time, camera=None):
+        seen.append((round(time * FRAMES), (camera or self.camera_at(time)).world_to_camera))
+        return render(self, time, camera)
+
+    monkeypatch.setattr(Scene, "render", recorded)
+    evaluate(scene, phantom, networks=False)
+    right = transform([-phantom.right_eye.baseline_mm, 0, 0], [0, 0, 0])
+    allowed = [np.eye(4), right, *phantom.truth.side_poses.values()]
+    offsets = [(index, pose @ np.linalg.inv(path()[index])) for index, pose in seen]
+    found = [[k for k, known in enumerate(allowed) if np.allclose(offset, known)] for _, offset in offsets]
+    assert all(found) and {k for ks in found for k in ks} == set(range(len(allowed)))
+    assert {index for index, _ in offsets} == set(range(FRAMES))
 
 
 def test_a_sequence_takes_the_poses_and_keeps_its_lens(phantom):
