@@ -11,7 +11,7 @@ LINE = "  {group:<7} {label:<18} {value:>15} {arrow:1}  {hint}"
 
 
 def score_table(scores: Mapping[str, float], skipped: Mapping[str, str], relative: bool = False) -> list[str]:
-    """The lines of the table, at most 27 and as many as there are reasons for skipped scores.
+    """The lines of the table, at most 29 and as many as there are reasons for skipped scores.
 
     Args:
         scores: value by name.

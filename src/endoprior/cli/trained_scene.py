@@ -31,7 +31,7 @@ def open_scene(run: Path) -> Scene:
 
 
 def sequence_of(scene: Scene, run: Path, data: Path | None, without: str) -> FrameSequence | None:
-    """The sequence of a run's scene; None, with a note, if it does not exist any more.
+    """The sequence of a run's scene, with the scene's poses; None, with a note, if it does not exist any more.
 
     Args:
         run: run folder. data: sequence folder that the user names, if any.
@@ -53,4 +53,4 @@ def sequence_of(scene: Scene, run: Path, data: Path | None, without: str) -> Fra
     if len(sequence) != len(scene.cameras):
         fix = "`--data FOLDER` with the sequence of the run."
         raise input_error(sequence.path, f"{len(scene.cameras)} frames", str(len(sequence)), fix)
-    return sequence
+    return sequence.with_poses(scene.cameras)

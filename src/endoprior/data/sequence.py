@@ -183,6 +183,20 @@ class FrameSequence:
         view._cache = BoundedCache(cache_bytes(), _frame_bytes)
         return view
 
+    def with_poses(self, cameras: Sequence[Camera]) -> FrameSequence:
+        """This sequence with the poses of other cameras, one for each frame; lenses and sizes stay.
+
+        A scene has poses of its own, in which it was trained: they are those to render it from.
+        """
+        poses = [camera.world_to_camera for camera in cameras]
+        if all(np.array_equal(own.world_to_camera, pose) for own, pose in zip(self._cameras, poses, strict=True)):
+            return self
+        view = copy(self)
+        view._cameras = [replace(own, world_to_camera=p) for own, p in zip(self._cameras, poses, strict=True)]
+        view._read_frame = lambda index: replace(self._read_frame(index), camera=view._cameras[index])
+        view._cache = BoundedCache(cache_bytes(), _frame_bytes)
+        return view
+
     def fingerprint(self) -> str:
         """SHA-256, in hex, of the names (below the folder) and contents of all files of the sequence."""
         digest = hashlib.sha256()

@@ -1,4 +1,4 @@
-"""Ground truth of a synthetic sequence: tissue behind the tool, exact depth, and tracked material points."""
+"""Ground truth of a synthetic sequence: tissue behind the tool, exact depth, material points, the camera path."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.geometry import FARTHEST_MM
 from .files import read_json
 from .images import read_color
 from .numpy_files import read_numpy
+from .poses import ROTATION_TOLERANCE, demand_rotations
 
-_FILE = ("a NumPy file", "write the truth again.")
+_AGAIN = "write the truth again."
+_FILE = ("a NumPy file", _AGAIN)
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class Truth:
         if not path.exists():
             return {}
         stored = read_json(path)
-        wrong = input_error(path, "finite poses of shape (4, 4)", "something else", "write the truth again.")
+        wrong = input_error(path, "finite poses of shape (4, 4)", "something else", _AGAIN)
         try:
             poses = {name: np.asarray(pose, np.float64) for name, pose in stored.items()}
         except (TypeError, ValueError):
@@ -85,6 +88,28 @@ class Truth:
         return read_color(path.with_suffix(".png")), np.asarray(read_numpy(path, *_FILE), np.float32)
 
     @cached_property
+    def camera_to_world(self) -> NDArray[np.float64] | None:
+        """(T, 4, 4) true pose of each frame's camera, mm, OpenCV axes; its world axes may differ from the sequence's.
+
+        Raises:
+            InputError: the file holds something else.
+        """
+        path = self.folder / "camera_to_world.npy"
+        if not path.exists():
+            return None
+        stored, shape = read_numpy(path, *_FILE), (len(self._names), 4, 4)
+        if isinstance(stored, dict) or stored.dtype.kind not in "iuf" or stored.shape != shape:
+            got = "several arrays" if isinstance(stored, dict) else f"{stored.shape} of {stored.dtype}"
+            raise input_error(path, f"numbers of shape {shape}", got, _AGAIN)
+        poses = stored.astype(np.float64)
+        if not (np.abs(poses) <= FARTHEST_MM).all():  # NaN fails too
+            raise input_error(path, f"finite numbers of at most {FARTHEST_MM:g}", "others", _AGAIN)
+        if not np.allclose(poses[:, 3], (0, 0, 0, 1), rtol=0, atol=ROTATION_TOLERANCE):
+            raise input_error(path, "poses with the last row 0 0 0 1", "another last row", _AGAIN)
+        demand_rotations(path, poses[:, :3, :3], "the poses", _AGAIN)
+        return poses
+
+    @cached_property
     def tracks(self) -> Tracks | None:
         """All tracks, or None."""
         path = self.folder / "tracks.npz"
@@ -93,7 +118,7 @@ class Truth:
         stored = read_numpy(path, *_FILE)
         if not isinstance(stored, dict) or not {"points", "visible"} <= stored.keys():
             got = ", ".join(stored) if isinstance(stored, dict) else "one array"
-            raise input_error(path, "arrays points and visible", got, "write the truth again.")
+            raise input_error(path, "arrays points and visible", got, _AGAIN)
         points, visible = np.asarray(stored["points"], np.float32), np.asarray(stored["visible"], bool)
         region = np.asarray(stored["region"], str) if "region" in stored else None
         tracks = Tracks(points, visible, bool(stored.get("paired", True)), region)
@@ -101,7 +126,7 @@ class Truth:
         if frames != len(self._names) or tracks.points.shape != (frames, count, 3):
             got = f"{tracks.points.shape} and {tracks.visible.shape}"
             want = f"shapes (T, P, 3) and (T, P) with T = {len(self._names)}"
-            raise input_error(path, want, got, "write the truth again.")
+            raise input_error(path, want, got, _AGAIN)
         if region is not None and region.shape != (count,):
-            raise input_error(path, f"a region of shape ({count},)", f"{region.shape}", "write the truth again.")
+            raise input_error(path, f"a region of shape ({count},)", f"{region.shape}", _AGAIN)
         return tracks

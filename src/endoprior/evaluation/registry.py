@@ -27,6 +27,7 @@ SCORERS = (
     "sides",
     "right_eye",
     "tracks",
+    "camera_path",
     "speed",
 )
 """Modules of `scorers/`, in the order in which they run. Each has `SCORES` and `compute(context)`."""

@@ -35,11 +35,13 @@ class Score:
     """A few words beside the printed value: what is good, or what to know of it. Only what can be said of any video."""
     in_summary: bool = True
     """Whether `endoprior train` and `eval` print it; metrics.json has every score."""
+    in_true_mm: bool = False
+    """Whether its length is measured in the ground truth, in mm also where the depth of the sequence is relative."""
 
     @property
     def is_length(self) -> bool:
         """Whether it is in mm, which it is not where depth is relative."""
-        return self.unit == "mm"
+        return self.unit == "mm" and not self.in_true_mm
 
     def shown_unit(self, relative: bool = False) -> str:
         """The unit to show. `relative`: whether the scale of the depth is unknown."""

@@ -45,6 +45,8 @@ def evaluate(
     if is_scene and len(sequence) != len(scene.cameras):
         frames = f"the {len(scene.cameras)} frames the scene was trained on"
         raise input_error(sequence.path, frames, str(len(sequence)), "pass the same sequence.")
+    if is_scene:  # the poses in which it was trained, which may have been estimated again since
+        sequence = sequence.with_poses(scene.cameras)
     result = Evaluation(_protocol(sequence, split, reading or (scene.config.data if is_scene else DataConfig())))
     if is_scene:
         result.protocol |= _rendering(scene)
@@ -96,6 +98,7 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
         "depth": "sum of weight * z against measured depth on tissue, mean of per-frame RMSE; " + unit,
         "flow_error": "consecutive frames of the split; *_adjacent: all adjacent frames of the video",
         "track_*": "all frames of the video; *_dis: optical flow chained over them, held-out frames included",
+        "ate_mm": "all frames of the video; aligned by a rigid motion, or a similarity where depth is relative",
         "right_*": "tissue that both eyes see by measured depth; right pictures as they are, left mask",
         "depth_instability_mm": "all adjacent frames of the video",
         "data_fingerprint": sequence.fingerprint(),

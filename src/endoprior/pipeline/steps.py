@@ -123,7 +123,7 @@ def _score(job: Job, progress: Progress) -> list[str]:
 
 def _render_video(job: Job, progress: Progress) -> list[str]:
     scene = load_scene(job.run)
-    frames = _frames_of(job, scene.config).frames("video")
+    frames = _frames_of(job, scene.config).with_poses(scene.cameras).frames("video")
     span = depth_span(scene)
 
     def images() -> Iterator[NDArray[np.uint8]]:

@@ -58,6 +58,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     carried to the middle and the last one, beside the input; then the training curve, the PSNR of each test frame, and
     the scores of `metrics.json`. A `title` stands above all.
     """
+    sequence = sequence.with_poses(scene.cameras)
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     per_frame = json.loads((run / "per_frame.json").read_text(encoding="utf-8"))
     log = [json.loads(line) for line in (run / "log.jsonl").read_text(encoding="utf-8").splitlines()]
