@@ -152,7 +152,7 @@ def test_equal_windows_show_no_seam(three):
         want, got = whole.render(frame / 40), three.render(frame / 40)
         solid = want.alpha > 0.999  # where the wall ends, its Gaussians fade more slowly than their centers
         assert solid.float().mean() > 0.5 and (got.alpha > 0.99)[solid].all()
-        assert (got.color - want.color)[solid].abs().max() < 0.03
+        assert (got.color - want.color)[solid].abs().max() < 0.05
         assert (got.depth / got.alpha - want.depth / want.alpha)[solid].abs().max() < 0.3
 
 

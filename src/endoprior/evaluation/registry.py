@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 SCORERS = (
     "image",
+    "seams",
     "depth",
     "flow",
     "color",
