@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 from .checks import InputError, check_range, read_ranges
 from .config_deformation import DeformationConfig
 from .config_io import from_dict, override, to_dict
+from .config_poses import PoseConfig
 from .config_windows import WindowConfig
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
@@ -329,6 +330,7 @@ class Config(Checked):
     density: DensityConfig = field(default_factory=DensityConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    poses: PoseConfig = field(default_factory=PoseConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
 
     def __post_init__(self) -> None:

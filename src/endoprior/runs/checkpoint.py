@@ -53,7 +53,7 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
 
     def schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
         reject_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, trainer.sequence.path)
-        return checkpoint_schema(cfg)
+        return checkpoint_schema(cfg, refines_poses=trainer.step_once.poses is not None)
 
     arrays, about = load_arrays(path, {FORMAT: schema}, next_step)
     with rejecting(path, "a training state", next_step):
@@ -65,12 +65,13 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
             )
         check_state(arrays, iteration)
         followed, num_frames = arrays.get("tracks.followed"), len(trainer.sequence.indices("train"))
-        if followed is not None and followed.shape[1] != num_frames:
-            raise InputError(f"expected {num_frames} training frames in tracks.followed; got {followed.shape[1]}.")
+        for name, held in (("tracks.followed", followed), ("poses.twists", arrays.get("poses.steps"))):
+            if held is not None and held.shape[-1] != num_frames:
+                raise InputError(f"expected {num_frames} training frames in {name}; got {held.shape[-1]}.")
     trainer.restore(stage, iteration, arrays)
 
 
-def checkpoint_schema(cfg: Config) -> dict[str, ArraySpec]:
+def checkpoint_schema(cfg: Config, *, refines_poses: bool = False) -> dict[str, ArraySpec]:
     """The arrays of a checkpoint: the model, Adam's moments, statistics; `N` Gaussians, `K` touched cells."""
     model = model_schema(cfg)
     trained = {name.removeprefix("gaussians."): spec for name, spec in model.items() if name.startswith("gaussians.")}
@@ -91,7 +92,15 @@ def checkpoint_schema(cfg: Config) -> dict[str, ArraySpec]:
         optimizer[f"{name}.steps"] = ArraySpec("int64", (spec.shape[1] if name == "motion" else 1,))
     optimizer |= {f"plane_adam.{name}": spec for name, spec in planes.items()}
     stats = {f"stats.{field.name}": ArraySpec("float32", ("N",)) for field in fields(DensityStats)}
-    return model | {f"optimizer.{name}": spec for name, spec in optimizer.items()} | stats | _track_specs(cfg)
+    found = {f"optimizer.{name}": spec for name, spec in optimizer.items()}
+    return model | found | stats | _track_specs(cfg) | (POSE_SPECS if refines_poses else {})
+
+
+POSE_SPECS = {
+    **{f"poses.{name}": ArraySpec("float64", ("F", 6)) for name in ("twists", "first", "second", "accepted")},
+    "poses.steps": ArraySpec("int64", ("F",)),
+}
+"""Refined poses of `F` training frames."""
 
 
 def _track_specs(cfg: Config) -> dict[str, ArraySpec]:
