@@ -96,7 +96,7 @@ def build_camera_path(cfg: PhantomConfig, plane: Plane) -> CameraPath:
     excursions = []
     for _ in range(count):
         aside = _flat(heading, 0.5)
-        back = _flat(heading + np.pi + rng.uniform(-1, 1), 0.35)
+        back = _flat(heading + np.pi + rng.uniform(-1, 1), 0.0)
         excursions.append(
             Excursion(
                 far * rng.uniform(18, 25) * (aside @ plane.axes[:2]),
