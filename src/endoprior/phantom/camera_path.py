@@ -18,7 +18,7 @@ from .motion import smooth_step
 from .surface import Plane
 
 EXCURSION_FRAMES = 300
-_SLOW_FRAMES = 130, 240
+SLOW_FRAMES = 130, 240
 """An excursion with fewer frames covers less distance, or turns less, in proportion: speeds stay those of a hand."""
 _PAN, _TURN, _ROLL = (0.07, 0.24, 0.80, 0.96), (0.28, 0.43, 0.62, 0.78), (0.44, 0.58, 0.79, 0.95)
 """When a move starts, is complete, starts to go back and has gone back, as shares of the excursion."""
@@ -91,7 +91,7 @@ def build_camera_path(cfg: PhantomConfig, plane: Plane) -> CameraPath:
     rng = np.random.default_rng([cfg.seed, 8])
     count = max(1, round(cfg.frames / EXCURSION_FRAMES))
     length = (cfg.frames - 1) / count
-    far, wide = (min(1.0, length / slow) for slow in _SLOW_FRAMES)
+    far, wide = (min(1.0, length / slow) for slow in SLOW_FRAMES)
     heading = rng.uniform(0, 2 * np.pi)
     excursions = []
     for _ in range(count):
