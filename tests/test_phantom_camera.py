@@ -148,7 +148,13 @@ def test_loops_in_the_middle_stay_and_more_surround_them():
 
 
 @pytest.mark.parametrize(
-    "change", [{}, {"breathing_mm": 8.0, "pull_mm": 30.0, "slide_mm": 12.0}, {"principal_x": 36.0}]
+    "change",
+    [
+        {"breathing_mm": 8.0, "pull_mm": 30.0, "slide_mm": 12.0},
+        pytest.param({"seed": 0, "principal_x": 36.0}, marks=pytest.mark.slow),
+        pytest.param({"seed": 1, "frames": 1000}, marks=pytest.mark.slow),
+        pytest.param({"seed": 3, "width": 80, "height": 100, "focal_per_width": 1.0}, marks=pytest.mark.slow),
+    ],
 )
 def test_no_pose_shows_the_end_of_the_tissue(change, monkeypatch):
     monkeypatch.setattr(making, "build_texture", lambda *_: np.zeros((2, 2, 7), np.float32))
