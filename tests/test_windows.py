@@ -19,6 +19,7 @@ from endoprior.core.config_windows import WindowConfig
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Splats
 from endoprior.data import load_sequence
+from endoprior.data.window_plan import Looks, look_through, plan_windows
 from endoprior.model.carry import carry, carry_points, centers_then
 from endoprior.model.deformation import Offsets
 from endoprior.model.fixed_color import with_fixed_color
@@ -29,7 +30,6 @@ from endoprior.model.single_scene import SingleScene
 from endoprior.model.support import Support
 from endoprior.model.windowed_scene import Span, WindowedScene, save_index, window_file
 from endoprior.runs.train import start_run, train
-from endoprior.training.window_plan import Looks, look_through, plan_windows
 
 RULES = WindowConfig(enabled=True, shortest=10, longest=40, overlap=4)
 SPEED_MM = 0.4

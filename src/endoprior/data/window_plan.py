@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.config_windows import WindowConfig
 from ..core.types import Camera
-from ..data import FrameSequence
+from .sequence import FrameSequence
 
 THUMBNAIL = (32, 24)
 """(width, height) of the pictures that are compared, px: noise and texture are averaged out."""
