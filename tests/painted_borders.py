@@ -1,6 +1,6 @@
 """Sample images with a painted border, for tests of the round border. As a program: what share of each kind is found.
 
-    PYTHONPATH=src python tests/painted_borders.py
+PYTHONPATH=src python tests/painted_borders.py
 """
 
 import sys

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .black_arcs import black_arcs
 from .circle import Circle
 from .round_border import find_circle
 from .strips import BLACK_LEVEL, Strips, find_strips
@@ -27,7 +28,7 @@ class Outline:
     in_strip: NDArray[np.bool_]
     """(H, W) True in the strips."""
     outside: NDArray[np.bool_]
-    """(H, W) True outside of the circle, and on its rim."""
+    """(H, W) True outside of the circle, on its rim, and on black parts inside of it."""
 
 
 def find_outline(images: Sequence[NDArray[np.uint8]]) -> Outline:
@@ -37,7 +38,9 @@ def find_outline(images: Sequence[NDArray[np.uint8]]) -> Outline:
     strips = find_strips(images, circle)
     in_strip = np.ones((height, width), bool)
     in_strip[strips.top : height - strips.bottom, strips.left : width - strips.right] = False
-    outside = ~circle.mask(width, height, circle.margin_px) if circle else np.zeros((height, width), bool)
+    outside = np.zeros((height, width), bool)
+    if circle:
+        outside = ~circle.mask(width, height, circle.margin_px) | black_arcs(images, circle)
     return Outline(strips, circle, in_strip, outside)
 
 

@@ -12,8 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.spread import spread
+
 WORKING_SIDE_PX = 640
 """Larger images are reduced to this: the outline needs no more, and the circle is measured in full images later."""
+FEW = 9
+"""Number of images that tell what black is."""
 DARKEST_SHARE = 0.01
 """A border covers at least this share of the image."""
 MOST_BLACK = 40
@@ -55,8 +59,9 @@ def reduced(grays: Sequence[Gray]) -> tuple[list[Gray], float]:
 
 def find_darkness(grays: Sequence[Gray]) -> Darkness | None:
     """Level and noise of the darkest region of (H, W) images; None if it is too bright for a border."""
-    smooth = np.stack([cv2.blur(gray, (3, 3)) for gray in grays])
-    typical = np.sort(smooth, axis=0)[(len(smooth) - 1) // 2]
+    some = [grays[i] for i in spread(len(grays), FEW)]
+    smooth = np.stack([cv2.blur(gray, (3, 3)) for gray in some])
+    typical = np.partition(smooth, (len(smooth) - 1) // 2, axis=0)[(len(smooth) - 1) // 2]
     darkest = float(np.quantile(typical, DARKEST_SHARE))
     if darkest >= MOST_BLACK:
         return None

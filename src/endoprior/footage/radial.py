@@ -16,10 +16,8 @@ from .circle import Circle
 from .dark_outline import Darkness
 
 ANGLES = 360
-OUTER, INNER = 0.05, 0.10
-"""Profiles reach this far outside and inside of the circle, in radii."""
 SEARCH = (0.02, 0.01, 0.005)
-"""Standard deviation of the search around the circle, in radii: one round each."""
+"""Standard deviation of the search around the circle, in radii: one round each, which reaches three times as far."""
 EDGE_WIDTH = 0.006
 """Length over which levels are averaged on both sides of an edge, in radii."""
 LEAST_EDGE_PX = 1.5
@@ -88,7 +86,8 @@ def measure_edges(grays: Sequence[NDArray[np.uint8]], start: Circle, darkness: D
     centers = np.repeat([[start.center_x, start.center_y]], len(grays), 0)
     for search in SEARCH:
         step = max(radius / 1000, 0.5)
-        depths = np.arange(-OUTER * radius, INNER * radius, step)
+        reach = 3 * search * radius + 2 * max(EDGE_WIDTH * radius, LEAST_EDGE_PX)
+        depths = np.arange(-reach, reach, step)
         circles = [Circle(x, y, radius) for x, y in centers]
         levels = profiles(grays, circles, angles, depths)
         error, contrast = _edges(levels, depths, search * radius, radius, darkness)

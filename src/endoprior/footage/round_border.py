@@ -19,6 +19,10 @@ from .rim import measure_rim
 
 LEAST_AGREEMENT = 0.35
 """Share of the visible circle on which the images show a border, if anything is lit there."""
+CERTAIN = 0.6
+"""Below this share, the border is uncertain, and only one with a sharp edge counts:"""
+SHARP = 0.55
+"""share of the level inside that is lost across a sharp edge, median."""
 LEAST_ARC_DEGREES = 40
 """Sum of the arcs on which the images show a border."""
 LEAST_HITS = 0.25
@@ -58,6 +62,8 @@ def find_circle(images: Sequence[NDArray[np.uint8]]) -> Circle | None:
     edges = measure_edges(grays, start, darkness)
     agreement = _agreement(edges, grays, small, factor, darkness)
     if agreement is None or agreement < LEAST_AGREEMENT:
+        return None
+    if agreement < CERTAIN and np.median(edges.contrast[edges.hits]) < SHARP:
         return None
     center, drift = _rest(edges)
     rim = measure_rim(grays, edges, darkness) + drift

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .circle import Circle
+from .dark_outline import brightness
 
 BLACK_LEVEL = 28
 """Levels 0..255 below this are black, including limited-range video with coding noise."""
@@ -53,8 +54,11 @@ def find_strips(images: Sequence[NDArray[np.uint8]], circle: Circle | None = Non
     grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in images]
     mean = sum(grays) / len(grays)
     change = np.sqrt(sum((gray - mean) ** 2 for gray in grays) / len(grays))
-    low = np.maximum.reduce([image.max(-1) for image in images])
-    chroma = sum(image.max(-1) - image.min(-1).astype(np.float32) for image in images) / len(images)
+    high = [brightness(image) for image in images]
+    low = np.maximum.reduce(high)
+    channels = (cv2.split(image) for image in images)
+    least = (cv2.min(cv2.min(red, green), blue) for red, green, blue in channels)
+    chroma = sum((h - m).astype(np.float32) for h, m in zip(high, least, strict=True)) / len(images)
     middle = tuple(slice(n // 4, n - n // 4) for n in low.shape)
     central_change = float(np.median(change[middle]))
     height, width = low.shape
@@ -87,7 +91,7 @@ def _strip_on_top(
         if not (black or (static and np.median(chroma[rows][at]) < STRIP_CHROMA)):
             break
         rows += 1
-    if rows - first < MIN_STRIP_PX or rows > limit:
+    if rows < MIN_STRIP_PX or rows == first or rows > limit:
         return 0
     # A row of coding noise can lie between strip and image.
     jumps = [
