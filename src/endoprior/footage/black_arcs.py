@@ -22,10 +22,10 @@ GROW_PX = 3
 
 
 def black_arcs(images: Sequence[NDArray[np.uint8]], circle: Circle) -> NDArray[np.bool_]:
-    """(H, W) True on parts of the circle that are black in all images, begin at its border, and end sharply.
+    """(H, W) True on black parts of the circle that begin at its border or the image's edge, and end sharply.
 
     Args:
-        images: (H, W, 3) samples.
+        images: (H, W, 3) samples; black in all of them.
         circle: its outside is False.
     """
     grays = [cv2.blur(brightness(image), (3, 3)) for image in images]
@@ -44,7 +44,8 @@ def black_arcs(images: Sequence[NDArray[np.uint8]], circle: Circle) -> NDArray[n
     size = 2 * SHARP_PX + 1
     lit = cv2.dilate(brightest, np.ones((size, size), np.uint8)) > darkness.level + 4 * darkness.step
     edge = (cv2.erode(black, np.ones((3, 3), np.uint8)) == 0) & (black > 0)
-    distance = cv2.distanceTransform((~beyond).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    framed = np.pad((~beyond).astype(np.uint8), 1)  # the edge of the image cuts the circle
+    distance = cv2.distanceTransform(framed, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     inner = edge & (distance > SHARP_PX)
     depth = np.zeros(count, np.float32)
     np.maximum.at(depth, regions[black > 0], distance[black > 0])

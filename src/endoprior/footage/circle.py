@@ -21,7 +21,7 @@ TOLERANCE = 0.012
 FACING = 0.9
 """Smallest cosine between the direction to the center and the direction in which the image becomes brighter."""
 UNMEASURED_RIM = 0.025
-"""Share of the radius that is left out if nobody measured the rim."""
+"""Share of the radius that is left out of a circle whose rim was not measured."""
 
 
 @dataclass(frozen=True)

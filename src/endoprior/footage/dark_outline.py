@@ -22,7 +22,7 @@ DARKEST_SHARE = 0.01
 """A border covers at least this share of the image."""
 MOST_BLACK = 40
 """A border is darker than this level."""
-LEAST_STEP = 6
+LEAST_STEP = 4
 """Smallest difference of levels between a border and the image."""
 LEAST_REGION = 0.001
 """Smaller dark regions, as a share of the image, are ignored."""

@@ -1,7 +1,7 @@
 """Detect the round border of an endoscope image, though glare or dark tissue touches it and it moves a little.
 
 Outline points of all sample images vote for one circle. It is then measured along radial lines in every image, and
-rejected unless the images agree: the edge is sharp, it is bent as the circle is, and its outside is dark.
+rejected unless the images agree: the edge is sharp, on the circle, bent as the circle is, and its outside is dark.
 """
 
 from __future__ import annotations
@@ -29,7 +29,11 @@ LEAST_HITS = 0.25
 """Share of the images that show an angle's border, of those that show anything there."""
 LEAST_OUTSIDE = 0.01
 """Share of the image that a round border leaves dark."""
-MOST_LIT_OUTSIDE = 0.3
+MOST_CONTRADICTION = 0.5
+"""Largest ratio of angles with an edge beside the circle to angles with an edge on it: another outline crosses it."""
+MOST_UNEVEN = 0.5
+"""Share of the tolerance within which four of five angles must lie: an ellipse fills the tolerance evenly."""
+MOST_LIT_OUTSIDE = 0.5
 """Share of the outside that text and other displays may cover."""
 BEND = (0.6, 1.4)
 """Bounds of the measured curvature of the border, in units of the circle's curvature; 0 is a straight line."""
@@ -82,6 +86,11 @@ def _agreement(
     supported, silent = _support(edges, grays, darkness)
     if supported.sum() * 360 / len(supported) < LEAST_ARC_DEGREES:
         return None
+    if _contradicted(edges).sum() > MOST_CONTRADICTION * supported.sum():
+        return None
+    uneven = [abs(np.median(edges.error[edges.hits[:, a], a])) for a in np.flatnonzero(supported)]
+    if np.quantile(uneven, 0.8) > MOST_UNEVEN * edges.tolerance_px:
+        return None
     bend, error = measured_bend(edges, supported)
     if not (BEND[0] < bend < BEND[1] and error < BEND_ERROR):
         return None
@@ -106,6 +115,18 @@ def _support(edges: Edges, grays: Sequence[NDArray], darkness: Darkness) -> tupl
     shown = lit.sum(0)
     supported = edges.visible & (edges.hits.sum(0) >= np.maximum(LEAST_HITS * shown, 1)) & (shown > 0)
     return supported, shown == 0
+
+
+def _contradicted(edges: Edges) -> NDArray[np.bool_]:
+    """(A,) True where half of the images show an edge in one place that is not on the circle."""
+    error = np.where(edges.visible, edges.error, np.nan)
+    shown = np.isfinite(error).mean(0) >= 0.5
+    found = np.zeros(len(edges.angles), bool)
+    some = error[:, shown]
+    middle = np.nanmedian(some, axis=0)
+    spread = np.nanmedian(np.abs(some - middle), axis=0)
+    found[shown] = (np.abs(middle) >= edges.tolerance_px) & (spread < edges.tolerance_px)
+    return found
 
 
 def measured_bend(edges: Edges, supported: NDArray[np.bool_]) -> tuple[float, float]:

@@ -29,6 +29,8 @@ EDGE_SHARE = 0.55
 """Share of the strip's edge with a brightness step: strips have straight edges, shadows do not."""
 EDGE_STEP = 12
 """Smallest brightness step, levels."""
+FADING, MOST_FADING_PX = 0.8, 3
+"""So many rows next to a strip belong to it if they have less than this share of the level two rows further inside."""
 
 
 @dataclass(frozen=True)
@@ -99,4 +101,13 @@ def _strip_on_top(
         for d in (0, 1)
         if rows + d < len(mean)
     ]
-    return rows if max((jump.mean() for jump in jumps if jump.size), default=0.0) > EDGE_SHARE else 0
+    if max((jump.mean() for jump in jumps if jump.size), default=0.0) <= EDGE_SHARE:
+        return 0
+    level = [
+        float(np.median(row[at])) if at.any() else 0.0
+        for row, at in zip(mean[rows : rows + 6], inside[rows : rows + 6], strict=True)
+    ]
+    fading = 0
+    while fading < min(MOST_FADING_PX, len(level) - 3) and level[fading] < FADING * level[fading + 2]:
+        fading += 1
+    return rows + fading

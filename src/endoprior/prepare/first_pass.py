@@ -79,7 +79,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         circle=circle,
         outside=outside,
     )
-    notes += _border_notes(strips, circle, labels, float(1 - geometry.inside.mean()))
+    notes += border_notes(strips, circle, labels, float(1 - geometry.inside.mean()))
     if calibration is None:
         notes.append(
             f"no calibration; a field of view of {cfg.field_of_view_degrees:g} degrees is assumed "
@@ -108,8 +108,8 @@ def _timing_notes(gaps: int, uneven: int, count: int) -> list[str]:
     return notes
 
 
-def _border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:
-    """Args: outside: share of the pixels of a frame that show nothing."""
+def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:
+    """Notes on detected borders and labels. Args: outside: share of the pixels of a frame that show nothing."""
     notes = []
     if strips:
         sides = ", ".join(f"{n} px {side}" for side, n in vars(strips).items() if n)
