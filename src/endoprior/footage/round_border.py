@@ -29,6 +29,8 @@ LEAST_HITS = 0.25
 """Share of the images that show an angle's border, of those that show anything there."""
 LEAST_OUTSIDE = 0.01
 """Share of the image that a round border leaves dark."""
+MOST_MARGIN = 0.1
+"""Largest share of the radius for rim and movement together."""
 MOST_CONTRADICTION = 0.5
 """Largest ratio of angles with an edge beside the circle to angles with an edge on it: another outline crosses it."""
 MOST_UNEVEN = 0.5
@@ -70,7 +72,7 @@ def find_circle(images: Sequence[NDArray[np.uint8]]) -> Circle | None:
     if agreement < CERTAIN and np.median(edges.contrast[edges.hits]) < SHARP:
         return None
     center, drift = _rest(edges)
-    rim = measure_rim(grays, edges, darkness) + drift
+    rim = min(measure_rim(grays, edges, darkness) + drift, MOST_MARGIN * edges.radius)
     return Circle(float(center[0]), float(center[1]), edges.radius, rim, agreement)
 
 
@@ -89,7 +91,8 @@ def _agreement(
     if _contradicted(edges).sum() > MOST_CONTRADICTION * supported.sum():
         return None
     uneven = [abs(np.median(edges.error[edges.hits[:, a], a])) for a in np.flatnonzero(supported)]
-    if np.quantile(uneven, 0.8) > MOST_UNEVEN * edges.tolerance_px:
+    partial = supported.sum() < 0.8 * edges.visible.sum()  # an outline that stays near the circle everywhere is one
+    if partial and np.quantile(uneven, 0.8) > MOST_UNEVEN * edges.tolerance_px:
         return None
     bend, error = measured_bend(edges, supported)
     if not (BEND[0] < bend < BEND[1] and error < BEND_ERROR):
