@@ -165,6 +165,8 @@ class LossConfig(Checked):
     """Depth that is compared: sum of weight * z, or that divided by alpha."""
     min_depth_pixels: Count = 10
     """A frame with fewer measured tissue depths gets no depth loss."""
+    fit_relative_depth: bool = False
+    """Relative depth of a frame is compared up to a scale and a shift of inverse depth, fitted anew at each use."""
     track_weight: Weight = 0.0
     """Weight of the distance to the tracks of `init.motion flow`, where the flow found them; 0 switches it off."""
     trust_masks: bool = True

@@ -41,6 +41,9 @@ class TrainState:
     poses: PoseState | None = None
     """Corrections of the camera poses; None: they stay as given."""
 
+    depth_fit: Tensor | None = None
+    """(F, 2) scale and shift of each training frame's inverse depth, where depth is relative."""
+
     def arrays(self) -> dict[str, Tensor]:
         """Every tensor by the name that it has in a checkpoint."""
         arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
@@ -50,6 +53,8 @@ class TrainState:
             arrays |= {f"tracks.{name}": value for name, value in self.tracks.tensors().items()}
         if self.poses is not None:
             arrays |= {f"poses.{name}": value for name, value in self.poses.tensors().items()}
+        if self.depth_fit is not None:
+            arrays["depth_fit"] = self.depth_fit
         if self.field is not None:
             arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
         return arrays

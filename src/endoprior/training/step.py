@@ -14,7 +14,7 @@ from ..core.types import RenderOutput, Splats
 from ..model.deformation import Offsets
 from ..model.single_scene import offsets_at
 from ..render import Rasterizer
-from . import density
+from . import density, depth_fit
 from .densify import apply_plan
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .frames import TrainingFrame, TrainingFrames
@@ -89,6 +89,8 @@ class TrainingStep:
         counted = batch.frame
         if self.doubt and fine and not right and iteration > START * stage_length(cfg, Stage.FINE):
             counted = self.doubt.counted(counted, out.color)
+        if state.depth_fit is not None and fine:
+            counted = depth_fit.fitted(counted, state.depth_fit[batch.position])
         terms = supervised_terms(out, counted, cfg.loss, self.ops)
         if offsets is not None and state.tracks is not None:
             terms |= self._track_terms(state, batch, offsets)
@@ -109,6 +111,8 @@ class TrainingStep:
         else:
             with torch.no_grad():
                 self._observe(state, batch, out)
+                if state.depth_fit is not None and fine:
+                    depth_fit.update(state.depth_fit, batch.position, batch.frame, out)
                 state.optimizer.step(iteration, self.check.skip)
                 if twist is not None:
                     self.poses.step(state.poses, batch.position, twist.grad, iteration)

@@ -24,6 +24,7 @@ from ..model.gaussians import Gaussians, create_gaussians
 from ..model.scene_file import check_cameras
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import part
+from . import depth_fit
 from .density import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
@@ -97,8 +98,15 @@ class Trainer:
             generator = torch.Generator().manual_seed(cfg.seed)
             field = HexPlaneField.from_points(gaussians["means"].detach(), cfg.deformation, generator)
         stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
-        poses = PoseState.at_start(len(self.sequence.indices("train"))) if self.step_once.poses else None
-        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, poses)
+        num = len(self.sequence.indices("train"))
+        poses = PoseState.at_start(num) if self.step_once.poses else None
+        fit = depth_fit.at_start(num) if self.fits_depth else None
+        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, poses, fit)
+
+    @property
+    def fits_depth(self) -> bool:
+        """Whether the depth of each frame is compared up to a scale and a shift."""
+        return self.cfg.loss.fit_relative_depth and self.sequence.depth_is_relative
 
     def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
         """Continue from a state that `TrainState.arrays` gave, trusted to fit the config."""
@@ -107,7 +115,8 @@ class Trainer:
             field = HexPlaneField.from_state_arrays(part(arrays, "field."), self.cfg.deformation).to(self.device)
         held = part(arrays, "tracks.")
         poses = PoseState(**part(arrays, "poses.")) if self.step_once.poses else None
-        self._enter(stage, gaussians, field, StartTracks(**held).to(self.device) if held else None, poses)
+        tracks = StartTracks(**held).to(self.device) if held else None
+        self._enter(stage, gaussians, field, tracks, poses, arrays.get("depth_fit"))
         self.state.iteration = iteration
         self.state.optimizer.load_state_arrays(part(arrays, "optimizer."))
         self.state.stats = DensityStats(
@@ -121,10 +130,11 @@ class Trainer:
         field: HexPlaneField | None,
         tracks: StartTracks | None,
         poses: PoseState | None,
+        fit: Tensor | None,
     ) -> None:
         optimizer = Optimizer(gaussians, field, self.cfg, self.spatial_scale, self.ops)
         stats = DensityStats.zeros(len(gaussians), self.device)
-        self.state = TrainState(stage, 0, gaussians, field, optimizer, stats, tracks, poses)
+        self.state = TrainState(stage, 0, gaussians, field, optimizer, stats, tracks, poses, fit)
 
     @property
     def finished(self) -> bool:
@@ -146,7 +156,7 @@ class Trainer:
         """
         state = self.state
         if state.stage is Stage.COARSE and state.iteration >= stage_length(self.cfg, Stage.COARSE):
-            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, state.poses)
+            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, state.poses, state.depth_fit)
         report = self.step_once(self.state)
         if report.divergence is not None:
             raise Diverged(report.divergence.reason)
