@@ -70,6 +70,11 @@ def plan_windows(cameras: Sequence[Camera], looks: Looks, cfg: WindowConfig) -> 
     return list(zip(starts, stops, strict=True))
 
 
+def windows_by_length(num_frames: int, cfg: WindowConfig) -> int:
+    """Number of windows where nothing but the length cuts: what a static camera needs."""
+    return max(-(-(num_frames - cfg.overlap) // (cfg.longest - cfg.overlap)), 1)
+
+
 def _has_changed(
     first: int,
     index: int,
