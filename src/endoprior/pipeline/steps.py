@@ -146,12 +146,13 @@ def _render_video(job: Job, progress: Progress) -> list[str]:
 def _player(job: Job, progress: Progress) -> list[str]:
     progress("packing", 0, 0)
     scene = load_scene(job.run)
-    times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (len(scene) / len(scene.windows) * LEAST_BYTES))
+    at_a_time = len(scene) / len(scene.windows)
+    times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (at_a_time * LEAST_BYTES))
     title = f"{job.video.stem} (preview)" if job.is_preview else job.video.stem
     while not job.player.exists():
         try:
             write_html(scene, job.player, title=title, times=times, max_bytes=PLAYER_BYTES)
-        except PageTooLarge as error:  # its size is known only when it is packed
+        except PageTooLarge as error:  # its size is known only when part of it is packed
             if len(times) == 1:
                 raise
             times = every_kth_time(len(scene.cameras), len(times) * PLAYER_BYTES / error.num_bytes)
