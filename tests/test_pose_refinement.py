@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,13 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from tiny_training import tiny_config
 
 from endoprior import render
 from endoprior.core.config import Config
 from endoprior.core.config_poses import PoseConfig
 from endoprior.core.types import Camera, Splats
+from endoprior.data import load_sequence
+from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.runs.checkpoint import load_checkpoint, save_checkpoint
 from endoprior.training.pose_check import FollowedCorners, corner_error_px
 from endoprior.training.pose_refinement import PoseRefinement, PoseState, moved, refined_cameras, rigid, rotation
+from endoprior.training.trainer import Trainer
 
 BACKENDS = ("reference", "numba")
 
@@ -149,3 +155,55 @@ def test_steps_that_held_out_corners_speak_against_are_undone(refinement):
     assert state.twists[1, 1] > 2e-4
     refinement.step(state, 1, torch.tensor([0, -1.0, 0, 0, 0, 0], dtype=torch.float64), 4)
     assert (state.twists == 0).all() and (state.first == 0).all() and (state.steps == 0).all()
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    """A phantom whose camera moves."""
+    folder = tmp_path_factory.mktemp("moving") / "data"
+    write_phantom(folder, PhantomConfig(frames=10, width=96, height=80, camera="inspect", side_views=False))
+    return load_sequence(folder)
+
+
+def refining(mode: str) -> Config:
+    cfg = tiny_config("basis")
+    return replace(cfg, poses=PoseConfig(refine=mode, start_iteration=2, check_every=5, worse=1.0))
+
+
+@pytest.mark.parametrize(
+    ("mode", "source", "refines"),
+    [
+        ("never", "own", False),
+        ("estimated", "given", False),
+        ("estimated", "estimated: own", True),
+        ("always", "given", True),
+    ],
+)
+def test_whose_poses_are_refined(moving, make_tiny_sequence, mode, source, refines):
+    sequence = copy(moving)
+    sequence.sources = {"poses": source}
+    trainer = Trainer(sequence, refining(mode))
+    assert (trainer.step_once.poses is not None) == refines
+    assert Trainer(load_sequence(make_tiny_sequence()), refining("always")).step_once.poses is None, "a static camera"
+
+
+def test_refined_poses_are_those_of_the_scene_and_resume_bit_for_bit(moving, tmp_path):
+    whole = Trainer(moving, refining("always"))
+    whole.start()
+    while not whole.finished:
+        whole.step()
+        if whole.progress()[0] == 13:
+            save_checkpoint(whole, tmp_path / "state", "0")
+    scene, twists = whole.scene(), whole.state.poses.twists
+    assert (whole.state.poses.steps > 0).any()
+    changed = [
+        not np.array_equal(a.world_to_camera, b.world_to_camera)
+        for a, b in zip(scene.cameras, whole.cameras, strict=True)
+    ]
+    assert any(changed) == bool(twists.any())
+    again = Trainer(moving, refining("always"))
+    load_checkpoint(again, tmp_path / "state", "0")
+    while not again.finished:
+        again.step()
+    assert torch.equal(again.state.poses.twists, twists)
+    assert torch.equal(again.state.gaussians["means"], whole.state.gaussians["means"])
