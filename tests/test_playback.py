@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera
+from endoprior.model.carry import carry_points
 from endoprior.model.gaussians import Gaussians, create_gaussians
 from endoprior.model.playback import Playback
 from endoprior.model.scene import Scene
+from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene
 
 NUM_FRAMES = 5
@@ -109,3 +112,20 @@ def test_what_draws_a_scene_fits_its_device(scene, trained, asked, on_gpu, want)
     config = replace(scene.config, render=replace(scene.config.render, backend=trained))
     moved = replace(scene, config=config).to("meta" if on_gpu else "cpu", backend=asked)
     assert moved.backend == want
+
+
+def test_motion_is_held_beyond_the_trained_times(scene, tmp_path):
+    """In pictures and in carried points, and again after it was saved."""
+    held = replace(scene, trained_from=0.2, trained_until=0.7)
+    held.save(tmp_path / "scene.safetensors")
+    for found in (held, load_scene(tmp_path)):
+        for time, same in ((0.0, 0.2), (0.1, 0.2), (0.5, 0.5), (0.8, 0.7), (1.0, 0.7)):
+            assert torch.equal(found.at(time).means, scene.at(same).means)
+        moved = carry_points(found, scene.at(0.2).means.numpy()[:3], np.zeros(3, int), [0.0, 0.7, 1.0])
+        assert np.array_equal(moved[1], moved[2]) and not np.array_equal(moved[0], moved[1])
+
+
+def test_a_scene_that_was_never_trained_is_rejected(scene, tmp_path):
+    replace(scene, trained_from=0.8, trained_until=0.7).save(tmp_path / "scene.safetensors")
+    with pytest.raises(InputError, match="trained_until"):
+        load_scene(tmp_path)

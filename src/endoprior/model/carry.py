@@ -13,9 +13,8 @@ from torch import Tensor
 
 from ..core.types import Camera
 from .gaussians import Gaussians
-from .ops import ops_for
 from .scene import Scene, Window
-from .single_scene import SingleScene, offsets_at
+from .single_scene import SingleScene
 
 NUM_CARRIERS = 8
 """Gaussians that carry a point."""
@@ -163,5 +162,4 @@ def _taken(gaussians: Gaussians, rows: Tensor) -> Gaussians:
 @torch.no_grad()
 def _centers(scene: SingleScene, gaussians: Gaussians, time: float) -> NDArray[np.float32]:
     """(N, 3) centers of some Gaussians of the scene at a time, mm."""
-    offsets = offsets_at(gaussians, scene.field, time, scene.config, ops_for(scene.device))
-    return (gaussians["means"] + offsets.means).cpu().numpy()
+    return (gaussians["means"] + scene.offsets(gaussians, time).means).cpu().numpy()

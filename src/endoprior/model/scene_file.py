@@ -72,10 +72,13 @@ class SceneFacts(Checked):
     height: Annotated[int, Range(1, LARGEST_SIDE)]
     frames_per_second: Annotated[float, Range(1e-3, 1e6)]
     lengths_are_relative: bool = False
+    trained_from: Annotated[float, Range(0, 1)] = 0.0
+    trained_until: Annotated[float, Range(0, 1)] = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range("width times height", self.width * self.height, 1, LARGEST_IMAGE)
+        check_range("trained_until", self.trained_until, self.trained_from, 1)
 
 
 def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
@@ -157,6 +160,8 @@ def _single(arrays: dict[str, Tensor], facts: SceneFacts) -> SingleScene:
         arrays["prior_score"],
         arrays["num_valid"],
         facts.lengths_are_relative,
+        facts.trained_from,
+        facts.trained_until,
     )
 
 

@@ -62,6 +62,10 @@ class SingleScene(Scene):
     """(N,) projections that score was averaged over."""
     lengths_are_relative: bool = False
     """Whether the scale of the sequence's depth was assumed: lengths are then not in mm."""
+    trained_from: float = 0.0
+    """Time of the first frame that motion was trained on; before it, motion is what it is then ..."""
+    trained_until: float = 1.0
+    """... and after this one too: a temporal basis that nothing holds leads anywhere."""
     rendered_by: render.Backend | None = None
     """Rendering backend; None: the one it was trained with, where it can be used."""
 
@@ -78,7 +82,12 @@ class SingleScene(Scene):
         """See `Scene.at`."""
         if not 0 <= time <= 1:
             raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
-        return self._splats(offsets_at(self.gaussians, self.field, time, self.config, ops_for(self.device)))
+        return self._splats(self.offsets(self.gaussians, time))
+
+    def offsets(self, gaussians: Gaussians, time: float) -> Offsets:
+        """Deformation of some Gaussians of the scene at `time` in [0, 1]."""
+        held = min(max(time, self.trained_from), self.trained_until)
+        return offsets_at(gaussians, self.field, held, self.config, ops_for(self.device))
 
     @torch.no_grad()
     def canonical(self) -> Splats:
@@ -133,6 +142,7 @@ class SingleScene(Scene):
         first = self.cameras[0]
         about = {"config": to_dict(self.config), "frames_per_second": self.frames_per_second}
         about |= {"lengths_are_relative": self.lengths_are_relative}
+        about |= {"trained_from": self.trained_from, "trained_until": self.trained_until}
         about |= {"width": first.width, "height": first.height}
         save_arrays(path, arrays, about, FORMAT)
 

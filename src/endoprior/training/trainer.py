@@ -191,7 +191,8 @@ class Trainer:
 
     def scene(self) -> SingleScene:
         """The scene as it is now, on the CPU."""
-        state = self.state
+        state, trained, num = self.state, self.step_once.frames.indices, len(self.sequence)
+        holds = self.cfg.deformation.kind == "basis"  # the papers' fields go on as they are
         return SingleScene(
             gaussians=state.gaussians.to("cpu"),
             field=state.field and state.field.to("cpu"),
@@ -201,6 +202,8 @@ class Trainer:
             prior_score=state.stats.score(self.cfg.density.unobserved_score).cpu(),
             num_valid=state.stats.num_valid.cpu().clone(),
             lengths_are_relative=self.sequence.depth_is_relative,
+            trained_from=trained[0] / num if holds else 0.0,
+            trained_until=trained[-1] / num if holds else 1.0,
         )
 
 
