@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +18,33 @@ EDGE_STEP = 0.05
 """No corners where depth changes by more than this share between neighbors: those are depth edges."""
 CELLS = (8, 6)
 """The image is divided into these columns and rows; no cell holds more than twice its share of the corners."""
+FLAT_WIDTHS, FLAT_CONTRAST = 64, 300.0
+"""Shading is what is left after a blur by the image width divided by this; contrast of the rest, gray levels."""
+COARSE = {"winSize": (21, 21), "maxLevel": 4}
+FINE = {"winSize": (21, 21), "maxLevel": 1, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW, "criteria": (3, 20, 0.01)}
+"""Options of Lucas-Kanade flow: between plain images, then between flat ones."""
+FINE_PX = 2.0
+"""The two results differ by less than this."""
 RETURN_PX = 1.0
 """Followed to the next frame and back, a corner returns within this distance."""
 
 
-def gray_of(rgb_u8: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W) gray image."""
-    return cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY)
+@dataclass(frozen=True)
+class Gray:
+    """A frame as corners are followed in it."""
+
+    plain: NDArray[np.uint8]
+    """(H, W) brightness: finds large motion."""
+    flat: NDArray[np.uint8]
+    """(H, W) without shading: the light moves with the camera, and what it paints must not count as tissue."""
+
+
+def gray_of(rgb_u8: NDArray[np.uint8]) -> Gray:
+    """The gray images of (H, W, 3)."""
+    plain = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY)
+    bright = np.log(plain.astype(np.float32) + 8)
+    bright -= cv2.GaussianBlur(bright, (0, 0), max(plain.shape[1] / FLAT_WIDTHS, 2.0))
+    return Gray(plain, np.clip(bright * FLAT_CONTRAST + 128, 0, 255).astype(np.uint8))
 
 
 def usable_tissue(seen: PoseInput) -> NDArray[np.bool_]:
@@ -36,16 +58,16 @@ def usable_tissue(seen: PoseInput) -> NDArray[np.bool_]:
 
 
 def new_corners(
-    gray: NDArray[np.uint8], usable: NDArray[np.bool_], depth: NDArray[np.float32], taken: NDArray[np.float32]
+    gray: Gray, usable: NDArray[np.bool_], depth: NDArray[np.float32], taken: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """(N, 2) corners on smooth tissue with depth, away from those `taken` (M, 2)."""
     near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
     allowed = (usable & (near > 0) & (far - near < EDGE_STEP * depth)).astype(np.uint8)
-    height, width = gray.shape
+    height, width = depth.shape
     apart = max(5, width // 80)
     for x, y in taken:
         cv2.circle(allowed, (round(float(x)), round(float(y))), apart, 0, -1)
-    found = cv2.goodFeaturesToTrack(gray, 3 * MAX_CORNERS, 0.002, apart, mask=allowed)
+    found = cv2.goodFeaturesToTrack(gray.flat, 3 * MAX_CORNERS, 0.002, apart, mask=allowed)
     if found is None:
         return np.zeros((0, 2), np.float32)
     found = found.reshape(-1, 2)  # strongest first
@@ -64,19 +86,22 @@ def _cells(pixels: NDArray, width: int, height: int) -> NDArray[np.intp]:
 
 
 def followed(
-    before: NDArray[np.uint8], now: NDArray[np.uint8], pixels: NDArray[np.float32], usable: NDArray[np.bool_]
+    before: Gray, now: Gray, pixels: NDArray[np.float32], usable: NDArray[np.bool_]
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
     """Follow corners (N, 2) by Lucas-Kanade flow, forward and backward: indices of those kept, and their pixels."""
     if not len(pixels):
         return np.zeros(0, np.intp), pixels
-    options = {"winSize": (21, 21), "maxLevel": 4, "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)}
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, now, pixels[:, None], None, **options)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(now, before, there, None, **options)
-    there, back = there[:, 0], back[:, 0]
-    good = (found & found_back).ravel().astype(bool) & (np.abs(back - pixels).max(1) < RETURN_PX)
-    good &= sampled(usable, there) > 0
+    start = pixels[:, None]
+    near, found, _ = cv2.calcOpticalFlowPyrLK(before.plain, now.plain, start, None, **COARSE)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(now.plain, before.plain, near, None, **COARSE)
+    good = (found & found_back).ravel().astype(bool) & (np.abs(back - start).max((1, 2)) < RETURN_PX)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before.flat, now.flat, start, near.copy(), **FINE)
+    guess = start + there - near
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(now.flat, before.flat, there, guess, **FINE)
+    good &= (found & found_back).ravel().astype(bool) & (np.abs(back - start).max((1, 2)) < RETURN_PX)
+    good &= (np.abs(there - near).max((1, 2)) < FINE_PX) & (sampled(usable, there[:, 0]) > 0)
     kept = np.flatnonzero(good)
-    return kept, there[kept]
+    return kept, there[kept, 0]
 
 
 def sampled(image: NDArray, pixels: NDArray) -> NDArray:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...core.spread import spread
 from .adjust import adjust
-from .corners import MAX_CORNERS, REFRESH, followed, gray_of, new_corners, sampled, usable_tissue
+from .corners import MAX_CORNERS, REFRESH, Gray, followed, gray_of, new_corners, sampled, usable_tissue
 from .keyframes import Keyframe, Link, keyframe, link
 from .resection import INLIER_PX, coarse_pose, refined_pose
 from .residuals import back_projected
@@ -41,7 +41,7 @@ RECENT, OLDER = 6, 14
 class _View:
     """The frame of which the next one is followed."""
 
-    gray: NDArray[np.uint8]
+    gray: Gray
     usable: NDArray[np.bool_]
     depth: NDArray[np.float32]
 
@@ -145,7 +145,7 @@ class Follower:
     def _add_keyframe(self, index: int) -> None:
         """Describe the frame in `self._view`, link its segment if it stands alone, adjust the last keyframes."""
         assert self._view is not None
-        new = keyframe(index, self._view.gray, self._view.usable, self._view.depth)
+        new = keyframe(index, self._view.gray.plain, self._view.usable, self._view.depth)
         segment = self.segment[index]
         others = [old for old in self.keyframes if self.segment[old.frame] != segment]
         self.keyframes.append(new)
