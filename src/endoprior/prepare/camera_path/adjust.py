@@ -145,13 +145,13 @@ class _System:
         by_pose, by_point = (part * root[:, :, None] for part in parts[:2])
         error = error * root
         slot = np.cumsum(~fixed) - 1
-        columns = np.where(fixed, 0, 6 * slot)[seen.camera][:, None] + np.arange(6)
+        columns = np.where(fixed[:, None], 0, 6 * slot[:, None] + np.arange(6))[seen.camera]
         by_pose = np.where(fixed[seen.camera][:, None, None], 0.0, by_pose)
         self.size = 6 * int((~fixed).sum()) + self.has_focal
         if self.has_focal:
             columns = np.concatenate([columns, np.full((len(columns), 1), self.size - 1)], 1)
             by_pose = np.concatenate([by_pose, (parts[2] * root)[:, :, None]], 2)
-        cameras = _rows(by_pose, columns, self.size)
+        cameras = _rows(by_pose, columns, max(self.size, 1))
         of_points = _rows(by_point, 3 * seen.point[:, None] + np.arange(3), 3 * len(points))
         residual = error.ravel()
         self.of_cameras = (cameras.T @ cameras).tocsr()
@@ -168,10 +168,10 @@ class _System:
     def solve(self, damping: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Steps of the poses (K, 6), of the points (P, 3) and of log f."""
         inverse = self._inverse(damping)
-        reduced = self._reduced(inverse, damping)
         right = self.camera_gradient - self.mixed @ (inverse @ self.point_gradient)
-        step = np.zeros(0)
+        step = np.zeros(len(right))
         if self.size:
+            reduced = self._reduced(inverse, damping)
             if self.size <= DENSE_LIMIT:
                 step = -np.linalg.solve(reduced.toarray(), right)
             else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,10 +53,10 @@ def own_path(
     if len(keyframes) > 1:
         close_loops(follower, keyframes, size)
         focal_factor = _adjust_all(follower, keyframes, refine_focal)
-    translation_std, rotation_std = _place_frames(follower, keyframes, followed_poses, explained)
+    starts = np.array([k.frame for k in keyframes])
+    translation_std, rotation_std = place_frames(follower, starts, followed_poses, explained)
     path = finished_path(follower, explained, translation_std, rotation_std)
-    path = CameraPath(**(vars(path) | {"method": "own", "focal_factor": focal_factor}))
-    return path, follower
+    return replace(path, focal_factor=focal_factor), follower
 
 
 def _adjust_all(follower: Follower, keyframes: list[Keyframe], refine_focal: bool) -> float:
@@ -97,20 +98,20 @@ def _frame_scale(follower: Follower, frame: int) -> float:
     return float(np.median(z[good] / depths[good])) if good.sum() >= 5 else float(follower.scales[frame])
 
 
-def _place_frames(
-    follower: Follower, keyframes: list[Keyframe], followed: NDArray[np.float64], explained: NDArray[np.bool_]
+def place_frames(
+    follower: Follower, starts: NDArray[np.intp], followed: NDArray[np.float64], explained: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Set the pose of every frame from the adjusted points; standard deviations of translation, mm, and rotation, rad.
 
     Args:
+        starts: frames whose pose stays.
         followed: (T, 4, 4) poses before the adjustment: they say how a frame lies to its keyframe.
     """
     tracks, lens = follower.tracks, follower.lens
     stds = np.full((2, len(explained)), np.nan)
-    starts = np.array([k.frame for k in keyframes])
     for f in np.flatnonzero(explained):
         at = starts[max(np.searchsorted(starts, f, "right") - 1, 0)]
-        if f not in (starts if len(starts) > 1 else ()):
+        if f not in starts:
             follower.poses[f] = followed[f] @ np.linalg.inv(followed[at]) @ follower.poses[at]
         ids, pixels, depths = tracks.ids[f], tracks.pixels[f], tracks.depths[f]
         used = tracks.adjusted[ids] & ~tracks.held_out(ids)
@@ -151,5 +152,5 @@ def finished_path(
     if len(spans) == 1 and spans[0] == (0, count - 1):
         poses = np.tile(np.eye(4), (count, 1, 1))
     return CameraPath(
-        poses, explained, scales * factor, "own", 1.0, translation_std * factor, np.degrees(rotation_std), still
+        poses, explained, scales * factor, "our own tracks", 1.0, translation_std * factor, np.degrees(rotation_std), still
     )

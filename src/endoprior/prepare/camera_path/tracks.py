@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +35,13 @@ class Tracks:
         self.keypoint = np.zeros(0, bool)
         self.adjusted = np.zeros(0, bool)
 
+    def copy(self) -> Tracks:
+        """The same observations; points and weights of its own."""
+        out = copy.copy(self)
+        out.points, out.weight = self.points.copy(), np.ones_like(self.weight)
+        out.adjusted = np.zeros_like(self.adjusted)
+        return out
+
     def add_points(self, points: NDArray, *, keypoint: bool) -> NDArray[np.int32]:
         """Ids of new points (N, 3)."""
         first, self.count = self.count, self.count + len(points)
@@ -57,7 +66,7 @@ class Tracks:
 
     def held_out(self, ids: NDArray) -> NDArray[np.bool_]:
         """(N,) which tracks take no part in estimates."""
-        return (ids % HELD_OUT == HELD_OUT - 1) & ~self.keypoint[ids]
+        return ids % HELD_OUT == HELD_OUT - 1
 
     def measured(self, ids: NDArray, depths: NDArray, scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(N,) inverse depth, 1/mm, and (N, 2) standard deviations of pixel and inverse depth."""
