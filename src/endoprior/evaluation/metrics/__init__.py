@@ -25,12 +25,14 @@ from .raft import raft_flow
 from .stability import depth_instability
 from .track_accuracy import track_accuracy
 from .tracks import TrackError, neighbor_breaks, track_error
+from .trajectory import TrajectoryErrors, trajectory_errors
 from .weights import ScoreUnavailable, WeightsMissing
 
 __all__ = [
     "FlowEstimator",
     "ScoreUnavailable",
     "TrackError",
+    "TrajectoryErrors",
     "WeightsMissing",
     "depth_instability",
     "depth_rmse",
@@ -49,4 +51,5 @@ __all__ = [
     "to_uint8",
     "track_accuracy",
     "track_error",
+    "trajectory_errors",
 ]
