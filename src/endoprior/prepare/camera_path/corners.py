@@ -53,7 +53,9 @@ def usable_tissue(seen: PoseInput) -> NDArray[np.bool_]:
     small = cv2.resize(seen.rgb_u8, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
     glint = (specular_likelihood(small * np.float32(1 / 255)) > 0.5).astype(np.uint8)
     glint = cv2.resize(cv2.dilate(glint, np.ones((3, 3))), (width, height), interpolation=cv2.INTER_NEAREST)
-    tissue = cv2.erode(seen.tissue_mask.astype(np.uint8), np.ones((7, 7)), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    tissue = cv2.erode(
+        seen.tissue_mask.astype(np.uint8), np.ones((7, 7)), borderType=cv2.BORDER_CONSTANT, borderValue=0
+    )
     return (tissue & (1 - glint)).astype(bool)
 
 

@@ -43,7 +43,9 @@ def explained_share(tracks: Tracks, lens: Lens, path: CameraPath) -> float:
     fitted = (turn % 2 == 0) & path.explained[frame]
     inverse = 1 / np.where(depths > 0, depths * path.depth_scale[frame], 1.0)
     number = np.bincount(ids[fitted], minlength=tracks.count)
-    std = np.where(depths > 0, DEPTH_STD[lens.depth_is_relative] * inverse * np.sqrt(np.maximum(number[ids], 1)), np.inf)
+    std = np.where(
+        depths > 0, DEPTH_STD[lens.depth_is_relative] * inverse * np.sqrt(np.maximum(number[ids], 1)), np.inf
+    )
     sigma = np.stack([np.full(len(ids), USUAL_PX * lens.px), std], 1)
     points = np.zeros((tracks.count, 3))
     at = np.flatnonzero(fitted)[::-1]

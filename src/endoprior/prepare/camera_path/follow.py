@@ -63,7 +63,8 @@ class Follower:
 
     def follow(self, index: int, seen: PoseInput) -> None:
         """Add the next frame."""
-        view = _View(gray_of(seen.rgb_u8), usable_tissue(seen), seen.depth)
+        measured = np.isfinite(seen.depth) & (seen.depth > 0)
+        view = _View(gray_of(seen.rgb_u8), usable_tissue(seen), np.where(measured, seen.depth, np.float32(0)))
         depths = np.zeros(0, np.float32)
         if self._view is None:
             lost = True
@@ -187,7 +188,11 @@ class Follower:
         done = adjust(self.lens.matrix, self.poses[frames], self.tracks.points[ids], seen, fixed, rounds=2, steps=1)
         if not np.isfinite(done.poses).all():
             return
-        self.poses[frames], self.tracks.points[ids], self.tracks.weight[ids] = done.poses, done.points, done.track_weight
+        self.poses[frames], self.tracks.points[ids], self.tracks.weight[ids] = (
+            done.poses,
+            done.points,
+            done.track_weight,
+        )
         for frame in frames:
             trusted = self.tracks.weight[self.tracks.ids[frame]] > 0.3
             here = self.tracks.ids[frame][trusted], self.tracks.depths[frame][trusted]

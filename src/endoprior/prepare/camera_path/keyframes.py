@@ -51,9 +51,7 @@ class Link:
     """Depth in the world of the old one, as a multiple of the new one's own depth."""
 
 
-def keyframe(
-    index: int, gray: NDArray[np.uint8], usable: NDArray[np.bool_], depth: NDArray[np.float32]
-) -> Keyframe:
+def keyframe(index: int, gray: NDArray[np.uint8], usable: NDArray[np.bool_], depth: NDArray[np.float32]) -> Keyframe:
     """Describe a frame by its SIFT keypoints on tissue with depth."""
     mask = (usable & (depth > 0)).astype(np.uint8)
     found, descriptors = cv2.SIFT_create(KEYPOINTS, contrastThreshold=0.01).detectAndCompute(gray, mask)
@@ -62,7 +60,9 @@ def keyframe(
     pixels = np.array([point.pt for point in found], np.float32).reshape(-1, 2)
     depths = sampled(depth, pixels).astype(np.float32)
     kept = depths > 0
-    return Keyframe(index, pixels[kept], depths[kept], descriptors[kept].astype(np.uint8), np.full(kept.sum(), -1, np.int32))
+    return Keyframe(
+        index, pixels[kept], depths[kept], descriptors[kept].astype(np.uint8), np.full(kept.sum(), -1, np.int32)
+    )
 
 
 def link(lens: Lens, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe) -> Link | None:

@@ -27,7 +27,9 @@ def close_loops(follower: Follower, keyframes: list[Keyframe], size: tuple[int, 
     """
     tracks, lens, found = follower.tracks, follower.lens, 0
     points = [
-        back_projected(lens.matrix, follower.poses[k.frame], k.pixels.astype(np.float64), k.depths * follower.scales[k.frame])
+        back_projected(
+            lens.matrix, follower.poses[k.frame], k.pixels.astype(np.float64), k.depths * follower.scales[k.frame]
+        )
         for k in keyframes
     ]
     ids = [tracks.ids[k.frame] for k in keyframes]

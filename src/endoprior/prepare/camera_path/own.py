@@ -109,7 +109,7 @@ def place_frames(
     """
     tracks, lens = follower.tracks, follower.lens
     stds = np.full((2, len(explained)), np.nan)
-    for f in np.flatnonzero(explained):
+    for f in np.flatnonzero(explained) if len(starts) else ():
         at = starts[max(np.searchsorted(starts, f, "right") - 1, 0)]
         if f not in starts:
             follower.poses[f] = followed[f] @ np.linalg.inv(followed[at]) @ follower.poses[at]
@@ -152,5 +152,12 @@ def finished_path(
     if len(spans) == 1 and spans[0] == (0, count - 1):
         poses = np.tile(np.eye(4), (count, 1, 1))
     return CameraPath(
-        poses, explained, scales * factor, "our own tracks", 1.0, translation_std * factor, np.degrees(rotation_std), still
+        poses,
+        explained,
+        scales * factor,
+        "our own tracks",
+        1.0,
+        translation_std * factor,
+        np.degrees(rotation_std),
+        still,
     )

@@ -42,9 +42,9 @@ def derivatives(
     z = np.maximum(seen[:, 2], NEAREST_MM)
     zero = np.zeros_like(z)
     a, b = matrix[0, 0] / z / sigma[:, 0], matrix[1, 1] / z / sigma[:, 0]
-    by_seen = np.stack(
-        [a, zero, -a * x / z, zero, b, -b * y / z, zero, zero, -1 / (z * z * sigma[:, 1])], 1
-    ).reshape(-1, 3, 3)
+    by_seen = np.stack([a, zero, -a * x / z, zero, b, -b * y / z, zero, zero, -1 / (z * z * sigma[:, 1])], 1).reshape(
+        -1, 3, 3
+    )
     turned = np.stack([zero, seen[:, 2], -y, -seen[:, 2], zero, x, y, -x, zero], 1).reshape(-1, 3, 3)  # -[X]_x
     by_pose = np.concatenate([by_seen @ turned, by_seen], 2)
     by_focal = np.stack([a * x, b * y, zero], 1)

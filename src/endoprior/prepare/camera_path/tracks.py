@@ -79,9 +79,7 @@ class Tracks:
         pixel = np.where(self.keypoint[ids], KEYPOINT_STD, PIXEL_STD) * lens.px
         return inverse, np.stack([pixel, np.where(there, std, np.inf)], 1)
 
-    def of_frames(
-        self, frames: list[int], scales: NDArray, least: int = 2
-    ) -> tuple[NDArray[np.int32], Observations]:
+    def of_frames(self, frames: list[int], scales: NDArray, least: int = 2) -> tuple[NDArray[np.int32], Observations]:
         """Points seen in at least `least` of the frames, and their observations, for an adjustment.
 
         Args:
