@@ -42,6 +42,8 @@ def find_path(
     own, follower = own_path(frame, count, lens, size, refine_focal=refine_focal, progress=progress)
     if how == "own" or not is_installed():
         return own
+    if how == "best" and own.breathes:  # COLMAP would give that motion to the camera
+        return own
     other = colmap_path(frame, count, follower, refine_focal=refine_focal)
     if other is None:
         if how == "colmap":

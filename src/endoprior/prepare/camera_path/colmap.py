@@ -31,6 +31,8 @@ DEFORMING = 0.1
 """Tracks below this weight deform; the tissue around them is masked ..."""
 AROUND = 40
 """... within the image width divided by this."""
+SECONDS_A_FRAME = 1.0
+"""Mapping that takes longer is stopped."""
 LEAST_SHARE = 0.3
 """A model with a smaller share of the frames is no path of the clip."""
 
@@ -122,6 +124,8 @@ def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: boo
     mapping.random_seed = 0
     mapping.extract_colors = False
     mapping.mapper.init_min_tri_angle = 4.0
+    mapping.max_num_models = 2
+    mapping.max_runtime_seconds = int(max(60, SECONDS_A_FRAME * len(list((folder / "images").iterdir()))))
     (folder / "models").mkdir()
     device = pycolmap.Device.cpu
     single = pycolmap.CameraMode.SINGLE

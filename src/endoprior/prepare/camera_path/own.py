@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .adjust import adjust
+from .breathing import Breathing, separate_breathing
 from .follow import Follower, follow_camera
 from .keyframes import Keyframe
 from .loops import close_loops
@@ -22,6 +23,7 @@ FOCAL_STD = 0.03
 """A refined focal length is kept if its own standard deviation is below this ..."""
 FOCAL_STEP = 0.02
 """... and it differs by more than this."""
+BREATHES, NOT_CAMERA = "the tissue breathes", "what the view does in this rhythm is not counted as camera motion"
 MIN_POINTS = 20
 """With fewer adjusted points a frame keeps its pose relative to its keyframe."""
 
@@ -53,10 +55,14 @@ def own_path(
     if len(keyframes) > 1:
         close_loops(follower, keyframes, size)
         focal_factor = _adjust_all(follower, keyframes, refine_focal)
-    starts = np.array([k.frame for k in keyframes])
-    translation_std, rotation_std = place_frames(follower, starts, followed_poses, explained)
-    path = finished_path(follower, explained, translation_std, rotation_std)
-    return replace(path, focal_factor=focal_factor), follower
+    starts, breathing = np.array([k.frame for k in keyframes], int), None
+    if not lens.depth_is_relative and len(keyframes) > 1 and explained[starts[0] : starts[-1] + 1].all():
+        place_frames(follower, starts, followed_poses, explained)
+        breathing = separate_breathing(follower, starts.tolist())
+    stds = place_frames(follower, starts, followed_poses, explained, breathing)
+    path = finished_path(follower, explained, *stds)
+    notes = [] if breathing is None else [f"{BREATHES} every {breathing.period:.1f} frames; {NOT_CAMERA}"]
+    return replace(path, focal_factor=focal_factor, breathes=breathing is not None, notes=notes), follower
 
 
 def _adjust_all(follower: Follower, keyframes: list[Keyframe], refine_focal: bool) -> float:
@@ -99,7 +105,11 @@ def _frame_scale(follower: Follower, frame: int) -> float:
 
 
 def place_frames(
-    follower: Follower, starts: NDArray[np.intp], followed: NDArray[np.float64], explained: NDArray[np.bool_]
+    follower: Follower,
+    starts: NDArray[np.intp],
+    followed: NDArray[np.float64],
+    explained: NDArray[np.bool_],
+    breathing: Breathing | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Set the pose of every frame from the adjusted points; standard deviations of translation, mm, and rotation, rad.
 
@@ -121,8 +131,10 @@ def place_frames(
         inverse, sigma = tracks.measured(ids, depths, 1.0)
         if lens.depth_is_relative:
             sigma[:, 1] = np.inf
-        start = follower.poses[f]
-        found = refined_pose(lens.matrix, start, tracks.points[ids], pixels, inverse, sigma, tracks.weight[ids])
+        start, points = follower.poses[f], tracks.points[ids]
+        if breathing is not None:
+            points = points + breathing.at(int(f), ids)
+        found = refined_pose(lens.matrix, start, points, pixels, inverse, sigma, tracks.weight[ids])
         if not np.isfinite(found.pose).all():
             continue
         stds[:, f] = found.translation_std, found.rotation_std

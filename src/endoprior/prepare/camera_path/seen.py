@@ -72,5 +72,7 @@ class CameraPath:
     """(T,) standard deviation of the rotation, degrees."""
     still: NDArray[np.bool_] | None = None
     """(T,) whether the pose is a copy, because the camera rests."""
+    breathes: bool = False
+    """Whether periodic motion of the tissue was told apart from the camera's."""
     notes: list[str] = field(default_factory=list)
     """Notes for the user, one line each."""
