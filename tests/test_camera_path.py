@@ -1,5 +1,6 @@
 """The camera path: residuals and their derivatives, adjustment, whole paths of a relief, losses, rests, bad input."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from relief import HEIGHT, MATRIX, WIDTH, lens, path, pose, smooth, view
 from endoprior.core.checks import InputError
 from endoprior.prepare.camera_path import choose, colmap
 from endoprior.prepare.camera_path.adjust import Observations, adjust, weights
+from endoprior.prepare.camera_path.breathing import breathing_period
 from endoprior.prepare.camera_path.choose import find_path
 from endoprior.prepare.camera_path.corners import gray_of, new_corners, sampled, usable_tissue
 from endoprior.prepare.camera_path.explained import explained_share
@@ -183,8 +185,9 @@ def test_relative_depth_gets_one_scale_per_frame(relief):
     product = found.depth_scale * factor
     assert np.ptp(product) / product.mean() < 0.02
     assert np.exp(np.median(np.log(found.depth_scale))) == pytest.approx(1)
-    unit = product.mean()
-    assert drift(found.camera_to_world * [1, 1, 1, 1 / unit] + 0, true) < 1.5  # shape and scale of the depth are free
+    measured = found.camera_to_world.copy()
+    measured[:, :3, 3] /= product.mean()
+    assert drift(measured, true) < 1.5  # shape and scale of the depth are free
 
 
 def test_given_poses_scale_relative_depth(relief):
@@ -242,7 +245,7 @@ def test_pulled_tissue_does_not_move_the_camera():
 
 
 def test_the_true_path_explains_more_than_others(relief):
-    frames, true = relief
+    frames, _ = relief
     found, follower = own_path(frames.__getitem__, 24, lens(), SIZE)
     right = explained_share(follower.tracks, lens(), found)
     resting = replace(found, camera_to_world=np.tile(np.eye(4), (24, 1, 1)))
@@ -323,6 +326,40 @@ def test_colmap_finds_the_path():
     found = find_path([view(p) for p in true].__getitem__, 24, lens(), (module.WIDTH, module.HEIGHT), "colmap")
     assert found.method == "COLMAP" and found.explained.mean() > 0.9
     assert drift(found.camera_to_world, true) < 2.0
+
+
+def test_breathing_is_not_given_to_the_camera():
+    true = path(60, 0.3)
+    swell = [np.array([1.5 * np.sin(2 * np.pi * i / 15), 1.0 * np.cos(2 * np.pi * i / 15)]) for i in range(60)]
+
+    def breath(i):
+        return lambda x, y: swell[i] * (1 + 0.3 * np.sin(x / 14) * np.cos(y / 12))[..., None]
+
+    seen = [view(p, move=breath(i)) for i, p in enumerate(true)]
+    found, follower = own_path(seen.__getitem__, 60, lens(), SIZE)
+    assert found.breathes and 14.5 < float(re.search(r"every ([0-9.]+) frames", found.notes[0])[1]) < 15.5
+    off = centers(found.camera_to_world) - centers(true)
+    leaked = np.linalg.norm(off - off.mean(0), axis=1)
+    assert np.sqrt((leaked**2).mean()) < 0.5  # of 1.3 mm
+    assert follower.tracks.weight[follower.tracks.adjusted].size > 50
+
+
+def test_no_breath_where_nothing_repeats(relief):
+    frames, _ = relief
+    found, _ = own_path([frames[i] for i in [*range(24), *range(22, -1, -1)]].__getitem__, 47, lens(), SIZE)
+    assert not found.breathes
+
+
+def test_a_period_is_found_to_a_tenth():
+    rng = np.random.default_rng(0)
+    frames, basis = rng.integers(0, 200, 1500), np.stack([np.ones(1500), rng.normal(size=1500)], 1)
+    by_point = np.tile(np.eye(3), (1500, 1, 1))
+    swing = 0.5 * (basis[:, 1] * np.sin(2 * np.pi * frames / 27.3))[:, None] * [1.0, 0.5, 0.0]
+    error, weight = swing + rng.normal(0, 0.5, (1500, 3)), np.ones((1500, 3))
+    assert breathing_period(error, by_point, weight, basis, frames, 200) == pytest.approx(27.3, abs=0.3)
+    noise = rng.normal(0, 0.5, (1500, 3))
+    assert breathing_period(noise, by_point, weight, basis, frames, 200) is None
+    assert breathing_period(error, by_point, weight, basis, frames, 20) is None  # too short for three breaths
 
 
 def still_views(frames):

@@ -9,10 +9,12 @@ What a camera does in the very rhythm of the breath is therefore lost. `K` frame
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from .adjust import Observations, weights
 from .follow import Follower
@@ -131,7 +133,8 @@ def breathing_period(
         frames: (N,) frame of each observation.
         count: frames of the clip.
     """
-    if count / CYCLES < SHORTEST:
+    frequencies = np.arange(CYCLES / count, 1 / SHORTEST, 0.5 / count)
+    if not len(frequencies):
         return None
     root = np.sqrt(weight)
     right = (error * root).ravel()
@@ -147,7 +150,6 @@ def breathing_period(
         normal += np.eye(len(normal)) * 1e-3 * np.trace(normal) / len(normal)
         return float(gradient @ np.linalg.solve(normal, gradient)) / total
 
-    frequencies = np.arange(CYCLES / count, 1 / SHORTEST, 0.5 / count)
     shares = np.array([share(f) for f in frequencies])
     best = float(frequencies[np.argmax(shares)])
     if shares.max() < max(SIGNIFICANT, PEAK * np.median(shares)):
@@ -174,8 +176,6 @@ def separate(
     basis, wave = surface_basis(points), waves(frames, period)
     coefficients = np.zeros((basis.shape[1], wave.shape[1], 3))
     distance = float(np.median(1 / seen.inverse_depth))
-    order = np.argsort(seen.camera, kind="stable")
-    starts = np.searchsorted(seen.camera[order], np.arange(len(poses) + 1))
     track = np.ones(len(points))
     for _ in range(rounds):
         swing = np.einsum("nb,nh->nbh", basis[seen.point], wave[seen.camera])
@@ -185,22 +185,9 @@ def separate(
         root = np.sqrt(weight)
         by_pose, by_point, _ = derivatives(matrix, poses[seen.camera], here, seen.sigma)
         by_pose, by_point, error = by_pose * root[..., None], by_point * root[..., None], error * root
-        cameras, shared = 6 * len(poses), coefficients.size
-        size = cameras + shared
-        normal, gradient = np.zeros((size, size)), np.zeros(size)
-        mixed = np.zeros((size, len(points), 3))
-        for k in range(len(poses)):
-            rows = order[starts[k] : starts[k + 1]]
-            a, c, e, p = by_pose[rows], by_point[rows], error[rows], seen.point[rows]
-            b = (c[:, :, None, :] * swing[rows].reshape(len(rows), 1, -1, 1)).reshape(len(rows), 3, shared)
-            both = np.concatenate([a, b], 2)
-            flat = both.reshape(-1, both.shape[2])
-            at = np.concatenate([np.arange(6 * k, 6 * k + 6), np.arange(cameras, size)])
-            normal[np.ix_(at, at)] += flat.T @ flat
-            gradient[at] += flat.T @ e.ravel()
-            product = np.einsum("nis,nij->snj", both, c)
-            mixed[6 * k : 6 * k + 6, p] += product[:6]
-            mixed[cameras:, p] += product[6:]
+        cameras = 6 * len(poses)
+        size = cameras + coefficients.size
+        normal, gradient, mixed = _normal_equations(by_pose, by_point, error, seen, basis, wave)
         _add_smoothness(normal, gradient, poses, frames, distance)
         normal[range(cameras, size), range(cameras, size)] += COEFFICIENT_MM**-2
         gradient[cameras:] += coefficients.ravel() * COEFFICIENT_MM**-2
@@ -210,6 +197,57 @@ def separate(
         coefficients += step[cameras:].reshape(coefficients.shape)
         points += point_step
     return poses, points, coefficients, track
+
+
+def _normal_equations(
+    by_pose: NDArray, by_point: NDArray, error: NDArray, seen: Observations, basis: NDArray, wave: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Normal matrix and gradient of cameras (6 K) and coefficients, and their products with the points (size, P, 3).
+
+    The derivative by a coefficient is that by the point times basis (of the point) times wave (of the camera): sums
+    over the points of a camera come first, products with its wave second.
+    """
+    count, cameras, points = len(error), len(wave), len(basis)
+    of_camera = sparse.csr_matrix((np.ones(count), (seen.camera, np.arange(count))), (cameras, count))
+    of_point = sparse.csr_matrix((np.ones(count), (seen.point, np.arange(count))), (points, count))
+    b, harmonics = basis[seen.point], wave.shape[1]
+    shared = b.shape[1] * harmonics * 3
+
+    def by_camera(*factors: NDArray) -> NDArray[np.float64]:
+        """Sums over the observations of each camera of products of (N, ...) arrays."""
+        product = factors[0].reshape(count, -1)
+        for factor in factors[1:]:
+            product = (product[:, :, None] * factor.reshape(count, 1, -1)).reshape(count, -1)
+        return of_camera @ product
+
+    own = np.einsum("nik,nil->nkl", by_pose, by_pose)
+    across = np.einsum("nik,nij->nkj", by_pose, by_point)
+    inner = np.einsum("nij,nil->njl", by_point, by_point)
+    first, second = np.triu_indices(b.shape[1])
+    normal = np.zeros((6 * cameras + shared, 6 * cameras + shared))
+    blocks = normal[: 6 * cameras, : 6 * cameras].reshape(cameras, 6, cameras, 6)
+    blocks[np.arange(cameras), :, np.arange(cameras)] = by_camera(own).reshape(-1, 6, 6)
+    sides = np.einsum("kxjb,kh->kxbhj", by_camera(across, b).reshape(cameras, 6, 3, -1), wave)
+    normal[: 6 * cameras, 6 * cameras :] = sides.reshape(6 * cameras, shared)
+    normal[6 * cameras :, : 6 * cameras] = sides.reshape(6 * cameras, shared).T
+    half = by_camera(inner, b[:, first] * b[:, second]).reshape(cameras, 3, 3, -1)
+    waves_twice = (wave[:, :, None] * wave[:, None]).reshape(cameras, -1)
+    half = (half.reshape(cameras, -1).T @ waves_twice).reshape(3, 3, len(first), harmonics, harmonics)
+    corner = np.zeros((b.shape[1], harmonics, 3, b.shape[1], harmonics, 3))
+    for n, (x, y) in enumerate(zip(first, second, strict=True)):
+        corner[x, :, :, y] = corner[y, :, :, x] = half[:, :, n].transpose(2, 0, 3, 1)
+    normal[6 * cameras :, 6 * cameras :] = corner.reshape(shared, shared)
+    pull = np.einsum("nij,ni->nj", by_point, error)
+    gradient = np.concatenate([
+        by_camera(np.einsum("nik,ni->nk", by_pose, error)).ravel(),
+        np.einsum("kjb,kh->bhj", by_camera(pull, b).reshape(cameras, 3, -1), wave).ravel(),
+    ])  # fmt: skip
+    mixed = np.zeros((6 * cameras + shared, points, 3))
+    np.add.at(mixed[: 6 * cameras].reshape(cameras, 6, points, 3), (seen.camera, slice(None), seen.point), across)
+    swung = inner.reshape(count, 9, 1) * wave[seen.camera][:, None]
+    swung = (of_point @ swung.reshape(count, -1)).reshape(points, 3, 3, harmonics)
+    mixed[6 * cameras :] = np.einsum("pb,pjih->bhjpi", basis, swung).reshape(shared, points, 3)
+    return normal, gradient, mixed
 
 
 def _solve(
@@ -233,7 +271,7 @@ def _solve(
 def _add_smoothness(normal: NDArray, gradient: NDArray, poses: NDArray, frames: NDArray, distance: float) -> None:
     """Add the L1 norm of the camera's changes of speed, re-weighted, to the normal equations of its steps."""
     motion = []
-    for before, after in zip(poses[:-1], poses[1:], strict=True):
+    for before, after in pairwise(poses):
         between = after @ np.linalg.inv(before)
         motion.append(np.concatenate([cv2.Rodrigues(between[:3, :3])[0].ravel(), between[:3, 3]]))
     unit = np.array([distance] * 3 + [1.0] * 3)

@@ -8,7 +8,7 @@ from typing import Literal
 
 from ...core.checks import input_error
 from ...core.extras import install_command
-from .colmap import colmap_path, is_installed
+from .colmap import LONGEST, colmap_path, is_installed
 from .explained import explained_share
 from .own import own_path
 from .seen import CameraPath, Lens, PoseInput
@@ -42,7 +42,7 @@ def find_path(
     own, follower = own_path(frame, count, lens, size, refine_focal=refine_focal, progress=progress)
     if how == "own" or not is_installed():
         return own
-    if how == "best" and own.breathes:  # COLMAP would give that motion to the camera
+    if how == "best" and (own.breathes or count > LONGEST):  # COLMAP would give breathing to the camera
         return own
     other = colmap_path(frame, count, follower, refine_focal=refine_focal)
     if other is None:

@@ -25,8 +25,10 @@ from .given import with_poses
 from .own import finished_path, place_frames
 from .seen import CameraPath, PoseInput
 
-MOST_IMAGES = 600
-"""Longer clips are mapped by evenly spaced frames; ours are placed between them."""
+ENOUGH_IMAGES, LARGEST_STRIDE = 150, 4
+"""A longer clip is mapped by every second to fourth frame; our tracks place those between."""
+LONGEST = 1000
+"""Longer clips are mapped only if COLMAP is asked for: it takes seconds a frame."""
 DEFORMING = 0.1
 """Tracks below this weight deform; the tissue around them is masked ..."""
 AROUND = 40
@@ -51,7 +53,7 @@ def colmap_poses(
     """
     import pycolmap
 
-    stride = -(-count // MOST_IMAGES)
+    stride = min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
     pycolmap.logging.minloglevel = 2
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -20,9 +20,7 @@ from .seen import CameraPath, Lens, PoseInput
 FOCAL_PRIOR = 0.2
 """Standard deviation of log f where the focal length is assumed."""
 FOCAL_STD = 0.03
-"""A refined focal length is kept if its own standard deviation is below this ..."""
-FOCAL_STEP = 0.02
-"""... and it differs by more than this."""
+"""A refined focal length is kept if the standard deviation of its logarithm is below this."""
 BREATHES, NOT_CAMERA = "the tissue breathes", "what the view does in this rhythm is not counted as camera motion"
 MIN_POINTS = 20
 """With fewer adjusted points a frame keeps its pose relative to its keyframe."""
@@ -70,7 +68,7 @@ def _adjust_all(follower: Follower, keyframes: list[Keyframe], refine_focal: boo
     tracks, frames = follower.tracks, [k.frame for k in keyframes]
     fixed = np.arange(len(frames)) == 0
     factor = 1.0
-    for turn in range(3):
+    for turn in range(4 if refine_focal else 3):
         ids, seen = tracks.of_frames(frames, follower.scales)
         if not len(ids):
             return factor
@@ -83,6 +81,9 @@ def _adjust_all(follower: Follower, keyframes: list[Keyframe], refine_focal: boo
         )  # fmt: skip
         if not np.isfinite(done.poses).all():
             return factor
+        if prior and done.focal_std > FOCAL_STD:
+            refine_focal = False  # the path does not determine it
+            continue
         follower.poses[frames], tracks.points[ids], tracks.weight[ids] = done.poses, done.points, done.track_weight
         tracks.adjusted[ids] = True
         if prior:
