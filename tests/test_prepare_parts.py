@@ -1,4 +1,4 @@
-"""The steps of `prepare`, one by one: stereo layout, geometry, file matching, camera poses, work folder."""
+"""The steps of `prepare`, one by one: stereo layout, geometry, file matching, work folder."""
 
 import cv2
 import numpy as np
@@ -11,7 +11,6 @@ from endoprior.prepare.config import PrepareConfig, parse_rectangle
 from endoprior.prepare.frame_files import match_files
 from endoprior.prepare.frame_geometry import make_geometry
 from endoprior.prepare.frames import REACH, MeasuredFrame, with_neighbors
-from endoprior.prepare.poses import PoseInput, estimate_poses, read_poses
 from endoprior.prepare.stereo_layout import find_layout, split_cameras
 from endoprior.prepare.work_folder import frames_done, work_folder
 
@@ -192,70 +191,6 @@ def test_files_that_do_not_match_are_named(tmp_path, names, says):
     with pytest.raises(InputError) as error:
         match_files(tmp_path, (".png",), "masks", [0, 1, 2])
     assert says in str(error.value) and "\n" not in str(error.value)
-
-
-def plane_frames(count=12):
-    """A camera that moves before a textured plane at 80 mm: what it sees, and where it was."""
-    texture, matrix = smooth(900, 900, sigma=3.0), np.array([[200.0, 0, 80], [0, 200, 60], [0, 0, 1]])
-    poses, seen = [], []
-    for i in range(count):
-        pose = np.eye(4)
-        pose[:3, :3] = cv2.Rodrigues(np.array([0.004, -0.006, 0.01]) * i)[0]
-        pose[:3, 3] = np.array([1.2, -0.8, 1.5]) * i
-        y, x = np.mgrid[:120, :160] + 0.5
-        rays = np.stack([(x - 80) / 200, (y - 60) / 200, np.ones_like(x)], -1) @ pose[:3, :3].T
-        z = (80 - pose[2, 3]) / rays[..., 2]
-        hit = pose[:3, 3] + rays * z[..., None]
-        at = (hit[..., :2] * 4 + 450).astype(np.float32) - 0.5
-        seen.append(
-            PoseInput(
-                cv2.remap(texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR),
-                np.ones((120, 160), bool),
-                z.astype(np.float32),
-            )
-        )
-        poses.append(pose)
-    return seen, np.array(poses), matrix
-
-
-def test_camera_poses_are_estimated():
-    seen, poses, matrix = plane_frames()
-    found = estimate_poses(seen.__getitem__, len(seen), matrix, relative_depth=False)
-    assert found.explained.all()
-    # Before a plane a turn and a shift look alike: they may be exchanged by a tenth, what is seen may not move.
-    assert np.abs(found.camera_to_world[:, :3, 3] - poses[:, :3, 3]).max() < 1.5  # of 22 mm
-    assert np.abs(found.camera_to_world[:, :3, :3] - poses[:, :3, :3]).max() < 0.02
-    point = np.array([2.0, 1.0, 80.0])
-    for mine, true in zip(found.camera_to_world, poses, strict=True):
-        a, b = (matrix @ np.linalg.inv(pose)[:3, :3] @ (point - pose[:3, 3]) for pose in (mine, true))
-        assert np.abs(a[:2] / a[2] - b[:2] / b[2]).max() < 1.0
-
-
-def test_relative_depth_is_scaled_to_the_tracked_points():
-    seen, _, matrix = plane_frames()
-    wrong = [PoseInput(s.rgb_u8, s.tissue_mask, s.depth * np.float32(1 + 0.02 * i)) for i, s in enumerate(seen)]
-    found = estimate_poses(wrong.__getitem__, len(wrong), matrix, relative_depth=True)
-    assert np.allclose(found.depth_scale, 1 / (1 + 0.02 * np.arange(len(seen))), atol=0.01)
-
-
-def test_a_frame_of_another_scene_is_unexplained():
-    seen, _, matrix = plane_frames(6)
-    seen[3] = PoseInput(smooth(120, 160, seed=9), seen[3].tissue_mask, seen[3].depth)
-    found = estimate_poses(seen.__getitem__, 6, matrix, relative_depth=False)
-    assert not found.explained[3] and found.explained[:3].all()
-    assert np.array_equal(found.camera_to_world[3], found.camera_to_world[2])
-
-
-def test_poses_from_a_file(tmp_path):
-    _, poses, _ = plane_frames(3)
-    np.save(tmp_path / "p.npy", poses)
-    assert np.allclose(read_poses(tmp_path / "p.npy", 3).camera_to_world, poses)
-    with pytest.raises(InputError, match=r"expected shape \(4, 4, 4\), one pose per frame, got \(3, 4, 4\)"):
-        read_poses(tmp_path / "p.npy", 4)
-    poses[1, 0, 0] = np.nan
-    np.save(tmp_path / "p.npy", poses)
-    with pytest.raises(InputError, match="expected finite numbers"):
-        read_poses(tmp_path / "p.npy", 3)
 
 
 def test_a_work_folder_survives_crashes(tmp_path):

@@ -21,6 +21,7 @@ COMMANDS = {
     "phantom": "write a synthetic surgical sequence with full ground truth",
     "prepare": "write a sequence folder from a video: rectified frames, depth, tool masks, poses",
     "masks": "find the tools in a sequence folder and write their masks",
+    "poses": "find the camera path of a sequence folder and write its poses",
     "check": "check a sequence before training: properties, problems with their fix, a figure",
     "prior": "write the cue maps and the joint texture prior of each frame",
     "train": "train one scene and score it",

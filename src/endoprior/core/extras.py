@@ -21,7 +21,8 @@ def install_command(extra: str) -> str:
     """
     listed = [Requirement(line) for line in requires("endoprior") or ()]
     names = [each.name for each in listed if each.marker and _wants(each.marker, extra)]
-    assert names, f"no optional part {extra}"
+    if not names:  # the installation is older than the program: a checkout that was updated since
+        return f"pip install -c constraints.txt '.[{extra}]'"
     return " ".join(["pip install", *([] if extra == "cuda" else ["-c constraints.txt"]), *names])
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..system.atomic import reject_occupied, whole_folder
 from .images import decode_image, save_png
+from .pose_writing import depth_bounds, pose_table
 
 TOOL_VALUE = 255
 """Value of tool pixels in `masks/`; tissue is 0."""
@@ -125,13 +126,9 @@ class FrameFiles:
         if self.count == 0:
             raise ValueError("a sequence must have at least one frame; got none")
         meta = self.meta
-        poses = np.zeros((self.count, 17))
-        # 3x5 per frame: camera-to-world [R | t], then (H, W, focal); row-major, then near and far.
         cameras = np.broadcast_to(np.eye(4), (self.count, 4, 4)) if camera_to_world is None else camera_to_world
-        size = np.broadcast_to([[meta.height], [meta.width], [meta.fx]], (self.count, 3, 1))
-        poses[:, :15] = np.concatenate([cameras[:, :3], size], 2).reshape(self.count, 15)
-        poses[:, 15:] = [self._depth_bounds(index) for index in range(self.count)]
-        self.write_array("poses_bounds.npy", poses)
+        bounds = np.array([self._depth_bounds(index) for index in range(self.count)])
+        self.write_array("poses_bounds.npy", pose_table(cameras, meta.height, meta.width, meta.fx, bounds))
         described = {
             "format_version": 1,
             "width": meta.width,
@@ -161,10 +158,7 @@ class FrameFiles:
         """Nearest and farthest depth of a written frame, mm; (0, 0) without depth."""
         path = self.file("depth", index)
         stored = decode_image(path, None) if path.exists() else np.zeros(0, np.uint16)
-        measured = stored[stored > 0]
-        if not measured.size:
-            return 0.0, 0.0
-        return float(measured.min() * self.meta.depth_scale), float(measured.max() * self.meta.depth_scale)
+        return depth_bounds(stored, self.meta.depth_scale)
 
     def _file(self, name: str) -> Path:
         """Path of a file in the folder; creates its parents."""

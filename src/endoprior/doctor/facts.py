@@ -26,7 +26,7 @@ TORCH_LIMIT_S = 90.0
 """Longest wait for torch, s: a first import from a slow disk, and a context on each of many GPUs, take time."""
 LOAD_LIMIT_S = 60.0
 COMPILE_LIMIT_S = 3600.0
-PACKAGES = ("OpenEXR", "transformers", "torchvision", "lpips", "ray")
+PACKAGES = ("OpenEXR", "transformers", "torchvision", "lpips", "pycolmap", "ray")
 """What optional parts import."""
 VARIABLES = (
     "CUDA_HOME", "CUDA_PATH", "CUDA_VISIBLE_DEVICES", "CUDA_INC_PATH", "TORCH_CUDA_ARCH_LIST", "TORCH_EXTENSIONS_DIR",

@@ -10,6 +10,7 @@ PARTS = {
     "exr": ("depth in OpenEXR files", ("OpenEXR",)),
     "mono": ("depth by a network", ("transformers",)),
     "networks": ("network scores", ("torchvision", "lpips")),
+    "poses": ("camera path by COLMAP", ("pycolmap",)),
     "ray": ("benchmarks on a cluster", ("ray",)),
 }
 """Optional part -> what it is for, and what it imports."""

@@ -3,27 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.checks import input_error, number_ranges
-from ..core.geometry import length_unit
 from ..data import write_stir_tracks
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.reading import kind_of
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
-from ..footage.camera_motion import camera_motion
-from ..footage.changes import find_changes
 from .calibration_files import read_calibration
+from .camera_path.seen import CameraPath, Lens, PoseInput
+from .camera_path.sequence_path import (
+    ASSUMED,
+    CALIBRATED,
+    PATH_RECORD,
+    record_of_path,
+    rescaled,
+    sequence_path,
+    sources_with,
+    unexplained_frames,
+)
 from .config import PrepareConfig
 from .depth_and_masks import ChosenMethods, choose_methods
 from .first_pass import run_first_pass, source_facts
 from .frame_geometry import FrameGeometry
 from .frames import write_frames
-from .poses import PoseInput, PosePath, estimate_poses, read_poses
 from .record import record_of
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
@@ -70,7 +78,7 @@ def prepare(
         first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
         progress("learning tools and light", 0, len(first_pass.indices))
         chosen = choose_methods(cfg, clip, first_pass)
-        meta = _meta(clip, first_pass.geometry, chosen)
+        meta = _meta(clip, first_pass.geometry, chosen, calibrated=calibration is not None)
         parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
         files = FrameFiles(folder, meta, frames_done(folder, parts))
         write_frames(
@@ -85,10 +93,14 @@ def prepare(
             fix = "Change --start, --end or --drop-out-of-body."
             raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
         progress("following the camera", 0, files.count)
-        path, motion_notes = _camera_path(cfg, files, meta)
-        unexplained = _unexplained(path, files)
-        if path is not None and meta.depth_relative:
-            _scale_depth(files, path)
+        path, motion_notes = _camera_path(cfg, files, lambda done: progress("following the camera", done, files.count))
+        unexplained = unexplained_frames(path, (read_color(files.file("images", i)) for i in range(files.count)))
+        if path is not None:
+            if meta.depth_relative:
+                _scale_depth(files, path)
+            focal = {"fx": meta.fx * path.focal_factor, "fy": meta.fy * path.focal_factor}
+            files.meta = replace(meta, **focal, sources=sources_with(meta.sources, path))
+            files.write_json(PATH_RECORD, record_of_path(path))
         files.finish(None if path is None else path.camera_to_world, unexplained)
         record_of(video, cfg, first_pass.geometry).save(folder)
         if cfg.stir is not None:
@@ -100,7 +112,7 @@ def prepare(
     return Prepared(out, files.count, first_pass.geometry.size, notes)
 
 
-def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods) -> SequenceMeta:
+def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, calibrated: bool) -> SequenceMeta:
     return SequenceMeta(
         width=geometry.size[0],
         height=geometry.size[1],
@@ -113,50 +125,40 @@ def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods) -> Sequenc
         depth_scale=DEPTH_SCALE,
         depth_source=chosen.sources["depth"],
         depth_relative=chosen.relative,
-        sources=chosen.sources,
+        sources=chosen.sources | {"lens": CALIBRATED if calibrated else ASSUMED},
     )
 
 
-def _camera_path(cfg: PrepareConfig, files: FrameFiles, meta: SequenceMeta) -> tuple[PosePath | None, list[str]]:
+def _camera_path(
+    cfg: PrepareConfig, files: FrameFiles, progress: Callable[[int], None]
+) -> tuple[CameraPath | None, list[str]]:
     """Poses of the written frames, None for a static camera; and notes for the user."""
-    if cfg.poses not in ("auto", "still", "estimate"):
-        return read_poses(Path(cfg.poses), files.count), []
-    if cfg.poses == "still":
-        return None, []
-    motion = camera_motion(
-        (read_color(files.file("images", i)) for i in range(files.count)),
-        (~read_tool_mask(files.file("masks", i)) for i in range(files.count)),
-    )
-    if cfg.poses == "auto" and not motion.moving:
-        return None, [f"the camera is static: {motion.reason}"]
-    if cfg.depth == "none":
-        return None, [f"the camera moves: {motion.reason}; without depth its path cannot be estimated"]
+    meta = files.meta
 
-    def load(index: int) -> PoseInput:
-        return PoseInput(
-            read_color(files.file("images", index)),
-            ~read_tool_mask(files.file("masks", index)),
-            read_depth(files.file("depth", index), meta.depth_scale),
-        )
+    def tissue(index: int) -> NDArray[np.bool_]:
+        return ~read_tool_mask(files.file("masks", index))
+
+    def frame(index: int) -> PoseInput:
+        depth = read_depth(files.file("depth", index), meta.depth_scale)
+        return PoseInput(read_color(files.file("images", index)), tissue(index), depth)
 
     matrix = np.array([[meta.fx, 0, meta.cx], [0, meta.fy, meta.cy], [0, 0, 1]])
-    path = estimate_poses(load, files.count, matrix, relative_depth=meta.depth_relative)
-    reach = np.linalg.norm(path.camera_to_world[:, :3, 3], axis=1).max()
-    unit = length_unit(meta.depth_relative)
-    return path, [f"the camera moves: {motion.reason}; the estimated path reaches {reach:.0f} {unit} from its start"]
+    return sequence_path(
+        cfg.poses,
+        frame,
+        lambda: ((read_color(files.file("images", i)) for i in range(files.count)), map(tissue, range(files.count))),
+        files.count,
+        Lens.centered_at_half(matrix, meta.depth_relative, meta.baseline_mm),
+        (meta.width, meta.height),
+        has_depth=cfg.depth != "none",
+        refine_focal=cfg.calibration is None,
+        progress=progress,
+    )
 
 
-def _scale_depth(files: FrameFiles, path: PosePath) -> None:
+def _scale_depth(files: FrameFiles, path: CameraPath) -> None:
     """Rescale the relative depth of each frame to agree with the tracked points of the pose estimation."""
     delete_plan(files.folder)
     for index, scale in enumerate(path.depth_scale):
         file = files.file("depth", index)
-        stored = decode_image(file, None).astype(np.float64) * scale
-        save_png(file, np.clip(np.round(stored), 0, 65535).astype(np.uint16))
-
-
-def _unexplained(path: PosePath | None, files: FrameFiles) -> list[int]:
-    """Frames without an estimated pose, and frames whose color differs from the rest."""
-    lost = set() if path is None else set(np.flatnonzero(~path.explained).tolist())
-    changes = find_changes(read_color(files.file("images", i)) for i in range(files.count))
-    return sorted(lost | set(changes.off_color))
+        save_png(file, rescaled(decode_image(file, None), float(scale)))

@@ -1,0 +1,1 @@
+"""Where the camera was in each frame."""

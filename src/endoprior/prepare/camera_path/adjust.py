@@ -1,0 +1,207 @@
+"""Bundle adjustment: poses of keyframes and the points they see, by Levenberg-Marquardt with the points eliminated.
+
+`K` cameras, `P` points, `N` observations. Weights are those of Geman-McClure: one for each track, from the mean of its
+residuals over time, so that tissue that breathes or is pulled falls out by its history; one for each observation,
+against single mistakes; one for each measured depth. They are updated between the steps (iterative re-weighting).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from .residuals import derivatives, geman_mcclure, moved, residuals
+
+TRACK_WIDTH = (1.5, 6.0)
+"""Range of the width of a track's weight, standard deviations; between them twice the median over the tracks."""
+SINGLE_WIDTH = 4.0
+"""Width of the weight of one observation, standard deviations."""
+DEPTH_WIDTH = 3.0
+"""Width of the weight of one depth, standard deviations."""
+DENSE_LIMIT = 900
+"""Up to this many unknowns of the cameras, their system is solved as a dense matrix."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Which camera saw which point where."""
+
+    camera: NDArray[np.intp]
+    """(N,) 0..K-1."""
+    point: NDArray[np.intp]
+    """(N,) 0..P-1."""
+    pixels: NDArray[np.float64]
+    """(N, 2) px."""
+    inverse_depth: NDArray[np.float64]
+    """(N,) 1 / measured depth, 1/mm; anything finite where its sigma is inf."""
+    sigma: NDArray[np.float64]
+    """(N, 2) standard deviations: px, 1/mm."""
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Result of the adjustment."""
+
+    poses: NDArray[np.float64]
+    """(K, 4, 4) world-to-camera."""
+    points: NDArray[np.float64]
+    """(P, 3) mm."""
+    track_weight: NDArray[np.float64]
+    """(P,) 0..1: how well the track follows the rigid scene over time."""
+    focal_factor: float
+    """Of the focal length; 1 where it is fixed."""
+    focal_std: float
+    """Standard deviation of its logarithm; 0 where it is fixed."""
+
+
+def adjust(
+    matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, fixed: NDArray[np.bool_], *,
+    rounds: int = 4, steps: int = 2, focal_prior: float = 0.0, widest: float = 1.0,
+) -> Adjusted:  # fmt: skip
+    """Adjust poses and points to what was seen.
+
+    Args:
+        matrix: (3, 3) K, px.
+        poses: (K, 4, 4) world-to-camera.
+        points: (P, 3) mm.
+        fixed: (K,) cameras that stay; at least one, or the world drifts.
+        rounds: updates of the weights.
+        steps: Levenberg-Marquardt steps after each update.
+        focal_prior: standard deviation of log f; 0 keeps the focal length.
+        widest: the widths of the weights start at this multiple and halve with each round: a path that drifted has
+            large residuals where it returns, and they must not count as moving tissue.
+    """
+    log_f, focal_std, damping = 0.0, 0.0, 1e-4
+    track = np.ones(len(points))
+    for turn in range(rounds):
+        error = _error(matrix, poses, points, seen, log_f)
+        weight, track = weights(error, seen.point, len(points), max(1.0, widest / 2**turn))
+        for _ in range(steps):
+            system = _System(matrix, poses, points, seen, fixed, weight, log_f, focal_prior)
+            for _ in range(5):
+                camera_step, point_step, focal_step = system.solve(damping)
+                new = moved(poses, camera_step), points + point_step, log_f + focal_step
+                error = _error(matrix, new[0], new[1], seen, new[2])
+                if _cost(error, weight, new[2], focal_prior) <= system.cost:
+                    poses, points, log_f = new
+                    damping = max(damping / 5, 1e-8)
+                    break
+                damping *= 10
+            focal_std = system.focal_std() if focal_prior else 0.0
+    return Adjusted(poses, points, track, float(np.exp(log_f)), focal_std)
+
+
+def weights(
+    error: NDArray, point: NDArray, count: int, wider: float = 1.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights (N, 3) of standardized residuals (N, 3), and (count,) of the tracks they belong to.
+
+    The width of the track weight follows the data: where more than half of the tissue moves, rigid is what moves least.
+    """
+    squared = (error[:, :2] ** 2).sum(1)
+    # One gross mistake must not condemn a long track: each residual counts up to twice the largest width.
+    capped = np.minimum(squared, (2 * wider * TRACK_WIDTH[1]) ** 2)
+    number = np.bincount(point, minlength=count)
+    history = np.bincount(point, weights=capped, minlength=count) / np.maximum(number, 1)
+    usual = float(np.sqrt(np.median(history[number > 1]))) if (number > 1).any() else TRACK_WIDTH[1]
+    width = wider * float(np.clip(2 * usual, *TRACK_WIDTH))
+    track = geman_mcclure(history, width)
+    pixel = track[point] * geman_mcclure(squared, max(wider * SINGLE_WIDTH, 1.5 * width))
+    depth = track[point] * geman_mcclure(error[:, 2] ** 2, wider * DEPTH_WIDTH)
+    return np.stack([pixel, pixel, depth], 1), track
+
+
+def _error(matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, log_f: float) -> NDArray[np.float64]:
+    scaled = _scaled(matrix, log_f)
+    return residuals(scaled, poses[seen.camera], points[seen.point], seen.pixels, seen.inverse_depth, seen.sigma)
+
+
+def _cost(error: NDArray, weight: NDArray, log_f: float, focal_prior: float) -> float:
+    return float((weight * error**2).sum()) + ((log_f / focal_prior) ** 2 if focal_prior else 0.0)
+
+
+def _scaled(matrix: NDArray, log_f: float) -> NDArray[np.float64]:
+    out = np.array(matrix, np.float64)
+    out[[0, 1], [0, 1]] *= np.exp(log_f)
+    return out
+
+
+class _System:
+    """The normal equations at one state: cameras (and log f) first, points second."""
+
+    def __init__(
+        self, matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, fixed: NDArray[np.bool_],
+        weight: NDArray, log_f: float, focal_prior: float,
+    ) -> None:  # fmt: skip
+        error = _error(matrix, poses, points, seen, log_f)
+        self.cost = _cost(error, weight, log_f, focal_prior)
+        self.fixed, self.has_focal = fixed, bool(focal_prior)
+        root = np.sqrt(weight)
+        parts = derivatives(_scaled(matrix, log_f), poses[seen.camera], points[seen.point], seen.sigma)
+        by_pose, by_point = (part * root[:, :, None] for part in parts[:2])
+        error = error * root
+        slot = np.cumsum(~fixed) - 1
+        columns = np.where(fixed[:, None], 0, 6 * slot[:, None] + np.arange(6))[seen.camera]
+        by_pose = np.where(fixed[seen.camera][:, None, None], 0.0, by_pose)
+        self.size = 6 * int((~fixed).sum()) + self.has_focal
+        if self.has_focal:
+            columns = np.concatenate([columns, np.full((len(columns), 1), self.size - 1)], 1)
+            by_pose = np.concatenate([by_pose, (parts[2] * root)[:, :, None]], 2)
+        cameras = _rows(by_pose, columns, max(self.size, 1))
+        of_points = _rows(by_point, 3 * seen.point[:, None] + np.arange(3), 3 * len(points))
+        residual = error.ravel()
+        self.of_cameras = (cameras.T @ cameras).tocsr()
+        self.mixed = (cameras.T @ of_points).tocsr()
+        products = np.einsum("nij,nik->njk", by_point, by_point).reshape(-1, 9)
+        summed = [np.bincount(seen.point, weights=products[:, i], minlength=len(points)) for i in range(9)]
+        self.of_points = np.stack(summed, 1).reshape(-1, 3, 3)
+        self.camera_gradient, self.point_gradient = cameras.T @ residual, of_points.T @ residual
+        if self.has_focal:
+            prior = sparse.csr_matrix(([focal_prior**-2], ([self.size - 1], [self.size - 1])), (self.size, self.size))
+            self.of_cameras = self.of_cameras + prior
+            self.camera_gradient[-1] += log_f / focal_prior**2
+
+    def solve(self, damping: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Steps of the poses (K, 6), of the points (P, 3) and of log f."""
+        inverse = self._inverse(damping)
+        right = self.camera_gradient - self.mixed @ (inverse @ self.point_gradient)
+        step = np.zeros(len(right))
+        if self.size:
+            reduced = self._reduced(inverse, damping)
+            if self.size <= DENSE_LIMIT:
+                step = -np.linalg.solve(reduced.toarray(), right)
+            else:
+                step = -splu(reduced.tocsc()).solve(right)
+        point_step = -(inverse @ (self.point_gradient + self.mixed.T @ step))
+        camera_step = np.zeros((len(self.fixed), 6))
+        camera_step[~self.fixed] = step[: self.size - self.has_focal].reshape(-1, 6)
+        return camera_step, point_step.reshape(-1, 3), float(step[-1]) if self.has_focal else 0.0
+
+    def focal_std(self) -> float:
+        """Standard deviation of log f, poses and points unknown too."""
+        unit = np.zeros(self.size)
+        unit[-1] = 1
+        reduced = self._reduced(self._inverse(1e-9), 1e-9)
+        return float(np.sqrt(max(splu(reduced.tocsc()).solve(unit)[-1], 0.0)))
+
+    def _inverse(self, damping: float) -> sparse.csr_matrix:
+        count = len(self.of_points)
+        diagonal = np.einsum("nii->ni", self.of_points)
+        least = 1e-9 * (1 + diagonal.max(1, keepdims=True))
+        blocks = self.of_points + (damping * diagonal + least)[:, :, None] * np.eye(3)
+        return sparse.bsr_matrix((np.linalg.inv(blocks), np.arange(count), np.arange(count + 1))).tocsr()
+
+    def _reduced(self, inverse: sparse.csr_matrix, damping: float) -> sparse.csr_matrix:
+        held = sparse.diags(self.of_cameras.diagonal() * damping + 1e-9)
+        return self.of_cameras + held - self.mixed @ inverse @ self.mixed.T
+
+
+def _rows(values: NDArray, columns: NDArray, width: int) -> sparse.csr_matrix:
+    """Sparse (3 N, width) from derivatives (N, 3, C) by the columns (N, C)."""
+    count, _, each = values.shape
+    indices = np.repeat(columns[:, None], 3, 1).ravel()
+    return sparse.csr_matrix((values.ravel(), indices, np.arange(0, 3 * count * each + 1, each)), (3 * count, width))

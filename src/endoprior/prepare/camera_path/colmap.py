@@ -1,0 +1,155 @@
+"""The path by COLMAP (`pycolmap`, optional): SIFT, sequential matching and incremental mapping on the CPU.
+
+Its images are masked by tools, highlights and what our own tracks found to deform. Its scale is set by our depth;
+frames that it does not register are placed by our own tracks.
+"""
+
+from __future__ import annotations
+
+import copy
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...data.images import save_png
+from .corners import usable_tissue
+from .follow import Follower
+from .given import with_poses
+from .own import finished_path, place_frames
+from .seen import CameraPath, PoseInput
+
+ENOUGH_IMAGES, LARGEST_STRIDE = 150, 4
+"""A longer clip is mapped by every second to fourth frame; our tracks place those between."""
+LONGEST = 1000
+"""Longer clips are mapped only if COLMAP is asked for: it takes seconds a frame."""
+DEFORMING = 0.1
+"""Tracks below this weight deform; the tissue around them is masked ..."""
+AROUND = 40
+"""... within the image width divided by this."""
+SECONDS_A_FRAME = 1.0
+"""Mapping that takes longer is stopped."""
+LEAST_SHARE = 0.3
+"""A model with a smaller share of the frames is no path of the clip."""
+
+
+def is_installed() -> bool:
+    """Whether `pycolmap` can be imported."""
+    return find_spec("pycolmap") is not None
+
+
+def colmap_poses(
+    frame: Callable[[int], PoseInput], count: int, follower: Follower, *, refine_focal: bool
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], float] | None:
+    """World-to-camera poses (T, 4, 4) in units of its own, (T,) which frames are registered, and the focal factor.
+
+    None if no model holds enough frames.
+    """
+    import pycolmap
+
+    stride = min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
+    pycolmap.logging.minloglevel = 2
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for i in range(0, count, stride):
+            seen = frame(i)
+            save_png(_file(folder, "images", i), seen.rgb_u8)
+            save_png(_file(folder, "masks", i, ".png"), _allowed(seen, follower, i).astype(np.uint8) * 255)
+        models = _reconstruct(pycolmap, folder, follower.lens.matrix, refine_focal)
+    if not models:
+        return None
+    best = max(models.values(), key=lambda model: model.num_reg_images())
+    if best.num_reg_images() < max(LEAST_SHARE * len(range(0, count, stride)), 3):
+        return None
+    poses, known = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
+    for image in best.images.values():
+        if image.has_pose:
+            index = int(Path(image.name).stem)
+            poses[index, :3], known[index] = image.cam_from_world().matrix(), True
+    focal = next(iter(best.cameras.values())).params[0]
+    return poses, known, float(focal / follower.lens.matrix[0, 0])
+
+
+def colmap_path(
+    frame: Callable[[int], PoseInput], count: int, follower: Follower, *, refine_focal: bool
+) -> CameraPath | None:
+    """The path by COLMAP, in the unit of our depth; None if it finds none.
+
+    Args:
+        frame: reads frame i.
+        follower: our own tracks, their points adjusted: they show what deforms, and fill in frames.
+        refine_focal: the focal length is an assumption; the factor of the path is relative to that of `follower`.
+    """
+    found = colmap_poses(frame, count, follower, refine_focal=refine_focal)
+    if found is None:
+        return None
+    poses, known, focal_factor = found
+    base = _with_lens(follower, focal_factor)
+    unit = float(np.exp(np.median(np.log(with_poses(base, poses, known).scales[known]))))
+    poses[:, :3, 3] /= unit
+    world = with_poses(base, poses, known)
+    if not world.lens.depth_is_relative:
+        world.scales[:] = 1.0
+    explained = known | (follower.segment == follower.segment[np.argmax(known)])
+    stds = place_frames(world, np.flatnonzero(known), follower.poses, explained)
+    explained = known | (explained & np.isfinite(stds[0]))
+    return replace(finished_path(world, explained, *stds), method="COLMAP", focal_factor=focal_factor)
+
+
+def _with_lens(follower: Follower, focal_factor: float) -> Follower:
+    out = copy.copy(follower)
+    out.lens = follower.lens.with_focal(focal_factor)
+    out.tracks = follower.tracks.copy()
+    out.tracks.lens = out.lens
+    return out
+
+
+def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: bool) -> dict[int, Any]:
+    """All models of the images in a folder; COLMAP counts the center of the left-most pixel as 0.5."""
+    database = folder / "database.db"
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model, reader.mask_path = "PINHOLE", folder / "masks"
+    reader.camera_params = ",".join(
+        str(v) for v in (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)
+    )
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = 2000
+    extraction.sift.peak_threshold = 0.003
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.ba_refine_focal_length = mapping.mapper.abs_pose_refine_focal_length = refine_focal
+    mapping.random_seed = 0
+    mapping.extract_colors = False
+    mapping.mapper.init_min_tri_angle = 4.0
+    mapping.max_num_models = 2
+    mapping.max_runtime_seconds = int(max(60, SECONDS_A_FRAME * len(list((folder / "images").iterdir()))))
+    (folder / "models").mkdir()
+    device = pycolmap.Device.cpu
+    single = pycolmap.CameraMode.SINGLE
+    pycolmap.set_random_seed(0)
+    pycolmap.extract_features(
+        database, folder / "images", camera_mode=single, reader_options=reader, extraction_options=extraction,
+        device=device,
+    )  # fmt: skip
+    pycolmap.match_sequential(database, device=device)
+    return pycolmap.incremental_mapping(database, folder / "images", folder / "models", mapping)
+
+
+def _allowed(seen: PoseInput, follower: Follower, index: int) -> NDArray[np.bool_]:
+    """(H, W) tissue without highlights, and without what deforms."""
+    tracks, mask = follower.tracks, usable_tissue(seen).astype(np.uint8)
+    ids = tracks.ids[index]
+    for x, y in tracks.pixels[index][tracks.adjusted[ids] & (tracks.weight[ids] < DEFORMING)]:
+        cv2.circle(mask, (round(float(x)), round(float(y))), mask.shape[1] // AROUND, 0, -1)
+    return mask.astype(bool)
+
+
+def _file(folder: Path, part: str, index: int, more: str = "") -> Path:
+    path = folder / part / f"{index:06d}.png{more}"
+    path.parent.mkdir(exist_ok=True)
+    return path

@@ -1,0 +1,222 @@
+"""Follow the camera through a clip: tracks from frame to frame, a pose each, keyframes, and the way back after a loss.
+
+A loss starts a new segment with a world of its own. A segment whose keyframe is recognized in another one moves into
+its world (relocalization), with the scale of its depth if that is relative. Only two frames are in memory at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.spread import spread
+from .adjust import adjust
+from .corners import MAX_CORNERS, REFRESH, Gray, followed, gray_of, new_corners, sampled, usable_tissue
+from .keyframes import Keyframe, Link, keyframe, link
+from .resection import INLIER_PX, coarse_pose, refined_pose
+from .residuals import back_projected
+from .seen import Lens, PoseInput
+from .tracks import Tracks
+
+MIN_TRACKS = 30
+"""With fewer tracks a frame gets no pose from the frame before."""
+MIN_INLIERS = 0.4
+"""Share of the tracks that one pose must explain; below, the frame shows another place or another scene."""
+KEYFRAME_GAP = 10
+"""Frames from one keyframe to the next at most: the weights need the history of a breath ..."""
+KEYFRAME_LEFT = 0.7
+"""... and earlier when less than this share of its tracks is left ..."""
+KEYFRAME_SHIFT = 0.08
+"""... or when they have moved by this share of the image width."""
+WINDOW = 8
+"""Keyframes that are adjusted together with each new one."""
+RECENT, OLDER = 6, 14
+"""Keyframes that a lost frame is compared with: the last ones, and others spread over the clip."""
+
+
+@dataclass
+class _View:
+    """The frame of which the next one is followed."""
+
+    gray: Gray
+    usable: NDArray[np.bool_]
+    depth: NDArray[np.float32]
+
+
+class Follower:
+    """What is known about the path so far."""
+
+    def __init__(self, lens: Lens, count: int) -> None:
+        """Args: lens: the camera. count: frames of the clip."""
+        self.lens, self.tracks = lens, Tracks(lens)
+        self.poses = np.tile(np.eye(4), (count, 1, 1))
+        """(T, 4, 4) world-to-camera, in the world of the frame's segment."""
+        self.scales = np.ones(count)
+        self.segment = np.full(count, -1)
+        self.keyframes: list[Keyframe] = []
+        self._ids, self._pixels = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+        self._view: _View | None = None
+        self._at_keyframe = self._ids, self._pixels
+
+    def follow(self, index: int, seen: PoseInput) -> None:
+        """Add the next frame."""
+        measured = np.isfinite(seen.depth) & (seen.depth > 0)
+        view = _View(gray_of(seen.rgb_u8), usable_tissue(seen), np.where(measured, seen.depth, np.float32(0)))
+        depths = np.zeros(0, np.float32)
+        if self._view is None:
+            lost = True
+        else:
+            kept, pixels = followed(self._view.gray, view.gray, self._pixels, view.usable)
+            depths = sampled(view.depth, pixels).astype(np.float32)
+            lost = not self._find_pose(index, self._ids[kept], self._pixels[kept], pixels, depths)
+            if not lost:
+                self._ids, self._pixels = self._ids[kept], pixels
+        if lost:
+            self._start_segment(index)
+            depths = np.zeros(0, np.float32)
+        self._view = view
+        self.tracks.see(index, self._ids, self._pixels, depths)
+        if lost or self._keyframe_is_due(index):
+            self._add_keyframe(index)
+        self._refill(index, view)
+        if self.keyframes[-1].frame == index:
+            self._at_keyframe = self._ids, self._pixels
+
+    def _find_pose(self, index: int, ids: NDArray, before: NDArray, pixels: NDArray, depths: NDArray) -> bool:
+        """Set pose and scale of a frame from its tracks; False if nothing rigid explains them."""
+        tracks, lens = self.tracks, self.lens
+        if len(ids) < MIN_TRACKS:
+            return False
+        used = ~tracks.held_out(ids)
+        trusted = used & (tracks.weight[ids] > 0.1)
+        used = trusted if trusted.sum() >= MIN_TRACKS else used
+        ids, before, pixels, depths = ids[used], before[used], pixels[used], depths[used]
+        last, limit = self.poses[index - 1], INLIER_PX * lens.px
+        found = coarse_pose(lens.matrix, tracks.points[ids], pixels, last, limit)
+        if found is not None and found[1].mean() >= MIN_INLIERS:
+            inverse, sigma = tracks.measured(ids, depths, 1.0)
+            if lens.depth_is_relative:
+                sigma[:, 1] = np.inf
+            fine = refined_pose(lens.matrix, found[0], tracks.points[ids], pixels, inverse, sigma, tracks.weight[ids])
+            pose, inlier = (fine.pose, fine.inlier) if fine.inlier.sum() >= 0.7 * found[1].sum() else found
+        else:
+            # Tissue that breathes leaves the place where it was first seen; from one frame to the next it moves little.
+            z = sampled(self._view.depth, before) * self.scales[index - 1]
+            there = z > 0
+            points = back_projected(lens.matrix, last, before[there].astype(np.float64), z[there])
+            found = coarse_pose(lens.matrix, points, pixels[there], last, limit)
+            if found is None or found[1].mean() < MIN_INLIERS:
+                return False
+            pose, inlier = found[0], np.zeros(len(ids), bool)
+            inlier[np.flatnonzero(there)[found[1]]] = True
+        self.poses[index], self.segment[index] = pose, self.segment[index - 1]
+        self.scales[index] = self._scale(pose, ids[inlier], depths[inlier], self.scales[index - 1])
+        return True
+
+    def _scale(self, pose: NDArray, ids: NDArray, depths: NDArray, otherwise: float) -> float:
+        """Median ratio of the points' z to the measured depth; 1 where depth has a unit."""
+        if not self.lens.depth_is_relative:
+            return 1.0
+        z = self.tracks.points[ids] @ pose[2, :3] + pose[2, 3]
+        good = (depths > 0) & (z > 0)
+        return float(np.median(z[good] / depths[good])) if good.sum() >= 5 else float(otherwise)
+
+    def _start_segment(self, index: int) -> None:
+        """Forget the tracks; the frame before becomes a keyframe, so that this one can be recognized by it."""
+        if index and (not self.keyframes or self.keyframes[-1].frame != index - 1):
+            self._add_keyframe(index - 1)
+        elif index and (self.segment == self.segment[index - 1]).sum() == 1:
+            self.keyframes.pop()  # a single frame that nothing recognizes
+        self._ids, self._pixels = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+        self.poses[index], self.scales[index] = np.eye(4), 1.0
+        self.segment[index] = index
+
+    def _keyframe_is_due(self, index: int) -> bool:
+        last = self.keyframes[-1].frame
+        ids, pixels = self._at_keyframe
+        kept, now, then = np.intersect1d(self._ids, ids, return_indices=True)
+        if index - last >= KEYFRAME_GAP or len(kept) < KEYFRAME_LEFT * len(ids):
+            return True
+        shift = np.hypot(*(self._pixels[now] - pixels[then]).T)
+        return bool(np.median(shift) > KEYFRAME_SHIFT * 640 * self.lens.px)
+
+    def _add_keyframe(self, index: int) -> None:
+        """Describe the frame in `self._view`, link its segment if it stands alone, adjust the last keyframes."""
+        assert self._view is not None
+        new = keyframe(index, self._view.gray.plain, self._view.usable, self._view.depth)
+        segment = self.segment[index]
+        others = [old for old in self.keyframes if self.segment[old.frame] != segment]
+        self.keyframes.append(new)
+        if others:
+            tried = [*others[-RECENT:], *(others[i] for i in spread(max(len(others) - RECENT, 0), OLDER))]
+            links = [(link(self.lens, old, self.poses[old.frame], self.scales[old.frame], new), old) for old in tried]
+            found = [(each, old) for each, old in links if each is not None]
+            if found:
+                best, old = max(found, key=lambda pair: len(pair[0].old))
+                self._move_segment(index, best, int(self.segment[old.frame]))
+        self._adjust_last()
+
+    def _move_segment(self, index: int, found: Link, target: int) -> None:
+        """Move the segment of a frame into the world in which the frame has the pose of the link."""
+        frames = np.flatnonzero(self.segment == self.segment[index])
+        factor = found.scale / self.scales[index] if self.lens.depth_is_relative else 1.0
+        back, old = np.linalg.inv(found.pose), self.poses[index].copy()
+        ids = np.unique(np.concatenate([self.tracks.ids[f] for f in frames if f < len(self.tracks.ids)] or [self._ids]))
+        points = (self.tracks.points[ids] @ old[:3, :3].T + old[:3, 3]) * factor
+        self.tracks.points[ids] = points @ back[:3, :3].T + back[:3, 3]
+        inverse = np.linalg.inv(old)
+        for frame in frames:
+            between = self.poses[frame] @ inverse
+            between[:3, 3] *= factor
+            self.poses[frame] = between @ found.pose
+        self.scales[frames] *= factor
+        self.segment[frames] = target
+
+    def _adjust_last(self) -> None:
+        """Adjust the last keyframes of the segment and their points; the oldest of them hold the world."""
+        segment = self.segment[self.keyframes[-1].frame]
+        frames = [k.frame for k in self.keyframes if self.segment[k.frame] == segment][-WINDOW:]
+        if len(frames) < 3:
+            return
+        ids, seen = self.tracks.of_frames(frames, self.scales)
+        if len(ids) < MIN_TRACKS:
+            return
+        fixed = np.arange(len(frames)) < (2 if len(frames) > 3 else 1)
+        done = adjust(self.lens.matrix, self.poses[frames], self.tracks.points[ids], seen, fixed, rounds=2, steps=1)
+        if not np.isfinite(done.poses).all():
+            return
+        self.poses[frames], self.tracks.points[ids], self.tracks.weight[ids] = (
+            done.poses,
+            done.points,
+            done.track_weight,
+        )
+        for frame in frames:
+            trusted = self.tracks.weight[self.tracks.ids[frame]] > 0.3
+            here = self.tracks.ids[frame][trusted], self.tracks.depths[frame][trusted]
+            self.scales[frame] = self._scale(self.poses[frame], *here, self.scales[frame])
+
+    def _refill(self, index: int, view: _View) -> None:
+        """Detect new corners where tracks died; their points come from depth."""
+        if len(self._ids) >= REFRESH * MAX_CORNERS:
+            return
+        pixels = new_corners(view.gray, view.usable, view.depth, self._pixels)
+        depths = sampled(view.depth, pixels).astype(np.float32)
+        z = depths.astype(np.float64) * self.scales[index]
+        points = back_projected(self.lens.matrix, self.poses[index], pixels.astype(np.float64), z)
+        ids = self.tracks.add_points(points, keypoint=False)
+        self.tracks.see(index, ids, pixels, depths)
+        self._ids, self._pixels = np.concatenate([self._ids, ids]), np.concatenate([self._pixels, pixels])
+
+
+def follow_camera(
+    frame: Callable[[int], PoseInput], count: int, lens: Lens, progress: Callable[[int], None] = lambda done: None
+) -> Follower:
+    """Follow the camera through frames 0..count-1, each read once, in order."""
+    follower = Follower(lens, count)
+    for index in range(count):
+        follower.follow(index, frame(index))
+        progress(index + 1)
+    return follower

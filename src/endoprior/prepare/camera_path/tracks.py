@@ -1,0 +1,101 @@
+"""All tracks of a clip: where each point was seen, and where it is. No image is kept. `P` points."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .adjust import Observations
+from .seen import Lens
+
+HELD_OUT = 8
+"""One in this many tracks takes no part in any estimate: it measures how well a path explains the frames."""
+PIXEL_STD = 0.5
+"""Error of a followed corner, px of an image 640 px wide."""
+KEYPOINT_STD = 1.0
+"""Error of a matched keypoint, px of an image 640 px wide."""
+DISPARITY_STD = 0.2
+"""Error of stereo, px."""
+DEPTH_STD = {False: 0.02, True: 0.15}
+"""Error of other depth as a share of it, by whether it is relative."""
+
+
+class Tracks:
+    """Observations by frame, and the points they belong to."""
+
+    def __init__(self, lens: Lens) -> None:
+        self.lens = lens
+        self.count = 0
+        self.ids: list[NDArray[np.int32]] = []
+        self.pixels: list[NDArray[np.float32]] = []
+        self.depths: list[NDArray[np.float32]] = []
+        self.points, self.weight = np.zeros((0, 3)), np.zeros(0)
+        self.keypoint = np.zeros(0, bool)
+        self.adjusted = np.zeros(0, bool)
+
+    def copy(self) -> Tracks:
+        """The same observations; points and weights of its own."""
+        out = copy.copy(self)
+        out.points, out.weight = self.points.copy(), np.ones_like(self.weight)
+        out.adjusted = np.zeros_like(self.adjusted)
+        return out
+
+    def add_points(self, points: NDArray, *, keypoint: bool) -> NDArray[np.int32]:
+        """Ids of new points (N, 3)."""
+        first, self.count = self.count, self.count + len(points)
+        while self.count > len(self.points):
+            more = max(1024, len(self.points))
+            self.points = np.concatenate([self.points, np.zeros((more, 3))])
+            self.weight = np.concatenate([self.weight, np.ones(more)])
+            self.keypoint = np.concatenate([self.keypoint, np.zeros(more, bool)])
+            self.adjusted = np.concatenate([self.adjusted, np.zeros(more, bool)])
+        self.points[first : self.count], self.keypoint[first : self.count] = points, keypoint
+        return np.arange(first, self.count, dtype=np.int32)
+
+    def see(self, frame: int, ids: NDArray, pixels: NDArray, depths: NDArray) -> None:
+        """Add observations to a frame; depth in mm before any scale, 0 where missing."""
+        while len(self.ids) <= frame:
+            self.ids.append(np.zeros(0, np.int32))
+            self.pixels.append(np.zeros((0, 2), np.float32))
+            self.depths.append(np.zeros(0, np.float32))
+        self.ids[frame] = np.concatenate([self.ids[frame], ids.astype(np.int32)])
+        self.pixels[frame] = np.concatenate([self.pixels[frame], pixels.astype(np.float32)])
+        self.depths[frame] = np.concatenate([self.depths[frame], depths.astype(np.float32)])
+
+    def held_out(self, ids: NDArray) -> NDArray[np.bool_]:
+        """(N,) which tracks take no part in estimates."""
+        return ids % HELD_OUT == HELD_OUT - 1
+
+    def measured(self, ids: NDArray, depths: NDArray, scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(N,) inverse depth, 1/mm, and (N, 2) standard deviations of pixel and inverse depth."""
+        lens, there = self.lens, depths > 0
+        inverse = 1 / np.where(there, depths.astype(np.float64) * scale, 1.0)
+        if lens.baseline_mm and not lens.depth_is_relative:
+            std = np.full(len(ids), DISPARITY_STD / (lens.matrix[0, 0] * lens.baseline_mm))
+        else:
+            std = DEPTH_STD[lens.depth_is_relative] * inverse
+        pixel = np.where(self.keypoint[ids], KEYPOINT_STD, PIXEL_STD) * lens.px
+        return inverse, np.stack([pixel, np.where(there, std, np.inf)], 1)
+
+    def of_frames(self, frames: list[int], scales: NDArray, least: int = 2) -> tuple[NDArray[np.int32], Observations]:
+        """Points seen in at least `least` of the frames, and their observations, for an adjustment.
+
+        Args:
+            scales: (T,) factor of the depth of every frame of the clip.
+        """
+        ids = np.concatenate([self.ids[f] for f in frames])
+        camera = np.repeat(np.arange(len(frames)), [len(self.ids[f]) for f in frames])
+        scale = np.repeat(scales[frames], [len(self.ids[f]) for f in frames])
+        pixels = np.concatenate([self.pixels[f] for f in frames]).astype(np.float64)
+        depths = np.concatenate([self.depths[f] for f in frames])
+        number = np.bincount(ids, minlength=self.count)
+        keep = (number[ids] >= least) & ~self.held_out(ids)
+        ids, camera, pixels, depths, scale = ids[keep], camera[keep], pixels[keep], depths[keep], scale[keep]
+        inverse, sigma = self.measured(ids, depths * scale.astype(np.float32), 1.0)
+        if self.lens.depth_is_relative:
+            # The depth of one place is wrong in the same way in every frame: all of them count as one measurement.
+            sigma[:, 1] *= np.sqrt(number[ids])
+        points, point = np.unique(ids, return_inverse=True)
+        return points, Observations(camera, point, pixels, inverse, sigma)

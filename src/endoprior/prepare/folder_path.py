@@ -1,0 +1,130 @@
+"""The camera path of a sequence folder: estimate it and write it into the folder, as `prepare` does for a video."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import input_error
+from ..data.description import intrinsics_of, read_description
+from ..data.endonerf import read_poses_bounds
+from ..data.files import demand_count, list_files
+from ..data.images import decode_image, read_color, read_depth, read_tool_mask
+from ..data.pose_writing import (
+    POSES,
+    demand_writable,
+    depth_bounds,
+    pose_table,
+    replace_depth,
+    replace_poses,
+)
+from ..system.atomic import write_json
+from .camera_path.seen import CameraPath, Lens, PoseInput
+from .camera_path.sequence_path import (
+    ASSUMED,
+    PATH_RECORD,
+    REFINED,
+    record_of_path,
+    rescaled,
+    sequence_path,
+    sources_with,
+    unexplained_frames,
+)
+
+STATIC = "static camera"
+
+
+@dataclass(frozen=True)
+class FolderPath:
+    """What was found and written."""
+
+    camera_to_world: NDArray[np.float64]
+    """(T, 4, 4) mm."""
+    relative: bool
+    """Lengths have no unit."""
+    unexplained: list[int]
+    """Frames without a pose, or of another scene."""
+    kept: Path | None
+    """The file of the poses that were there, if it was kept."""
+    notes: list[str]
+    """Notes for the user, one line each."""
+
+
+def write_folder_path(
+    folder: Path, how: str = "auto", progress: Callable[[int, int], None] = lambda done, total: None
+) -> FolderPath:
+    """Find the camera path of a sequence folder and write it there, with relative depth at the scale of the path.
+
+    Args:
+        folder: with `images/ masks/ depth/` and, for the focal length, `sequence.json` or old poses.
+        how: as `--poses` of `prepare`.
+        progress: is told the number of frames followed, and of all.
+    Raises:
+        InputError: no sequence folder, read-only, or the poses named by `how` cannot be used; nothing is written.
+    """
+    demand_writable(folder)
+    images, masks, depths = (list_files(folder / part, (".png",), "EndoNeRF") for part in ("images", "masks", "depth"))
+    for part, files in (("masks", masks), ("depth", depths)):
+        demand_count(files, folder / part, len(images))
+    described = read_description(folder / "sequence.json")
+    height, width = read_color(images[0]).shape[:2]
+    size, scale = (width, height), float(described.get("depth_scale", 1.0))
+    fx, fy, cx, cy = intrinsics_of(
+        folder / "sequence.json", described, width, height, _focal(folder, described, images)
+    )
+    tool_value, relative = described.get("mask_tool_value", 255), described.get("depth_relative", False)
+
+    def colors() -> Iterator[NDArray[np.uint8]]:
+        return (read_color(file, size) for file in images)
+
+    def tissue(index: int) -> NDArray[np.bool_]:
+        return ~read_tool_mask(masks[index], tool_value, size)
+
+    def frame(index: int) -> PoseInput:
+        return PoseInput(read_color(images[index], size), tissue(index), read_depth(depths[index], scale, size))
+
+    sources = described.get("sources", {})
+    path, notes = sequence_path(
+        how,
+        frame,
+        lambda: (colors(), map(tissue, range(len(images)))),
+        len(images),
+        Lens.centered_at_half(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), relative, described.get("baseline_mm")),
+        size,
+        has_depth=True,
+        refine_focal=sources.get("lens") in (ASSUMED, REFINED),
+        progress=lambda done: progress(done, len(images)),
+    )
+    unexplained = unexplained_frames(path, colors())
+    new = path or CameraPath(np.tile(np.eye(4), (len(images), 1, 1)), np.ones(len(images), bool), np.ones(len(images)))
+    if relative and path is not None:
+        scaled = zip(depths, path.depth_scale, strict=True)
+        replace_depth(folder, ((file.name, rescaled(decode_image(file, size), float(s))) for file, s in scaled))
+    focal = fx * new.focal_factor
+    bounds = np.array([depth_bounds(decode_image(file, size), scale) for file in depths])
+    facts = {"width": width, "height": height, "fx": focal, "fy": fy * new.focal_factor, "cx": cx, "cy": cy}
+    origin = sources | {"poses": STATIC} if path is None else sources_with(sources, path)
+    more = facts | {"sources": origin, "unexplained_frames": unexplained}
+    table = pose_table(new.camera_to_world, height, width, focal, bounds)
+    kept = replace_poses(folder, table, described | more, ours="poses" in sources)
+    if path is not None:
+        write_json(folder / PATH_RECORD, record_of_path(path))
+    return FolderPath(new.camera_to_world, relative, unexplained, kept, notes)
+
+
+def _focal(folder: Path, described: dict[str, Any], images: list[Path]) -> float:
+    """The focal length of the old poses, px, where `sequence.json` has none."""
+    if "fx" in described:
+        return float(described["fx"])
+    if not (folder / POSES).exists():
+        fix = 'write it to sequence.json: {"fx": 600.0}, px.'
+        raise input_error(folder / "sequence.json", "the focal length fx", "neither that nor old poses", fix)
+    focal = float(read_poses_bounds(folder / POSES, len(images))[0, 2, 4])
+    if not focal > 0:
+        raise input_error(folder / POSES, "a focal length > 0 px", f"{focal:g}", "correct row 0, column 14.")
+    return focal

@@ -1,0 +1,395 @@
+"""The camera path: residuals and their derivatives, adjustment, whole paths of a relief, losses, rests, bad input."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from relief import HEIGHT, MATRIX, WIDTH, lens, path, pose, smooth, view
+
+from endoprior.core.checks import InputError
+from endoprior.prepare.camera_path import choose, colmap
+from endoprior.prepare.camera_path.adjust import Observations, adjust, weights
+from endoprior.prepare.camera_path.breathing import breathing_period
+from endoprior.prepare.camera_path.choose import find_path
+from endoprior.prepare.camera_path.corners import gray_of, new_corners, sampled, usable_tissue
+from endoprior.prepare.camera_path.explained import explained_share
+from endoprior.prepare.camera_path.follow import follow_camera
+from endoprior.prepare.camera_path.given import ray_points, with_poses
+from endoprior.prepare.camera_path.own import own_path
+from endoprior.prepare.camera_path.pose_file import read_poses
+from endoprior.prepare.camera_path.resection import refined_pose
+from endoprior.prepare.camera_path.residuals import back_projected, derivatives, moved, residuals
+from endoprior.prepare.camera_path.seen import PoseInput
+from endoprior.prepare.camera_path.sequence_path import sequence_path
+
+SIZE = (WIDTH, HEIGHT)
+OPENCV = lens().matrix
+
+
+def scene(cameras=6, points=80, seed=0):
+    """Cameras (world-to-camera), points and what each camera sees of each point, without any error."""
+    rng = np.random.default_rng(seed)
+    poses = np.linalg.inv(path(cameras, 3.0))
+    world = rng.uniform([-30, -25, 70], [40, 25, 95], (points, 3))
+    camera, point = (index.ravel() for index in np.meshgrid(np.arange(cameras), np.arange(points), indexing="ij"))
+    seen = poses[camera, :3, :3] @ world[point, :, None]
+    seen = seen[:, :, 0] + poses[camera, :3, 3]
+    pixels = seen[:, :2] / seen[:, 2:] * [OPENCV[0, 0], OPENCV[1, 1]] + OPENCV[:2, 2]
+    sigma = np.tile([0.5, 0.2 / (OPENCV[0, 0] * 4)], (len(camera), 1))
+    return poses, world, Observations(camera, point, pixels, 1 / seen[:, 2], sigma)
+
+
+def shaken(poses, world, seed=1):
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(0, 1, (len(poses), 6)) * [0.01, 0.01, 0.01, 1, 1, 1]
+    steps[0] = 0
+    return moved(poses, steps), world + rng.normal(0, 1.0, world.shape)
+
+
+def centers(paths):
+    return paths[:, :3, 3]
+
+
+def drift(found, true):
+    """Largest distance of the centers, mm; both paths start at the origin."""
+    return np.linalg.norm(centers(found) - centers(np.linalg.inv(true[0]) @ true), axis=1).max()
+
+
+def test_residuals_vanish_where_the_point_is_seen():
+    poses, world, seen = scene()
+    error = residuals(OPENCV, poses[seen.camera], world[seen.point], seen.pixels, seen.inverse_depth, seen.sigma)
+    assert np.abs(error).max() < 1e-9
+    unmeasured = np.stack([seen.sigma[:, 0], np.full(len(seen.camera), np.inf)], 1)
+    error = residuals(OPENCV, poses[seen.camera], world[seen.point] + 1, seen.pixels, seen.inverse_depth, unmeasured)
+    assert np.all(error[:, 2] == 0) and np.abs(error[:, :2]).min(1).max() > 0
+
+
+def test_derivatives_equal_finite_differences():
+    poses, world, seen = scene(3, 7)
+    poses, world = shaken(poses, world)
+    a, x = poses[seen.camera], world[seen.point]
+    rest = seen.pixels, seen.inverse_depth, seen.sigma
+    by_pose, by_point, by_focal = derivatives(OPENCV, a, x, seen.sigma)
+    for i in range(len(seen.camera)):  # slowly: one observation and one parameter at a time
+        one = [part[i : i + 1] for part in rest]
+
+        def at(pose_=a[i : i + 1], point_=x[i : i + 1], matrix=OPENCV, one=one):
+            return residuals(matrix, pose_, point_, *one)[0]
+
+        for k in range(6):
+            step = np.zeros((1, 6))
+            step[0, k] = 1e-6
+            slope = (at(pose_=moved(a[i : i + 1], step)) - at(pose_=moved(a[i : i + 1], -step))) / 2e-6
+            assert np.allclose(by_pose[i, :, k], slope, rtol=1e-5, atol=1e-5)
+        for k in range(3):
+            step = np.zeros((1, 3))
+            step[0, k] = 1e-5
+            slope = (at(point_=x[i : i + 1] + step) - at(point_=x[i : i + 1] - step)) / 2e-5
+            assert np.allclose(by_point[i, :, k], slope, rtol=1e-5, atol=1e-5)
+        bigger, smaller = OPENCV.copy(), OPENCV.copy()
+        bigger[[0, 1], [0, 1]] *= np.exp(1e-6)
+        smaller[[0, 1], [0, 1]] *= np.exp(-1e-6)
+        assert np.allclose(by_focal[i], (at(matrix=bigger) - at(matrix=smaller)) / 2e-6, rtol=1e-5, atol=1e-5)
+
+
+def test_adjustment_recovers_an_exact_scene():
+    poses, world, seen = scene()
+    found = adjust(OPENCV, *shaken(poses, world), seen, np.arange(6) == 0, rounds=6, steps=4, widest=16)
+    assert np.abs(found.poses - poses).max() < 1e-5 and np.abs(found.points - world).max() < 1e-4
+    assert found.track_weight.min() > 0.99
+
+
+def test_tracks_that_move_fall_out_by_their_history():
+    poses, world, seen = scene(8, 100)
+    moving = seen.point < 30
+    swing = np.sin(seen.camera)[:, None] * [6.0, 3.0]
+    seen = replace(seen, pixels=seen.pixels + np.where(moving[:, None], swing, 0))
+    found = adjust(OPENCV, *shaken(poses, world), seen, np.arange(8) == 0, rounds=8, steps=3, widest=16)
+    assert found.track_weight[:30].max() < 0.2 < 0.9 < found.track_weight[30:].min()
+    assert np.abs(found.poses - poses).max() < 0.02
+
+
+def test_one_mistake_does_not_condemn_a_track():
+    error = np.zeros((20, 3))
+    error[7, 0] = 500.0
+    weight, track = weights(error, np.repeat([0, 1], 10), 2)
+    assert track[1] == 1 and track[0] > 0.01 and weight[7, 0] < 1e-6
+
+
+def test_the_focal_length_is_refined():
+    poses, world, seen = scene(8, 100)
+    no_depth = replace(seen, sigma=np.stack([seen.sigma[:, 0], np.full(len(seen.camera), np.inf)], 1))
+    wrong = OPENCV.copy()
+    wrong[[0, 1], [0, 1]] *= 0.93
+    fixed = np.arange(8) < 2
+    found = adjust(wrong, poses, world, no_depth, fixed, rounds=8, steps=4, focal_prior=2.0, widest=16)
+    assert abs(found.focal_factor - 1 / 0.93) < 0.002 and 0 < found.focal_std < 0.1
+
+
+def test_all_cameras_may_be_fixed():
+    poses, world, seen = scene()
+    found = adjust(OPENCV, poses, world + 0.5, seen, np.ones(6, bool), rounds=4, steps=3)
+    assert np.array_equal(found.poses, poses) and np.abs(found.points - world).max() < 1e-4
+
+
+def test_the_pose_of_one_frame():
+    poses, world, seen = scene(2, 60)
+    here = seen.camera == 1
+    part = seen.pixels[here], seen.inverse_depth[here], seen.sigma[here]
+    start = moved(poses[1:], np.array([[0.01, -0.01, 0.02, 1.0, -1.0, 0.5]]))[0]
+    found = refined_pose(OPENCV, start, world, *part, np.ones(60))
+    assert np.abs(found.pose - poses[1]).max() < 1e-6 and found.inlier.all() and found.translation_std < 1e-5
+    noise = np.random.default_rng(0).normal(0, 0.5, (200, 60, 2))
+    many = [refined_pose(OPENCV, start, world, part[0] + n, part[1], part[2], np.ones(60)) for n in noise[:40]]
+    off = np.array([np.linalg.norm(np.linalg.inv(f.pose)[:3, 3] - np.linalg.inv(poses[1])[:3, 3]) for f in many])
+    claimed = np.median([f.translation_std for f in many])
+    assert 0.5 < np.sqrt((off**2).mean()) / claimed < 2  # the depth is exact here, so the claim is a little too large
+
+
+def test_rays_meet_in_their_points():
+    follower = follow_camera([view(p) for p in path(8, 2.0)].__getitem__, 8, lens())
+    tracks, poses = follower.tracks, np.linalg.inv(path(8, 2.0))
+    world = np.random.default_rng(0).uniform([-10, -10, 75], [10, 10, 85], (tracks.count, 3))
+    for f in range(8):  # what it would see of these points
+        seen = world[tracks.ids[f]] @ poses[f][:3, :3].T + poses[f][:3, 3]
+        tracks.pixels[f] = seen[:, :2] / seen[:, 2:] * [OPENCV[0, 0], OPENCV[1, 1]] + OPENCV[:2, 2]
+    found, spread = ray_points(tracks, poses, np.ones(8, bool))
+    assert np.abs(found - world)[spread > 0.02].max() < 1e-3
+    assert np.all(spread[np.bincount(np.concatenate(tracks.ids), minlength=tracks.count) < 2] == 0)
+
+
+@pytest.fixture(scope="module")
+def relief():
+    """24 frames of a relief and their true poses."""
+    true = path(24)
+    return [view(p) for p in true], true
+
+
+def test_a_path_is_recovered(relief):
+    frames, true = relief
+    found, _ = own_path(frames.__getitem__, len(frames), lens(), SIZE)
+    assert found.explained.all() and not found.still.any()
+    # 25 mm long, before a relief 80 mm away; tracks of 160 px images are good to about 0.1 px.
+    assert drift(found.camera_to_world, true) < 0.4
+    turn = np.linalg.inv(found.camera_to_world[:, :3, :3]) @ true[:, :3, :3]
+    assert np.abs(turn - turn[0]).max() < 0.005
+    assert np.nanmedian(found.translation_std) < 0.5 and np.all(found.depth_scale == 1)
+
+
+def test_relative_depth_gets_one_scale_per_frame(relief):
+    frames, true = relief
+    factor = 1 + 0.2 * np.sin(np.arange(24))
+    wrong = [replace(seen, depth=seen.depth * np.float32(f)) for seen, f in zip(frames, factor, strict=True)]
+    found, _ = own_path(wrong.__getitem__, 24, lens(relative=True), SIZE)
+    product = found.depth_scale * factor
+    assert np.ptp(product) / product.mean() < 0.02
+    assert np.exp(np.median(np.log(found.depth_scale))) == pytest.approx(1)
+    measured = found.camera_to_world.copy()
+    measured[:, :3, 3] /= product.mean()
+    assert drift(measured, true) < 1.5  # shape and scale of the depth are free
+
+
+def test_given_poses_scale_relative_depth(relief):
+    frames, true = relief
+    wrong = [replace(s, depth=s.depth * np.float32(0.5 + 0.02 * i)) for i, s in enumerate(frames)]
+    follower = follow_camera(wrong.__getitem__, 24, lens(relative=True))
+    scales = with_poses(follower, np.linalg.inv(true), np.ones(24, bool)).scales
+    assert np.allclose(scales * (0.5 + 0.02 * np.arange(24)), 1, atol=0.03)
+
+
+def test_a_lost_camera_is_found_again(relief):
+    frames, true = relief
+    other = [replace(frames[0], rgb_u8=smooth(HEIGHT, WIDTH, seed=9 + i)) for i in range(3)]
+    order = [*range(12), *range(18, 24)]  # after the gap the camera is elsewhere
+    seen = [*(frames[i] for i in order[:12]), *other, *(frames[i] for i in order[12:])]
+    found, _ = own_path(seen.__getitem__, len(seen), lens(), SIZE)
+    assert np.flatnonzero(~found.explained).tolist() == [12, 13, 14]
+    assert all(np.array_equal(found.camera_to_world[i], found.camera_to_world[11]) for i in (12, 13, 14))
+    kept = np.flatnonzero(found.explained)
+    assert drift(found.camera_to_world[kept], true[order]) < 0.8
+
+
+def test_a_leap_is_bridged(relief):
+    frames, true = relief
+    order = [0, 1, 2, 3, 14, 15, 16]
+    found, _ = own_path([frames[i] for i in order].__getitem__, len(order), lens(), SIZE)
+    assert found.explained.all() and drift(found.camera_to_world, true[order]) < 1.0
+
+
+def test_rests_are_copied_exactly():
+    rng = np.random.default_rng(0)
+    stops = [path(5)[0]] * 12 + list(path(14)) + [path(14)[-1]] * 12
+    seen = [view(p) for p in stops]
+    seen = [
+        replace(s, rgb_u8=np.clip(s.rgb_u8 + rng.normal(0, 1.5, s.rgb_u8.shape), 0, 255).astype(np.uint8)) for s in seen
+    ]
+    found, _ = own_path(seen.__getitem__, len(seen), lens(), SIZE)
+    for span in (slice(0, 12), slice(26, 38)):
+        assert found.still[span].all()
+        assert np.ptp(found.camera_to_world[span], axis=0).max() == 0
+    assert not found.still[15:23].any() and drift(found.camera_to_world, np.array(stops)) < 0.5
+
+
+def test_pulled_tissue_does_not_move_the_camera():
+    true = path(24)
+
+    def pull(strength):
+        return lambda x, y: strength * np.exp(-((x - 5) ** 2 + y**2) / 150)[..., None] * [5.0, -3.0]
+
+    seen = [view(p, move=pull(np.sin(i / 4))) for i, p in enumerate(true)]
+    found, follower = own_path(seen.__getitem__, 24, lens(), SIZE)
+    assert found.explained.all() and drift(found.camera_to_world, true) < 0.8
+    weight = follower.tracks.weight[: follower.tracks.count][follower.tracks.adjusted[: follower.tracks.count]]
+    assert weight.min() < 0.1 < 0.5 < np.median(weight)
+
+
+def test_the_true_path_explains_more_than_others(relief):
+    frames, _ = relief
+    found, follower = own_path(frames.__getitem__, 24, lens(), SIZE)
+    right = explained_share(follower.tracks, lens(), found)
+    resting = replace(found, camera_to_world=np.tile(np.eye(4), (24, 1, 1)))
+    dropped = replace(found, explained=np.arange(24) % 2 == 0)
+    assert right > 0.8 and explained_share(follower.tracks, lens(), resting) < 0.7 * right
+    assert explained_share(follower.tracks, lens(), dropped) < 0.6 * right  # half of the frames are missing
+    nothing = replace(found, explained=np.zeros(24, bool))
+    assert explained_share(follower.tracks, lens(), nothing) == 0
+
+
+@pytest.mark.parametrize("kind", ["black", "no depth", "all tool", "flat", "NaN depth"])
+def test_frames_that_show_nothing_have_no_pose(kind, relief):
+    good = relief[0][0]
+    bad = {
+        "black": replace(good, rgb_u8=np.zeros_like(good.rgb_u8)),
+        "no depth": replace(good, depth=np.zeros_like(good.depth)),
+        "all tool": replace(good, tissue_mask=np.zeros_like(good.tissue_mask)),
+        "flat": replace(good, rgb_u8=np.full_like(good.rgb_u8, 128)),
+        "NaN depth": replace(good, depth=np.full_like(good.depth, np.nan)),
+    }[kind]
+    found, _ = own_path([bad, bad, bad].__getitem__, 3, lens(), SIZE)
+    assert np.array_equal(found.camera_to_world, np.tile(np.eye(4), (3, 1, 1)))
+    frames = [*relief[0][:5], bad, *relief[0][5:9]]
+    found, _ = own_path(frames.__getitem__, len(frames), lens(), SIZE)
+    assert np.isfinite(found.camera_to_world).all() and found.explained.sum() >= 9
+
+
+def test_corners_keep_off_edges_tools_and_each_other(relief):
+    seen = relief[0][0]
+    mask = seen.tissue_mask.copy()
+    mask[:, :40] = False
+    depth = seen.depth.copy()
+    depth[:, 100:] += 30
+    seen = PoseInput(seen.rgb_u8, mask, depth)
+    gray, usable = gray_of(seen.rgb_u8), usable_tissue(seen)
+    taken = np.array([[70.0, 60.0]], np.float32)
+    corners = new_corners(gray, usable, depth, taken)
+    assert len(corners) > 20 and corners[:, 0].min() > 42
+    assert (np.abs(corners[:, 0] - 99.5) > 1).all()
+    assert np.hypot(*(corners - taken).T).min() >= 4
+    assert sampled(depth, np.array([[np.nan, 1], [-5, 3], [1e9, 2]])).tolist() == [0, 0, 0]
+
+
+def test_back_projection_inverts_projection():
+    p = np.linalg.inv(pose([0.1, -0.2, 0.3], [3, 4, 5]))
+    points = back_projected(OPENCV, p, np.array([[10.0, 20.0], [100.0, 70.0]]), np.array([50.0, 80.0]))
+    seen = points @ p[:3, :3].T + p[:3, 3]
+    assert np.allclose(seen[:, 2], [50, 80])
+    assert np.allclose(seen[:, :2] / seen[:, 2:] * MATRIX[0, 0] + OPENCV[:2, 2], [[10, 20], [100, 70]])
+
+
+def test_the_better_path_is_taken(relief, monkeypatch):
+    frames, _ = relief
+    args = frames.__getitem__, 24, lens(), SIZE
+    monkeypatch.setattr(choose, "is_installed", lambda: False)
+    own = find_path(*args)
+    assert own.method == "our own tracks" and not own.notes
+    with pytest.raises(InputError, match="expected the package pycolmap"):
+        monkeypatch.setattr(choose, "install_command", lambda extra: f"pip install {extra}")
+        find_path(*args, "colmap")
+    worse = replace(own, method="COLMAP", camera_to_world=np.tile(np.eye(4), (24, 1, 1)))
+    monkeypatch.setattr(choose, "is_installed", lambda: True)
+    monkeypatch.setattr(choose, "colmap_path", lambda *args, **options: worse)
+    assert find_path(*args).method == "our own tracks" and "COLMAP explains" in find_path(*args).notes[0]
+    assert find_path(*args, "colmap").method == "COLMAP"
+    monkeypatch.setattr(choose, "colmap_path", lambda *args, **options: None)
+    assert "too few frames" in find_path(*args).notes[0]
+    with pytest.raises(InputError, match="COLMAP can register"):
+        find_path(*args, "colmap")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not colmap.is_installed(), reason="needs pycolmap: pip install pycolmap")
+def test_colmap_finds_the_path():
+    import relief as module
+
+    true = path(24)
+    found = find_path([view(p) for p in true].__getitem__, 24, lens(), (module.WIDTH, module.HEIGHT), "colmap")
+    assert found.method == "COLMAP" and found.explained.mean() > 0.9
+    assert drift(found.camera_to_world, true) < 2.0
+
+
+def test_breathing_is_not_given_to_the_camera():
+    true = path(60, 0.3)
+    swell = [np.array([1.5 * np.sin(2 * np.pi * i / 15), 1.0 * np.cos(2 * np.pi * i / 15)]) for i in range(60)]
+
+    def breath(i):
+        return lambda x, y: swell[i] * (1 + 0.3 * np.sin(x / 14) * np.cos(y / 12))[..., None]
+
+    seen = [view(p, move=breath(i)) for i, p in enumerate(true)]
+    found, follower = own_path(seen.__getitem__, 60, lens(), SIZE)
+    assert found.breathes and 14.5 < float(re.search(r"every ([0-9.]+) frames", found.notes[0])[1]) < 15.5
+    off = centers(found.camera_to_world) - centers(true)
+    leaked = np.linalg.norm(off - off.mean(0), axis=1)
+    assert np.sqrt((leaked**2).mean()) < 0.5  # of 1.3 mm
+    assert follower.tracks.weight[follower.tracks.adjusted].size > 50
+
+
+def test_no_breath_where_nothing_repeats(relief):
+    frames, _ = relief
+    found, _ = own_path([frames[i] for i in [*range(24), *range(22, -1, -1)]].__getitem__, 47, lens(), SIZE)
+    assert not found.breathes
+
+
+def test_a_period_is_found_to_a_tenth():
+    rng = np.random.default_rng(0)
+    frames, basis = rng.integers(0, 200, 1500), np.stack([np.ones(1500), rng.normal(size=1500)], 1)
+    by_point = np.tile(np.eye(3), (1500, 1, 1))
+    swing = 0.5 * (basis[:, 1] * np.sin(2 * np.pi * frames / 27.3))[:, None] * [1.0, 0.5, 0.0]
+    error, weight = swing + rng.normal(0, 0.5, (1500, 3)), np.ones((1500, 3))
+    assert breathing_period(error, by_point, weight, basis, frames, 200) == pytest.approx(27.3, abs=0.3)
+    noise = rng.normal(0, 0.5, (1500, 3))
+    assert breathing_period(noise, by_point, weight, basis, frames, 200) is None
+    assert breathing_period(error, by_point, weight, basis, frames, 20) is None  # too short for three breaths
+
+
+def still_views(frames):
+    return lambda: ((f.rgb_u8 for f in frames), (f.tissue_mask for f in frames))
+
+
+def test_a_static_camera_has_no_path(relief):
+    frames = [relief[0][0]] * 6
+    args = frames.__getitem__, still_views(frames), 6, lens(), SIZE
+    found, notes = sequence_path("auto", *args, has_depth=True, refine_focal=False)
+    assert found is None and "static" in notes[0]
+    assert sequence_path("still", *args, has_depth=True, refine_focal=False) == (None, [])
+    found, _ = sequence_path("own", *args, has_depth=True, refine_focal=False)
+    assert np.array_equal(found.camera_to_world, np.tile(np.eye(4), (6, 1, 1))) or not found.still.any()
+
+
+def test_a_path_needs_depth(relief):
+    frames, _ = relief
+    args = frames.__getitem__, still_views(frames), 24, lens(), SIZE
+    found, notes = sequence_path("auto", *args, has_depth=False, refine_focal=False)
+    assert found is None and "without depth its path cannot be estimated" in notes[0]
+
+
+def test_poses_from_a_file(tmp_path):
+    poses = path(3)
+    np.save(tmp_path / "p.npy", poses)
+    assert np.allclose(read_poses(tmp_path / "p.npy", 3), poses)
+    with pytest.raises(InputError, match=r"expected shape \(4, 4, 4\), one pose per frame, got \(3, 4, 4\)"):
+        read_poses(tmp_path / "p.npy", 4)
+    poses[1, 0, 0] = np.nan
+    np.save(tmp_path / "p.npy", poses)
+    with pytest.raises(InputError, match="expected finite numbers"):
+        read_poses(tmp_path / "p.npy", 3)
