@@ -17,6 +17,7 @@ from .usage_errors import unknown_command
 
 COMMANDS = {
     "run": "from a video to a model to look at: prepare, check, train, score, video, player",
+    "batch": "many videos and sequence folders: run for each, on this computer or a Ray cluster",
     "demo": "phantom sequence -> train -> eval -> render, with a summary and pictures",
     "phantom": "write a synthetic surgical sequence with full ground truth",
     "prepare": "write a sequence folder from a video: rectified frames, depth, tool masks, poses",

@@ -77,7 +77,7 @@ HELP = Help(
 
 def run(argv: list[str]) -> None:
     """Train, score, and print the results."""
-    args = _arguments(argv)
+    args = arguments(argv)
     wanted = device_to_resume(args.config) if args.resume and args.device == "auto" else args.device
     cfg = with_device(args.config, wanted)
     if args.weights_dir and not args.weights_dir.is_dir():
@@ -148,7 +148,7 @@ def _logged_seconds(log: Path) -> float:
     return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0
 
 
-def _arguments(argv: list[str]) -> Train:
+def arguments(argv: list[str]) -> Train:
     """The parsed arguments. A resumed run takes its config from its folder, and its data too if only RUN is given.
 
     Raises:

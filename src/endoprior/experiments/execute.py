@@ -106,7 +106,7 @@ def ray_executor(address: str, threads: int) -> Iterator[Executor]:
         def execute(jobs: list[Job]) -> Iterator[Outcome]:
             for job in jobs:
                 cluster.start(job, run_job, job, cores=threads)
-            while len(cluster):
+            while cluster.num_running:
                 ended = cluster.next()
                 yield ended.value or Outcome(ended.key, 0.0, f"{ended.error}")
 

@@ -57,6 +57,9 @@ class Trained:
     notes: tuple[str, ...]
     """Lines for the user about the sequence."""
 
+    def __str__(self) -> str:
+        return f"trained in {self.seconds:.0f} s, {self.num_gaussians:,} Gaussians"
+
 
 def trainings(run: TrainingRun | WindowedRun, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> list[Training]:
     """What is left to train of a run in a folder; a run of several windows has been `opened`."""
@@ -64,8 +67,8 @@ def trainings(run: TrainingRun | WindowedRun, checkpoint_seconds: float = CHECKP
     out, threads = run.out.absolute(), Threads.of_this_process()
     if isinstance(run, TrainingRun):
         sequence, cfg = run.trainer.sequence, run.trainer.cfg
-        data, name = sequence.path.absolute(), f"{sequence.path}"
-        return [Training(name, data, cfg, out, run.resume, threads, checkpoint_seconds)]
+        data = sequence.path.absolute()
+        return [Training("the whole sequence", data, cfg, out, run.resume, threads, checkpoint_seconds)]
     return [
         Training(
             name=run.window_name(k),
@@ -96,10 +99,10 @@ def train_here(training: Training) -> Trained:
     return Trained(len(scene), clock.perf_counter() - began, found)
 
 
-def start_training(cluster: Cluster, training: Training, cores: int) -> None:
-    """Train on a cluster with so many cores; `cluster.next` tells how it ended, with `training` as its key."""
+def start_training_on(cluster: Cluster, key: object, training: Training, cores: int) -> None:
+    """Train on a cluster with so many cores; `cluster.next` tells how `key` ended."""
     sent = replace(training, threads=replace(training.threads, numba=cores))
-    cluster.start(training, train_here, sent, cores=cores, on_gpu=training.on_gpu, restarts=RESTARTS)
+    cluster.start(key, train_here, sent, cores=cores, on_gpu=training.on_gpu, restarts=RESTARTS)
 
 
 def complete_on(
@@ -128,11 +131,11 @@ def _train_all(cluster: Cluster, left: list[Training], say: Callable[[str], None
     """Train all of them, and say when each is done."""
     cores = cluster.cores_for(len(left))
     for training in left:
-        start_training(cluster, training, cores)
+        start_training_on(cluster, training, training, cores)
     if left:
         say(f"on the cluster: {len(left)} to train, cores for each: {cores}")
     failures, told = [], set[str]()
-    while len(cluster):
+    while cluster.num_running:
         ended = cluster.next()
         if ended.error is not None:
             failures.append(ended.error)
@@ -142,11 +145,6 @@ def _train_all(cluster: Cluster, left: list[Training], say: Callable[[str], None
             if note not in told:
                 say(note)
                 told.add(note)
-        say(f"{ended.key}: {trained_words(ended.value)}; {len(cluster)} not done yet")
+        say(f"{ended.key}: {ended.value}; {cluster.num_running} not done yet")
     if failures:
         raise failures[0]
-
-
-def trained_words(trained: Trained) -> str:
-    """`trained in 12 s, 3,000 Gaussians`."""
-    return f"trained in {trained.seconds:.0f} s, {trained.num_gaussians:,} Gaussians"

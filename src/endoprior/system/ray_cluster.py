@@ -51,7 +51,8 @@ class Cluster:
     def __init__(self, ray: Any, say: Callable[[str], None]) -> None:
         self._ray, self._say, self._running = ray, say, dict[Any, _Call]()
 
-    def __len__(self) -> int:
+    @property
+    def num_running(self) -> int:
         """Number of calls that have not ended."""
         return len(self._running)
 
@@ -96,7 +97,10 @@ class Cluster:
                 return Ended(call.key, self._ray.get(reference))
             except errors.RayTaskError as error:
                 cause = getattr(error, "cause", None)
-                return Ended(call.key, error=cause if isinstance(cause, Exception) else error)
+                if not isinstance(cause, Exception):
+                    return Ended(call.key, error=error)
+                cause.__cause__ = error  # which tells where it was raised
+                return Ended(call.key, error=cause)
             except errors.RayError as error:
                 reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
                 if not call.restarts:
