@@ -15,6 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from conftest import write_tiny_sequence
@@ -407,22 +409,22 @@ def test_an_interrupted_cluster_saves_and_resumes_without_one(trained, tmp_path)
 @pytest.mark.slow
 @needs_ray
 def test_a_batch_on_a_cluster(trained, tmp_path):
-    data, config, whole = trained
-    one = write_config(tmp_path / "one.json", tiny_config("basis"))
-    train(load_sequence(data, tiny_config("basis").data), tiny_config("basis"), tmp_path / "alone")
+    data, cfgs = trained[0], {"three": in_windows(14), "one": tiny_config("basis")}
+    for name, cfg in cfgs.items():
+        write_config(tmp_path / f"{name}.json", cfg)
+        train(load_sequence(data, cfg.data), cfg, tmp_path / name)
     no_depth = shutil.copytree(data, tmp_path / "no depth")
     for file in (no_depth / "depth").iterdir():
-        shutil.copy(no_depth / "masks" / file.name, file)
-        file.write_bytes((no_depth / "masks/000000.png").read_bytes())
+        cv2.imwrite(str(file), np.zeros((40, 48), np.uint16))
     listed = tmp_path / "list.txt"
-    listed.write_text(f"three = '{data}' --config '{config}'\none = '{data}' --config '{one}'\n'{no_depth}'\n")
+    lines = [f"{name} = '{data}' --config '{tmp_path / name}.json'" for name in cfgs]
+    listed.write_text("\n".join([*lines, f"'{no_depth}'"]))
     process = begin("batch", listed, tmp_path / "out", "--ray", "local")
     said, _ = process.communicate(timeout=300)
     assert process.returncode == 1, said
     for file in SCENES:
-        assert (tmp_path / "out/three/run" / file).read_bytes() == (whole / file).read_bytes()
-    scene = (tmp_path / "out/one/run/scene.safetensors").read_bytes()
-    assert scene == (tmp_path / "alone/scene.safetensors").read_bytes()
+        assert (tmp_path / "out/three/run" / file).read_bytes() == (tmp_path / "three" / file).read_bytes()
+    assert (tmp_path / "out/one/run" / SCENES[0]).read_bytes() == (tmp_path / "one" / SCENES[0]).read_bytes()
     summary = (tmp_path / "out/summary.md").read_text()
     assert "| three | " in summary and "| one | " in summary and "\n- no depth: " in summary
     assert all((tmp_path / "out/one" / name).exists() for name in ("report.png", "video.mp4", "player.html"))

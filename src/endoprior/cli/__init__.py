@@ -17,7 +17,6 @@ from .usage_errors import unknown_command
 
 COMMANDS = {
     "run": "from a video to a model to look at: prepare, check, train, score, video, player",
-    "batch": "many videos and sequence folders: run for each, on this computer or a Ray cluster",
     "demo": "phantom sequence -> train -> eval -> render, with a summary and pictures",
     "phantom": "write a synthetic surgical sequence with full ground truth",
     "prepare": "write a sequence folder from a video: rectified frames, depth, tool masks, poses",
@@ -30,6 +29,7 @@ COMMANDS = {
     "export": "write open formats: PLY, splat, SPZ, glTF, mesh, points, tracks, depth, video",
     "view": "show a trained scene, or a sequence before training, in a web browser",
     "doctor": "report whether this computer can train and use a GPU, and what to install for it",
+    "batch": "do `run` for many videos and sequence folders, here or on a Ray cluster",
     "bench": "compare methods on sequences over seeds, under one protocol",
     "plugins": "list datasets, methods, scores and exporters: built in, and of other packages",
 }

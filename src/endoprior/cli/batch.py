@@ -93,12 +93,13 @@ def _shown(entry: Entry, step: str) -> AbstractContextManager[Progress]:
 
 def _tell(outcome: Outcome) -> None:
     """Say how a job ended, with the notes of its steps."""
-    from ..pipeline import notes_of, problems, steps_of
+    from ..pipeline import notes_of, steps_of
 
     entry = outcome.entry
     if outcome.failure:
         say(f"{entry.name}: failed: {outcome.failure}")
         return
     say(f"{entry.name}: done: {entry.job.out}")
-    for line in [*(line for step in steps_of(entry.job) for line in notes_of(step, entry.job)), *problems(entry.job)]:
-        say(f"     {line}")
+    for step in steps_of(entry.job):
+        for line in notes_of(step, entry.job):
+            say(f"     {line}")

@@ -68,7 +68,7 @@ HELP = Help(
         "what to train on": ("--data.first-frames", "--data.shrink"),
         "how long": ("--iterations", "--resume"),
         "how large": ("--gaussians",),
-        "where it runs": ("--device", "--ray"),
+        "where it runs": ("--device",),
         "during and after training": ("--view", "--no-networks", "--weights-dir"),
     },
     short={f"--{short}".replace("_", "-"): f"--{full}".replace("_", "-") for short, full in SHORT_NAMES.items()},
