@@ -179,10 +179,8 @@ STEPS = (
 
 
 def steps_of(job: SequenceJob) -> tuple[Step, ...]:
-    """The steps that a job needs: a sequence folder is not prepared, and the player shows one window only."""
-    left_out = {"prepare"} if not isinstance(job, Job) else set[str]()
-    left_out |= {"player"} if job.cfg.windows.enabled else set()
-    return tuple(step for step in STEPS if step.name not in left_out)
+    """The steps that a job needs: a sequence folder is not prepared."""
+    return STEPS if isinstance(job, Job) else STEPS[1:]
 
 
 def _usable(job: SequenceJob, num_frames: int) -> int:

@@ -102,7 +102,8 @@ class Cluster:
                 cause.__cause__ = error  # which tells where it was raised
                 return Ended(call.key, error=cause)
             except errors.RayError as error:
-                reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+                lines = [line for line in str(error).splitlines() if line.strip()]
+                reason = lines[0].partition(". ")[0].rstrip(".")[:160] if lines else type(error).__name__
                 if not call.restarts:
                     return Ended(call.key, error=RuntimeError(f"Ray: {reason}"))
                 self._say(f"{call.key}: its process died and is started again ({reason})")
@@ -139,7 +140,7 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
         ray: Any = importlib.import_module("ray")
     except ImportError:
         raise input_error("--ray", "Ray", "none", f"`{install_command('ray')}`.") from None
-    fix = "start it, correct --ray, or use `--ray local`."
+    fix = "start it, correct --ray, or use `--ray local`; if it asks for a token, set RAY_AUTH_MODE=token."
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to others
     wait_policy = {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
     try:
@@ -151,8 +152,9 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
             logging_level=logging.ERROR,
             runtime_env={"env_vars": wait_policy},
         )
-    except (ConnectionError, OSError, ValueError, RuntimeError) as error:
-        got = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    except (ConnectionError, OSError, ValueError, RuntimeError, SystemExit) as error:
+        is_silent = isinstance(error, SystemExit)  # raised by Ray, after minutes, where another program answers
+        got = "none" if is_silent else " ".join(str(error).split()).rstrip(".") or type(error).__name__
         raise input_error(f"--ray {address}", "a running cluster", got[:200], fix) from error
     cluster = Cluster(ray, say)
     try:
