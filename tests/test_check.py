@@ -1,6 +1,7 @@
 """`endoprior check`: each defect of a phantom is reported with its fix; a good sequence gives no findings."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -63,6 +64,20 @@ def only(folder: Path, code: str) -> Finding:
     found = findings(folder)
     assert list(found) == [code]
     return found[code]
+
+
+def test_windows_and_their_cost(facts):
+    """A note only where there is more than one; twice the pixels cost nearly twice the time."""
+    assert facts.windows == ((0, FRAMES),)
+    assert "windows" not in {finding.code for finding in find(facts)}
+    cut = replace(facts, windows=((0, 60), (50, 110), (100, 150)))
+    note = next(finding for finding in find(cut) if finding.code == "windows")
+    assert note.severity == "note" and "a long video: it is trained in 3 windows of 50 to 60 frames" in note.what
+    minutes = [int(re.search(r"about (\d+) min", note.what)[1])]
+    wide = replace(cut, camera=replace(facts.camera, width=1280, height=1024), camera_path_mm=50.0)
+    note = next(finding for finding in find(wide) if finding.code == "windows")
+    minutes.append(int(re.search(r"about (\d+) min", note.what)[1]))
+    assert "the camera moves far" in note.what and 3 < minutes[1] / minutes[0] < 12
 
 
 def test_a_good_sequence_gives_no_findings(facts):

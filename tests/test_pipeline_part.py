@@ -16,6 +16,11 @@ from endoprior.prepare.source import SourceFrame
 WHOLE = (0.0, math.inf)
 
 
+def test_a_long_video_is_used_to_its_end():
+    part = choose_part(300.0, 25.0, 0.0, *WHOLE, most=10_000, usual=300)
+    assert part.is_whole and part.frames_per_second == 12.5 and part.num_frames == 3750
+
+
 def test_a_short_video_is_used_as_it_is():
     part = choose_part(10.0, 25.0, 0.0, *WHOLE, most=300)
     assert (part.frames_per_second, part.num_frames, part.end, part.is_whole) == (25.0, 250, math.inf, True)

@@ -53,8 +53,7 @@ def written(folder: Path, meta, frames, poses):
     with SequenceWriter(folder, meta) as writer:
         for rgb, tool, depth in frames:
             writer.add(rgb, tool, depth)
-        writer.finish(poses)
-        writer.finish = lambda: None  # done, with poses
+        writer.camera_to_world = poses
     return folder
 
 

@@ -1,7 +1,9 @@
 """Pure functions of the viewer: playback, canvas, lines, measuring, video paths, points, access control, files."""
 
 import socket
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.geometry import project
 from endoprior.core.types import Camera
 from endoprior.view.access_control import check_address, is_trusted
+from endoprior.view.browsers import Browsers
 from endoprior.view.line_overlay import concatenated, draw_lines, no_lines, ruler, track_lines
 from endoprior.view.measure import POINTS_OF, Measurement, measurement_text, pick
 from endoprior.view.point_rendering import render_points
@@ -140,6 +143,8 @@ def test_a_video_follows_the_frames_or_the_saved_views():
     away = np.eye(4)
     away[:3, 3] = -10, 0, 0
     moved = replace(CAMERA, world_to_camera=away)
+    beside = [place.camera.center.tolist() for place in follow_frames((CAMERA, moved), moved, rides_from=0)]
+    assert beside == [[10, 0, 0], [20, 0, 0]], "it keeps its place beside the endoscope"
     path = interpolate([PathPoint(frame, camera) for frame, camera in ((2, CAMERA), (6, moved), (5, CAMERA))])
     assert [place.frame for place in path] == [2, 3, 4, 5, 6, 5]
     assert [place.camera.center[0] for place in path] == pytest.approx([0, 2.5, 5, 7.5, 10, 0])
@@ -212,3 +217,27 @@ def test_the_measured_quantity_is_told_with_its_unit_and_reference():
     assert "Unknown" in measurement_text(two, 0, False, "Stretch")
     crossed = Measurement(0, np.array([[[0.0, 0, 0], [2, 2, 0], [2, 0, 0], [0, 1, 0]]]))
     assert "cross" in measurement_text(crossed, 0, False, "Area")
+
+
+def test_browsers_ride_along_with_the_endoscope():
+    """A browser 5 mm beside the endoscope stays 5 mm beside it, turned as it is; one without a place stays nowhere."""
+    turned = np.eye(4)
+    turned[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # the camera looks along -x
+    place = {
+        "position": np.array([5.0, 0, 0]),
+        "look_at": np.array([5.0, 0, 60]),
+        "up_direction": np.array([0, -1.0, 0]),
+    }
+    cameras = [SimpleNamespace(wxyz=np.array([1.0, 0, 0, 0]), fov=0.9, **place) for _ in range(2)]
+    cameras[1].fov = np.nan
+    clients = {i: SimpleNamespace(client_id=i, camera=c, atomic=nullcontext) for i, c in enumerate(cameras)}
+    browsers = Browsers(SimpleNamespace(get_clients=lambda: clients))
+    for client in clients.values():
+        browsers.join(client)
+    browsers.ride(CAMERA, CAMERA)
+    np.testing.assert_array_equal(cameras[0].position, [5, 0, 0])
+    browsers.ride(CAMERA, replace(CAMERA, world_to_camera=turned))
+    np.testing.assert_allclose(cameras[0].position, [0, 0, -5], atol=1e-12)
+    np.testing.assert_allclose(cameras[0].look_at, [60, 0, -5], atol=1e-12)
+    np.testing.assert_allclose(cameras[0].up_direction, [0, -1, 0], atol=1e-12)
+    np.testing.assert_array_equal(cameras[1].position, [5, 0, 0])

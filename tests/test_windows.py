@@ -19,6 +19,7 @@ from endoprior.core.config_windows import WindowConfig
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Splats
 from endoprior.data import load_sequence
+from endoprior.data.window_plan import Looks, look_through, plan_windows, windows_by_length
 from endoprior.model.carry import carry, carry_points, centers_then
 from endoprior.model.deformation import Offsets
 from endoprior.model.fixed_color import with_fixed_color
@@ -29,7 +30,8 @@ from endoprior.model.single_scene import SingleScene
 from endoprior.model.support import Support
 from endoprior.model.windowed_scene import Span, WindowedScene, save_index, window_file
 from endoprior.runs.train import start_run, train
-from endoprior.training.window_plan import Looks, look_through, plan_windows
+from endoprior.view.view_settings import ViewSettings
+from endoprior.view.viewable_scene import ViewableScene
 
 RULES = WindowConfig(enabled=True, shortest=10, longest=40, overlap=4)
 SPEED_MM = 0.4
@@ -112,6 +114,12 @@ def test_where_a_sequence_is_cut(cameras, seen, starts):
     assert all(stop == following + RULES.overlap for (_, stop), (following, _) in pairwise(plan))
     assert all(RULES.shortest <= stop - start <= RULES.longest for start, stop in plan)
     assert plan_windows(cameras, seen, replace(RULES, enabled=False)) == [(0, len(cameras))]
+
+
+@pytest.mark.parametrize("num", [4, 39, 40, 41, 76, 100, 400])
+def test_the_number_of_windows_of_a_static_camera_is_known_before(num):
+    plan = plan_windows([camera_at()] * num, looks(num), RULES)
+    assert abs(windows_by_length(num, RULES) - len(plan)) <= 1
 
 
 def test_without_depth_only_turns_pictures_and_length_cut():
@@ -324,3 +332,16 @@ def test_a_scene_of_windows_is_a_scene(trained):
     with pytest.raises(ValueError, match=r"time must be in \[0, 1\]"):
         scene.at(1.1)
     assert scene.to("cpu").render(1.0).color.shape == (40, 48, 3)
+
+
+@pytest.mark.parametrize("layer", ["color", "depth", "alpha", "displacement", "stretch", "prior"])
+def test_the_viewer_shows_every_layer_of_windows(three, layer):
+    """Inside a window, where two overlap, and in another window than the reference frame's."""
+    viewable = ViewableScene(three, "three windows")
+    for frame in (3, 16, 37):
+        settings = ViewSettings(frame=frame, layer=layer, since=2)
+        picture = viewable.picture(settings, three.cameras[frame])
+        assert picture.shape == (48, 64, 3) and picture.max() > 0, frame
+    settings = ViewSettings(frame=37, layer="displacement", since=2)
+    assert "14.8 mm" in viewable.legend(settings), "37 frames of 0.4 mm, to the last one"
+    assert len(viewable.follow(np.array([[0.0, 0, 80]]), [16]).positions) == 40

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError
 from ..core.config import DataConfig
+from ..core.presets import preset
 from ..core.spread import spread
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..data.description import read_description
+from ..data.window_plan import look_through, plan_windows
 from ..footage.border import find_outline, masked_border
 from ..footage.camera_motion import CameraMotion, camera_motion
 from ..footage.changes import Changes, find_changes
@@ -91,6 +93,8 @@ class Facts:
     """Motion of the image as a whole."""
     motion_step: int
     """Distance between the frames compared by `motion`."""
+    windows: tuple[tuple[int, int], ...]
+    """First frame, and the frame after the last one, of each window that `train` would cut the sequence into."""
     changes: Changes
     masks: MaskFacts
     border: BorderFacts
@@ -132,7 +136,8 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
     tissue = [masks.tissue(frame) for frame in samples]
     step = -(-count // MOTION_FRAMES)
     followed = [sequence.frame(i) for i in range(0, count, step)]
-    distance, turn = _camera_path([sequence.camera(i) for i in range(count)])
+    cameras = [sequence.camera(i) for i in range(count)]
+    distance, turn = _camera_path(cameras)
     described = read_description(sequence.path / "sequence.json")
     return Facts(
         path=sequence.path,
@@ -148,6 +153,7 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         camera_turn_deg=turn,
         motion=camera_motion([f.rgb_u8 for f in followed], [masks.tissue(f) for f in followed]),
         motion_step=step,
+        windows=tuple(plan_windows(cameras, look_through(sequence), preset("default").windows)),
         changes=find_changes(frame.rgb_u8 for frame in frames),
         masks=masks,
         border=measure_border(outline, images, tissue, masked),

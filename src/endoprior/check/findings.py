@@ -14,6 +14,8 @@ import numpy as np
 from ..core.checks import number_ranges
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
+from ..core.presets import preset
+from ..core.types import Camera
 from ..footage.camera_motion import MOVING_FRACTION
 from .facts import Facts
 from .fixes import detect_tools, in_stored_px, longest_part, mask_tools, measure_depth_again, set_values, skip, train
@@ -35,6 +37,8 @@ ODD_VIEW_DEG = (20.0, 120.0)
 """Range of the horizontal field of view of endoscopes."""
 USUAL_FOCAL = 0.9
 """Focal length of a usual endoscope, image widths: 58 degrees."""
+ITERATION_S, USUAL_PIXELS, FIXED_SHARE = 0.09, 640 * 512, 0.3
+"""Seconds of a training iteration at this size of the image, and the share that does not depend on it."""
 DEPTH_JUMP = 0.2
 """Change of the log median depth between two frames that is too large for tissue motion."""
 
@@ -198,6 +202,27 @@ def _motion(facts: Facts) -> Iterator[Finding]:
     yield Finding("camera-moves", "warning", what, ", or ".join(fixes) or "store the poses of the camera")
 
 
+def _windows(facts: Facts) -> Iterator[Finding]:
+    if len(facts.windows) == 1:
+        return
+    lengths = [stop - start for start, stop in facts.windows]
+    spans = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"
+    iterations = len(lengths) * preset("default").schedule.fine_iterations
+    minutes = iterations * iteration_seconds(facts.camera) / 60
+    why = "a long video" if facts.camera_is_fixed else "the camera moves far"
+    what = (
+        f"{why}: it is trained in {len(lengths)} windows of {spans} frames, in about {minutes:.0f} min on two cores, "
+        "with the memory of one window"
+    )
+    fix = "nothing; `--ray ADDRESS` trains windows on several machines, and `--windows.longest` changes their length"
+    yield Finding("windows", "note", what, fix)
+
+
+def iteration_seconds(camera: Camera) -> float:
+    """Time of a training iteration with `default` on two cores, start and scoring included (docs/measurements.md)."""
+    return ITERATION_S * (FIXED_SHARE + (1 - FIXED_SHARE) * camera.width * camera.height / USUAL_PIXELS)
+
+
 def _changes(facts: Facts) -> Iterator[Finding]:
     changes = facts.changes
     if copies := changes.duplicates:
@@ -254,6 +279,7 @@ CHECKS: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
     _border,
     _stereo,
     _motion,
+    _windows,
     _changes,
     _size,
     _points,

@@ -21,7 +21,7 @@ from ..data.prepare_record import PrepareRecord, read_record
 
 FROM_FRAMES = ("endonerf", "plain")
 """Layouts whose files `prepare` reads with their meaning unchanged."""
-MOST_FRAMES = 500
+MOST_FRAMES = 10_000
 """Number of frames that `prepare` accepts without `--max-frames`."""
 VIEWS = (10.0, 170.0)
 """Fields of view that `prepare` accepts, degrees."""

@@ -95,8 +95,10 @@ def _words(scene: Scene, out: Path, options: ExportOptions) -> str:
     from ..export.exporting import format_name
     from ..export.formats import formats_of, load_format
 
-    name, holds, count = format_name(out, options), _holds(out, options), f"{len(scene):,} "
-    words = f"{count if holds == 'Gaussians' else ''}{holds}"
+    name, holds = format_name(out, options), _holds(out, options)
+    # Of several windows, a time shows one or two.
+    count = f"{len(scene):,} " if holds == "Gaussians" and len(scene.windows) == 1 else ""
+    words = f"{count}{holds}"
     if out.is_dir():
         words += ", one file for each time step" if load_format(name).files else ""
     elif options.format is None:

@@ -28,7 +28,7 @@ HELP = Help(
     examples=(("DATA",), ("DATA", "--frames", "16", "--width", "320", "--height", "256", "--stereo")),
     basics={
         "size": ("--frames", "--width", "--height", "--stereo"),
-        "scene": ("--seed", "--breathing-mm", "--pull-mm", "--slide-mm", "--smooth-share", "--noise"),
+        "scene": ("--seed", "--camera", "--breathing-mm", "--pull-mm", "--slide-mm", "--smooth-share", "--noise"),
     },
 )
 

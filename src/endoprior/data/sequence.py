@@ -20,7 +20,7 @@ from ..core.checks import input_error
 from ..core.types import Camera, Frame
 from ..footage.right_view import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
-from .description import TOOLS_FOUND
+from .description import ESTIMATED, TOOLS_FOUND
 from .right_eye import RightEye
 from .truth import Truth
 
@@ -106,6 +106,11 @@ class FrameSequence:
     def masks_are_found(self) -> bool:
         """Whether a program found the tools, rather than a person."""
         return TOOLS_FOUND in self.sources.get("masks", "")
+
+    @property
+    def poses_are_estimated(self) -> bool:
+        """Whether a program found the camera's path in the video."""
+        return ESTIMATED in self.sources.get("poses", "")
 
     def __len__(self) -> int:
         return len(self._cameras)

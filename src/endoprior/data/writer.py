@@ -189,6 +189,8 @@ class SequenceWriter(FrameFiles):
         reject_occupied(self.out)
         self._whole = whole_folder(self.out)
         super().__init__(self._whole.__enter__(), meta)
+        self.camera_to_world: NDArray[np.float64] | None = None
+        """(T, 4, 4) poses of a camera that moves, to be set before the block ends; see `finish`."""
 
     def __enter__(self) -> SequenceWriter:
         return self
@@ -198,7 +200,7 @@ class SequenceWriter(FrameFiles):
     ) -> None:
         if kind is None:
             try:
-                self.finish()
+                self.finish(self.camera_to_world)
             except BaseException as error:
                 self._whole.__exit__(type(error), error, error.__traceback__)
                 raise

@@ -1,25 +1,28 @@
 """The moving Gaussians of a scene as small integers, coded over time: the data of the HTML player.
 
-Every Gaussian has 20 channels, each `low + step * q` with q a 16-bit integer: center x, y, z (mm), quaternion w, x, y,
-z, the logarithms of the three scales (mm), opacity, red, green, blue, and the change of these three per standard
-deviation along the first and the second local axis. A channel that never changes is stored once. The others store frame
-0 and then the residual of a prediction from one frame before (q[t-1]) or two (2 q[t-1] - q[t-2]), whichever leaves
-less. Arithmetic is modulo 2**16, so that unpacking is exact. Shared letters: `T` frames, `N` Gaussians, `C = 20`
-channels.
+The data are blocks: one for each window of the scene, with the time steps that show it. Where two windows overlap, a
+time step shows two blocks, and the opacities of each contain how far it is faded.
+
+Every Gaussian of a block has 20 channels, each `low + step * q` with q a 16-bit integer: center x, y, z (mm),
+quaternion w, x, y, z, the logarithms of the three scales (mm), opacity, red, green, blue, and the change of these three
+per standard deviation along the first and the second local axis. A channel that never changes is stored once. The
+others store time step 0 and then the residual of a prediction from one step before (q[t-1]) or two (2 q[t-1] - q[t-2]),
+whichever leaves less. Arithmetic is modulo 2**16, so that unpacking is exact. Shared letters: `T` time steps of a
+block, `N` Gaussians, `C = 20` channels.
 """
 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..core.checks import InputError
 from ..core.types import Camera, Splats
-from ..model.scene import Scene
+from ..model.scene import Scene, Shown, faded
 from ..render.constants import ALPHA_MIN, NEAR_Z
 from ..render.projection import color_slopes
 from ..render.sh import colors
@@ -45,48 +48,65 @@ COLOR_STEP = 1 / 255
 SLOPE_STEP = 1 / 510
 LARGEST_SLOPE = 8
 """A color would change by its whole range within an eighth of a standard deviation."""
-NOTHING_VISIBLE = "scene: expected Gaussians in front of the camera, got none that is visible. Fix: Train it again."
 
 
 @dataclass(frozen=True)
-class Quantized:
-    """A scene at some times, as integers."""
+class Block:
+    """The Gaussians of one window at successive time steps, as integers."""
 
+    first: int
+    """The first of its time steps."""
     values: NDArray[np.uint16]
     """(C, T, N)."""
     low: NDArray[np.float64]
     """(C,) what q = 0 stands for."""
     step: NDArray[np.float64]
     """(C,)."""
-    working_distance: float
-    """1st percentile of z of the visible Gaussians, mm."""
     depth_range: tuple[float, float]
-    """1st and 99th percentile of z, at least 1 % apart, mm."""
+    """1st and 99th percentile of z of the visible Gaussians, at least 1 % apart, mm."""
     focus: float
     """Median z, mm: a free view turns around a point at this depth."""
 
+    @property
+    def steps(self) -> range:
+        """The time steps that show it."""
+        return range(self.first, self.first + self.values.shape[1])
 
-def quantize(scene: Scene, times: list[float]) -> Quantized:
-    """The Gaussians of `scene` at `times`, without those that are never visible.
+
+def quantized_blocks(scene: Scene, times: list[float]) -> Iterator[Block]:
+    """The Gaussians of `scene` at `times`, window by window, without those that are never visible.
 
     Colors are those seen from the sequence's camera at each time, with all degrees of the harmonics. A Gaussian counts
     as invisible at a time, and its opacity is stored as 0, if its opacity is below 1/255, if a value of it is not
-    finite, or if it is too far away for 16 bits.
+    finite, or if it is too far away for 16 bits. A window in which nothing is visible is left out.
 
     Args:
-        times: T times in [0, 1].
+        times: increasing times in [0, 1].
     Raises:
         ValueError: a time is not in [0, 1].
-        InputError: no Gaussian is visible.
     """
-    raw, depths = _sample(scene, times)
+    cameras = [scene.camera_at(time) for time in times]
+    focal = max(max(camera.fx, camera.fy) for camera in cameras)
+    shown: dict[int, list[tuple[int, Shown]]] = {}
+    for t, time in enumerate(times):
+        for part in scene.shown_at(time):
+            shown.setdefault(part.window.start, []).append((t, part))
+    for steps in shown.values():
+        first, last = steps[0][0], steps[-1][0]
+        raw, depths = _sample([part for _, part in steps], cameras[first : last + 1])
+        block = _quantize(raw, depths, first, focal)
+        if block is not None:
+            yield block
+
+
+def _quantize(raw: NDArray[np.float32], depths: NDArray[np.float32], first: int, focal: float) -> Block | None:
+    """Args: as `_sample` returns them; `raw` is changed. None: nothing is visible."""
     opacity = raw[CHANNELS.index("opacity")]
     finite = np.isfinite(raw).all(0)
     visible_depths = depths[finite & (depths > NEAR_Z) & (opacity >= ALPHA_MIN)]
     if not len(visible_depths):
-        raise InputError(NOTHING_VISIBLE)
+        return None
     near, focus, far = (float(v) for v in np.percentile(visible_depths, [1, 50, 99]))
-    focal = max(max(camera.fx, camera.fy) for camera in scene.cameras)
     step = np.array(
         [min(MAX_STEP_MM, STEP_PX * near / focal)] * 3
         + [QUAT_STEP] * 4
@@ -102,7 +122,7 @@ def quantize(scene: Scene, times: list[float]) -> Quantized:
     visible = finite & within & (opacity >= ALPHA_MIN)
     kept = visible.any(0)
     if not kept.any():
-        raise InputError(NOTHING_VISIBLE)
+        return None
     raw, visible = raw[:, :, kept], visible[:, kept]
 
     low = np.zeros(len(CHANNELS))
@@ -115,7 +135,7 @@ def quantize(scene: Scene, times: list[float]) -> Quantized:
     for c in range(len(CHANNELS)):
         values[c] = np.rint((raw[c] - float(low[c])) / float(step[c])).clip(0, LARGEST)
     _repeat_hidden(values, visible)
-    return Quantized(values, low, step, near, (near, max(far, near * 1.01)), focus)
+    return Block(first, values, low, step, (near, max(far, near * 1.01)), focus)
 
 
 def pack(values: NDArray[np.uint16], level: int = 9) -> tuple[bytes, list[dict[str, int]]]:
@@ -153,13 +173,13 @@ def _predict(plane: NDArray[np.uint16]) -> tuple[int, NDArray[np.uint16]]:
     return 1, np.concatenate([plane[:1], first])
 
 
-def _sample(scene: Scene, times: list[float]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(C, T, N) channels before rounding, and (T, N) z in the camera at each time, mm."""
-    raw = np.empty((len(CHANNELS), len(times), len(scene)), np.float32)
-    depths = np.empty((len(times), len(scene)), np.float32)
-    for t, time in enumerate(times):
-        splats, camera = scene.at(time), scene.camera_at(time)
-        raw[:, t], depths[t] = _channels(splats, camera)
+def _sample(shown: list[Shown], cameras: list[Camera]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(C, T, N) channels of one window before rounding, and (T, N) z in the camera at each time, mm."""
+    scene = shown[0].window.scene
+    raw = np.empty((len(CHANNELS), len(shown), len(scene)), np.float32)
+    depths = np.empty((len(shown), len(scene)), np.float32)
+    for t, (part, camera) in enumerate(zip(shown, cameras, strict=True)):
+        raw[:, t], depths[t] = _channels(faded(scene.at(part.time), part.weight), camera)
         if t:  # q and -q are one rotation: take the one nearer to the time step before
             raw[3:7, t] *= np.where((raw[3:7, t] * raw[3:7, t - 1]).sum(0) < 0, -1, 1)
     return raw, depths

@@ -53,7 +53,9 @@ def surface_mesh(scene: Scene, step: TimeStep, options: ExportOptions) -> Mesh:
         InputError: no surface is rendered, or a fusion has fewer than two camera positions.
     """
     if options.mesh_method == "tsdf":
-        views = [render_surface(scene, step.time, c, options.min_alpha) for c in viewpoints(scene.cameras)]
+        shown = scene.shown_at(step.time)  # cameras of other windows look elsewhere
+        cameras = scene.cameras[shown[0].window.start : shown[-1].window.stop]
+        views = [render_surface(scene, step.time, c, options.min_alpha) for c in viewpoints(cameras)]
         mesh = Mesh(*fused_mesh(views, options.voxel_mm))
     else:
         surface = render_surface(scene, step.time, step.camera(scene), options.min_alpha)

@@ -5,13 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..model.scene import Scene
+from ..system.atomic import whole_folder
 from .formats import Format, Progress
 from .options import ExportOptions
 
 
 def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
-    """One safetensors file, of equal bytes to the run's own if this version wrote that."""
-    scene.save(out)
+    """One safetensors file, of equal bytes to the run's own if this version wrote that.
+
+    For a scene of several windows, whose files stand side by side, a folder `out` with those of a run folder.
+    """
+    if len(scene.windows) == 1:
+        scene.save(out)
+    else:
+        with whole_folder(out) as folder:
+            scene.save(folder / "scene.safetensors")
     progress(1, 1)
 
 

@@ -29,7 +29,7 @@ class TimeStep:
 
     def splats(self, scene: Scene, axes: Axes) -> Splats:
         """The Gaussians, activated, in `axes`."""
-        return splats_in_axes(scene.canonical() if self.time is None else scene.at(self.time), axes)
+        return splats_in_axes(canonical(scene) if self.time is None else scene.at(self.time), axes)
 
     def plain_splats(self, scene: Scene, axes: Axes) -> Splats:
         """The Gaussians in `axes`, as other programs know them: one color each, fitted to what the camera sees."""
@@ -42,6 +42,18 @@ class TimeStep:
     def facts(self) -> dict[str, Any]:
         """What `index.json` says about it."""
         return {"time": self.time} | ({} if self.frame is None else {"frame": self.frame})
+
+
+def canonical(scene: Scene) -> Splats:
+    """The Gaussians as they are stored, before any motion, activated.
+
+    Raises:
+        InputError: the scene has several windows, each with Gaussians of its own.
+    """
+    if len(scene.windows) > 1:
+        fix = "choose a time with --times, or export one window: RUN/windows/000."
+        raise input_error("--canonical", "a scene of one window", f"{len(scene.windows)} windows", fix)
+    return scene.windows[0].scene.canonical()
 
 
 def frame_indices(num_frames: int, split: Split) -> list[int]:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from ..core.checks import input_error
 
 MOST_PIXELS = 3840 * 2160
 GB_PER_PIXEL = 1.3e-6
 """Memory for writing, measured at 1920x1080."""
+MOVING_SHARE = 4
+"""A camera that moves sees up to this many times as much tissue, which takes that much more memory."""
+WIDEST_MOVING = 0.75
+"""Least focal length of a moving camera, as a share of the longer side of the image."""
 
 NARROW_PULL_MM = 15.0
 """Up to this pull, mm, the moved neighborhood keeps its size; beyond, it grows in proportion, or tissue would fold."""
@@ -32,6 +37,8 @@ class PhantomConfig:
     """Image height, 32..4096 px."""
     seed: int = 0
     """Seed of anatomy, texture, motion and noise. The same seed gives the same bytes."""
+    camera: Literal["still", "inspect"] = "still"
+    """`inspect`: the camera moves; every 300 frames or so it pans, turns, rolls, retreats, approaches and returns."""
     stereo: bool = False
     """Also write the images of the right camera (`right/`) and `calibration.json`."""
     side_views: bool = True
@@ -80,9 +87,17 @@ class PhantomConfig:
             ("tracks", 1, 20000),
         ):
             _require(name, getattr(self, name), low, high)
-        if self.width * self.height > MOST_PIXELS:
-            got = f"{self.width}x{self.height}, which needs about {self.width * self.height * GB_PER_PIXEL:.0f} GB"
-            raise input_error("width, height", "at most 3840x2160 px in all", got, "Choose a smaller size.")
+        moves = self.camera == "inspect"
+        share = MOVING_SHARE if moves else 1
+        if self.width * self.height * share > MOST_PIXELS:
+            needed = self.width * self.height * share * GB_PER_PIXEL
+            got = f"{self.width}x{self.height}, which needs about {needed:.0f} GB"
+            allowed = "at most 1920x1080 px in all with a moving camera" if moves else "at most 3840x2160 px in all"
+            raise input_error("width, height", allowed, got, "Choose a smaller size.")
+        if moves:
+            # A wide view of the tilted tissue would reach its horizon when it turns.
+            longest = max(self.width, self.height)
+            _require("focal length with --camera inspect, / longer side", self.focal / longest, WIDEST_MOVING, 1.4)
         _require("width / height", self.width / self.height, 0.6, 2.0)
         # With a principal point far off center, the image would extend beyond the modeled tissue.
         _require("principal_x", self.center[0], 0.35 * self.width, 0.65 * self.width)

@@ -11,6 +11,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
+from .eye import STILL, Eye
 from .motion import ToolPose
 from .raster import FAR
 from .shading import HIGHLIGHT_LIMIT, LIGHTS_MM, REFERENCE_MM, ggx
@@ -239,18 +240,23 @@ def render_tools(
     camera: NDArray[np.float32],
     focal: float,
     center: tuple[float, float],
+    endoscope: Eye = STILL,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Render both instruments in front of the tissue.
 
     Args:
-        poses: the carbon-shafted grasper, and the gold and black one.
+        poses: the carbon-shafted grasper, and the gold and black one, in world axes.
         tissue_z: (SH, SW) depth of the tissue, mm.
         camera: (3,) camera center in the left camera's axes, mm.
         focal, center: of the sample grid, px.
+        endoscope: the left camera in the world.
     Returns:
         (SH, SW, 3) linear radiance and (SH, SW) z in mm; z = raster.FAR where no tool is visible.
     """
     tools = np.stack([pack_tool(poses[0], STEEL, CARBON), pack_tool(poses[1], GOLD, BLACK)])
+    # Two points and four directions; they are chosen in the world, so that a tool at rest stays when the camera moves.
+    tools[:, :6] = endoscope.sees(tools[:, :6].reshape(2, 2, 3)).reshape(2, 6)
+    tools[:, 6:18] = (tools[:, 6:18].reshape(2, 4, 3) @ endoscope.turn).reshape(2, 12)
     color = np.zeros((*tissue_z.shape, 3), np.float32)
     depth = np.full(tissue_z.shape, FAR, np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))

@@ -57,7 +57,7 @@ class Pull:
 
 @dataclass(frozen=True)
 class ToolPose:
-    """Pose of an instrument at one time, in camera axes, mm."""
+    """Pose of an instrument at one time, in world axes, mm."""
 
     pivot: NDArray[np.float64]
     """(3,) point the shaft always passes through (the port in the abdominal wall)."""
@@ -105,7 +105,7 @@ class Motion:
         return moved
 
     def held(self, pull: Pull, phase: float) -> NDArray[np.float64]:
-        """(3,) camera-space position of the surface point grasped by `pull`, mm."""
+        """(3,) position in world axes of the surface point grasped by `pull`, mm."""
         a, b = pull.center
         moved = self.displacement(np.array(a), np.array(b), phase)
         return self.plane.lift(a + moved[0], b + moved[1], pull.height + moved[2])

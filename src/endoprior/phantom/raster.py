@@ -13,6 +13,8 @@ from ..compute.fastmath import REORDERED
 
 _BANDS = 16
 _RIM = np.float32(1e-4)  # triangles are widened by this, so that samples on a shared edge belong to one of the two
+_NEAR_MM = 2.0
+"""Vertices nearer than this, or behind the camera, are not drawn."""
 FAR = np.float32(1e9)
 """Depth of samples without a surface."""
 
@@ -20,7 +22,8 @@ FAR = np.float32(1e9)
 @njit(parallel=True, cache=True, fastmath=REORDERED)
 def _rasterize(x, y, inverse_z, row_low, row_high, out):
     # One task per band of image rows; it walks the mesh in a fixed order and keeps the nearest triangle of each sample.
-    # x, y, inverse_z (MH, MW) projected vertices, px and 1/mm; row_low/high (MH - 1,) y range of each mesh row.
+    # x, y, inverse_z (MH, MW) projected vertices, px and 1/mm (0: not to be drawn); row_low/high (MH - 1,) y range of
+    # each mesh row.
     # Writes out (SH, SW, 3): g_u, g_v, z. The plane equations of u/z, v/z, 1/z make it perspective-correct.
     height, width = out.shape[0], out.shape[1]
     mesh_h, mesh_w = x.shape
@@ -35,6 +38,9 @@ def _rasterize(x, y, inverse_z, row_low, row_high, out):
                     ia, ja = i, j
                     ib, jb = (i + 1, j + 1) if t == 0 else (i + 1, j)
                     ic, jc = (i, j + 1) if t == 0 else (i + 1, j + 1)
+                    wa, wb, wc = inverse_z[ia, ja], inverse_z[ib, jb], inverse_z[ic, jc]
+                    if wa == zero or wb == zero or wc == zero:
+                        continue
                     ax, ay, bx, by, cx, cy = x[ia, ja], y[ia, ja], x[ib, jb], y[ib, jb], x[ic, jc], y[ic, jc]
                     low, high = min(ay, by, cy), max(ay, by, cy)
                     first, last = max(y0, int(np.ceil(low - half))), min(y1 - 1, int(np.floor(high - half)))
@@ -46,7 +52,6 @@ def _rasterize(x, y, inverse_z, row_low, row_high, out):
                     if left > right or area == zero:
                         continue
                     scale = one / area
-                    wa, wb, wc = inverse_z[ia, ja], inverse_z[ib, jb], inverse_z[ic, jc]
                     for py in range(first, last + 1):
                         sy = np.float32(py) + half
                         for px in range(left, right + 1):
@@ -72,10 +77,11 @@ def rasterize(
     """(height, width, 3): g_u, g_v in [0, 1] and z in mm of the nearest surface; z = FAR where there is none.
 
     Args:
-        vertices: (MH, MW, 3) camera-space mesh, mm, all with z > 0.
+        vertices: (MH, MW, 3) camera-space mesh, mm; what is behind the camera is left out.
         focal, center: focal length and principal point, px of the sample grid.
     """
-    inverse_z = 1 / vertices[..., 2]
+    z = vertices[..., 2]
+    inverse_z = np.divide(1, z, out=np.zeros_like(z), where=z > _NEAR_MM)
     x = (focal * vertices[..., 0] * inverse_z + center[0]).astype(np.float32)
     y = (focal * vertices[..., 1] * inverse_z + center[1]).astype(np.float32)
     low, high = y.min(1), y.max(1)

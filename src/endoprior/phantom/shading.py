@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from ..compute.fastmath import REORDERED
 from .eye import Eye
-from .surface import Plane
 
 LIGHTS_MM = np.array([[-3.6, -2.2, 0.0], [3.9, -1.8, 0.0]], np.float32)
 """(2, 3) light guides in the left camera's axes, mm."""
@@ -112,7 +111,7 @@ def shade(
     hits: NDArray[np.float32],
     normals: NDArray[np.float32],
     texture: NDArray[np.float32],
-    plane: Plane,
+    axes: NDArray[np.float64],
     eye: Eye,
     viewer: NDArray[np.float64],
     focal: float,
@@ -125,13 +124,14 @@ def shade(
         hits: (SH, SW, 3) from `raster.rasterize`, as `eye` sees them.
         normals: (MH, MW, 3) unit vertex normals.
         texture: (TH, TW, 7) material maps.
+        axes: (2, 3) e_a and e_b of the tissue's plane in the axes of the left camera.
         eye: the camera; the lights stay with the left one.
         viewer: (3,) mm, where the light goes to: the center of `eye`, or of another camera.
         focal, center: of the sample grid, px.
         far: the depth that marks nothing hit.
     """
     out = np.empty_like(hits)
-    e_a, e_b = plane.axes[:2].astype(np.float32)
+    e_a, e_b = np.ascontiguousarray(axes, np.float32)
     f, cx, cy = (np.float32(value) for value in (focal, *center))
     center_mm, turn = eye.center.astype(np.float32), np.ascontiguousarray(eye.turn, np.float32)
     seen_from = viewer.astype(np.float32)

@@ -1,8 +1,9 @@
 """The anatomy at rest: bowel loops, folded mesentery and a liver edge, as heights over a tilted plane.
 
 Letters: (g_u, g_v) in [0, 1] are material grid coordinates, uniform in the image of the plane at rest and larger than
-the image; (a, b) are metric coordinates on the plane, mm (a right, b towards the lower image edge); heights are mm
-along the plane's normal, towards the camera. Camera axes are OpenCV's.
+the image, or uniform on the plane where the camera moves; (a, b) are metric coordinates on the plane, mm (a right, b
+towards the lower image edge); heights are mm along the plane's normal, towards the camera. Axes are those of the left
+camera in the first frame, OpenCV's.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ MARGIN = 0.27
 """Margin of the material around the image, in image sizes, so that no motion uncovers its border."""
 FLOOR, LIVER = -1, -2
 """Owners that are not loops."""
+_LOOP_POINTS = 36
+_MM2_PER_LOOP = 740.0
 _RIM = 0.94
 """Distance from a loop's axis, in radii, where its round profile turns into a straight skirt."""
 
@@ -35,12 +38,17 @@ class Plane:
     axes: NDArray[np.float64]
     """(3, 3) rows e_a, e_b, normal (towards the camera), orthonormal."""
     window: tuple[float, float, float, float]
-    """Range (x0, x1, y0, y1) of X/Z and Y/Z that g_u, g_v in [0, 1] span."""
+    """Range (x0, x1, y0, y1) that g_u, g_v in [0, 1] span: of X/Z and Y/Z, or of a and b in mm if `metric`."""
+    metric: bool = False
+    """Whether the grid is uniform on the plane, as for a camera that moves, and not in the first image."""
 
     def coordinates(self, grid_u: NDArray, grid_v: NDArray) -> tuple[NDArray, NDArray]:
         """(a, b) in mm where the viewing ray of (g_u, g_v) meets the plane."""
         x0, x1, y0, y1 = self.window
-        rays = np.stack(np.broadcast_arrays(x0 + (x1 - x0) * grid_u, y0 + (y1 - y0) * grid_v, 1.0), -1)
+        across, down = np.broadcast_arrays(x0 + (x1 - x0) * grid_u, y0 + (y1 - y0) * grid_v)
+        if self.metric:
+            return across, down
+        rays = np.stack(np.broadcast_arrays(across, down, 1.0), -1)
         normal = self.axes[2]
         offset = rays * ((self.origin @ normal) / (rays @ normal))[..., None] - self.origin
         return offset @ self.axes[0], offset @ self.axes[1]
@@ -51,8 +59,10 @@ class Plane:
 
     def grid(self, a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
         """(g_u, g_v) of plane points: the inverse of `coordinates`."""
-        point = self.lift(a, b, np.zeros(()))
         x0, x1, y0, y1 = self.window
+        if self.metric:
+            return (a - x0) / (x1 - x0), (b - y0) / (y1 - y0)
+        point = self.lift(a, b, np.zeros(()))
         return (point[..., 0] / point[..., 2] - x0) / (x1 - x0), (point[..., 1] / point[..., 2] - y0) / (y1 - y0)
 
 
@@ -99,8 +109,13 @@ def build_plane(cfg: PhantomConfig) -> Plane:
     return Plane(origin, np.stack([e_a, np.cross(e_a, normal), normal]), window)
 
 
-def build_anatomy(seed: int) -> Anatomy:
-    """Choose the organs of one patient."""
+def build_anatomy(seed: int, wider: tuple[float, float, float, float] | None = None) -> Anatomy:
+    """Choose the organs of one patient.
+
+    Args:
+        seed: of the layout.
+        wider: range (a0, a1, b0, b1), mm, to fill with further loops; those in the middle are the same without it.
+    """
     rng = np.random.default_rng([seed, 2])
     # The main loop crosses the center of the image: arching or sagging, from either side, slightly rotated.
     side, sag = rng.choice([-1.0, 1.0]), rng.uniform(-6, 14)
@@ -112,23 +127,37 @@ def build_anatomy(seed: int) -> Anatomy:
     knots = knots @ [[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]]
     loops, radii, bases = [knots], [rng.uniform(11.0, 13.5)], [1.5]
     # Each further loop is placed in the emptiest region, so that loops fill the whole image.
-    for _ in range(26):
-        candidates = rng.uniform([-78, -62], [78, 62], (40, 2))
-        placed = np.concatenate(loops)
-        bare = np.linalg.norm(candidates[:, None] - placed, axis=-1).min(1)
-        center, angle, turn = candidates[bare.argmax()], rng.uniform(0, np.pi), rng.uniform(-1.3, 1.3)
-        reach = np.linspace(-1, 1, 6) * rng.uniform(18, 34)
-        heading = angle + turn * np.linspace(-1, 1, 6)
-        loops.append(center + reach[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1))
-        radii.append(rng.uniform(7.0, 11.5))
-        bases.append(rng.uniform(-5.5, 0.0))
-    paths = np.stack([_spline(loop, 36) for loop in loops])
-    steps = np.linspace(0, 1, paths.shape[1])
-    waves = [1 + 0.05 * np.sin(2 * np.pi * (rng.uniform(3, 5) * steps + rng.uniform())) for _ in loops]
+    steps = np.linspace(0, 1, _LOOP_POINTS)
+
+    def add_loops(count: int, low: tuple[float, float], high: tuple[float, float]) -> None:
+        for _ in range(count):
+            candidates = rng.uniform(low, high, (40, 2))
+            placed = np.concatenate(loops)
+            bare = np.linalg.norm(candidates[:, None] - placed, axis=-1).min(1)
+            center, angle, turn = candidates[bare.argmax()], rng.uniform(0, np.pi), rng.uniform(-1.3, 1.3)
+            reach = np.linspace(-1, 1, 6) * rng.uniform(18, 34)
+            heading = angle + turn * np.linspace(-1, 1, 6)
+            loops.append(center + reach[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1))
+            radii.append(rng.uniform(7.0, 11.5))
+            bases.append(rng.uniform(-5.5, 0.0))
+
+    def draw_waves(count: int) -> list[NDArray]:
+        return [1 + 0.05 * np.sin(2 * np.pi * (rng.uniform(3, 5) * steps + rng.uniform())) for _ in range(count)]
+
+    add_loops(26, (-78, -62), (78, 62))
+    waves = draw_waves(len(loops))
+    edge = np.array([rng.uniform(-33, -27), rng.uniform(-0.22, 0.22), rng.uniform(2, 5), rng.uniform(0, 6.3)])
+    if wider is not None:
+        # As many to a square mm as in the middle; under the liver there are none to be seen.
+        a0, a1, b0, b1 = wider
+        b0 = max(b0, edge[0] - 30)
+        more = max(0, round((a1 - a0) * (b1 - b0) / _MM2_PER_LOOP) - len(loops))
+        add_loops(more, (a0, b0), (a1, b1))
+        waves += draw_waves(more)
+    paths = np.stack([_spline(loop, _LOOP_POINTS) for loop in loops])
     radii = np.array(radii)[:, None] * np.array(waves)
     dive = np.clip(1 - np.minimum(steps, 1 - steps) / 0.24, 0, 1) ** 2
     bases = np.array(bases)[:, None] - radii[:, :1] * 0.9 * dive
-    edge = np.array([rng.uniform(-33, -27), rng.uniform(-0.22, 0.22), rng.uniform(2, 5), rng.uniform(0, 6.3)])
     as_f32 = [np.ascontiguousarray(values, np.float32) for values in (paths, radii, bases)]
     return Anatomy(seed, *as_f32, edge)
 

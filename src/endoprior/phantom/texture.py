@@ -67,7 +67,7 @@ def build_texture(
     # Patches with hardly any texture: pale, vessel-free serosa.
     plain = _step(0.12, 0.42, fractal(a / 21, b / 21, 1, seed))
     wrinkles = _wrinkles(organs, a, b, seed)
-    albedo = _albedo(organs, a, b, plain, wrinkles, trunks, twigs, seed, rng)
+    albedo = _albedo(organs, a, b, plain, wrinkles, trunks, twigs, seed, rng, len(anatomy.paths))
     relief = _relief(organs, a, b, wrinkles, trunks, seed) * (1 - 0.6 * plain)
     if smooth_share > 0:
         patches = smooth_patches(a, b, anatomy.seed, smooth_share)
@@ -123,13 +123,14 @@ def _albedo(
     twigs: NDArray,
     seed: int,
     rng: np.random.Generator,
+    loops: int,
 ) -> NDArray[np.float32]:
     """(TH, TW, 3) linear color in [0, 1]."""
     mottle = fractal(a / 6, b / 6, 4, seed + 20)
     fine = fractal(a / 1.1, b / 1.1, 3, seed + 21)
     loop, pale, dusky = _linear(_LOOP), _linear(_LOOP_PALE), _linear(_LOOP_DUSKY)
     # Each loop has its own complexion between dusky and pale.
-    complexion = np.concatenate([rng.uniform(-0.45, 0.35, 64), [0, 0]]).astype(np.float32)[organs.owner]
+    complexion = np.concatenate([rng.uniform(-0.45, 0.35, max(64, loops)), [0, 0]]).astype(np.float32)[organs.owner]
     tone = np.clip(complexion - 0.12 + 0.95 * mottle, -1, 1)[..., None]
     color = loop + np.maximum(tone, 0) * (pale - loop) + np.maximum(-tone, 0) * (dusky - loop)
     fat_amount = _step(0.02, 0.34, fractal(a / 10, b / 10, 3, seed + 22)) * 0.85

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from .surface import LIVER, Organs, Plane
 
 TREES = 1000
-"""Number of trees, over the whole tissue."""
+"""Number of trees, over the whole tissue of a camera that stands still."""
+_TISSUE_MM2 = 30_000
+"""Its usual size."""
 _STEP_MM = 0.7
 _SUBPIXEL_BITS = 4
 
@@ -41,7 +43,8 @@ def vessel_maps(
     trunks, twigs = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     low, high = np.array([a.min(), b.min()]), np.array([a.max(), b.max()])
     pending = []
-    for _ in range(TREES):
+    trees = round(TREES * np.prod(high - low) / _TISSUE_MM2) if plane.metric else TREES
+    for _ in range(trees):
         start, heading = rng.uniform(low, high), rng.uniform(0, 2 * np.pi)
         caliber = 0.16 + 0.34 * rng.uniform() ** 4
         pending.append(_Branch(start, heading, caliber, rng.uniform(10, 26)))

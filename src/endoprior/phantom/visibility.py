@@ -12,9 +12,11 @@ def visible_points(
     points: NDArray, z: NDArray[np.float32], tool: NDArray[np.bool_], cfg: PhantomConfig
 ) -> NDArray[np.bool_]:
     """(...,) True where `points` (..., 3) are in the image and not occluded by tissue `z` (H, W) or `tool`."""
-    x = cfg.focal * points[..., 0] / points[..., 2] + cfg.center[0]
-    y = cfg.focal * points[..., 1] / points[..., 2] + cfg.center[1]
-    inside = (x >= 0) & (x < cfg.width) & (y >= 0) & (y < cfg.height)
+    ahead = points[..., 2] > 0
+    depth = np.where(ahead, points[..., 2], np.inf)
+    x = cfg.focal * points[..., 0] / depth + cfg.center[0]
+    y = cfg.focal * points[..., 1] / depth + cfg.center[1]
+    inside = ahead & (x >= 0) & (x < cfg.width) & (y >= 0) & (y < cfg.height)
     # Depth of the four pixels around the point: on a slope the point may lie behind some of them, never behind all.
     j = np.clip(np.floor(x - 0.5).astype(int), 0, cfg.width - 2)
     i = np.clip(np.floor(y - 0.5).astype(int), 0, cfg.height - 2)

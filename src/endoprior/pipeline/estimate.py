@@ -14,6 +14,7 @@ from typing import TypeVar
 
 from ..core.config import Config
 from ..data import load_sequence
+from ..data.window_plan import windows_by_length
 from ..evaluation.scorers.speed import FPS_RENDERS, FPS_WARM_UP
 from ..evaluation.scoring import evaluate, scored_data
 from ..prepare import prepare
@@ -86,6 +87,7 @@ def scaled(trial: Trial, cfg: Config, num_frames: int, num_images: int) -> dict[
     more = num_frames / FRAMES
     half = min(cfg.schedule.half_resolution_iterations, cfg.schedule.fine_iterations)
     full = cfg.schedule.coarse_iterations + cfg.schedule.fine_iterations - half
+    windows = windows_by_length(num_frames, cfg.windows) if cfg.windows.enabled else 1
     # Scoring renders some frames several times to measure the speed, however long the sequence is.
     speed = (FPS_WARM_UP + 2 * FPS_RENDERS) * trial.render
     return {
@@ -95,7 +97,7 @@ def scaled(trial: Trial, cfg: Config, num_frames: int, num_images: int) -> dict[
         + num_frames * (trial.write - trial.decode)
         + trial.follow * more,
         "check": trial.check * (1 + (num_frames - FRAMES) / CHECK_FRAMES),
-        "train": trial.start * more + half * trial.half_iteration + full * trial.iteration,
+        "train": trial.start * more + windows * (half * trial.half_iteration + full * trial.iteration),
         "score": max(trial.score - speed, 0.0) * more + speed,
         "video": trial.rendered_video * num_frames,
         "player": trial.player * more,

@@ -11,7 +11,9 @@ from ..prepare.config import PrepareConfig
 from ..prepare.source import open_source
 from .part import Part, choose_part
 
-MOST_FRAMES = 300
+MOST_FRAMES = 10_000
+USUAL_FRAMES = 300
+"""A video with more frames loses some in between, as long as tissue can be followed."""
 PREVIEW_FRAMES = 60
 PREVIEW_WIDTH = 320
 """Width of the frames of a preview, px."""
@@ -106,8 +108,9 @@ def make_job(
         InputError: the video cannot be read.
     """
     source = open_source(video, prepare.folder_rate)
-    rate, most = source.frames_per_second, PREVIEW_FRAMES if preview else MOST_FRAMES
-    part = choose_part(source.seconds, rate, prepare.frames_per_second, prepare.start, prepare.end, most)
+    rate = source.frames_per_second
+    most, usual = (PREVIEW_FRAMES, PREVIEW_FRAMES) if preview else (MOST_FRAMES, USUAL_FRAMES)
+    part = choose_part(source.seconds, rate, prepare.frames_per_second, prepare.start, prepare.end, most, usual)
     width = min(prepare.max_width or PREVIEW_WIDTH, PREVIEW_WIDTH) if preview else prepare.max_width
     chosen = replace(prepare, frames_per_second=part.frames_per_second, end=part.end, max_width=width)
     options: Options = {"--preview": ()} if preview else {"--preset": (preset,)} if preset != "default" else {}

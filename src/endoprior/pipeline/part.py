@@ -33,12 +33,15 @@ class Part:
     """Whether it reaches the end that was asked for."""
 
 
-def choose_part(seconds: float, rate: float, wanted_rate: float, start: float, end: float, most: int) -> Part:
+def choose_part(
+    seconds: float, rate: float, wanted_rate: float, start: float, end: float, most: int, usual: int | None = None
+) -> Part:
     """The first part of a video that has at most `most` frames.
 
-    A long video first loses frames in between, down to `LEAST_RATE`, then its end.
+    A long video loses frames in between, down to `LEAST_RATE`, until it has at most `usual`, then its end.
 
     Args:
+        usual: None: `most`.
         seconds: duration of the video; 0 if unknown.
         rate: of the video, 1/s.
         wanted_rate: rate that the user chose, 1/s; 0 for none.
@@ -54,8 +57,8 @@ def choose_part(seconds: float, rate: float, wanted_rate: float, start: float, e
 
     every = 1
     if not wanted_rate:
-        most_skipped = max(math.floor(rate / LEAST_RATE), 1)
-        every = max(math.ceil(num_frames(rate, end, most_skipped * most) / most), 1)
+        most_skipped, usual = max(math.floor(rate / LEAST_RATE), 1), usual or most
+        every = max(math.ceil(num_frames(rate, end, most_skipped * usual) / usual), 1)
     used = wanted_rate or rate / every
     if (count := num_frames(used, end, most + 1)) <= most:
         return Part(used, start, end, count, True)

@@ -89,7 +89,8 @@ def _check(job: SequenceJob, progress: Progress) -> list[str]:
     findings = find(facts)
     draw_check(sequence, facts, findings, job.figure)
     write_json(job.findings, as_json(facts, findings))
-    return [f"{finding.severity}: {finding.what}" for finding in findings if finding.severity != "note"]
+    shown = [finding for finding in findings if finding.severity != "note" or finding.code == "windows"]
+    return [f"{finding.severity}: {finding.what}" for finding in shown]
 
 
 def problems(job: SequenceJob) -> list[str]:
@@ -153,12 +154,13 @@ def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
 def _player(job: SequenceJob, progress: Progress) -> list[str]:
     progress("packing", 0, 0)
     scene = load_scene(job.run)
-    times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (len(scene) * LEAST_BYTES))
+    at_a_time = len(scene) / len(scene.windows)
+    times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (at_a_time * LEAST_BYTES))
     title = f"{job.source.stem} (preview)" if job.is_preview else job.source.stem
     while not job.player.exists():
         try:
             write_html(scene, job.player, title=title, times=times, max_bytes=PLAYER_BYTES)
-        except PageTooLarge as error:  # its size is known only when it is packed
+        except PageTooLarge as error:  # its size is known only when part of it is packed
             if len(times) == 1:
                 raise
             times = every_kth_time(len(scene.cameras), len(times) * PLAYER_BYTES / error.num_bytes)

@@ -56,7 +56,7 @@ class PrepareConfig:
     """Frame rate of the output; 0 uses every frame of the source."""
     folder_rate: float = 25.0
     """Frame rate of a folder of images, 1/s."""
-    max_frames: int = 500
+    max_frames: int = 10_000
     """Stop with an error above this number of frames; choose a part of the video or a lower rate."""
     drop_out_of_body: bool = False
     """Leave out frames without the color of the inside of a body."""

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..footage.border import Circle, Strips, find_circle, find_strips
+from ..footage.border import Circle, Strips, find_outline
 from ..footage.optical_flow import MOTION_S
 from ..footage.overlays import find_static_overlays
+from ..footage.round_border import CERTAIN
 from .calibration import Calibration
 from .config import PrepareConfig, Rectangle, parse_rectangle
 from .frame_geometry import FrameGeometry, make_geometry
@@ -59,11 +60,11 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
     lefts = [sampled.frame.left for sampled in sample.kept]
     notes = [source.note for source in (clip.source, clip.second) if source and source.note]
     notes += _timing_notes(selection.gaps, selection.uneven_steps, len(indices))
-    strips = circle = None
+    strips = circle = outside = None
     labels: list[Rectangle] = []
     if cfg.border == "auto":
-        circle = find_circle(lefts)
-        strips = find_strips(lefts) or None
+        outline = find_outline(lefts)
+        circle, strips, outside = outline.circle, outline.strips or None, outline.outside
         labels = [tuple(box) for box in find_static_overlays([_without(p, strips) for p in lefts])]
     geometry = make_geometry(
         clip.camera_size,
@@ -76,8 +77,9 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         blank=[*labels, *(parse_rectangle(text, "--blank") for text in cfg.blank)],
         strips=strips,
         circle=circle,
+        outside=outside,
     )
-    notes += _border_notes(strips, circle, labels, float(1 - geometry.inside.mean()))
+    notes += border_notes(strips, circle, labels, float(1 - geometry.inside.mean()))
     if calibration is None:
         notes.append(
             f"no calibration; a field of view of {cfg.field_of_view_degrees:g} degrees is assumed "
@@ -106,8 +108,8 @@ def _timing_notes(gaps: int, uneven: int, count: int) -> list[str]:
     return notes
 
 
-def _border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:
-    """Args: outside: share of the pixels of a frame that show nothing."""
+def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:
+    """Notes on detected borders and labels. Args: outside: share of the pixels of a frame that show nothing."""
     notes = []
     if strips:
         sides = ", ".join(f"{n} px {side}" for side, n in vars(strips).items() if n)
@@ -115,7 +117,13 @@ def _border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rec
     if circle:
         center = f"({circle.center_x:.0f}, {circle.center_y:.0f})"
         where = f"center {center}, radius {circle.radius:.0f} px"
-        notes.append(f"round border: {where}. Its outside is masked, {outside:.1%} of a frame.")
+        rim = f"its rim of {circle.margin_px:.0f} px"
+        notes.append(f"round border: {where}. Its outside and {rim} are masked, {outside:.1%} of a frame.")
+        if circle.agreement < CERTAIN:
+            notes.append(
+                f"the round border is uncertain: {circle.agreement:.0%} of it agree with the images. If it is wrong, "
+                "use --border keep, with --crop and --field-of-view-degrees."
+            )
     notes += [f"a burned-in label was painted over: {x},{y},{w},{h}" for x, y, w, h in labels]
     return notes
 

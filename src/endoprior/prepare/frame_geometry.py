@@ -18,8 +18,6 @@ from ..footage.border import Circle, Strips
 from .calibration import Calibration, check_pair
 from .config import Rectangle
 
-CIRCLE_MARGIN = 0.025
-"""Share of the radius to leave out: the rim of a round border is dark, blurred and moves slightly with the optics."""
 MIN_SIDE_PX = 32
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 
@@ -92,6 +90,7 @@ def make_geometry(
     blank: Sequence[Rectangle] = (),
     strips: Strips | None = None,
     circle: Circle | None = None,
+    outside: NDArray[np.bool_] | None = None,
 ) -> FrameGeometry:
     """Compute the geometry of all frames.
 
@@ -99,7 +98,8 @@ def make_geometry(
         size: (width, height) of one camera's source image.
         calibration: None assumes a pinhole camera of `field_of_view_degrees` with a centered principal point.
         name: of the calibration, for error messages.
-        crop, blank, strips, circle: parts to keep and parts to paint over.
+        crop, blank, strips, circle: parts to keep and parts to paint over. The rim of the circle is left out.
+        outside: (h, w) of the source, True on more that shows no tissue, such as black arcs inside of the circle.
     Raises:
         InputError: the crop leaves too little, or the calibration does not fit.
     """
@@ -116,7 +116,9 @@ def make_geometry(
         keep[: strips.top] = keep[height - strips.bottom :] = False
         keep[:, : strips.left] = keep[:, width - strips.right :] = False
     if circle:
-        keep &= circle.mask(width, height, CIRCLE_MARGIN * circle.radius)
+        keep &= circle.mask(width, height, circle.margin_px)
+    if outside is not None:
+        keep &= ~outside
     painted = np.zeros_like(keep)
     for x, y, w, h in blank:
         painted[y : y + h, x : x + w] = True

@@ -53,7 +53,7 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
 
     def schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
         reject_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, trainer.sequence.path)
-        return checkpoint_schema(cfg)
+        return checkpoint_schema(cfg) | _frame_specs(trainer)
 
     arrays, about = load_arrays(path, {FORMAT: schema}, next_step)
     with rejecting(path, "a training state", next_step):
@@ -65,8 +65,11 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
             )
         check_state(arrays, iteration)
         followed, num_frames = arrays.get("tracks.followed"), len(trainer.sequence.indices("train"))
-        if followed is not None and followed.shape[1] != num_frames:
-            raise InputError(f"expected {num_frames} training frames in tracks.followed; got {followed.shape[1]}.")
+        counts = {"tracks.followed": followed.shape[1]} if followed is not None else {}
+        counts |= {name: len(arrays[name]) for name in ("poses.steps", "depth_fit") if name in arrays}
+        for name, got in counts.items():
+            if got != num_frames:
+                raise InputError(f"expected {num_frames} training frames in {name}; got {got}.")
     trainer.restore(stage, iteration, arrays)
 
 
@@ -91,7 +94,17 @@ def checkpoint_schema(cfg: Config) -> dict[str, ArraySpec]:
         optimizer[f"{name}.steps"] = ArraySpec("int64", (spec.shape[1] if name == "motion" else 1,))
     optimizer |= {f"plane_adam.{name}": spec for name, spec in planes.items()}
     stats = {f"stats.{field.name}": ArraySpec("float32", ("N",)) for field in fields(DensityStats)}
-    return model | {f"optimizer.{name}": spec for name, spec in optimizer.items()} | stats | _track_specs(cfg)
+    found = {f"optimizer.{name}": spec for name, spec in optimizer.items()}
+    return model | found | stats | _track_specs(cfg)
+
+
+def _frame_specs(trainer: Trainer) -> dict[str, ArraySpec]:
+    """What is found of each of the `F` training frames: its pose, and how its depth fits."""
+    specs = {}
+    if trainer.step_once.poses is not None:
+        specs = {f"poses.{name}": ArraySpec("float64", ("F", 6)) for name in ("twists", "first", "second", "accepted")}
+        specs["poses.steps"] = ArraySpec("int64", ("F",))
+    return specs | ({"depth_fit": ArraySpec("float64", ("F", 2))} if trainer.fits_depth else {})
 
 
 def _track_specs(cfg: Config) -> dict[str, ArraySpec]:

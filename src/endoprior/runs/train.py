@@ -10,9 +10,9 @@ from pathlib import Path
 
 from ..core.config import Config
 from ..data import FrameSequence, load_sequence
+from ..data.window_plan import look_through, plan_windows
 from ..model.scene import Scene
 from ..training.trainer import Observer
-from ..training.window_plan import look_through, plan_windows
 from .observers import CHECKPOINT_SECONDS
 from .progress import is_watched, training_progress
 from .stored_run import config_of_run, sequence_of_run

@@ -14,6 +14,7 @@ from ..model.gaussians import Gaussians
 from .density import DensityStats
 from .divergence import Divergence
 from .optimizer import Optimizer
+from .pose_refinement import PoseState
 from .track_loss import StartTracks
 
 
@@ -37,6 +38,11 @@ class TrainState:
     stats: DensityStats
     tracks: StartTracks | None = None
     """Where motion started from optical flow and is held to it."""
+    poses: PoseState | None = None
+    """Corrections of the camera poses; None: they stay as given."""
+
+    depth_fit: Tensor | None = None
+    """(F, 2) scale and shift of each training frame's inverse depth, where depth is relative."""
 
     def arrays(self) -> dict[str, Tensor]:
         """Every tensor by the name that it has in a checkpoint."""
@@ -45,6 +51,10 @@ class TrainState:
         arrays |= {f"optimizer.{name}": value for name, value in self.optimizer.state_arrays().items()}
         if self.tracks is not None:
             arrays |= {f"tracks.{name}": value for name, value in self.tracks.tensors().items()}
+        if self.poses is not None:
+            arrays |= {f"poses.{name}": value for name, value in self.poses.tensors().items()}
+        if self.depth_fit is not None:
+            arrays["depth_fit"] = self.depth_fit
         if self.field is not None:
             arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
         return arrays

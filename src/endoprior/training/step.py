@@ -14,7 +14,7 @@ from ..core.types import RenderOutput, Splats
 from ..model.deformation import Offsets
 from ..model.single_scene import offsets_at
 from ..render import Rasterizer
-from . import density
+from . import density, depth_fit
 from .densify import apply_plan
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .frames import TrainingFrame, TrainingFrames
@@ -22,6 +22,7 @@ from .losses import supervised_terms
 from .mask_doubt import MaskDoubt
 from .missed_tools import START
 from .ops import TrainingOps
+from .pose_refinement import PoseRefinement, moved, smoothness
 from .scale_limit import limit_scales
 from .state import Stage, StepReport, TrainState
 from .temporal import temporal_terms
@@ -57,6 +58,8 @@ class TrainingStep:
     rasterize: Rasterizer
     ops: TrainingOps
     check: DivergenceCheck
+    poses: PoseRefinement | None = None
+    """Trains the camera poses; None leaves them as given."""
     doubt: MaskDoubt | None = None
     """Takes missed tools out of the frames; None trusts the masks."""
     background: Tensor = field(default_factory=lambda: torch.zeros(3))
@@ -78,18 +81,23 @@ class TrainingStep:
         batch = self._right_batch(iteration, position) if right else self._batch(iteration, position, fine)
 
         splats, offsets, means_before = self._deform(state, batch, iteration)
+        drawn, twist = self._posed(state, splats, batch)
         out = self.rasterize(
-            splats, batch.frame.camera, background=self.background, depth_grad_to_means=cfg.render.depth_grad_to_means
+            drawn, batch.frame.camera, background=self.background, depth_grad_to_means=cfg.render.depth_grad_to_means
         )
         out.means2d.retain_grad()
         counted = batch.frame
         if self.doubt and fine and not right and iteration > START * stage_length(cfg, Stage.FINE):
             counted = self.doubt.counted(counted, out.color)
+        if state.depth_fit is not None and fine:
+            counted = depth_fit.fitted(counted, state.depth_fit[batch.position])
         terms = supervised_terms(out, counted, cfg.loss, self.ops)
         if offsets is not None and state.tracks is not None:
             terms |= self._track_terms(state, batch, offsets)
         if batch.before is not None:
             terms |= temporal_terms(state, batch.frame, batch.before, splats.means, means_before, out, cfg, self.ops)
+        if twist is not None:
+            terms["poses"] = smoothness(state.poses.twists, batch.position, twist, cfg.poses)
         sum(terms.values()).backward()
 
         last = iteration == stage_length(cfg, state.stage)
@@ -103,7 +111,11 @@ class TrainingStep:
         else:
             with torch.no_grad():
                 self._observe(state, batch, out)
+                if state.depth_fit is not None and fine:
+                    depth_fit.update(state.depth_fit, batch.position, batch.frame, out)
                 state.optimizer.step(iteration, self.check.skip)
+                if twist is not None:
+                    self.poses.step(state.poses, batch.position, twist.grad, iteration)
                 if cfg.density.max_scale_share:
                     log_scales = state.gaussians["log_scales"].detach()
                     limit_scales(log_scales, splats.means, batch.frame.camera, cfg.density.max_scale_share)
@@ -147,6 +159,13 @@ class TrainingStep:
                 )
                 means_before = gaussians["means"] + displacement
         return gaussians.splats(offsets, sh_degree(self.cfg, state.stage, iteration)), offsets, means_before
+
+    def _posed(self, state: TrainState, splats: Splats, batch: Batch) -> tuple[Splats, Tensor | None]:
+        """The Gaussians as the refined camera sees them, and its twist (6,), which gets a gradient; None: as given."""
+        if self.poses is None or state.stage is not Stage.FINE:
+            return splats, None
+        twist = state.poses.twists[batch.position].clone().requires_grad_()
+        return moved(splats, batch.frame.camera, twist), twist
 
     def _track_terms(self, state: TrainState, batch: Batch, offsets: Offsets) -> dict[str, Tensor]:
         means, basis = state.gaussians["means"], self.cfg.deformation.basis

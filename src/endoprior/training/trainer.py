@@ -5,7 +5,7 @@ Two stages. Coarse: the first training frame alone, nothing deforms. Fine: a ran
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from .. import render
 from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.shell import command
+from ..core.types import Camera
 from ..data import FrameSequence
 from ..initialization.first_gaussians import first_gaussians
 from ..model.attributes import motion_layout
@@ -23,12 +24,14 @@ from ..model.gaussians import Gaussians, create_gaussians
 from ..model.scene_file import check_cameras
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import part
+from . import depth_fit
 from .density import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
 from .mask_doubt import MaskDoubt
 from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
+from .pose_refinement import PoseRefinement, PoseState, refined_cameras
 from .state import Stage, StepReport, TrainState
 from .step import TrainingStep, stage_length
 from .track_loss import StartTracks
@@ -73,6 +76,7 @@ class Trainer:
             render.load(cfg.render.backend),
             self.ops,
             DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
+            PoseRefinement(self.cameras, frames, self.cfg) if refines_poses(sequence, self.cameras, cfg) else None,
             MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
             torch.zeros(3, device=self.device),
         )
@@ -94,7 +98,15 @@ class Trainer:
             generator = torch.Generator().manual_seed(cfg.seed)
             field = HexPlaneField.from_points(gaussians["means"].detach(), cfg.deformation, generator)
         stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
-        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks)
+        num = len(self.sequence.indices("train"))
+        poses = PoseState.at_start(num) if self.step_once.poses else None
+        fit = depth_fit.at_start(num) if self.fits_depth else None
+        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, poses, fit)
+
+    @property
+    def fits_depth(self) -> bool:
+        """Whether the depth of each frame is compared up to a scale and a shift."""
+        return self.cfg.loss.fit_relative_depth and self.sequence.depth_is_relative
 
     def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
         """Continue from a state that `TrainState.arrays` gave, trusted to fit the config."""
@@ -102,7 +114,9 @@ class Trainer:
         if self.cfg.deformation.kind == "hexplane":
             field = HexPlaneField.from_state_arrays(part(arrays, "field."), self.cfg.deformation).to(self.device)
         held = part(arrays, "tracks.")
-        self._enter(stage, gaussians, field, StartTracks(**held).to(self.device) if held else None)
+        poses = PoseState(**part(arrays, "poses.")) if self.step_once.poses else None
+        tracks = StartTracks(**held).to(self.device) if held else None
+        self._enter(stage, gaussians, field, tracks, poses, arrays.get("depth_fit"))
         self.state.iteration = iteration
         self.state.optimizer.load_state_arrays(part(arrays, "optimizer."))
         self.state.stats = DensityStats(
@@ -110,11 +124,17 @@ class Trainer:
         )
 
     def _enter(
-        self, stage: Stage, gaussians: Gaussians, field: HexPlaneField | None, tracks: StartTracks | None
+        self,
+        stage: Stage,
+        gaussians: Gaussians,
+        field: HexPlaneField | None,
+        tracks: StartTracks | None,
+        poses: PoseState | None,
+        fit: Tensor | None,
     ) -> None:
         optimizer = Optimizer(gaussians, field, self.cfg, self.spatial_scale, self.ops)
         stats = DensityStats.zeros(len(gaussians), self.device)
-        self.state = TrainState(stage, 0, gaussians, field, optimizer, stats, tracks)
+        self.state = TrainState(stage, 0, gaussians, field, optimizer, stats, tracks, poses, fit)
 
     @property
     def finished(self) -> bool:
@@ -136,7 +156,7 @@ class Trainer:
         """
         state = self.state
         if state.stage is Stage.COARSE and state.iteration >= stage_length(self.cfg, Stage.COARSE):
-            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks)
+            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, state.poses, state.depth_fit)
         report = self.step_once(self.state)
         if report.divergence is not None:
             raise Diverged(report.divergence.reason)
@@ -164,6 +184,11 @@ class Trainer:
             self.state.iteration = divergence.last_good
             raise Diverged(divergence.reason)
 
+    def _refined_cameras(self) -> tuple[Camera, ...]:
+        if self.state.poses is None:
+            return self.cameras
+        return refined_cameras(self.cameras, self.step_once.frames.indices, self.state.poses.twists.numpy())
+
     def scene(self) -> SingleScene:
         """The scene as it is now, on the CPU."""
         state = self.state
@@ -171,12 +196,18 @@ class Trainer:
             gaussians=state.gaussians.to("cpu"),
             field=state.field and state.field.to("cpu"),
             config=self.cfg,
-            cameras=self.cameras,
+            cameras=self._refined_cameras(),
             frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
             prior_score=state.stats.score(self.cfg.density.unobserved_score).cpu(),
             num_valid=state.stats.num_valid.cpu().clone(),
             lengths_are_relative=self.sequence.depth_is_relative,
         )
+
+
+def refines_poses(sequence: FrameSequence, cameras: Sequence[Camera], cfg: Config) -> bool:
+    """Whether training changes camera poses: as `PoseConfig.refine` says, and never those of a static camera."""
+    wanted = cfg.poses.refine == "always" or (cfg.poses.refine == "estimated" and sequence.poses_are_estimated)
+    return wanted and any((camera.world_to_camera != cameras[0].world_to_camera).any() for camera in cameras)
 
 
 def device_for(backend: render.Backend) -> torch.device:

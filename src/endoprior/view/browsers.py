@@ -68,6 +68,20 @@ class Browsers:
         for browser in self._browsers.values():
             browser.pose = None
 
+    def ride(self, before: Camera, now: Camera) -> None:
+        """Move the camera of every browser as the endoscope moves from `before` to `now`."""
+        move = np.linalg.inv(now.world_to_camera) @ before.world_to_camera
+        if np.allclose(move, np.eye(4), atol=1e-12):
+            return
+        for browser in self._connected():
+            camera = browser.client.camera
+            if not is_camera({name: np.asarray(getattr(camera, name)).tolist() for name in CAMERA_FIELDS}):
+                continue
+            places = [move[:3, :3] @ place + move[:3, 3] for place in (camera.position, camera.look_at)]
+            with browser.client.atomic():
+                camera.position, camera.look_at = places
+                camera.up_direction = move[:3, :3] @ camera.up_direction
+
     def viewport(
         self, client: viser.ClientHandle, viewable: Viewable, settings: ViewSettings, shrink: int = 1
     ) -> Viewport | None:

@@ -59,6 +59,9 @@ class Panel:
             names = [LAYER_NAMES[layer] for layer in viewable.layers]
             self.layer = gui.add_dropdown("Layer", names, initial_value=names[0])
             self.camera = gui.add_dropdown("Camera", (ENDOSCOPE, ORBIT), initial_value=ENDOSCOPE)
+            moves = bool(np.ptp([camera.world_to_camera for camera in viewable.cameras], axis=0).any())
+            hint = "The view of Orbit keeps its place beside the endoscope."
+            self.riding = gui.add_checkbox("Move with the endoscope", True, visible=moves, hint=hint)
             self.rendered_by = gui.add_dropdown("Rendered by", (SERVER, BROWSER), initial_value=SERVER, visible=trained)
             self.rendered_as = gui.add_dropdown("Rendered as", (SPLATS, POINTS), initial_value=SPLATS, visible=trained)
             hint = "Displacement and stretch are measured since this frame."
@@ -114,7 +117,7 @@ class Panel:
         allow(lambda value: are_numbers([value], 1, self.radius.max) and value >= self.radius.min, self.radius)
         buttons = self.play, self.clear, self.table, self.screenshot, self.keep, self.forget, self.video
         buttons += self.undo, self.carry, self.save_masks, self.clear_tracks
-        switches = self.tool, self.tracks, self.follow, self.measure, self.correct, self.erase
+        switches = self.tool, self.riding, self.tracks, self.follow, self.measure, self.correct, self.erase
         allow(lambda value: isinstance(value, bool), *switches, *buttons)
         for handle in (self.speed, self.layer, self.camera, self.rendered_by, self.rendered_as, self.quantity):
             allow(lambda value, names=handle.options: isinstance(value, str) and value in names, handle)
@@ -144,6 +147,7 @@ class Panel:
             settings,
             layer=layers[self.layer.value],
             endoscope=self.camera.value == ENDOSCOPE,
+            riding=self.riding.value,
             in_browser=self.rendered_by.value == BROWSER,
             points=self.rendered_as.value == POINTS,
             tool=self.tool.value,

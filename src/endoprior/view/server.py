@@ -223,9 +223,15 @@ class Viewer:
 
     def _go_to(self, frame: int) -> None:
         self._moved_at = clock.monotonic()
-        self.settings = replace(self.settings, frame=min(max(frame, 0), len(self.viewable.cameras) - 1))
+        self._set_frame(min(max(frame, 0), len(self.viewable.cameras) - 1))
         self._restart_clock()
         self._update_panel()
+
+    def _set_frame(self, frame: int) -> None:
+        """Show a frame; the cameras of browsers ride along with the endoscope, if they are to."""
+        if self.settings.riding and not self.settings.endoscope:
+            self._browsers.ride(self.viewable.cameras[self.settings.frame], self.viewable.cameras[frame])
+        self.settings = replace(self.settings, frame=frame)
 
     # Playback.
 
@@ -245,7 +251,7 @@ class Viewer:
         frame = frame_due(start, clock.monotonic() - since, rate, total)
         if frame != self.settings.frame:
             self._moved_at = clock.monotonic()
-            self.settings = replace(self.settings, frame=frame)
+            self._set_frame(frame)
             self.panel.frame.value = frame
             self._update_panel()
 
@@ -333,7 +339,11 @@ class Viewer:
             return
         settings, places = (
             self.settings,
-            follow_frames(self.viewable.cameras, None if self.settings.endoscope else viewport.camera),
+            follow_frames(
+                self.viewable.cameras,
+                None if self.settings.endoscope else viewport.camera,
+                self.settings.frame if self.settings.riding else None,
+            ),
         )
         if len(self.kept_views) > 1:
             settings, places = replace(settings, endoscope=False), interpolate(self.kept_views)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..core.types import Camera
+from .viewport import riding
 
 LEAST_STEPS = 24
 """Images between two saved views of the same frame."""
@@ -22,9 +23,17 @@ class PathPoint:
     camera: Camera
 
 
-def follow_frames(cameras: tuple[Camera, ...], standing: Camera | None) -> list[PathPoint]:
-    """Every frame, from the endoscope camera of that frame or, if given, from the static camera `standing`."""
-    return [PathPoint(i, standing or camera) for i, camera in enumerate(cameras)]
+def follow_frames(cameras: tuple[Camera, ...], free: Camera | None, rides_from: int | None = None) -> list[PathPoint]:
+    """Every frame, from the endoscope camera of that frame or, if given, from a `free` camera.
+
+    Args:
+        rides_from: the frame in which `free` is where it is; from there it moves with the endoscope. None: it stands.
+    """
+    if free is None:
+        return [PathPoint(i, camera) for i, camera in enumerate(cameras)]
+    if rides_from is None:
+        return [PathPoint(i, free) for i in range(len(cameras))]
+    return [PathPoint(i, riding(free, cameras[rides_from], camera)) for i, camera in enumerate(cameras)]
 
 
 def interpolate(places: list[PathPoint]) -> list[PathPoint]:

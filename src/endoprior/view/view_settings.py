@@ -25,6 +25,8 @@ class ViewSettings:
     layer: Layer = "color"
     endoscope: bool = True
     """Use the camera of the sequence in this frame; False: the camera of the browser."""
+    riding: bool = True
+    """A camera of the browser moves with the endoscope from frame to frame; False: it stands still."""
     in_browser: bool = False
     """Send the Gaussians to the browser and render there (smooth); False: render on the server (exact)."""
     points: bool = False

@@ -88,6 +88,12 @@ def free_viewport(
     return Viewport(Camera(width, height, focal, focal, width / 2, height / 2, pose), width, height, 0, 0)
 
 
+def riding(camera: Camera, before: Camera, now: Camera) -> Camera:
+    """`camera` moved as the endoscope moves from `before` to `now`: it stays where it was beside the endoscope."""
+    pose = camera.world_to_camera @ np.linalg.inv(before.world_to_camera) @ now.world_to_camera
+    return replace(camera, world_to_camera=pose)
+
+
 def bounded_aspect(width: float, height: float) -> float:
     """width / height of a canvas, clamped; 1 for an empty canvas."""
     if not (0 < width < float("inf") and 0 < height < float("inf")):

@@ -1,5 +1,6 @@
 // Where the scene is seen from. A view is {rotation, translation, focal, center, size}: world to camera (rows of the
-// rotation one after the other, mm), and a pinhole in pixels of the recording; x right, y down, z forward.
+// rotation one after the other, mm), and a pinhole in pixels of the recording; x right, y down, z forward. A recorded
+// one has a `focus` too: the depth of the tissue there, mm.
 
 const FARTHEST_ZOOM = 4;
 const NEAREST_ZOOM = 0.1;
@@ -26,13 +27,13 @@ function recordedView(about, frame) {
     focal: [fx, fy],
     center: [cx, cy],
     size: [about.width, about.height],
+    focus: about.focus[frame],
   };
 }
 
 // A free camera that starts as the recorded one and turns around the point at the center of its image.
 class FreeCamera {
-  constructor(focus) {
-    this.focus = focus; // mm in front of the camera
+  constructor() {
     this.reset();
   }
 
@@ -49,7 +50,7 @@ class FreeCamera {
   }
 
   move(dx, dy, base) {
-    const distance = this.focus * this.zoom;
+    const distance = base.focus * this.zoom;
     this.shift = [this.shift[0] + (dx * distance) / base.focal[0], this.shift[1] + (dy * distance) / base.focal[1]];
   }
 
@@ -59,12 +60,12 @@ class FreeCamera {
 
   // size: px of the recording that fit in the window, with the recorded image in the center.
   view(base, size) {
-    const middle = base.size.map((length, i) => ((length / 2 - base.center[i]) / base.focal[i]) * this.focus);
-    const pivot = [...middle, this.focus];
+    const middle = base.size.map((length, i) => ((length / 2 - base.center[i]) / base.focal[i]) * base.focus);
+    const pivot = [...middle, base.focus];
     const [sy, cy] = [Math.sin(this.yaw), Math.cos(this.yaw)];
     const [sp, cp] = [Math.sin(this.pitch), Math.cos(this.pitch)];
     const turned = multiply([1, 0, 0, 0, cp, -sp, 0, sp, cp], [cy, 0, sy, 0, 1, 0, -sy, 0, cy]);
-    const away = [middle[0] * this.zoom + this.shift[0], middle[1] * this.zoom + this.shift[1], this.focus * this.zoom];
+    const away = [middle[0] * this.zoom + this.shift[0], middle[1] * this.zoom + this.shift[1], base.focus * this.zoom];
     const offset = rotate(turned, base.translation.map((t, i) => t - pivot[i]));
     return {
       rotation: multiply(turned, base.rotation),
@@ -76,9 +77,9 @@ class FreeCamera {
   }
 }
 
-// Weights that take a center's integers (x, y, z, 1) to its camera z, mm.
-function depthWeights(about, view) {
+// Weights that take the integers (x, y, z, 1) of a center of a block to its camera z, mm.
+function depthWeights({ low, step }, view) {
   const row = view.rotation.slice(6, 9);
-  const weights = row.map((r, i) => r * about.channels[i].step);
-  return [...weights, view.translation[2] + row.reduce((sum, r, i) => sum + r * about.channels[i].low, 0)];
+  const weights = row.map((r, i) => r * step[i]);
+  return [...weights, view.translation[2] + row.reduce((sum, r, i) => sum + r * low[i], 0)];
 }

@@ -34,11 +34,9 @@ function cornersOfSquares(count) {
 }
 
 class Painter {
-  // planes: Uint16Array per channel, as `unpack` returns them
-  constructor(canvas, about, planes) {
+  constructor(canvas, about) {
     this.canvas = canvas;
     this.about = about;
-    this.planes = planes;
     this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
     if (!this.gl) throw new Error("This browser has no WebGL 2, which draws the scene. Turn on hardware acceleration, or use a recent Chrome, Edge, Firefox or Safari.");
     this.start();
@@ -87,26 +85,28 @@ class Painter {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.sum, 0);
   }
 
-  upload(frame) {
+  upload(frame, parts) {
     if (this.uploaded === frame) return;
     const { gl, texels } = this;
-    const { gaussians } = this.about;
-    CHANNEL_SLOTS.forEach((slot, c) => {
-      const plane = this.planes[c];
-      const start = plane.length > gaussians ? frame * gaussians : 0;
-      for (let n = 0, i = slot; n < gaussians; n++, i += 4 * GAUSSIAN_TEXELS) texels[i] = plane[start + n];
-    });
+    let start = 0;
+    for (const { gaussians, values } of parts) {
+      CHANNEL_SLOTS.forEach((slot, c) => {
+        const own = values[c];
+        for (let n = 0, i = start + slot; n < gaussians; n++, i += 4 * GAUSSIAN_TEXELS) texels[i] = own[n];
+      });
+      start += 4 * GAUSSIAN_TEXELS * gaussians;
+    }
     gl.bindTexture(gl.TEXTURE_2D, this.gaussians);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, GAUSSIANS_PER_ROW * GAUSSIAN_TEXELS, this.rows, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, texels);
     this.uploaded = frame;
   }
 
-  // order: indices far to near; depth: show depth in place of color
-  draw(frame, order, view, depth) {
+  // parts: as `Blocks.parts` gives them for that frame; order: indices far to near; depth: show depth, not color
+  draw(frame, parts, order, view, depth) {
     const { gl } = this;
     if (gl.isContextLost()) return;
     this.resizeSum();
-    this.upload(frame);
+    this.upload(frame, parts);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.clearColor(0, 0, 0, 0);
@@ -114,7 +114,7 @@ class Painter {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(this.splats.program);
-    this.setView(view, depth);
+    this.setView(view, parts, depth);
     gl.activeTexture(gl.TEXTURE1);
     gl.bindTexture(gl.TEXTURE_2D, this.order);
     this.orderTexels.set(order);
@@ -148,17 +148,19 @@ class Painter {
     return performance.now() - this.began;
   }
 
-  setView(view, depth) {
+  setView(view, parts, depth) {
     const { gl, about } = this;
     const at = this.splats.places;
     const { rotation: r, focal, center, size } = view;
-    const [low, stepSize] = [new Float32Array(4 * GAUSSIAN_TEXELS), new Float32Array(4 * GAUSSIAN_TEXELS)];
-    CHANNEL_SLOTS.forEach((slot, c) => {
-      low[slot] = about.channels[c].low;
-      stepSize[slot] = about.channels[c].step;
-    });
+    const perPart = 4 * GAUSSIAN_TEXELS;
+    const [low, stepSize] = [new Float32Array(2 * perPart), new Float32Array(2 * perPart)];
+    parts.forEach((part, p) => CHANNEL_SLOTS.forEach((slot, c) => {
+      low[p * perPart + slot] = part.low[c];
+      stepSize[p * perPart + slot] = part.step[c];
+    }));
     gl.uniform1i(at.gaussians, 0);
     gl.uniform1i(at.order, 1);
+    gl.uniform1i(at.border, parts.length ? parts[0].gaussians : 0);
     gl.uniform4fv(at.low, low);
     gl.uniform4fv(at.stepSize, stepSize);
     gl.uniformMatrix3fv(at.toCamera, true, r);

@@ -14,9 +14,10 @@ const canvas = byId("picture");
 const about = JSON.parse(byId("about").textContent);
 const numFrames = about.seconds.length;
 const state = { frame: 0, clock: 0, playing: false, speed: 1, loop: true, free: false, depth: false, base: 0 };
-const hand = new FreeCamera(about.focus);
-const swaying = new FreeCamera(about.focus); // until the first touch
+const hand = new FreeCamera();
+const swaying = new FreeCamera(); // until the first touch
 let swayedFor = window.matchMedia("(prefers-reduced-motion: reduce)").matches ? Infinity : 0; // s
+let blocks = null;
 let painter = null;
 let sorter = null;
 let stale = true;
@@ -33,6 +34,11 @@ function fail(text) {
   byId("message").firstElementChild.textContent = text;
   document.body.dataset.state = "failed";
   stage.removeAttribute("aria-busy");
+}
+
+function failWith(error) {
+  console.error(error);
+  fail(error.message);
 }
 
 // ---- rendering
@@ -61,19 +67,25 @@ function fit() {
   return { scale, size: [width / scale, height / scale] };
 }
 
+// A free view starts at the endoscope. Within one window it stays there; over several it goes along with the endoscope,
+// because what it showed at first is not shown any more after a while.
+function freeBase() {
+  return recordedView(about, about.blocks.length > 1 ? state.frame : state.base);
+}
+
 function requestPicture(share) {
   stale = false;
   const { free, depth, frame } = state;
-  const recorded = recordedView(about, free ? state.base : frame);
+  const recorded = free ? freeBase() : recordedView(about, frame);
   const beside = swayedFor < Infinity ? swaying.view(recorded, recorded.size) : recorded;
   const view = free ? hand.view(recorded, fit().size) : beside;
-  sorter.ask({ frame, weights: depthWeights(about, view), nearZ: NEAR_Z, view, depth, share });
+  sorter.ask({ frame, parts: blocks.parts(frame), nearZ: NEAR_Z, view, depth, share }).catch(failWith);
 }
 
 // Called by the sorter with the order and its request.
-function drawAnswer(order, { frame, view, depth, share }) {
+function drawAnswer(order, { frame, parts, view, depth, share }) {
   layOut(share);
-  painter.draw(frame, order, view, depth);
+  painter.draw(frame, parts, order, view, depth);
   drawnQuality = share;
   canvas.dataset.frame = frame;
   canvas.dataset.drawn = Number(canvas.dataset.drawn || 0) + 1;
@@ -206,7 +218,7 @@ function onMove(event) {
   const [dx, dy] = [0, 1].map((i) => (after.middle[i] - before.middle[i]) / scale);
   if (!dx && !dy && before.spread === after.spread) return;
   if (!state.free) setFree(true);
-  if (touching.size > 1 || event.buttons & 6 || event.shiftKey) hand.move(dx, dy, recordedView(about, state.base));
+  if (touching.size > 1 || event.buttons & 6 || event.shiftKey) hand.move(dx, dy, freeBase());
   else hand.turn(dx, dy);
   if (before.spread > 0 && after.spread > 0) hand.approach(before.spread / after.spread);
   changed();
@@ -334,7 +346,11 @@ function learnFrom(took) {
 function run() {
   let before = performance.now();
   const tick = (now) => {
-    if (state.playing) advance((now - before) / 1000);
+    const ready = blocks.ready(state.frame);
+    if (state.playing && ready) advance((now - before) / 1000);
+    if (state.playing && !ready) canvas.dataset.waits = Number(canvas.dataset.waits || 0) + 1;
+    blocks.want(state.frame).catch(failWith);
+    canvas.dataset.unpacked = [...blocks.planes.keys()].filter((k) => blocks.planes[k]);
     sway((now - before) / 1000);
     before = now;
     const took = painter.finished();
@@ -343,7 +359,7 @@ function run() {
       const share = state.playing || swayedFor < Infinity || touching.size || now - changedAt < REST ? quality : 1;
       const fine = !stale && drawnQuality >= share;
       canvas.dataset.settled = fine && share === 1;
-      if (!fine) requestPicture(share);
+      if (!fine && blocks.ready(state.frame)) requestPicture(share);
     }
     requestAnimationFrame(tick);
   };
@@ -357,18 +373,16 @@ async function start() {
   if (!("DecompressionStream" in window)) {
     throw new Error("This browser cannot unpack the scene. Chrome or Edge 80, Firefox 113, Safari 16.4 or later can.");
   }
-  const planes = await unpack(about, byId("data").textContent, (share) => {
-    byId("message").firstElementChild.textContent = `Unpacking… ${Math.round(100 * share)} %`;
+  blocks = new Blocks(about, bytesOfBase64(byId("data").textContent), (share) => {
+    if (!painter) byId("message").firstElementChild.textContent = `Unpacking… ${Math.round(100 * share)} %`;
   });
   byId("data").remove();
-  painter = new Painter(canvas, about, planes);
-  sorter = new Sorter(planes.slice(0, 3), about.gaussians, drawAnswer);
+  await blocks.load(state.frame);
+  painter = new Painter(canvas, about);
+  sorter = new Sorter(drawAnswer);
   connect();
   stage.removeAttribute("aria-busy");
   run();
 }
 
-start().catch((error) => {
-  console.error(error);
-  fail(error.message);
-});
+start().catch(failWith);

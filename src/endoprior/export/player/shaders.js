@@ -11,7 +11,8 @@ precision highp float;
 precision highp int;
 precision highp usampler2D;
 uniform usampler2D gaussians, order;
-uniform vec4 low[${GAUSSIAN_TEXELS}], stepSize[${GAUSSIAN_TEXELS}];
+uniform vec4 low[${2 * GAUSSIAN_TEXELS}], stepSize[${2 * GAUSSIAN_TEXELS}];  // of the first block, then of the second
+uniform int border;        // index of the first Gaussian of the second block
 uniform mat3 toCamera;
 uniform vec3 origin;
 uniform vec2 focal, center, size;
@@ -28,7 +29,8 @@ const float ALPHA_MIN = 1.0 / 255.0;
 
 vec4 part(int i, int k) {
   ivec2 at = ivec2((i % ${GAUSSIANS_PER_ROW}) * ${GAUSSIAN_TEXELS} + k, i / ${GAUSSIANS_PER_ROW});
-  return low[k] + stepSize[k] * vec4(texelFetch(gaussians, at, 0));
+  int own = i < border ? k : k + ${GAUSSIAN_TEXELS};
+  return low[own] + stepSize[own] * vec4(texelFetch(gaussians, at, 0));
 }
 
 mat3 rotation(vec4 q) {  // w, x, y, z

@@ -1,19 +1,19 @@
 // Order of rendering: far to near, by camera z of the centers, in a worker where the browser allows one.
 
-// planes: integers of x, y, z, each with one frame or all of them; weights: z = weights . (x, y, z, 1) in integers.
-// Returns the indices of Gaussians beyond nearZ, the farthest first. Counting sort over 2**16 bins; stable.
-function sortFarToNear(planes, numGaussians, frame, weights, nearZ) {
-  const [xs, ys, zs] = planes.map((plane) => {
-    const start = plane.length > numGaussians ? frame * numGaussians : 0;
-    return plane.subarray(start, start + numGaussians);
-  });
-  const [a, b, c, d] = weights;
+// parts: for each block {centers, weights}: integers of x, y, z, and z = weights . (x, y, z, 1) of those integers.
+// Returns the indices of Gaussians beyond nearZ, the farthest first; those of the second block are counted on from the
+// first. Counting sort over 2**16 bins; stable.
+function sortFarToNear({ parts, nearZ }) {
+  const numGaussians = parts.reduce((sum, { centers }) => sum + centers[0].length, 0);
   const depth = new Float32Array(numGaussians);
+  let from = 0;
+  for (const { centers: [xs, ys, zs], weights: [a, b, c, d] } of parts) {
+    for (let n = 0; n < xs.length; n++) depth[from + n] = a * xs[n] + b * ys[n] + c * zs[n] + d;
+    from += xs.length;
+  }
   let least = Infinity;
   let most = -Infinity;
-  for (let n = 0; n < numGaussians; n++) {
-    const z = a * xs[n] + b * ys[n] + c * zs[n] + d;
-    depth[n] = z;
+  for (const z of depth) {
     if (z > nearZ) {
       if (z < least) least = z;
       if (z > most) most = z;
@@ -39,63 +39,30 @@ function sortFarToNear(planes, numGaussians, frame, weights, nearZ) {
 
 // Sorts one request at a time; of the requests that arrive meanwhile, only the newest is answered.
 class Sorter {
-  constructor(planes, numGaussians, answered) {
-    this.planes = planes;
-    this.numGaussians = numGaussians;
+  constructor(answered) {
     this.answered = answered; // (order, question)
     this.asked = null;
     this.waiting = null;
-    this.worker = this.startWorker();
+    this.aside = new Aside(sortFarToNear);
   }
 
-  startWorker() {
-    const source = `${sortFarToNear}
-      let planes, numGaussians;
-      onmessage = ({ data }) => {
-        if (data.planes) { ({ planes, numGaussians } = data); return; }
-        const order = sortFarToNear(planes, numGaussians, data.frame, data.weights, data.nearZ);
-        postMessage(order, [order.buffer]);
-      };`;
-    try {
-      const address = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
-      const worker = new Worker(address);
-      worker.onmessage = ({ data }) => this.finish(data);
-      worker.onerror = (event) => {
-        event.preventDefault();
-        if (this.worker) this.stopWorker();
-      };
-      worker.postMessage({ planes: this.planes, numGaussians: this.numGaussians });
-      return worker;
-    } catch (error) {
-      return null; // some browsers forbid workers in pages from disk
-    }
-  }
-
-  stopWorker() {
-    this.worker.terminate();
-    this.worker = null;
-    const { asked, waiting } = this;
-    this.asked = this.waiting = null;
-    if (waiting || asked) this.ask(waiting || asked);
-  }
-
-  // question: {frame, weights, nearZ, ...}, handed back with the answer
-  ask(question) {
+  // question: {parts, view, nearZ, ...}, handed back with the answer
+  async ask(question) {
     if (this.asked) {
       this.waiting = question;
       return;
     }
     this.asked = question;
-    const { frame, weights, nearZ } = question;
-    if (this.worker) this.worker.postMessage({ frame, weights, nearZ });
-    else this.finish(sortFarToNear(this.planes, this.numGaussians, frame, weights, nearZ));
-  }
-
-  finish(order) {
-    const question = this.asked;
+    const { parts, view, nearZ } = question;
+    // Copies: a view would be sent with all that lies behind it.
+    const sorted = parts.map((part) => ({
+      centers: part.values.slice(0, 3).map((values) => values.slice()),
+      weights: depthWeights(part, view),
+    }));
+    const order = await this.aside.call({ parts: sorted, nearZ });
     const next = this.waiting;
     this.asked = this.waiting = null;
     this.answered(order, question);
-    if (next) this.ask(next);
+    if (next) await this.ask(next);
   }
 }

@@ -13,10 +13,10 @@ async function inflate(bytes) {
 }
 
 // bytes: a plane of low bytes, then one of high bytes, Gaussian by Gaussian.
-// Returns integers frame by frame: value of Gaussian n in frame t at [t * numGaussians + n]; one frame for order 0.
-function undoPrediction(bytes, order, numFrames, numGaussians) {
-  const frames = order === 0 ? 1 : numFrames;
-  const size = frames * numGaussians;
+// Returns integers step by step: value of Gaussian n in time step t at [t * numGaussians + n]; one step for order 0.
+function undoPrediction(bytes, order, steps, numGaussians) {
+  const stored = order === 0 ? 1 : steps;
+  const size = stored * numGaussians;
   if (bytes.length !== 2 * size) throw new Error(`expected ${2 * size} bytes in a channel; got ${bytes.length}`);
   const values = new Uint16Array(size);
   for (let n = 0, i = 0; n < numGaussians; n++) {
@@ -24,7 +24,7 @@ function undoPrediction(bytes, order, numFrames, numGaussians) {
     let speed = 0;
     i++;
     values[n] = value;
-    for (let t = 1; t < frames; t++, i++) {
+    for (let t = 1; t < stored; t++, i++) {
       const code = bytes[i] | (bytes[size + i] << 8);
       const residual = (code >>> 1) ^ -(code & 1);
       speed = order === 2 ? speed + residual : residual;
@@ -35,16 +35,12 @@ function undoPrediction(bytes, order, numFrames, numGaussians) {
   return values;
 }
 
-// Returns one Uint16Array per channel; progress(share) is called in between.
-async function unpack(about, text, progress) {
-  const packed = bytesOfBase64(text);
+// All channels of a block: {streams, orders, steps, gaussians}, the first two with an entry per channel.
+async function unpackBlock({ streams, orders, steps, gaussians }, tell) {
   const planes = [];
-  let start = 0;
-  for (const channel of about.channels) {
-    const bytes = await inflate(packed.subarray(start, start + channel.bytes));
-    planes.push(undoPrediction(bytes, channel.order, about.seconds.length, about.gaussians));
-    start += channel.bytes;
-    progress(planes.length / about.channels.length);
+  for (const stream of streams) {
+    planes.push(undoPrediction(await inflate(stream), orders[planes.length], steps, gaussians));
+    tell(planes.length / streams.length);
   }
   return planes;
 }

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.config_windows import WindowConfig
 from ..core.types import Camera
-from ..data import FrameSequence
+from .sequence import FrameSequence
 
 THUMBNAIL = (32, 24)
 """(width, height) of the pictures that are compared, px: noise and texture are averaged out."""
@@ -68,6 +68,11 @@ def plan_windows(cameras: Sequence[Camera], looks: Looks, cfg: WindowConfig) -> 
             starts.append(first)
     stops = [min(start + cfg.overlap, num) for start in starts[1:]] + [num]
     return list(zip(starts, stops, strict=True))
+
+
+def windows_by_length(num_frames: int, cfg: WindowConfig) -> int:
+    """Number of windows where nothing but the length cuts: what a static camera needs."""
+    return max(-(-(num_frames - cfg.overlap) // (cfg.longest - cfg.overlap)), 1)
 
 
 def _has_changed(
