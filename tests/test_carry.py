@@ -81,7 +81,7 @@ def test_confidence_is_a_probability_that_never_rises_with_the_spread():
 
 def test_few_points_need_few_gaussians(monkeypatch):
     scene, evaluated = moving_scene(), []
-    from endoprior.model import carry as module
+    from endoprior.model import single_scene as module
 
     before = module.offsets_at
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -29,9 +30,11 @@ def on_device(scene: Scene, wanted: Wanted, *, fp16_planes: bool = False) -> Sce
     return scene.to(choice.device, backend=choice.backend if on_gpu else None, fp16_planes=fp16_planes and on_gpu)
 
 
-def with_device(cfg: Config, wanted: Wanted) -> Config:
-    """The config with the rendering backend of the chosen device. Prints the device and the reason.
+def with_device(cfg: Config, wanted: Wanted, tell: Callable[[str], None] = say) -> Config:
+    """The config with the rendering backend of the chosen device.
 
+    Args:
+        tell: takes the device and the reason, as a line for the user.
     Raises:
         InputError: CUDA was requested and is not usable, or the config names a GPU backend and the user the CPU.
     """
@@ -42,7 +45,7 @@ def with_device(cfg: Config, wanted: Wanted) -> Config:
         fix = f"Remove --device cpu or --render.backend {named}."
         raise input_error(f"--render.backend {named}", "--device cuda or auto", "cpu", fix)
     choice = choose_here("cuda" if named else wanted)
-    say(choice.why)
+    tell(choice.why)
     if choice.device == "cpu" or named:
         return cfg
     return replace(cfg, render=replace(cfg.render, backend=choice.backend))

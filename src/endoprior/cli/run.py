@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -65,13 +66,11 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Do every step, with one progress display."""
     args = parse(Run, argv, "run", HELP)
-    from ..pipeline import STEPS, estimate, make_job, notes_of, open_folder, problems, run_step
+    from ..pipeline import STEPS, estimate, notes_of, open_folder, problems, run_step
     from ..runs import kernel_cache
 
     began = clock.perf_counter()
-    cfg = replace(preset("preview" if args.preview else args.preset), seed=args.seed)
-    cfg = with_device(cfg, args.device)
-    job = make_job(args.video, args.out, args.config, cfg, preset=args.preset, preview=args.preview)
+    job = job_of(args, say)
     resumes = open_folder(job)
     say(_part_words(job))
     waiting = [step for step in STEPS if not step.result(job).exists()]
@@ -79,7 +78,7 @@ def run(argv: list[str]) -> None:
         say(resume_words([step.name for step in STEPS], [step.name for step in waiting]))
     kernel_cache.fill(job.cfg, say)
     seconds: dict[str, float] = {}
-    if waiting == list(STEPS) and not args.preview and job.part.num_frames:
+    if waiting == list(STEPS) and not job.is_preview and job.part.num_frames:
         say("Estimating the time ...")
         seconds = estimate(job)
         say(f"This takes about {duration(sum(seconds.values()))}: {_seconds_words(seconds)}.")
@@ -112,17 +111,32 @@ def run(argv: list[str]) -> None:
         say(f"The whole model:     {_whole_command(job)}")
 
 
+def job_of(args: Run, tell: Callable[[str], None]) -> Job:
+    """The job that the arguments ask for.
+
+    Args:
+        tell: takes the device that trains, and the reason.
+    Raises:
+        InputError: the video cannot be read, or the device not be used.
+    """
+    from ..pipeline import make_job
+
+    cfg = replace(preset("preview" if args.preview else args.preset), seed=args.seed)
+    cfg = with_device(cfg, args.device, tell)
+    return make_job(args.video, args.out, args.config, cfg, preset=args.preset, preview=args.preview)
+
+
 def _whole_command(job: Job) -> str:
     """The command for the whole model, with the options of the preview: a stereo video needs its calibration again."""
     options = {name: words for name, words in job.options.items() if name != "--preview"}
-    return command_of("run", (job.video, Path("OUT")), options)
+    return command_of("run", (job.source, Path("OUT")), options)
 
 
 def _part_words(job: Job) -> str:
     """What is used of the video."""
     part = job.part
     seconds = part.num_frames / part.frames_per_second
-    words = f"{job.video}: {part.num_frames} frames, {seconds:.1f} s at {part.frames_per_second:g} frames/s"
+    words = f"{job.source}: {part.num_frames} frames, {seconds:.1f} s at {part.frames_per_second:g} frames/s"
     return words if part.is_whole else f"{words} from {part.start:g} s on (--start and --end choose another part)"
 
 

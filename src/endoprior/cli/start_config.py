@@ -63,13 +63,16 @@ def device_to_resume(cfg: Config) -> Wanted:
     return "cuda" if cfg.render.backend in ON_GPU else "cpu"
 
 
-def resume_command(run: Path, networks: bool, weights_dir: Path | None, checkpoint_seconds: float) -> str:
+def resume_command(
+    run: Path, networks: bool, weights_dir: Path | None, checkpoint_seconds: float, ray: str | None = None
+) -> str:
     """The command that resumes an interrupted training; config and data are those of the run folder."""
     words: list[str | Path] = [] if networks else ["--no-networks"]
     if weights_dir:
         words += ["--weights-dir", weights_dir]
     if checkpoint_seconds != 60:
         words += ["--checkpoint-seconds", f"{checkpoint_seconds:g}"]
+    words += ["--ray", ray] if ray else []
     return command("train", "--resume", run, *words)
 
 

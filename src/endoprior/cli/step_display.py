@@ -44,11 +44,11 @@ class StepDisplay:
         finally:
             if self._terminal:
                 print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-        say(f"{head:<14}{duration(clock.monotonic() - began)}")
+        say(f"{head:<13} {duration(clock.monotonic() - began)}")
 
     def skip(self, name: str) -> None:
         """Say that a step was done before."""
-        say(f"{self._head(name):<14}done before")
+        say(f"{self._head(name):<13} done before")
 
     def _head(self, name: str) -> str:
         return f"{self._names.index(name) + 1}/{len(self._names)}  {name}"

@@ -47,6 +47,9 @@ class Train:
     """Continue a run after a stop, with its data and config. The result is bit-identical to an uninterrupted run."""
     checkpoint_seconds: float = 60.0
     """Time between two checkpoints, and the most time that a crash can cost."""
+    ray: str | None = None
+    """Train on a Ray cluster that shares this file system: its address, `auto`, or `local`, which starts one. The
+    windows of a long sequence train at the same time; a machine that is lost costs the work since a checkpoint."""
     view: bool = False
     """Show the scene in a web browser during training. At 127.0.0.1 and --view-port; it slows down training."""
     view_port: int = 8080
@@ -74,7 +77,7 @@ HELP = Help(
 
 def run(argv: list[str]) -> None:
     """Train, score, and print the results."""
-    args = _arguments(argv)
+    args = arguments(argv)
     wanted = device_to_resume(args.config) if args.resume and args.device == "auto" else args.device
     cfg = with_device(args.config, wanted)
     if args.weights_dir and not args.weights_dir.is_dir():
@@ -82,7 +85,9 @@ def run(argv: list[str]) -> None:
     port = args.view_port if args.view else None
     if not args.checkpoint_seconds >= 0:
         raise input_error("--checkpoint-seconds", "at least 0", str(args.checkpoint_seconds), "Remove it for 60.")
-    kept = {"resume": args.resume, "checkpoint_seconds": args.checkpoint_seconds}
+    if args.ray and args.view:
+        raise input_error("--view", "a training in this process", f"--ray {args.ray}", "remove one of them.")
+    kept = {"resume": args.resume, "checkpoint_seconds": args.checkpoint_seconds, "ray": args.ray}
     train_and_evaluate(args.data, cfg, args.out, args.networks, args.weights_dir, port, **kept)
 
 
@@ -96,25 +101,33 @@ def train_and_evaluate(
     *,
     resume: bool = False,
     checkpoint_seconds: float = 60.0,
+    ray: str | None = None,
 ) -> None:
     """Train on the folder `data`, write the run folder `out`, score the test split, print the scores.
 
     Args:
         view_port: port of a live view of the training; None for no view.
-        resume, checkpoint_seconds: as in `runs.training_run.train`.
+        resume, checkpoint_seconds: as in `runs.train.train`.
+        ray: address of a Ray cluster that trains; None trains in this process.
     """
     from ..data import load_sequence
+    from ..runs.remote import complete_on
     from ..runs.train import start_run
+    from ..system.ray_cluster import connected
     from ..training.trainer import device_for
     from .evaluate import evaluate_run
 
     training = start_run(load_sequence(data, cfg.data), cfg, out, resume=resume, say=say)
     began = clock.perf_counter()
     try:
-        with training_progress() as show_progress, live_view(view_port) as show_scene:
-            scene = training.complete(show_progress, show_scene, checkpoint_seconds=checkpoint_seconds)
+        if ray:
+            with connected(ray, say) as cluster:
+                scene = complete_on(cluster, training, say, checkpoint_seconds)
+        else:
+            with training_progress() as show_progress, live_view(view_port) as show_scene:
+                scene = training.complete(show_progress, show_scene, checkpoint_seconds=checkpoint_seconds)
     except KeyboardInterrupt:
-        resume_with = resume_command(out, networks, weights_dir, checkpoint_seconds)
+        resume_with = resume_command(out, networks, weights_dir, checkpoint_seconds, ray)
         say(f"Stopped; the state is saved in {out}. To resume, run `{resume_with}`.")
         raise
     seconds = clock.perf_counter() - began
@@ -135,7 +148,7 @@ def _logged_seconds(log: Path) -> float:
     return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0
 
 
-def _arguments(argv: list[str]) -> Train:
+def arguments(argv: list[str]) -> Train:
     """The parsed arguments. A resumed run takes its config from its folder, and its data too if only RUN is given.
 
     Raises:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import subprocess
@@ -13,10 +12,10 @@ from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from ..core.checks import input_error
-from ..core.extras import install_command
+from ..system.console import say
+from ..system.ray_cluster import connected
 from .worker import Job
 
 SHOWN_LOG_LINES = 3
@@ -100,29 +99,15 @@ def ray_executor(address: str, threads: int) -> Iterator[Executor]:
     """A Ray cluster that shares this machine's file system; `local` starts one here.
 
     Raises:
-        InputError: Ray is not installed, or the cluster cannot be reached.
+        InputError: as `connected`, and if no machine has so many cores.
     """
-    try:
-        ray: Any = importlib.import_module("ray")
-    except ImportError:
-        raise input_error("--ray", "Ray", "none", f"`{install_command('ray')}`.") from None
-    try:
-        ray.init(**({} if address == "local" else {"address": address}), log_to_driver=False, include_dashboard=False)
-    except (ConnectionError, OSError, ValueError, RuntimeError) as error:
-        raise input_error(f"--ray {address}", "a running cluster", f"{error}", "start it or correct --ray.") from error
+    with connected(address, say) as cluster:
 
-    def execute(jobs: list[Job]) -> Iterator[Outcome]:
-        remote = ray.remote(num_cpus=threads, max_retries=0)(run_job)
-        running = {remote.remote(job): job for job in jobs}
-        while running:
-            (done,), _ = ray.wait(list(running), num_returns=1)
-            job = running.pop(done)
-            try:
-                yield ray.get(done)
-            except ray.exceptions.RayError as error:
-                yield Outcome(job, 0.0, f"Ray: {str(error).splitlines()[0]}")
+        def execute(jobs: list[Job]) -> Iterator[Outcome]:
+            for job in jobs:
+                cluster.start(job, run_job, job, cores=threads)
+            while cluster.num_running:
+                ended = cluster.next()
+                yield ended.value or Outcome(ended.key, 0.0, f"{ended.error}")
 
-    try:
         yield execute
-    finally:
-        ray.shutdown()

@@ -68,7 +68,7 @@ def estimate(job: Job) -> dict[str, float]:
     folder = job.out / ".trial"
     shutil.rmtree(folder, ignore_errors=True)
     try:
-        source = open_source(job.video, job.prepare.folder_rate)
+        source = open_source(job.source, job.prepare.folder_rate)
         end = job.part.start + (job.part.num_frames - 0.5) / job.part.frames_per_second
         images = round(end * source.frames_per_second)
         seconds = scaled(_measure(job, folder), job.cfg, job.part.num_frames, images)
@@ -111,9 +111,9 @@ def _measure(job: Job, folder: Path) -> Trial:
     short = replace(job, out=folder, prepare=replace(job.prepare, end=min(end, job.prepare.end)))
     folder.mkdir(parents=True)
     stamps = Stamps()
-    source = open_source(job.video, job.prepare.folder_rate)
+    source = open_source(job.source, job.prepare.folder_rate)
     decode, _ = _timed(lambda: [None for _ in islice(source, FRAMES)])
-    prepare(short.video, short.data, short.prepare, stamps)
+    prepare(short.source, short.data, short.prepare, stamps)
     prepared = clock.perf_counter()
     looked, followed = stamps.at["looking through"][0], stamps.at["following the camera"][0]
     learned, write = stamps.at["learning tools and light"][0], stamps.step("writing frames")

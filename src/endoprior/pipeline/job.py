@@ -1,4 +1,4 @@
-"""What to do with one video: its part, its settings, and where the results go."""
+"""What to do with one video or sequence folder: its part, its settings, and where the results go."""
 
 from __future__ import annotations
 
@@ -20,27 +20,25 @@ PREVIEW_WIDTH = 320
 
 
 @dataclass(frozen=True)
-class Job:
-    """One video on its way to a scene. Results are in `out`."""
+class SequenceJob:
+    """A sequence folder on its way to a scene. Results are in `out`."""
 
-    video: Path
+    source: Path
+    """What the user gave: the sequence folder."""
     out: Path
-    prepare: PrepareConfig
-    """Options of `prepare`, for `part` only."""
     cfg: Config
-    part: Part
     options: Options
-    """What the user chose, as it is typed; all of the above follows from it: `{"--preview": (), "--end": ("2.5",)}`."""
+    """What the user chose, as it is typed; all else follows from it: `{"--preview": (), "--end": ("2.5",)}`."""
 
     @property
     def is_preview(self) -> bool:
         """Whether it is a first look: few and small frames, a short training."""
-        return "--preview" in self.options
+        return False
 
     @property
     def data(self) -> Path:
         """The sequence folder."""
-        return self.out / "data"
+        return self.source
 
     @property
     def run(self) -> Path:
@@ -78,6 +76,25 @@ class Job:
         return self.out / "player.html"
 
 
+@dataclass(frozen=True)
+class Job(SequenceJob):
+    """A video on its way to a scene; it is prepared first."""
+
+    prepare: PrepareConfig
+    """Options of `prepare`, for `part` only."""
+    part: Part
+
+    @property
+    def is_preview(self) -> bool:
+        """See `SequenceJob`."""
+        return "--preview" in self.options
+
+    @property
+    def data(self) -> Path:
+        """The sequence folder, which `prepare` writes."""
+        return self.out / "data"
+
+
 def make_job(
     video: Path, out: Path, prepare: PrepareConfig, cfg: Config, *, preset: str = "default", preview: bool = False
 ) -> Job:
@@ -98,4 +115,4 @@ def make_job(
     chosen = replace(prepare, frames_per_second=part.frames_per_second, end=part.end, max_width=width)
     options: Options = {"--preview": ()} if preview else {"--preset": (preset,)} if preset != "default" else {}
     options |= {"--seed": (str(cfg.seed),)} if cfg.seed else {}
-    return Job(video, out, chosen, cfg, part, options | changed_options(prepare))
+    return Job(video, out, cfg, options | changed_options(prepare), chosen, part)

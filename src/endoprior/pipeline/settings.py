@@ -9,10 +9,11 @@ from typing import Any
 from ..core.checks import input_error
 from ..core.config_io import to_dict
 from ..core.options import command_of
+from ..data import load_sequence
 from ..data.files import read_json
 from ..prepare.first_pass import source_facts
 from ..system.atomic import reject_occupied, write_json
-from .job import Job
+from .job import Job, SequenceJob
 
 SETTINGS = "settings.json"
 """File in the output folder with everything that decides the results."""
@@ -20,7 +21,7 @@ MOST_NAMED = 4
 """Differences that a message names; more are counted."""
 
 
-def open_folder(job: Job) -> bool:
+def open_folder(job: SequenceJob) -> bool:
     """Create the output folder, or accept that of an interrupted job with the same settings.
 
     Returns:
@@ -36,7 +37,7 @@ def open_folder(job: Job) -> bool:
         return False
     if found := differences(read_json(file), given):
         got = "; ".join(found[:MOST_NAMED]) + (f"; and {len(found) - MOST_NAMED} more" if found[MOST_NAMED:] else "")
-        other = command_of("run", (job.video, Path("OUT2")), job.options)
+        other = command_of("run" if isinstance(job, Job) else "train", (job.source, Path("OUT2")), job.options)
         fix = f"give the stored settings to resume, or choose another folder: `{other}`."
         raise input_error(job.out, "results of the same video and options", got, fix)
     return True
@@ -64,11 +65,14 @@ def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:
     return named or [f"{name}: stored {before.get(name)}, given {now.get(name)}" for name in changed]
 
 
-def _settings(job: Job) -> dict[str, Any]:
+def _settings(job: SequenceJob) -> dict[str, Any]:
     """Everything that decides the results of a job."""
+    if not isinstance(job, Job):
+        facts = {"name": job.source.name, "fingerprint": load_sequence(job.source, job.cfg.data).fingerprint()}
+        return {"video": facts, "options": job.options, "derived": {"config": to_dict(job.cfg)}}
     prepare = {name: repr(value) for name, value in vars(job.prepare).items()}
     derived = {"prepare": prepare, "config": to_dict(job.cfg)}
-    return {"video": source_facts(job.video), "options": job.options, "derived": derived}
+    return {"video": source_facts(job.source), "options": job.options, "derived": derived}
 
 
 def _text(words: Any, others: Any) -> str:

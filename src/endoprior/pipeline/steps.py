@@ -22,14 +22,16 @@ from ..export.html import PageTooLarge, write_html
 from ..model.scene_file import load_scene
 from ..prepare import prepare
 from ..prepare.pipeline import Progress
-from ..runs.folder import CHECKPOINT
+from ..runs.folder import CHECKPOINT, CONFIG
 from ..runs.report import write_report
 from ..runs.train import start_run
+from ..runs.training_run import TrainingRun
+from ..runs.windowed_run import WindowedRun
 from ..system.atomic import write_json
 from ..visualization.image_tools import colorize, label, tile, to_u8
 from ..visualization.rendered_views import depth_span
 from ..visualization.video import write_video
-from .job import Job
+from .job import Job, SequenceJob
 from .part import every_kth_time, usable_frames
 
 PLAYER_BYTES = 40_000_000
@@ -45,13 +47,13 @@ class Step:
     """One step of a job."""
 
     name: str
-    result: Callable[[Job], Path]
+    result: Callable[[SequenceJob], Path]
     """File or folder that is there when the step is done."""
-    act: Callable[[Job, Progress], list[str]]
+    act: Callable[[SequenceJob, Progress], list[str]]
     """Does it; returns lines for the user."""
 
 
-def run_step(step: Step, job: Job, progress: Progress) -> list[str] | None:
+def run_step(step: Step, job: SequenceJob, progress: Progress) -> list[str] | None:
     """Do a step, and keep what it returns for a resumed job; None if it was done before.
 
     Raises:
@@ -64,22 +66,23 @@ def run_step(step: Step, job: Job, progress: Progress) -> list[str] | None:
     return lines
 
 
-def notes_of(step: Step, job: Job) -> list[str]:
+def notes_of(step: Step, job: SequenceJob) -> list[str]:
     """What a step that was done before returned."""
     lines = _stored_notes(job).get(step.name)
     return [str(line) for line in lines] if isinstance(lines, list) else []
 
 
-def _stored_notes(job: Job) -> dict[str, Any]:
+def _stored_notes(job: SequenceJob) -> dict[str, Any]:
     return read_json(job.notes) if job.notes.is_file() else {}
 
 
-def _prepare(job: Job, progress: Progress) -> list[str]:
-    done = prepare(job.video, job.data, job.prepare, progress)
+def _prepare(job: SequenceJob, progress: Progress) -> list[str]:
+    assert isinstance(job, Job), "a sequence folder is prepared"
+    done = prepare(job.source, job.data, job.prepare, progress)
     return [f"{done.num_frames} frames of {done.size[0]}x{done.size[1]}", *(f"note: {note}" for note in done.notes)]
 
 
-def _check(job: Job, progress: Progress) -> list[str]:
+def _check(job: SequenceJob, progress: Progress) -> list[str]:
     progress("measuring", 0, 0)
     sequence = load_sequence(job.data, job.cfg.data)
     facts = measure(sequence, job.cfg.data)
@@ -90,27 +93,32 @@ def _check(job: Job, progress: Progress) -> list[str]:
     return [f"{finding.severity}: {finding.what}" for finding in shown]
 
 
-def problems(job: Job) -> list[str]:
+def problems(job: SequenceJob) -> list[str]:
     """Errors and warnings of `check`, each with its fix, one line each."""
     found = (Finding(**finding) for finding in read_json(job.findings)["findings"])
     return [str(finding) for finding in found if finding.severity != "note"]
 
 
-def _train(job: Job, progress: Progress) -> list[str]:
+def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[str]]:
+    """The run of a job, new or resumed, and lines for the user."""
     sequence = load_sequence(job.data, job.cfg.data)
-    usable = _usable(job, len(sequence))
-    cfg, notes = job.cfg, []
+    cfg, notes = job.cfg, list[str]()
+    usable = _usable(job, len(sequence)) if isinstance(job, Job) else len(sequence)
     if usable < len(sequence):
         cfg = replace(cfg, data=replace(cfg.data, first_frames=usable))
         sequence = load_sequence(job.data, cfg.data)
         notes = [f"note: the camera is lost, or the scene changes, at frame {usable}: training uses the frames before"]
-    begun = (job.run / CHECKPOINT).is_file() or (job.run / "config.json").is_file()
-    run = start_run(sequence, cfg, job.run, resume=begun, say=lambda text: None)
+    begun = (job.run / CHECKPOINT).is_file() or (job.run / CONFIG).is_file()
+    return start_run(sequence, cfg, job.run, resume=begun, say=lambda text: None), notes
+
+
+def _train(job: SequenceJob, progress: Progress) -> list[str]:
+    run, notes = start_training(job)
     scene = run.complete(lambda report, trainer: progress("training", *trainer.progress()))
     return [*notes, f"{len(scene):,} Gaussians"]
 
 
-def _score(job: Job, progress: Progress) -> list[str]:
+def _score(job: SequenceJob, progress: Progress) -> list[str]:
     progress("rendering held-out frames", 0, 0)
     scene = load_scene(job.run)
     sequence = _frames_of(job, scene.config)
@@ -122,7 +130,7 @@ def _score(job: Job, progress: Progress) -> list[str]:
     return [f"held-out frames: {', '.join(shown)}"]
 
 
-def _render_video(job: Job, progress: Progress) -> list[str]:
+def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
     scene = load_scene(job.run)
     frames = _frames_of(job, scene.config).with_poses(scene.cameras).frames("video")
     span = depth_span(scene)
@@ -143,12 +151,12 @@ def _render_video(job: Job, progress: Progress) -> list[str]:
     return []
 
 
-def _player(job: Job, progress: Progress) -> list[str]:
+def _player(job: SequenceJob, progress: Progress) -> list[str]:
     progress("packing", 0, 0)
     scene = load_scene(job.run)
     at_a_time = len(scene) / len(scene.windows)
     times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (at_a_time * LEAST_BYTES))
-    title = f"{job.video.stem} (preview)" if job.is_preview else job.video.stem
+    title = f"{job.source.stem} (preview)" if job.is_preview else job.source.stem
     while not job.player.exists():
         try:
             write_html(scene, job.player, title=title, times=times, max_bytes=PLAYER_BYTES)
@@ -172,7 +180,12 @@ STEPS = (
 """In order. Every result is written completely or not at all."""
 
 
-def _usable(job: Job, num_frames: int) -> int:
+def steps_of(job: SequenceJob) -> tuple[Step, ...]:
+    """The steps that a job needs: a sequence folder is not prepared."""
+    return STEPS if isinstance(job, Job) else STEPS[1:]
+
+
+def _usable(job: SequenceJob, num_frames: int) -> int:
     """Number of frames that one scene can explain: see `usable_frames`."""
     unexplained = read_description(job.data / "sequence.json").get("unexplained_frames", [])
     findings = read_json(job.findings)["findings"]
@@ -180,5 +193,5 @@ def _usable(job: Job, num_frames: int) -> int:
     return usable_frames(num_frames, unexplained, cuts)
 
 
-def _frames_of(job: Job, cfg: Config) -> FrameSequence:
+def _frames_of(job: SequenceJob, cfg: Config) -> FrameSequence:
     return load_sequence(job.data, scored_data(cfg.data))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,14 +27,17 @@ from .training_run import TrainingRun
 
 
 def window_config(cfg: Config, start: int, stop: int) -> Config:
-    """The config of the run of one window: an ordinary training on these frames."""
+    """The config of the run of one window: an ordinary training on these frames of what `cfg` reads."""
+    first = int(cfg.data.window.partition("-")[0] or 0)
     return replace(
-        cfg, data=replace(cfg.data, window=f"{start}-{stop - 1}"), windows=replace(cfg.windows, enabled=False)
+        cfg,
+        data=replace(cfg.data, window=f"{first + start}-{first + stop - 1}"),
+        windows=replace(cfg.windows, enabled=False),
     )
 
 
 class WindowedRun:
-    """A run of several windows, trained one after the other; see `TrainingRun`."""
+    """A run of several windows, which are trained one after the other or elsewhere; see `TrainingRun`."""
 
     def __init__(
         self,
@@ -61,16 +65,50 @@ class WindowedRun:
         if self.out is None:
             scenes = [self._train(k, None, observers, checkpoint_seconds) for k in range(len(self.plan))]
             return self._scene([len(scene) for scene in scenes], scenes.__getitem__)
+        with self.opened() as out:
+            scene_file = out / SCENE
+            for k in self.waiting(out):  # one at a time is in memory
+                self._train(k, window_file(scene_file, k).parent, observers, checkpoint_seconds)
+            return self.join(out)
+
+    @contextmanager
+    def opened(self) -> Iterator[Path]:
+        """Begin or continue the run in its folder, which no other process can use meanwhile.
+
+        Raises:
+            InputError: the folder cannot take the run; one that was created is removed.
+        """
+        assert self.out is not None, "a run in memory has no folder"
         created, began = prepare_run_folder(self.out, resume=self.resume), False
         try:
             with locked(self.out, self.out / LOCK):
                 self._begin(self.out)
                 began = True
-                return self._train_in(self.out, observers, checkpoint_seconds)
+                yield self.out
         except InputError:
             if created and not began:
                 shutil.rmtree(self.out, ignore_errors=True)
             raise
+
+    def waiting(self, out: Path) -> list[int]:
+        """The windows that are not trained yet."""
+        return [k for k in range(len(self.plan)) if not window_file(out / SCENE, k).is_file()]
+
+    def window_name(self, k: int) -> str:
+        """`window 2 of 3: frames 7 to 16`."""
+        start, stop = self.plan[k]
+        return f"window {k + 1} of {len(self.plan)}: frames {start} to {stop - 1}"
+
+    def join(self, out: Path) -> WindowedScene:
+        """Write log and list of the windows, all of which are trained."""
+        files, lines = [window_file(out / SCENE, k) for k in range(len(self.plan))], []
+        for k, file in enumerate(files):
+            logged = (file.parent / LOG).read_text(encoding="utf-8").splitlines()
+            lines += [json.dumps({"window": k} | json.loads(line)) + "\n" for line in logged]
+        write_text(out / LOG, "".join(lines))
+        scene = self._scene([len(load_scene(file)) for file in files], lambda k: load_scene(files[k]))
+        save_index(out / SCENE, scene)
+        return scene
 
     def _begin(self, out: Path) -> None:
         fingerprint, about = self.sequence.fingerprint(), out / CONFIG
@@ -83,29 +121,13 @@ class WindowedRun:
             raise InputError(f"{about}: expected a run to resume; found none. Start without --resume.")
         write_json(about, run_facts(self.sequence, self.cfg, fingerprint) | {"windows": self.plan})
 
-    def _train_in(self, out: Path, observers: Sequence[Observer], checkpoint_seconds: float) -> WindowedScene:
-        """Train all windows into their folders; one at a time is in memory."""
-        scene_file, sizes, lines = out / SCENE, [], []
-        for k in range(len(self.plan)):
-            file = window_file(scene_file, k)
-            done = self.resume and file.is_file()
-            sizes.append(len(load_scene(file) if done else self._train(k, file.parent, observers, checkpoint_seconds)))
-            lines += [
-                json.dumps({"window": k} | json.loads(line)) + "\n"
-                for line in (file.parent / LOG).read_text(encoding="utf-8").splitlines()
-            ]
-        write_text(out / LOG, "".join(lines))
-        scene = self._scene(sizes, lambda k: load_scene(window_file(scene_file, k)))
-        save_index(scene_file, scene)
-        return scene
-
     def _train(
         self, k: int, folder: Path | None, observers: Sequence[Observer], checkpoint_seconds: float
     ) -> SingleScene:
         start, stop = self.plan[k]
-        self.say(f"window {k + 1} of {len(self.plan)}: frames {start} to {stop - 1}")
+        self.say(self.window_name(k))
         part, cfg = self.sequence.part(start, stop), window_config(self.cfg, start, stop)
-        resume = self.resume and folder is not None and (folder / CONFIG).is_file()
+        resume = folder is not None and (folder / CONFIG).is_file()
         run = TrainingRun(part, cfg, folder, resume=resume, say=self.say)
         return run.complete(*observers, checkpoint_seconds=checkpoint_seconds)
 

@@ -1,0 +1,126 @@
+"""Read the list of `endoprior batch`: a line for each job, as it would be typed for one video or sequence folder."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..core.checks import InputError, input_error
+from ..core.options import Options
+from ..data.reading import kind_of, read_text
+from ..data.recognize import is_sequence
+from ..pipeline import Entry, SequenceJob
+from .devices import with_device
+from .options import option_name
+from .parsing import parse
+from .run import HELP, Run, job_of
+from .train import arguments
+
+NAME = re.compile(r"[^\W_][\w .+-]*")
+"""A name of a folder."""
+NOT_IN_A_LIST = (
+    "--help", "-h", "--help-all", "--networks", "--no-networks", "--weights-dir", "--resume", "--checkpoint-seconds",
+    "--ray", "--view", "--view-port",
+)  # fmt: skip
+"""Options of a single training; a batch does as `endoprior run`."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a list: `[NAME =] PATH [OPTIONS]`."""
+
+    number: int
+    name: str
+    path: Path
+    options: tuple[str, ...]
+
+
+def read_list(file: Path) -> list[Line]:
+    """The jobs in a list; empty lines and what follows a `#` are skipped.
+
+    Raises:
+        InputError: the file cannot be read, has no job, or two with one name.
+    """
+    fix = "write a line `PATH [OPTIONS]` for each video or sequence folder."
+    text, lines = read_text(file, "a list of videos and sequence folders", fix), list[Line]()
+    for number, written in enumerate(text.splitlines(), 1):
+        try:
+            words = _words(written)
+        except ValueError as error:
+            raise input_error(f"{file}, line {number}", "words as in a shell", f"{error}", "correct it.") from None
+        if words:
+            lines.append(_line(file, number, words))
+    if not lines:
+        raise input_error(file, "a list of videos and sequence folders", "an empty file", fix)
+    first = {line.name: line for line in reversed(lines)}
+    for line in lines:
+        if (other := first[line.name]) is not line:
+            got = f"{line.name!r} in line {other.number}, too"
+            raise input_error(f"{file}, line {line.number}", "another name", got, f"`NAME = {line.path}`.")
+    return lines
+
+
+def entries_of(file: Path, out: Path, tell: Callable[[str], None]) -> list[Entry]:
+    """The jobs in a list, with results in folders of `out`. Nothing is written.
+
+    Args:
+        tell: takes the device that trains, and the reason.
+    Raises:
+        InputError: the list, or what a line of it names, cannot be used.
+    """
+    entries = []
+    for line in read_list(file):
+        try:
+            entries.append(Entry(line.name, _job(line, out / line.name, tell)))
+        except InputError as error:
+            raise InputError(f"{file}, line {line.number}: {error}") from None
+    return entries
+
+
+def _words(line: str) -> list[str]:
+    """The words of a line; on Windows a backslash stands in paths."""
+    if os.name != "nt":
+        return shlex.split(line, comments=True)
+    return [word.strip('"') for word in shlex.split(line, comments=True, posix=False)]
+
+
+def _line(file: Path, number: int, words: list[str]) -> Line:
+    name, rest = (words[0], words[2:]) if words[1:2] == ["="] else (None, words)
+    where, fix = f"{file}, line {number}", "write `PATH [OPTIONS]` or `NAME = PATH [OPTIONS]`."
+    if not rest or rest[0].startswith("-"):
+        raise input_error(where, "a path", rest[0] if rest else "none", fix)
+    path = Path(rest[0]).expanduser()
+    name = name or (path.name if kind_of(path) == "a folder" else path.stem)
+    if not NAME.fullmatch(name):
+        raise input_error(where, "a name for a folder: letters, digits, and spaces, dots or dashes", repr(name), fix)
+    return Line(number, name, path, tuple(rest[1:]))
+
+
+def _job(line: Line, out: Path, tell: Callable[[str], None]) -> SequenceJob:
+    if kind_of(line.path) == "nothing":
+        raise input_error(line.path, "a video or a sequence folder", "nothing", "correct the path.")
+    for word in line.options:
+        if option_name(word) in NOT_IN_A_LIST:
+            raise input_error(word, "options of what to train", "one of a single training", "remove it.")
+    argv = [str(line.path), str(out), *line.options]
+    if not is_sequence(line.path):
+        return job_of(parse(Run, argv, "run", HELP), tell)
+    args = arguments(argv)
+    return SequenceJob(line.path, out, with_device(args.config, args.device, tell), _typed(line.options))
+
+
+def _typed(words: tuple[str, ...]) -> Options:
+    """Options and the words after them."""
+    options: Options = {}
+    name = ""
+    for word in words:
+        if word.startswith("--"):
+            name, equals, value = option_name(word), *word.partition("=")[1:]
+            options[name] = (value,) if equals else ()
+        else:
+            options[name] = (*options.get(name, ()), word)
+    return options

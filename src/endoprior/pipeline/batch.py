@@ -1,0 +1,168 @@
+"""Many jobs: one after the other in this process, or on a Ray cluster. A job that fails does not stop the others."""
+
+from __future__ import annotations
+
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+from ..core.checks import InputError
+from ..prepare.pipeline import Progress
+from ..render import ON_GPU
+from ..runs.remote import RESTARTS, Training, start_training_on, trainings
+from ..runs.windowed_run import WindowedRun
+from ..system.atomic import write_text
+from ..system.ray_cluster import Cluster
+from ..system.threads import Threads
+from .job import SequenceJob
+from .settings import open_folder
+from .steps import run_step, start_training, steps_of
+
+FAILURE = "failure.txt"
+"""In the folder of a job: the traceback, if it failed by an error of the program."""
+BEGIN, FINISH = "before training", "after training"
+"""Calls of a job on a cluster; between them are those that train."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A job of a list."""
+
+    name: str
+    """Of its folder."""
+    job: SequenceJob
+
+    @property
+    def is_done(self) -> bool:
+        """Whether every step has its result."""
+        return all(step.result(self.job).exists() for step in steps_of(self.job))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended."""
+
+    entry: Entry
+    failure: str = ""
+    """Why it failed, one line; empty if it is done."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of a job on a cluster; messages call it `name: what`."""
+
+    entry: Entry
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.entry.name}: {self.what}"
+
+
+def run_here(
+    entries: Sequence[Entry], shown: Callable[[Entry, str], AbstractContextManager[Progress]]
+) -> Iterator[Outcome]:
+    """Do all jobs in this process, in order, and yield how each ended.
+
+    Args:
+        shown: shows the progress of a step by its name.
+    """
+    for entry in entries:
+        try:
+            _open(entry)
+            for step in steps_of(entry.job):
+                if not step.result(entry.job).exists():
+                    with shown(entry, step.name) as progress:
+                        run_step(step, entry.job, progress)
+        except Exception as error:
+            yield Outcome(entry, _reason(entry, error))
+        else:
+            yield Outcome(entry)
+
+
+def run_on(cluster: Cluster, entries: Sequence[Entry], say: Callable[[str], None]) -> Iterator[Outcome]:
+    """Do all jobs on a cluster, and yield how each ended. Windows of all sequences train at the same time."""
+    threads, left, failures = Threads.of_this_process(), Counter[str](), dict[str, str]()
+
+    def start(entry: Entry, what: str, function: Callable[..., object], cores: int) -> None:
+        on_gpu, mine = entry.job.cfg.render.backend in ON_GPU, Threads(cores, threads.torch)
+        left[entry.name] += 1
+        cluster.start(Call(entry, what), function, entry.job, mine, cores=cores, on_gpu=on_gpu, restarts=RESTARTS)
+
+    for entry in entries:
+        try:
+            _open(entry)
+        except InputError as error:
+            yield Outcome(entry, _reason(entry, error))
+            continue
+        if entry.is_done:
+            yield Outcome(entry)
+        else:
+            start(entry, BEGIN, begin, cluster.cores_for(len(entries)))
+    while cluster.num_running:
+        ended = cluster.next()
+        entry, what = ended.key.entry, ended.key.what
+        left[entry.name] -= 1
+        if ended.error is not None:
+            failures.setdefault(entry.name, _reason(entry, ended.error))
+        elif what == BEGIN:
+            say(f"{entry.name}: checked; left to train: {len(ended.value)}")
+            cores = cluster.cores_for(cluster.num_running + len(ended.value))
+            for training in ended.value:
+                left[entry.name] += 1
+                start_training_on(cluster, Call(entry, training.name), training, cores)
+        elif what != FINISH:
+            say(f"{ended.key}: {ended.value}")
+        if left[entry.name]:
+            continue
+        if entry.name in failures or what == FINISH:
+            yield Outcome(entry, failures.get(entry.name, ""))
+        else:
+            start(entry, FINISH, finish, cluster.cores_for(cluster.num_running + 1))
+
+
+def begin(job: SequenceJob, threads: Threads) -> list[Training]:
+    """Do the steps of a job before its training, in this process.
+
+    Returns:
+        What is left to train.
+    """
+    threads.use()
+    for step in steps_of(job):
+        if step.name == "train":
+            break
+        run_step(step, job, _quiet)
+    if step.result(job).exists():
+        return []
+    run, _ = start_training(job)
+    if isinstance(run, WindowedRun):
+        with run.opened():
+            return trainings(run)
+    return trainings(run)
+
+
+def finish(job: SequenceJob, threads: Threads) -> None:
+    """Do the steps of a job that are left, in this process. Windows that are trained are joined by the training."""
+    threads.use()
+    for step in steps_of(job):
+        run_step(step, job, _quiet)
+
+
+def _quiet(what: str, done: int, total: int) -> None:
+    """No progress."""
+
+
+def _open(entry: Entry) -> None:
+    open_folder(entry.job)
+    (entry.job.out / FAILURE).unlink(missing_ok=True)
+
+
+def _reason(entry: Entry, error: Exception) -> str:
+    """One line; the traceback of an error of the program is written to the folder of the job."""
+    line = " ".join(str(error).split())
+    if isinstance(error, InputError):
+        return line
+    file = entry.job.out / FAILURE
+    write_text(file, "".join(traceback.format_exception(error)))
+    return f"{type(error).__name__}: {line[:200]} ({file})"

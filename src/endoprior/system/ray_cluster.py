@@ -1,0 +1,196 @@
+"""Call functions in the processes of a Ray cluster, whose machines share one file system. A process may die."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import re
+import signal
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ..core.checks import input_error
+from ..core.extras import install_command
+
+CONNECT_SECONDS = 5.0
+"""Longest time that a machine may take to answer."""
+SAVE_SECONDS = 120.0
+"""Longest time that interrupted calls may take to save their state."""
+HOST_AND_PORT = re.compile(r"(?:ray://)?\[?([^/\]]+)\]?:(\d+)")
+"""An address that names a machine, unlike `auto` and `local`."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a call ended."""
+
+    key: Any
+    """What `Cluster.start` was given."""
+    value: Any = None
+    """What the function returned."""
+    error: Exception | None = None
+    """What it raised; or why its process died, too often."""
+
+
+@dataclass(frozen=True)
+class _Call:
+    key: Any
+    remote: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    restarts: int
+
+
+class Cluster:
+    """Calls that run on a cluster, as many at a time as it has cores for. See `connected`."""
+
+    def __init__(self, ray: Any, say: Callable[[str], None]) -> None:
+        self._ray, self._say, self._running = ray, say, dict[Any, _Call]()
+
+    @property
+    def num_running(self) -> int:
+        """Number of calls that have not ended."""
+        return len(self._running)
+
+    def cores_for(self, num_calls: int) -> int:
+        """Cores for each of so many equal calls, so that all of them run at once if that is possible."""
+        machines = self._cores()
+        return max(1, min(sum(machines) // max(num_calls, 1), *machines))
+
+    def start(
+        self,
+        key: Any,
+        function: Callable[..., Any],
+        *arguments: Any,
+        cores: int = 1,
+        on_gpu: bool = False,
+        restarts: int = 0,
+    ) -> None:
+        """Call `function(*arguments)` as soon as a machine has that many free cores; `next` tells how it ended.
+
+        Args:
+            key: what `next` calls it.
+            function: of a module of this program, which every machine has.
+            on_gpu: it also needs a GPU of its own.
+            restarts: how often it is called again if its process dies.
+        Raises:
+            InputError: no machine has so many cores, or none has a GPU.
+        """
+        if cores > (most := max(self._cores())):
+            raise input_error("--ray", f"a machine with {cores} cores", f"at most {most}", "ask for fewer cores.")
+        if on_gpu and not self._ray.cluster_resources().get("GPU"):
+            raise input_error("--ray", "a cluster with a GPU", "none", "add `--device cpu`.")
+        options = {"num_cpus": cores, "max_retries": 0} | ({"num_gpus": 1} if on_gpu else {})
+        self._submit(_Call(key, self._ray.remote(**options)(function).remote, arguments, restarts))
+
+    def next(self) -> Ended:
+        """Wait for a call to end. One whose process dies is called again, as often as it may be."""
+        errors = self._ray.exceptions
+        while True:
+            (reference,), _ = self._ray.wait(list(self._running), num_returns=1)
+            call = self._running.pop(reference)
+            try:
+                return Ended(call.key, self._ray.get(reference))
+            except errors.RayTaskError as error:
+                cause = getattr(error, "cause", None)
+                if not isinstance(cause, Exception):
+                    return Ended(call.key, error=error)
+                cause.__cause__ = error  # which tells where it was raised
+                return Ended(call.key, error=cause)
+            except errors.RayError as error:
+                lines = [line for line in str(error).splitlines() if line.strip()]
+                reason = lines[0].partition(". ")[0].rstrip(".")[:160] if lines else type(error).__name__
+                if not call.restarts:
+                    return Ended(call.key, error=RuntimeError(f"Ray: {reason}"))
+                self._say(f"{call.key}: its process died and is started again ({reason})")
+                self._submit(replace(call, restarts=call.restarts - 1))
+
+    def interrupt(self) -> None:
+        """Interrupt every call, like Ctrl-C, and wait until all have saved their state and ended."""
+        if self._running:
+            for reference in self._running:
+                self._ray.cancel(reference)
+            self._ray.wait(list(self._running), num_returns=len(self._running), timeout=SAVE_SECONDS)
+
+    def _submit(self, call: _Call) -> None:
+        self._running[call.remote(*call.arguments)] = call
+
+    def _cores(self) -> list[int]:
+        """Cores of each machine that has any."""
+        found = (int(node["Resources"].get("CPU", 0)) for node in self._ray.nodes() if node["Alive"])
+        return [cores for cores in found if cores] or [1]
+
+
+@contextmanager
+def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
+    """Connect to a Ray cluster; `local` starts one on this machine, `auto` finds one that runs here.
+
+    If the body raises, all calls are interrupted. SIGTERM and SIGHUP count as Ctrl-C.
+
+    Args:
+        say: takes lines for the user.
+    Raises:
+        InputError: Ray is not installed, or the cluster cannot be reached.
+    """
+    try:
+        ray: Any = importlib.import_module("ray")
+    except ImportError:
+        raise input_error("--ray", "Ray", "none", f"`{install_command('ray')}`.") from None
+    fix = "start it, correct --ray, or use `--ray local`; if it asks for a token, set RAY_AUTH_MODE=token."
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to others
+    wait_policy = {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
+    try:
+        _reject_silent(address)
+        ray.init(
+            address=address,
+            log_to_driver=False,
+            include_dashboard=False,
+            logging_level=logging.ERROR,
+            runtime_env={"env_vars": wait_policy},
+        )
+    except (ConnectionError, OSError, ValueError, RuntimeError, SystemExit) as error:
+        is_silent = isinstance(error, SystemExit)  # raised by Ray, after minutes, where another program answers
+        got = "none" if is_silent else " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        raise input_error(f"--ray {address}", "a running cluster", got[:200], fix) from error
+    cluster = Cluster(ray, say)
+    try:
+        with _terminated_by_interrupt():
+            try:
+                yield cluster
+            except BaseException:
+                cluster.interrupt()
+                raise
+    finally:
+        ray.shutdown()
+
+
+def _reject_silent(address: str) -> None:
+    """Raise OSError if the machine of an address does not answer: Ray would wait for minutes, then end the process."""
+    if named := HOST_AND_PORT.fullmatch(address):
+        socket.create_connection((named[1], int(named[2])), CONNECT_SECONDS).close()
+
+
+@contextmanager
+def _terminated_by_interrupt() -> Iterator[None]:
+    """Treat the signals of schedulers and closing terminals as Ctrl-C: Ray ends the process on the first."""
+    if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
+        yield
+        return
+
+    def interrupt(signum: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    previous = {number: signal.getsignal(number) for number in (getattr(signal, name) for name in names)}
+    try:
+        for number, handler in previous.items():
+            if handler is not signal.SIG_IGN:
+                signal.signal(number, interrupt)
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
