@@ -35,6 +35,7 @@ DECISIONS = {
     "vertical-offset": "only the user has the calibration of the endoscope",
     "no-points": "masks or depth are wrong in a way that the figure shows",
     "reader": "the note itself says what is unusual",
+    "windows": "nothing is wrong",
 }
 """Problems that no command solves, with the reason."""
 

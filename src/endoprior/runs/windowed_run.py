@@ -64,7 +64,7 @@ class WindowedRun:
         """Train every window that is not trained yet. See `TrainingRun.complete`."""
         if self.out is None:
             scenes = [self._train(k, None, observers, checkpoint_seconds) for k in range(len(self.plan))]
-            return self._scene([len(scene) for scene in scenes], scenes.__getitem__)
+            return self._scene(scenes.__getitem__)
         with self.opened() as out:
             scene_file = out / SCENE
             for k in self.waiting(out):  # one at a time is in memory
@@ -106,7 +106,7 @@ class WindowedRun:
             logged = (file.parent / LOG).read_text(encoding="utf-8").splitlines()
             lines += [json.dumps({"window": k} | json.loads(line)) + "\n" for line in logged]
         write_text(out / LOG, "".join(lines))
-        scene = self._scene([len(load_scene(file)) for file in files], lambda k: load_scene(files[k]))
+        scene = self._scene(lambda k: load_scene(files[k]))
         save_index(out / SCENE, scene)
         return scene
 
@@ -131,13 +131,21 @@ class WindowedRun:
         run = TrainingRun(part, cfg, folder, resume=resume, say=self.say)
         return run.complete(*observers, checkpoint_seconds=checkpoint_seconds)
 
-    def _scene(self, sizes: list[int], read: Callable[[int], SingleScene]) -> WindowedScene:
-        sequence = self.sequence
+    def _scene(self, read: Callable[[int], SingleScene]) -> WindowedScene:
+        """Args: read: the scene of window k; one at a time is in memory."""
+        spans, cameras, reached = [], [], 0
+        for k, (start, stop) in enumerate(self.plan):
+            part, shared = read(k), reached - start
+            spans.append(Span(start, stop, len(part)))
+            # Training may have refined them; in the overlap those count whose window shows more.
+            own = (max(shared, 0) + 1) // 2
+            cameras[start + own :] = part.cameras[own:]
+            reached = stop
         return WindowedScene(
             config=self.cfg,
-            cameras=tuple(sequence.camera(i) for i in range(len(sequence))),
-            frames_per_second=sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
-            spans=tuple(Span(*ends, size) for ends, size in zip(self.plan, sizes, strict=True)),
+            cameras=tuple(cameras),
+            frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
+            spans=tuple(spans),
             read=read,
-            lengths_are_relative=sequence.depth_is_relative,
+            lengths_are_relative=self.sequence.depth_is_relative,
         )
