@@ -174,7 +174,7 @@ def refining(mode: str) -> Config:
     [
         ("never", "own", False),
         ("estimated", "given", False),
-        ("estimated", "estimated: own", True),
+        ("estimated", "our own tracks", True),
         ("always", "given", True),
     ],
 )

@@ -12,8 +12,8 @@ LEAST, MOST = 1e-6, 1e6
 """Range of every number in the file."""
 TOOLS_FOUND = "tools found"
 """Part of the source of masks that a program found: "tools found in 70% of the samples", "no tools found"."""
-ESTIMATED = "estimated"
-"""Part of the source of poses that a program found in the video."""
+OWN_POSES, COLMAP_POSES = "our own tracks", "COLMAP"
+"""Sources of poses that a program found in the video."""
 FORMAT_VERSION = 1
 """Newest `format_version` this program can read; a file without one is of version 1."""
 POSITIVE = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")

@@ -20,7 +20,7 @@ from ..core.checks import input_error
 from ..core.types import Camera, Frame
 from ..footage.right_view import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
-from .description import ESTIMATED, TOOLS_FOUND
+from .description import COLMAP_POSES, OWN_POSES, TOOLS_FOUND
 from .right_eye import RightEye
 from .truth import Truth
 
@@ -110,7 +110,7 @@ class FrameSequence:
     @property
     def poses_are_estimated(self) -> bool:
         """Whether a program found the camera's path in the video."""
-        return ESTIMATED in self.sources.get("poses", "")
+        return self.sources.get("poses") in (OWN_POSES, COLMAP_POSES)
 
     def __len__(self) -> int:
         return len(self._cameras)

@@ -99,7 +99,7 @@ def colmap_path(
     explained = known | (follower.segment == follower.segment[np.argmax(known)])
     stds = place_frames(world, np.flatnonzero(known), follower.poses, explained)
     explained = known | (explained & np.isfinite(stds[0]))
-    return replace(finished_path(world, explained, *stds), method="COLMAP", focal_factor=focal_factor)
+    return replace(finished_path(world, explained, *stds), method=COLMAP_POSES, focal_factor=focal_factor)
 
 
 def _with_lens(follower: Follower, focal_factor: float) -> Follower:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...data.description import OWN_POSES
 from .adjust import adjust
 from .breathing import Breathing, separate_breathing
 from .follow import Follower, follow_camera
@@ -168,7 +169,7 @@ def finished_path(
         poses,
         explained,
         scales * factor,
-        "our own tracks",
+        OWN_POSES,
         1.0,
         translation_std * factor,
         np.degrees(rotation_std),
