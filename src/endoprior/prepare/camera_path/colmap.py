@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...data.description import COLMAP_POSES
 from ...data.images import save_png
 from .corners import usable_tissue
 from .follow import Follower
