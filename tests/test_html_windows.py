@@ -21,7 +21,9 @@ from endoprior.model.windowed_scene import Span, WindowedScene
 
 SPANS = (Span(0, 7, 900), Span(4, 11, 1100), Span(8, 15, 700), Span(12, 20, 1000))
 NUM_FRAMES = 20
-OVERLAPS = (4, 5, 6, 8, 9, 10, 12, 13, 14)
+SHOWN = ((0, 6), (5, 10), (9, 14), (13, 20))
+"""First frame that shows each window, and the frame after the last one: not the ends of an overlap."""
+OVERLAPS = (5, 9, 13)
 FORWARD_MM = 9.0
 """How much nearer the tissue of each window is than that of the one before."""
 
@@ -58,17 +60,15 @@ def player(scene: WindowedScene, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 def test_every_window_is_stored_for_the_time_steps_that_show_it(scene, player):
     about, blocks = unpack(player)
-    assert [(block["first"], block["first"] + block["steps"]) for block in about["blocks"]] == [
-        (span.start, span.stop) for span in SPANS
-    ]
+    assert tuple((block["first"], block["first"] + block["steps"]) for block in about["blocks"]) == SHOWN
     assert about["gaussians"] == max(len(scene.at(frame / NUM_FRAMES).means) for frame in range(NUM_FRAMES))
     near, far = about["depth_range"]
     assert 15 < near < 40 and 60 < far < 80
     assert (np.diff(about["focus"]) < 1e-3).all() and about["focus"][0] - about["focus"][-1] > 2 * FORWARD_MM
     for frame in range(NUM_FRAMES):
-        shown = [k for k, span in enumerate(SPANS) if span.start <= frame < span.stop]
+        shown = [k for k, (start, stop) in enumerate(SHOWN) if start <= frame < stop]
         assert len(shown) == (2 if frame in OVERLAPS else 1)
-        stored = np.concatenate([blocks[k][:, frame - SPANS[k].start] for k in shown], 1)
+        stored = np.concatenate([blocks[k][:, frame - SHOWN[k][0]] for k in shown], 1)
         splats = scene.at(frame / NUM_FRAMES)  # faded where two windows overlap
         visible = splats.opacities.numpy() >= 1 / 255
         assert np.abs(stored[:3].T - splats.means.numpy())[visible].max() <= 0.05
@@ -93,7 +93,7 @@ def test_windows_are_packed_one_after_the_other(scene):
     watched, read = counted(scene)
     blocks = quantized_blocks(watched, [i / NUM_FRAMES for i in range(NUM_FRAMES)])
     assert next(blocks).first == 0 and read == [0]
-    assert next(blocks).first == 4 and read == [0, 1]
+    assert next(blocks).first == 5 and read == [0, 1]
 
 
 def test_packing_stops_as_soon_as_the_page_is_too_large(scene, player, tmp_path):
@@ -113,7 +113,7 @@ def test_a_window_in_which_nothing_is_visible_is_left_out(scene, tmp_path):
         hidden.gaussians["opacity_logits"].fill_(-20)
     gap = replace(scene, read=lambda k: hidden if k == 1 else scene.read(k))
     about, _ = unpack(write_html(gap, tmp_path / "gap.html"))
-    assert [block["first"] for block in about["blocks"]] == [0, 8, 12]
+    assert [block["first"] for block in about["blocks"]] == [0, 9, 13]
     with pytest.raises(InputError, match="got none that is visible"):
         write_html(replace(scene, read=lambda k: hidden, spans=SPANS[1:2]), tmp_path / "none.html")
 

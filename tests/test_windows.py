@@ -25,7 +25,7 @@ from endoprior.model.carry import carry, carry_points, centers_then
 from endoprior.model.deformation import Offsets
 from endoprior.model.fixed_color import with_fixed_color
 from endoprior.model.gaussians import create_gaussians
-from endoprior.model.scene import Scene, faded, joined
+from endoprior.model.scene import Scene, faded, faded_in, joined
 from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.model.support import Support
@@ -139,12 +139,13 @@ def test_one_window_fades_into_the_next(three):
     for frame in range(40):
         shown = three.shown_at(frame / 40)
         assert sum(part.weight for part in shown) == pytest.approx(1)
-        assert len(shown) == (2 if 14 <= frame < 20 or 28 <= frame < 34 else 1)
+        assert len(shown) == (2 if 16 <= frame < 18 or 30 <= frame < 32 else 1)
         for part in shown:
             at = part.window.start + part.time * (part.window.stop - part.window.start)
             assert at == pytest.approx(frame)
-    into = [three.shown_at(frame / 40)[-1].weight for frame in range(14, 21)]
-    np.testing.assert_allclose(into, [1 / 7, 2 / 7, 3 / 7, 4 / 7, 5 / 7, 6 / 7, 1])
+    into = [sum(part.weight for part in three.shown_at(f / 40) if part.window.start == 14) for f in range(14, 20)]
+    np.testing.assert_allclose(into, [0, 0, 1 / 3, 2 / 3, 1, 1], atol=0.01)
+    assert faded_in(0.25) == 0 and faded_in(0.5) == 0.5 and faded_in(0.75) == 1
 
 
 def test_fading_halves_the_optical_depth():

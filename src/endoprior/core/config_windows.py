@@ -27,8 +27,8 @@ class WindowConfig(Checked):
     """These rules count from this frame of a window on."""
     longest: Frames = 200
     """A window ends here at the latest."""
-    overlap: Annotated[int, Range(0, 10_000)] = 10
-    """Frames that a window shares with the next one: there one fades into the other."""
+    overlap: Annotated[int, Range(0, 10_000)] = 20
+    """Frames that a window shares with the next one: in the middle half of them one fades into the other."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -111,10 +111,10 @@ class Scene(ABC):
         last = max(k for k, window in enumerate(windows) if window.start <= position or k == 0)
         weight = 1.0
         if last > 0:
-            overlap = windows[last - 1].stop - windows[last].start
-            weight = min((position - windows[last].start + 1) / (overlap + 1), 1.0)
-        shown = [_shown(windows[last], position, weight)]
-        return shown if weight == 1 else [_shown(windows[last - 1], position, 1 - weight), *shown]
+            overlap = max(windows[last - 1].stop - windows[last].start, 1)
+            weight = faded_in((position - windows[last].start + 0.5) / overlap)
+        parts = [(windows[last - 1], 1 - weight), (windows[last], weight)] if weight < 1 else [(windows[last], 1.0)]
+        return [_shown(window, position, share) for window, share in parts if share > 0]
 
     @torch.no_grad()
     def at(self, time: float) -> Splats:
@@ -165,6 +165,14 @@ class Scene(ABC):
     def camera_at(self, time: float) -> Camera:
         """Camera of the frame nearest in time."""
         return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
+
+
+def faded_in(place: float) -> float:
+    """Weight, 0 to 1, of the later of two windows at a `place` in their overlap, in [0, 1].
+
+    It grows in the middle half only: a window is worse near its ends, which see motion from one side (docs/log.md).
+    """
+    return min(max(2 * place - 0.5, 0.0), 1.0)
 
 
 def _shown(window: Window, position: float, weight: float) -> Shown:
