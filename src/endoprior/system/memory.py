@@ -13,8 +13,8 @@ from ..core.checks import input_error
 
 CACHE_SHARE = 0.1
 """Size of each frame cache, as a share of the free memory at its creation ..."""
-LEAST_CACHE = 256 * 2**20
-"""... but at least this many bytes."""
+LEAST_CACHE, LARGEST_CACHE = 256 * 2**20, 2**30
+"""... but at least and at most so many bytes: a window of a long sequence fits, and memory does not grow with length."""
 LEAST_DATA, LEAST_SPACE = 600 * 2**20, 1500 * 2**20
 """Writable memory and address space that the libraries alone need, bytes (docs/reliability.md)."""
 VARIABLE = "ENDOPRIOR_CACHE_GB"
@@ -35,7 +35,7 @@ def cache_bytes() -> int:
     try:
         return max(int(float(os.environ[VARIABLE]) * 1e9), 0)
     except (KeyError, ValueError, OverflowError):
-        return max(int(CACHE_SHARE * (available_bytes() or 0)), LEAST_CACHE)
+        return min(max(int(CACHE_SHARE * (available_bytes() or 0)), LEAST_CACHE), LARGEST_CACHE)
 
 
 def reject_small_limits() -> None:
