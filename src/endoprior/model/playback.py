@@ -6,9 +6,8 @@ from collections import OrderedDict
 
 import torch
 
-from .. import render
 from ..core.types import Camera, RenderedView, Splats
-from .scene import Scene
+from .scene import Scene, faded, joined, rendered, rendered_many
 
 DEFAULT_MAX_BYTES = 1 << 30
 """Memory that cached frames may take; about 2 MB a frame for 40,000 Gaussians of one color each."""
@@ -28,41 +27,41 @@ class Playback:
             max_bytes: for all cached frames together; at least one frame is always cached.
         """
         self.scene, self.max_bytes = scene, max_bytes
-        self._kept: OrderedDict[int, Splats] = OrderedDict()
-        self._rasterize = render.load(scene.backend)
-        self._background = torch.zeros(3, device=scene.device)
+        self._kept: OrderedDict[int, list[tuple[Splats, float]]] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self.scene.cameras)
 
     def splats(self, index: int) -> Splats:
-        """The Gaussians of frame `index`, activated.
+        """The Gaussians of frame `index`, activated; see `Scene.at`.
 
         Raises:
             IndexError: no such frame.
         """
+        return joined([faded(splats, weight) for splats, weight in self._parts(index)])
+
+    def _parts(self, index: int) -> list[tuple[Splats, float]]:
         if not 0 <= index < len(self):
             raise IndexError(f"frame must be in 0..{len(self) - 1}; got {index}")
         if index not in self._kept:
-            splats = self.scene.at(index / len(self))
-            capacity = max(self.max_bytes // max(_num_bytes(splats), 1), 1)
+            parts = self.scene.parts_at(index / len(self))
+            capacity = max(self.max_bytes // max(sum(_num_bytes(splats) for splats, _ in parts), 1), 1)
             while len(self._kept) >= capacity:
                 self._kept.popitem(last=False)
-            self._kept[index] = splats
+            self._kept[index] = parts
         self._kept.move_to_end(index)
         return self._kept[index]
 
     @torch.no_grad()
     def render(self, index: int, camera: Camera | None = None) -> RenderedView:
         """Render frame `index`, from `camera` or else from its own. See `Scene.render`."""
-        splats = self.splats(index)
-        return self._rasterize(splats, camera or self.scene.cameras[index], background=self._background).view
+        return rendered(self._parts(index), camera or self.scene.cameras[index], self.scene.backend)
 
     @torch.no_grad()
     def render_many(self, indices: list[int]) -> list[RenderedView]:
         """Render several frames from their own cameras. See `Scene.render_many`."""
-        splats, cameras = [self.splats(i) for i in indices], [self.scene.cameras[i] for i in indices]
-        return [out.view for out in render.load_many(self.scene.backend)(splats, cameras, background=self._background)]
+        cameras = [self.scene.cameras[i] for i in indices]
+        return rendered_many([self._parts(i) for i in indices], cameras, self.scene.backend)
 
 
 def _num_bytes(splats: Splats) -> int:

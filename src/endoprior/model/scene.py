@@ -117,20 +117,31 @@ class Scene(ABC):
         return [_shown(window, position, share) for window, share in parts if share > 0]
 
     @torch.no_grad()
-    def at(self, time: float) -> Splats:
-        """The Gaussians at `time`, activated. Where two windows overlap, those of both, each as opaque as its weight.
-
-        A ray that passes Gaussians of opacity o keeps the product of 1 - o. The opacities 1 - (1 - o) ** weight make
-        that of both windows together the weighted geometric mean of the two.
+    def parts_at(self, time: float) -> list[tuple[Splats, float]]:
+        """The Gaussians, activated, of each window that shows at `time`, and its weight.
 
         Raises:
             ValueError: time is not in [0, 1].
         """
-        return joined([faded(part.window.scene.at(part.time), part.weight) for part in self.shown_at(time)])
+        return [(part.window.scene.at(part.time), part.weight) for part in self.shown_at(time)]
+
+    def at(self, time: float) -> Splats:
+        """The Gaussians at `time`, activated. Where two windows show, those of both, each as opaque as its weight.
+
+        A ray that passes Gaussians of opacity o keeps the product of 1 - o. The opacities 1 - (1 - o) ** weight make
+        that of both windows together the weighted geometric mean of the two. `render` is sharper there: it mixes the
+        pictures of the two.
+
+        Raises:
+            ValueError: time is not in [0, 1].
+        """
+        return joined([faded(splats, weight) for splats, weight in self.parts_at(time)])
 
     @torch.no_grad()
     def render(self, time: float, camera: Camera | None = None) -> RenderedView:
         """Render the scene at `time` in [0, 1], from `camera` or else the camera of the frame nearest in time.
+
+        Where two windows show, it is the weighted mean of the pictures of both.
 
         Returns:
             color (H, W, 3) in [0, 1], depth (H, W) mm as the sum of weight * z, alpha (H, W) in [0, 1), and
@@ -138,9 +149,7 @@ class Scene(ABC):
         Raises:
             ValueError: time is not in [0, 1].
         """
-        splats = self.at(time)
-        rasterize = render.load(self.backend)
-        return rasterize(splats, camera or self.camera_at(time), background=splats.means.new_zeros(3)).view
+        return rendered(self.parts_at(time), camera or self.camera_at(time), self.backend)
 
     @torch.no_grad()
     def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
@@ -149,9 +158,7 @@ class Scene(ABC):
         Raises:
             ValueError: a time is not in [0, 1], or cameras differ in size where the backend renders them together.
         """
-        splats = [self.at(time) for time in times]
-        outputs = render.load_many(self.backend)(splats, cameras, background=splats[0].means.new_zeros(3))
-        return [out.view for out in outputs]
+        return rendered_many([self.parts_at(time) for time in times], cameras, self.backend)
 
     @property
     def backend(self) -> render.Backend:
@@ -179,6 +186,31 @@ def _shown(window: Window, position: float, weight: float) -> Shown:
     """Args: position: in frames from the start of the sequence."""
     length = window.stop - window.start
     return Shown(window, min(max((position - window.start) / length, 0.0), 1.0), weight)
+
+
+def rendered(parts: Sequence[tuple[Splats, float]], camera: Camera, backend: render.Backend) -> RenderedView:
+    """The weighted mean of what `camera` sees of each of some Gaussians."""
+    rasterize, black = render.load(backend), parts[0][0].means.new_zeros(3)
+    return mixed([(rasterize(splats, camera, background=black).view, weight) for splats, weight in parts])
+
+
+def rendered_many(
+    parts: Sequence[Sequence[tuple[Splats, float]]], cameras: Sequence[Camera], backend: render.Backend
+) -> list[RenderedView]:
+    """`rendered` for several cameras, in one call where the backend can."""
+    every = [(splats, camera) for some, camera in zip(parts, cameras, strict=True) for splats, _ in some]
+    black = every[0][0].means.new_zeros(3)
+    outputs = render.load_many(backend)([s for s, _ in every], [camera for _, camera in every], background=black)
+    views = iter(out.view for out in outputs)
+    return [mixed([(next(views), weight) for _, weight in some]) for some in parts]
+
+
+def mixed(views: Sequence[tuple[RenderedView, float]]) -> RenderedView:
+    """The weighted mean of pictures of one size; the weights add up to 1."""
+    if len(views) == 1:
+        return views[0][0]
+    names = [field.name for field in fields(RenderedView)]
+    return RenderedView(*(sum(weight * getattr(view, name) for view, weight in views) for name in names))
 
 
 def faded(splats: Splats, weight: float) -> Splats:

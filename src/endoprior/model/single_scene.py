@@ -84,6 +84,10 @@ class SingleScene(Scene):
             raise ValueError(f"time must be in [0, 1]; got {time!r}. Frame i of T is at time i / T.")
         return self._splats(self.offsets(self.gaussians, time))
 
+    def parts_at(self, time: float) -> list[tuple[Splats, float]]:
+        """See `Scene.parts_at`."""
+        return [(self.at(time), 1.0)]
+
     def offsets(self, gaussians: Gaussians, time: float) -> Offsets:
         """Deformation of some Gaussians of the scene at `time` in [0, 1]."""
         held = min(max(time, self.trained_from), self.trained_until)
