@@ -25,6 +25,7 @@ from endoprior.model.carry import carry, carry_points, centers_then
 from endoprior.model.deformation import Offsets
 from endoprior.model.fixed_color import with_fixed_color
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.playback import Playback
 from endoprior.model.scene import Scene, faded, faded_in, joined
 from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene
@@ -165,6 +166,19 @@ def test_equal_windows_show_no_seam(three):
         assert solid.float().mean() > 0.5 and (got.alpha > 0.99)[solid].all()
         assert (got.color - want.color)[solid].abs().max() < 0.05
         assert (got.depth / got.alpha - want.depth / want.alpha)[solid].abs().max() < 0.3
+
+
+def test_a_picture_of_two_windows_is_the_mean_of_theirs(three):
+    """By `render`, `render_many` and `Playback` alike."""
+    frame, camera = 17, three.cameras[17]
+    parts = three.shown_at(frame / 40)
+    views = [part.window.scene.render(part.time, camera) for part in parts]
+    found = three.render_many([frame / 40, 0.0], [camera, camera])[0]
+    for name in ("unclamped_color", "depth", "alpha"):
+        want = sum(part.weight * getattr(view, name) for part, view in zip(parts, views, strict=True))
+        for got in (three.render(frame / 40), found, Playback(three).render(frame)):
+            torch.testing.assert_close(getattr(got, name), want)
+    assert len(Playback(three).splats(frame)) == 2 * 1271
 
 
 def test_points_are_carried_from_window_to_window(three):
