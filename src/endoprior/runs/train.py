@@ -83,7 +83,8 @@ def start_run(
     """
     if cfg.windows.enabled:
         cameras = [sequence.camera(i) for i in range(len(sequence))]
-        plan = plan_windows(cameras, look_through(sequence), cfg.windows)
+        whole = sequence.part(0, len(sequence))  # with a cache of its own, which is freed
+        plan = plan_windows(cameras, look_through(whole), cfg.windows)
         if len(plan) > 1:
             return WindowedRun(sequence, cfg, plan, out, resume=resume, say=say)
     return TrainingRun(sequence, cfg, out, resume=resume, say=say)
