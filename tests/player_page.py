@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera
 from endoprior.export.html_data import CHANNELS
+from endoprior.model import scene as scenes
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
@@ -125,4 +126,5 @@ def picture(page: Page, path: Path) -> NDArray[np.float64]:
 
 def rendered(scene: Scene, time: float) -> NDArray[np.float64]:
     """(H, W, 3) the renderer's picture, 0..255."""
-    return 255.0 * scene.render(time).color.numpy()
+    # Where two windows show, the page has the Gaussians of both, and `Scene.render` mixes their pictures.
+    return 255.0 * scenes.rendered([(scene.at(time), 1.0)], scene.camera_at(time), scene.backend).color.numpy()
