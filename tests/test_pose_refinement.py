@@ -22,7 +22,15 @@ from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.runs.checkpoint import load_checkpoint, save_checkpoint
 from endoprior.training.pose_check import FollowedCorners, corner_error_px
-from endoprior.training.pose_refinement import PoseRefinement, PoseState, moved, refined_cameras, rigid, rotation
+from endoprior.training.pose_refinement import (
+    PoseRefinement,
+    PoseState,
+    moved,
+    refined_cameras,
+    rigid,
+    rotation,
+    smoothness,
+)
 from endoprior.training.trainer import Trainer
 
 BACKENDS = ("reference", "numba")
@@ -206,3 +214,16 @@ def test_refined_poses_are_those_of_the_scene_and_resume_bit_for_bit(moving, tmp
         again.step()
     assert torch.equal(again.state.poses.twists, twists)
     assert torch.equal(again.state.gaussians["means"], whole.state.gaussians["means"])
+
+
+def test_a_single_training_frame_is_not_pulled():
+    twist = torch.ones(6, dtype=torch.float64)
+    assert smoothness(twist[None], 0, twist, PoseConfig()) == 0
+    neighbors = torch.zeros((3, 6), dtype=torch.float64)
+    assert smoothness(neighbors, 1, twist, PoseConfig()) > 0
+
+
+def test_a_gradient_that_is_not_finite_reaches_no_pose(refinement):
+    state = PoseState.at_start(2)
+    refinement.step(state, 1, torch.full((6,), torch.nan, dtype=torch.float64), 1)
+    assert (state.twists == 0).all() and (state.first == 0).all()

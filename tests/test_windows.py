@@ -107,8 +107,18 @@ def three() -> WindowedScene:
         ([camera_at(x_mm=0.01 * i) for i in range(36)], looks(36, 12), [0, 12]),
         ([camera_at() for _ in range(36)], looks(36, 12), [0]),
         ([camera_at() for _ in range(100)], looks(100), [0, 36, 72]),
+        ([camera_at() for _ in range(44)], looks(44), [0, 34]),
     ],
-    ids=["short and still", "turned", "turning fast", "moved", "picture", "picture of a still camera", "long"],
+    ids=[
+        "short and still",
+        "turned",
+        "turning fast",
+        "moved",
+        "picture",
+        "picture of a still camera",
+        "long",
+        "a little too long",
+    ],
 )
 def test_where_a_sequence_is_cut(cameras, seen, starts):
     plan = plan_windows(cameras, seen, RULES)

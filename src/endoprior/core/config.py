@@ -58,6 +58,7 @@ class DataConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         read_ranges("skip_frames", self.skip_frames)
+        read_ranges("window", self.window)
         check_range("depth_clip_high_percentile", self.depth_clip_high_percentile, self.depth_clip_low_percentile, 100)
 
 

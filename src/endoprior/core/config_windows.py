@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from .checks import check_range
-from .ranges import Checked, Range, Share
-
-Frames = Annotated[int, Range(1, 10_000_000)]
+from .ranges import Checked, Positive, Range, Share, Weight
 
 
 @dataclass(frozen=True)
@@ -19,13 +17,13 @@ class WindowConfig(Checked):
     """Cut where one of the rules below says so; else the whole sequence is one window."""
     turn_degrees: Annotated[float, Range(0, 180)] = 15.0
     """A window ends where the camera has turned by this since the window's first frame, degrees, ..."""
-    shift_share: Annotated[float, Range(0, 1e6)] = 0.1
+    shift_share: Weight = 0.1
     """... or has moved by this share of the median depth ..."""
     picture_change: Share = 0.05
     """... or, where the camera moves at all, the picture differs by this: mean absolute difference of color."""
-    shortest: Frames = 40
+    shortest: Positive = 40
     """These rules count from this frame of a window on."""
-    longest: Frames = 200
+    longest: Positive = 200
     """A window ends here at the latest."""
     overlap: Annotated[int, Range(0, 10_000)] = 20
     """Frames that a window shares with the next one: in the middle half of them one fades into the other."""

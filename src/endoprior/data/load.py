@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from ..core.checks import input_error
+from ..core.checks import input_error, read_ranges
 from ..core.config import DataConfig
 from .endonerf import load_endonerf
 from .files import entries
@@ -49,11 +49,9 @@ def _window_of(sequence: FrameSequence, window: str) -> FrameSequence:
     """The frames of `sequence` that `DataConfig.window` names; all of them if it names none."""
     if not window:
         return sequence
-    ends = window.split("-")
-    if len(ends) == 2 and all(end.isdecimal() for end in ends):
-        start, stop = int(ends[0]), int(ends[1]) + 1
-        if start + 1 < stop <= len(sequence):
-            return sequence.part(start, stop)
+    frames = sorted(read_ranges("data.window", window))
+    if len(frames) > 1 and frames[-1] < len(sequence) and frames[-1] - frames[0] == len(frames) - 1:
+        return sequence.part(frames[0], frames[-1] + 1)
     expected = f"two frames within 0 to {len(sequence) - 1}, such as 0-{len(sequence) // 2}"
     raise input_error("data.window", expected, window, "correct it, or leave it out for all frames.")
 

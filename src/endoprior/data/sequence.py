@@ -32,7 +32,7 @@ TOOL_FRACTION_WARNING = 0.6
 """With a larger share of tool pixels, the mask is probably inverted."""
 
 
-class Span(Protocol):
+class FrameSpan(Protocol):
     """Some successive frames: a window of a scene, for example."""
 
     @property
@@ -172,7 +172,7 @@ class FrameSequence:
         view.truth, view.right_eye = None, self.right_eye and self.right_eye.part(start, stop)
         return view
 
-    def training_part(self, span: Span) -> FrameList:
+    def training_part(self, span: FrameSpan) -> FrameList:
         """The training frames of a part of the sequence; see `part`."""
         return self.part(span.start, span.stop).frames("train")
 

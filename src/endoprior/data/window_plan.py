@@ -61,6 +61,8 @@ def plan_windows(cameras: Sequence[Camera], looks: Looks, cfg: WindowConfig) -> 
     for index in range(1, num):
         length = index - first
         if num - index < cfg.shortest:  # what is left would be too short a window
+            if num - first > cfg.longest and num - cfg.shortest >= first + cfg.overlap:
+                starts.append(num - cfg.shortest)
             break
         due = moving and length >= cfg.shortest and _has_changed(first, index, rotations, centers, looks, usual_mm, cfg)
         if due or length + cfg.overlap >= cfg.longest:

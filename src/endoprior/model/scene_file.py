@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..core.checks import InputError, check_range, input_error
@@ -56,7 +55,7 @@ def load_scene(path: str | Path) -> Scene:
     arrays, about = load_arrays(file, {FORMAT: scene_schema, windowed_scene.FORMAT: index_schema}, NEXT_STEP)
     with rejecting(file, "a scene", NEXT_STEP):
         facts = from_dict(SceneFacts, {name: value for name, value in about.items() if name != "format"}, "about")
-        _check_cameras(arrays["camera.intrinsics"].numpy(), arrays["camera.world_to_camera"].numpy())
+        _check_cameras(arrays)
         if about["format"] == windowed_scene.FORMAT:
             return _windowed(arrays, facts, file)
         check_values(arrays)
@@ -117,10 +116,11 @@ def check_cameras(cameras: tuple[Camera, ...]) -> None:
         ("width and height", max(first.width, first.height) <= LARGEST_SIDE, f"at most {LARGEST_SIDE:,} px"),
         ("width times height", first.width * first.height <= LARGEST_IMAGE, f"at most {LARGEST_IMAGE:,} px"),
     )
-    _check_cameras(*camera_arrays(cameras))
+    _check_cameras(camera_arrays(cameras))
 
 
-def _check_cameras(intrinsics: NDArray, poses: NDArray) -> None:
+def _check_cameras(arrays: Mapping[str, Tensor]) -> None:
+    intrinsics, poses = (arrays[name].numpy() for name in CAMERAS)
     deviation = poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
     rigid = (np.abs(deviation) <= LARGEST_DEVIATION).all((1, 2)) & (np.linalg.det(poses[:, :3, :3]) > 0)
     rigid &= (poses[:, 3] == (0, 0, 0, 1)).all(1) & (np.abs(poses[:, :3, 3]) <= FARTHEST_MM).all(1)

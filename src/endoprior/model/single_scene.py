@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import render
@@ -137,21 +137,29 @@ class SingleScene(Scene):
         """
         if self.field is not None and self.field.grid.values.dtype != torch.float32:
             raise ValueError("save the scene itself, not a copy with fp16 planes")
-        intrinsics, poses = camera_arrays(self.cameras)
         arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
         arrays |= {"prior_score": self.prior_score, "num_valid": self.num_valid}
-        arrays |= {"camera.intrinsics": torch.from_numpy(intrinsics), "camera.world_to_camera": torch.from_numpy(poses)}
+        arrays |= camera_arrays(self.cameras)
         if self.field is not None:
             arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
-        first = self.cameras[0]
-        about = {"config": to_dict(self.config), "frames_per_second": self.frames_per_second}
-        about |= {"lengths_are_relative": self.lengths_are_relative}
-        about |= {"trained_from": self.trained_from, "trained_until": self.trained_until}
-        about |= {"width": first.width, "height": first.height}
-        save_arrays(path, arrays, about, FORMAT)
+        about = {"trained_from": self.trained_from, "trained_until": self.trained_until}
+        save_arrays(path, arrays, scene_facts(self) | about, FORMAT)
 
 
-def camera_arrays(cameras: tuple[Camera, ...]) -> tuple[NDArray, NDArray]:
-    """(T, 4) fx, fy, cx, cy in px, and (T, 4, 4) world-to-camera."""
+def scene_facts(scene: Scene) -> dict[str, Any]:
+    """What the metadata of every scene's file say."""
+    first = scene.cameras[0]
+    return {
+        "config": to_dict(scene.config),
+        "frames_per_second": scene.frames_per_second,
+        "lengths_are_relative": scene.lengths_are_relative,
+        "width": first.width,
+        "height": first.height,
+    }
+
+
+def camera_arrays(cameras: tuple[Camera, ...]) -> dict[str, Tensor]:
+    """By their names in a file: (T, 4) fx, fy, cx, cy in px, and (T, 4, 4) world-to-camera; float64."""
     intrinsics = np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras])
-    return intrinsics, np.stack([c.world_to_camera for c in cameras])
+    poses = np.stack([c.world_to_camera for c in cameras])
+    return {"camera.intrinsics": torch.from_numpy(intrinsics), "camera.world_to_camera": torch.from_numpy(poses)}

@@ -10,6 +10,7 @@ from ..core.checks import InputError
 from ..core.config import Config
 from ..core.config_io import to_dict
 from ..core.shell import command
+from ..data.files import read_json
 from .stored_run import config_of
 
 
@@ -29,6 +30,14 @@ def reject_other_run(
     reject_other_config(file, config_of(stored_config, file), cfg)
     if stored_fingerprint != fingerprint:
         raise InputError(f"{file}: was trained on other data than {data}. Pass the same sequence.")
+
+
+def reject_other_start(about: Path, cfg: Config, fingerprint: str, data: Path) -> None:
+    """`reject_other_run` for what `config.json` (`about`) says."""
+    stored = read_json(about)
+    facts = stored.get("data")
+    known = facts.get("fingerprint") if isinstance(facts, dict) else None
+    reject_other_run(about, stored.get("config"), known, cfg, fingerprint, data)
 
 
 def reject_other_config(file: Path, stored: Config, cfg: Config) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from ..core.checks import InputError
 from ..core.config import Config
 from ..data import FrameSequence
-from ..data.files import read_json
 from ..model.single_scene import SingleScene
 from ..system.atomic import write_json, writing
 from ..system.file_lock import locked
@@ -19,7 +18,7 @@ from ..training.trainer import Observer, Trainer
 from . import kernel_cache
 from .checkpoint import load_checkpoint, save_checkpoint
 from .folder import CHECKPOINT, CONFIG, LOCK, LOG, SCENE, prepare_run_folder, reject_unusable_folder
-from .identity import reject_other_run
+from .identity import reject_other_start
 from .interrupt import deferred_interrupt
 from .observers import CHECKPOINT_SECONDS, CheckpointWriter, LogWriter, cut_log
 from .provenance import run_facts
@@ -87,10 +86,7 @@ class TrainingRun:
         if self.resume and checkpoint.is_file():
             load_checkpoint(trainer, checkpoint, fingerprint)
         elif self.resume and about.is_file():  # stopped before its first checkpoint
-            stored = read_json(about)
-            data = stored.get("data")
-            known = data.get("fingerprint") if isinstance(data, dict) else None
-            reject_other_run(about, stored.get("config"), known, trainer.cfg, fingerprint, trainer.sequence.path)
+            reject_other_start(about, trainer.cfg, fingerprint, trainer.sequence.path)
         elif self.resume:
             raise InputError(f"{checkpoint}: expected a checkpoint to resume from; found none. Start without --resume.")
         write_json(about, run_facts(trainer.sequence, trainer.cfg, fingerprint))

@@ -9,10 +9,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from ..core.checks import InputError
+from ..core.checks import InputError, read_ranges
 from ..core.config import Config
 from ..data import FrameSequence
-from ..data.files import read_json
 from ..model.scene_file import load_scene
 from ..model.single_scene import SingleScene
 from ..model.windowed_scene import Span, WindowedScene, save_index, window_file
@@ -20,7 +19,7 @@ from ..system.atomic import write_json, write_text
 from ..system.file_lock import locked
 from ..training.trainer import DEFAULT_FRAMES_PER_SECOND, Observer
 from .folder import CONFIG, LOCK, LOG, SCENE, prepare_run_folder, reject_unusable_folder
-from .identity import reject_other_run
+from .identity import reject_other_start
 from .observers import CHECKPOINT_SECONDS
 from .provenance import run_facts
 from .training_run import TrainingRun
@@ -28,7 +27,7 @@ from .training_run import TrainingRun
 
 def window_config(cfg: Config, start: int, stop: int) -> Config:
     """The config of the run of one window: an ordinary training on these frames of what `cfg` reads."""
-    first = int(cfg.data.window.partition("-")[0] or 0)
+    first = min(read_ranges("data.window", cfg.data.window), default=0)
     return replace(
         cfg,
         data=replace(cfg.data, window=f"{first + start}-{first + stop - 1}"),
@@ -113,10 +112,7 @@ class WindowedRun:
     def _begin(self, out: Path) -> None:
         fingerprint, about = self.sequence.fingerprint(), out / CONFIG
         if self.resume and about.is_file():
-            stored = read_json(about)
-            data = stored.get("data")
-            known = data.get("fingerprint") if isinstance(data, dict) else None
-            reject_other_run(about, stored.get("config"), known, self.cfg, fingerprint, self.sequence.path)
+            reject_other_start(about, self.cfg, fingerprint, self.sequence.path)
         elif self.resume:
             raise InputError(f"{about}: expected a run to resume; found none. Start without --resume.")
         write_json(about, run_facts(self.sequence, self.cfg, fingerprint) | {"windows": self.plan})

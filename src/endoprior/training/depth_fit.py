@@ -52,6 +52,8 @@ def update(fits: Tensor, position: int, frame: TrainingFrame, out: RenderOutput)
         return
     rendered = (out.alpha / out.depth.clamp(min=1e-6)).flatten()[::EVERY][counts].double()
     found = line(measured, rendered)
+    if not bool(torch.isfinite(found).all()):  # a divergence, which on a device is known some iterations later
+        return
     found[0] = found[0].clamp(1 / MOST_CHANGE, MOST_CHANGE)
     fits[position] += MOMENTUM * (found.to(fits) - fits[position])
     fits /= fits[:, 0].log().mean().exp()  # only ratios between frames are to be found: the scene has its scale

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from ..core.types import Camera, Splats
 from .adam import BETA1, BETA2
 from .frames import TrainingFrames
 from .optimizer import log_linear
-from .pose_check import corner_error_px, follow_corners
+from .pose_check import FollowedCorners, corner_error_px, follow_corners
 
 EPSILON = 1e-15
 """Adam's."""
@@ -101,7 +102,7 @@ def _turned(quats: Tensor, matrix: Tensor) -> Tensor:
 
 def smoothness(twists: Tensor, position: int, twist: Tensor, cfg: PoseConfig) -> Tensor:
     """Square of how far the `twist` (6,) of a frame is from the mean of its neighbors', in units of `cfg`; ()."""
-    near = [k for k in (position - 1, position + 1) if 0 <= k < len(twists)]
+    near = [k for k in (position - 1, position + 1) if 0 <= k < len(twists)] or [position]  # alone: no pull
     unit = twists.new_tensor([cfg.turn_unit_rad] * 3 + [cfg.shift_unit_mm] * 3)
     return cfg.smooth_weight * (((twist - twists[near].mean(0)) / unit) ** 2).sum()
 
@@ -112,7 +113,11 @@ class PoseRefinement:
     def __init__(self, cameras: Sequence[Camera], frames: TrainingFrames, cfg: Config) -> None:
         """Args: cameras: of all frames, as given."""
         self._cameras, self._trained, self.cfg = cameras, frames.indices, cfg
-        self._corners = follow_corners(frames)
+        self._frames = frames
+
+    @cached_property
+    def _corners(self) -> list[FollowedCorners]:
+        return follow_corners(self._frames)
 
     def step(self, state: PoseState, position: int, gradient: Tensor, iteration: int) -> None:
         """One step of Adam for the twist of one training frame; every few iterations the poses are checked.
@@ -123,7 +128,8 @@ class PoseRefinement:
             iteration: 1-based, of the fine stage.
         """
         poses, optim = self.cfg.poses, self.cfg.optim
-        if iteration >= poses.start_iteration:
+        # On a device, a divergence is known some iterations later: it must not reach the poses.
+        if iteration >= poses.start_iteration and bool(torch.isfinite(gradient).all()):
             share = log_linear(1.0, optim.basis_decay, iteration, optim.decay_iterations)
             _adam_step(state, position, gradient, poses, share)
         if iteration % poses.check_every == 0 or iteration == self.cfg.schedule.fine_iterations:

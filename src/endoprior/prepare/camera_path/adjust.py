@@ -156,9 +156,7 @@ class _System:
         residual = error.ravel()
         self.of_cameras = (cameras.T @ cameras).tocsr()
         self.mixed = (cameras.T @ of_points).tocsr()
-        products = np.einsum("nij,nik->njk", by_point, by_point).reshape(-1, 9)
-        summed = [np.bincount(seen.point, weights=products[:, i], minlength=len(points)) for i in range(9)]
-        self.of_points = np.stack(summed, 1).reshape(-1, 3, 3)
+        self.of_points = summed_by(seen.point, np.einsum("nij,nik->njk", by_point, by_point), len(points))
         self.camera_gradient, self.point_gradient = cameras.T @ residual, of_points.T @ residual
         if self.has_focal:
             prior = sparse.csr_matrix(([focal_prior**-2], ([self.size - 1], [self.size - 1])), (self.size, self.size))
@@ -198,6 +196,13 @@ class _System:
     def _reduced(self, inverse: sparse.csr_matrix, damping: float) -> sparse.csr_matrix:
         held = sparse.diags(self.of_cameras.diagonal() * damping + 1e-9)
         return self.of_cameras + held - self.mixed @ inverse @ self.mixed.T
+
+
+def summed_by(point: NDArray[np.intp], values: NDArray, count: int) -> NDArray[np.float64]:
+    """(count, ...) sums over the observations of each point, of values (N, ...)."""
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
+    sums = [np.bincount(point, weights=column, minlength=count) for column in flat.T]
+    return np.stack(sums, 1).reshape(count, *values.shape[1:])
 
 
 def _rows(values: NDArray, columns: NDArray, width: int) -> sparse.csr_matrix:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from .adjust import Observations, weights
+from .adjust import Observations, summed_by, weights
 from .follow import Follower
 from .residuals import derivatives, moved, residuals
 
@@ -254,10 +254,8 @@ def _solve(
     normal: NDArray, gradient: NDArray, mixed: NDArray, by_point: NDArray, error: NDArray, point: NDArray, count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Steps of cameras and coefficients, and of the points (P, 3), which are eliminated."""
-    products = np.einsum("nij,nik->njk", by_point, by_point).reshape(-1, 9)
-    own = np.stack([np.bincount(point, weights=products[:, i], minlength=count) for i in range(9)], 1).reshape(-1, 3, 3)
-    pull = np.einsum("nij,ni->nj", by_point, error)
-    pull = np.stack([np.bincount(point, weights=pull[:, i], minlength=count) for i in range(3)], 1)
+    own = summed_by(point, np.einsum("nij,nik->njk", by_point, by_point), count)
+    pull = summed_by(point, np.einsum("nij,ni->nj", by_point, error), count)
     inverse = np.linalg.inv(own + (1e-6 * np.trace(own, axis1=1, axis2=2)[:, None, None] + 1e-6) * np.eye(3))
     eliminated = np.einsum("spj,pjk->spk", mixed, inverse)
     size = len(normal)

@@ -11,7 +11,7 @@ import numpy as np
 from .adjust import Observations, adjust
 from .residuals import back_projected, residuals
 from .seen import CameraPath, Lens
-from .tracks import DEPTH_STD, HELD_OUT, Tracks
+from .tracks import DEPTH_STD, Tracks
 
 USUAL_PX = 1.0
 """An error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)."""
@@ -30,7 +30,7 @@ def explained_share(tracks: Tracks, lens: Lens, path: CameraPath) -> float:
     parts: list[list[np.ndarray]] = [[], [], [], []]
     turn = np.zeros(tracks.count, int)
     for f in range(len(poses)):
-        mine = tracks.ids[f] % HELD_OUT == HELD_OUT - 1
+        mine = tracks.held_out(tracks.ids[f])
         ids = tracks.ids[f][mine]
         columns = ids, np.full(len(ids), f), tracks.pixels[f][mine], tracks.depths[f][mine]
         for part, column in zip(parts, columns, strict=True):
