@@ -286,10 +286,12 @@ def test_a_part_of_a_sequence_holds_out_the_same_frames(make_tiny_sequence):
     assert [i + 5 for i in again.indices("test")] == [9, 17]
 
 
-@pytest.mark.parametrize("window", ["5", "18-5", "5-20", "a-b", "5-5"])
+@pytest.mark.parametrize("window", ["5", "18-5", "5-20", "2-5,9-12", "5-5"])
 def test_a_window_that_is_no_range_of_frames(make_tiny_sequence, window):
     with pytest.raises(InputError, match=r"data\.window: expected two frames within 0 to 19"):
         load_sequence(make_tiny_sequence(num_frames=20), DataConfig(window=window))
+    with pytest.raises(ValueError, match="window must look like"):
+        DataConfig(window="a-b")
 
 
 def in_windows(cfg: Config) -> Config:
