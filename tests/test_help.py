@@ -22,6 +22,7 @@ VALUES = {
     "FLOAT ...": "0.5",
     "STR ...": "x",
     "--data.skip-frames": "0-9",
+    "--data.window": "0-9",
 }
 """Values of options without a default, by their name or by what the page calls them."""
 
