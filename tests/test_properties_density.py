@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from endoprior.training.densify import apply_plan
 from endoprior.training.density import DensityStats
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import Optimizer
+from endoprior.training.rates import rate_of
 
 SEEDS = st.integers(0, 2**31 - 1)
 EMPTY = torch.zeros(0)
@@ -93,7 +95,7 @@ def test_an_applied_plan_gives_the_planned_number_of_finite_gaussians(made, degr
     config = replace(config, schedule=replace(config.schedule, sh_degree=degree))
     rng = np.random.default_rng(num)
     gaussians = create_gaussians(rng.normal(size=(num, 3)), rng.random((num, 3)), scales.amax(-1).log().numpy(), config)
-    optimizer = Optimizer(gaussians, None, config, 1.0, NUMBA)
+    optimizer = Optimizer(gaussians, None, config, partial(rate_of, cfg=config, spatial_scale=1.0), NUMBA)
     planned = density.plan(stats, gaussians.scales, gaussians.opacities, extent, cfg)
     new, _ = apply_plan(optimizer, planned, stats, rng)
     after = num + int(planned.clone.sum()) + int(planned.split.sum()) - int(planned.remove.sum())

@@ -8,8 +8,7 @@ from typing import Any, Literal, get_args
 from .checks import InputError
 from .config import Config, DataConfig, DensityConfig, InitConfig, OptimConfig, SalienceConfig, TemporalConfig
 from .config_deformation import DeformationConfig, HexPlaneConfig
-
-PresetName = Literal["default", "best", "paper", "released", "endogaussian", "preview"]
+from .methods import METHODS, OWN, method_named
 
 
 def preset(name: str = "default", **changes: Any) -> Config:
@@ -20,19 +19,11 @@ def preset(name: str = "default", **changes: Any) -> Config:
     Raises:
         InputError: no preset or field has this name, or a value has the wrong type or range.
     """
-    makers = {
-        "default": default,
-        "best": best,
-        "paper": paper,
-        "released": released,
-        "endogaussian": endogaussian,
-        "preview": preview,
-    }
-    if name not in makers:
+    if name not in get_args(PresetName):
         raise InputError(
             f"preset: expected one of {', '.join(get_args(PresetName))}; got {name!r}. Choose one of them."
         )
-    made = makers[name]()
+    made = OWN_PRESETS[name]() if name in OWN_PRESETS else method_named(name).config()
     return made.replace(changes) if changes else made
 
 
@@ -152,3 +143,8 @@ def preview() -> Config:
         optim=replace(base.optim, decay_iterations=500),
         schedule=replace(base.schedule, fine_iterations=500, half_resolution_iterations=170),
     )
+
+
+OWN_PRESETS = {made.__name__: made for made in (default, best, paper, released, endogaussian, preview)}
+"""Those of our own method; every other method has one preset, of its name."""
+PresetName = Literal[(*OWN_PRESETS, *(name for name in METHODS if name != OWN))]

@@ -17,6 +17,7 @@ from torch import Tensor
 from ..core.checks import InputError, check_shape
 from ..core.config_deformation import DeformationConfig
 from .attributes import offset_widths
+from .field import Field
 from .heads import OffsetHeads
 from .hexplane import PLANE_NAMES, PlaneGrid, plane_shapes
 from .ops import ModelOps
@@ -48,11 +49,10 @@ class Offsets:
         return Offsets(**channels)
 
 
-class HexPlaneField:
-    """The paper's deformation field: box, planes, trunk and heads.
+class HexPlaneField(Field):
+    """The paper's deformation field: box, planes, trunk and heads."""
 
-    Autograd trains `heads.parameters` and, if it needs a gradient, `box` (2, 3); the planes get theirs in `grid.grads`.
-    """
+    grid: PlaneGrid
 
     def __init__(self, box: Tensor, cfg: DeformationConfig, generator: torch.Generator, *, draw: bool = True) -> None:
         """Start a field.
@@ -130,6 +130,12 @@ class HexPlaneField:
             raise ValueError(f"time must be finite; got {times!r}")
         return ops.hexplane_linear(self.grid, unit, times, *self.heads.trunk)
 
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """Network and box by name; the box only if it is trained. See `Field.parameters`."""
+        named = {f"network.{i}": value for i, value in enumerate(self.heads.parameters.values())}
+        return named | ({"box": self.box} if self.box.requires_grad else {})
+
     def state_arrays(self) -> dict[str, Tensor]:
         """Every number that defines the field, by name; views of live memory, not copies."""
         arrays = {"hexplane.box": self.box.detach()}
@@ -166,6 +172,14 @@ def state_shapes(cfg: DeformationConfig) -> dict[str, tuple[int, ...]]:
     for name, weight in layers.items():
         shapes |= {f"heads.{name}.weight": weight, f"heads.{name}.bias": weight[:1]}
     return shapes
+
+
+def parameter_shapes(cfg: DeformationConfig) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of `HexPlaneField.parameters`."""
+    shapes = state_shapes(cfg)
+    heads = [shape for name, shape in shapes.items() if name.startswith("heads.")]
+    named = {f"network.{i}": shape for i, shape in enumerate(heads)}
+    return named | ({"box": shapes["hexplane.box"]} if cfg.hexplane.learn_box else {})
 
 
 def box_of_points(points: Tensor) -> Tensor:

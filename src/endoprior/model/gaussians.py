@@ -19,6 +19,7 @@ from ..core.types import Splats
 from .attributes import attribute_shapes
 from .basis import RankOneGradient
 from .deformation import Offsets
+from .method import motion_of
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -28,7 +29,7 @@ class Gaussians:
     """Trainable per-Gaussian tensors, by name.
 
     Names are those of `attributes.ATTRIBUTES`, shapes those of `attribute_shapes`: centers in mm, quaternions wxyz,
-    spherical harmonics (coefficient, channel). With the basis deformation there is `motion` too.
+    spherical harmonics (coefficient, channel). What moves them may add its own: `Motion.tensors`.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
@@ -115,5 +116,6 @@ def create_gaussians(
         "sh_dc": (torch.from_numpy(np.asarray(colors, np.float32))[:, None, :] - 0.5) / SH_C0,
     }
     # Everything else starts at zero: color that does not depend on the view, one in each Gaussian, and no motion.
-    zeros = {name: torch.zeros(num, *shape) for name, shape in attribute_shapes(cfg).items() if name not in tensors}
+    shapes = attribute_shapes(cfg) | motion_of(cfg).tensors(cfg)
+    zeros = {name: torch.zeros(num, *shape) for name, shape in shapes.items() if name not in tensors}
     return Gaussians(tensors | zeros)

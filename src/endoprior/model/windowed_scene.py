@@ -15,7 +15,8 @@ from ..core.types import Camera
 from ..system.arrays_file import save_arrays
 from ..system.memory import BoundedCache
 from .scene import Scene, Window
-from .single_scene import SingleScene, camera_arrays, scene_facts
+from .scene_facts import camera_arrays, scene_facts
+from .single_scene import SingleScene
 
 FORMAT = "endoprior-windows-1"
 """Name and version of the file that lists the windows, in its metadata."""

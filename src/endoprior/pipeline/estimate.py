@@ -17,6 +17,7 @@ from ..data import load_sequence
 from ..data.window_plan import windows_by_length
 from ..evaluation.scorers.speed import FPS_RENDERS, FPS_WARM_UP
 from ..evaluation.scoring import evaluate, scored_data
+from ..model.method import method_of
 from ..prepare import prepare
 from ..prepare.first_pass import SAMPLES
 from ..prepare.frames import REACH
@@ -118,7 +119,8 @@ def _measure(job: Job, folder: Path) -> Trial:
     looked, followed = stamps.at["looking through"][0], stamps.at["following the camera"][0]
     learned, write = stamps.at["learning tools and light"][0], stamps.step("writing frames")
 
-    trainer = Trainer(load_sequence(short.data, job.cfg.data), shortened(job.cfg, part.num_frames))
+    cfg = shortened(job.cfg, part.num_frames)
+    trainer = method_of(cfg).trainer(load_sequence(short.data, cfg.data), cfg)
     start, _ = _timed(partial(_start, trainer))
     iterations = [_timed(trainer.step)[0] for _ in range(2 * ITERATIONS + 2)]
     scene = trainer.scene()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from ..system.console import say
 
 if TYPE_CHECKING:
-    from ..training.state import StepReport
+    from ..training.stage import StepReport
     from ..training.trainer import Observer, Trainer
 
 PLAIN_EVERY_SECONDS = 10.0
