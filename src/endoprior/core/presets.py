@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from .checks import InputError
 from .config import Config, DataConfig, DensityConfig, InitConfig, OptimConfig, SalienceConfig, TemporalConfig
@@ -19,10 +19,8 @@ def preset(name: str = "default", **changes: Any) -> Config:
     Raises:
         InputError: no preset or field has this name, or a value has the wrong type or range.
     """
-    if name not in get_args(PresetName):
-        raise InputError(
-            f"preset: expected one of {', '.join(get_args(PresetName))}; got {name!r}. Choose one of them."
-        )
+    if name not in preset_names():
+        raise InputError(f"preset: expected one of {', '.join(preset_names())}; got {name!r}. Choose one of them.")
     made = OWN_PRESETS[name]() if name in OWN_PRESETS else method_named(name).config()
     return made.replace(changes) if changes else made
 
@@ -147,4 +145,11 @@ def preview() -> Config:
 
 OWN_PRESETS = {made.__name__: made for made in (default, best, paper, released, endogaussian, preview)}
 """Those of our own method; every other method has one preset, of its name."""
-PresetName = Literal[(*OWN_PRESETS, *(name for name in METHODS if name != OWN))]
+
+
+def preset_names() -> tuple[str, ...]:
+    """Every name that `preset` knows."""
+    return (*OWN_PRESETS, *(name for name in METHODS if name != OWN))
+
+
+PresetName = Literal[preset_names()]

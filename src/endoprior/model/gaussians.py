@@ -115,7 +115,6 @@ def create_gaussians(
         "opacity_logits": torch.from_numpy(np.log(chances / (1 - chances)).astype(np.float32)),
         "sh_dc": (torch.from_numpy(np.asarray(colors, np.float32))[:, None, :] - 0.5) / SH_C0,
     }
-    # Everything else starts at zero: color that does not depend on the view, one in each Gaussian, and no motion.
-    shapes = attribute_shapes(cfg) | motion_of(cfg).tensors(cfg)
-    zeros = {name: torch.zeros(num, *shape) for name, shape in shapes.items() if name not in tensors}
-    return Gaussians(tensors | zeros)
+    # Everything else starts at zero: color that does not depend on the view, and is one in each Gaussian.
+    zeros = {name: torch.zeros(num, *shape) for name, shape in attribute_shapes(cfg).items() if name not in tensors}
+    return Gaussians(tensors | zeros | motion_of(cfg).first_tensors(num, cfg))

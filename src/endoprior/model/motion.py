@@ -33,12 +33,16 @@ class Motion(ABC):
     """Gaussians stay, before and after the training frames, where they are at the first and the last of these."""
 
     def tensors(self, cfg: Config) -> dict[str, tuple[int, ...]]:
-        """Shape, without the first axis, of each tensor that Gaussians have for it; all start at 0.
+        """Shape, without the first axis, of each tensor that Gaussians have for it.
 
         Raises:
             InputError: the config leaves a shape open.
         """
         return {}
+
+    def first_tensors(self, num: int, cfg: Config) -> dict[str, Tensor]:
+        """These tensors of `num` Gaussians before training: zeros, unless a method starts otherwise."""
+        return {name: torch.zeros(num, *shape) for name, shape in self.tensors(cfg).items()}
 
     def field(self, points: Tensor, cfg: Config) -> Field | None:
         """The field around the initial points (N, 3), mm, before training; None: no field."""
