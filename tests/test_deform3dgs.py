@@ -143,7 +143,7 @@ def test_the_loss_by_hand(tiny_sequence):
         radii=torch.zeros(1, dtype=torch.int32),
     )
     for ops in (NUMBA, TORCH):
-        drawn = Drawn(Stage.FINE, 1, 0, frame, None, None, None, None, out, None)
+        drawn = Drawn(Stage.FINE, 1, 0, frame, None, None, None, None, out, None, None)
         terms = METHOD.terms(drawn, preset("deform3dgs"), ops)
         values = {name: float(value) for name, value in terms.items()}
         assert values["color"] == pytest.approx(0.25, rel=1e-4) and values["depth"] == pytest.approx(0.125, rel=1e-3)

@@ -17,6 +17,7 @@ OWN = "endoprior"
 METHODS = {
     OWN: "endoprior.methods.own",
     "deform3dgs": "endoprior.methods.deform3dgs",
+    "endogs": "endoprior.methods.endogs",
 }
 """Module of each method; its object is called `METHOD` there. The name is that of its preset, too."""
 

@@ -66,13 +66,14 @@ class Gaussians:
         sh_dc = t["sh_dc"]
         if offsets is not None and offsets.sh_dc is not None:
             sh_dc = sh_dc + offsets.sh_dc[:, None, :]
+        sh_rest = _moved(t["sh_rest"], offsets and offsets.sh_rest)
         num_rest = (sh_degree + 1) ** 2 - 1
         return Splats(
             means=_moved(t["means"], offsets and offsets.means),
             quats=_moved(t["quats"], offsets and offsets.quats),
             scales=_moved(t["log_scales"], offsets and offsets.log_scales).exp(),
             opacities=_moved(t["opacity_logits"], offsets and offsets.opacity_logits).sigmoid(),
-            sh=torch.cat([sh_dc, t["sh_rest"][:, :num_rest]], 1) if num_rest else sh_dc,
+            sh=torch.cat([sh_dc, sh_rest[:, :num_rest]], 1) if num_rest else sh_dc,
             color_slopes=t.get("color_slopes"),
         )
 

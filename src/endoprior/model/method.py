@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 class Method(ABC):
     """One way from a sequence to a scene."""
 
+    background = (0.0, 0.0, 0.0)
+    """Color behind everything, in [0, 1], in training and where its scenes are rendered."""
+
     @abstractmethod
     def config(self) -> Config:
         """The config that the preset of its name starts from."""

@@ -18,7 +18,7 @@ from ..core.config_deformation import HexPlaneConfig
 from ..core.types import Splats
 from .attributes import motion_shape
 from .basis import basis_offsets
-from .deformation import HexPlaneField, Offsets, parameter_shapes, state_shapes
+from .deformation import HexPlaneField, Offsets
 from .field import Field
 from .ops import ModelOps
 
@@ -88,21 +88,23 @@ class Motion(ABC):
 class HexPlaneMotion(Motion):
     """The paper's: a field of space-time planes."""
 
+    field_class: type[HexPlaneField] = HexPlaneField
+
     def field(self, points: Tensor, cfg: Config) -> HexPlaneField:
         """See `Motion.field`."""
-        return HexPlaneField.from_points(points, cfg.deformation, torch.Generator().manual_seed(cfg.seed))
+        return self.field_class.from_points(points, cfg.deformation, torch.Generator().manual_seed(cfg.seed))
 
     def field_of(self, arrays: Mapping[str, Tensor], cfg: Config) -> HexPlaneField:
         """See `Motion.field_of`."""
-        return HexPlaneField.from_state_arrays(arrays, cfg.deformation)
+        return self.field_class.from_state_arrays(arrays, cfg.deformation)
 
     def field_shapes(self, cfg: Config) -> dict[str, tuple[int, ...]]:
         """See `Motion.field_shapes`."""
-        return state_shapes(cfg.deformation)
+        return self.field_class.state_shapes(cfg.deformation)
 
     def parameter_shapes(self, cfg: Config) -> dict[str, tuple[int, ...]]:
         """See `Motion.parameter_shapes`."""
-        return parameter_shapes(cfg.deformation)
+        return self.field_class.parameter_shapes(cfg.deformation)
 
     def planes(self, cfg: Config) -> HexPlaneConfig:
         """See `Motion.planes`."""

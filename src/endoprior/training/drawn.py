@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from ..core.types import RenderOutput, Splats
 from ..model.deformation import Offsets
@@ -33,3 +34,5 @@ class Drawn:
     out: RenderOutput
     draw: Callable[[Splats], RenderOutput]
     """Draws other Gaussians from the same camera."""
+    context: Any
+    """What the method's `context` made of all training frames."""

@@ -6,6 +6,7 @@ See docs/add_a_method.md for the smallest complete one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -23,6 +24,7 @@ from ..system.arrays_file import ArraySpec
 from . import density
 from .density import DensityStats, Plan
 from .drawn import Drawn
+from .frames import TrainingFrames
 from .gaussian_trainer import GaussianTrainer
 from .losses import supervised_terms
 from .ops import TrainingOps
@@ -30,12 +32,19 @@ from .rates import Rate, rate_of
 from .stage import Stage
 from .trainer import Trainer
 
+EPOCHS = 2**31
+"""Keeps the random numbers of epochs apart from those of iterations."""
+
 
 class GaussianMethod(Method):
     """See `Method`. A subclass gives its `motion` and its `config`, and overrides what it does differently."""
 
     uses_prior = True
     """The texture prior of the frames is computed, for density control and the temporal term."""
+    uses_radii = False
+    """The largest radius of each Gaussian on screen is kept, for `plan`."""
+    keeps_optimizer = False
+    """Adam's moments and steps go on from the coarse to the fine stage."""
 
     def trainer(self, sequence: FrameSequence, cfg: Config) -> Trainer:
         """See `Method.trainer`."""
@@ -66,6 +75,10 @@ class GaussianMethod(Method):
         """The training frame of an iteration; a pure function of its arguments. `rng` belongs to the iteration."""
         return int(rng.integers(num_frames)) if stage is Stage.FINE else 0
 
+    def context(self, frames: TrainingFrames, cfg: Config) -> Any:
+        """What the loss needs of all training frames, made once: `Drawn.context`."""
+        return None
+
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
         """The weighted terms of the loss, () each."""
         return supervised_terms(drawn.out, drawn.frame, cfg.loss, ops)
@@ -85,3 +98,13 @@ class GaussianMethod(Method):
     ) -> Plan:
         """What to clone, split and remove; see `density.plan`."""
         return density.plan(stats, gaussians.scales, gaussians.opacities, extent, cfg.density)
+
+    def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
+        """Whether opacities are lowered to 0.01 after this iteration."""
+        return False
+
+
+def in_epochs(seed: int, stage: Stage, iteration: int, num_frames: int) -> int:
+    """A position for `GaussianMethod.position`: every frame once in each epoch, in random order."""
+    epoch, place = divmod(iteration - 1, num_frames)
+    return int(np.random.default_rng([seed, int(stage), EPOCHS, epoch]).permutation(num_frames)[place])

@@ -82,7 +82,7 @@ class GaussianTrainer(Trainer):
             DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
             PoseRefinement(self.cameras, frames, self.cfg) if refines_poses(sequence, self.cameras, cfg) else None,
             MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
-            torch.zeros(3, device=self.device),
+            torch.tensor(self.method.background, device=self.device),
         )
         self.state: GaussiansState | None = None
 
@@ -152,6 +152,8 @@ class GaussianTrainer(Trainer):
         state = self.state
         if state.stage is Stage.COARSE and state.iteration >= stage_length(self.cfg, Stage.COARSE):
             self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, state.poses, state.depth_fit)
+            if self.method.keeps_optimizer:
+                self.state.optimizer = state.optimizer
         report = self.step_once(self.state)
         if report.divergence is not None:
             raise Diverged(report.divergence.reason)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time as clock
 from dataclasses import dataclass, field
-from functools import partial
-from typing import TYPE_CHECKING
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from ..core.types import RenderOutput, Splats
 from ..model.deformation import HexPlaneField, Offsets
 from ..render import Rasterizer
 from . import density, depth_fit
-from .densify import apply_plan
+from .densify import apply_plan, reset_opacities
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .drawn import Drawn
 from .frames import TrainingFrame, TrainingFrames
@@ -32,6 +32,10 @@ from .track_loss import track_term
 
 if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
+
+
+RESET_OPACITY = 0.01
+"""Where methods that reset opacities lower them to (3DGS)."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,11 @@ class TrainingStep:
     background: Tensor = field(default_factory=lambda: torch.zeros(3))
     """(3,) color behind everything."""
 
+    @cached_property
+    def context(self) -> Any:
+        """See `GaussianMethod.context`."""
+        return self.method.context(self.frames, self.cfg)
+
     def __call__(self, state: GaussiansState) -> StepReport:
         """Deform, render, compare, differentiate, check, update, then grow or prune.
 
@@ -102,7 +111,17 @@ class TrainingStep:
         if state.depth_fit is not None and fine:
             counted = depth_fit.fitted(counted, state.depth_fit[batch.position])
         drawn = Drawn(
-            state.stage, iteration, position, counted, state.gaussians, state.field, offsets, posed, out, draw
+            stage=state.stage,
+            iteration=iteration,
+            position=position,
+            frame=counted,
+            gaussians=state.gaussians,
+            field=state.field,
+            offsets=offsets,
+            splats=posed,
+            out=out,
+            draw=draw,
+            context=self.context,
         )
         terms = self.method.terms(drawn, cfg, self.ops)
         if offsets is not None and state.tracks is not None:
@@ -134,6 +153,8 @@ class TrainingStep:
                     limit_scales(log_scales, splats.means, batch.frame.camera, cfg.density.max_scale_share)
                 if densify:
                     self._densify(state, iteration, rng)
+                if self.method.reset_due(state.stage, iteration, cfg):
+                    reset_opacities(state.optimizer, RESET_OPACITY)
             state.iteration = iteration
         losses = {name: value.detach() for name, value in terms.items()}
         seconds = clock.perf_counter() - began
@@ -193,6 +214,8 @@ class TrainingStep:
         """Add to the running statistics: the gradient always, the prior's score where there is a prior."""
         camera, skip = batch.frame.camera, self.check.skip
         self.ops.add_gradient(state.stats, out, camera.width, camera.height, skip)
+        if self.method.uses_radii:
+            state.stats.add_radii(out.radii, skip)
         if batch.prior is not None:
             scale = batch.prior.shape[1] / camera.width
             opacities = state.gaussians.opacities
