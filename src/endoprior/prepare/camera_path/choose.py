@@ -8,12 +8,19 @@ from typing import Literal
 
 from ...core.checks import input_error
 from ...core.extras import install_command
-from .colmap import LONGEST, colmap_path, is_installed
+from .colmap import LONGEST, SECONDS_AN_IMAGE, colmap_path, is_installed, stride_of
 from .explained import explained_share
 from .own import own_path
 from .seen import CameraPath, Lens, PoseInput
 
 How = Literal["best", "own", "colmap"]
+
+
+def colmap_seconds(how: How, count: int) -> float:
+    """About how long COLMAP takes to find the path of a clip of `count` frames, s; 0 where it takes no part."""
+    if how == "own" or not is_installed() or (how == "best" and count > LONGEST):
+        return 0.0
+    return SECONDS_AN_IMAGE * len(range(0, count, stride_of(count)))
 
 
 def find_path(

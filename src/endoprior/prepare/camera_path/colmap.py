@@ -36,6 +36,8 @@ AROUND = 40
 """... within the image width divided by this."""
 SECONDS_A_FRAME = 1.0
 """Mapping that takes longer is stopped."""
+SECONDS_AN_IMAGE = 1.0
+"""About the time for each image that is mapped, on two cores: for estimates."""
 LEAST_SHARE = 0.3
 """A model with a smaller share of the frames is no path of the clip."""
 
@@ -43,6 +45,11 @@ LEAST_SHARE = 0.3
 def is_installed() -> bool:
     """Whether `pycolmap` can be imported."""
     return find_spec("pycolmap") is not None
+
+
+def stride_of(count: int) -> int:
+    """Every how many frames of a clip one is mapped."""
+    return min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
 
 
 def colmap_poses(
@@ -54,7 +61,7 @@ def colmap_poses(
     """
     import pycolmap
 
-    stride = min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
+    stride = stride_of(count)
     pycolmap.logging.minloglevel = 2
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
