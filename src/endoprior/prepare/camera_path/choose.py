@@ -60,4 +60,4 @@ def find_path(
     mine, theirs = (explained_share(follower.tracks, lens, path) for path in (own, other))
     best = other if how == "colmap" or theirs > mine else own
     note = f"camera path by {best.method}: COLMAP explains {theirs:.1%} of the held-out tracks, our own path {mine:.1%}"
-    return replace(best, notes=[*best.notes, note])
+    return replace(best, notes=[*own.notes, note, *other.notes] if best is own else [*best.notes, note])
