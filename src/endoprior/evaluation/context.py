@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..data import FrameList, FrameSequence, Split
 from ..model.scene import Scene
@@ -79,6 +80,14 @@ class EvaluationContext:
     """Folder to look for network weights in first."""
     result: Evaluation
     """Where scores go; `add`, `add_mean`, `add_frames` and `skip` write to it."""
+    given_path: NDArray[np.float64] | None = None
+    """(T, 4, 4) camera-to-world, mm: stands in for the true path where there is none."""
+
+    @cached_property
+    def true_path(self) -> NDArray[np.float64] | None:
+        """(T, 4, 4) camera-to-world, mm, to compare the scene's cameras with; None without."""
+        true = None if self.sequence.truth is None else self.sequence.truth.camera_to_world
+        return self.given_path if true is None else true
 
     @cached_property
     def frames(self) -> FrameList:

@@ -9,6 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..data import FrameSequence, Split
@@ -29,6 +32,7 @@ def evaluate(
     networks: bool = True,
     weights_dir: Path | None = None,
     reading: DataConfig | None = None,
+    given_path: NDArray[np.float64] | None = None,
 ) -> Evaluation:
     """Score `scene` on a split of `sequence`: every score that docs/scores.md lists.
 
@@ -38,6 +42,8 @@ def evaluate(
         networks: also compute the scores that need a network (RAFT, LPIPS). Their weights are looked for in
             `weights_dir`, then in `ENDOPRIOR_WEIGHTS`, then in torch's cache, and are downloaded at last.
         reading: how `sequence` was read, for the protocol; None: as the scene's config says, or the default.
+        given_path: (T, 4, 4) camera-to-world, mm, with which the scene's cameras are compared where the sequence has no
+            true path.
     Raises:
         InputError: the sequence is not the one the scene was trained on (the number of frames differs).
     """
@@ -53,7 +59,7 @@ def evaluate(
     result.provenance = dict(getattr(scene, "provenance", {}))
     result.per_frame = [{"index": i, "time": i / len(sequence)} for i in sequence.indices(split)]
     frames = SceneFrames(scene, sequence) if is_scene else scene
-    context = EvaluationContext(frames, sequence, split, networks, weights_dir, result)
+    context = EvaluationContext(frames, sequence, split, networks, weights_dir, result, given_path)
     for name, scorer in scorers().items():
         with context.skip_if_unavailable(*(score.name for score in scorer.SCORES)):
             _compute(name, scorer, context)

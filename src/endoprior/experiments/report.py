@@ -105,9 +105,10 @@ def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
         scores, others = _of_scenes(spec), [method for method in spec.methods if method != spec.reference]
         changes = {m: {s: results.difference(s, m, spec.reference, name) for s in scores} for m in others}
         blocks += _differences(results, name, spec.label(spec.reference), changes)
-        if own := spec.with_own_masks(name):
-            changes = {m: {s: results.gain_of_masks(s, m, name, own) for s in scores} for m in spec.methods}
-            blocks += _differences(results, name, f"{own}, which has its own masks", changes)
+        if own := spec.with_own_parts(name):
+            changes = {m: {s: results.gain_of_found(s, m, name, own) for s in scores} for m in spec.methods}
+            parts = " and ".join(spec.sequences[name].found_parts)
+            blocks += _differences(results, name, f"{own}, which has its own {parts}", changes)
     return blocks
 
 
@@ -219,11 +220,11 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
         if method != spec.reference
         for score in _of_scenes(spec)
     ]
-    gains_of_masks = [
+    gains_of_found = [
         {"sequence": name, "than": own, "method": method, "score": score}
-        | _json(results.gain_of_masks(score, method, name, own))
+        | _json(results.gain_of_found(score, method, name, own))
         for name in spec.sequences
-        if (own := spec.with_own_masks(name))
+        if (own := spec.with_own_parts(name))
         for method in spec.methods
         for score in _of_scenes(spec)
     ]
@@ -233,7 +234,7 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
         "commits": commits_of(matrix),
         "cells": cells,
         "differences": differences,
-        "gains_of_found_masks": gains_of_masks,
+        "gains_of_found_parts": gains_of_found,
         "claims": claims,
         "missing": missing,
     }

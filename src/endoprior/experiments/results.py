@@ -59,11 +59,11 @@ class Results:
         """Mean paired difference with its interval."""
         return difference(self.gains(score, method, than, sequence=sequence))
 
-    def gain_of_masks(self, score: str, method: str, sequence: str, own: str) -> Difference:
-        """Mean paired difference of one method with found masks to the same with the sequence's `own` masks.
+    def gain_of_found(self, score: str, method: str, sequence: str, own: str) -> Difference:
+        """Mean paired difference of one method with found masks or poses to the same with the sequence's own.
 
         Args:
-            sequence, own: names of the sequence with found masks, and with its own.
+            sequence, own: names of the sequence with found parts, and with its own.
         """
         pairs = [
             (Cell(sequence, method, size, seed), Cell(own, method, size, seed))
