@@ -5,6 +5,7 @@ A score that cannot be computed is listed as skipped, with the reason. No other 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,9 @@ from ..model.scene import Scene
 from ..system.devices import name_of
 from .context import Evaluation, EvaluationContext
 from .metrics import ScoreUnavailable
+from .protocols.compute import score_protocols
+from .protocols.table import OURS, ProtocolName
+from .protocols.tags import tags_of
 from .registry import REGISTRY, SCORERS, Scorer, scorers
 from .rendered import Reconstruction, SceneFrames
 from .scorers.speed import FPS_RENDERS
@@ -29,6 +33,7 @@ def evaluate(
     networks: bool = True,
     weights_dir: Path | None = None,
     reading: DataConfig | None = None,
+    protocols: Sequence[ProtocolName] = (),
 ) -> Evaluation:
     """Score `scene` on a split of `sequence`: every score that docs/scores.md lists.
 
@@ -38,6 +43,7 @@ def evaluate(
         networks: also compute the scores that need a network (RAFT, LPIPS). Their weights are looked for in
             `weights_dir`, then in `ENDOPRIOR_WEIGHTS`, then in torch's cache, and are downloaded at last.
         reading: how `sequence` was read, for the protocol; None: as the scene's config says, or the default.
+        protocols: also score as these papers did, into `Evaluation.protocols`.
     Raises:
         InputError: the sequence is not the one the scene was trained on (the number of frames differs).
     """
@@ -47,7 +53,8 @@ def evaluate(
         raise input_error(sequence.path, frames, str(len(sequence)), "pass the same sequence.")
     if is_scene:  # the poses in which it was trained, which may have been estimated again since
         sequence = sequence.with_poses(scene.cameras)
-    result = Evaluation(_protocol(sequence, split, reading or (scene.config.data if is_scene else DataConfig())))
+    reading = reading or (scene.config.data if is_scene else DataConfig())
+    result = Evaluation(_protocol(sequence, split, reading))
     if is_scene:
         result.protocol |= _rendering(scene)
     result.provenance = dict(getattr(scene, "provenance", {}))
@@ -57,6 +64,8 @@ def evaluate(
     for name, scorer in scorers().items():
         with context.skip_if_unavailable(*(score.name for score in scorer.SCORES)):
             _compute(name, scorer, context)
+    result.protocol["tags"] = tags_of(OURS, context, sequence.indices(split), sequence.mask_folder, reading.shrink)
+    result.protocols = score_protocols(protocols, context, scored_data(reading))
     return result
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 from ..core.checks import InputError
 from ..data.files import read_json
+from ..evaluation.protocols.table import ProtocolName
 from ..system.atomic import write_json, write_text
 
 DONE = "cell.json"
@@ -50,6 +51,8 @@ class Job:
     weights_dir: str | None
     threads: int
     """Threads of Numba and torch."""
+    protocols: tuple[ProtocolName, ...] = ()
+    """Also score as these papers did."""
 
     def write(self, path: Path) -> None:
         """Save as JSON."""
@@ -92,7 +95,8 @@ def work(job: Job) -> None:
     seconds = clock.perf_counter() - began
     sequence = load_sequence(job.scored_on, scored_data(reading))
     weights_dir = Path(job.weights_dir) if job.weights_dir else None
-    result = evaluate(found, sequence, networks=job.networks, weights_dir=weights_dir, reading=reading)
+    networks = {"networks": job.networks, "weights_dir": weights_dir}
+    result = evaluate(found, sequence, **networks, reading=reading, protocols=job.protocols)
     if job.scored_on != job.data:
         of_masks = read_json(Path(job.data) / SCORES_FILE)
         result.scores |= of_masks["scores"]
