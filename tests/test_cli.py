@@ -125,7 +125,7 @@ def test_protocols_of_other_papers_stand_beside_our_scores(run, tmp_path):
     assert main([*words, "--protocol", "endonerf,endogaussian"]) == 0
     metrics = json.loads((tmp_path / "metrics_video.json").read_text())
     ours, theirs = metrics["protocol"]["tags"], metrics["protocols"]["endonerf"]["tags"]
-    assert ours["split"] == "video, 17 frames" and theirs["split"] == "video, 16 frames, not 0"
+    assert ours["split"] == "video, 17 frames" and theirs["split"] == "video, 16 without 0"
     assert ours["saw_test_frames"] == "yes: 15 of 17" and theirs["saw_test_frames"] == "yes: 14 of 16"
     assert ours["background"] == theirs["background"] == "black"
     same = metrics["protocols"]["endogaussian"]["scores"]["psnr"]

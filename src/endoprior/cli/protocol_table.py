@@ -11,8 +11,8 @@ from ..evaluation.protocols.tags import KEYS
 
 OURS = "ours"
 COLUMNS = 3
-"""Protocols beside ours in one block, so that lines stay below 100 characters."""
-NAME, WIDTH = 18, 20
+"""Protocols beside ours in one block, so that lines stay near 100 characters."""
+NAME, WIDTH = 18, 21
 
 
 def protocol_table(result: Evaluation, relative: bool = False) -> list[str]:
@@ -24,17 +24,28 @@ def protocol_table(result: Evaluation, relative: bool = False) -> list[str]:
     """
     lines: list[str] = []
     ours = {"scores": result.scores, "tags": result.protocol["tags"]}
-    for start in range(0, len(result.protocols), COLUMNS):
-        names = list(result.protocols)[start : start + COLUMNS]
-        lines += ["", *_block({OURS: ours} | {name: result.protocols[name] for name in names}, relative)]
-    skipped: dict[str, list[str]] = {}
+    scored = [name for name, about in result.protocols.items() if about["tags"]]
+    for start in range(0, len(scored), COLUMNS):
+        some = {name: result.protocols[name] for name in scored[start : start + COLUMNS]}
+        lines += ["", *_block({OURS: ours} | some, relative)]
     for name, about in result.protocols.items():
         published = [f"{KEYS[tag]}: {text}" for tag, text in about["paper"].items() if text != about["tags"].get(tag)]
         lines += ["", f"{name}: {about['title']} ({about['source']})", "  as published: " + "; ".join(published)]
         lines += [f"  {sentence}" for sentence in about["differs"]]
+    return [*lines, *_not_computed(result)]
+
+
+def _not_computed(result: Evaluation) -> list[str]:
+    """One line for each reason and the scores that it costs, with the protocols."""
+    protocols: dict[tuple[str, str], list[str]] = {}
+    for name, about in result.protocols.items():
+        labels: dict[str, list[str]] = {}
         for score, reason in about["skipped"].items():
-            skipped.setdefault(reason, []).append(f"{SCORES[score].label} of {name}")
-    return [*lines, *(f"  not computed: {', '.join(scores)}: {reason}" for reason, scores in skipped.items())]
+            labels.setdefault(reason, []).append(SCORES[score].label)
+        for reason, scores in labels.items():
+            protocols.setdefault((", ".join(scores), reason), []).append(name)
+    lines = [f"  not computed: {scores} ({', '.join(who)}): {why}" for (scores, why), who in protocols.items()]
+    return ["", *lines] if lines else []
 
 
 def _block(columns: Mapping[str, Mapping[str, Any]], relative: bool) -> list[str]:

@@ -42,7 +42,7 @@ def tags_of(
     rows = f"0..{kept - 1} of {height}" if kept < height else f"all {height}"
     without = protocol.skips_first and 0 in context.sequence.indices(context.split)
     values = {
-        "split": f"{context.split}, {total} frames" + (", not 0" if without else ""),
+        "split": f"{context.split}, {total} {'without 0' if without else 'frames'}",
         "saw_test_frames": (f"yes: {seen} of {total}" if seen else "no") if is_scene else "not known",
         "mask_folder": mask_folder or "none: by the reader",
         "rows": rows + (f", {masked} masked" if masked else ""),
