@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -199,14 +200,14 @@ def sequence(tiny_sequence):
 
 
 def noisy(folder, sequence, indices=TEST):
-    """Pictures of the frames, changed by noise of up to 20 gray levels; true depth plus 2 mm."""
+    """Pictures of the frames, changed by noise of up to 20 gray levels; true depth plus 2 mm, of frame 9 plus 4."""
     for name in ("rgb", "depth"):
         (folder / name).mkdir(parents=True)
     for i in indices:
         frame, rng = sequence.frame(i), np.random.default_rng(i)
         noise = rng.integers(-20, 21, frame.rgb_u8.shape)
         save_png(folder / "rgb" / f"{i:06d}.png", np.clip(frame.rgb_u8 + noise, 0, 255).astype(np.uint8))
-        np.save(folder / "depth" / f"{i:06d}.npy", frame.depth + np.float32(2))
+        np.save(folder / "depth" / f"{i:06d}.npy", frame.depth + np.float32(4 if i == 9 else 2))
     return folder
 
 
@@ -248,7 +249,10 @@ def test_scores_of_each_protocol_by_hand(sequence, scored):
     assert found["surgicalgaussian"]["ssim"] == pytest.approx(np.mean([metrics.ssim(*f[:3]) for f in cut]), abs=1e-9)
     valid = np.mean([metrics.ssim_valid(*f[:3]) for f in plain])
     assert found["endosurf"]["ssim"] == pytest.approx(valid, abs=1e-9)
-    assert found["endosurf"]["depth_rmse_mm"] == pytest.approx(2, abs=1e-4)
+    first, second = ((mask & frame.depth_valid).sum() for _, _, mask, frame in plain)
+    pooled = np.sqrt((4 * first + 16 * second) / (first + second))
+    assert found["endosurf"]["depth_rmse_mm"] == pytest.approx(pooled, abs=1e-4) != pytest.approx(3, abs=0.1)
+    assert result.scores["depth_rmse_mm"] == pytest.approx(3, abs=1e-4), "ours is the mean of frames"
     for name in ("endogaussian", "deform3dgs"):
         assert set(found[name]) == {"psnr", "ssim", "depth_rmse_8bit"}
     assert all("lpips" in about["skipped"] for about in result.protocols.values())
@@ -352,6 +356,17 @@ def test_rows_below_500_do_not_count_where_the_paper_cuts_them(tmp_path, make_ti
         save_png(folder / "rgb" / "000001.png", image)
     assert before[1]["scores"] == after[1]["scores"] and before[1]["tags"]["rows"] == "0..499 of 512"
     assert before[0]["scores"]["psnr"] > after[0]["scores"]["psnr"] + 1
+
+
+def test_only_the_paper_without_8_bit_files_sees_less_than_a_gray_level(tmp_path, sequence):
+    (tmp_path / "fine").mkdir()
+    for i in TEST:
+        image = np.clip(sequence.frame(i).rgb_u8.astype(np.float64) / 255 + 0.4 / 255, 0, 1)
+        cv2.imwrite(str(tmp_path / "fine" / f"{i:06d}.png"), np.round(image[..., ::-1] * 65535).astype(np.uint16))
+    result = evaluate(Pictures(tmp_path / "fine", sequence, "test"), sequence, networks=False, protocols=NAMES)
+    assert result.protocols["endosurf"]["scores"]["psnr"] == pytest.approx(-20 * np.log10(0.4 / 255), abs=0.1)
+    others = [about for name, about in result.protocols.items() if name != "endosurf"]
+    assert all(about["skipped"]["psnr"].startswith("infinite") for about in others), "rounding makes them exact"
 
 
 def test_each_classifier_is_loaded_once_and_sees_the_range_of_the_protocol(tmp_path, sequence, monkeypatch):
