@@ -39,6 +39,8 @@ class Evaluation:
     """One row for each frame of the split: `index`, `time`, and the scores that a single frame has."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Where rendered images come from, for `metrics.json`; a scene has its `config.json`."""
+    protocols: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """By name of another paper's protocol: its `tags`, `scores` and `skipped`; see `protocols.score_protocols`."""
 
     def add(self, name: str, value: float, reason: str = "not finite") -> None:
         """Record a score, or `reason` where it is not finite; an int stays one."""
@@ -62,7 +64,7 @@ class Evaluation:
         suffix = "" if self.protocol["split"] == "test" else f"_{self.protocol['split']}"
         file = folder / f"metrics{suffix}.json"
         facts = {name: getattr(self, name) for name in ("protocol", "scores", "skipped")}
-        write_json(file, facts | self.provenance)
+        write_json(file, facts | ({"protocols": self.protocols} if self.protocols else {}) | self.provenance)
         write_json(folder / f"per_frame{suffix}.json", self.per_frame)
         return file
 

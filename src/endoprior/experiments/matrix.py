@@ -128,6 +128,9 @@ def _jobs(
             continue
         first, *others = known[cell.sequence]
         facts = [options, first, spec.networks, SCORES_VERSION, *made, *others]
+        if spec.protocols:
+            own_masks = matrix.data[cell.sequence] / "gt_masks"  # protocols may read them, methods need not
+            facts.append([sorted(spec.protocols), fingerprint(own_masks) if own_masks.is_dir() else ""])
         key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
         folder = (matrix.out / "cells" / key[:KEY_DIGITS]).absolute()
         if finished(folder, key):
@@ -147,6 +150,7 @@ def _jobs(
             networks=spec.networks,
             weights_dir=str(weights_dir.absolute()) if weights_dir else None,
             threads=threads,
+            protocols=spec.protocols,
         )
     return jobs
 

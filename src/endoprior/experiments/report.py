@@ -12,6 +12,7 @@ from ..system.atomic import write_json, write_text
 from .image_grids import GRIDS, write_image_grids
 from .matrix import Matrix, commits_of, scores_of
 from .plots import budget_figure, curve_figure
+from .protocol_report import protocol_blocks, protocol_tables, protocol_values
 from .results import Results
 from .spec import ClaimSpec, Spec
 from .statistics import MIN_PAIRS, Difference
@@ -29,8 +30,9 @@ def write_report(matrix: Matrix, out: Path) -> Path:
     results = Results.of(matrix)
     _figures(matrix, results, out / "figures")
     tables = [score_table(results, name) for name in matrix.spec.sequences if name in matrix.data]
+    tables += protocol_tables(matrix)
     write_text(out / "results.tex", "\n\n".join(latex(table) for table in tables) + "\n")
-    write_text(out / "results.csv", csv_lines(results))
+    write_text(out / "results.csv", csv_lines(results, protocol_values(matrix)))
     write_json(out / "results.json", _facts(matrix, results))
     write_text(out / "results.md", "\n\n".join([*_body(matrix, results, out, out, 1), *_protocol([matrix], 2)]) + "\n")
     return out / "results.md"
@@ -56,6 +58,7 @@ def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int
         *_head(matrix, "#" * level),
         *_tables(matrix, results, below),
         *_claims(results, below),
+        *protocol_blocks(matrix, below),
         *_figure_links(matrix, folder, base, below),
     ]
 
@@ -90,7 +93,7 @@ def _protocol(matrices: list[Matrix], level: int) -> list[str]:
     folders = [folder for matrix in matrices for folder in matrix.done.values()]
     if not folders:
         return []
-    hidden = ("frames", "data_fingerprint", "shrink")
+    hidden = ("frames", "data_fingerprint", "shrink", "tags")
     whole = max((scores_of(folder)["protocol"] for folder in folders), key=len)
     shown = {name: text for name, text in whole.items() if name not in hidden}
     return [f"{'#' * level} Protocol", "\n".join(f"- `{name}`: {text}" for name, text in shown.items())]

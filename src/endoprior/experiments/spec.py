@@ -20,6 +20,7 @@ from ..core.presets import PresetName
 from ..data.formats import REGISTRY as LAYOUTS
 from ..data.reading import read_text
 from ..data.yaml_text import load_yaml
+from ..evaluation.protocols.table import ProtocolName
 from ..evaluation.registry import all_scores
 from ..phantom import PhantomConfig
 from .method import PICTURES, REGISTRY
@@ -135,6 +136,8 @@ class Spec:
     """Reference of the paired differences; the first method if empty."""
     networks: bool = False
     """Also compute the scores that need a network (RAFT, LPIPS), if their weights are found."""
+    protocols: tuple[ProtocolName, ...] = ()
+    """Also score as these papers did; each protocol has tables of its own (docs/scores.md)."""
     folder: str = "."
     """Base of relative paths: the folder of the spec file."""
 
@@ -275,6 +278,8 @@ def _check(spec: Spec) -> None:
     for name in (*spec.scores, *(claim.score for claim in spec.claims)):
         if name not in all_scores():
             raise input_error("scores, claims", "names of scores", f"{name!r}", "see docs/scores.md.")
+    if len(set(spec.protocols)) < len(spec.protocols):
+        raise input_error("protocols", "different names", ", ".join(spec.protocols), "remove one.")
     if not spec.seeds or len(set(spec.seeds)) < len(spec.seeds):
         raise input_error("seeds", "different numbers", f"{list(spec.seeds)}", "correct them.")
     count = len(spec.seeds) * len(spec.sequences) * max(len(spec.budgets), 1) * len(spec.methods)

@@ -18,6 +18,7 @@ from typing import Any
 
 from ..core.checks import InputError
 from ..data.files import read_json
+from ..evaluation.protocols.table import ProtocolName
 from ..system.atomic import write_json, write_text
 
 DONE = "cell.json"
@@ -54,6 +55,8 @@ class Job:
     weights_dir: str | None
     threads: int
     """Threads of Numba and torch."""
+    protocols: tuple[ProtocolName, ...] = ()
+    """Also score as these papers did."""
 
     def write(self, path: Path) -> None:
         """Save as JSON."""
@@ -98,9 +101,9 @@ def work(job: Job) -> None:
     sequence = load_sequence(job.scored_on, scored_data(reading))
     weights_dir = Path(job.weights_dir) if job.weights_dir else None
     given_path = camera_to_world(map(sequence.camera, range(len(sequence)))) if "poses" in job.found_parts else None
-    result = evaluate(
-        found, sequence, networks=job.networks, weights_dir=weights_dir, reading=reading, given_path=given_path
-    )
+    networks = {"networks": job.networks, "weights_dir": weights_dir}
+    asked = {"reading": reading, "given_path": given_path, "protocols": job.protocols}
+    result = evaluate(found, sequence, **networks, **asked)
     if "poses" in job.found_parts:
         source = read_json(Path(job.data) / "sequence.json")["sources"]["poses"]
         result.protocol["poses: estimated"] = f"{ESTIMATED}; found: {source}"
