@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ..compute.fastmath import REORDERED
+
 
 def sums(plane: NDArray[np.float32]) -> tuple[float, float]:
     """Sum of the squared second differences along the rows, and of |1 - p|, of a plane (rows, columns, C)."""
@@ -20,17 +22,18 @@ def add_gradient(plane: NDArray[np.float32], gradient: NDArray[np.float32], fact
     _add_gradient(plane.reshape(rows, -1), gradient.reshape(rows, -1), np.float32(factor), np.float32(pull))
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, fastmath=REORDERED)
 def _sums(plane, squares, distance):
     # One task per row; writes its entry of both.
     rows, width = plane.shape
     for r in prange(rows):
-        square, away = 0.0, 0.0
+        square, away = np.float32(0), np.float32(0)
         for i in range(width):
             away += abs(1 - plane[r, i])
         if 0 < r < rows - 1:
+            before, here, after = plane[r - 1], plane[r], plane[r + 1]
             for i in range(width):
-                curve = plane[r - 1, i] - 2 * plane[r, i] + plane[r + 1, i]
+                curve = before[i] - 2 * here[i] + after[i]
                 square += curve * curve
         squares[r], distance[r] = square, away
 
@@ -40,14 +43,19 @@ def _add_gradient(plane, gradient, factor, pull):
     # One task per row; the second differences that contain a row are those at the row before, itself and the next.
     rows, width = plane.shape
     for r in prange(rows):
-        for i in range(width):
-            total = np.float32(0)
-            if 1 < r:
-                total += plane[r - 2, i] - 2 * plane[r - 1, i] + plane[r, i]
-            if 0 < r < rows - 1:
-                total -= 2 * (plane[r - 1, i] - 2 * plane[r, i] + plane[r + 1, i])
-            if r < rows - 2:
-                total += plane[r, i] - 2 * plane[r + 1, i] + plane[r + 2, i]
-            away = plane[r, i] - 1
-            side = np.float32(1) if away > 0 else (np.float32(-1) if away < 0 else np.float32(0))
-            gradient[r, i] += factor * total + pull * side
+        into, here = gradient[r], plane[r]
+        if 1 < r:
+            first, second = plane[r - 2], plane[r - 1]
+            for i in range(width):
+                into[i] += factor * (first[i] - 2 * second[i] + here[i])
+        if 0 < r < rows - 1:
+            first, second = plane[r - 1], plane[r + 1]
+            for i in range(width):
+                into[i] -= 2 * factor * (first[i] - 2 * here[i] + second[i])
+        if r < rows - 2:
+            first, second = plane[r + 1], plane[r + 2]
+            for i in range(width):
+                into[i] += factor * (here[i] - 2 * first[i] + second[i])
+        if pull:
+            for i in range(width):
+                into[i] += pull * np.sign(here[i] - 1)
