@@ -40,22 +40,20 @@ def _sums(plane, squares, distance):
 
 @njit(parallel=True, cache=True)
 def _add_gradient(plane, gradient, factor, pull):
-    # One task per row; the second differences that contain a row are those at the row before, itself and the next.
+    # One task per row. The second differences that contain a row are those at the row before, itself and the next;
+    # the rows that these read have weights 1, -4, 6, -4, 1 where all three are there.
     rows, width = plane.shape
     for r in prange(rows):
-        into, here = gradient[r], plane[r]
-        if 1 < r:
-            first, second = plane[r - 2], plane[r - 1]
-            for i in range(width):
-                into[i] += factor * (first[i] - 2 * second[i] + here[i])
-        if 0 < r < rows - 1:
-            first, second = plane[r - 1], plane[r + 1]
-            for i in range(width):
-                into[i] -= 2 * factor * (first[i] - 2 * here[i] + second[i])
-        if r < rows - 2:
-            first, second = plane[r + 1], plane[r + 2]
-            for i in range(width):
-                into[i] += factor * (here[i] - 2 * first[i] + second[i])
+        before = np.float32(1 < r)
+        here = np.float32(0 < r < rows - 1)
+        after = np.float32(r < rows - 2)
+        far_back, back = factor * before, -2 * factor * (before + here)
+        middle = factor * (before + 4 * here + after)
+        ahead, far_ahead = -2 * factor * (here + after), factor * after
+        a, b, c = plane[max(r - 2, 0)], plane[max(r - 1, 0)], plane[r]
+        d, e, into = plane[min(r + 1, rows - 1)], plane[min(r + 2, rows - 1)], gradient[r]
+        for i in range(width):
+            into[i] += far_back * a[i] + back * b[i] + middle * c[i] + ahead * d[i] + far_ahead * e[i]
         if pull:
             for i in range(width):
-                into[i] += pull * np.sign(here[i] - 1)
+                into[i] += pull * (np.float32(c[i] > 1) - np.float32(c[i] < 1))
