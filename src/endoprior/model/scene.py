@@ -50,8 +50,8 @@ class Shown:
     """In (0, 1]: 1 unless two windows overlap there. The weights of all windows add up to 1."""
 
 
-class Scene(ABC):
-    """Everything needed to render the tissue at any time from any viewpoint. Frame i of T was taken at time i / T."""
+class RenderedScene(ABC):
+    """What renders the tissue at any time from any viewpoint. Frame i of T was taken at time i / T."""
 
     config: Config
     cameras: tuple[Camera, ...]
@@ -59,6 +59,48 @@ class Scene(ABC):
     frames_per_second: float
     lengths_are_relative: bool
     """Whether the scale of the sequence's depth was assumed: lengths are then not in mm."""
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Device that holds the scene and renders it."""
+
+    @property
+    @abstractmethod
+    def backend(self) -> str:
+        """What renders it, in words."""
+
+    @abstractmethod
+    def to(self, device: torch.device | str) -> RenderedScene:
+        """This scene on a device; itself if it is there."""
+
+    @abstractmethod
+    def save(self, path: Path) -> None:
+        """Write the scene as safetensors, completely or not at all."""
+
+    @abstractmethod
+    def render(self, time: float, camera: Camera | None = None) -> RenderedView:
+        """Render the scene at `time` in [0, 1], from `camera` or else the camera of the frame nearest in time.
+
+        Returns:
+            color (H, W, 3) in [0, 1], depth (H, W) mm as the sum of weight * z, alpha (H, W) in [0, 1], and
+            unclamped_color (H, W, 3).
+        Raises:
+            ValueError: time is not in [0, 1].
+        """
+
+    def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
+        """`render` at several times, one camera each."""
+        return [self.render(time, camera) for time, camera in zip(times, cameras, strict=True)]
+
+    def camera_at(self, time: float) -> Camera:
+        """Camera of the frame nearest in time."""
+        return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
+
+
+class Scene(RenderedScene):
+    """A scene of Gaussians."""
+
     rendered_by: render.Backend | None
     """Rendering backend; None: the one it was trained with, where it can be used."""
 
@@ -66,11 +108,6 @@ class Scene(ABC):
     @abstractmethod
     def windows(self) -> Sequence[Window]:
         """Its windows, in order; a window overlaps the next one only."""
-
-    @property
-    @abstractmethod
-    def device(self) -> torch.device:
-        """Device that holds the scene and renders it."""
 
     @abstractmethod
     def __len__(self) -> int:
@@ -168,10 +205,6 @@ class Scene(ABC):
             if backend is not None and (backend in render.ON_GPU) == on_gpu:
                 return backend
         return "gsplat" if on_gpu else "numba"
-
-    def camera_at(self, time: float) -> Camera:
-        """Camera of the frame nearest in time."""
-        return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
 
 
 def faded_in(place: float) -> float:

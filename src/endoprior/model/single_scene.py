@@ -20,7 +20,7 @@ from .basis import basis_offsets
 from .deformation import HexPlaneField, Offsets
 from .gaussians import Gaussians
 from .ops import ModelOps, ops_for
-from .scene import Scene, Window
+from .scene import RenderedScene, Scene, Window
 
 FORMAT = "endoprior-scene-1"
 """Name and version of the file format, in the file's metadata."""
@@ -146,7 +146,7 @@ class SingleScene(Scene):
         save_arrays(path, arrays, scene_facts(self) | about, FORMAT)
 
 
-def scene_facts(scene: Scene) -> dict[str, Any]:
+def scene_facts(scene: RenderedScene) -> dict[str, Any]:
     """What the metadata of every scene's file say."""
     first = scene.cameras[0]
     return {
