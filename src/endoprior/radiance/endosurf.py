@@ -16,8 +16,8 @@ from torch import Generator, Tensor
 from ..core.config_radiance import RadianceConfig
 from . import endosurf_losses as loss
 from .compositing import Composited, composited, surface_alpha
-from .endosurf_networks import SHARPNESS, ColorNetwork, DeformationNetwork, SurfaceNetwork
 from .enclosing_sphere import enclosing_sphere
+from .endosurf_networks import SHARPNESS, ColorNetwork, DeformationNetwork, SurfaceNetwork
 from .field import RadianceField, RayBatch, uniform
 from .frames import RayFrames
 from .marching import first_crossing
@@ -31,7 +31,7 @@ FIRST_SHARPNESS = 64.0
 BESIDE = 0.1
 """Side of the cube around a surface point in which its neighbor lies."""
 WARM_UP, LAST_RATE, ANNEALED = 0.05, 0.05, 0.5
-"""Shares of the schedule: the rate rises over the first, then falls to this factor; alpha is annealed until the last."""
+"""Share of the schedule over which the rate rises, the factor it then falls to, and the share that anneals alpha."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,10 @@ class EndoSurf(RadianceField):
         there = origins + target[:, None] * units
         counted = batch.measured & (there.norm(dim=-1) < 1)
         distance, gradient = self.distance_and_gradient(there, batch.time)
-        terms = {"color": loss.color_term(view.color, batch.color), "depth": loss.depth_term(view.depth, target, counted)}
+        terms = {
+            "color": loss.color_term(view.color, batch.color),
+            "depth": loss.depth_term(view.depth, target, counted),
+        }
         terms |= loss.surface_terms(distance, (gradient * units).sum(-1), counted)
         terms["eikonal"] = loss.eikonal_term(probed.gradient, points.norm(dim=-1))
         found = first_crossing(lambda at: self.distance(at, batch.time), origins, units)
@@ -127,7 +130,9 @@ class EndoSurf(RadianceField):
         probed = self.probe(points, directions, time)
         slope = (probed.gradient * directions).sum(-1)
         sharpness = torch.exp(10 * self.sharpness)
-        alpha = surface_alpha(*(each.view_as(s) for each in (probed.distance, slope)), steps, sharpness, float(self.anneal))
+        alpha = surface_alpha(
+            *(each.view_as(s) for each in (probed.distance, slope)), steps, sharpness, float(self.anneal)
+        )
         return composited(alpha, probed.color.unflatten(0, s.shape), middles), probed, points
 
     def _samples(self, origins: Tensor, units: Tensor, time: float, shift: Tensor | float) -> Tensor:

@@ -29,10 +29,11 @@ def first_crossing(distance: Callable[[Tensor], Tensor], origins: Tensor, units:
     at = enters[rows].int().argmax(-1)
     low, high = s[rows, at], s[rows, at + 1]
     above, below = values[rows, at], values[rows, at + 1]
+    middle = low
     for _ in range(SECANT_STEPS):
         middle = low + (high - low) * above / (above - below).clamp(min=1e-12)
         value = distance(origins[rows] + middle[:, None] * units[rows])
         outside = value > 0
         low, above = torch.where(outside, middle, low), torch.where(outside, value, above)
         high, below = torch.where(outside, high, middle), torch.where(outside, below, value)
-    return origins[rows] + ((low + high) / 2)[:, None] * units[rows] if len(rows) else origins[:0]
+    return origins[rows] + middle[:, None] * units[rows]

@@ -19,7 +19,7 @@ from ..radiance.rays import rays_of
 from ..radiance.refinement import due, refined
 from ..radiance.scene import RadianceScene
 from ..system.arrays_file import ArraySpec
-from .divergence import LARGEST_GRADIENT, Divergence, Diverged, unusable_numbers
+from .divergence import LARGEST_GRADIENT, Diverged, unusable_numbers
 from .radiance_state import RadianceState, state_schema
 from .state import Stage, StepReport
 from .trainer import DEFAULT_FRAMES_PER_SECOND, device_for
@@ -114,7 +114,7 @@ class RadianceTrainer:
             state.optimizer.zero_grad(set_to_none=True)
             for name, value in field.named_buffers():
                 value.copy_(buffers[name])
-            raise Diverged(Divergence(reason, state.iteration).reason)
+            raise Diverged(reason)
         for group in state.optimizer.param_groups:
             group["lr"] = cfg.radiance.learning_rate * field.rate(share)
         state.optimizer.step()

@@ -38,7 +38,7 @@ def compute(context: EvaluationContext) -> None:
     truth = context.sequence.truth
     if truth is None or truth.camera_to_world is None:
         return
-    scene = context.scene
+    scene = context.rendered_scene
     estimated = np.linalg.inv(np.stack([camera.world_to_camera for camera in scene.cameras]))
     errors = metrics.trajectory_errors(estimated, truth.camera_to_world, with_scale=scene.lengths_are_relative)
     for score in SCORES:
