@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+
 from endoprior.core import radiance_presets
 from endoprior.core.config_radiance import RadianceConfig
 from endoprior.radiance import endonerf_networks, endosurf_networks

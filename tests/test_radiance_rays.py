@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from render_scenes import camera as some_camera
+
 from endoprior.core.geometry import pixel_centers, project
 from endoprior.core.types import Camera
 from endoprior.radiance import endonerf_losses, endosurf_losses
@@ -13,7 +15,6 @@ from endoprior.radiance.marching import first_crossing
 from endoprior.radiance.rays import all_rays, from_perspective, rays_of, to_perspective
 from endoprior.radiance.refinement import due, refined
 from endoprior.radiance.sampling import by_weight, centers, even, jittered, sphere_ends, surface_places
-from render_scenes import camera as some_camera
 
 
 def test_rays_pass_the_pixel_centers():
@@ -119,7 +120,9 @@ def test_alpha_of_a_surface():
 @pytest.mark.parametrize("anneal", [0.0, 0.4, 1.0])
 def test_gradients_of_the_alpha_of_a_surface(anneal: float):
     rng = np.random.default_rng(1)
-    distance, slope, step = (torch.from_numpy(rng.uniform(*ends, (3, 5))) for ends in ((-0.1, 0.1), (-1, -0.2), (0.05, 0.2)))
+    distance, slope, step = (
+        torch.from_numpy(rng.uniform(*ends, (3, 5))) for ends in ((-0.1, 0.1), (-1, -0.2), (0.05, 0.2))
+    )
     sharpness = torch.tensor(20.0, dtype=torch.float64)
     inputs = [value.requires_grad_() for value in (distance, slope, step, sharpness)]
     assert torch.autograd.gradcheck(lambda *values: surface_alpha(*values, anneal), inputs)

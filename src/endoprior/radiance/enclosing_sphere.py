@@ -10,7 +10,9 @@ from ..core.geometry import back_project, pixel_centers
 from .frames import RayFrames
 
 SHARE = 0.005
-"""Share of the measured pixels of a frame that are taken."""
+"""Share of the measured pixels of a frame that are taken, ..."""
+FEWEST = 100
+"""... but at least about so many: a sphere around a few points of a small frame would miss most of the tissue."""
 NEIGHBORS, SPREAD = 5, 20.0
 """A point stays if this many others lie within so many times the mean distance to the nearest one."""
 FILLED = 0.8
@@ -29,7 +31,7 @@ def _points(frames: RayFrames, position: int) -> NDArray[np.float64]:
     """Evenly chosen measured points of a frame; a fixed choice, since nothing depends on which."""
     depth, camera = frames.depth(position), frames.frame(position).camera
     pixels = np.flatnonzero(depth)
-    chosen = pixels[:: int(1 / SHARE)]
+    chosen = pixels[:: max(1, min(int(1 / SHARE), len(pixels) // FEWEST))]
     at = pixel_centers(camera.width, camera.height).reshape(-1, 2)[chosen].astype(np.float64)
     return without_outliers(back_project(at, depth.ravel()[chosen].astype(np.float64), camera))
 
