@@ -45,9 +45,8 @@ def sequence(make_tiny_sequence: Callable[..., Path]) -> FrameSequence:
 
 def changed(sequence: FrameSequence, change: Callable[[Frame], Frame]) -> FrameSequence:
     """The sequence with other frames."""
-    view = sequence.without_masks()
-    view._read_frame = lambda index: change(sequence.frame(index))
-    return view
+    cameras = [sequence.camera(i) for i in range(len(sequence))]
+    return FrameSequence(sequence.path, cameras, lambda index: change(sequence.frame(index)))
 
 
 def started(sequence: FrameSequence, name: str, cfg: Config | None = None) -> RadianceTrainer:
