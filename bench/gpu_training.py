@@ -20,7 +20,7 @@ from endoprior.evaluation.scoring import evaluate
 from endoprior.model.scene import Scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.system.devices import wait_for
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 FRAMES, WIDTH, HEIGHT = 63, 640, 512
 SCORES = (
@@ -93,7 +93,7 @@ def trained(name: str, folder: Path, backend: render.Backend, iterations: int | 
     cfg = config(backend, iterations)
     sequence = load_sequence(folder, cfg.data)
     began = time.perf_counter()
-    trainer = Trainer(sequence, cfg)
+    trainer = GaussianTrainer(sequence, cfg)
     on_gpu = trainer.device.type == "cuda"
     if on_gpu:
         torch.cuda.reset_peak_memory_stats(trainer.device)

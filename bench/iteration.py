@@ -19,16 +19,16 @@ import torch
 from endoprior.core.config import Config
 from endoprior.core.presets import preset
 from endoprior.data import FrameSequence, load_sequence
-from endoprior.model import single_scene as scene_module
+from endoprior.model import motion
 from endoprior.model.deformation import HexPlaneField
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.render import numba as numba_backend
+from endoprior.training import gaussian_method, temporal, temporal_numba
 from endoprior.training import step as iteration_module
-from endoprior.training import temporal, temporal_numba
+from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
 from endoprior.training.optimizer import Optimizer
-from endoprior.training.state import Stage, StepReport
-from endoprior.training.trainer import Trainer
+from endoprior.training.stage import Stage, StepReport
 
 PRESETS = ("default", "paper")
 FRAMES = 4
@@ -40,14 +40,14 @@ TORCH_MOST = common.Size(20_000, 640, 512)
 """With more Gaussians or pixels, autograd's memory takes torch from seconds to minutes."""
 PARTS = {
     "deformation": [
-        (scene_module, "basis_offsets"),
+        (motion, "basis_offsets"),
         (HexPlaneField, "offsets"),
         (HexPlaneField, "offsets_and_displacement"),
     ],
     "projection + SH": [(numba_backend, "project_forward")],
     "binning + sort": [(numba_backend.tiles, "build")],
     "compositing": [(numba_backend, "composite_forward")],
-    "losses": [(iteration_module, "supervised_terms")],
+    "losses": [(gaussian_method, "supervised_terms")],
     "temporal term": [(temporal, "choose"), *((temporal_numba, n) for n in ("neighbors", "affinity", "local_motion"))],
     "compositing backward": [(numba_backend, "composite_backward"), (numba_backend, "gather")],
     "projection backward": [(numba_backend, "project_backward")],
@@ -96,9 +96,9 @@ def config(name: str, num: int) -> Config:
     )
 
 
-def started(sequence: FrameSequence, cfg: Config, ops: TrainingOps = NUMBA) -> Trainer:
+def started(sequence: FrameSequence, cfg: Config, ops: TrainingOps = NUMBA) -> GaussianTrainer:
     """A trainer before its first iteration, with its cache of frames filled; with `TORCH`, plain torch throughout."""
-    trainer = Trainer(sequence, cfg, ops)
+    trainer = GaussianTrainer(sequence, cfg, ops)
     if ops is TORCH:
         trainer.step_once.rasterize = plain.rasterize
     trainer.start()
@@ -109,7 +109,7 @@ def started(sequence: FrameSequence, cfg: Config, ops: TrainingOps = NUMBA) -> T
     return trainer
 
 
-def settle(trainer: Trainer) -> int:
+def settle(trainer: GaussianTrainer) -> int:
     """Train until all is warm and an iteration had the temporal term; return that iteration."""
     for iteration in range(1, LAST):
         if "distance" in trainer.step().terms and iteration >= FIRST:
@@ -117,7 +117,7 @@ def settle(trainer: Trainer) -> int:
     raise RuntimeError(f"no iteration up to {LAST} had the temporal term: too few Gaussians or frames")
 
 
-def repeat(trainer: Trainer, iteration: int) -> StepReport:
+def repeat(trainer: GaussianTrainer, iteration: int) -> StepReport:
     """Do a fine iteration again: the same frame, the same terms."""
     trainer.state.stage, trainer.state.iteration = Stage.FINE, iteration - 1
     return trainer.step()

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import common
 import numpy as np
 import scenes
@@ -12,13 +14,14 @@ import torch
 
 from endoprior.core.config_deformation import DeformationConfig
 from endoprior.core.presets import preset
-from endoprior.model.attributes import attribute_shapes
+from endoprior.model.attributes import motion_shape
 from endoprior.model.basis import RankOneGradient, basis_offsets
 from endoprior.model.deformation import HexPlaneField
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
-from endoprior.training.optimizer import Optimizer, motion_rates
+from endoprior.training.optimizer import Optimizer
 from endoprior.training.plane_adam import PlaneAdam
+from endoprior.training.rates import motion_rates, rate_of
 
 TIME, RATE, EPSILON = 0.4, 1e-3, 1e-15
 EARLIER_TIMES = (0.05, 0.2, 0.6, 0.85)
@@ -67,7 +70,7 @@ def hexplane(num: int, ops: TrainingOps) -> common.Steps:
 def basis(num: int, ops: TrainingOps) -> common.Steps:
     """Offsets from temporal coefficients, their gradient and their Adam step."""
     cfg = preset("default").fitted(68)
-    motion = torch.zeros(num, *attribute_shapes(cfg)["motion"], requires_grad=True)
+    motion = torch.zeros(num, *motion_shape(cfg.deformation), requires_grad=True)
     state, rates = AdamState(motion, cfg.deformation.basis.num_bases), motion_rates(cfg, 1)
     sink: list[RankOneGradient] = []
 
@@ -92,7 +95,7 @@ def optimizer(num: int, ops: TrainingOps) -> common.Steps:
     splats, _ = scenes.splats(common.Size(num, 640, 512))
     gaussians = scenes.gaussians(splats, cfg)
     gradients = {name: torch.rand_like(value) for name, value in gaussians.tensors.items()}
-    adam = Optimizer(gaussians, None, cfg, 10.0, ops)
+    adam = Optimizer(gaussians, None, cfg, partial(rate_of, cfg=cfg, spatial_scale=10.0), ops)
 
     def give(_: object) -> None:
         for name, value in gaussians.tensors.items():

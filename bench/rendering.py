@@ -13,7 +13,7 @@ import torch
 from endoprior.core.config import Config
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, RenderOutput, Splats
-from endoprior.model import single_scene as scene_module
+from endoprior.model import motion
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.playback import Playback
 from endoprior.model.scene import Scene
@@ -25,7 +25,7 @@ TIME = 0.4
 TORCH_MOST = 20_000
 """Gaussians; with more, torch takes many seconds."""
 PARTS = {
-    "deformation": [(scene_module, "offsets_at")],
+    "deformation": [(motion.HexPlaneMotion, "offsets"), (motion.BasisMotion, "offsets")],
     "projection + SH": [(numba_backend, "project_forward")],
     "binning + sort": [(numba_backend.tiles, "build")],
     "compositing": [(numba_backend, "composite_forward")],

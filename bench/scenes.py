@@ -10,7 +10,7 @@ from torch import Tensor
 from endoprior.compute.morton import morton_order
 from endoprior.core.config import Config
 from endoprior.core.types import Camera, Splats
-from endoprior.model.attributes import attribute_shapes
+from endoprior.model.attributes import motion_shape
 from endoprior.model.gaussians import Gaussians
 
 FOCAL_PER_WIDTH = 0.9
@@ -59,7 +59,7 @@ def gaussians(drawn: Splats, cfg: Config) -> Gaussians:
     if cfg.render.color_slopes:
         tensors["color_slopes"] = drawn.color_slopes
     if cfg.deformation.kind == "basis":
-        tensors["motion"] = torch.zeros(len(drawn), *attribute_shapes(cfg)["motion"])
+        tensors["motion"] = torch.zeros(len(drawn), *motion_shape(cfg.deformation))
     return Gaussians({name: value.clone() for name, value in tensors.items()})
 
 

@@ -23,8 +23,8 @@ from endoprior.core.presets import preset
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
-from endoprior.training.trainer import Trainer
 
 UNCOUNTED, COUNTED, NEVER = 30, 80, 10**6
 NO_WORK = (
@@ -48,7 +48,7 @@ class Launches(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def trainer_of(name: str, folder: Path, ops: TrainingOps = NUMBA, **changes: int) -> Trainer:
+def trainer_of(name: str, folder: Path, ops: TrainingOps = NUMBA, **changes: int) -> GaussianTrainer:
     """A started trainer of a preset in which every term is active at once, without density events."""
     cfg = preset(name)
     cfg = replace(
@@ -58,12 +58,12 @@ def trainer_of(name: str, folder: Path, ops: TrainingOps = NUMBA, **changes: int
         temporal=replace(cfg.temporal, start_iteration=1, min_valid=0),
         density=replace(cfg.density, start_iteration=NEVER),
     )
-    trainer = Trainer(load_sequence(folder), cfg, ops)
+    trainer = GaussianTrainer(load_sequence(folder), cfg, ops)
     trainer.start()
     return trainer
 
 
-def median_ms(trainer: Trainer) -> float:
+def median_ms(trainer: GaussianTrainer) -> float:
     """Of the counted iterations."""
     taken = []
     for _ in range(UNCOUNTED + COUNTED):

@@ -23,7 +23,7 @@ from endoprior.core.presets import preset
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.evaluation.predicted_tracks import PredictedTracks, TrueTracks, by_chained_flow, by_scene, true_tracks
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 ALLOWED_PX = 0.05
 WORSE_SHARE = 0.02
@@ -47,7 +47,7 @@ def track_errors(predicted: PredictedTracks, true: TrueTracks) -> NDArray[np.flo
 def compare(name: str, sequence: FrameSequence, preset_name: str, seed: int) -> list[str]:
     """Print the errors of one training; what is wrong with them."""
     true = true_tracks(sequence)
-    trainer = Trainer(sequence, preset(preset_name, seed=seed))
+    trainer = GaussianTrainer(sequence, preset(preset_name, seed=seed))
     trainer.start()
     start = track_errors(by_scene(trainer.scene(), true, sequence), true)
     trainer.run([])

@@ -6,10 +6,14 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from browser import Page
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch is imported
 
@@ -123,6 +127,25 @@ def all_vessels() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("endoprior.phantom.vessels.TREES", 1000)
         yield
+
+
+@pytest.fixture(scope="module")
+def browser(player: Path) -> Iterator[Page]:
+    """One Chromium for the HTML page `player` of a file of tests; skips loudly where there is none."""
+    from browser import open_page, require_chromium
+
+    require_chromium()
+    with open_page(player.as_uri(), width=640, height=520) as page:
+        yield page
+
+
+@pytest.fixture
+def page(browser: Page, player: Path) -> Page:
+    """That page, just opened, in a window in which one recorded pixel is one pixel of the screen."""
+    from player_page import open_player
+
+    open_player(browser, player)
+    return browser
 
 
 def shrink_tool_network(patch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -34,6 +34,14 @@ class Still:
 
     centers: np.ndarray
     step: float = 0.0
+    shift_mm: float = 0.0
+    """How far to the left the scene's own cameras stand."""
+
+    @property
+    def cameras(self) -> list[Camera]:
+        pose = np.eye(4)
+        pose[0, 3] = self.shift_mm
+        return [replace(frame(i).camera, world_to_camera=pose) for i in range(4)]
 
     def at(self, time: float) -> SimpleNamespace:
         return SimpleNamespace(means=torch.from_numpy(self.centers))
@@ -41,7 +49,8 @@ class Still:
     def render(self, time: float, camera: Camera) -> SimpleNamespace:
         depth = torch.full((HEIGHT, WIDTH), 50 + self.step * 4 * time)
         depth[:, -5:] = 0
-        return SimpleNamespace(depth=depth, color=torch.full((HEIGHT, WIDTH, 3), 0.5))
+        shade = 0.5 + camera.world_to_camera[0, 3] / 100
+        return SimpleNamespace(depth=depth, color=torch.full((HEIGHT, WIDTH, 3), shade))
 
 
 def test_windows_hold_what_they_are_named_for():
@@ -76,14 +85,26 @@ def test_density_counts_centers_in_front_and_inside():
     assert np.unravel_index(found.argmax(), found.shape) == (HEIGHT // 2, WIDTH // 2)
 
 
+class FrameSequence:
+    """Stands in for a sequence of two frames, of which one is held out."""
+
+    def frames(self, split):
+        return [frame(1)]
+
+    def frame(self, index):
+        return frame(index)
+
+
+def test_scenes_are_shown_from_their_own_poses():
+    rest, moved = (Still(np.array([[0.0, 0, 50]]), shift_mm=shift) for shift in (0, 5))
+    found = center_density(moved, frame())
+    assert np.unravel_index(found.argmax(), found.shape) == (HEIGHT // 2, WIDTH // 2 + 10)  # 100 px * 5 mm / 50 mm
+    both = frames_grid(FrameSequence(), {"rest": rest, "moved": moved})
+    first, second = both[200, 480 + 240], both[200, 2 * 480 + 240]
+    assert (second.astype(int) - first > 5).all()
+
+
 def test_grids_have_a_column_for_each_method():
-    class FrameSequence:
-        def frames(self, split):
-            return [frame(1)]
-
-        def frame(self, index):
-            return frame(index)
-
     scenes = {name: Still(np.array([[0.0, 0, 50]])) for name in "ab"}
     width, height = 6 * WIDTH, 6 * HEIGHT  # enlarged to 480 px
     assert frames_grid(FrameSequence(), scenes).shape == (4 * height, 3 * width, 3)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from benchmark_runs import contents, in_this_process
 from conftest import write_tiny_sequence
 
 from endoprior.cli import main
@@ -20,13 +19,12 @@ from endoprior.evaluation.mask_scores import SCORES
 from endoprior.evaluation.scoring import evaluate, scored_data
 from endoprior.evaluation.true_masks import TrueMasks, score_masks
 from endoprior.experiments import found_masks
-from endoprior.experiments.execute import Outcome
+from endoprior.experiments.changed_copy import write_copy
 from endoprior.experiments.matrix import Matrix, run_matrix, scores_of
 from endoprior.experiments.preset_method import PresetMethod
 from endoprior.experiments.report import write_report
 from endoprior.experiments.results import Results
-from endoprior.experiments.spec import Cell, load_spec
-from endoprior.experiments.worker import Job, work
+from endoprior.experiments.spec import Cell, SequenceSpec, load_spec
 from endoprior.model.scene_file import load_scene
 from endoprior.tool_masks import FoundTools
 
@@ -47,18 +45,6 @@ def write_spec(folder: Path, **changes) -> Path:
     path = folder / "spec.yaml"
     path.write_text(yaml.safe_dump(values))
     return path
-
-
-def in_this_process(jobs: list[Job]) -> Iterator[Outcome]:
-    for job in jobs:
-        work(job)
-        yield Outcome(job, 1.0)
-
-
-def contents(folder: Path) -> dict[str, tuple[int, str]]:
-    """Time of change and hash of every file."""
-    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
-    return {str(f): (f.stat().st_mtime_ns, hashlib.sha256(f.read_bytes()).hexdigest()) for f in files}
 
 
 def masks_of(folder: Path) -> list[np.ndarray]:
@@ -138,7 +124,7 @@ def test_the_report_shows_what_found_masks_cost(finished):
     cost = f"{values[1] - values[0]:+.2f} dB"
     assert "Paired difference to tiny, which has its own masks, positive where better" in found
     assert found.count("| method | tissue PSNR, dB |\n") == 1 and f"| m | {cost} |" in found
-    (gain,) = json.loads((matrix.out / "results.json").read_text())["gains_of_found_masks"]
+    (gain,) = json.loads((matrix.out / "results.json").read_text())["gains_of_found_parts"]
     assert (gain["sequence"], gain["than"], gain["score"]) == ("tiny_found", "tiny", "psnr_tissue")
     assert gain["mean"] == pytest.approx(values[1] - values[0]) and gain["pairs"] == 1
     assert np.isnan(Results.of(matrix).value(OWN, "mask_iou"))
@@ -177,7 +163,7 @@ def test_found_masks_are_found_once_and_again_for_other_files(finished, tmp_path
 
 
 def test_the_masks_are_hidden_from_the_finder_and_an_interruption_leaves_nothing(tmp_path, monkeypatch):
-    sequence = found_masks.whole_sequence(write_tiny_sequence(tmp_path / "tiny"), "auto")
+    sequence = load_sequence(write_tiny_sequence(tmp_path / "tiny"), DataConfig())
 
     def interrupted(hidden):
         assert all(frame.tissue_mask.all() for frame in hidden.frames("video"))
@@ -186,7 +172,7 @@ def test_the_masks_are_hidden_from_the_finder_and_an_interruption_leaves_nothing
 
     monkeypatch.setattr(found_masks, "find_in_sequence", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        found_masks.write_found(sequence, tmp_path / "found" / "copy")
+        write_copy(sequence, tmp_path / "found" / "copy", SequenceSpec(masks="found"))
     assert not [*(tmp_path / "found").iterdir()]
     assert not sequence.frame(0).tissue_mask.all(), "the sequence itself keeps its masks"
 
@@ -198,7 +184,7 @@ def test_masks_of_either_polarity_are_written_as_the_sequence_has_them(tmp_path,
     mask = np.zeros((40, 48), bool)
     mask[:, 30:] = True
     monkeypatch.setattr(found_masks, "find_in_sequence", lambda sequence: iter([(mask, FoundTools(mask, 1.0))] * 17))
-    found_masks.write_found(found_masks.whole_sequence(data, "auto"), tmp_path / "copy")
+    write_copy(load_sequence(data, DataConfig()), tmp_path / "copy", SequenceSpec(masks="found"))
     assert all((found == mask).all() for found in masks_of(tmp_path / "copy"))
 
 

@@ -23,7 +23,7 @@ from endoprior.experiments.report import write_report
 from endoprior.experiments.spec import cells, load_spec
 from endoprior.experiments.worker import work
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 PHANTOM = {"frames": 10, "width": 48, "height": 40}
 METHODS = {
@@ -134,7 +134,7 @@ def test_a_method_may_return_a_scene(tmp_path, make_tiny_sequence, monkeypatch):
 
         def train(self, sequence, options, *, seed, out):
             out.mkdir()
-            trainer = Trainer(sequence, options)
+            trainer = GaussianTrainer(sequence, options)
             trainer.start()
             return trainer.scene()
 

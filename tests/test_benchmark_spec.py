@@ -89,15 +89,26 @@ def test_places_of_sequences(tmp_path, monkeypatch):
     assert sequence_folder(replaced, "clip", tmp_path) == tmp_path / "mine"
 
 
-def test_a_sequence_with_found_masks_knows_the_one_with_its_own(tmp_path):
+def test_a_sequence_with_found_parts_knows_the_one_with_its_own(tmp_path):
     ph, clip = {"phantom": {"frames": 9}}, {"path": "clips/a", "shrink": 2}
     found = {"found": clip | {"masks": "found"}, "ph_found": ph | {"masks": "found"}, "other": {"path": "b"}}
+    found |= {"posed": clip | {"poses": "estimated"}, "both": clip | {"masks": "found", "poses": "estimated"}}
     spec = load_spec(written(tmp_path, sequences={"clip": clip, "ph": ph} | found))
-    own = {name: spec.with_own_masks(name) for name in spec.sequences}
-    assert own == {"clip": None, "ph": None, "found": "clip", "ph_found": "ph", "other": None}
+    own = {name: spec.with_own_parts(name) for name in spec.sequences}
+    assert own == {
+        "clip": None,
+        "ph": None,
+        "found": "clip",
+        "ph_found": "ph",
+        "other": None,
+        "posed": "clip",
+        "both": "clip",
+    }
+    parts = {"posed": {"poses": "estimated"}, "both": {"masks": "found", "poses": "estimated"}, "clip": {}}
+    assert all(spec.sequences[name].found_parts == found for name, found in parts.items())
     assert sequence_folder(spec, "ph", tmp_path) == sequence_folder(spec, "ph_found", tmp_path)
     alone = load_spec(written(tmp_path, sequences={"found": found["found"], "larger": clip | {"shrink": 1}}))
-    assert alone.with_own_masks("found") is None
+    assert alone.with_own_parts("found") is None
 
 
 def test_toml_says_the_same(tmp_path):
@@ -125,6 +136,14 @@ def test_toml_says_the_same(tmp_path):
         (
             {"sequences": {"a": {"path": "x", "masks": "found"}}, "set": {"data.use_gt_masks": True}},
             "sequences.a.masks: expected either found or gt_masks, got both",
+        ),
+        (
+            {"sequences": {"a": {"path": "x", "poses": "own"}}},
+            "a.poses: expected one of 'given', 'estimated'",
+        ),
+        (
+            {"sequences": {"a": {"path": "x", "poses": "estimated"}}, "set": {"data.depth_unit_mm": 0.5}},
+            "sequences.a.poses: expected either estimated or data.depth_unit_mm, got both",
         ),
         ({"methods": {"m": {"preset": "finest"}}}, "methods.m.preset: expected one of default"),
         ({"methods": {"m": {"set": {"init": 3}}}}, "methods.m.set: expected the name of a config field"),
@@ -167,7 +186,7 @@ def test_ready_specs_are_read_by_name(name):
 
 def test_names_are_listed_and_win_over_paths(tmp_path, monkeypatch, capsys):
     names = spec_names()
-    assert {"quick", "masks", "sized", "sized/phantom", "full", "full/methods"} <= {*names}
+    assert {"quick", "masks", "poses", "sized", "sized/phantom", "full", "full/methods"} <= {*names}
     assert not [name for name in names if "_small" in name], "it is only there to be extended"
     monkeypatch.chdir(tmp_path)
     written(tmp_path).rename("quick")

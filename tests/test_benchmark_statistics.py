@@ -30,6 +30,7 @@ def test_gains_are_positive_where_better():
     np.testing.assert_allclose(gains("depth_rmse_mm", [3.0], [2.0]), [-0.5])
     np.testing.assert_allclose(gains("track_tear_rate", [0.25], [0.0]), [-0.25])
     np.testing.assert_allclose(gains("num_large_scale", [0.0], [5.0]), [5.0])
+    np.testing.assert_allclose(gains("ate_mm", [2.0, 0.0, 1.0], [0.0, 0.0, 2.0]), [np.nan, 0.0, 0.5])
 
 
 def test_changes_in_words():

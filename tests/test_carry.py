@@ -81,15 +81,14 @@ def test_confidence_is_a_probability_that_never_rises_with_the_spread():
 
 def test_few_points_need_few_gaussians(monkeypatch):
     scene, evaluated = moving_scene(), []
-    from endoprior.model import single_scene as module
+    motion = type(scene.motion)
+    before = motion.offsets
 
-    before = module.offsets_at
-
-    def counting(gaussians, *others):
+    def counting(self, gaussians, *others):
         evaluated.append(len(gaussians))
-        return before(gaussians, *others)
+        return before(self, gaussians, *others)
 
-    monkeypatch.setattr(module, "offsets_at", counting)
+    monkeypatch.setattr(motion, "offsets", counting)
     carry(scene, np.array([[0.5, 0.5, 60.1]]), np.array([3]), TIMES)
     assert sum(evaluated) <= len(scene) + NUM_CARRIERS * 11
 

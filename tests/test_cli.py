@@ -70,6 +70,7 @@ def test_every_command_explains_itself(command, capsys):
         (["eval", "nowhere", "--device", "gpu"], "gpu"),
         (["train", "nowhere", "out", "--weights-dir", "no-weights"], "no-weights"),
         (["eval", "nowhere"], "nowhere"),
+        (["eval", "nowhere", "--protocol", "nerf"], "got 'nerf'. Fix: See docs/scores.md."),
         (["render", "nowhere"], "nowhere"),
         (["prior", "nowhere", "out"], "nowhere"),
         (["phantom", "out", "--frames", "1"], "frames"),
@@ -116,6 +117,26 @@ def test_another_split_does_not_replace_the_test_scores(run, split, capsys):
     rows = json.loads((folder / f"per_frame_{split}.json").read_text())
     assert metrics["protocol"]["split"] == split and metrics["protocol"]["frames"] == [row["index"] for row in rows]
     assert str(folder / f"metrics_{split}.json") in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_protocols_of_other_papers_stand_beside_our_scores(run, tmp_path):
+    _, folder = run
+    words = ["eval", str(folder), "--out", str(tmp_path), "--no-networks", "--split", "video"]
+    assert main([*words, "--protocol", "endonerf,endogaussian"]) == 0
+    metrics = json.loads((tmp_path / "metrics_video.json").read_text())
+    ours, theirs = metrics["protocol"]["tags"], metrics["protocols"]["endonerf"]["tags"]
+    assert ours["split"] == "video, 17 frames" and theirs["split"] == "video, 16 without 0"
+    assert ours["saw_test_frames"] == "yes: 15 of 17" and theirs["saw_test_frames"] == "yes: 14 of 16"
+    assert ours["background"] == theirs["background"] == "black"
+    same = metrics["protocols"]["endogaussian"]["scores"]["psnr"]
+    assert (
+        same == pytest.approx(metrics["scores"]["psnr"], abs=1e-6) != metrics["protocols"]["endonerf"]["scores"]["psnr"]
+    )
+    stored = json.loads((folder / "metrics.json").read_text())
+    assert (
+        stored["protocol"]["tags"]["saw_test_frames"] == "no"
+        and stored["protocol"]["tags"]["split"] == "test, 2 frames"
+    )
 
 
 def test_eval_of_other_data_is_an_error(run, make_tiny_sequence, capsys):

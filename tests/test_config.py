@@ -16,7 +16,7 @@ from endoprior.core.config_deformation import BasisConfig, HexPlaneConfig
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.core.presets import preset
 from endoprior.experiments.spec import MethodSpec, SequenceSpec, Spec
-from endoprior.model.attributes import attribute_shapes
+from endoprior.model.attributes import motion_shape
 from endoprior.model.scene_file import SceneFacts
 from endoprior.runs.identity import reject_other_run
 
@@ -93,7 +93,7 @@ def test_basis_functions_follow_the_length_of_the_sequence():
     fitted = preset("default").fitted(48)
     assert fitted.deformation.basis.num_bases == 27 and fitted.fitted(99) == fitted
     with pytest.raises(ValueError, match="num_bases: expected at least 2"):
-        attribute_shapes(preset("default"))
+        motion_shape(preset("default").deformation)
 
 
 def test_replaced_fields_are_set_and_the_others_stay():

@@ -15,9 +15,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import Config
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
-from endoprior.model.attributes import attribute_shapes, motion_layout
+from endoprior.model.attributes import motion_layout, motion_shape
 from endoprior.model.basis import basis_offsets, basis_weights
 from endoprior.model.deformation import HexPlaneField, Offsets, box_of_points
 from endoprior.model.heads import OffsetHeads
@@ -219,7 +218,7 @@ def test_motion_layout_follows_the_configuration() -> None:
     rigid = replace(BASIS, deform_scales=False, deform_quats=False, deform_opacity=True)
     assert motion_layout(rigid) == {"means": slice(0, 3), "opacity_logits": slice(3, 4), "sh_dc": slice(4, 7)}
     plain = replace(rigid, deform_opacity=False, basis=replace(BASIS.basis, deform_color=False))
-    assert attribute_shapes(Config(deformation=plain))["motion"] == (9, 3)
+    assert motion_shape(plain) == (9, 3)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.31, 0.5, 0.999, 1.0])

@@ -1,6 +1,7 @@
 """Density control: the score of Eq. (7), the weight of Eq. (8), the plan, and its application."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from endoprior.training.densify import apply_plan, split_children
 from endoprior.training.density import DensityStats, Plan
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import Optimizer
+from endoprior.training.rates import rate_of
 
 CFG = DensityConfig()
 
@@ -194,13 +196,13 @@ def test_every_row_stays_together_through_a_plan(kind):
     cfg = Config()
     cfg = replace(cfg, deformation=replace(cfg.deformation, kind=kind))
     model = gaussians(6, cfg)
-    optimizer = Optimizer(model, None, cfg, 10.0, NUMBA)
+    optimizer = Optimizer(model, None, cfg, partial(rate_of, cfg=cfg, spatial_scale=10.0), NUMBA)
     for i, (name, value) in enumerate(model.tensors.items()):  # mark every row of every tensor by its Gaussian
         marks = torch.arange(6.0).reshape(-1, *[1] * (value.ndim - 1)) + 10 * i
         value.data += 0 if name in ("means", "quats", "log_scales") else marks
         optimizer.states[name].first += marks + 1
     before = {name: value.detach().clone() for name, value in model.tensors.items()}
-    stats = DensityStats(*(torch.arange(6.0) + k for k in range(5)))
+    stats = DensityStats(*(torch.arange(6.0) + k for k in range(6)))
     flags = torch.eye(6, dtype=torch.bool)
     planned = Plan(clone=flags[1], split=flags[2], remove=flags[4])
     grown, returned = apply_plan(optimizer, planned, stats, np.random.default_rng(0))

@@ -14,7 +14,7 @@ from endoprior.data import load_sequence
 from endoprior.runs.checkpoint import load_checkpoint, save_checkpoint
 from endoprior.training.depth_fit import LEAST_PIXELS, MOMENTUM, at_start, fitted, line, update
 from endoprior.training.frames import TrainingFrame
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 HEIGHT, WIDTH = 60, 80
 
@@ -76,12 +76,12 @@ def relative(make_tiny_sequence):
     sequence.depth_is_relative = True
     cfg = tiny_config("basis")
     cfg = replace(cfg, init=replace(cfg.init, opacity=0.95, budget=2000))  # so that it renders something solid
-    return lambda fit: Trainer(sequence, replace(cfg, loss=replace(cfg.loss, fit_relative_depth=fit)))
+    return lambda fit: GaussianTrainer(sequence, replace(cfg, loss=replace(cfg.loss, fit_relative_depth=fit)))
 
 
 def test_only_relative_depth_is_fitted(relative, make_tiny_sequence):
     trainer = relative(True)
-    metric = Trainer(load_sequence(make_tiny_sequence("metric")), trainer.cfg)
+    metric = GaussianTrainer(load_sequence(make_tiny_sequence("metric")), trainer.cfg)
     assert trainer.fits_depth and not metric.fits_depth and not relative(False).fits_depth
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -24,9 +25,10 @@ from endoprior.training.divergence import (
     Watch,
     unusable_numbers,
 )
+from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.optimizer import Optimizer
-from endoprior.training.trainer import Trainer
+from endoprior.training.rates import rate_of
 
 BAD = [float("nan"), float("inf"), -float("inf"), 2 * LARGEST_GRADIENT, -1e30]
 
@@ -94,7 +96,7 @@ def poison(trainer, name, value):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_unusable_gradient_stops_before_anything_changes(tiny_sequence, kind):
-    trainer = Trainer(load_sequence(tiny_sequence), tiny_config(kind, fine=40))
+    trainer = GaussianTrainer(load_sequence(tiny_sequence), tiny_config(kind, fine=40))
     trainer.start()
     for _ in range(8):
         trainer.step()
@@ -113,7 +115,7 @@ def test_an_unusable_gradient_stops_before_anything_changes(tiny_sequence, kind)
 
 
 def test_a_poisoned_plane_is_noticed(tiny_sequence):
-    trainer = Trainer(load_sequence(tiny_sequence), tiny_config("hexplane"))
+    trainer = GaussianTrainer(load_sequence(tiny_sequence), tiny_config("hexplane"))
     trainer.start()
     while trainer.state.iteration < 8 or trainer.state.stage == 0:
         trainer.step()
@@ -167,7 +169,8 @@ def as_on_a_device(trainer):
     trainer.step_once.ops = TORCH
     trainer.step_once.check = DivergenceCheck(torch.device("cpu"), blocking=False)
     state = trainer.state
-    state.optimizer = Optimizer(state.gaussians, state.field, trainer.cfg, trainer.spatial_scale, TORCH)
+    rate = partial(rate_of, cfg=trainer.cfg, spatial_scale=trainer.spatial_scale)
+    state.optimizer = Optimizer(state.gaussians, state.field, trainer.cfg, rate, TORCH)
     return trainer
 
 
@@ -179,7 +182,9 @@ def without_density_events(cfg):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["means", "opacity_logits"])
 def test_a_late_check_finds_the_state_before_a_bad_gradient(tiny_sequence, kind, name):
-    trainer = Trainer(load_sequence(tiny_sequence), without_density_events(tiny_config(kind, coarse=0, fine=200)))
+    trainer = GaussianTrainer(
+        load_sequence(tiny_sequence), without_density_events(tiny_config(kind, coarse=0, fine=200))
+    )
     trainer.start()
     as_on_a_device(trainer)
     for _ in range(8):
@@ -199,8 +204,10 @@ def test_a_late_check_finds_the_state_before_a_bad_gradient(tiny_sequence, kind,
 
 
 def test_the_last_iteration_and_a_checkpoint_wait_for_the_check(tiny_sequence):
-    for ending in (Trainer.step, Trainer.synchronize):
-        trainer = Trainer(load_sequence(tiny_sequence), without_density_events(tiny_config("basis", coarse=0, fine=2)))
+    for ending in (GaussianTrainer.step, GaussianTrainer.synchronize):
+        trainer = GaussianTrainer(
+            load_sequence(tiny_sequence), without_density_events(tiny_config("basis", coarse=0, fine=2))
+        )
         trainer.start()
         as_on_a_device(trainer)
         poison(trainer, "means", float("nan"))

@@ -18,7 +18,7 @@ from endoprior.evaluation.scoring import evaluate
 from endoprior.model.carry import carry_points
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.runs.train import train
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def still_scene(sequence, budget=400):
     """An untrained scene: Gaussians where they start, that do not move."""
     cfg = preset("default")
     cfg = replace(cfg, init=replace(cfg.init, budget=budget, motion="rest"))
-    trainer = Trainer(sequence, cfg)
+    trainer = GaussianTrainer(sequence, cfg)
     trainer.start()
     return trainer.scene()
 

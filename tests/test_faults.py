@@ -20,7 +20,7 @@ from endoprior.runs.interrupt import deferred_interrupt
 from endoprior.runs.train import train
 from endoprior.system import atomic
 from endoprior.system.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.visualization import video
 from endoprior.visualization.video import write_video
 
@@ -134,7 +134,7 @@ def test_a_run_killed_while_it_finds_its_first_points_starts_again(tiny_sequence
         raise SystemExit
 
     with monkeypatch.context() as patched, pytest.raises(SystemExit):
-        patched.setattr(Trainer, "start", die)
+        patched.setattr(GaussianTrainer, "start", die)
         train(load_sequence(tiny_sequence), tiny_config("basis"), tmp_path / "run")
     train(load_sequence(tiny_sequence), tiny_config("basis"), tmp_path / "run", resume=True)
     assert (tmp_path / "run" / "scene.safetensors").is_file()
@@ -148,7 +148,7 @@ def test_a_run_that_cannot_begin_leaves_the_folder_as_it_was(tiny_sequence, tmp_
     out = tmp_path / "run"
     if there:
         out.mkdir()
-    monkeypatch.setattr(Trainer, "start", refuse)
+    monkeypatch.setattr(GaussianTrainer, "start", refuse)
     with pytest.raises(InputError):
         train(load_sequence(tiny_sequence), tiny_config("basis"), out)
     assert out.exists() == there and not (out / "config.json").exists()

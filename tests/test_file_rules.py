@@ -167,7 +167,7 @@ def test_a_run_that_cannot_begin_leaves_nothing(windows, tiny_sequence, tmp_path
     def fail(trainer):
         raise InputError("no points")
 
-    monkeypatch.setattr("endoprior.training.trainer.Trainer.start", fail)
+    monkeypatch.setattr("endoprior.training.gaussian_trainer.GaussianTrainer.start", fail)
     with pytest.raises(InputError, match="no points"):
         train(load_sequence(tiny_sequence), tiny_config("basis"), tmp_path / "run")
     assert not (tmp_path / "run" / "config.json").exists()

@@ -7,9 +7,9 @@ from state_files import StateFile
 
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.runs.checkpoint import check_state, checkpoint_schema, load_checkpoint
+from endoprior.runs.checkpoint import check_state, load_checkpoint
 from endoprior.runs.train import train
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 
 @pytest.fixture(scope="module", params=["basis", pytest.param("hexplane", marks=pytest.mark.slow)])
@@ -23,10 +23,10 @@ def run(request, tmp_path_factory):
     cfg = tiny_config(request.param, coarse=2, fine=3)
     train(sequence, cfg, folder / "run")
     file = folder / "run" / "checkpoint.safetensors"
-    return Trainer(sequence, cfg), file, StateFile.read(file)
+    return GaussianTrainer(sequence, cfg), file, StateFile.read(file)
 
 
-def resume(run) -> Trainer:
+def resume(run) -> GaussianTrainer:
     """A trainer that took over the checkpoint in the folder."""
     trainer, file, _ = run
     trainer.state = None
@@ -42,7 +42,7 @@ def test_the_schema_is_what_a_checkpoint_holds(run):
     trainer, file, stored = run
     stored.write(file)
     assert resume(run).finished
-    assert set(checkpoint_schema(trainer.cfg)) == set(stored.arrays)
+    assert set(trainer.schema()) == set(stored.arrays)
 
 
 def test_each_array_of_a_checkpoint_is_checked(run):
@@ -104,7 +104,7 @@ def test_tracks_of_another_sequence(tmp_path):
     cfg = tiny_config("basis", coarse=0, fine=1).replace({"init.motion": "flow", "loss.track_weight": 0.01})
     train(sequence, cfg, tmp_path / "run")
     file = tmp_path / "run" / "checkpoint.safetensors"
-    taken = (Trainer(sequence, cfg), file, StateFile.read(file))
+    taken = (GaussianTrainer(sequence, cfg), file, StateFile.read(file))
     assert resume(taken).state.tracks.followed.shape[1] == len(sequence.indices("train"))
     followed = taken[2].arrays["tracks.followed"]
     StateFile(taken[2].about, taken[2].arrays | {"tracks.followed": followed[:, 1:]}).write(file)

@@ -24,7 +24,7 @@ from endoprior.core.config_io import from_dict, to_dict
 from endoprior.core.presets import preset
 from endoprior.export.html import write_html
 from endoprior.model import hexplane
-from endoprior.model.deformation import HexPlaneField, state_shapes
+from endoprior.model.deformation import HexPlaneField
 from endoprior.model.scene_file import load_scene
 from endoprior.system.arrays_file import LARGEST_HEADER
 
@@ -310,7 +310,7 @@ def test_the_shapes_of_a_field_are_known_before_it_is_made(deform_opacity):
         cfg = replace(cfg, hexplane=replace(cfg.hexplane, resolution=(3, 4, 5), time_resolution=6, channels=7, width=8))
         field = HexPlaneField(torch.tensor([[1.0] * 3, [0.0] * 3]), cfg, torch.Generator())
         found = {name: tuple(value.shape) for name, value in field.state_arrays().items()}
-        assert list(state_shapes(cfg).items()) == list(found.items())
+        assert list(HexPlaneField.state_shapes(cfg).items()) == list(found.items())
 
 
 def test_a_title_stays_text_in_the_page(tmp_path):

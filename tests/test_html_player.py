@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from browser import Page, open_page, pictures_folder, require_chromium
+from browser import pictures_folder
 from player_page import RATE, WIDTH, open_player, picture, random_scene, rendered, settle, unpack
 
 from endoprior.core.checks import InputError
@@ -104,21 +103,6 @@ def test_what_cannot_be_written_is_rejected_in_one_line(scene, tmp_path):
 
 
 # ---- in a browser
-
-
-@pytest.fixture(scope="module")
-def browser(player: Path) -> Iterator[Page]:
-    """One Chromium for all tests of this file; skips loudly where there is none."""
-    require_chromium()
-    with open_page(player.as_uri(), width=640, height=520) as page:
-        yield page
-
-
-@pytest.fixture
-def page(browser: Page, player: Path) -> Page:
-    """The player, just opened, in a window in which one recorded pixel is one pixel of the screen."""
-    open_player(browser, player)
-    return browser
 
 
 @pytest.fixture

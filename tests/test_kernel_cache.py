@@ -13,7 +13,7 @@ from endoprior.core.config_io import to_dict
 from endoprior.core.presets import preset
 from endoprior.runs import kernel_cache
 from endoprior.runs.warm_up import shortened, tiny_sequence
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_a_warm_up_that_fails_is_tried_again_by_the_next_process(cold):
 @pytest.mark.parametrize("name", ["default", "paper", "released", "endogaussian"])
 def test_the_warm_up_reaches_every_part_of_a_preset(name):
     cfg = shortened(preset(name))
-    trainer = Trainer(tiny_sequence(), cfg)
+    trainer = GaussianTrainer(tiny_sequence(), cfg)
     trainer.start()
     reports = []
     while not trainer.finished:

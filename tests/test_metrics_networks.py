@@ -20,7 +20,7 @@ from safetensors.torch import save_file
 
 from endoprior.evaluation.metrics import ScoreUnavailable, WeightsMissing, flow_error, lpips_distance, raft_flow
 from endoprior.evaluation.metrics.torchvision_compat import import_torchvision
-from endoprior.evaluation.metrics.weights import ALEXNET, RAFT_LARGE, RAFT_SMALL, SQUEEZENET, find_weights
+from endoprior.evaluation.metrics.weights import ALEXNET, RAFT_LARGE, RAFT_SMALL, SQUEEZENET, VGG16, find_weights
 
 pytestmark = pytest.mark.skipif(
     not all(find_spec(package) for package in ("lpips", "torchvision")),
@@ -156,10 +156,13 @@ def test_published_networks_load_the_published_weights(no_weights):
     models = import_torchvision().models
     save_file(constant_weights(models.optical_flow.raft_large), no_weights / RAFT_LARGE.names[0])
     torch.save(constant_weights(models.AlexNet, "features."), no_weights / ALEXNET.names[1])
-    raft, distance = raft_flow("large", no_weights, download=False), lpips_distance("alex", no_weights, download=False)
+    save_file(constant_weights(models.vgg16, "features."), no_weights / VGG16.names[0])
+    raft = raft_flow("large", no_weights, download=False)
     assert all((value == 0.01).all() for value in raft.network.parameters())
     image = texture(64, 64) / 255
-    assert distance(image, image, np.ones((64, 64), bool)) == 0
+    for backbone in ("alex", "vgg"):
+        distance = lpips_distance(backbone, no_weights, download=False)
+        assert distance(image, image, np.ones((64, 64), bool)) == 0
 
 
 def test_missing_weights_give_a_reason_and_no_other_network(no_weights):
@@ -181,6 +184,7 @@ def test_file_names_are_those_torchvision_publishes():
         (RAFT_LARGE, models.optical_flow.Raft_Large_Weights.DEFAULT),
         (RAFT_SMALL, models.optical_flow.Raft_Small_Weights.DEFAULT),
         (ALEXNET, models.AlexNet_Weights.DEFAULT),
+        (VGG16, models.VGG16_Weights.DEFAULT),
         (SQUEEZENET, models.SqueezeNet1_1_Weights.DEFAULT),
     ):
         assert files.url == published.url

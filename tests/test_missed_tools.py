@@ -16,9 +16,9 @@ from endoprior.data import load_sequence
 from endoprior.data.images import read_tool_mask, save_png
 from endoprior.data.mask_writing import note_found_masks
 from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.mask_doubt import MaskDoubt
 from endoprior.training.missed_tools import missed_tools
-from endoprior.training.trainer import Trainer
 
 VIEW = np.ones((128, 160), bool)
 NOWHERE = np.zeros_like(VIEW)
@@ -100,7 +100,7 @@ def test_found_masks_are_noted_beside_what_was_there(phantom):
 
 def test_pixels_of_a_missed_tool_do_not_count(phantom):
     sequence = load_sequence(phantom[1]).training_view()
-    frame = Trainer(sequence, tiny_config("basis")).step_once.frames.frame(2)  # frame 1 is held out
+    frame = GaussianTrainer(sequence, tiny_config("basis")).step_once.frames.frame(2)  # frame 1 is held out
     tool = torch.from_numpy(read_tool_mask(phantom[0] / "masks" / "000003.png"))
     assert frame.index == 3 and tool.any()
     color = torch.where(tool[..., None], torch.tensor([0.5, 0.2, 0.2]), frame.rgb)
@@ -114,7 +114,7 @@ def test_pixels_of_a_missed_tool_do_not_count(phantom):
 def test_frames_of_half_and_full_resolution_share_what_is_surely_tissue(make_tiny_sequence):
     data = make_tiny_sequence(num_frames=3, width=328, height=213)  # 104 and 103 rows of 160 px
     sequence = load_sequence(data).training_view()
-    frames, doubt = Trainer(sequence, tiny_config("basis")).step_once.frames, MaskDoubt(sequence)
+    frames, doubt = GaussianTrainer(sequence, tiny_config("basis")).step_once.frames, MaskDoubt(sequence)
     for half in (True, False):
         frame = frames.frame(0, half=half)
         assert doubt.counted(frame, frame.rgb) is frame
@@ -123,7 +123,7 @@ def test_frames_of_half_and_full_resolution_share_what_is_surely_tissue(make_tin
 @pytest.mark.parametrize(("which", "trust", "doubts"), [(1, False, True), (1, True, False), (0, False, False)])
 def test_only_found_masks_that_are_not_trusted_are_doubted(phantom, which, trust, doubts):
     cfg = tiny_config("basis").replace({"trust_masks": trust})
-    trainer = Trainer(load_sequence(Path(phantom[which])), cfg)
+    trainer = GaussianTrainer(load_sequence(Path(phantom[which])), cfg)
     assert (trainer.step_once.doubt is not None) == doubts
     assert from_dict(type(cfg), to_dict(cfg)).loss.trust_masks == trust
 
@@ -132,7 +132,7 @@ def test_doubt_begins_when_the_scene_explains_resting_tissue(phantom, monkeypatc
     calls = []
     monkeypatch.setattr(MaskDoubt, "counted", lambda self, frame, color: calls.append(color.shape) or frame)
     cfg = tiny_config("basis", coarse=2, fine=20).replace({"trust_masks": False})
-    trainer = Trainer(load_sequence(phantom[1]).training_view(), cfg)
+    trainer = GaussianTrainer(load_sequence(phantom[1]).training_view(), cfg)
     trainer.start()
     trainer.run([])
     assert len(calls) == 18

@@ -24,7 +24,7 @@ from endoprior.model.attributes import motion_layout
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.scene import Scene
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 FRAMES = 10
 OF_THE_PATH = ("ate_mm", "rpe_mm", "rpe_deg", "rotation_error_deg")
@@ -75,7 +75,7 @@ def scene(phantom):
     """Untrained Gaussians that all move alike, in the world of a camera that moves."""
     cfg = preset("default")
     cfg = replace(cfg, init=replace(cfg.init, budget=400, motion="rest"))
-    trainer = Trainer(posed(phantom, path()), cfg)
+    trainer = GaussianTrainer(posed(phantom, path()), cfg)
     trainer.start()
     scene = trainer.scene()
     layout = motion_layout(cfg.deformation)

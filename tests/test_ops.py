@@ -18,8 +18,8 @@ from endoprior.model.basis import RankOneGradient
 from endoprior.model.scene_file import load_scene
 from endoprior.training.adam import AdamState
 from endoprior.training.density import DensityStats
+from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
-from endoprior.training.trainer import Trainer
 
 KINDS = ("basis", "hexplane")
 BOTH = pytest.mark.parametrize("ops", [NUMBA, TORCH], ids=lambda ops: ops.model.name)
@@ -32,7 +32,7 @@ def test_training_agrees(tiny_sequence, kind, ends):
     cfg = replace(cfg, temporal=replace(cfg.temporal, **ends))
     found = []
     for ops in (NUMBA, TORCH):
-        trainer = Trainer(load_sequence(tiny_sequence), cfg, ops)
+        trainer = GaussianTrainer(load_sequence(tiny_sequence), cfg, ops)
         trainer.start()
         found.append([trainer.step() for _ in range(20)])
     assert any("distance" in report.terms for report in found[0])
@@ -143,7 +143,7 @@ def test_a_skipped_step_changes_nothing():
 
 
 def test_fp16_planes_render_the_same_and_cannot_be_saved(tiny_sequence, tmp_path):
-    trainer = Trainer(load_sequence(tiny_sequence), tiny_config("hexplane"))
+    trainer = GaussianTrainer(load_sequence(tiny_sequence), tiny_config("hexplane"))
     trainer.start()
     scene = trainer.scene()
     scene.save(tmp_path / "scene.safetensors")

@@ -1,5 +1,7 @@
 """Adam: against torch's, with outer-product gradients, and with basis functions that are not looked at."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -12,7 +14,8 @@ from endoprior.model.gaussians import create_gaussians
 from endoprior.training import adam_numba
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA
-from endoprior.training.optimizer import Optimizer, late_share, log_linear, motion_rates
+from endoprior.training.optimizer import Optimizer
+from endoprior.training.rates import late_share, log_linear, motion_rates, rate_of
 
 
 def test_update_is_torchs_adam():
@@ -65,7 +68,7 @@ def test_without_a_gradient_nothing_moves():
     cfg = preset("paper")
     rng = np.random.default_rng(0)
     model = create_gaussians(rng.random((5, 3)), rng.random((5, 3)), np.zeros(5), cfg)
-    optimizer = Optimizer(model, None, cfg, 1.0, NUMBA)
+    optimizer = Optimizer(model, None, cfg, partial(rate_of, cfg=cfg, spatial_scale=1.0), NUMBA)
     model["means"].grad = torch.ones(5, 3)
     optimizer.step(1)
     moved, first = model["means"].detach().clone(), optimizer.states["means"].first.clone()

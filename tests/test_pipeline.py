@@ -58,6 +58,14 @@ def done(said):
     return said[0]
 
 
+@pytest.mark.parametrize(("asked", "taken"), [("auto", "auto-own"), ("estimate", "estimate"), ("still", "still")])
+def test_a_preview_does_without_colmap_unless_it_is_asked_for(asked, taken, video, tmp_path):
+    job = make_job(video, tmp_path, PrepareConfig(poses=asked), preset("preview"), preview=True)
+    assert job.prepare.poses == taken and job.options.get("--poses", ("auto",)) == (asked,)
+    whole = make_job(video, tmp_path, PrepareConfig(poses=asked), preset("default"))
+    assert whole.prepare.poses == asked
+
+
 def test_every_step_leaves_its_result(done):
     assert all(step.result(done).exists() for step in STEPS)
     assert (done.run / "metrics.json").is_file() and done.report.is_file()
@@ -184,9 +192,13 @@ def test_the_command_ends_with_a_player(video, tmp_path, capsys):
 def test_the_whole_run_says_first_how_long_it_takes(video, tmp_path, capsys, monkeypatch):
     quick = preset("default").replace({"gaussians": 300, "iterations": 60, "schedule.half_resolution_iterations": 20})
     monkeypatch.setattr("endoprior.cli.run.preset", lambda name: quick)
+    monkeypatch.setattr("endoprior.pipeline.seconds_if_moving", lambda job: 90.0)
     assert main(["run", str(video), str(tmp_path / "out")]) == 0
     lines = capsys.readouterr().out.splitlines()
     says = next(k for k, line in enumerate(lines) if line.startswith("This takes about"))
     starts = next(k for k, line in enumerate(lines) if line.startswith("1/6  prepare"))
     assert says < starts
+    assert lines[says + 1].startswith(
+        "If the camera moves, COLMAP takes up to about 1 min 30 s more; `--poses auto-own`"
+    )
     assert not (tmp_path / "out/.trial").exists()

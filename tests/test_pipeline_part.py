@@ -1,15 +1,19 @@
 """Which part of a video becomes a scene, how long that takes, and what fits into a player: pure functions."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from endoprior.cli.step_display import duration
 from endoprior.core.presets import preset
-from endoprior.pipeline.estimate import FRAMES, Trial, scaled, shortened
-from endoprior.pipeline.part import choose_part, every_kth_time, usable_frames
+from endoprior.pipeline import Job, seconds_if_moving
+from endoprior.pipeline.estimate import FRAMES, Trial, scaled, seconds_of_colmap, shortened
+from endoprior.pipeline.part import Part, choose_part, every_kth_time, usable_frames
+from endoprior.prepare.camera_path import choose
+from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.frame_selection import FrameSelection
 from endoprior.prepare.source import SourceFrame
 
@@ -98,6 +102,25 @@ def test_the_estimate_of_the_trial_itself_is_what_the_trial_took():
     assert seconds["train"] == pytest.approx(1.0 + 500 * 0.02 + 1000 * 0.05)
     assert (seconds["check"], seconds["score"]) == (pytest.approx(3.0), pytest.approx(2.5))
     assert scaled(trial, cfg, 100, 100)["video"] == pytest.approx(100 * 0.06)
+
+
+@pytest.mark.parametrize(
+    ("poses", "depth", "forced", "if_moving"),
+    [
+        ("auto", "auto", 60, 60), ("estimate", "auto", 60, 0), ("colmap", "auto", 60, 0), ("auto", "none", 0, 0),
+        ("auto-own", "auto", 0, 0), ("own", "auto", 0, 0), ("still", "auto", 0, 0), ("poses.npy", "auto", 0, 0),
+    ],
+)  # fmt: skip
+def test_the_estimate_knows_what_colmap_takes(poses, depth, forced, if_moving, monkeypatch):
+    monkeypatch.setattr(choose, "is_installed", lambda: True)
+    monkeypatch.setattr(choose, "SECONDS_AN_IMAGE", 1.0)
+    prepare, part = PrepareConfig(poses=poses, depth=depth), Part(25.0, 0.0, 2.4, 60, True)
+    job = Job(Path("video.mp4"), Path("out"), preset(), {}, prepare, part)
+    assert seconds_of_colmap(job) == forced and seconds_if_moving(job) == if_moving
+    trial = Trial(*[0.0] * len(fields(Trial)))
+    assert scaled(trial, preset(), 60, 60, forced)["prepare"] == forced
+    monkeypatch.setattr(choose, "is_installed", lambda: False)
+    assert seconds_of_colmap(job) == seconds_if_moving(job) == 0
 
 
 def test_iterations_of_the_trial_cost_what_those_of_the_job_cost():

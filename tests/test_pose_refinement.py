@@ -21,6 +21,7 @@ from endoprior.core.types import Camera, Splats
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.runs.checkpoint import load_checkpoint, save_checkpoint
+from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.pose_check import FollowedCorners, corner_error_px
 from endoprior.training.pose_refinement import (
     PoseRefinement,
@@ -31,7 +32,6 @@ from endoprior.training.pose_refinement import (
     rotation,
     smoothness,
 )
-from endoprior.training.trainer import Trainer
 
 BACKENDS = ("reference", "numba")
 
@@ -189,13 +189,15 @@ def refining(mode: str) -> Config:
 def test_whose_poses_are_refined(moving, make_tiny_sequence, mode, source, refines):
     sequence = copy(moving)
     sequence.sources = {"poses": source}
-    trainer = Trainer(sequence, refining(mode))
+    trainer = GaussianTrainer(sequence, refining(mode))
     assert (trainer.step_once.poses is not None) == refines
-    assert Trainer(load_sequence(make_tiny_sequence()), refining("always")).step_once.poses is None, "a static camera"
+    assert GaussianTrainer(load_sequence(make_tiny_sequence()), refining("always")).step_once.poses is None, (
+        "a static camera"
+    )
 
 
 def test_refined_poses_are_those_of_the_scene_and_resume_bit_for_bit(moving, tmp_path):
-    whole = Trainer(moving, refining("always"))
+    whole = GaussianTrainer(moving, refining("always"))
     whole.start()
     while not whole.finished:
         whole.step()
@@ -208,7 +210,7 @@ def test_refined_poses_are_those_of_the_scene_and_resume_bit_for_bit(moving, tmp
         for a, b in zip(scene.cameras, whole.cameras, strict=True)
     ]
     assert any(changed) == bool(twists.any())
-    again = Trainer(moving, refining("always"))
+    again = GaussianTrainer(moving, refining("always"))
     load_checkpoint(again, tmp_path / "state", "0")
     while not again.finished:
         again.step()

@@ -5,12 +5,16 @@ from __future__ import annotations
 import builtins
 import io
 import sys
+import time
+from types import SimpleNamespace
 
 import pytest
 from tiny_training import tiny_config
 
 from endoprior.data import load_sequence
+from endoprior.runs.progress import training_progress
 from endoprior.runs.train import train
+from endoprior.training.stage import Stage
 
 
 class Terminal(io.StringIO):
@@ -62,3 +66,16 @@ def test_nobody_sees_it_where_it_is_switched_off(train_tiny, monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal := Terminal())
     train_tiny(False)
     assert not terminal.getvalue()
+
+
+def test_the_rate_is_that_of_the_window(capfd):
+    """A scene of several windows trains one after the other: preparing the next one is no iteration."""
+    color = {"color": 0.1}
+    with training_progress() as show:
+        for _ in range(2):
+            for done in (1, 2):
+                report = SimpleNamespace(seconds=0.01, stage=Stage.FINE, terms=color, num_gaussians=3)
+                show(report, SimpleNamespace(progress=lambda done=done: (done, 2)))
+            time.sleep(0.3)
+    rates = [float(line.split()[2]) for line in capfd.readouterr().out.splitlines()]
+    assert len(rates) == 2 and min(rates) > 20

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from endoprior.training.densify import apply_plan
 from endoprior.training.density import DensityStats
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import Optimizer
+from endoprior.training.rates import rate_of
 
 SEEDS = st.integers(0, 2**31 - 1)
 EMPTY = torch.zeros(0)
@@ -31,7 +33,8 @@ def states(draw):
     rng, num = np.random.default_rng(draw(SEEDS)), draw(st.integers(0, 40))
     seen, valid = rng.integers(0, 30, num), rng.integers(0, 60, num)
     gradient = rng.choice([0.0, 1e-30, 1e-4, 2e-4, 1.0, 1e30], num) * seen
-    values = (gradient, seen, rng.random(num) * valid, valid, rng.choice([0.0, 0.001, 0.5, 1.0], num) * valid)
+    seen_opacity = rng.choice([0.0, 0.001, 0.5, 1.0], num) * valid
+    values = (gradient, seen, rng.random(num) * valid, valid, seen_opacity, np.zeros(num))
     stats = DensityStats(*(torch.tensor(np.asarray(v), dtype=torch.float32) for v in values))
     scales = torch.tensor(10.0 ** rng.uniform(-8, 8, (num, 1)) * rng.uniform(0.1, 1, (num, 3)), dtype=torch.float32)
     opacities = torch.tensor(rng.choice(draw(st.sampled_from([[0.0], [1.0], [0.0, 0.004, 0.3, 1.0]])), num)).float()
@@ -93,7 +96,7 @@ def test_an_applied_plan_gives_the_planned_number_of_finite_gaussians(made, degr
     config = replace(config, schedule=replace(config.schedule, sh_degree=degree))
     rng = np.random.default_rng(num)
     gaussians = create_gaussians(rng.normal(size=(num, 3)), rng.random((num, 3)), scales.amax(-1).log().numpy(), config)
-    optimizer = Optimizer(gaussians, None, config, 1.0, NUMBA)
+    optimizer = Optimizer(gaussians, None, config, partial(rate_of, cfg=config, spatial_scale=1.0), NUMBA)
     planned = density.plan(stats, gaussians.scales, gaussians.opacities, extent, cfg)
     new, _ = apply_plan(optimizer, planned, stats, rng)
     after = num + int(planned.clone.sum()) + int(planned.split.sum()) - int(planned.remove.sum())

@@ -20,7 +20,7 @@ from endoprior.data.sequence import FrameSequence
 from endoprior.evaluation import metrics
 from endoprior.evaluation.context import EXACT, Evaluation
 from endoprior.evaluation.scoring import evaluate
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 IMAGE_SCORES = (metrics.psnr, metrics.psnr_tissue, metrics.ssim, metrics.ssim_tissue)
 
@@ -134,7 +134,7 @@ def test_a_scene_of_a_few_pixels_trains_and_is_scored_in_numbers(count, height, 
     """Frames of a line or a handful of pixels, white and black ones; files without NaN; reasons that are true."""
     image, mask = np.full((height, width, 3), level, np.uint8), np.ones((height, width), bool)
     sequence = _sequence(count, height, width, image, mask)
-    trainer = Trainer(sequence, preset("default"))
+    trainer = GaussianTrainer(sequence, preset("default"))
     trainer.start()
     for _ in range(4):
         trainer.step()

@@ -29,7 +29,7 @@ from endoprior.initialization.sampling import (
     quotas,
     sample_pixels,
 )
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 
 @st.composite
@@ -184,7 +184,7 @@ def test_initialization_reads_no_test_frame(count):
         return Frame(index, index / count, camera, picture, np.ones((36, 40), bool), depth, depth > 0)
 
     cfg = preset("default")
-    trainer = Trainer(
+    trainer = GaussianTrainer(
         FrameSequence(Path("made"), [camera] * count, read), replace(cfg, init=replace(cfg.init, budget=60))
     )
     trainer.start()

@@ -18,6 +18,7 @@ FLOORS = [
     {"data", "model"},
     {"initialization", "evaluation", "visualization", "phantom", "tool_masks", "radiance"},
     {"training", "doctor", "prepare", "check", "export", "view"},
+    {"methods"},
     {"runs"},
     {"experiments", "pipeline"},
     {"cli"},

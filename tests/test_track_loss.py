@@ -12,9 +12,9 @@ from endoprior.core.presets import preset
 from endoprior.core.types import Camera
 from endoprior.data import load_sequence
 from endoprior.model.basis import basis_weights
+from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.track_loss import StartTracks, track_term
-from endoprior.training.trainer import Trainer
 
 BASIS = BasisConfig(num_bases=6)
 CAMERA = Camera(320, 256, 300.0, 300.0, 160.0, 128.0, np.eye(4))
@@ -101,7 +101,9 @@ def test_training_is_held_to_the_tracks(tiny_sequence):
     distance = {}
     for weight in (0.0, 100.0):
         changes = {"loss.track_weight": weight, "density.start_iteration": 1000}
-        trainer = Trainer(load_sequence(tiny_sequence), preset("default", gaussians=200, iterations=30, **changes))
+        trainer = GaussianTrainer(
+            load_sequence(tiny_sequence), preset("default", gaussians=200, iterations=30, **changes)
+        )
         trainer.start()
         start = trainer.state.gaussians["motion"].detach()[..., :3].clone()
         assert (trainer.state.tracks is None) == (weight == 0)

@@ -22,7 +22,7 @@ from endoprior.initialization import flow_tracks as tracks
 from endoprior.initialization.cleanup import PointCloud
 from endoprior.initialization.neighbor_motion import fill_gaps, smooth_motion
 from endoprior.model.basis import basis_weights
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 WIDTH, HEIGHT, NUM_FRAMES, DEPTH = 160, 128, 7, 50.0
 
@@ -246,7 +246,7 @@ def test_frames_too_small_for_flow_get_no_motion(caplog):
 def test_training_starts_along_the_tracks(tmp_path):
     sequence = load_sequence(write_tiny_sequence(tmp_path / "tiny", width=96, height=80))
     cfg = preset("default")
-    trainer = Trainer(sequence, replace(cfg, init=replace(cfg.init, budget=300)))
+    trainer = GaussianTrainer(sequence, replace(cfg, init=replace(cfg.init, budget=300)))
     trainer.start()
     cfg = trainer.cfg
     motion = trainer.state.gaussians["motion"].detach()

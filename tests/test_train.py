@@ -22,11 +22,11 @@ from endoprior.export import export
 from endoprior.export.options import ExportOptions
 from endoprior.model.scene_file import load_scene
 from endoprior.runs.train import train
+from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA
-from endoprior.training.optimizer import log_linear
-from endoprior.training.state import Stage
+from endoprior.training.rates import log_linear
+from endoprior.training.stage import Stage
 from endoprior.training.step import sh_degree
-from endoprior.training.trainer import Trainer
 
 GOLDEN = Path(__file__).parent / "golden" / "train_losses.json"
 
@@ -157,7 +157,7 @@ def test_only_the_configured_ends_of_a_displacement_are_trained(tiny_sequence, k
         trained.append((now.requires_grad, before.requires_grad))
         return NUMBA.local_consistency(now, before, weights, cfg)
 
-    trainer = Trainer(
+    trainer = GaussianTrainer(
         load_sequence(tiny_sequence),
         replace(cfg, temporal=replace(cfg.temporal, gradient=gradient)),
         replace(NUMBA, local_consistency=observe),
@@ -170,7 +170,7 @@ def test_only_the_configured_ends_of_a_displacement_are_trained(tiny_sequence, k
 @pytest.mark.parametrize("kind", KINDS)
 def test_gaussians_stay_in_the_order_of_space(tiny_sequence, kind):
     cfg = tiny_config(kind)
-    trainer = Trainer(load_sequence(tiny_sequence), cfg)
+    trainer = GaussianTrainer(load_sequence(tiny_sequence), cfg)
     trainer.start()
     ordered = [np.arange(len(trainer.state.gaussians))]
     found = [morton_order(trainer.state.gaussians["means"].detach().numpy())]
@@ -216,7 +216,7 @@ def test_a_backend_of_a_gpu_without_one_is_refused_in_words(tiny_sequence, backe
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     cfg = tiny_config("basis")
     with pytest.raises(InputError, match=f"render.backend {backend}: expected a GPU .*`endoprior doctor`"):
-        Trainer(load_sequence(tiny_sequence), replace(cfg, render=replace(cfg.render, backend=backend)))
+        GaussianTrainer(load_sequence(tiny_sequence), replace(cfg, render=replace(cfg.render, backend=backend)))
 
 
 def test_the_run_says_what_computed_it(tiny_sequence, tmp_path):

@@ -73,7 +73,7 @@ def looks(num: int, change_from: int | None = None) -> Looks:
 
 def wall(start: int, stop: int) -> SingleScene:
     """An opaque wall, the same in every window, that slides."""
-    cfg = preset("default").fitted(stop - start)
+    cfg = preset("default", **{"init.motion": "rest", "deformation.kind": "hexplane"})
     x, y = (g.ravel() for g in np.meshgrid(np.linspace(-30, 30, 41), np.linspace(-22, 22, 31)))
     points = np.column_stack([x, y, 80 + 0.1 * x]).astype(np.float32)
     colors = np.stack([0.5 + 0.3 * np.sin(x / 4), 0.4 + 0.2 * np.cos(y / 5), 0.3 + 0 * x], 1)

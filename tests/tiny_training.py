@@ -8,7 +8,7 @@ from pathlib import Path
 from endoprior.core.config import Config
 from endoprior.core.presets import preset
 from endoprior.data import load_sequence
-from endoprior.training.trainer import Trainer
+from endoprior.training.gaussian_trainer import GaussianTrainer
 
 KINDS = ("basis", "hexplane")
 """The deformation models."""
@@ -33,7 +33,7 @@ def tiny_config(kind: str, coarse: int = 6, fine: int = 14) -> Config:
 
 def losses_of(folder: Path, cfg: Config) -> list[list[float]]:
     """Objective after each iteration, and the number of Gaussians."""
-    trainer = Trainer(load_sequence(folder, cfg.data), cfg)
+    trainer = GaussianTrainer(load_sequence(folder, cfg.data), cfg)
     trainer.start()
     rows = []
     while not trainer.finished:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -22,6 +23,7 @@ from .trained_scene import open_scene
 if TYPE_CHECKING:
     from ..data import FrameSequence
     from ..evaluation.context import Evaluation
+    from ..evaluation.protocols.table import ProtocolName
     from ..model.scene import Scene
 
 
@@ -55,6 +57,8 @@ class Eval:
     """Score the tool masks of DATA against the true masks in this folder (docs/scores.md)."""
     name: str = ""
     """Name of the method in metrics.json. Default: that of the folder."""
+    protocol: str = ""
+    """Also score as other papers did: names such as `endonerf,endogs`, or `all` (docs/scores.md)."""
     networks: bool = True
     """Scores by networks (RAFT, LPIPS). They need their weights."""
     weights_dir: Path | None = None
@@ -71,6 +75,7 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Score and print."""
     args = parse(Eval, argv, "eval", HELP)
+    from ..evaluation.protocols.table import chosen_protocols
     from ..runs.stored_run import sequence_of_run
     from .output_paths import require_writable_folder
 
@@ -79,8 +84,9 @@ def run(argv: list[str]) -> None:
         return
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
+    protocols = chosen_protocols(args.protocol) if args.protocol else ()
     if args.pictures:
-        evaluate_pictures(args, args.pictures)
+        evaluate_pictures(args, args.pictures, protocols)
         return
     if given := [o for o in ("depth_pictures", "depth_scale", "name") if getattr(args, o) not in (None, "")]:
         option = f"--{given[0].replace('_', '-')}"
@@ -92,7 +98,7 @@ def run(argv: list[str]) -> None:
     data = args.data or sequence_of_run(args.run)
     scene = on_device(scene, args.device)
     out = args.out or args.run
-    evaluate_run(scene, args.run, data, out, args.split, args.networks, args.weights_dir, extra={})
+    evaluate_run(scene, args.run, data, out, args.split, args.networks, args.weights_dir, extra={}, protocols=protocols)
 
 
 def evaluate_run(
@@ -104,6 +110,7 @@ def evaluate_run(
     networks: bool,
     weights_dir: Path | None,
     extra: dict[str, float],
+    protocols: Sequence[ProtocolName] = (),
 ) -> None:
     """Score the `scene` of a `run` on the sequence folder `data`, write the two files into `out`, print a table.
 
@@ -113,12 +120,12 @@ def evaluate_run(
     from ..evaluation.scoring import evaluate, scored_data
 
     sequence = load_sequence(data, scored_data(scene.config.data))
-    result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir)
+    result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir, protocols=protocols)
     result.scores |= extra
     save_and_print(result, sequence, out, split, run)
 
 
-def evaluate_pictures(args: Eval, folder: Path) -> None:
+def evaluate_pictures(args: Eval, folder: Path, protocols: Sequence[ProtocolName]) -> None:
     """Score the rendered frames in `folder` on the sequence that takes the place of the run."""
     from ..data import load_sequence
     from ..evaluation.pictures import Pictures
@@ -137,7 +144,8 @@ def evaluate_pictures(args: Eval, folder: Path) -> None:
     pictures = Pictures(folder, sequence, args.split, name=args.name, **depth)
     for line in pictures.remarks:
         say(line)
-    result = evaluate(pictures, sequence, args.split, networks=args.networks, weights_dir=args.weights_dir)
+    networks = {"networks": args.networks, "weights_dir": args.weights_dir}
+    result = evaluate(pictures, sequence, args.split, **networks, protocols=protocols)
     save_and_print(result, sequence, out, args.split)
 
 
@@ -178,9 +186,13 @@ def save_and_print(
     run: Path | None = None,
 ) -> None:
     """Write the two files into `out`, and print a table; name frames to look at in the `run`, if there is one."""
+    from .protocol_table import protocol_table
+
     file = result.save(out)
     say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({BETTER})")
     for line in score_table(result.scores, result.skipped, sequence.depth_is_relative):
+        say(line)
+    for line in protocol_table(result, sequence.depth_is_relative):
         say(line)
     if outliers := result.outlier_frames():
         frames = ", ".join(map(str, outliers))

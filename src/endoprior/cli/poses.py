@@ -33,7 +33,7 @@ class Poses:
     """Sequence folder."""
     poses: str = "auto"
     """`auto` (static, or estimated if the camera moves), `estimate` (by our own tracks, or by COLMAP if it is installed
-    and explains the frames better), `own`, `colmap`, `still`, or a file of poses as for `prepare --poses`."""
+    and explains the frames better), `own`, `colmap`, `auto-own`, `still`, or a file as for `prepare --poses`."""
 
 
 HELP = Help(examples=(("DATA",), ("DATA", "--poses", "estimate")))

@@ -66,7 +66,7 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Do every step, with one progress display."""
     args = parse(Run, argv, "run", HELP)
-    from ..pipeline import STEPS, estimate, notes_of, open_folder, problems, run_step
+    from ..pipeline import STEPS, estimate, notes_of, open_folder, problems, run_step, seconds_if_moving
     from ..runs import kernel_cache
 
     began = clock.perf_counter()
@@ -82,6 +82,8 @@ def run(argv: list[str]) -> None:
         say("Estimating the time ...")
         seconds = estimate(job)
         say(f"This takes about {duration(sum(seconds.values()))}: {_seconds_words(seconds)}.")
+        if more := seconds_if_moving(job):
+            say(f"If the camera moves, COLMAP takes up to about {duration(more)} more; `--poses auto-own` skips it.")
     display = StepDisplay([step.name for step in STEPS], seconds)
     try:
         for step in STEPS:

@@ -21,7 +21,7 @@ from .parsing import parse
 from .trained_scene import sequence_of
 
 if TYPE_CHECKING:
-    from ..training.state import StepReport
+    from ..training.stage import StepReport
     from ..training.trainer import Trainer
     from ..view.server import Viewer
     from ..view.viewable import Viewable

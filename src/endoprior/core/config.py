@@ -21,6 +21,7 @@ from .config_io import from_dict, override, to_dict
 from .config_poses import PoseConfig
 from .config_radiance import RadianceConfig
 from .config_windows import WindowConfig
+from .methods import METHODS, OWN
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
 Backend = Literal["reference", "numba", "triton", "gsplat"]
@@ -322,6 +323,8 @@ class ScheduleConfig(Checked):
 class Config(Checked):
     """The whole config. Equal configs, data and machine give bit-identical results on a CPU."""
 
+    method: str = OWN
+    """Whose rules start, draw, compare and grow: ours, or those of a compared method (docs/methods.md)."""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of all random choices. Sampling, initial weights, frame order and splits."""
     data: DataConfig = field(default_factory=DataConfig)
@@ -340,6 +343,10 @@ class Config(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.method not in METHODS:
+            raise InputError(
+                f"method: expected one of {', '.join(METHODS)}; got {self.method!r:.80}. Start from its preset."
+            )
         if self.init.motion == "flow" and self.deformation.kind != "basis":
             raise InputError(
                 f"init.motion: expected rest with deformation.kind {self.deformation.kind}; got flow, which only the "

@@ -5,6 +5,8 @@ Pixel (0, 0) is centered at (0.5, 0.5); `x = fx X / Z + cx`. Everything is in mm
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,11 @@ FARTHEST_MM = 1e6
 def length_unit(relative: bool) -> str:
     """The unit to show beside lengths: mm, or `rel.` where the scale of the depth is unknown or assumed."""
     return "rel." if relative else "mm"
+
+
+def camera_to_world(cameras: Iterable[Camera]) -> NDArray[np.float64]:
+    """(T, 4, 4) pose of each camera in the world, mm."""
+    return np.linalg.inv(np.stack([camera.world_to_camera for camera in cameras]))
 
 
 def pixel_centers(width: int, height: int) -> NDArray[np.float32]:

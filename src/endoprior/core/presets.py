@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from .checks import InputError
 from .config import Config, DataConfig, DensityConfig, InitConfig, OptimConfig, SalienceConfig, TemporalConfig
 from .config_deformation import DeformationConfig, HexPlaneConfig
-
-PresetName = Literal["default", "best", "paper", "released", "endogaussian", "preview"]
+from .methods import METHODS, OWN, method_named
 
 
 def preset(name: str = "default", **changes: Any) -> Config:
@@ -20,19 +19,9 @@ def preset(name: str = "default", **changes: Any) -> Config:
     Raises:
         InputError: no preset or field has this name, or a value has the wrong type or range.
     """
-    makers = {
-        "default": default,
-        "best": best,
-        "paper": paper,
-        "released": released,
-        "endogaussian": endogaussian,
-        "preview": preview,
-    }
-    if name not in makers:
-        raise InputError(
-            f"preset: expected one of {', '.join(get_args(PresetName))}; got {name!r}. Choose one of them."
-        )
-    made = makers[name]()
+    if name not in preset_names():
+        raise InputError(f"preset: expected one of {', '.join(preset_names())}; got {name!r}. Choose one of them.")
+    made = OWN_PRESETS[name]() if name in OWN_PRESETS else method_named(name).config()
     return made.replace(changes) if changes else made
 
 
@@ -152,3 +141,15 @@ def preview() -> Config:
         optim=replace(base.optim, decay_iterations=500),
         schedule=replace(base.schedule, fine_iterations=500, half_resolution_iterations=170),
     )
+
+
+OWN_PRESETS = {made.__name__: made for made in (default, best, paper, released, endogaussian, preview)}
+"""Those of our own method; every other method has one preset, of its name."""
+
+
+def preset_names() -> tuple[str, ...]:
+    """Every name that `preset` knows."""
+    return (*OWN_PRESETS, *(name for name in METHODS if name != OWN))
+
+
+PresetName = Literal[preset_names()]

@@ -112,6 +112,11 @@ class FrameSequence:
         """Whether a program found the camera's path in the video."""
         return self.sources.get("poses") in (OWN_POSES, COLMAP_POSES)
 
+    @property
+    def mask_folder(self) -> str:
+        """Name of the folder of the masks that are read; empty where the layout has none, or it is missing."""
+        return self._masks.name if self._masks.name in ("masks", "gt_masks") and self._masks.is_dir() else ""
+
     def __len__(self) -> int:
         return len(self._cameras)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..data import FrameList, FrameSequence, Split
 from ..model.scene import RenderedScene, Scene
@@ -39,6 +40,8 @@ class Evaluation:
     """One row for each frame of the split: `index`, `time`, and the scores that a single frame has."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Where rendered images come from, for `metrics.json`; a scene has its `config.json`."""
+    protocols: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """By name of another paper's protocol: its `tags`, `scores` and `skipped`; see `protocols.score_protocols`."""
 
     def add(self, name: str, value: float, reason: str = "not finite") -> None:
         """Record a score, or `reason` where it is not finite; an int stays one."""
@@ -62,7 +65,7 @@ class Evaluation:
         suffix = "" if self.protocol["split"] == "test" else f"_{self.protocol['split']}"
         file = folder / f"metrics{suffix}.json"
         facts = {name: getattr(self, name) for name in ("protocol", "scores", "skipped")}
-        write_json(file, facts | self.provenance)
+        write_json(file, facts | ({"protocols": self.protocols} if self.protocols else {}) | self.provenance)
         write_json(folder / f"per_frame{suffix}.json", self.per_frame)
         return file
 
@@ -80,6 +83,14 @@ class EvaluationContext:
     """Folder to look for network weights in first."""
     result: Evaluation
     """Where scores go; `add`, `add_mean`, `add_frames` and `skip` write to it."""
+    given_path: NDArray[np.float64] | None = None
+    """(T, 4, 4) camera-to-world, mm: stands in for the true path where there is none."""
+
+    @cached_property
+    def true_path(self) -> NDArray[np.float64] | None:
+        """(T, 4, 4) camera-to-world, mm, to compare the scene's cameras with; None without."""
+        true = None if self.sequence.truth is None else self.sequence.truth.camera_to_world
+        return self.given_path if true is None else true
 
     @cached_property
     def frames(self) -> FrameList:

@@ -5,9 +5,13 @@ A score that cannot be computed is listed as skipped, with the reason. No other 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
@@ -16,6 +20,9 @@ from ..model.scene import RenderedScene
 from ..system.devices import name_of
 from .context import Evaluation, EvaluationContext
 from .metrics import ScoreUnavailable
+from .protocols.compute import score_protocols
+from .protocols.table import OURS, ProtocolName
+from .protocols.tags import tags_of
 from .registry import REGISTRY, SCORERS, Scorer, scorers
 from .rendered import Reconstruction, SceneFrames
 from .scorers.speed import FPS_RENDERS, LONGEST_SECONDS
@@ -29,6 +36,8 @@ def evaluate(
     networks: bool = True,
     weights_dir: Path | None = None,
     reading: DataConfig | None = None,
+    given_path: NDArray[np.float64] | None = None,
+    protocols: Sequence[ProtocolName] = (),
 ) -> Evaluation:
     """Score `scene` on a split of `sequence`: every score that docs/scores.md lists.
 
@@ -38,6 +47,9 @@ def evaluate(
         networks: also compute the scores that need a network (RAFT, LPIPS). Their weights are looked for in
             `weights_dir`, then in `ENDOPRIOR_WEIGHTS`, then in torch's cache, and are downloaded at last.
         reading: how `sequence` was read, for the protocol; None: as the scene's config says, or the default.
+        given_path: (T, 4, 4) camera-to-world, mm, with which the scene's cameras are compared where the sequence has no
+            true path.
+        protocols: also score as these papers did, into `Evaluation.protocols`.
     Raises:
         InputError: the sequence is not the one the scene was trained on (the number of frames differs).
     """
@@ -47,16 +59,19 @@ def evaluate(
         raise input_error(sequence.path, frames, str(len(sequence)), "pass the same sequence.")
     if is_scene:  # the poses in which it was trained, which may have been estimated again since
         sequence = sequence.with_poses(scene.cameras)
-    result = Evaluation(_protocol(sequence, split, reading or (scene.config.data if is_scene else DataConfig())))
+    reading = reading or (scene.config.data if is_scene else DataConfig())
+    result = Evaluation(_protocol(sequence, split, reading))
     if is_scene:
         result.protocol |= _rendering(scene)
     result.provenance = dict(getattr(scene, "provenance", {}))
     result.per_frame = [{"index": i, "time": i / len(sequence)} for i in sequence.indices(split)]
     frames = SceneFrames(scene, sequence) if is_scene else scene
-    context = EvaluationContext(frames, sequence, split, networks, weights_dir, result)
+    context = EvaluationContext(frames, sequence, split, networks, weights_dir, result, given_path)
     for name, scorer in scorers().items():
         with context.skip_if_unavailable(*(score.name for score in scorer.SCORES)):
             _compute(name, scorer, context)
+    result.protocol["tags"] = tags_of(OURS, context, sequence.indices(split), sequence.mask_folder, reading.shrink)
+    result.protocols = score_protocols(protocols, context, scored_data(reading))
     return result
 
 

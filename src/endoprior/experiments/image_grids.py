@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.config import DataConfig, PriorConfig
 from ..core.geometry import length_unit, project
-from ..core.types import Frame
+from ..core.types import Camera, Frame, RenderOutput
 from ..data import FrameSequence, load_sequence
 from ..model.scene import Scene
 from ..model.scene_file import load_scene
@@ -43,13 +44,22 @@ def scenes_of(matrix: Matrix, sequence: str) -> dict[str, Scene]:
     return {spec.label(m): load_scene(run) for m, run in runs.items() if (run / "scene.safetensors").exists()}
 
 
+def _camera(scene: Scene, frame: Frame) -> Camera:
+    """The camera of a frame, where the scene has it: its poses may have been estimated or refined."""
+    return replace(frame.camera, world_to_camera=scene.cameras[frame.index].world_to_camera)
+
+
+def _rendered(scene: Scene, frame: Frame) -> RenderOutput:
+    return scene.render(frame.time, _camera(scene, frame))
+
+
 def frames_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
     """The middle test frame, zoomed to a highlight, a dark part and a mask border; columns: input and each method."""
     test = sequence.frames("test")
     frame = test[len(test) // 2]
     windows = zoom_windows(frame)
     columns = {"input": frame.rgb_u8}
-    columns |= {name: to_u8(scene.render(frame.time, frame.camera).color.numpy()) for name, scene in scenes.items()}
+    columns |= {name: to_u8(_rendered(scene, frame).color.numpy()) for name, scene in scenes.items()}
     height, width = frame.tissue_mask.shape
     tiles = [_labeled(_outlined(image, windows), name) for name, image in columns.items()]
     for what, (rows, cols) in windows.items():
@@ -108,7 +118,7 @@ def instability_map(scene: Scene, frames: list[Frame]) -> NDArray[np.float64]:
     """(H, W) mean |change of depth|, mm, over adjacent pairs that both show rendered tissue; NaN where none does."""
     total = np.zeros(frames[0].tissue_mask.shape)
     count = np.zeros_like(total)
-    depths = (scene.render(frame.time, frame.camera).depth.numpy() for frame in frames)
+    depths = (_rendered(scene, frame).depth.numpy() for frame in frames)
     for (a, depth_a), (b, depth_b) in pairwise(zip(frames, depths, strict=True)):
         both = a.tissue_mask & b.tissue_mask & (depth_a > 0) & (depth_b > 0)
         total += np.where(both, np.abs(depth_b - depth_a), 0)
@@ -130,7 +140,7 @@ def prior_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.
 def center_density(scene: Scene, frame: Frame) -> NDArray[np.float32]:
     """(H, W) projected centers per pixel at the frame's time, blurred."""
     height, width = frame.tissue_mask.shape
-    pixels, z = project(scene.at(frame.time).means.numpy().astype(np.float64), frame.camera)
+    pixels, z = project(scene.at(frame.time).means.numpy().astype(np.float64), _camera(scene, frame))
     seen = (z > 0) & ((pixels >= 0) & (pixels < (width, height))).all(-1)
     column, row = pixels[seen].astype(int).T
     counts = np.zeros((height, width), np.float32)

@@ -1,7 +1,8 @@
-"""The whole matrix: write phantoms, find tool masks, find finished cells, run the others.
+"""The whole matrix: write phantoms and changed copies, find finished cells, run the others.
 
-Below OUT: `sequences/` (phantoms, sequences with found masks) and `cells/KEY/` (metrics, run folder). A cell's folder
-is named by a hash of everything that determines its result, so that equal cells of different specs run once.
+Below OUT: `sequences/` (phantoms, copies with found masks or an estimated path) and `cells/KEY/` (metrics, run
+folder). A cell's folder is named by a hash of everything that determines its result, so that equal cells of different
+specs run once.
 """
 
 from __future__ import annotations
@@ -106,10 +107,11 @@ def _jobs(
         try:
             sequence = _sequence(spec, name, matrix.out, write)
             trained_on[name], known[name] = sequence.path, [sequence.fingerprint()]
-            if spec.sequences[name].masks == "found":
-                found = _with_found_masks(spec, name, sequence.path, matrix.out, progress, write)
-                trained_on[name] = found.path
-                known[name] += [found.fingerprint(), read_json(found.path / SCORES_FILE)["scores"]]
+            if found := spec.sequences[name].found_parts:
+                copy = _changed_copy(spec, name, sequence.path, matrix.out, progress, write)
+                trained_on[name] = copy.path
+                known[name] += [copy.fingerprint()]
+                known[name] += [read_json(copy.path / SCORES_FILE)["scores"]] if "masks" in found else []
             matrix.data[name] = sequence.path
             matrix.relative |= {name} if sequence.depth_is_relative else set()
         except InputError as error:
@@ -126,6 +128,9 @@ def _jobs(
             continue
         first, *others = known[cell.sequence]
         facts = [options, first, spec.networks, SCORES_VERSION, *made, *others]
+        if spec.protocols:
+            own_masks = matrix.data[cell.sequence] / "gt_masks"  # protocols may read them, methods need not
+            facts.append([sorted(spec.protocols), fingerprint(own_masks) if own_masks.is_dir() else ""])
         key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
         folder = (matrix.out / "cells" / key[:KEY_DIGITS]).absolute()
         if finished(folder, key):
@@ -136,6 +141,7 @@ def _jobs(
             folder=str(folder),
             data=str(trained_on[cell.sequence].absolute()),
             scored_on=str(matrix.data[cell.sequence].absolute()),
+            found_parts=spec.sequences[cell.sequence].found_parts,
             method=method,
             options=options,
             reading=options["data"] if spec.has_config(cell.method) else reading,
@@ -144,6 +150,7 @@ def _jobs(
             networks=spec.networks,
             weights_dir=str(weights_dir.absolute()) if weights_dir else None,
             threads=threads,
+            protocols=spec.protocols,
         )
     return jobs
 
@@ -183,28 +190,16 @@ def _sequence(spec: Spec, name: str, out: Path, write: bool) -> FrameSequence:
     return load_sequence(folder, DataConfig(**chosen.reading))
 
 
-def _with_found_masks(
+def _changed_copy(
     spec: Spec, name: str, folder: Path, out: Path, progress: Callable[[str], None], write: bool
 ) -> FrameSequence:
-    """The copy of a sequence that has found masks; a missing one is written.
+    """See `changed_copy`, which is imported late: it needs what finds tools and follows the camera."""
+    from .changed_copy import changed_copy
 
-    Raises:
-        InputError: it has no masks to hide, or is missing or cannot be read.
-    """
-    from ..core.config import DataConfig
-    from ..data import load_sequence
-    from .found_masks import whole_sequence, write_found, write_scores
+    def say(text: str) -> None:
+        progress(f"{name}: {text}")
 
-    chosen = spec.sequences[name]
-    whole = whole_sequence(folder, chosen.format)
-    key = hashlib.sha256(f"{whole.fingerprint()} {SCORES_VERSION}".encode()).hexdigest()[:8]
-    copy = out / "sequences" / f"{folder.resolve().name}-found-{key}"
-    if write and not copy.is_dir():
-        progress(f"{name}: finding tools in {len(whole)} frames")
-        write_found(whole, copy)
-    if write and not (copy / SCORES_FILE).exists():
-        write_scores(whole, copy, chosen.format)
-    return load_sequence(copy, DataConfig(**chosen.reading))
+    return changed_copy(folder, spec.sequences[name], out / "sequences", SCORES_VERSION, say, write=write)
 
 
 def commits_of(matrix: Matrix) -> list[str]:

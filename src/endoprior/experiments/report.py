@@ -12,6 +12,7 @@ from ..system.atomic import write_json, write_text
 from .image_grids import GRIDS, write_image_grids
 from .matrix import Matrix, commits_of, scores_of
 from .plots import budget_figure, curve_figure
+from .protocol_report import protocol_blocks, protocol_tables, protocol_values
 from .results import Results
 from .spec import ClaimSpec, Spec
 from .statistics import MIN_PAIRS, Difference
@@ -29,8 +30,9 @@ def write_report(matrix: Matrix, out: Path) -> Path:
     results = Results.of(matrix)
     _figures(matrix, results, out / "figures")
     tables = [score_table(results, name) for name in matrix.spec.sequences if name in matrix.data]
+    tables += protocol_tables(matrix)
     write_text(out / "results.tex", "\n\n".join(latex(table) for table in tables) + "\n")
-    write_text(out / "results.csv", csv_lines(results))
+    write_text(out / "results.csv", csv_lines(results, protocol_values(matrix)))
     write_json(out / "results.json", _facts(matrix, results))
     write_text(out / "results.md", "\n\n".join([*_body(matrix, results, out, out, 1), *_protocol([matrix], 2)]) + "\n")
     return out / "results.md"
@@ -56,6 +58,7 @@ def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int
         *_head(matrix, "#" * level),
         *_tables(matrix, results, below),
         *_claims(results, below),
+        *protocol_blocks(matrix, below),
         *_figure_links(matrix, folder, base, below),
     ]
 
@@ -90,7 +93,7 @@ def _protocol(matrices: list[Matrix], level: int) -> list[str]:
     folders = [folder for matrix in matrices for folder in matrix.done.values()]
     if not folders:
         return []
-    hidden = ("frames", "data_fingerprint", "shrink")
+    hidden = ("frames", "data_fingerprint", "shrink", "tags")
     whole = max((scores_of(folder)["protocol"] for folder in folders), key=len)
     shown = {name: text for name, text in whole.items() if name not in hidden}
     return [f"{'#' * level} Protocol", "\n".join(f"- `{name}`: {text}" for name, text in shown.items())]
@@ -105,9 +108,10 @@ def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
         scores, others = _of_scenes(spec), [method for method in spec.methods if method != spec.reference]
         changes = {m: {s: results.difference(s, m, spec.reference, name) for s in scores} for m in others}
         blocks += _differences(results, name, spec.label(spec.reference), changes)
-        if own := spec.with_own_masks(name):
-            changes = {m: {s: results.gain_of_masks(s, m, name, own) for s in scores} for m in spec.methods}
-            blocks += _differences(results, name, f"{own}, which has its own masks", changes)
+        if own := spec.with_own_parts(name):
+            changes = {m: {s: results.gain_of_found(s, m, name, own) for s in scores} for m in spec.methods}
+            parts = " and ".join(spec.sequences[name].found_parts)
+            blocks += _differences(results, name, f"{own}, which has its own {parts}", changes)
     return blocks
 
 
@@ -219,11 +223,11 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
         if method != spec.reference
         for score in _of_scenes(spec)
     ]
-    gains_of_masks = [
+    gains_of_found = [
         {"sequence": name, "than": own, "method": method, "score": score}
-        | _json(results.gain_of_masks(score, method, name, own))
+        | _json(results.gain_of_found(score, method, name, own))
         for name in spec.sequences
-        if (own := spec.with_own_masks(name))
+        if (own := spec.with_own_parts(name))
         for method in spec.methods
         for score in _of_scenes(spec)
     ]
@@ -233,7 +237,7 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
         "commits": commits_of(matrix),
         "cells": cells,
         "differences": differences,
-        "gains_of_found_masks": gains_of_masks,
+        "gains_of_found_parts": gains_of_found,
         "claims": claims,
         "missing": missing,
     }

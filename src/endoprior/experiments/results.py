@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..evaluation.protocols.table import ProtocolName
 from ..evaluation.registry import all_scores
 from .matrix import Matrix, scores_of
 from .spec import Cell, ClaimSpec, Spec
@@ -24,10 +25,12 @@ class Results:
     """Sequences whose lengths are not in mm."""
 
     @staticmethod
-    def of(matrix: Matrix) -> Results:
-        """Read the scores of all finished cells, in the order of the spec."""
+    def of(matrix: Matrix, protocol: ProtocolName | None = None) -> Results:
+        """Read the scores of all finished cells, in the order of the spec; those of another paper's `protocol`."""
         order = sorted(matrix.done, key=lambda c: (c.sequence, c.budget or 0, c.method, c.seed))
-        scores = {cell: scores_of(matrix.done[cell])["scores"] for cell in order}
+        stored = {cell: scores_of(matrix.done[cell]) for cell in order}
+        own = {cell: about["protocols"][protocol] if protocol else about for cell, about in stored.items()}
+        scores = {cell: about["scores"] for cell, about in own.items()}
         return Results(matrix.spec, scores, frozenset(matrix.relative))
 
     def value(self, cell: Cell, score: str) -> float:
@@ -37,7 +40,8 @@ class Results:
     def summary(self, sequence: str, budget: int | None, method: str, score: str) -> Summary:
         """Mean and standard deviation over seeds; scores of masks, which are found once, have no deviation."""
         values = [self.value(Cell(sequence, method, budget, seed), score) for seed in self.spec.seeds]
-        return summary([*{*values}] if all_scores()[score].group == "masks" else values)
+        known = all_scores().get(score)
+        return summary([*{*values}] if known and known.group == "masks" else values)
 
     def gains(
         self, score: str, method: str, than: str, *, sequence: str | None = None, budget: int | None = None
@@ -59,11 +63,11 @@ class Results:
         """Mean paired difference with its interval."""
         return difference(self.gains(score, method, than, sequence=sequence))
 
-    def gain_of_masks(self, score: str, method: str, sequence: str, own: str) -> Difference:
-        """Mean paired difference of one method with found masks to the same with the sequence's `own` masks.
+    def gain_of_found(self, score: str, method: str, sequence: str, own: str) -> Difference:
+        """Mean paired difference of one method with found masks or poses to the same with the sequence's own.
 
         Args:
-            sequence, own: names of the sequence with found masks, and with its own.
+            sequence, own: names of the sequence with found parts, and with its own.
         """
         pairs = [
             (Cell(sequence, method, size, seed), Cell(own, method, size, seed))

@@ -20,6 +20,7 @@ from ..core.presets import PresetName
 from ..data.formats import REGISTRY as LAYOUTS
 from ..data.reading import read_text
 from ..data.yaml_text import load_yaml
+from ..evaluation.protocols.table import ProtocolName
 from ..evaluation.registry import all_scores
 from ..phantom import PhantomConfig
 from .method import PICTURES, REGISTRY
@@ -49,11 +50,18 @@ class SequenceSpec:
     """Layout of the folder (docs/datasets.md)."""
     masks: Literal["given", "found"] = "given"
     """`found`: train with tool masks found from the footage; the sequence's own ones are the truth of all scores."""
+    poses: Literal["given", "estimated"] = "given"
+    """`estimated`: train with a camera path estimated from the footage; the sequence's own one is that of scores."""
 
     @property
     def reading(self) -> dict[str, Any]:
         """The fields of `DataConfig` that it sets."""
         return {"shrink": self.shrink, "first_frames": self.first_frames, "stride": self.stride, "format": self.format}
+
+    @property
+    def found_parts(self) -> dict[str, str]:
+        """What methods train with in place of the sequence's own: `{"masks": "found", "poses": "estimated"}`."""
+        return {part: how for part, how in (("masks", self.masks), ("poses", self.poses)) if how != "given"}
 
 
 @dataclass(frozen=True)
@@ -128,6 +136,8 @@ class Spec:
     """Reference of the paired differences; the first method if empty."""
     networks: bool = False
     """Also compute the scores that need a network (RAFT, LPIPS), if their weights are found."""
+    protocols: tuple[ProtocolName, ...] = ()
+    """Also score as these papers did; each protocol has tables of its own (docs/scores.md)."""
     folder: str = "."
     """Base of relative paths: the folder of the spec file."""
 
@@ -140,10 +150,10 @@ class Spec:
         """Name of a method in tables."""
         return self.methods[method].label or method
 
-    def with_own_masks(self, sequence: str) -> str | None:
-        """The sequence that differs from one with found masks in having its own; None if there is none."""
+    def with_own_parts(self, sequence: str) -> str | None:
+        """The sequence that differs from one with `found_parts` in having its own; None if there is none."""
         chosen = self.sequences[sequence]
-        own = replace(chosen, masks="given")
+        own = replace(chosen, masks="given", poses="given")
         return next((name for name, other in self.sequences.items() if own == other != chosen), None)
 
     def has_config(self, method: str) -> bool:
@@ -268,6 +278,8 @@ def _check(spec: Spec) -> None:
     for name in (*spec.scores, *(claim.score for claim in spec.claims)):
         if name not in all_scores():
             raise input_error("scores, claims", "names of scores", f"{name!r}", "see docs/scores.md.")
+    if len(set(spec.protocols)) < len(spec.protocols):
+        raise input_error("protocols", "different names", ", ".join(spec.protocols), "remove one.")
     if not spec.seeds or len(set(spec.seeds)) < len(spec.seeds):
         raise input_error("seeds", "different numbers", f"{list(spec.seeds)}", "correct them.")
     count = len(spec.seeds) * len(spec.sequences) * max(len(spec.budgets), 1) * len(spec.methods)
@@ -275,10 +287,12 @@ def _check(spec: Spec) -> None:
         raise input_error("methods x sequences x budgets x seeds", f"at most {MOST_CELLS}", f"{count}", "split.")
     for cell in cells(spec):
         options = spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
-        found = spec.sequences[cell.sequence].masks == "found"
-        if found and spec.has_config(cell.method) and options.data.use_gt_masks:
-            fix = "remove data.use_gt_masks."
-            raise input_error(f"sequences.{cell.sequence}.masks", "either found or gt_masks", "both", fix)
+        found, where = spec.sequences[cell.sequence].found_parts, f"sequences.{cell.sequence}"
+        if "masks" in found and spec.has_config(cell.method) and options.data.use_gt_masks:
+            raise input_error(f"{where}.masks", "either found or gt_masks", "both", "remove data.use_gt_masks.")
+        if "poses" in found and spec.has_config(cell.method) and options.data.depth_unit_mm:
+            fix = "write the unit to sequence.json as depth_scale."
+            raise input_error(f"{where}.poses", "either estimated or data.depth_unit_mm", "both", fix)
 
 
 def _check_method(spec: Spec, where: str, method: MethodSpec, known: list[str]) -> None:

@@ -18,6 +18,8 @@ Verdict = Literal["holds", "does not hold", "cannot be told"]
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
+NOTHING = 1e-12
+"""Values up to this size count as 0 where a share is taken of them."""
 MIN_PAIRS = 3
 """Fewer pairs give no verdict: the bootstrap interval of two pairs is the two values themselves."""
 
@@ -51,11 +53,15 @@ def summary(values: ArrayLike) -> Summary:
 
 
 def gains(score: str, ours: ArrayLike, theirs: ArrayLike) -> np.ndarray:
-    """(K,) differences between ours and theirs, positive where ours is better; relative ones are shares of |theirs|."""
+    """(K,) differences between ours and theirs, positive where ours is better; relative ones are shares of |theirs|.
+
+    There is no share of nothing: NaN where theirs is 0 and ours is not.
+    """
     ours, theirs, about = np.asarray(ours, float), np.asarray(theirs, float), all_scores()[score]
     change = ours - theirs
     if about.compare == "relative":
-        change = change / np.maximum(np.abs(theirs), 1e-12)
+        share = change / np.maximum(np.abs(theirs), NOTHING)
+        change = np.where((np.abs(theirs) > NOTHING) | (np.abs(change) <= NOTHING), share, np.nan)
     return change if about.higher_is_better else -change
 
 

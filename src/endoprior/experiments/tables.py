@@ -5,9 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from ..evaluation.registry import all_scores
+from ..evaluation.score import Score
 from .results import Results
 from .statistics import Summary
 
@@ -30,8 +33,13 @@ class Table:
     rows: list[tuple[str, list[Entry]]]
 
 
-def score_table(results: Results, sequence: str) -> Table:
-    """Mean and standard deviation over seeds of every score on one sequence; a row for each method and budget."""
+def score_table(results: Results, sequence: str, scores: Mapping[str, Score] | None = None, title: str = "") -> Table:
+    """Mean and standard deviation over seeds of every score on one sequence; a row for each method and budget.
+
+    Args:
+        scores: columns, if there is any value; default: those of the spec.
+        title: default: the name of the sequence.
+    """
     spec = results.spec
     sized = {method for method in spec.methods if spec.has_config(method)}
     # A method without a budget has one row, not the same one for every budget.
@@ -41,22 +49,23 @@ def score_table(results: Results, sequence: str) -> Table:
         for method in spec.methods
         if method in sized or not spec.budgets or budget == spec.budgets[0]
     ]
-    columns = [score for score in spec.scores if any(results.summary(sequence, *row, score).count for row in rows)]
+    about = {name: all_scores()[name] for name in spec.scores} if scores is None else scores
+    columns = [score for score in about if any(results.summary(sequence, *row, score).count for row in rows)]
     by_column = []
     for score in columns:
         summaries = [results.summary(sequence, *row, score) for row in rows]
-        ranks = _ranks(score, [value.mean for value in summaries])
+        ranks = _ranks(about[score], [value.mean for value in summaries])
         by_column.append([Entry(number(value), rank) for value, rank in zip(summaries, ranks, strict=True)])
     names = [spec.label(method) + (f", {budget:,}" if budget and method in sized else "") for budget, method in rows]
     return Table(
-        sequence,
-        [all_scores()[score].heading(sequence in results.relative) for score in columns],
+        title or sequence,
+        [about[score].heading(sequence in results.relative) for score in columns],
         [(name, [column[i] for column in by_column]) for i, name in enumerate(names)],
     )
 
 
-def _ranks(score: str, means: list[float]) -> list[int]:
-    higher_is_better = all_scores()[score].higher_is_better
+def _ranks(score: Score, means: list[float]) -> list[int]:
+    higher_is_better = score.higher_is_better
     known = sorted({round(m, 12) for m in means if math.isfinite(m)}, reverse=bool(higher_is_better))
     if higher_is_better is None or len(known) < 2:
         return [0] * len(means)
@@ -117,12 +126,13 @@ def _escaped(text: str) -> str:
     return text
 
 
-def csv_lines(results: Results) -> str:
-    """One line for each cell and score."""
+def csv_lines(results: Results, more: Sequence[tuple[Any, ...]] = ()) -> str:
+    """One line for each cell and score, then those of `more`."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["sequence", "method", "budget", "seed", "score", "value"])
     for cell, scores in results.scores.items():
         for name, value in scores.items():
             writer.writerow([cell.sequence, cell.method, cell.budget or "", cell.seed, name, repr(value)])
+    writer.writerows(more)
     return text.getvalue()

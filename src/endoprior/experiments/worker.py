@@ -18,12 +18,15 @@ from typing import Any
 
 from ..core.checks import InputError
 from ..data.files import read_json
+from ..evaluation.protocols.table import ProtocolName
 from ..system.atomic import write_json, write_text
 
 DONE = "cell.json"
 """Written last: a folder that has it, with the same key, is finished."""
 FOUND = "methods train with masks found from the footage; scores of these masks: all frames, full size, against masks/"
 """Protocol of cells on sequences with `masks: found`."""
+ESTIMATED = "methods train with a camera path estimated from the footage; path scores: against the sequence's own poses"
+"""Protocol of cells on sequences with `poses: estimated`."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,9 @@ class Job:
     data: str
     """Sequence folder to train on, absolute."""
     scored_on: str
-    """Sequence folder to score on: `data`, or with found masks the one that has the true ones."""
+    """Sequence folder to score on: `data`, or with `found_parts` the one that has the true ones."""
+    found_parts: dict[str, str]
+    """See `SequenceSpec.found_parts`."""
     method: str
     """Name in the registry of methods."""
     options: dict[str, Any]
@@ -50,6 +55,8 @@ class Job:
     weights_dir: str | None
     threads: int
     """Threads of Numba and torch."""
+    protocols: tuple[ProtocolName, ...] = ()
+    """Also score as these papers did."""
 
     def write(self, path: Path) -> None:
         """Save as JSON."""
@@ -73,6 +80,7 @@ def work(job: Job) -> None:
     """
     from ..core.config import DataConfig
     from ..core.config_io import from_dict
+    from ..core.geometry import camera_to_world
     from ..data import load_sequence
     from ..evaluation.scoring import evaluate, scored_data
     from ..evaluation.true_masks import SCORES_FILE
@@ -92,8 +100,14 @@ def work(job: Job) -> None:
     seconds = clock.perf_counter() - began
     sequence = load_sequence(job.scored_on, scored_data(reading))
     weights_dir = Path(job.weights_dir) if job.weights_dir else None
-    result = evaluate(found, sequence, networks=job.networks, weights_dir=weights_dir, reading=reading)
-    if job.scored_on != job.data:
+    given_path = camera_to_world(map(sequence.camera, range(len(sequence)))) if "poses" in job.found_parts else None
+    networks = {"networks": job.networks, "weights_dir": weights_dir}
+    asked = {"reading": reading, "given_path": given_path, "protocols": job.protocols}
+    result = evaluate(found, sequence, **networks, **asked)
+    if "poses" in job.found_parts:
+        source = read_json(Path(job.data) / "sequence.json")["sources"]["poses"]
+        result.protocol["poses: estimated"] = f"{ESTIMATED}; found: {source}"
+    if "masks" in job.found_parts:
         of_masks = read_json(Path(job.data) / SCORES_FILE)
         result.scores |= of_masks["scores"]
         result.skipped |= of_masks["skipped"]

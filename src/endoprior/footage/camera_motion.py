@@ -9,11 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .corner_flow import follow_both_ways
+
 WORK_WIDTH = 320
 """Images are resized to this width, px: enough for hundreds of corners, and fast."""
 MAX_CORNERS = 400
 MIN_TRACKS = 24
 """With fewer tracked corners, no motion is estimated for a pair of images."""
+RETURN_PX = 1.0
+"""Followed to the next image and back, a corner returns within this distance."""
 MIN_INLIERS = 0.4
 """Share of corners that must be inliers; below, camera motion does not explain the pair."""
 MOVING_FRACTION = 0.06
@@ -82,9 +86,8 @@ def _step(before: NDArray[np.uint8], allowed: NDArray[np.uint8] | None, now: NDA
     corners = cv2.goodFeaturesToTrack(before, MAX_CORNERS, 0.01, 5, mask=allowed)
     if corners is None or len(corners) < MIN_TRACKS:
         return None
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None, winSize=(15, 15), maxLevel=3)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(now, before, there, None, winSize=(15, 15), maxLevel=3)
-    good = (found & found_back).ravel().astype(bool) & (np.abs(back - corners).max((1, 2)) < 1)
+    corners = corners[:, 0]
+    there, good = follow_both_ways(before, now, corners, RETURN_PX, side_px=15)
     if good.sum() < MIN_TRACKS:
         return None
     cv2.setRNGSeed(0)  # RANSAC uses OpenCV's own random generator

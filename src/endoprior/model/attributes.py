@@ -57,21 +57,23 @@ def motion_layout(cfg: DeformationConfig) -> dict[str, slice]:
     return layout
 
 
-def attribute_shapes(cfg: Config) -> dict[str, tuple[int, ...]]:
-    """Shape of each tensor of the Gaussians without its first axis, `motion` included where `cfg` has it.
+def motion_shape(cfg: DeformationConfig) -> tuple[int, int]:
+    """Basis functions and channels of `motion`.
 
     Raises:
         InputError: the config leaves the number of temporal basis functions open.
     """
+    if cfg.basis.num_bases == 0:
+        raise InputError("config.deformation.basis.num_bases: expected at least 2; got 0.")
+    return cfg.basis.num_bases, sum(offset_widths(cfg).values())
+
+
+def attribute_shapes(cfg: Config) -> dict[str, tuple[int, ...]]:
+    """Shape of each tensor that Gaussians have whatever moves them, without its first axis."""
     shapes: dict[str, tuple[int, ...]] = {a.name: (a.width,) for a in ATTRIBUTES}
     shapes["opacity_logits"] = ()
     shapes["sh_dc"], shapes["sh_rest"] = (1, 3), ((cfg.schedule.sh_degree + 1) ** 2 - 1, 3)
     shapes["color_slopes"] = (2, 3)
     if not cfg.render.color_slopes:
         del shapes["color_slopes"]
-    if cfg.deformation.kind == "basis":
-        num_bases = cfg.deformation.basis.num_bases
-        if num_bases == 0:
-            raise InputError("config.deformation.basis.num_bases: expected at least 2; got 0.")
-        shapes["motion"] = (num_bases, sum(offset_widths(cfg.deformation).values()))
     return shapes

@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -17,7 +18,8 @@ from torch import Tensor
 from ..core.checks import InputError, check_shape
 from ..core.config_deformation import DeformationConfig
 from .attributes import offset_widths
-from .heads import OffsetHeads
+from .field import Field
+from .heads import LinearLayers, OffsetHeads, head_shapes
 from .hexplane import PLANE_NAMES, PlaneGrid, plane_shapes
 from .ops import ModelOps
 
@@ -36,6 +38,8 @@ class Offsets:
     """(N,)."""
     sh_dc: Tensor | None = None
     """(N, 3), added to the spherical-harmonic coefficient of degree 0."""
+    sh_rest: Tensor | None = None
+    """(N, (D+1)**2 - 1, 3), added to those of the other degrees."""
 
     @staticmethod
     def from_channels(channels: dict[str, Tensor], cfg: DeformationConfig) -> Offsets:
@@ -48,11 +52,10 @@ class Offsets:
         return Offsets(**channels)
 
 
-class HexPlaneField:
-    """The paper's deformation field: box, planes, trunk and heads.
+class HexPlaneField(Field):
+    """The paper's deformation field: box, planes, trunk and heads."""
 
-    Autograd trains `heads.parameters` and, if it needs a gradient, `box` (2, 3); the planes get theirs in `grid.grads`.
-    """
+    grid: PlaneGrid
 
     def __init__(self, box: Tensor, cfg: DeformationConfig, generator: torch.Generator, *, draw: bool = True) -> None:
         """Start a field.
@@ -68,17 +71,25 @@ class HexPlaneField:
         if draw:
             self.grid.initialize(generator)
         self.box = box.detach().to(torch.float32).clone().requires_grad_(cfg.hexplane.learn_box)
-        self.heads = OffsetHeads(
-            self.grid.num_features, cfg.hexplane.width, offset_widths(cfg), cfg.hexplane.bias_init, generator
-        )
+        self.heads = self.make_heads(cfg, generator)
 
     @classmethod
-    def from_points(cls, points: Tensor, cfg: DeformationConfig, generator: torch.Generator) -> HexPlaneField:
+    def make_heads(cls, cfg: DeformationConfig, generator: torch.Generator) -> LinearLayers:
+        """Trunk and heads with fresh weights."""
+        return OffsetHeads(num_features(cfg), cfg.hexplane.width, offset_widths(cfg), cfg.hexplane.bias_init, generator)
+
+    @classmethod
+    def layer_shapes(cls, cfg: DeformationConfig) -> dict[str, tuple[int, int]]:
+        """Outputs and inputs of each layer of trunk and heads."""
+        return head_shapes(num_features(cfg), cfg.hexplane.width, offset_widths(cfg))
+
+    @classmethod
+    def from_points(cls, points: Tensor, cfg: DeformationConfig, generator: torch.Generator) -> Self:
         """A field whose box holds the initial points (N, 3), mm."""
         return cls(box_of_points(points), cfg, generator)
 
     @classmethod
-    def from_state_arrays(cls, arrays: Mapping[str, Tensor], cfg: DeformationConfig) -> HexPlaneField:
+    def from_state_arrays(cls, arrays: Mapping[str, Tensor], cfg: DeformationConfig) -> Self:
         """The field whose `state_arrays` these are.
 
         Raises:
@@ -112,23 +123,47 @@ class HexPlaneField:
         Returns:
             Offsets with a gradient path to `means`, the box and the network; the planes' gradient goes to `grid.grads`.
         """
-        (trunk,) = self._trunk(means, (time,), ops)
+        (trunk,) = self.trunk(means, (time,), ops)
         return Offsets.from_channels(self.heads(trunk, ops), self.cfg)
 
     def offsets_and_displacement(
         self, means: Tensor, time: float, other: float, ops: ModelOps
     ) -> tuple[Offsets, Tensor]:
         """`offsets` at `time`, and those of the centers alone, (N, 3) mm, at an `other` time: faster than two calls."""
-        here, there = self._trunk(means, (time, other), ops)
+        here, there = self.trunk(means, (time, other), ops)
         return Offsets.from_channels(self.heads(here, ops), self.cfg), self.heads(there, ops, ("means",))["means"]
 
-    def _trunk(self, means: Tensor, times: tuple[float, ...], ops: ModelOps) -> tuple[Tensor, ...]:
+    def trunk(self, means: Tensor, times: tuple[float, ...], ops: ModelOps) -> tuple[Tensor, ...]:
         """Output of the trunk on the features, (N, W) per time."""
         # As in the paper's code the first corner is the maximum, so coordinates run against the axes.
         unit = (means - self.box[0]) / (self.box[1] - self.box[0])
         if not np.isfinite(times).all():
             raise ValueError(f"time must be finite; got {times!r}")
         return ops.hexplane_linear(self.grid, unit, times, *self.heads.trunk)
+
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """Network and box by name; the box only if it is trained. See `Field.parameters`."""
+        named = {f"network.{i}": value for i, value in enumerate(self.heads.parameters.values())}
+        return named | ({"box": self.box} if self.box.requires_grad else {})
+
+    @classmethod
+    def state_shapes(cls, cfg: DeformationConfig) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of `state_arrays`, all float32, in the same order; nothing is allocated."""
+        shapes: dict[str, tuple[int, ...]] = {"hexplane.box": (2, 3)}
+        for scale, planes in enumerate(plane_shapes(cfg.hexplane)):
+            shapes |= {f"hexplane.{scale}.{name}": (*size, cfg.hexplane.channels) for name, size in planes.items()}
+        for name, weight in cls.layer_shapes(cfg).items():
+            shapes |= {f"heads.{name}.weight": weight, f"heads.{name}.bias": weight[:1]}
+        return shapes
+
+    @classmethod
+    def parameter_shapes(cls, cfg: DeformationConfig) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of `parameters`."""
+        shapes = cls.state_shapes(cfg)
+        heads = [shape for name, shape in shapes.items() if name.startswith("heads.")]
+        named = {f"network.{i}": shape for i, shape in enumerate(heads)}
+        return named | ({"box": shapes["hexplane.box"]} if cfg.hexplane.learn_box else {})
 
     def state_arrays(self) -> dict[str, Tensor]:
         """Every number that defines the field, by name; views of live memory, not copies."""
@@ -154,18 +189,9 @@ class HexPlaneField:
             target.copy_(found)
 
 
-def state_shapes(cfg: DeformationConfig) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of `HexPlaneField.state_arrays`, all float32, in the same order; nothing is allocated."""
-    planes, width = cfg.hexplane, cfg.hexplane.width
-    shapes: dict[str, tuple[int, ...]] = {"hexplane.box": (2, 3)}
-    for scale, rows_and_columns in enumerate(plane_shapes(planes)):
-        shapes |= {f"hexplane.{scale}.{name}": (*size, planes.channels) for name, size in rows_and_columns.items()}
-    layers = {"trunk": (width, len(planes.multires) * planes.channels)}
-    for name, outputs in offset_widths(cfg).items():
-        layers |= {f"{name}.hidden": (width, width), f"{name}.output": (outputs, width)}
-    for name, weight in layers.items():
-        shapes |= {f"heads.{name}.weight": weight, f"heads.{name}.bias": weight[:1]}
-    return shapes
+def num_features(cfg: DeformationConfig) -> int:
+    """Width of the feature of a point: channels of all scales."""
+    return len(cfg.hexplane.multires) * cfg.hexplane.channels
 
 
 def box_of_points(points: Tensor) -> Tensor:

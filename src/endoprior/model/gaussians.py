@@ -19,6 +19,7 @@ from ..core.types import Splats
 from .attributes import attribute_shapes
 from .basis import RankOneGradient
 from .deformation import Offsets
+from .method import motion_of
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -28,7 +29,7 @@ class Gaussians:
     """Trainable per-Gaussian tensors, by name.
 
     Names are those of `attributes.ATTRIBUTES`, shapes those of `attribute_shapes`: centers in mm, quaternions wxyz,
-    spherical harmonics (coefficient, channel). With the basis deformation there is `motion` too.
+    spherical harmonics (coefficient, channel). What moves them may add its own: `Motion.tensors`.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
@@ -65,13 +66,14 @@ class Gaussians:
         sh_dc = t["sh_dc"]
         if offsets is not None and offsets.sh_dc is not None:
             sh_dc = sh_dc + offsets.sh_dc[:, None, :]
+        sh_rest = _moved(t["sh_rest"], offsets and offsets.sh_rest)
         num_rest = (sh_degree + 1) ** 2 - 1
         return Splats(
             means=_moved(t["means"], offsets and offsets.means),
             quats=_moved(t["quats"], offsets and offsets.quats),
             scales=_moved(t["log_scales"], offsets and offsets.log_scales).exp(),
             opacities=_moved(t["opacity_logits"], offsets and offsets.opacity_logits).sigmoid(),
-            sh=torch.cat([sh_dc, t["sh_rest"][:, :num_rest]], 1) if num_rest else sh_dc,
+            sh=torch.cat([sh_dc, sh_rest[:, :num_rest]], 1) if num_rest else sh_dc,
             color_slopes=t.get("color_slopes"),
         )
 
@@ -114,6 +116,6 @@ def create_gaussians(
         "opacity_logits": torch.from_numpy(np.log(chances / (1 - chances)).astype(np.float32)),
         "sh_dc": (torch.from_numpy(np.asarray(colors, np.float32))[:, None, :] - 0.5) / SH_C0,
     }
-    # Everything else starts at zero: color that does not depend on the view, one in each Gaussian, and no motion.
+    # Everything else starts at zero: color that does not depend on the view, and is one in each Gaussian.
     zeros = {name: torch.zeros(num, *shape) for name, shape in attribute_shapes(cfg).items() if name not in tensors}
-    return Gaussians(tensors | zeros)
+    return Gaussians(tensors | zeros | motion_of(cfg).first_tensors(num, cfg))

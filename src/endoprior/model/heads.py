@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from copy import copy
-from typing import Literal
+from typing import Literal, Self
 
 import torch
 from torch import Tensor
@@ -18,31 +18,20 @@ from torch.nn.init import xavier_uniform_
 from .ops import ModelOps
 
 
-class OffsetHeads:
-    """Trunk and heads; `parameters` names every trained tensor."""
+class LinearLayers:
+    """Linear layers by name; `parameters` names every trained tensor. The layer `trunk` reads a field's features."""
 
     def __init__(
-        self,
-        num_features: int,
-        width: int,
-        outputs: dict[str, int],
-        bias_init: Literal["default", "zero"],
-        generator: torch.Generator,
+        self, shapes: dict[str, tuple[int, int]], bias_init: Literal["default", "zero"], generator: torch.Generator
     ) -> None:
         """Draw the weights from `generator`.
 
         Args:
-            num_features: F, width of the feature.
-            width: W, hidden width.
-            outputs: what to predict and how many numbers of each, as `attributes.offset_widths` gives them.
+            shapes: outputs and inputs of each layer by name.
             bias_init: `default` draws biases from U[-1, 1] / sqrt(inputs) as PyTorch does; `zero` sets them to 0.
         """
-        self.outputs = tuple(outputs)
         self.parameters: dict[str, Tensor] = {}
-        layers = [("trunk", num_features, width)]
-        for name, num in outputs.items():
-            layers += [(f"{name}.hidden", width, width), (f"{name}.output", width, num)]
-        for layer, fan_in, fan_out in layers:
+        for layer, (fan_out, fan_in) in shapes.items():
             weight, bias = torch.empty(fan_out, fan_in), torch.zeros(fan_out)
             xavier_uniform_(weight, generator=generator)
             if bias_init == "default":
@@ -50,7 +39,7 @@ class OffsetHeads:
             self.parameters[f"{layer}.weight"] = weight.requires_grad_(True)
             self.parameters[f"{layer}.bias"] = bias.requires_grad_(True)
 
-    def to(self, device: torch.device) -> OffsetHeads:
+    def to(self, device: torch.device) -> Self:
         """A copy on a device."""
         moved = copy(self)
         moved.parameters = {
@@ -63,6 +52,39 @@ class OffsetHeads:
         """Weight (W, F) and bias (W,) of the linear trunk; `ops.hexplane_linear` applies it to the features."""
         return self.parameters["trunk.weight"], self.parameters["trunk.bias"]
 
+    def linear(self, layer: str, inputs: Tensor) -> Tensor:
+        """One linear layer by name."""
+        return linear(inputs, self.parameters[f"{layer}.weight"], self.parameters[f"{layer}.bias"])
+
+
+def head_shapes(num_features: int, width: int, outputs: dict[str, int]) -> dict[str, tuple[int, int]]:
+    """Outputs and inputs of the layers of `OffsetHeads`, by name.
+
+    Args:
+        num_features: F, width of the feature. width: W, hidden width.
+        outputs: what to predict and how many numbers of each, as `attributes.offset_widths` gives them.
+    """
+    shapes = {"trunk": (width, num_features)}
+    for name, num in outputs.items():
+        shapes |= {f"{name}.hidden": (width, width), f"{name}.output": (num, width)}
+    return shapes
+
+
+class OffsetHeads(LinearLayers):
+    """Trunk and heads."""
+
+    def __init__(
+        self,
+        num_features: int,
+        width: int,
+        outputs: dict[str, int],
+        bias_init: Literal["default", "zero"],
+        generator: torch.Generator,
+    ) -> None:
+        """Args: as those of `head_shapes` and `LinearLayers`."""
+        self.outputs = tuple(outputs)
+        super().__init__(head_shapes(num_features, width, outputs), bias_init, generator)
+
     def __call__(self, trunk: Tensor, ops: ModelOps, only: tuple[str, ...] | None = None) -> dict[str, Tensor]:
         """Offsets (N, outputs) by name from the output of the trunk, (N, W); of the heads in `only`, if given."""
         shared, names = relu(trunk), only or self.outputs
@@ -71,9 +93,5 @@ class OffsetHeads:
             bias = torch.cat([self.parameters[f"{name}.hidden.bias"] for name in names])
             hidden = linear(shared, weight, bias).chunk(len(names), -1)
         else:
-            hidden = [self._linear(f"{name}.hidden", shared) for name in names]
-        return {name: self._linear(f"{name}.output", relu(part)) for name, part in zip(names, hidden, strict=True)}
-
-    def _linear(self, layer: str, inputs: Tensor) -> Tensor:
-        """One linear layer by name."""
-        return linear(inputs, self.parameters[f"{layer}.weight"], self.parameters[f"{layer}.bias"])
+            hidden = [self.linear(f"{name}.hidden", shared) for name in names]
+        return {name: self.linear(f"{name}.output", relu(part)) for name, part in zip(names, hidden, strict=True)}

@@ -55,13 +55,15 @@ class Playback:
     @torch.no_grad()
     def render(self, index: int, camera: Camera | None = None) -> RenderedView:
         """Render frame `index`, from `camera` or else from its own. See `Scene.render`."""
-        return rendered(self._parts(index), camera or self.scene.cameras[index], self.scene.backend)
+        scene = self.scene
+        return rendered(self._parts(index), camera or scene.cameras[index], scene.backend, scene.background)
 
     @torch.no_grad()
     def render_many(self, indices: list[int]) -> list[RenderedView]:
         """Render several frames from their own cameras. See `Scene.render_many`."""
         cameras = [self.scene.cameras[i] for i in indices]
-        return rendered_many([self._parts(i) for i in indices], cameras, self.scene.backend)
+        parts = [self._parts(i) for i in indices]
+        return rendered_many(parts, cameras, self.scene.backend, self.scene.background)
 
 
 def _num_bytes(splats: Splats) -> int:

@@ -17,9 +17,15 @@ import torch
 from .. import render
 from ..core.config import Config
 from ..core.types import Camera, RenderedView, Splats
+from .method import method_of
 
 if TYPE_CHECKING:
     from .single_scene import SingleScene
+
+
+Background = tuple[float, float, float]
+"""Color in [0, 1]."""
+BLACK = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -186,7 +192,7 @@ class Scene(RenderedScene):
         Raises:
             ValueError: time is not in [0, 1].
         """
-        return rendered(self.parts_at(time), camera or self.camera_at(time), self.backend)
+        return rendered(self.parts_at(time), camera or self.camera_at(time), self.backend, self.background)
 
     @torch.no_grad()
     def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
@@ -195,7 +201,12 @@ class Scene(RenderedScene):
         Raises:
             ValueError: a time is not in [0, 1], or cameras differ in size where the backend renders them together.
         """
-        return rendered_many([self.parts_at(time) for time in times], cameras, self.backend)
+        return rendered_many([self.parts_at(time) for time in times], cameras, self.backend, self.background)
+
+    @property
+    def background(self) -> Background:
+        """Color behind everything: that of its method."""
+        return method_of(self.config).background
 
     @property
     def backend(self) -> render.Backend:
@@ -221,19 +232,24 @@ def _shown(window: Window, position: float, weight: float) -> Shown:
     return Shown(window, min(max((position - window.start) / length, 0.0), 1.0), weight)
 
 
-def rendered(parts: Sequence[tuple[Splats, float]], camera: Camera, backend: render.Backend) -> RenderedView:
+def rendered(
+    parts: Sequence[tuple[Splats, float]], camera: Camera, backend: render.Backend, background: Background = BLACK
+) -> RenderedView:
     """The weighted mean of what `camera` sees of each of some Gaussians."""
-    rasterize, black = render.load(backend), parts[0][0].means.new_zeros(3)
-    return mixed([(rasterize(splats, camera, background=black).view, weight) for splats, weight in parts])
+    rasterize, behind = render.load(backend), parts[0][0].means.new_tensor(background)
+    return mixed([(rasterize(splats, camera, background=behind).view, weight) for splats, weight in parts])
 
 
 def rendered_many(
-    parts: Sequence[Sequence[tuple[Splats, float]]], cameras: Sequence[Camera], backend: render.Backend
+    parts: Sequence[Sequence[tuple[Splats, float]]],
+    cameras: Sequence[Camera],
+    backend: render.Backend,
+    background: Background = BLACK,
 ) -> list[RenderedView]:
     """`rendered` for several cameras, in one call where the backend can."""
     every = [(splats, camera) for some, camera in zip(parts, cameras, strict=True) for splats, _ in some]
-    black = every[0][0].means.new_zeros(3)
-    outputs = render.load_many(backend)([s for s, _ in every], [camera for _, camera in every], background=black)
+    behind = every[0][0].means.new_tensor(background)
+    outputs = render.load_many(backend)([s for s, _ in every], [camera for _, camera in every], background=behind)
     views = iter(out.view for out in outputs)
     return [mixed([(next(views), weight) for _, weight in some]) for some in parts]
 

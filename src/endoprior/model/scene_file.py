@@ -4,35 +4,28 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from torch import Tensor
 
-from ..core.checks import InputError, check_range, input_error
+from ..core.checks import input_error
 from ..core.config import Config
 from ..core.config_io import from_dict
 from ..core.geometry import FARTHEST_MM
-from ..core.ranges import Checked, Range
 from ..core.shell import command
 from ..core.types import Camera
-from ..system.arrays_file import ArraySpec, load_arrays, part, rejecting
+from ..system.arrays_file import ArraySpec, load_arrays, rejecting
 from . import windowed_scene
-from .deformation import HexPlaneField
-from .gaussians import Gaussians
+from .method import method_of
 from .scene import Scene
-from .schema import model_schema
-from .single_scene import FORMAT, SingleScene, camera_arrays
+from .scene_facts import LARGEST_IMAGE, LARGEST_SIDE, MOST_GAUSSIANS, SceneFacts, camera_arrays, demand
+from .single_scene import FORMAT, SingleScene
 from .windowed_scene import Span, WindowedScene, window_file
 
-LARGEST_SIDE = 2**16
-"""Largest width or height of an image, px."""
-LARGEST_IMAGE = 2**26
-"""Largest number of pixels of an image: 8192 x 8192."""
-MOST_GAUSSIANS, MOST_FRAMES = 10_000_000, 1_000_000
+MOST_FRAMES = 1_000_000
 NEXT_STEP = "Train the scene again."
 CAMERAS = {
     "camera.intrinsics": ArraySpec("float64", ("T", 4)),
@@ -58,51 +51,18 @@ def load_scene(path: str | Path) -> Scene:
         _check_cameras(arrays)
         if about["format"] == windowed_scene.FORMAT:
             return _windowed(arrays, facts, file)
-        check_values(arrays)
-        return _single(arrays, facts)
-
-
-@dataclass(frozen=True)
-class SceneFacts(Checked):
-    """Metadata of a scene's file."""
-
-    config: Config
-    width: Annotated[int, Range(1, LARGEST_SIDE)]
-    height: Annotated[int, Range(1, LARGEST_SIDE)]
-    frames_per_second: Annotated[float, Range(1e-3, 1e6)]
-    lengths_are_relative: bool = False
-    trained_from: Annotated[float, Range(0, 1)] = 0.0
-    trained_until: Annotated[float, Range(0, 1)] = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range("width times height", self.width * self.height, 1, LARGEST_IMAGE)
-        check_range("trained_until", self.trained_until, self.trained_from, 1)
+        return method_of(facts.config).scene(arrays, _cameras(arrays, facts), facts)
 
 
 def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
-    """The arrays of a scene's file of this description; `N` Gaussians, `T` frames."""
-    per_gaussian = {name: ArraySpec("float32", ("N",)) for name in ("prior_score", "num_valid")}
-    return model_schema(from_dict(Config, about["config"])) | per_gaussian | CAMERAS
+    """The arrays of a scene's file of this description; `T` frames."""
+    cfg = from_dict(Config, about["config"])
+    return method_of(cfg).schema(cfg) | CAMERAS
 
 
 def index_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
     """The arrays of a list of `K` windows."""
     return CAMERAS | {"windows": ArraySpec("int64", ("K", 3))}
-
-
-def check_values(arrays: Mapping[str, Tensor]) -> None:
-    """Reject arrays of a scene, finite and of the right shapes, that no scene can have.
-
-    Raises:
-        InputError: naming the array.
-    """
-    num, quats = len(arrays["gaussians.means"]), arrays["gaussians.quats"]
-    _demand(
-        ("gaussians", num <= MOST_GAUSSIANS, f"at most {MOST_GAUSSIANS:,} Gaussians"),
-        ("gaussians.quats", bool((quats.abs().amax(1) >= 1e-12).all()) if num else True, "no quaternion of length 0"),
-        ("num_valid", bool((arrays["num_valid"] >= 0).all()), "counts"),
-    )
 
 
 def check_cameras(cameras: tuple[Camera, ...]) -> None:
@@ -112,7 +72,7 @@ def check_cameras(cameras: tuple[Camera, ...]) -> None:
         InputError: naming what is wrong with them.
     """
     first = cameras[0]
-    _demand(
+    demand(
         ("width and height", max(first.width, first.height) <= LARGEST_SIDE, f"at most {LARGEST_SIDE:,} px"),
         ("width times height", first.width * first.height <= LARGEST_IMAGE, f"at most {LARGEST_IMAGE:,} px"),
     )
@@ -125,7 +85,7 @@ def _check_cameras(arrays: Mapping[str, Tensor]) -> None:
     rigid = (np.abs(deviation) <= LARGEST_DEVIATION).all((1, 2)) & (np.linalg.det(poses[:, :3, :3]) > 0)
     rigid &= (poses[:, 3] == (0, 0, 0, 1)).all(1) & (np.abs(poses[:, :3, 3]) <= FARTHEST_MM).all(1)
     focal = (intrinsics[:, :2] >= 1e-3) & (intrinsics[:, :2] <= 1e7)
-    _demand(
+    demand(
         ("camera.intrinsics", 1 <= len(intrinsics) <= MOST_FRAMES, f"1 to {MOST_FRAMES:,} frames"),
         ("camera.intrinsics", focal.all(), "focal lengths of 0.001 to 1e7 px"),
         ("camera.intrinsics", (np.abs(intrinsics[:, 2:]) <= 1e7).all(), "principal points within 1e7 px"),
@@ -133,35 +93,10 @@ def _check_cameras(arrays: Mapping[str, Tensor]) -> None:
     )
 
 
-def _demand(*facts: tuple[str, Any, str]) -> None:
-    """Raise InputError at the first (name, whether it is so, what was expected) that is not so."""
-    for name, so, expected in facts:
-        if not so:
-            raise InputError(f"expected {expected} in {name}; got something else.")
-
-
 def _cameras(arrays: Mapping[str, Tensor], facts: SceneFacts) -> tuple[Camera, ...]:
     intrinsics, poses = arrays["camera.intrinsics"].numpy(), arrays["camera.world_to_camera"].numpy()
     return tuple(
         Camera(facts.width, facts.height, *map(float, k), pose) for k, pose in zip(intrinsics, poses, strict=True)
-    )
-
-
-def _single(arrays: dict[str, Tensor], facts: SceneFacts) -> SingleScene:
-    field = None
-    if facts.config.deformation.kind == "hexplane":
-        field = HexPlaneField.from_state_arrays(part(arrays, "field."), facts.config.deformation)
-    return SingleScene(
-        Gaussians(part(arrays, "gaussians.")),
-        field,
-        facts.config,
-        _cameras(arrays, facts),
-        facts.frames_per_second,
-        arrays["prior_score"],
-        arrays["num_valid"],
-        facts.lengths_are_relative,
-        facts.trained_from,
-        facts.trained_until,
     )
 
 
@@ -187,7 +122,7 @@ def _check_spans(spans: tuple[Span, ...], num_frames: int) -> None:
     ends = [(0, 0), *((span.start, span.stop) for span in spans)]
     ordered = all(a < b <= stop < d for (a, stop), (b, d) in pairwise(ends[1:]))
     apart = all(first.stop <= third.start for first, third in zip(spans, spans[2:], strict=False))
-    _demand(
+    demand(
         ("windows", bool(spans) and ends[1][0] == 0 and ends[-1][1] == num_frames, f"frames 0 to {num_frames}"),
         ("windows", ordered and apart and all(a < b for a, b in ends[1:]), "windows in order"),
         ("windows", all(0 <= span.num_gaussians <= MOST_GAUSSIANS for span in spans), "counts of Gaussians"),

@@ -2,47 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from .. import render
 from ..core.config import Config
-from ..core.config_io import to_dict
 from ..core.types import Camera, Splats
-from ..system.arrays_file import save_arrays
-from .basis import basis_offsets
-from .deformation import HexPlaneField, Offsets
+from ..system.arrays_file import part, save_arrays
+from .deformation import Offsets
+from .field import Field
 from .gaussians import Gaussians
-from .ops import ModelOps, ops_for
-from .scene import RenderedScene, Scene, Window
+from .method import motion_of
+from .motion import Motion
+from .ops import ops_for
+from .scene import Scene, Window
+from .scene_facts import MOST_GAUSSIANS, SceneFacts, camera_arrays, demand, scene_facts
 
 FORMAT = "endoprior-scene-1"
 """Name and version of the file format, in the file's metadata."""
-
-
-def offsets_at(
-    gaussians: Gaussians,
-    field: HexPlaneField | None,
-    time: float,
-    cfg: Config,
-    ops: ModelOps,
-    chosen: Tensor | None = None,
-) -> Offsets:
-    """Deformation of the Gaussians (of the `chosen` (P,) ones only, if given) at `time` in [0, 1].
-
-    Unless some are chosen, the gradient of temporal coefficients goes to `gaussians.motion_gradients`.
-    """
-    rows = slice(None) if chosen is None else chosen
-    if field is not None:
-        return field.offsets(gaussians["means"][rows], time, ops)
-    sink = gaussians.motion_gradients if chosen is None else None
-    return basis_offsets(gaussians["motion"][rows], time, cfg.deformation, ops, sink)
 
 
 @dataclass(frozen=True)
@@ -50,8 +31,8 @@ class SingleScene(Scene):
     """A scene of one window: canonical Gaussians, their motion and the cameras of the sequence."""
 
     gaussians: Gaussians
-    field: HexPlaneField | None
-    """The HexPlane deformation; None when the Gaussians carry temporal coefficients."""
+    field: Field | None
+    """What they share to move, if the method has such a thing."""
     config: Config
     cameras: tuple[Camera, ...]
     """Camera of each frame of the sequence; frame i was taken at time i / T."""
@@ -91,7 +72,12 @@ class SingleScene(Scene):
     def offsets(self, gaussians: Gaussians, time: float) -> Offsets:
         """Deformation of some Gaussians of the scene at `time` in [0, 1]."""
         held = min(max(time, self.trained_from), self.trained_until)
-        return offsets_at(gaussians, self.field, held, self.config, ops_for(self.device))
+        return self.motion.offsets(gaussians, self.field, held, self.config, ops_for(self.device))
+
+    @property
+    def motion(self) -> Motion:
+        """How its Gaussians move."""
+        return motion_of(self.config)
 
     @torch.no_grad()
     def canonical(self) -> Splats:
@@ -99,7 +85,7 @@ class SingleScene(Scene):
         return self._splats(None)
 
     def _splats(self, offsets: Offsets | None) -> Splats:
-        found = self.gaussians.splats(offsets, self.config.schedule.sh_degree)
+        found = self.motion.splats(self.gaussians, offsets, self.config.schedule.sh_degree)
         # A tensor that no deformation changes is the trained tensor itself, with its gradient.
         return Splats(**{name: value.detach() for name, value in found.tensors.items()})
 
@@ -129,13 +115,39 @@ class SingleScene(Scene):
         """See `Scene.changed`."""
         return change(self, self.windows[0])
 
+    @staticmethod
+    def of_arrays(arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> SingleScene:
+        """The scene that `save` wrote as these arrays, which fit its method's `schema`.
+
+        Raises:
+            InputError: a value that no scene can have.
+        """
+        num, quats = len(arrays["gaussians.means"]), arrays["gaussians.quats"]
+        demand(
+            ("gaussians", num <= MOST_GAUSSIANS, f"at most {MOST_GAUSSIANS:,} Gaussians"),
+            ("gaussians.quats", not num or bool((quats.abs().amax(1) >= 1e-12).all()), "no quaternion of length 0"),
+            ("num_valid", bool((arrays["num_valid"] >= 0).all()), "counts"),
+        )
+        return SingleScene(
+            Gaussians(part(arrays, "gaussians.")),
+            motion_of(facts.config).field_of(part(arrays, "field."), facts.config),
+            facts.config,
+            cameras,
+            facts.frames_per_second,
+            arrays["prior_score"],
+            arrays["num_valid"],
+            facts.lengths_are_relative,
+            facts.trained_from,
+            facts.trained_until,
+        )
+
     def save(self, path: Path) -> None:
         """Write the scene as one safetensors file, completely or not at all.
 
         Raises:
             ValueError: its planes are in half precision.
         """
-        if self.field is not None and self.field.grid.values.dtype != torch.float32:
+        if self.field is not None and self.field.grid is not None and self.field.grid.values.dtype != torch.float32:
             raise ValueError("save the scene itself, not a copy with fp16 planes")
         arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
         arrays |= {"prior_score": self.prior_score, "num_valid": self.num_valid}
@@ -144,22 +156,3 @@ class SingleScene(Scene):
             arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
         about = {"trained_from": self.trained_from, "trained_until": self.trained_until}
         save_arrays(path, arrays, scene_facts(self) | about, FORMAT)
-
-
-def scene_facts(scene: RenderedScene) -> dict[str, Any]:
-    """What the metadata of every scene's file say."""
-    first = scene.cameras[0]
-    return {
-        "config": to_dict(scene.config),
-        "frames_per_second": scene.frames_per_second,
-        "lengths_are_relative": scene.lengths_are_relative,
-        "width": first.width,
-        "height": first.height,
-    }
-
-
-def camera_arrays(cameras: tuple[Camera, ...]) -> dict[str, Tensor]:
-    """By their names in a file: (T, 4) fx, fy, cx, cy in px, and (T, 4, 4) world-to-camera; float64."""
-    intrinsics = np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras])
-    poses = np.stack([c.world_to_camera for c in cameras])
-    return {"camera.intrinsics": torch.from_numpy(intrinsics), "camera.world_to_camera": torch.from_numpy(poses)}

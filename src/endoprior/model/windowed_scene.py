@@ -15,11 +15,12 @@ from ..core.types import Camera
 from ..system.arrays_file import save_arrays
 from ..system.memory import BoundedCache
 from .scene import Scene, Window
-from .single_scene import SingleScene, camera_arrays, scene_facts
+from .scene_facts import camera_arrays, scene_facts
+from .single_scene import SingleScene
 
 FORMAT = "endoprior-windows-1"
 """Name and version of the file that lists the windows, in its metadata."""
-CACHE_BYTES = 2**29
+CACHE_BYTES = 2**28
 """Memory of the windows that are kept; a window of 33,000 Gaussians and 60 frames has 60 MB."""
 
 

@@ -17,7 +17,10 @@ from ..data import load_sequence
 from ..data.window_plan import windows_by_length
 from ..evaluation.scorers.speed import FPS_RENDERS, FPS_WARM_UP
 from ..evaluation.scoring import evaluate, scored_data
+from ..model.method import method_of
 from ..prepare import prepare
+from ..prepare.camera_path.choose import colmap_seconds
+from ..prepare.camera_path.sequence_path import METHODS, ONLY_IF_MOVING, WITHOUT_COLMAP
 from ..prepare.first_pass import SAMPLES
 from ..prepare.frames import REACH
 from ..prepare.source import open_source
@@ -71,18 +74,33 @@ def estimate(job: Job) -> dict[str, float]:
         source = open_source(job.source, job.prepare.folder_rate)
         end = job.part.start + (job.part.num_frames - 0.5) / job.part.frames_per_second
         images = round(end * source.frames_per_second)
-        seconds = scaled(_measure(job, folder), job.cfg, job.part.num_frames, images)
+        colmap = 0.0 if job.prepare.poses in ONLY_IF_MOVING else seconds_of_colmap(job)
+        seconds = scaled(_measure(job, folder), job.cfg, job.part.num_frames, images, colmap)
         return {name: RESERVE * value for name, value in seconds.items()}
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def scaled(trial: Trial, cfg: Config, num_frames: int, num_images: int) -> dict[str, float]:
+def seconds_if_moving(job: Job) -> float:
+    """About how much longer a job takes than `estimate` says if the camera turns out to move; 0 if that is known."""
+    return seconds_of_colmap(job) if job.prepare.poses in ONLY_IF_MOVING else 0.0
+
+
+def seconds_of_colmap(job: Job) -> float:
+    """About how long COLMAP takes where it takes part in finding the camera path, s."""
+    how = job.prepare.poses
+    if how not in METHODS or job.prepare.depth == "none":
+        return 0.0
+    return colmap_seconds(METHODS[how], job.part.num_frames)
+
+
+def scaled(trial: Trial, cfg: Config, num_frames: int, num_images: int, colmap: float = 0.0) -> dict[str, float]:
     """Seconds of each step of the whole job, from those of the trial.
 
     Args:
         num_frames: frames that are used.
         num_images: images of the video up to the last of them; both passes of `prepare` decode all.
+        colmap: seconds that COLMAP takes, which takes no part in the trial.
     """
     more = num_frames / FRAMES
     half = min(cfg.schedule.half_resolution_iterations, cfg.schedule.fine_iterations)
@@ -95,7 +113,8 @@ def scaled(trial: Trial, cfg: Config, num_frames: int, num_images: int) -> dict[
         + (trial.look - FRAMES * trial.decode) * min(SAMPLES, num_frames) / FRAMES
         + trial.learn
         + num_frames * (trial.write - trial.decode)
-        + trial.follow * more,
+        + trial.follow * more
+        + colmap,
         "check": trial.check * (1 + (num_frames - FRAMES) / CHECK_FRAMES),
         "train": trial.start * more + windows * (half * trial.half_iteration + full * trial.iteration),
         "score": max(trial.score - speed, 0.0) * more + speed,
@@ -108,7 +127,9 @@ def _measure(job: Job, folder: Path) -> Trial:
     """Do every step on the first frames, in `folder`."""
     part = job.part
     end = part.start + (FRAMES - 0.5) / part.frames_per_second
-    short = replace(job, out=folder, prepare=replace(job.prepare, end=min(end, job.prepare.end)))
+    # On few frames COLMAP takes another time than its share: `seconds_of_colmap`.
+    poses = WITHOUT_COLMAP.get(job.prepare.poses, job.prepare.poses) if seconds_of_colmap(job) else job.prepare.poses
+    short = replace(job, out=folder, prepare=replace(job.prepare, end=min(end, job.prepare.end), poses=poses))
     folder.mkdir(parents=True)
     stamps = Stamps()
     source = open_source(job.source, job.prepare.folder_rate)
@@ -118,7 +139,8 @@ def _measure(job: Job, folder: Path) -> Trial:
     looked, followed = stamps.at["looking through"][0], stamps.at["following the camera"][0]
     learned, write = stamps.at["learning tools and light"][0], stamps.step("writing frames")
 
-    trainer = Trainer(load_sequence(short.data, job.cfg.data), shortened(job.cfg, part.num_frames))
+    cfg = shortened(job.cfg, part.num_frames)
+    trainer = method_of(cfg).trainer(load_sequence(short.data, cfg.data), cfg)
     start, _ = _timed(partial(_start, trainer))
     iterations = [_timed(trainer.step)[0] for _ in range(2 * ITERATIONS + 2)]
     scene = trainer.scene()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ..core.config import Config
 from ..core.options import Options, changed_options
+from ..prepare.camera_path.sequence_path import WITHOUT_COLMAP
 from ..prepare.config import PrepareConfig
 from ..prepare.source import open_source
 from .part import Part, choose_part
@@ -103,7 +104,7 @@ def make_job(
     Args:
         prepare: the user's options; frame rate and end are filled in.
         preset: what the user calls `cfg`; a preview has its own.
-        preview: at most `PREVIEW_FRAMES` frames of at most `PREVIEW_WIDTH` px.
+        preview: at most `PREVIEW_FRAMES` frames of at most `PREVIEW_WIDTH` px, and no COLMAP unless it is asked for.
     Raises:
         InputError: the video cannot be read.
     """
@@ -112,7 +113,8 @@ def make_job(
     most, usual = (PREVIEW_FRAMES, PREVIEW_FRAMES) if preview else (MOST_FRAMES, USUAL_FRAMES)
     part = choose_part(source.seconds, rate, prepare.frames_per_second, prepare.start, prepare.end, most, usual)
     width = min(prepare.max_width or PREVIEW_WIDTH, PREVIEW_WIDTH) if preview else prepare.max_width
-    chosen = replace(prepare, frames_per_second=part.frames_per_second, end=part.end, max_width=width)
+    poses = WITHOUT_COLMAP["auto"] if preview and prepare.poses == "auto" else prepare.poses
+    chosen = replace(prepare, frames_per_second=part.frames_per_second, end=part.end, max_width=width, poses=poses)
     options: Options = {"--preview": ()} if preview else {"--preset": (preset,)} if preset != "default" else {}
     options |= {"--seed": (str(cfg.seed),)} if cfg.seed else {}
     return Job(video, out, cfg, options | changed_options(prepare), chosen, part)

@@ -17,7 +17,7 @@ from .frame_geometry import FrameGeometry
 
 GRID_POINTS = 9
 """Points a side of the grid over a rectified frame; between them the rectification is nearly linear."""
-METHODS = ("auto", "none", "sgbm", "shading", "still", "estimate", "own", "colmap", NETWORK)
+METHODS = ("auto", "none", "sgbm", "shading", "still", "auto-own", "estimate", "own", "colmap", NETWORK)
 """Values of --depth, --masks and --poses that are no paths."""
 
 

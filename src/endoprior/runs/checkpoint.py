@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core.checks import InputError
-from ..core.config import Config
 from ..core.config_io import to_dict
-from ..model.hexplane import TOUCHED, plane_shapes
-from ..model.schema import model_schema
+from ..model.hexplane import TOUCHED
 from ..system.arrays_file import ArraySpec, load_arrays, rejecting, save_arrays
-from ..training.density import DensityStats
-from ..training.state import Stage
-from ..training.step import stage_length
+from ..training.stage import Stage, stage_length
 from ..training.trainer import Trainer
 from .identity import reject_other_run
 
@@ -53,7 +48,7 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
 
     def schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
         reject_other_run(path, about["config"], about["fingerprint"], cfg, fingerprint, trainer.sequence.path)
-        return checkpoint_schema(cfg) | _frame_specs(trainer)
+        return trainer.schema()
 
     arrays, about = load_arrays(path, {FORMAT: schema}, next_step)
     with rejecting(path, "a training state", next_step):
@@ -64,56 +59,13 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
                 f"expected 0 to {length} as iteration of the {stage.name.lower()} stage; got {iteration!r:.80}."
             )
         check_state(arrays, iteration)
-        followed, num_frames = arrays.get("tracks.followed"), len(trainer.sequence.indices("train"))
-        counts = {"tracks.followed": followed.shape[1]} if followed is not None else {}
-        counts |= {name: len(arrays[name]) for name in ("poses.steps", "depth_fit") if name in arrays}
+        num_frames = len(trainer.sequence.indices("train"))
+        axes = {name: spec.shape.index("F") for name, spec in trainer.schema().items() if "F" in spec.shape}
+        counts = {name: arrays[name].shape[axis] for name, axis in axes.items()}
         for name, got in counts.items():
             if got != num_frames:
                 raise InputError(f"expected {num_frames} training frames in {name}; got {got}.")
     trainer.restore(stage, iteration, arrays)
-
-
-def checkpoint_schema(cfg: Config) -> dict[str, ArraySpec]:
-    """The arrays of a checkpoint: the model, Adam's moments, statistics; `N` Gaussians, `K` touched cells."""
-    model = model_schema(cfg)
-    trained = {name.removeprefix("gaussians."): spec for name, spec in model.items() if name.startswith("gaussians.")}
-    network = [spec for name, spec in model.items() if name.startswith("field.heads.")]
-    trained |= {f"network.{i}": spec for i, spec in enumerate(network)}
-    planes = {}
-    if cfg.deformation.kind == "hexplane":
-        if cfg.deformation.hexplane.learn_box:
-            trained["box"] = model["field.hexplane.box"]
-        moments = ArraySpec("float32", ("K", cfg.deformation.hexplane.channels))
-        cells = sum(
-            rows * columns for scale in plane_shapes(cfg.deformation.hexplane) for rows, columns in scale.values()
-        )
-        planes = {"marks": ArraySpec("uint8", (cells,)), "exp_avg": moments, "exp_avg_sq": moments}
-        planes["steps"] = ArraySpec("int64", (1,))
-    optimizer = {f"{name}.{moment}": spec for name, spec in trained.items() for moment in ("first", "second")}
-    for name, spec in trained.items():
-        optimizer[f"{name}.steps"] = ArraySpec("int64", (spec.shape[1] if name == "motion" else 1,))
-    optimizer |= {f"plane_adam.{name}": spec for name, spec in planes.items()}
-    stats = {f"stats.{field.name}": ArraySpec("float32", ("N",)) for field in fields(DensityStats)}
-    found = {f"optimizer.{name}": spec for name, spec in optimizer.items()}
-    return model | found | stats | _track_specs(cfg)
-
-
-def _frame_specs(trainer: Trainer) -> dict[str, ArraySpec]:
-    """What is found of each of the `F` training frames: its pose, and how its depth fits."""
-    specs = {}
-    if trainer.step_once.poses is not None:
-        specs = {f"poses.{name}": ArraySpec("float64", ("F", 6)) for name in ("twists", "first", "second", "accepted")}
-        specs["poses.steps"] = ArraySpec("int64", ("F",))
-    return specs | ({"depth_fit": ArraySpec("float64", ("F", 2))} if trainer.fits_depth else {})
-
-
-def _track_specs(cfg: Config) -> dict[str, ArraySpec]:
-    """The tracks to which motion is held, where it is; `P` tracks, `F` training frames."""
-    if not (cfg.loss.track_weight and cfg.init.motion == "flow"):
-        return {}
-    specs = {"coefficients": ArraySpec("float32", ("P", cfg.deformation.basis.num_bases, 3))}
-    specs |= {"followed": ArraySpec("float32", ("P", "F")), "rows": ArraySpec("int64", ("N",))}
-    return {f"tracks.{name}": spec for name, spec in specs.items()}
 
 
 def check_state(arrays: Mapping[str, Tensor], iteration: int) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from ..system.atomic import write_text
-from ..training.state import Stage, StepReport
+from ..training.stage import Stage, StepReport
 from ..training.trainer import Trainer
 from .checkpoint import save_checkpoint
 

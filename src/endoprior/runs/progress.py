@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from ..system.console import say
 
 if TYPE_CHECKING:
-    from ..training.state import StepReport
+    from ..training.stage import StepReport
     from ..training.trainer import Observer, Trainer
 
 PLAIN_EVERY_SECONDS = 10.0
@@ -53,15 +53,15 @@ class _Lines:
 
     def __init__(self, every_seconds: float, show: Callable[[str], None]) -> None:
         self.every_seconds, self.show = every_seconds, show
-        self.began = clock.monotonic()
-        self.last = self.began
-        self.done_before: int | None = None
+        self.began = self.last = clock.monotonic()
+        self.done = self.done_before = 0
 
     def __call__(self, report: StepReport, trainer: Trainer) -> None:
         done, total = trainer.progress()
-        if self.done_before is None:
-            self.done_before = done - 1
         now = clock.monotonic()
+        if self.done == 0 or done <= self.done:  # the first iteration, or that of the next window
+            self.began, self.done_before = now - report.seconds, done - 1
+        self.done = done
         if now - self.last < self.every_seconds and done < total:
             return
         self.last = now

@@ -9,12 +9,13 @@ from pathlib import Path
 from ..core.checks import InputError
 from ..core.config import Config
 from ..data import FrameSequence
-from ..model.single_scene import SingleScene
+from ..model.method import method_of
+from ..model.scene import Scene
 from ..system.atomic import write_json, writing
 from ..system.file_lock import locked
 from ..training.divergence import Diverged
 from ..training.memory_check import reject_too_large
-from ..training.trainer import Observer, Trainer
+from ..training.trainer import Observer
 from . import kernel_cache
 from .checkpoint import load_checkpoint, save_checkpoint
 from .folder import CHECKPOINT, CONFIG, LOCK, LOG, SCENE, prepare_run_folder, reject_unusable_folder
@@ -55,9 +56,9 @@ class TrainingRun:
         say(f"{sequence.path}: {len(sequence)} frames; backend {cfg.render.backend}")
         for warning in sequence.validate():
             say(f"note: {warning}")
-        self.trainer = Trainer(sequence, cfg)
+        self.trainer = method_of(cfg).trainer(sequence, cfg)
 
-    def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> SingleScene:
+    def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> Scene:
         """Train to the end; `observers` are called after each iteration, in this order. See `runs.train`."""
         if self.out is None:
             self.trainer.start()

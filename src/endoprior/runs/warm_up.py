@@ -14,7 +14,7 @@ from ..core.config_io import from_dict
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..evaluation.scoring import evaluate
-from ..training.trainer import Trainer
+from ..model.method import method_of
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
 
@@ -50,7 +50,7 @@ def shortened(cfg: Config) -> Config:
 def main() -> None:
     """Read the config, train, score."""
     cfg, sequence = shortened(from_dict(Config, json.load(sys.stdin))), tiny_sequence()
-    trainer = Trainer(sequence, cfg)
+    trainer = method_of(cfg).trainer(sequence, cfg)
     trainer.start()
     while not trainer.finished:
         trainer.step()

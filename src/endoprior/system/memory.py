@@ -13,7 +13,7 @@ from ..core.checks import input_error
 
 CACHE_SHARE = 0.1
 """Size of each frame cache, as a share of the free memory at its creation ..."""
-LEAST_CACHE, LARGEST_CACHE = 256 * 2**20, 768 * 2**20
+LEAST_CACHE, LARGEST_CACHE = 256 * 2**20, 512 * 2**20
 """... but at least and at most so many bytes: a window of a long sequence fits, and memory does not grow."""
 LEAST_DATA, LEAST_SPACE = 600 * 2**20, 1500 * 2**20
 """Writable memory and address space that the libraries alone need, bytes (docs/reliability.md)."""

@@ -49,6 +49,14 @@ def apply_plan(
     return grown, parents[rows]
 
 
+def reset_opacities(optimizer: Optimizer, most: float) -> None:
+    """Lower every opacity above `most` to it, and let Adam forget what it knew of them."""
+    logits, state = optimizer.gaussians["opacity_logits"], optimizer.states["opacity_logits"]
+    logits.detach().clamp_(max=math.log(most / (1 - most)))
+    state.first.zero_()
+    state.second.zero_()
+
+
 def split_children(gaussians: Gaussians, split: Tensor, shrink: float, rng: np.random.Generator) -> dict[str, Tensor]:
     """Two children for each Gaussian marked in `split` (N,): centers sampled from it, scales divided by `shrink`."""
     tensors = {name: value.detach()[split] for name, value in gaussians.tensors.items()}

@@ -11,7 +11,7 @@ import math
 from ..core.checks import InputError
 from ..core.config import Config
 from ..data import FrameSequence
-from ..model.schema import model_schema
+from ..model.method import method_of
 from ..system.memory import available_bytes
 
 FLOAT = 4
@@ -36,12 +36,13 @@ def least_bytes(cfg: Config, num_train: int, width: int, height: int) -> int:
     num = cfg.init.budget
     sizes = {
         name: FLOAT * math.prod(num if length == "N" else length for length in spec.shape)
-        for name, spec in model_schema(cfg).items()
+        for name, spec in method_of(cfg).schema(cfg).items()
+        if name.startswith(("gaussians.", "field."))
     }
     motion = sizes.get("gaussians.motion", 0)
     state = (1 + MOMENTS) * sum(sizes.values())
     # Growing and pruning copy a tensor twice; tracks are there before the moments are.
-    growing = 2 * max(size for name, size in sizes.items() if name.startswith("gaussians."))
+    growing = 2 * max((size for name, size in sizes.items() if name.startswith("gaussians.")), default=0)
     tracks = TRACK_BYTES * num_train * num + motion if cfg.init.motion == "flow" and motion else 0
     return LEAST_BYTES + PICTURE_BYTES * width * height + max(state + growing, tracks)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..core.geometry import back_project, project
 from ..core.types import Camera
+from ..footage.corner_flow import follow_both_ways
 from .frames import TrainingFrames
 
 CORNERS = 120
@@ -58,15 +59,13 @@ def _followed(
     corners = cv2.goodFeaturesToTrack(was, CORNERS, 0.01, 9, mask=inner)
     if corners is None:
         return None
-    options = {"winSize": (21, 21), "maxLevel": 3}
-    there, ok, _ = cv2.calcOpticalFlowPyrLK(was, gray, corners, None, **options)
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(gray, was, there, None, **options)
-    kept = (ok & ok_back)[:, 0].astype(bool) & (np.abs(back - corners)[:, 0].max(1) < RETURN_PX)
+    corners = corners[:, 0]
+    there, kept = follow_both_ways(was, gray, corners, RETURN_PX)
     if not kept.any():
         return None
-    x, y = corners[kept, 0].round().astype(int).T
+    x, y = corners[kept].round().astype(int).T
     # OpenCV counts pixel centers from 0.
-    pixels, ends = (points[kept, 0].astype(np.float64) + 0.5 for points in (corners, there))
+    pixels, ends = (points[kept].astype(np.float64) + 0.5 for points in (corners, there))
     return FollowedCorners(first, pixels, 1 / inverse[y, x].astype(np.float64), ends)
 
 

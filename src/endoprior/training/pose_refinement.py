@@ -21,8 +21,8 @@ from ..core.config_poses import PoseConfig
 from ..core.types import Camera, Splats
 from .adam import BETA1, BETA2
 from .frames import TrainingFrames
-from .optimizer import log_linear
 from .pose_check import FollowedCorners, corner_error_px, follow_corners
+from .rates import log_linear
 
 EPSILON = 1e-15
 """Adam's."""

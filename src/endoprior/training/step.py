@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time as clock
 from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -11,22 +13,29 @@ from torch import Tensor
 
 from ..core.config import Config
 from ..core.types import RenderOutput, Splats
-from ..model.deformation import Offsets
-from ..model.single_scene import offsets_at
+from ..model.deformation import HexPlaneField, Offsets
 from ..render import Rasterizer
 from . import density, depth_fit
-from .densify import apply_plan
+from .densify import apply_plan, reset_opacities
 from .divergence import ADVICE, Diverged, DivergenceCheck
+from .drawn import Drawn
 from .frames import TrainingFrame, TrainingFrames
-from .losses import supervised_terms
+from .gaussians_state import GaussiansState
 from .mask_doubt import MaskDoubt
 from .missed_tools import START
 from .ops import TrainingOps
 from .pose_refinement import PoseRefinement, moved, smoothness
 from .scale_limit import limit_scales
-from .state import Stage, StepReport, TrainState
+from .stage import Stage, StepReport, stage_length
 from .temporal import temporal_terms
 from .track_loss import track_term
+
+if TYPE_CHECKING:
+    from .gaussian_method import GaussianMethod
+
+
+RESET_OPACITY = 0.01
+"""Where methods that reset opacities lower them to (3DGS)."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +60,7 @@ class TrainingStep:
     Every random choice is a pure function of (seed, stage, iteration), so a resumed run repeats an uninterrupted one.
     """
 
+    method: GaussianMethod
     cfg: Config
     frames: TrainingFrames
     camera_centers: Tensor
@@ -65,7 +75,12 @@ class TrainingStep:
     background: Tensor = field(default_factory=lambda: torch.zeros(3))
     """(3,) color behind everything."""
 
-    def __call__(self, state: TrainState) -> StepReport:
+    @cached_property
+    def context(self) -> Any:
+        """See `GaussianMethod.context`."""
+        return self.method.context(self.frames, self.cfg)
+
+    def __call__(self, state: GaussiansState) -> StepReport:
         """Deform, render, compare, differentiate, check, update, then grow or prune.
 
         Where the report has a `divergence`, the state is the one after the last good iteration.
@@ -76,22 +91,39 @@ class TrainingStep:
         began = clock.perf_counter()
         cfg, iteration, fine = self.cfg, state.iteration + 1, state.stage is Stage.FINE
         rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
-        position = int(rng.integers(len(self.frames))) if fine else 0
+        position = self.method.position(cfg.seed, state.stage, iteration, len(self.frames), rng)
         right = fine and cfg.data.eyes == "both" and rng.random() < 0.5
         batch = self._right_batch(iteration, position) if right else self._batch(iteration, position, fine)
 
         splats, offsets, means_before = self._deform(state, batch, iteration)
-        drawn, twist = self._posed(state, splats, batch)
-        out = self.rasterize(
-            drawn, batch.frame.camera, background=self.background, depth_grad_to_means=cfg.render.depth_grad_to_means
+        posed, twist = self._posed(state, splats, batch)
+        draw = partial(
+            self.rasterize,
+            camera=batch.frame.camera,
+            background=self.background,
+            depth_grad_to_means=cfg.render.depth_grad_to_means,
         )
+        out = draw(posed)
         out.means2d.retain_grad()
         counted = batch.frame
         if self.doubt and fine and not right and iteration > START * stage_length(cfg, Stage.FINE):
             counted = self.doubt.counted(counted, out.color)
         if state.depth_fit is not None and fine:
             counted = depth_fit.fitted(counted, state.depth_fit[batch.position])
-        terms = supervised_terms(out, counted, cfg.loss, self.ops)
+        drawn = Drawn(
+            stage=state.stage,
+            iteration=iteration,
+            position=position,
+            frame=counted,
+            gaussians=state.gaussians,
+            field=state.field,
+            offsets=offsets,
+            splats=posed,
+            out=out,
+            draw=draw,
+            context=self.context,
+        )
+        terms = self.method.terms(drawn, cfg, self.ops)
         if offsets is not None and state.tracks is not None:
             terms |= self._track_terms(state, batch, offsets)
         if batch.before is not None:
@@ -101,7 +133,7 @@ class TrainingStep:
         sum(terms.values()).backward()
 
         last = iteration == stage_length(cfg, state.stage)
-        densify = density.due(iteration, fine and last, cfg.density)
+        densify = self.method.density_due(state.stage, iteration, last, cfg)
         divergence = self.check.after_backward(
             iteration, terms, state.optimizer.count_unusable(), batch.frame.brightness, wait=densify or last
         )
@@ -120,7 +152,9 @@ class TrainingStep:
                     log_scales = state.gaussians["log_scales"].detach()
                     limit_scales(log_scales, splats.means, batch.frame.camera, cfg.density.max_scale_share)
                 if densify:
-                    self._densify(state, rng)
+                    self._densify(state, iteration, rng)
+                if self.method.reset_due(state.stage, iteration, cfg):
+                    reset_opacities(state.optimizer, RESET_OPACITY)
             state.iteration = iteration
         losses = {name: value.detach() for name, value in terms.items()}
         seconds = clock.perf_counter() - began
@@ -131,6 +165,7 @@ class TrainingStep:
         cfg = self.cfg
         compared = fine and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration
         sampled = cfg.density.score_mode == "every" or density.due(iteration, False, cfg.density)
+        sampled &= self.method.uses_prior
         prior, prior_mask = self.frames.prior(position) if sampled else (None, None)
         return Batch(
             position=position,
@@ -145,55 +180,55 @@ class TrainingStep:
         half = iteration <= self.cfg.schedule.half_resolution_iterations
         return Batch(self.frames.frame(position, half=half, right=True), position, None, None, None)
 
-    def _deform(self, state: TrainState, batch: Batch, iteration: int) -> tuple[Splats, Offsets | None, Tensor | None]:
+    def _deform(
+        self, state: GaussiansState, batch: Batch, iteration: int
+    ) -> tuple[Splats, Offsets | None, Tensor | None]:
         """The Gaussians at the frame, what moved them, and (N, 3) centers at the frame before if known already."""
         gaussians, field, time, before = state.gaussians, state.field, batch.frame.time, batch.before
         offsets: Offsets | None = None
         means_before = None
+        motion = self.method.motion(self.cfg)
         if state.stage is Stage.FINE:
-            if before is None or field is None or self.cfg.temporal.gradient != "both":
-                offsets = offsets_at(gaussians, field, time, self.cfg, self.ops.model)
+            if before is None or self.cfg.temporal.gradient != "both" or not isinstance(field, HexPlaneField):
+                offsets = motion.offsets(gaussians, field, time, self.cfg, self.ops.model)
             else:
                 offsets, displacement = field.offsets_and_displacement(
                     gaussians["means"], time, before.time, self.ops.model
                 )
                 means_before = gaussians["means"] + displacement
-        return gaussians.splats(offsets, sh_degree(self.cfg, state.stage, iteration)), offsets, means_before
+        return motion.splats(gaussians, offsets, sh_degree(self.cfg, state.stage, iteration)), offsets, means_before
 
-    def _posed(self, state: TrainState, splats: Splats, batch: Batch) -> tuple[Splats, Tensor | None]:
+    def _posed(self, state: GaussiansState, splats: Splats, batch: Batch) -> tuple[Splats, Tensor | None]:
         """The Gaussians as the refined camera sees them, and its twist (6,), which gets a gradient; None: as given."""
         if self.poses is None or state.stage is not Stage.FINE:
             return splats, None
         twist = state.poses.twists[batch.position].clone().requires_grad_()
         return moved(splats, batch.frame.camera, twist), twist
 
-    def _track_terms(self, state: TrainState, batch: Batch, offsets: Offsets) -> dict[str, Tensor]:
+    def _track_terms(self, state: GaussiansState, batch: Batch, offsets: Offsets) -> dict[str, Tensor]:
         means, basis = state.gaussians["means"], self.cfg.deformation.basis
         term = track_term(means, offsets.means, state.tracks, batch.frame, batch.position, basis, self.ops)
         return {"track": self.cfg.loss.track_weight * term}
 
-    def _observe(self, state: TrainState, batch: Batch, out: RenderOutput) -> None:
+    def _observe(self, state: GaussiansState, batch: Batch, out: RenderOutput) -> None:
         """Add to the running statistics: the gradient always, the prior's score where there is a prior."""
         camera, skip = batch.frame.camera, self.check.skip
         self.ops.add_gradient(state.stats, out, camera.width, camera.height, skip)
+        if self.method.uses_radii:
+            state.stats.add_radii(out.radii, skip)
         if batch.prior is not None:
             scale = batch.prior.shape[1] / camera.width
             opacities = state.gaussians.opacities
             self.ops.add_score(state.stats, out, batch.prior, batch.prior_mask, opacities, scale, skip)
 
-    def _densify(self, state: TrainState, rng: np.random.Generator) -> None:
-        cfg, gaussians = self.cfg.density, state.gaussians
-        extent = density.scene_extent(self.camera_centers, gaussians["means"], cfg)
-        planned = density.plan(state.stats, gaussians.scales, gaussians.opacities, extent, cfg)
+    def _densify(self, state: GaussiansState, iteration: int, rng: np.random.Generator) -> None:
+        gaussians = state.gaussians
+        extent = density.scene_extent(self.camera_centers, gaussians["means"], self.cfg.density)
+        planned = self.method.plan(state.stats, gaussians, extent, state.stage, iteration, self.cfg)
         if bool(planned.remove.all()):
             raise Diverged(f"expected Gaussians that explain the frames; all {len(planned.remove):,} faded. {ADVICE}")
         state.stats, parents = apply_plan(state.optimizer, planned, state.stats, rng)
         state.tracks = state.tracks and state.tracks.inherited(parents)
-
-
-def stage_length(cfg: Config, stage: Stage) -> int:
-    """Iterations of a stage."""
-    return cfg.schedule.coarse_iterations if stage is Stage.COARSE else cfg.schedule.fine_iterations
 
 
 def sh_degree(cfg: Config, stage: Stage, iteration: int) -> int:

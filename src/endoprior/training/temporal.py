@@ -14,10 +14,10 @@ from torch import Tensor
 from ..core.config import Config, TemporalConfig
 from ..core.geometry import project
 from ..core.types import RenderOutput
-from ..model.single_scene import offsets_at
+from ..model.method import motion_of
 from .frames import TrainingFrame
+from .gaussians_state import GaussiansState
 from .ops import TrainingOps
-from .state import TrainState
 
 MIN_WEIGHT = 1e-4
 """Motion weights up to this are treated as zero (released code)."""
@@ -100,7 +100,7 @@ def least_points(cfg: TemporalConfig) -> int:
 
 
 def temporal_terms(
-    state: TrainState,
+    state: GaussiansState,
     frame: TrainingFrame,
     before: TrainingFrame,
     means: Tensor,
@@ -141,14 +141,15 @@ def temporal_terms(
     }
 
 
-def _means_before(state: TrainState, time: float, index: Tensor, cfg: Config, ops: TrainingOps) -> Tensor:
+def _means_before(state: GaussiansState, time: float, index: Tensor, cfg: Config, ops: TrainingOps) -> Tensor:
     """(P, 3) centers of the chosen Gaussians at an earlier time, with a gradient only if that end is trained."""
+    motion = motion_of(cfg)
     if cfg.temporal.gradient == "both":
         # Moving all and then choosing is cheaper than the scattered gradient of choosing first.
-        moved = state.gaussians["means"] + offsets_at(state.gaussians, state.field, time, cfg, ops.model).means
+        moved = state.gaussians["means"] + motion.offsets(state.gaussians, state.field, time, cfg, ops.model).means
         return moved[index]
     with torch.no_grad():
-        offsets = offsets_at(state.gaussians, state.field, time, cfg, ops.model, index)
+        offsets = motion.offsets(state.gaussians, state.field, time, cfg, ops.model, index)
         return state.gaussians["means"][index] + offsets.means
 
 

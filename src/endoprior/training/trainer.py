@@ -1,40 +1,21 @@
-"""A training run: its first Gaussians, its two stages, and the scene that results.
-
-Two stages. Coarse: the first training frame alone, nothing deforms. Fine: a random training frame each time, deformed.
-"""
+"""What a training run is, whatever the method: it starts or is restored, iterates, and gives a scene."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from .. import render
-from ..core.checks import InputError, input_error
+from ..core.checks import InputError
 from ..core.config import Config
-from ..core.shell import command
-from ..core.types import Camera
 from ..data import FrameSequence
-from ..initialization.first_gaussians import first_gaussians
-from ..model.attributes import motion_layout
-from ..model.deformation import HexPlaneField
-from ..model.gaussians import Gaussians, create_gaussians
-from ..model.scene_file import check_cameras
-from ..model.single_scene import SingleScene
-from ..system.arrays_file import part
-from . import depth_fit
-from .density import DensityStats
-from .divergence import Diverged, DivergenceCheck
-from .frames import TrainingFrames
-from .mask_doubt import MaskDoubt
-from .ops import TrainingOps, ops_for
-from .optimizer import Optimizer
-from .pose_refinement import PoseRefinement, PoseState, refined_cameras
-from .state import Stage, StepReport, TrainState
-from .step import TrainingStep, stage_length
-from .track_loss import StartTracks
+from ..model.scene import Scene
+from ..system.arrays_file import ArraySpec
+from .stage import Stage, StepReport, stage_length
 
 DEFAULT_FRAMES_PER_SECOND = 25.0
 """Playing speed of a sequence that does not state its own."""
@@ -43,98 +24,60 @@ Observer = Callable[[StepReport, "Trainer"], None]
 """Called after each iteration: progress, log, checkpoints, viewer."""
 
 
-class Trainer:
+class State(Protocol):
+    """What changes while training; a checkpoint holds exactly this."""
+
+    stage: Stage
+    iteration: int
+    """Iterations of this stage already done."""
+
+    def arrays(self) -> dict[str, Tensor]:
+        """Every tensor by the name that it has in a checkpoint."""
+        ...
+
+
+class Trainer(ABC):
     """One training run: `start` or `restore`, then `run`; `scene` is its result so far."""
 
-    def __init__(self, sequence: FrameSequence, cfg: Config, ops: TrainingOps | None = None) -> None:
-        """Prepare; nothing is computed yet.
+    sequence: FrameSequence
+    cfg: Config
+    """Fitted to the length of the sequence."""
+    device: torch.device
+    state: Any
+    """A `State`; None before `start` or `restore`."""
 
-        Args:
-            ops: implementation of the operations; None takes the one that suits the device.
-        Raises:
-            InputError: the cameras cannot be used, the backend has no device here, or there is no right eye to train
-                on.
-        """
-        if cfg.data.eyes == "both" and sequence.right_eye is None:
-            fix = f"`{command('prepare', 'VIDEO', sequence.path)} --keep-right`, or leave --eyes out."
-            raise input_error(sequence.path, "right/ and baseline_mm for --eyes both", "no right eye", fix)
-        self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
-        self.device = device_for(cfg.render.backend)
-        self.ops = ops or ops_for(self.device)
-        self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
-        try:
-            check_cameras(self.cameras)
-        except InputError as error:
-            raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
-        frames = TrainingFrames(sequence, cfg.prior, self.device)
-        centers = torch.from_numpy(np.stack([self.cameras[i].center for i in frames.indices]))
-        self.spatial_scale = spatial_scale(centers, cfg)
-        self.step_once = TrainingStep(
-            self.cfg,
-            frames,
-            centers,
-            render.load(cfg.render.backend),
-            self.ops,
-            DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
-            PoseRefinement(self.cameras, frames, self.cfg) if refines_poses(sequence, self.cameras, cfg) else None,
-            MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
-            torch.zeros(3, device=self.device),
-        )
-        self.state: TrainState | None = None
-
+    @abstractmethod
     def start(self) -> None:
-        """Sample the initial points and build the state before the first iteration."""
-        cfg = self.cfg
-        first = first_gaussians(self.sequence.frames("train"), cfg)
-        cloud, motion, tracks = first.cloud, first.motion, None
-        gaussians = create_gaussians(cloud.points, cloud.colors, first.log_scales, cfg, first.quats, first.opacities)
-        if motion is not None:
-            coefficients = torch.from_numpy(motion.coefficients)
-            gaussians["motion"].detach()[..., motion_layout(cfg.deformation)["means"]] = coefficients
-            if cfg.loss.track_weight:
-                tracks = StartTracks.of_first(coefficients, torch.from_numpy(motion.followed).float()).to(self.device)
-        field = None
-        if cfg.deformation.kind == "hexplane":
-            generator = torch.Generator().manual_seed(cfg.seed)
-            field = HexPlaneField.from_points(gaussians["means"].detach(), cfg.deformation, generator)
-        stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
-        num = len(self.sequence.indices("train"))
-        poses = PoseState.at_start(num) if self.step_once.poses else None
-        fit = depth_fit.at_start(num) if self.fits_depth else None
-        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, poses, fit)
+        """Build the state before the first iteration."""
 
-    @property
-    def fits_depth(self) -> bool:
-        """Whether the depth of each frame is compared up to a scale and a shift."""
-        return self.cfg.loss.fit_relative_depth and self.sequence.depth_is_relative
-
+    @abstractmethod
     def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
-        """Continue from a state that `TrainState.arrays` gave, trusted to fit the config."""
-        gaussians, field = Gaussians(part(arrays, "gaussians.")).to(self.device), None
-        if self.cfg.deformation.kind == "hexplane":
-            field = HexPlaneField.from_state_arrays(part(arrays, "field."), self.cfg.deformation).to(self.device)
-        held = part(arrays, "tracks.")
-        poses = PoseState(**part(arrays, "poses.")) if self.step_once.poses else None
-        tracks = StartTracks(**held).to(self.device) if held else None
-        self._enter(stage, gaussians, field, tracks, poses, arrays.get("depth_fit"))
-        self.state.iteration = iteration
-        self.state.optimizer.load_state_arrays(part(arrays, "optimizer."))
-        self.state.stats = DensityStats(
-            **{name: value.to(self.device) for name, value in part(arrays, "stats.").items()}
-        )
+        """Continue from a state that `State.arrays` gave and that `schema` describes."""
 
-    def _enter(
-        self,
-        stage: Stage,
-        gaussians: Gaussians,
-        field: HexPlaneField | None,
-        tracks: StartTracks | None,
-        poses: PoseState | None,
-        fit: Tensor | None,
-    ) -> None:
-        optimizer = Optimizer(gaussians, field, self.cfg, self.spatial_scale, self.ops)
-        stats = DensityStats.zeros(len(gaussians), self.device)
-        self.state = TrainState(stage, 0, gaussians, field, optimizer, stats, tracks, poses, fit)
+    @abstractmethod
+    def schema(self) -> dict[str, ArraySpec]:
+        """Names, types and shapes of the arrays of its state; `F` training frames."""
+
+    @abstractmethod
+    def step(self) -> StepReport:
+        """One iteration.
+
+        Raises:
+            Diverged: training cannot go on. Nothing infinite has reached the state, and `state.iteration` is the last
+                good one.
+        """
+
+    @abstractmethod
+    def scene(self) -> Scene:
+        """The scene as it is now, on the CPU."""
+
+    @abstractmethod
+    def synchronize(self) -> None:
+        """Wait for a device and check what it did, so that the state is known to be good; on the CPU it always is.
+
+        Raises:
+            Diverged: as `step`.
+        """
 
     @property
     def finished(self) -> bool:
@@ -147,21 +90,6 @@ class Trainer:
         before = coarse if self.state.stage is Stage.FINE else 0
         return before + self.state.iteration, coarse + fine
 
-    def step(self) -> StepReport:
-        """One iteration; see `TrainingStep`.
-
-        Raises:
-            Diverged: the loss or a gradient is not finite, the images show nothing, or no Gaussian is left. Nothing
-                infinite has reached the state, and `state.iteration` is the last good one.
-        """
-        state = self.state
-        if state.stage is Stage.COARSE and state.iteration >= stage_length(self.cfg, Stage.COARSE):
-            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, state.poses, state.depth_fit)
-        report = self.step_once(self.state)
-        if report.divergence is not None:
-            raise Diverged(report.divergence.reason)
-        return report
-
     def run(self, observers: list[Observer]) -> None:
         """Iterate to the end; every observer is called after each iteration, in order.
 
@@ -172,45 +100,6 @@ class Trainer:
             report = self.step()
             for observe in observers:
                 observe(report, self)
-
-    def synchronize(self) -> None:
-        """Wait for a device and check what it did, so that the state is known to be good; on the CPU it always is.
-
-        Raises:
-            Diverged: as `step`.
-        """
-        divergence = self.step_once.check.results(applied=self.state.iteration)
-        if divergence is not None:
-            self.state.iteration = divergence.last_good
-            raise Diverged(divergence.reason)
-
-    def _refined_cameras(self) -> tuple[Camera, ...]:
-        if self.state.poses is None:
-            return self.cameras
-        return refined_cameras(self.cameras, self.step_once.frames.indices, self.state.poses.twists.numpy())
-
-    def scene(self) -> SingleScene:
-        """The scene as it is now, on the CPU."""
-        state, trained, num = self.state, self.step_once.frames.indices, len(self.sequence)
-        holds = self.cfg.deformation.kind == "basis"  # the papers' fields go on as they are
-        return SingleScene(
-            gaussians=state.gaussians.to("cpu"),
-            field=state.field and state.field.to("cpu"),
-            config=self.cfg,
-            cameras=self._refined_cameras(),
-            frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
-            prior_score=state.stats.score(self.cfg.density.unobserved_score).cpu(),
-            num_valid=state.stats.num_valid.cpu().clone(),
-            lengths_are_relative=self.sequence.depth_is_relative,
-            trained_from=trained[0] / num if holds else 0.0,
-            trained_until=trained[-1] / num if holds else 1.0,
-        )
-
-
-def refines_poses(sequence: FrameSequence, cameras: Sequence[Camera], cfg: Config) -> bool:
-    """Whether training changes camera poses: as `PoseConfig.refine` says, and never those of a static camera."""
-    wanted = cfg.poses.refine == "always" or (cfg.poses.refine == "estimated" and sequence.poses_are_estimated)
-    return wanted and any((camera.world_to_camera != cameras[0].world_to_camera).any() for camera in cameras)
 
 
 def device_for(backend: render.Backend) -> torch.device:
@@ -227,9 +116,3 @@ def device_for(backend: render.Backend) -> torch.device:
             "`endoprior doctor` tells what is missing."
         )
     return torch.device("cuda")
-
-
-def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:
-    """Factor of the learning rates that are lengths: 1.1 x radius of the camera path; constant for a static one."""
-    radius = 1.1 * float((camera_centers - camera_centers.mean(0)).norm(dim=-1).max())
-    return radius if radius > 1e-3 else cfg.optim.still_camera_scale

@@ -13,7 +13,7 @@ from .server import Viewer
 from .viewable_scene import ViewableScene
 
 if TYPE_CHECKING:
-    from ..training.state import StepReport
+    from ..training.stage import StepReport
     from ..training.trainer import Trainer
 
 REFRESH_SECONDS = 2.0

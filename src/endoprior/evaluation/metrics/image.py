@@ -101,6 +101,20 @@ def ssim_tissue(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> flo
     return float(_ssim_map(image, target, mask)[mask].mean()) if mask.any() else float("nan")
 
 
+def ssim_valid(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
+    """Structural similarity of the masked images over the windows that lie completely inside the frame.
+
+    No zeros are added around the frame: 5 px at each border are no center of a window. Otherwise as `ssim`.
+
+    Returns:
+        Value in [-1, 1]; 1 for equal images, NaN for an empty mask or a frame smaller than the window.
+    """
+    _check_images(image, target, mask)
+    border = SSIM_WINDOW // 2
+    inside = _ssim_map(image, target, mask)[border:-border, border:-border]
+    return float(inside.mean()) if mask.any() and inside.size else float("nan")
+
+
 def _ssim_map(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(H, W, 3) structural similarity of the masked images."""
     a = np.where(mask[..., None], image, 0).astype(np.float64)
@@ -148,13 +162,29 @@ def depth_rmse_endogaussian(depth: NDArray, target: NDArray, mask: NDArray[np.bo
     Raises:
         ValueError: as `depth_rmse`.
     """
-    _valid_differences(depth, target, mask)
-    if not mask.any():
+    return depth_rmse_8bit(depth, target, mask, mask.size)
+
+
+def depth_rmse_8bit(depth: NDArray, target: NDArray, counted: NDArray[np.bool_], pixels: int) -> float:
+    """A depth figure of 8-bit files: values, differences and squares wrap modulo 256. Not an error in any unit.
+
+    Args:
+        depth: (H, W) rendered z, mm, >= 0.
+        target: (H, W) measured z, mm, >= 0.
+        counted: (H, W) True = add the pixel's wrapped square.
+        pixels: number that divides the sum: those of the frame, or the counted ones.
+    Returns:
+        A number without unit; NaN where no pixel counts.
+    Raises:
+        ValueError: as `depth_rmse`.
+    """
+    _valid_differences(depth, target, counted)
+    if not counted.any():
         return float("nan")
     # The remainder first: casting a float above 255 straight to uint8 is undefined, one above 2^63 to any integer.
-    a, b = (np.fmod(np.where(mask, z, 0), 256).astype(np.int64).astype(np.uint8) for z in (depth, target))
+    a, b = (np.fmod(z[counted], 256).astype(np.int64).astype(np.uint8) for z in (depth, target))
     difference = a - b
-    return float(np.sqrt(np.sum(difference * difference, dtype=np.int64) / mask.size))
+    return float(np.sqrt(np.sum(difference * difference, dtype=np.int64) / pixels))
 
 
 def _squared_error(image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -1,7 +1,8 @@
 """LPIPS (Zhang et al. 2018): the distance of two images in the features of a classifier, through the lpips package.
 
-`lpips` means AlexNet, as published; the same distance with SqueezeNet is scored as `lpips_squeeze`. The package
-contains the calibrated heads; `weights.find_weights` finds the classifier's weights.
+`lpips` means AlexNet, as published; the same distance with SqueezeNet is scored as `lpips_squeeze`. VGG16 and images in
+[0, 1] are for the protocols of other papers. The package contains the calibrated heads; `weights.find_weights` finds
+the classifier's weights.
 """
 
 from __future__ import annotations
@@ -17,13 +18,25 @@ from numpy.typing import NDArray
 from ...core.checks import check_shape
 from ...core.extras import missing_package
 from .torchvision_compat import import_torchvision
-from .weights import ALEXNET, SQUEEZENET, FoundWeights, ScoreUnavailable, find_weights, load_weights, select_weights
+from .weights import (
+    ALEXNET,
+    SQUEEZENET,
+    VGG16,
+    FoundWeights,
+    ScoreUnavailable,
+    WeightFiles,
+    find_weights,
+    load_weights,
+    select_weights,
+)
 
 if TYPE_CHECKING:
     from torch.nn import Module
 
 HEADS_VERSION = "0.1"
 """Version of the calibrated heads: the one every published LPIPS figure uses."""
+Backbone = Literal["alex", "squeeze", "vgg"]
+CLASSIFIERS: dict[Backbone, WeightFiles] = {"alex": ALEXNET, "squeeze": SQUEEZENET, "vgg": VGG16}
 MIN_SIZE = 32
 """Shortest side, px: much below it the deepest features have no pixel left."""
 
@@ -33,9 +46,11 @@ class LpipsDistance:
     """The distance, ready to be called on one frame after another."""
 
     network: Module
+    lowest: Literal[-1, 0] = -1
+    """Value of black in what the network sees; white is 1. The network is calibrated for -1."""
 
     def __call__(self, image: NDArray, target: NDArray, mask: NDArray[np.bool_]) -> float:
-        """LPIPS of the masked images scaled to [-1, 1], averaged over the frame.
+        """LPIPS of the masked images scaled to [lowest, 1], averaged over the frame.
 
         Args:
             image: (H, W, 3) rendered color in [0, 1].
@@ -59,21 +74,20 @@ class LpipsDistance:
             raise ScoreUnavailable(f"LPIPS needs images of at least {MIN_SIZE} px a side; got {size['W']}x{size['H']}")
         if not mask.any():
             return float("nan")
-        a, b = (
-            torch.from_numpy(np.where(mask[..., None], x, 0).astype(np.float32) * 2 - 1).permute(2, 0, 1)[None]
-            for x in (image, target)
-        )
+        scale = np.float32(1 - self.lowest)
+        scaled = (np.where(mask[..., None], x, 0).astype(np.float32) * scale + self.lowest for x in (image, target))
+        a, b = (torch.from_numpy(x).permute(2, 0, 1)[None] for x in scaled)
         with torch.inference_mode():
             return float(self.network(a, b))
 
 
 def lpips_distance(
-    backbone: Literal["alex", "squeeze"] = "alex",
+    backbone: Backbone = "alex",
     weights_dir: Path | None = None,
     *,
     download: bool = True,
 ) -> LpipsDistance:
-    """Load LPIPS. "alex" is the published score's classifier; "squeeze" has a score of its own.
+    """Load LPIPS. "alex" is the published score's classifier; "squeeze" has a score of its own, "vgg" is for protocols.
 
     Args:
         backbone: which classifier.
@@ -84,7 +98,7 @@ def lpips_distance(
         ScoreUnavailable: lpips, torchvision or the weights are missing, with the reason.
     """
     import_torchvision()
-    found = find_weights(ALEXNET if backbone == "alex" else SQUEEZENET, weights_dir, download=download)
+    found = find_weights(CLASSIFIERS[backbone], weights_dir, download=download)
     network, heads = _untrained(backbone)
     state = network.state_dict()
     trunk = {name: _stored_name(name) for name in state if name.startswith("net.")}

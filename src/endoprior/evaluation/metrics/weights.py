@@ -67,6 +67,7 @@ def _published(network: str, folder_name: str, url_name: str) -> WeightFiles:
 RAFT_LARGE = _published("RAFT-large", "raft_large.safetensors", "raft_large_C_T_SKHT_V2-ff5fadd5.pth")
 RAFT_SMALL = _published("RAFT-small", "raft_small.safetensors", "raft_small_C_T_V2-01064c6d.pth")
 ALEXNET = _published("AlexNet", "alexnet_features.safetensors", "alexnet-owt-7be5be79.pth")
+VGG16 = _published("VGG16", "vgg16_features.safetensors", "vgg16-397923af.pth")
 SQUEEZENET = _published("SqueezeNet 1.1", "squeezenet1_1_features.safetensors", "squeezenet1_1-b8a52dc0.pth")
 
 

@@ -1,9 +1,8 @@
-"""The path of the camera in the scene, against the true one; needs ground truth."""
+"""The path of the camera in the scene, against the true one, or a given one that stands in for it."""
 
 from __future__ import annotations
 
-import numpy as np
-
+from ...core.geometry import camera_to_world
 from .. import metrics
 from ..context import EvaluationContext
 from ..score import Score
@@ -35,11 +34,11 @@ ONE_FRAME = "a single frame has no motion"
 
 def compute(context: EvaluationContext) -> None:
     """Compare the cameras of all frames, whatever the split; nothing without the true path."""
-    truth = context.sequence.truth
-    if truth is None or truth.camera_to_world is None:
+    if context.true_path is None:
         return
     scene = context.rendered_scene
-    estimated = np.linalg.inv(np.stack([camera.world_to_camera for camera in scene.cameras]))
-    errors = metrics.trajectory_errors(estimated, truth.camera_to_world, with_scale=scene.lengths_are_relative)
+    errors = metrics.trajectory_errors(
+        camera_to_world(scene.cameras), context.true_path, with_scale=scene.lengths_are_relative
+    )
     for score in SCORES:
         context.add(score.name, getattr(errors, score.name), ONE_FRAME)

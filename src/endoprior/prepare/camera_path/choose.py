@@ -8,12 +8,19 @@ from typing import Literal
 
 from ...core.checks import input_error
 from ...core.extras import install_command
-from .colmap import LONGEST, colmap_path, is_installed
+from .colmap import LONGEST, SECONDS_AN_IMAGE, colmap_path, is_installed, stride_of
 from .explained import explained_share
 from .own import own_path
 from .seen import CameraPath, Lens, PoseInput
 
 How = Literal["best", "own", "colmap"]
+
+
+def colmap_seconds(how: How, count: int) -> float:
+    """About how long COLMAP takes to find the path of a clip of `count` frames, s; 0 where it takes no part."""
+    if how == "own" or not is_installed() or (how == "best" and count > LONGEST):
+        return 0.0
+    return SECONDS_AN_IMAGE * len(range(0, count, stride_of(count)))
 
 
 def find_path(
@@ -53,4 +60,4 @@ def find_path(
     mine, theirs = (explained_share(follower.tracks, lens, path) for path in (own, other))
     best = other if how == "colmap" or theirs > mine else own
     note = f"camera path by {best.method}: COLMAP explains {theirs:.1%} of the held-out tracks, our own path {mine:.1%}"
-    return replace(best, notes=[*best.notes, note])
+    return replace(best, notes=[*own.notes, note, *other.notes] if best is own else [*best.notes, note])

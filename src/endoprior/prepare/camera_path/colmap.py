@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import tempfile
+import time as clock
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
@@ -34,10 +35,24 @@ DEFORMING = 0.1
 """Tracks below this weight deform; the tissue around them is masked ..."""
 AROUND = 40
 """... within the image width divided by this."""
-SECONDS_A_FRAME = 1.0
-"""Mapping that takes longer is stopped."""
+SECONDS_AN_IMAGE = 1.0
+"""About the time for each image, on two cores. Mapping that alone takes longer is stopped: see `time_note`."""
+LEAST_SECONDS = 60
+"""Mapping may always take this long."""
 LEAST_SHARE = 0.3
 """A model with a smaller share of the frames is no path of the clip."""
+
+
+def time_note(seconds: float, limit: float) -> list[str]:
+    """A note for the user if mapping was stopped, because the path then depends on the speed of the machine.
+
+    Args:
+        seconds: that it took.
+        limit: after which COLMAP stops it, s.
+    """
+    if seconds < limit:
+        return []
+    return [f"COLMAP was stopped after {limit:.0f} s: a faster machine may find another path; `--poses own` does not"]
 
 
 def is_installed() -> bool:
@@ -45,16 +60,21 @@ def is_installed() -> bool:
     return find_spec("pycolmap") is not None
 
 
+def stride_of(count: int) -> int:
+    """Every how many frames of a clip one is mapped."""
+    return min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
+
+
 def colmap_poses(
     frame: Callable[[int], PoseInput], count: int, follower: Follower, *, refine_focal: bool
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], float] | None:
-    """World-to-camera poses (T, 4, 4) in units of its own, (T,) which frames are registered, and the focal factor.
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], float, list[str]] | None:
+    """World-to-camera poses (T, 4, 4) in units of its own, (T,) which frames are registered, focal factor, notes.
 
     None if no model holds enough frames.
     """
     import pycolmap
 
-    stride = min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
+    stride = stride_of(count)
     pycolmap.logging.minloglevel = 2
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -62,7 +82,7 @@ def colmap_poses(
             seen = frame(i)
             save_png(_file(folder, "images", i), seen.rgb_u8)
             save_png(_file(folder, "masks", i, ".png"), _allowed(seen, follower, i).astype(np.uint8) * 255)
-        models = _reconstruct(pycolmap, folder, follower.lens.matrix, refine_focal)
+        models, notes = _reconstruct(pycolmap, folder, follower.lens.matrix, refine_focal)
     if not models:
         return None
     best = max(models.values(), key=lambda model: model.num_reg_images())
@@ -74,7 +94,7 @@ def colmap_poses(
             index = int(Path(image.name).stem)
             poses[index, :3], known[index] = image.cam_from_world().matrix(), True
     focal = next(iter(best.cameras.values())).params[0]
-    return poses, known, float(focal / follower.lens.matrix[0, 0])
+    return poses, known, float(focal / follower.lens.matrix[0, 0]), notes
 
 
 def colmap_path(
@@ -90,7 +110,7 @@ def colmap_path(
     found = colmap_poses(frame, count, follower, refine_focal=refine_focal)
     if found is None:
         return None
-    poses, known, focal_factor = found
+    poses, known, focal_factor, notes = found
     base = _with_lens(follower, focal_factor)
     unit = float(np.exp(np.median(np.log(with_poses(base, poses, known).scales[known]))))
     poses[:, :3, 3] /= unit
@@ -100,7 +120,8 @@ def colmap_path(
     explained = known | (follower.segment == follower.segment[np.argmax(known)])
     stds = place_frames(world, np.flatnonzero(known), follower.poses, explained)
     explained = known | (explained & np.isfinite(stds[0]))
-    return replace(finished_path(world, explained, *stds), method=COLMAP_POSES, focal_factor=focal_factor)
+    path = finished_path(world, explained, *stds)
+    return replace(path, method=COLMAP_POSES, focal_factor=focal_factor, notes=notes)
 
 
 def _with_lens(follower: Follower, focal_factor: float) -> Follower:
@@ -111,8 +132,8 @@ def _with_lens(follower: Follower, focal_factor: float) -> Follower:
     return out
 
 
-def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: bool) -> dict[int, Any]:
-    """All models of the images in a folder; COLMAP counts the center of the left-most pixel as 0.5."""
+def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: bool) -> tuple[dict[int, Any], list[str]]:
+    """All models of the images in a folder, and notes; COLMAP counts the center of the left-most pixel as 0.5."""
     database = folder / "database.db"
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model, reader.mask_path = "PINHOLE", folder / "masks"
@@ -128,7 +149,8 @@ def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: boo
     mapping.extract_colors = False
     mapping.mapper.init_min_tri_angle = 4.0
     mapping.max_num_models = 2
-    mapping.max_runtime_seconds = int(max(60, SECONDS_A_FRAME * len(list((folder / "images").iterdir()))))
+    limit = int(max(LEAST_SECONDS, SECONDS_AN_IMAGE * len(list((folder / "images").iterdir()))))
+    mapping.max_runtime_seconds = limit
     (folder / "models").mkdir()
     device = pycolmap.Device.cpu
     single = pycolmap.CameraMode.SINGLE
@@ -138,7 +160,9 @@ def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: boo
         device=device,
     )  # fmt: skip
     pycolmap.match_sequential(database, device=device)
-    return pycolmap.incremental_mapping(database, folder / "images", folder / "models", mapping)
+    began = clock.perf_counter()
+    models = pycolmap.incremental_mapping(database, folder / "images", folder / "models", mapping)
+    return models, time_note(clock.perf_counter() - began, limit)
 
 
 def _allowed(seen: PoseInput, follower: Follower, index: int) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...footage.corner_flow import follow_both_ways
 from ...priors.specular import specular_likelihood
 from .seen import PoseInput
 
@@ -20,9 +21,9 @@ CELLS = (8, 6)
 """The image is divided into these columns and rows; no cell holds more than twice its share of the corners."""
 FLAT_WIDTHS, FLAT_CONTRAST = 64, 300.0
 """Shading is what is left after a blur by the image width divided by this; contrast of the rest, gray levels."""
-COARSE = {"winSize": (21, 21), "maxLevel": 4}
-FINE = {"winSize": (21, 21), "maxLevel": 1, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW, "criteria": (3, 20, 0.01)}
-"""Options of Lucas-Kanade flow: between plain images, then between flat ones."""
+COARSE_HALVINGS, FINE_HALVINGS = 4, 1
+"""How often images are halved to follow corners: plain images, then flat ones."""
+FINE_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 0.01)
 FINE_PX = 2.0
 """The two results differ by less than this."""
 RETURN_PX = 1.0
@@ -93,17 +94,13 @@ def followed(
     """Follow corners (N, 2) by Lucas-Kanade flow, forward and backward: indices of those kept, and their pixels."""
     if not len(pixels):
         return np.zeros(0, np.intp), pixels
-    start = pixels[:, None]
-    near, found, _ = cv2.calcOpticalFlowPyrLK(before.plain, now.plain, start, None, **COARSE)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(now.plain, before.plain, near, None, **COARSE)
-    good = (found & found_back).ravel().astype(bool) & (np.abs(back - start).max((1, 2)) < RETURN_PX)
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before.flat, now.flat, start, near.copy(), **FINE)
-    guess = start + there - near
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(now.flat, before.flat, there, guess, **FINE)
-    good &= (found & found_back).ravel().astype(bool) & (np.abs(back - start).max((1, 2)) < RETURN_PX)
-    good &= (np.abs(there - near).max((1, 2)) < FINE_PX) & (sampled(usable, there[:, 0]) > 0)
+    near, good = follow_both_ways(before.plain, now.plain, pixels, RETURN_PX, halvings=COARSE_HALVINGS)
+    there, still_good = follow_both_ways(
+        before.flat, now.flat, pixels, RETURN_PX, halvings=FINE_HALVINGS, guess=near, criteria=FINE_CRITERIA
+    )
+    good &= still_good & (np.abs(there - near).max(1) < FINE_PX) & (sampled(usable, there) > 0)
     kept = np.flatnonzero(good)
-    return kept, there[kept, 0]
+    return kept, there[kept]
 
 
 def sampled(image: NDArray, pixels: NDArray) -> NDArray:

@@ -1,0 +1,1 @@
+"""The methods that can be trained, a file each; `core.methods` names them."""

@@ -1,0 +1,104 @@
+"""Deform3DGS: Gaussians that move by learned basis functions over time. Yang et al., MICCAI 2024, as released.
+
+Its loss and its density control are the defaults, with the weights of `config`. What differs from the release, and why,
+is in docs/methods.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core.config import Config, DensityConfig, LossConfig, OptimConfig, ScheduleConfig, TemporalConfig
+from ..core.types import Frame
+from ..initialization.first_gaussians import FirstGaussians
+from ..initialization.sampling import initial_log_scales
+from ..model.deformation import Offsets
+from ..model.field import Field
+from ..model.gaussians import Gaussians
+from ..model.motion import Motion
+from ..model.ops import ModelOps
+from ..training.gaussian_method import GaussianMethod
+from ..training.rates import Rate, log_linear
+from .deform3dgs_points import first_points
+from .learned_basis import value_at
+
+NUM_BASES = 17
+"""Basis functions of each Gaussian and channel."""
+CHANNELS = {"means": 3, "quats": 4, "log_scales": 3}
+"""What moves, in the order of the channels."""
+FIRST_WIDTH = 0.01
+COEFFICIENTS = ("basis_weights", "basis_centers", "basis_widths")
+"""Names of the tensors, (N, 17, 10) each."""
+SPATIAL_SCALE = 10.0
+"""Factor of the rates of centers and coefficients, whatever the camera does."""
+
+
+class LearnedBasisMotion(Motion):
+    """Coefficients of each Gaussian: weight, center and width of 17 basis functions in each of 10 channels."""
+
+    def tensors(self, cfg: Config) -> dict[str, tuple[int, ...]]:
+        """See `Motion.tensors`."""
+        return dict.fromkeys(COEFFICIENTS, (NUM_BASES, sum(CHANNELS.values())))
+
+    def first_tensors(self, num: int, cfg: Config) -> dict[str, Tensor]:
+        """See `Motion.first_tensors`."""
+        size = (num, NUM_BASES, sum(CHANNELS.values()))
+        centers = torch.linspace(0, 1, NUM_BASES)[None, :, None].expand(size)
+        return dict(zip(COEFFICIENTS, (torch.zeros(size), centers, torch.full(size, FIRST_WIDTH)), strict=True))
+
+    def offsets(
+        self,
+        gaussians: Gaussians,
+        field: Field | None,
+        time: float,
+        cfg: Config,
+        ops: ModelOps,
+        chosen: Tensor | None = None,
+    ) -> Offsets:
+        """See `Motion.offsets`."""
+        coefficients = [gaussians[name] if chosen is None else gaussians[name][chosen] for name in COEFFICIENTS]
+        parts = value_at(*coefficients, time).split(list(CHANNELS.values()), 1)
+        return Offsets(**dict(zip(CHANNELS, parts, strict=True)))
+
+
+class Deform3DGS(GaussianMethod):
+    """See `GaussianMethod`."""
+
+    uses_prior = False
+    _motion = LearnedBasisMotion()
+
+    def config(self) -> Config:
+        """See `Method.config`. The rates are those of 3DGS: the defaults."""
+        return Config(
+            method="deform3dgs",
+            loss=LossConfig(tv_weight=0.0),
+            temporal=TemporalConfig(weight=0.0),
+            density=DensityConfig(min_densify_weight=1.0, prior_prune=False, clone_extent=0.0),
+            optim=OptimConfig(decay_iterations=4000),
+            schedule=ScheduleConfig(coarse_iterations=0, fine_iterations=3000, sh_every=500),
+        )
+
+    def motion(self, cfg: Config) -> Motion:
+        """See `Method.motion`."""
+        return self._motion
+
+    def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
+        """See `GaussianMethod.first_gaussians`."""
+        cloud = first_points(frames, cfg.seed)
+        log_scales = np.tile(initial_log_scales(cloud.points)[:, None], 3)
+        quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(cloud), 1))
+        return FirstGaussians(cloud, log_scales, quats, np.full(len(cloud), cfg.init.opacity, np.float32), None)
+
+    def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
+        """See `GaussianMethod.rate`: coefficients learn as centers do."""
+        if name not in COEFFICIENTS:
+            return super().rate(name, cfg, SPATIAL_SCALE)
+        start, end, steps = cfg.optim.means_lr, cfg.optim.means_lr_final, cfg.optim.decay_iterations
+        return lambda iteration: SPATIAL_SCALE * log_linear(start, end, iteration, steps)
+
+
+METHOD = Deform3DGS()

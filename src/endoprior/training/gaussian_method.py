@@ -1,0 +1,110 @@
+"""A method that consists of moving Gaussians: what a new one may change. Everything has a default: our own way.
+
+See docs/add_a_method.md for the smallest complete one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from ..core.config import Config
+from ..core.types import Camera, Frame
+from ..data import FrameSequence
+from ..initialization.first_gaussians import FirstGaussians, first_gaussians
+from ..model.gaussians import Gaussians
+from ..model.method import Method
+from ..model.scene_facts import SceneFacts
+from ..model.schema import gaussians_schema
+from ..model.single_scene import SingleScene
+from ..system.arrays_file import ArraySpec
+from . import density
+from .density import DensityStats, Plan
+from .drawn import Drawn
+from .frames import TrainingFrames
+from .gaussian_trainer import GaussianTrainer
+from .losses import supervised_terms
+from .ops import TrainingOps
+from .rates import Rate, rate_of
+from .stage import Stage
+from .trainer import Trainer
+
+EPOCHS = 2**31
+"""Keeps the random numbers of epochs apart from those of iterations."""
+
+
+class GaussianMethod(Method):
+    """See `Method`. A subclass gives its `motion` and its `config`, and overrides what it does differently."""
+
+    uses_prior = True
+    """The texture prior of the frames is computed, for density control and the temporal term."""
+    uses_radii = False
+    """The largest radius of each Gaussian on screen is kept, for `plan`."""
+    keeps_optimizer = False
+    """Adam's moments and steps go on from the coarse to the fine stage."""
+
+    def trainer(self, sequence: FrameSequence, cfg: Config) -> Trainer:
+        """See `Method.trainer`."""
+        return GaussianTrainer(sequence, cfg)
+
+    def schema(self, cfg: Config) -> dict[str, ArraySpec]:
+        """See `Method.schema`."""
+        per_gaussian = {name: ArraySpec("float32", ("N",)) for name in ("prior_score", "num_valid")}
+        return gaussians_schema(self.motion(cfg), cfg) | per_gaussian
+
+    def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> SingleScene:
+        """See `Method.scene`."""
+        return SingleScene.of_arrays(arrays, cameras, facts)
+
+    def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
+        """The Gaussians before training, from the training frames.
+
+        Raises:
+            InputError: the frames give too few points.
+        """
+        return first_gaussians(frames, cfg)
+
+    def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
+        """Learning rate of a tensor of the Gaussians, of a parameter of the field or of its planes."""
+        return rate_of(name, cfg, spatial_scale)
+
+    def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
+        """The training frame of an iteration; a pure function of its arguments. `rng` belongs to the iteration."""
+        return int(rng.integers(num_frames)) if stage is Stage.FINE else 0
+
+    def context(self, frames: TrainingFrames, cfg: Config) -> Any:
+        """What the loss needs of all training frames, made once: `Drawn.context`."""
+        return None
+
+    def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
+        """The weighted terms of the loss, () each."""
+        return supervised_terms(drawn.out, drawn.frame, cfg.loss, ops)
+
+    def density_due(self, stage: Stage, iteration: int, last: bool, cfg: Config) -> bool:
+        """Whether Gaussians are cloned, split and removed after this iteration; `last`: of the stage."""
+        return density.due(iteration, stage is Stage.FINE and last, cfg.density)
+
+    def plan(
+        self,
+        stats: DensityStats,
+        gaussians: Gaussians,
+        extent: float,
+        stage: Stage,
+        iteration: int,
+        cfg: Config,
+    ) -> Plan:
+        """What to clone, split and remove; see `density.plan`."""
+        return density.plan(stats, gaussians.scales, gaussians.opacities, extent, cfg.density)
+
+    def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
+        """Whether opacities are lowered to 0.01 after this iteration."""
+        return False
+
+
+def in_epochs(seed: int, stage: Stage, iteration: int, num_frames: int) -> int:
+    """A position for `GaussianMethod.position`: every frame once in each epoch, in random order."""
+    epoch, place = divmod(iteration - 1, num_frames)
+    return int(np.random.default_rng([seed, int(stage), EPOCHS, epoch]).permutation(num_frames)[place])

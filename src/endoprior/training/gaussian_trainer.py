@@ -1,0 +1,201 @@
+"""Training of Gaussians: their start, the two stages, and the scene that results.
+
+Two stages. Coarse: the first training frame alone, nothing deforms. Fine: a random training frame each time, deformed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import render
+from ..core.checks import InputError, input_error
+from ..core.config import Config
+from ..core.shell import command
+from ..core.types import Camera
+from ..data import FrameSequence
+from ..model.attributes import motion_layout
+from ..model.field import Field
+from ..model.gaussians import Gaussians, create_gaussians
+from ..model.method import method_of
+from ..model.scene_file import check_cameras
+from ..model.single_scene import SingleScene
+from ..system.arrays_file import ArraySpec, part
+from . import depth_fit
+from .density import DensityStats
+from .divergence import Diverged, DivergenceCheck
+from .frames import TrainingFrames
+from .gaussians_schema import frame_schema, state_schema
+from .gaussians_state import GaussiansState
+from .mask_doubt import MaskDoubt
+from .ops import TrainingOps, ops_for
+from .optimizer import Optimizer
+from .pose_refinement import PoseRefinement, PoseState, refined_cameras
+from .stage import Stage, StepReport, stage_length
+from .step import TrainingStep
+from .track_loss import StartTracks
+from .trainer import DEFAULT_FRAMES_PER_SECOND, Trainer, device_for
+
+if TYPE_CHECKING:
+    from .gaussian_method import GaussianMethod
+
+
+class GaussianTrainer(Trainer):
+    """See `Trainer`."""
+
+    def __init__(self, sequence: FrameSequence, cfg: Config, ops: TrainingOps | None = None) -> None:
+        """Prepare; nothing is computed yet.
+
+        Args:
+            ops: implementation of the operations; None takes the one that suits the device.
+        Raises:
+            InputError: the cameras cannot be used, the backend has no device here, or there is no right eye to train
+                on.
+        """
+        if cfg.data.eyes == "both" and sequence.right_eye is None:
+            fix = f"`{command('prepare', 'VIDEO', sequence.path)} --keep-right`, or leave --eyes out."
+            raise input_error(sequence.path, "right/ and baseline_mm for --eyes both", "no right eye", fix)
+        self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
+        self.method: GaussianMethod = method_of(cfg)
+        self.device = device_for(cfg.render.backend)
+        self.ops = ops or ops_for(self.device)
+        self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
+        try:
+            check_cameras(self.cameras)
+        except InputError as error:
+            raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
+        frames = TrainingFrames(sequence, cfg.prior, self.device)
+        centers = torch.from_numpy(np.stack([self.cameras[i].center for i in frames.indices]))
+        self.spatial_scale = spatial_scale(centers, cfg)
+        self.step_once = TrainingStep(
+            self.method,
+            self.cfg,
+            frames,
+            centers,
+            render.load(cfg.render.backend),
+            self.ops,
+            DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
+            PoseRefinement(self.cameras, frames, self.cfg) if refines_poses(sequence, self.cameras, cfg) else None,
+            MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
+            torch.tensor(self.method.background, device=self.device),
+        )
+        self.state: GaussiansState | None = None
+
+    def start(self) -> None:
+        """See `Trainer.start`."""
+        cfg = self.cfg
+        first = self.method.first_gaussians(self.sequence.frames("train"), cfg)
+        cloud, motion, tracks = first.cloud, first.motion, None
+        gaussians = create_gaussians(cloud.points, cloud.colors, first.log_scales, cfg, first.quats, first.opacities)
+        if motion is not None:
+            coefficients = torch.from_numpy(motion.coefficients)
+            gaussians["motion"].detach()[..., motion_layout(cfg.deformation)["means"]] = coefficients
+            if cfg.loss.track_weight:
+                tracks = StartTracks.of_first(coefficients, torch.from_numpy(motion.followed).float()).to(self.device)
+        field = self.method.motion(cfg).field(gaussians["means"].detach(), cfg)
+        stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
+        num = len(self.sequence.indices("train"))
+        poses = PoseState.at_start(num) if self.step_once.poses else None
+        fit = depth_fit.at_start(num) if self.fits_depth else None
+        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, poses, fit)
+
+    @property
+    def fits_depth(self) -> bool:
+        """Whether the depth of each frame is compared up to a scale and a shift."""
+        return self.cfg.loss.fit_relative_depth and self.sequence.depth_is_relative
+
+    def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
+        """See `Trainer.restore`."""
+        gaussians = Gaussians(part(arrays, "gaussians.")).to(self.device)
+        field = self.method.motion(self.cfg).field_of(part(arrays, "field."), self.cfg)
+        held = part(arrays, "tracks.")
+        poses = PoseState(**part(arrays, "poses.")) if self.step_once.poses else None
+        tracks = StartTracks(**held).to(self.device) if held else None
+        self._enter(stage, gaussians, field and field.to(self.device), tracks, poses, arrays.get("depth_fit"))
+        self.state.iteration = iteration
+        self.state.optimizer.load_state_arrays(part(arrays, "optimizer."))
+        self.state.stats = DensityStats(
+            **{name: value.to(self.device) for name, value in part(arrays, "stats.").items()}
+        )
+
+    def _enter(
+        self,
+        stage: Stage,
+        gaussians: Gaussians,
+        field: Field | None,
+        tracks: StartTracks | None,
+        poses: PoseState | None,
+        fit: Tensor | None,
+    ) -> None:
+        rate_of = partial(self.method.rate, cfg=self.cfg, spatial_scale=self.spatial_scale)
+        optimizer = Optimizer(gaussians, field, self.cfg, rate_of, self.ops)
+        stats = DensityStats.zeros(len(gaussians), self.device)
+        self.state = GaussiansState(stage, 0, gaussians, field, optimizer, stats, tracks, poses, fit)
+
+    def schema(self) -> dict[str, ArraySpec]:
+        """See `Trainer.schema`."""
+        return state_schema(self.method.motion(self.cfg), self.cfg) | frame_schema(
+            refined=self.step_once.poses is not None, fitted=self.fits_depth
+        )
+
+    def step(self) -> StepReport:
+        """See `Trainer.step`, and `TrainingStep` for what happens in it.
+
+        Raises:
+            Diverged: the loss or a gradient is not finite, the images show nothing, or no Gaussian is left.
+        """
+        state = self.state
+        if state.stage is Stage.COARSE and state.iteration >= stage_length(self.cfg, Stage.COARSE):
+            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, state.poses, state.depth_fit)
+            if self.method.keeps_optimizer:
+                self.state.optimizer = state.optimizer
+        report = self.step_once(self.state)
+        if report.divergence is not None:
+            raise Diverged(report.divergence.reason)
+        return report
+
+    def synchronize(self) -> None:
+        """See `Trainer.synchronize`."""
+        divergence = self.step_once.check.results(applied=self.state.iteration)
+        if divergence is not None:
+            self.state.iteration = divergence.last_good
+            raise Diverged(divergence.reason)
+
+    def _refined_cameras(self) -> tuple[Camera, ...]:
+        if self.state.poses is None:
+            return self.cameras
+        return refined_cameras(self.cameras, self.step_once.frames.indices, self.state.poses.twists.numpy())
+
+    def scene(self) -> SingleScene:
+        """See `Trainer.scene`."""
+        state, trained, num = self.state, self.step_once.frames.indices, len(self.sequence)
+        holds = self.method.motion(self.cfg).stays_at_the_ends
+        return SingleScene(
+            gaussians=state.gaussians.to("cpu"),
+            field=state.field and state.field.to("cpu"),
+            config=self.cfg,
+            cameras=self._refined_cameras(),
+            frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
+            prior_score=state.stats.score(self.cfg.density.unobserved_score).cpu(),
+            num_valid=state.stats.num_valid.cpu().clone(),
+            lengths_are_relative=self.sequence.depth_is_relative,
+            trained_from=trained[0] / num if holds else 0.0,
+            trained_until=trained[-1] / num if holds else 1.0,
+        )
+
+
+def refines_poses(sequence: FrameSequence, cameras: Sequence[Camera], cfg: Config) -> bool:
+    """Whether training changes camera poses: as `PoseConfig.refine` says, and never those of a static camera."""
+    wanted = cfg.poses.refine == "always" or (cfg.poses.refine == "estimated" and sequence.poses_are_estimated)
+    return wanted and any((camera.world_to_camera != cameras[0].world_to_camera).any() for camera in cameras)
+
+
+def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:
+    """Factor of the learning rates that are lengths: 1.1 x radius of the camera path; constant for a static one."""
+    radius = 1.1 * float((camera_centers - camera_centers.mean(0)).norm(dim=-1).max())
+    return radius if radius > 1e-3 else cfg.optim.still_camera_scale
