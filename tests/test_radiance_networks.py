@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from endoprior.core import radiance_presets
+from endoprior.core import presets_radiance
 from endoprior.core.config_radiance import RadianceConfig
 from endoprior.radiance import endonerf_networks, endosurf_networks
 from endoprior.radiance.encoding import encoded, encoded_change, encoded_size
@@ -143,11 +143,11 @@ def test_rounds_add_all_samples():
 
 
 def test_configs_differ_from_the_published_ones_in_size_only():
-    sized, full = radiance_presets.endonerf(), radiance_presets.endonerf_published()
+    sized, full = presets_radiance.endonerf(), presets_radiance.endonerf_published()
     assert (sized.schedule.fine_iterations, sized.radiance.rays, sized.radiance.refine_every) == (2000, 512, 0)
     assert (full.schedule.fine_iterations, full.radiance.rays, full.radiance.refine_every) == (100_000, 2048, 4000)
-    surf = radiance_presets.endosurf_published()
+    surf = presets_radiance.endosurf_published()
     assert (surf.schedule.fine_iterations, surf.radiance.rays) == (100_000, 1024)
-    for cfg in (sized, full, surf, radiance_presets.endosurf()):
+    for cfg in (sized, full, surf, presets_radiance.endosurf()):
         assert (cfg.radiance.even_samples, cfg.radiance.more_samples, cfg.radiance.learning_rate) == (32, 32, 5e-4)
         assert cfg.schedule.coarse_iterations == 0

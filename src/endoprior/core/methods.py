@@ -18,6 +18,8 @@ METHODS = {
     OWN: "endoprior.methods.own",
     "deform3dgs": "endoprior.methods.deform3dgs",
     "endogs": "endoprior.methods.endogs",
+    "endonerf": "endoprior.methods.endonerf",
+    "endosurf": "endoprior.methods.endosurf",
 }
 """Module of each method; its object is called `METHOD` there. The name is that of its preset, too."""
 

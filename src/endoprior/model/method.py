@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..data import FrameSequence
     from ..training.trainer import Trainer
     from .motion import Motion
-    from .scene import Scene
+    from .scene import RenderedScene
     from .scene_facts import SceneFacts
 
 
@@ -48,7 +48,7 @@ class Method(ABC):
         """The arrays that its scenes are saved as, beside the cameras; `N` Gaussians, if there are any."""
 
     @abstractmethod
-    def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> Scene:
+    def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> RenderedScene:
         """The scene whose arrays these are; they fit `schema`.
 
         Raises:

@@ -11,13 +11,12 @@ import torch
 from ..core.config import Config
 from ..core.types import Camera, RenderedView
 from ..model.scene import RenderedScene
-from ..model.single_scene import camera_arrays, scene_facts
+from ..model.scene_facts import camera_arrays, scene_facts
+from ..model.single_scene import FORMAT
 from ..system.arrays_file import save_arrays
 from .field import RadianceField
 from .rays import all_rays
 
-FORMAT = "endoprior-radiance-1"
-"""Name and version of the file format, in the file's metadata."""
 SAMPLES_AT_ONCE = 2**15
 """Samples of rays in memory at a time: about 0.4 GB for EndoNeRF's networks and 2 GB for EndoSurf's on the CPU."""
 
@@ -64,4 +63,4 @@ class RadianceScene(RenderedScene):
         """See `RenderedScene.save`."""
         arrays = {f"field.{name}": value for name, value in self.field.state_dict().items()}
         arrays |= camera_arrays(self.cameras)
-        save_arrays(path, arrays, scene_facts(self) | {"field": self.field.name}, FORMAT)
+        save_arrays(path, arrays, scene_facts(self), FORMAT)

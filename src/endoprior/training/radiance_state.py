@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..radiance.field import RadianceField
 from ..system.arrays_file import ArraySpec, part
-from .state import Stage
+from .stage import Stage
 
 MOMENTS = {"first": "exp_avg", "second": "exp_avg_sq"}
 """Adam's moments: name in a checkpoint, name in torch."""
@@ -52,7 +52,7 @@ class RadianceState:
         self.depths = arrays.get("depths")
 
 
-def state_schema(field: RadianceField, depths: tuple[int, int, int] | None) -> dict[str, ArraySpec]:
+def state_schema(field: RadianceField, depths: tuple[int | str, ...] | None) -> dict[str, ArraySpec]:
     """The arrays of a state; `depths` is the shape of the refined depths, None without them."""
     schema = {f"field.{name}": spec for name, spec in type(field).schema(field.cfg).items()}
     for name, parameter in field.named_parameters():

@@ -1,9 +1,9 @@
-"""Training of a radiance field: the same outer form as `Trainer`, one stage, rays instead of images."""
+"""Training of a radiance field: one stage, rays of one frame in each iteration."""
 
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -21,15 +21,15 @@ from ..radiance.scene import RadianceScene
 from ..system.arrays_file import ArraySpec
 from .divergence import LARGEST_GRADIENT, Diverged, unusable_numbers
 from .radiance_state import RadianceState, state_schema
-from .state import Stage, StepReport
-from .trainer import DEFAULT_FRAMES_PER_SECOND, device_for
+from .stage import Stage, StepReport, stage_length
+from .trainer import DEFAULT_FRAMES_PER_SECOND, Trainer, device_for
 
 BETAS, EPSILON = (0.9, 0.999), 1e-8
 """Adam's: torch's own, which both releases use."""
 
 
-class RadianceTrainer:
-    """One training run: `start` or `restore`, then `run`; `scene` is its result so far.
+class RadianceTrainer(Trainer):
+    """See `Trainer`.
 
     Every random choice is a pure function of (seed, iteration), so a resumed run repeats an uninterrupted one.
     """
@@ -45,7 +45,7 @@ class RadianceTrainer:
         """
         if cfg.data.eyes == "both":
             raise input_error(kind.name, "--data.eyes left", "both", "leave --eyes out: it trains on the left eye.")
-        self.sequence, self.cfg, self.kind = sequence, cfg, kind
+        self.sequence, self.cfg, self.kind = sequence, cfg.fitted(len(sequence)), kind
         self.device = device_for(cfg.render.backend)
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
         try:
@@ -56,7 +56,7 @@ class RadianceTrainer:
         self.state: RadianceState | None = None
 
     def start(self) -> None:
-        """Measure the sequence and give the networks their first values."""
+        """See `Trainer.start`: measure the sequence and give the networks their first values."""
         self._enter()
         self.state.field.cpu().start(self.frames, torch.Generator().manual_seed(self.cfg.seed))
         self.state.field.to(self.device)
@@ -65,7 +65,7 @@ class RadianceTrainer:
             self.state.depths = torch.from_numpy(np.stack(depths))
 
     def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
-        """Continue from a state that `RadianceState.arrays` gave, trusted to fit the config."""
+        """See `Trainer.restore`."""
         self._enter()
         self.state.load(iteration, arrays)
 
@@ -74,27 +74,13 @@ class RadianceTrainer:
         adam = torch.optim.Adam(field.parameters(), self.cfg.radiance.learning_rate, BETAS, EPSILON, foreach=False)
         self.state = RadianceState(Stage.FINE, 0, field, adam, None)
 
-    def checkpoint_schema(self) -> dict[str, ArraySpec]:
-        """The arrays of a checkpoint of this run."""
+    def schema(self) -> dict[str, ArraySpec]:
+        """See `Trainer.schema`."""
         camera = self.frames.camera
         refines = self.cfg.radiance.refine_every > 0
         with torch.device("meta"):
             field = self.kind(self.cfg.radiance)
-        return state_schema(field, (len(self.frames), camera.height, camera.width) if refines else None)
-
-    @property
-    def length(self) -> int:
-        """Iterations in all."""
-        return self.cfg.schedule.fine_iterations
-
-    @property
-    def finished(self) -> bool:
-        """Whether all iterations are done."""
-        return self.state.iteration >= self.length
-
-    def progress(self) -> tuple[int, int]:
-        """Iterations done and in all."""
-        return self.state.iteration, self.length
+        return state_schema(field, ("F", camera.height, camera.width) if refines else None)
 
     def step(self) -> StepReport:
         """One iteration: rays of one frame, their terms, their gradients, a check, then Adam.
@@ -103,7 +89,7 @@ class RadianceTrainer:
             Diverged: the loss or a gradient is not finite. The state is the one before.
         """
         began, state, cfg = clock.perf_counter(), self.state, self.cfg
-        iteration, share = state.iteration + 1, (state.iteration + 1) / self.length
+        iteration, share = state.iteration + 1, (state.iteration + 1) / stage_length(self.cfg, Stage.FINE)
         rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
         field, buffers = state.field, {name: value.clone() for name, value in state.field.named_buffers()}
         terms = field.losses(self.batch(rng), share, rng)
@@ -148,22 +134,11 @@ class RadianceTrainer:
             rendered = (view.depth / view.alpha.clamp(min=1e-6)).cpu()
             measured.copy_(refined(measured, rendered, torch.from_numpy(frame.tissue_mask)))
 
-    def run(self, observers: list[Callable[[StepReport, RadianceTrainer], None]]) -> None:
-        """Iterate to the end; every observer is called after each iteration, in order.
-
-        Raises:
-            Diverged: as `step`.
-        """
-        while not self.finished:
-            report = self.step()
-            for observe in observers:
-                observe(report, self)
-
     def synchronize(self) -> None:
         """Nothing to wait for: each iteration is checked before its update, on every device."""
 
     def scene(self) -> RadianceScene:
-        """The scene as it is now, on the CPU."""
+        """See `Trainer.scene`."""
         return self._scene().to("cpu")
 
     def _scene(self) -> RadianceScene:
