@@ -11,9 +11,11 @@ import pytest
 import torch
 from state_files import StateFile
 
+from endoprior.cli.trained_scene import open_gaussians
 from endoprior.core import presets_radiance
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
+from endoprior.core.presets import preset
 from endoprior.core.types import Frame
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.evaluation.scorers import speed
@@ -24,6 +26,7 @@ from endoprior.radiance.endonerf import EndoNeRF, depth_spread
 from endoprior.radiance.endosurf import EndoSurf
 from endoprior.radiance.frames import RayFrames, measured
 from endoprior.radiance.scene import RadianceScene
+from endoprior.runs.train import train
 from endoprior.system.arrays_file import load_arrays, save_arrays
 from endoprior.training.divergence import Diverged
 from endoprior.training.radiance_trainer import RadianceTrainer
@@ -251,3 +254,21 @@ def test_right_eyes_are_rejected(sequence: FrameSequence):
     cfg = tiny("endonerf")
     with pytest.raises(InputError, match=r"expected --data\.eyes left, got both"):
         RadianceTrainer(sequence, replace(cfg, data=replace(cfg.data, eyes="both")), FIELDS["endonerf"])
+
+
+def test_presets_of_both_sizes():
+    for name in NAMES:
+        assert preset(name) == getattr(presets_radiance, name)() and preset(name).method == name
+        assert preset(f"{name}-published").method == name
+
+
+def test_a_run_folder_is_like_any_other(sequence: FrameSequence, tmp_path: Path):
+    cfg = tiny("endonerf", 3)
+    scene = train(sequence, cfg, tmp_path / "run", progress=False)
+    again = train(sequence, cfg, tmp_path / "run", resume=True, progress=False)  # there is nothing left to do
+    loaded = load_scene(tmp_path / "run")
+    assert isinstance(loaded, RadianceScene) and loaded.config == scene.config
+    for other in (again, loaded):
+        assert same(dict(scene.field.state_dict()), dict(other.field.state_dict()))
+    with pytest.raises(InputError, match="expected a scene of Gaussians, got a radiance field"):
+        open_gaussians(tmp_path / "run")

@@ -31,6 +31,9 @@ class Method(ABC):
     background = (0.0, 0.0, 0.0)
     """Color behind everything, in [0, 1], in training and where its scenes are rendered."""
 
+    has_gaussians = True
+    """Whether its scenes consist of Gaussians: a `Scene`; else they are only a `RenderedScene`."""
+
     @abstractmethod
     def config(self) -> Config:
         """The config that the preset of its name starts from."""

@@ -77,8 +77,15 @@ class RenderedScene(ABC):
         """What renders it, in words."""
 
     @abstractmethod
-    def to(self, device: torch.device | str) -> RenderedScene:
-        """This scene on a device; itself if it is there."""
+    def to(
+        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
+    ) -> RenderedScene:
+        """This scene on a device; itself if it is there.
+
+        Args:
+            backend: renders Gaussians there; None: the one they were trained with, or gsplat on a GPU.
+            fp16_planes: HexPlane in half precision, half the memory and faster: for rendering, cannot be saved.
+        """
 
     @abstractmethod
     def save(self, path: Path) -> None:
@@ -118,17 +125,6 @@ class Scene(RenderedScene):
     @abstractmethod
     def __len__(self) -> int:
         """Number of Gaussians in all windows."""
-
-    @abstractmethod
-    def to(
-        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
-    ) -> Scene:
-        """This scene on a device; itself if it is there.
-
-        Args:
-            backend: renders it there; None: the one it was trained with, or gsplat on a GPU.
-            fp16_planes: HexPlane in half precision, half the memory and faster: for rendering, cannot be saved.
-        """
 
     @abstractmethod
     def changed(self, change: Callable[[SingleScene, Window], SingleScene]) -> Scene:

@@ -13,6 +13,7 @@ from ..core.types import Camera, RenderedView
 from ..model.scene import RenderedScene
 from ..model.scene_facts import camera_arrays, scene_facts
 from ..model.single_scene import FORMAT
+from ..render import Backend
 from ..system.arrays_file import save_arrays
 from .field import RadianceField
 from .rays import all_rays
@@ -41,8 +42,10 @@ class RadianceScene(RenderedScene):
         """See `RenderedScene.backend`."""
         return f"torch, {self.config.radiance.even_samples + self.config.radiance.more_samples} samples per ray"
 
-    def to(self, device: torch.device | str) -> RadianceScene:
-        """See `RenderedScene.to`."""
+    def to(
+        self, device: torch.device | str, *, backend: Backend | None = None, fp16_planes: bool = False
+    ) -> RadianceScene:
+        """See `RenderedScene.to`; `backend` and `fp16_planes` have no meaning here."""
         if torch.device(device) == self.device:
             return self
         return replace(self, field=deepcopy(self.field).to(device))

@@ -21,6 +21,8 @@ from .radiance_trainer import RadianceTrainer
 class RadianceMethod(Method):
     """See `Method`."""
 
+    has_gaussians = False
+
     def __init__(self, kind: type[RadianceField], config: Callable[[], Config]) -> None:
         """Args: kind: of the field. config: what its preset starts from."""
         self.kind, self._config = kind, config
