@@ -63,7 +63,7 @@ def test_the_field_is_its_formula():
     expected["sh_rest"] = values[:, 14:].reshape(9, 15, 3)
     for name, value in expected.items():
         torch.testing.assert_close(getattr(found, name), value, rtol=1e-4, atol=1e-5)
-    splats = METHOD.motion(cfg).splats(gaussians, found, 3)
+    splats = gaussians.splats(found, 3)
     torch.testing.assert_close(splats.sh[:, 1:], gaussians["sh_rest"] + found.sh_rest)
     torch.testing.assert_close(splats.opacities, (gaussians["opacity_logits"] + found.opacity_logits).sigmoid())
 

@@ -71,9 +71,12 @@ def looks(num: int, change_from: int | None = None) -> Looks:
     return Looks(thumbnails, np.full(num, 100.0))
 
 
-def wall(start: int, stop: int) -> SingleScene:
+def wall(start: int, stop: int, *, slides: bool = True) -> SingleScene:
     """An opaque wall, the same in every window, that slides."""
-    cfg = preset("default", **{"init.motion": "rest", "deformation.kind": "hexplane"})
+    field, cfg = None, preset("default").fitted(stop - start)
+    if slides:
+        field = Sliding(start, stop - start)
+        cfg = cfg.replace({"init.motion": "rest", "deformation.kind": "hexplane"})
     x, y = (g.ravel() for g in np.meshgrid(np.linspace(-30, 30, 41), np.linspace(-22, 22, 31)))
     points = np.column_stack([x, y, 80 + 0.1 * x]).astype(np.float32)
     colors = np.stack([0.5 + 0.3 * np.sin(x / 4), 0.4 + 0.2 * np.cos(y / 5), 0.3 + 0 * x], 1)
@@ -82,7 +85,7 @@ def wall(start: int, stop: int) -> SingleScene:
         gaussians["opacity_logits"].fill_(5.0)
     cameras = tuple(camera_at() for _ in range(stop - start))
     score, count = torch.zeros(len(points)), torch.ones(len(points))
-    return SingleScene(gaussians, Sliding(start, stop - start), cfg, cameras, 25.0, score, count)
+    return SingleScene(gaussians, field, cfg, cameras, 25.0, score, count)
 
 
 def windowed(*ends: tuple[int, int]) -> WindowedScene:
@@ -225,7 +228,7 @@ def test_the_support_of_a_time_is_that_of_the_windows_shown(three):
 
 def stored(folder: Path) -> Path:
     """A run folder with two windows of resting scenes."""
-    parts = [replace(wall(*ends), field=None) for ends in ((0, 12), (8, 20))]
+    parts = [wall(*ends, slides=False) for ends in ((0, 12), (8, 20))]
     spans = (Span(0, 12, len(parts[0])), Span(8, 20, len(parts[1])))
     cfg = preset("default")
     scene = WindowedScene(cfg, tuple(camera_at(x_mm=i) for i in range(20)), 25.0, spans, parts.__getitem__)

@@ -28,12 +28,23 @@ def value_at_backward(
     v_value: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Gradients of the three coefficients from that of the value, `v_value` (N, C)."""
-    found = tuple(np.empty_like(weights) for _ in range(3))
+    found = tuple(np.zeros_like(weights) for _ in range(3))
     _value_at_backward(weights, centers, widths, np.float32(time), v_value, *found)
     return found
 
 
-@njit(parallel=True, cache=True)
+@njit(inline="always")
+def _reaches(n, b, centers, widths, time):
+    # Whether basis function b of Gaussian n is above 0 at the time in any channel; one pass without branches.
+    nearest = _REACH
+    for c in range(centers.shape[2]):
+        away = time - centers[n, b, c]
+        width = widths[n, b, c]
+        nearest = min(nearest, away * away / (width * width + _SMALLEST_SQUARE))
+    return nearest < _REACH
+
+
+@njit(parallel=True, cache=True, fastmath={"nnan", "nsz"})
 def _value_at(weights, centers, widths, time, out):
     # One task per chunk of Gaussians; writes out (N, C).
     num, bases, channels = weights.shape
@@ -42,31 +53,27 @@ def _value_at(weights, centers, widths, time, out):
             for c in range(channels):
                 out[n, c] = 0
             for b in range(bases):
-                for c in range(channels):
-                    away = time - centers[n, b, c]
-                    ratio = away * away / (widths[n, b, c] * widths[n, b, c] + _SMALLEST_SQUARE)
-                    if ratio < _REACH:
+                if _reaches(n, b, centers, widths, time):
+                    for c in range(channels):
+                        away, width = time - centers[n, b, c], widths[n, b, c]
+                        ratio = away * away / (width * width + _SMALLEST_SQUARE)
                         out[n, c] += weights[n, b, c] * np.exp(-ratio * ratio)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, fastmath={"nnan", "nsz"})
 def _value_at_backward(weights, centers, widths, time, v_value, v_weights, v_centers, v_widths):
-    # One task per chunk of Gaussians; writes the last three, (N, B, C), zeros included.
+    # One task per chunk of Gaussians; writes the last three, (N, B, C), where they are not 0, as they are before.
     num, bases, channels = weights.shape
     for task in prange((num + _CHUNK - 1) // _CHUNK):
         for n in range(task * _CHUNK, min(num, (task + 1) * _CHUNK)):
             for b in range(bases):
-                for c in range(channels):
-                    v_weight, v_center, v_width = np.float32(0), np.float32(0), np.float32(0)
-                    away, width = time - centers[n, b, c], widths[n, b, c]
-                    square = width * width + _SMALLEST_SQUARE
-                    ratio = away * away / square
-                    if ratio < _REACH:
-                        value = np.exp(-ratio * ratio)
-                        v_weight = v_value[n, c] * value
+                if _reaches(n, b, centers, widths, time):
+                    for c in range(channels):
+                        away, width = time - centers[n, b, c], widths[n, b, c]
+                        square = width * width + _SMALLEST_SQUARE
+                        ratio = away * away / square
+                        v_weight = v_value[n, c] * np.exp(-ratio * ratio)
                         v_ratio = -2 * ratio * weights[n, b, c] * v_weight
-                        v_center = v_ratio * (-2 * away / square)
-                        v_width = v_ratio * (-2 * ratio * width / square)
-                    v_weights[n, b, c] = v_weight
-                    v_centers[n, b, c] = v_center
-                    v_widths[n, b, c] = v_width
+                        v_weights[n, b, c] = v_weight
+                        v_centers[n, b, c] = v_ratio * (-2 * away / square)
+                        v_widths[n, b, c] = v_ratio * (-2 * ratio * width / square)

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ..core.config import Config
 from ..core.config_deformation import HexPlaneConfig
-from ..core.types import Splats
 from .attributes import motion_shape
 from .basis import basis_offsets
 from .deformation import HexPlaneField, Offsets
@@ -79,10 +78,6 @@ class Motion(ABC):
         chosen: Tensor | None = None,
     ) -> Offsets:
         """Offsets of the Gaussians, or of the `chosen` (P,) ones only, at `time` in [0, 1]; differentiable."""
-
-    def splats(self, gaussians: Gaussians, offsets: Offsets | None, sh_degree: int) -> Splats:
-        """The Gaussians, moved by `offsets` (None: canonical), as they are drawn, with color up to `sh_degree`."""
-        return gaussians.splats(offsets, sh_degree)
 
 
 class HexPlaneMotion(Motion):

@@ -85,7 +85,7 @@ class SingleScene(Scene):
         return self._splats(None)
 
     def _splats(self, offsets: Offsets | None) -> Splats:
-        found = self.motion.splats(self.gaussians, offsets, self.config.schedule.sh_degree)
+        found = self.gaussians.splats(offsets, self.config.schedule.sh_degree)
         # A tensor that no deformation changes is the trained tensor itself, with its gradient.
         return Splats(**{name: value.detach() for name, value in found.tensors.items()})
 

@@ -196,7 +196,7 @@ class TrainingStep:
                     gaussians["means"], time, before.time, self.ops.model
                 )
                 means_before = gaussians["means"] + displacement
-        return motion.splats(gaussians, offsets, sh_degree(self.cfg, state.stage, iteration)), offsets, means_before
+        return gaussians.splats(offsets, sh_degree(self.cfg, state.stage, iteration)), offsets, means_before
 
     def _posed(self, state: GaussiansState, splats: Splats, batch: Batch) -> tuple[Splats, Tensor | None]:
         """The Gaussians as the refined camera sees them, and its twist (6,), which gets a gradient; None: as given."""

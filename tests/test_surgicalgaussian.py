@@ -1,0 +1,204 @@
+"""SurgicalGaussian: the facts of the release, one by one, and that it trains, resumes and comes back from disk."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
+from endoprior.core.presets import preset
+from endoprior.core.types import RenderOutput
+from endoprior.data import load_sequence
+from endoprior.evaluation import metrics
+from endoprior.methods.surgicalgaussian import METHOD, first_seen, neighbor_terms
+from endoprior.methods.surgicalgaussian_terms import covariances, distance_change, ssim
+from endoprior.methods.time_network import TimeNetwork, encoded, state_shapes
+from endoprior.model.gaussians import create_gaussians
+from endoprior.model.scene_file import load_scene
+from endoprior.runs.train import train
+from endoprior.training.density import DensityStats
+from endoprior.training.drawn import Drawn
+from endoprior.training.frames import TrainingFrames
+from endoprior.training.ops import NUMBA
+from endoprior.training.stage import Stage
+
+CFG = preset("surgicalgaussian")
+
+
+def gaussians_at(points, scale_mm=1.0):
+    """Gray Gaussians at points (N, 3), mm."""
+    points = np.asarray(points, np.float32)
+    return create_gaussians(points, np.full((len(points), 3), 0.5), np.full(len(points), np.log(scale_mm)), CFG)
+
+
+def network(seed: int = 0) -> TimeNetwork:
+    return TimeNetwork.fresh(torch.Generator().manual_seed(seed))
+
+
+# The network.
+
+
+def test_layers_are_eight_of_256_with_one_skip():
+    weights = {name: shape for name, shape in state_shapes().items() if name.endswith("weight")}
+    inputs = [shape[1] for shape in weights.values()]
+    assert inputs == [72, 256, 256, 256, 256, 328, 256, 256, 256, 256, 256]
+    assert [shape[0] for shape in weights.values()] == [256] * 8 + [3, 4, 3]
+    assert set(METHOD.motion(CFG).parameter_shapes(CFG)) == set(network().parameters)
+
+
+def test_the_encoding_by_hand():
+    value = torch.tensor([[0.5, 0.25]])
+    found = encoded(value, 2)
+    x = value.numpy()
+    expected = np.concatenate([x, np.sin(x), np.cos(x), np.sin(2 * x), np.cos(2 * x)], 1)
+    torch.testing.assert_close(found, torch.from_numpy(expected))
+
+
+def test_the_start_is_pytorchs_and_not_rest():
+    field = network()
+    for name, value in field.state_arrays().items():
+        bound = state_shapes()[name.rsplit(".", 1)[0] + ".weight"][1] ** -0.5
+        assert value.abs().max() <= bound and value.abs().max() > 0.1 * bound, name
+    assert field(torch.zeros(1, 3), 0.0)["means"].abs().max() > 0
+
+
+def test_offsets_are_added_after_activation():
+    gaussians, field = gaussians_at(np.random.default_rng(0).normal(size=(6, 3)) * 20), network()
+    with torch.no_grad():
+        gaussians["quats"].mul_(3.0)
+    offsets = METHOD.motion(CFG).offsets(gaussians, field, 0.4, CFG, NUMBA.model)
+    found, splats = field(gaussians["means"].detach() / 100, 0.4), gaussians.splats(offsets, 0)
+    torch.testing.assert_close(splats.means, gaussians["means"] + 100 * found["means"])
+    torch.testing.assert_close(splats.scales, (1.0 + 100 * found["scales"]).abs(), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(splats.quats, gaussians["quats"] / 3 + found["quats"], rtol=1e-4, atol=1e-5)
+    splats.means.sum().backward()
+    assert gaussians["means"].grad.eq(1).all(), "the network gets centers without their gradient"
+
+
+# Terms.
+
+
+def test_similarity_is_that_of_the_scores():
+    rng = np.random.default_rng(0)
+    image, target = rng.random((2, 30, 40, 3)).astype(np.float32)
+    mask = np.ones((30, 40), bool)
+    expected = metrics.ssim(image, target, mask)
+    assert float(ssim(torch.from_numpy(image), torch.from_numpy(target))) == pytest.approx(expected, abs=1e-4)
+    same = torch.from_numpy(image)
+    assert float(ssim(same, same)) == pytest.approx(1)
+
+
+def test_covariances_are_those_of_rotations():
+    rng = np.random.default_rng(1)
+    quats, scales = rng.normal(size=(5, 4)), rng.random((5, 3))
+    turned = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix() * scales[:, None]
+    full = turned @ turned.transpose(0, 2, 1)
+    expected = full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    np.testing.assert_allclose(covariances(torch.from_numpy(quats), torch.from_numpy(scales)), expected, atol=1e-12)
+
+
+def test_a_rigid_motion_changes_no_distance():
+    points = torch.randn(8, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    turn = torch.from_numpy(Rotation.from_rotvec([0.2, 0.5, -0.1]).as_matrix())
+    neighbors = torch.arange(8)[:, None].roll(1, 0)
+    assert float(distance_change(points, points @ turn.T + 3, neighbors)) < 1e-9
+    assert float(distance_change(points, 2 * points, neighbors)) == pytest.approx(
+        float((points - points[neighbors[:, 0]]).norm(dim=1).mean())
+    )
+    same = torch.zeros(2, 3, requires_grad=True)
+    distance_change(same, same, torch.tensor([[1], [0]])).backward()
+    assert same.grad.isfinite().all(), "points that coincide"
+
+
+def test_neighbor_terms_by_hand():
+    gaussians = gaussians_at([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10], [10, 10, 0]])
+    offsets = METHOD.motion(CFG).offsets(gaussians, network(), 0.2, CFG, NUMBA.model)
+    splats = gaussians.splats(offsets, 0)
+    found = neighbor_terms(gaussians, offsets, splats)
+    before, after = gaussians["means"] / 100, splats.means / 100
+    rows = [[j for j in range(5) if j != i] for i in range(5)]  # all four others
+    change = [abs((before[i] - before[j]).norm() - (after[i] - after[j]).norm()) for i in range(5) for j in rows[i]]
+    assert float(found["distance"].detach()) == pytest.approx(
+        0.2 * float(torch.stack(change).mean().detach()), rel=1e-4
+    )
+    assert found["shape"].detach() > 0
+
+
+def test_the_loss_by_hand(tiny_sequence):
+    frames = TrainingFrames(load_sequence(tiny_sequence), CFG.prior)
+    frame = frames.frame(0)
+    depth = torch.where(frame.measured, 1 / frame.inverse_depth.clamp(min=1e-9), 0)
+    out = RenderOutput(frame.rgb + 0.1, torch.ones_like(depth), depth + 5, torch.zeros(1, 2), torch.zeros(1))
+    drawn = Drawn(Stage.COARSE, 1, 0, frame, gaussians_at(np.eye(3)), None, None, None, out, None, None)
+    terms = {name: float(value.detach()) for name, value in METHOD.terms(drawn, CFG, NUMBA).items()}
+    assert terms["color"] == pytest.approx(0.8 * 0.1 * float(frame.tissue_mask.float().mean()), rel=1e-4)
+    assert terms["depth"] == pytest.approx(0.001 * 5 * float(frame.measured.float().mean()) / 100, rel=1e-4)
+    assert terms["ssim"] > 0 and terms["tv"] > 0 and set(terms) == {"color", "ssim", "tv", "depth"}
+
+
+# Start, rates, growth.
+
+
+def test_points_start_at_every_third_pixel_where_first_seen(tiny_sequence):
+    frames = load_sequence(tiny_sequence, DataConfig()).frames("train")
+    cloud = first_seen(frames)
+    cells = np.zeros_like(frames[0].tissue_mask)
+    cells[1::3, 1::3] = True
+    seen = np.zeros_like(cells)
+    for position, frame in enumerate(frames):
+        new = cells & ~seen & frame.tissue_mask & frame.depth_valid
+        assert np.count_nonzero(cloud.origins == position) == np.count_nonzero(new)
+        seen |= new
+    assert len(cloud) == np.count_nonzero(seen)
+    with pytest.raises(InputError, match="at least 4 points"):
+        first_seen([replace(frames[0], tissue_mask=np.zeros_like(frames[0].tissue_mask))])
+
+
+def test_rates_at_given_iterations():
+    means, net = METHOD.rate("means", CFG, 7.0), METHOD.rate("network.layer.0.weight", CFG, 7.0)
+    assert [means(0), means(3000), means(4000)] == pytest.approx([1.6e-2, 1.6e-4, 1.6e-4])
+    assert [net(0), net(4000)] == pytest.approx([1.6e-4, 1.6e-6]) and net(3000) == pytest.approx(1.6e-4 * 10**-1.5)
+    others = {"sh_dc": 2.5e-3, "sh_rest": 1.25e-4, "opacity_logits": 0.05, "log_scales": 1e-3, "quats": 1e-3}
+    assert {name: METHOD.rate(name, CFG, 1.0)(9) for name in others} == others
+
+
+def test_growth_removal_and_resets():
+    gaussians = create_gaussians(
+        np.zeros((5, 3)), np.zeros((5, 3)), np.log([0.9, 1.1, 11.0, 0.5, 0.5]), CFG, opacities=np.full(5, 0.5)
+    )
+    stats = DensityStats.zeros(5)
+    stats.num_seen += 1
+    stats.grad2d_ndc_sum += torch.tensor([3e-4, 3e-4, 0, 0, 2e-4])
+    stats.max_radius_px += torch.tensor([0, 0, 0, 21.0, 0])
+    plan = METHOD.plan(stats, gaussians, 0.0, Stage.FINE, 3000, CFG)
+    assert plan.clone.tolist() == [True, False, False, False, False] and not plan.remove.any()
+    assert plan.split.tolist() == [False, True, False, False, False]
+    later = METHOD.plan(stats, gaussians, 0.0, Stage.FINE, 3100, CFG)
+    assert later.remove.tolist() == [False, False, True, True, False]
+    due = [i for i in (400, 500, 3000, 3100, 15_000) if METHOD.reset_due(Stage.FINE, i, CFG)]
+    assert due == [500, 3000]
+
+
+# All together.
+
+
+def test_it_trains_resumes_with_equal_bits_and_comes_back(tiny_sequence, tmp_path):
+    changes = {"density.start_iteration": 2, "density.every": 3, "schedule.sh_every": 3}
+    sequence, cfg = load_sequence(tiny_sequence), preset("surgicalgaussian", iterations=8, **changes)
+    whole = train(sequence, cfg, tmp_path / "whole")
+
+    def stop(report, trainer):
+        if report.iteration == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(sequence, cfg, tmp_path / "parts", on_step=stop)
+    train(sequence, cfg, tmp_path / "parts", resume=True)
+    scenes = [load_scene(tmp_path / name) for name in ("whole", "parts")]
+    for scene in scenes:
+        for name, value in whole.field.state_arrays().items():
+            assert torch.equal(scene.field.state_arrays()[name], value), name
+    assert torch.equal(scenes[0].render(0.5).color, whole.render(0.5).color)
