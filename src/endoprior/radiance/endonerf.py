@@ -125,6 +125,5 @@ class EndoNeRF(RadianceField):
 
 def depth_spread(frames: RayFrames) -> float:
     """P99.9 - P3 of the depths of all training frames, mm; missing ones count as 0, as in the release."""
-    depths = np.concatenate([frames.depth(k).ravel() for k in range(len(frames))])
-    low, high = np.percentile(depths, (LOW, HIGH))
-    return float(high - low) or float(depths.max()) or 1.0
+    low, high = frames.depth_percentiles(LOW, HIGH, missing=True)
+    return high - low or high or 1.0

@@ -16,6 +16,9 @@ from ..core.geometry import FARTHEST_MM
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 
+MOST_DEPTHS = 2**22
+"""Depths over which percentiles are taken, about: evenly spaced pixels of all frames."""
+
 
 class RayFrames:
     """The training frames of a sequence by position, 0 to len - 1."""
@@ -72,6 +75,18 @@ class RayFrames:
         """(H, W) z of the surface, mm; 0 where tissue has no depth."""
         frame = self.frame(position)
         return np.where(measured(frame), frame.depth, np.float32(0))
+
+    def depth_percentiles(self, low: float, high: float, *, missing: bool) -> tuple[float, float]:
+        """Percentiles of the depths of all training frames, mm; 0 without any depth.
+
+        Args:
+            missing: a missing depth counts as 0; else it does not count.
+        """
+        every = max(1, len(self) * self.camera.width * self.camera.height // MOST_DEPTHS)
+        depths = np.concatenate([self.depth(k).ravel()[::every] for k in range(len(self))])
+        depths = depths if missing else depths[depths > 0]
+        first, last = np.percentile(depths, (low, high)) if depths.size else (0.0, 0.0)
+        return float(first), float(last)
 
 
 def measured(frame: Frame) -> NDArray[np.bool_]:
