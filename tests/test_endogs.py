@@ -115,7 +115,7 @@ def test_the_loss_by_hand(tiny_sequence):
     weight = METHOD.context(frames, CFG)
     torch.testing.assert_close(weight.double(), 1 + 30 * hidden / hidden.square().sum().sqrt())
     frame = frames.frame(0)
-    depth = torch.where(frame.measured, 1 / frame.inverse_depth.clamp(min=1e-9), 0)
+    depth = frame.depth
     out = RenderOutput(frame.rgb + 0.1, torch.ones_like(depth), 2 * depth, torch.zeros(1, 2), torch.zeros(1))
     drawn = Drawn(Stage.COARSE, 1, 0, frame, None, None, None, None, out, None, weight)
     terms = METHOD.terms(drawn, CFG, NUMBA)
@@ -128,13 +128,13 @@ def test_the_loss_by_hand(tiny_sequence):
 
 def test_depth_is_compared_without_its_scale():
     target = torch.tensor([[10.0, 20.0], [40.0, 0.0]])
-    inverse, measured = torch.where(target > 0, 1 / target.clamp(min=1), 0), target > 0
-    assert float(depth_huber(3 * target, inverse, measured)) == pytest.approx(0, abs=1e-9)
+    measured = target > 0
+    assert float(depth_huber(3 * target, target, measured)) == pytest.approx(0, abs=1e-9)
     depth = torch.tensor([[10.0, 40.0], [40.0, 99.0]])  # the largest lies where nothing was measured
     scaled, wanted = depth / 99 * measured, target / 40
     gap = (scaled - wanted).abs()
     expected = torch.where(gap < 0.2, 0.5 * gap**2, 0.2 * (gap - 0.1)).mean()
-    assert float(depth_huber(depth, inverse, measured)) == pytest.approx(float(expected), rel=1e-4)
+    assert float(depth_huber(depth, target, measured)) == pytest.approx(float(expected), rel=1e-4)
 
 
 def test_rates_at_given_iterations():

@@ -13,7 +13,8 @@ from endoprior.core.presets import preset
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
 from endoprior.evaluation import metrics
-from endoprior.methods.surgicalgaussian import METHOD, first_seen, neighbor_terms
+from endoprior.methods.surface_points import grid_points
+from endoprior.methods.surgicalgaussian import METHOD, neighbor_terms
 from endoprior.methods.surgicalgaussian_terms import covariances, distance_change, ssim
 from endoprior.methods.time_network import TimeNetwork, encoded, state_shapes
 from endoprior.model.gaussians import create_gaussians
@@ -130,7 +131,7 @@ def test_neighbor_terms_by_hand():
 def test_the_loss_by_hand(tiny_sequence):
     frames = TrainingFrames(load_sequence(tiny_sequence), CFG.prior)
     frame = frames.frame(0)
-    depth = torch.where(frame.measured, 1 / frame.inverse_depth.clamp(min=1e-9), 0)
+    depth = frame.depth
     out = RenderOutput(frame.rgb + 0.1, torch.ones_like(depth), depth + 5, torch.zeros(1, 2), torch.zeros(1))
     drawn = Drawn(Stage.COARSE, 1, 0, frame, gaussians_at(np.eye(3)), None, None, None, out, None, None)
     terms = {name: float(value.detach()) for name, value in METHOD.terms(drawn, CFG, NUMBA).items()}
@@ -144,7 +145,7 @@ def test_the_loss_by_hand(tiny_sequence):
 
 def test_points_start_at_every_third_pixel_where_first_seen(tiny_sequence):
     frames = load_sequence(tiny_sequence, DataConfig()).frames("train")
-    cloud = first_seen(frames)
+    cloud = grid_points(frames, 3, 1)
     cells = np.zeros_like(frames[0].tissue_mask)
     cells[1::3, 1::3] = True
     seen = np.zeros_like(cells)
@@ -154,7 +155,7 @@ def test_points_start_at_every_third_pixel_where_first_seen(tiny_sequence):
         seen |= new
     assert len(cloud) == np.count_nonzero(seen)
     with pytest.raises(InputError, match="at least 4 points"):
-        first_seen([replace(frames[0], tissue_mask=np.zeros_like(frames[0].tissue_mask))])
+        grid_points([replace(frames[0], tissue_mask=np.zeros_like(frames[0].tissue_mask))], 3, 1)
 
 
 def test_rates_at_given_iterations():

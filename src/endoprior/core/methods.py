@@ -18,6 +18,7 @@ METHODS = {
     OWN: "endoprior.methods.own",
     "deform3dgs": "endoprior.methods.deform3dgs",
     "endogs": "endoprior.methods.endogs",
+    "endo4dgs": "endoprior.methods.endo4dgs",
     "surgicalgaussian": "endoprior.methods.surgicalgaussian",
     "endonerf": "endoprior.methods.endonerf",
     "endosurf": "endoprior.methods.endosurf",

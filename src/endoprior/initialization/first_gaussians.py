@@ -37,6 +37,18 @@ class FirstGaussians:
     """None: at rest."""
 
 
+def resting_spheres(cloud: PointCloud, opacity: float) -> FirstGaussians:
+    """Spheres at rest, as wide as their neighbors are apart: how 3DGS and what follows it starts.
+
+    Args:
+        opacity: in (0, 1).
+    """
+    num = len(cloud)
+    log_scales = np.tile(initial_log_scales(cloud.points)[:, None], 3)
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (num, 1))
+    return FirstGaussians(cloud, log_scales, quats, np.full(num, opacity, np.float32), None)
+
+
 def first_gaussians(frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
     """Sample points from the training frames, let them move by optical flow, fill what no frame shows, as `cfg` says.
 

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..core.config import Config, DensityConfig, LossConfig, OptimConfig, ScheduleConfig, TemporalConfig
 from ..core.types import Frame
-from ..initialization.first_gaussians import FirstGaussians
-from ..initialization.sampling import initial_log_scales
+from ..initialization.first_gaussians import FirstGaussians, resting_spheres
 from ..model.deformation import Offsets
 from ..model.field import Field
 from ..model.gaussians import Gaussians
@@ -88,10 +86,7 @@ class Deform3DGS(GaussianMethod):
 
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
         """See `GaussianMethod.first_gaussians`."""
-        cloud = first_points(frames, cfg.seed)
-        log_scales = np.tile(initial_log_scales(cloud.points)[:, None], 3)
-        quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(cloud), 1))
-        return FirstGaussians(cloud, log_scales, quats, np.full(len(cloud), cfg.init.opacity, np.float32), None)
+        return resting_spheres(first_points(frames, cfg.seed), cfg.init.opacity)
 
     def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
         """See `GaussianMethod.rate`: coefficients learn as centers do."""

@@ -90,7 +90,7 @@ class EndoGS(GaussianMethod):
         mask = frame.tissue_mask[..., None]
         terms = {
             "color": ((out.color - frame.rgb).abs() * mask * drawn.context[..., None]).mean(),
-            "depth": DEPTH_WEIGHT * depth_huber(out.depth, frame.inverse_depth, frame.measured),
+            "depth": DEPTH_WEIGHT * depth_huber(out.depth, frame.depth, frame.measured),
             "tv": TV_WEIGHT * total_variation(out.color * ~mask),
         }
         if drawn.stage is Stage.FINE:
@@ -120,14 +120,13 @@ class EndoGS(GaussianMethod):
         return inside and (iteration == FIRST_RESET or iteration % RESET_EVERY == 0)
 
 
-def depth_huber(depth: Tensor, target_inverse: Tensor, measured: Tensor) -> Tensor:
+def depth_huber(depth: Tensor, target: Tensor, measured: Tensor) -> Tensor:
     """Huber loss, mean over all pixels, of depths that are each divided by the largest of their image.
 
     Args:
-        depth: (H, W) mm; its largest value counts wherever it is, and carries a gradient.
-        target_inverse: (H, W) 1 / mm. measured: (H, W) bool; other pixels are 0 on both sides.
+        depth, target: (H, W) mm; the largest value of each counts wherever it is; that of `depth` has a gradient.
+        measured: (H, W) bool; other pixels are 0 on both sides.
     """
-    target = torch.where(target_inverse > 0, 1 / target_inverse.clamp(min=1e-12), 0)
     scaled, wanted = (values / (values.max() + DEPTH_EPSILON) * measured for values in (depth, target))
     return huber_loss(scaled, wanted, delta=HUBER_DELTA)
 

@@ -14,13 +14,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ..compute.neighbors import nearest
-from ..core.checks import input_error
 from ..core.config import Config, DensityConfig, OptimConfig, ScheduleConfig, TemporalConfig
-from ..core.geometry import back_project
 from ..core.types import Frame, Splats
-from ..initialization.cleanup import PointCloud, concatenated
-from ..initialization.first_gaussians import FirstGaussians
-from ..initialization.sampling import MIN_POINTS, has_surface, initial_log_scales
+from ..initialization.first_gaussians import FirstGaussians, resting_spheres
 from ..model.deformation import Offsets
 from ..model.gaussians import Gaussians
 from ..model.motion import Motion
@@ -33,6 +29,7 @@ from ..training.losses_torch import total_variation
 from ..training.ops import TrainingOps
 from ..training.rates import Rate, log_linear, rate_of
 from ..training.stage import Stage
+from .surface_points import grid_points
 from .surgicalgaussian_terms import covariances, distance_change, ssim
 from .time_network import TimeNetwork, state_shapes
 
@@ -115,10 +112,7 @@ class SurgicalGaussian(GaussianMethod):
 
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
         """See `GaussianMethod.first_gaussians`."""
-        cloud = first_seen(frames)
-        log_scales = np.tile(initial_log_scales(cloud.points)[:, None], 3)
-        quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(cloud), 1))
-        return FirstGaussians(cloud, log_scales, quats, np.full(len(cloud), cfg.init.opacity, np.float32), None)
+        return resting_spheres(grid_points(frames, EVERY_PX, FIRST_PX), cfg.init.opacity)
 
     def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
         """See `GaussianMethod.position`."""
@@ -137,12 +131,11 @@ class SurgicalGaussian(GaussianMethod):
         frame, out, gaussians = drawn.frame, drawn.out, drawn.gaussians
         mask = frame.tissue_mask[..., None]
         color, target = out.color * mask, frame.rgb * mask
-        wanted = torch.where(frame.measured, 1 / frame.inverse_depth.clamp(min=1e-12), 0)
         terms = {
             "color": COLOR_SHARE * (color - target).abs().mean(),
             "ssim": (1 - COLOR_SHARE) * (1 - ssim(color, target)),
             "tv": TV_WEIGHT * 2 * total_variation(out.color * ~mask),
-            "depth": DEPTH_WEIGHT * (out.depth * frame.measured - wanted).abs().mean() / UNIT_MM,
+            "depth": DEPTH_WEIGHT * ((out.depth - frame.depth) * frame.measured).abs().mean() / UNIT_MM,
         }
         return terms if drawn.offsets is None else terms | neighbor_terms(gaussians, drawn.offsets, drawn.splats)
 
@@ -177,28 +170,6 @@ def neighbor_terms(gaussians: Gaussians, offsets: Offsets, splats: Splats) -> di
         "distance": DISTANCE_WEIGHT * distance_change(means / UNIT_MM, splats.means / UNIT_MM, neighbors),
         "shape": SHAPE_WEIGHT * distance_change(before, after, neighbors),
     }
-
-
-def first_seen(frames: Sequence[Frame]) -> PointCloud:
-    """A point at every third pixel, from the first frame that shows tissue with depth there.
-
-    Raises:
-        InputError: fewer than 4 points.
-    """
-    grid = np.zeros_like(frames[0].tissue_mask)
-    grid[FIRST_PX::EVERY_PX, FIRST_PX::EVERY_PX] = True
-    clouds = []
-    for position, frame in enumerate(frames):
-        v, u = np.nonzero(grid & frame.tissue_mask & has_surface(frame))
-        grid[v, u] = False
-        points = back_project(np.stack([u, v], -1) + 0.5, frame.depth[v, u].astype(np.float64), frame.camera)
-        colors = frame.rgb_u8[v, u].astype(np.float32) / np.float32(255)
-        clouds.append(PointCloud(points.astype(np.float32), colors, np.full(len(v), position, np.int32)))
-    cloud = concatenated(clouds)
-    if len(cloud) < MIN_POINTS:
-        want = f"at least {MIN_POINTS} points, one for nine tissue pixels with depth"
-        raise input_error("initialization", want, str(len(cloud)), "Check masks and depth: `endoprior check DATA`.")
-    return cloud
 
 
 METHOD = SurgicalGaussian()

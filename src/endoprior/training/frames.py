@@ -48,6 +48,11 @@ class TrainingFrame:
         """(H, W, 3) color in [0, 1]."""
         return self.rgb_u8.float() / 255
 
+    @property
+    def depth(self) -> Tensor:
+        """(H, W) mm; 0 where there is none."""
+        return torch.where(self.inverse_depth > 0, 1 / self.inverse_depth.clamp(min=1e-12), 0)
+
 
 DEVICE_SHARE = 0.25
 """Share of a device's free memory that frames may take; frames beyond it are copied at each use."""
