@@ -167,7 +167,7 @@ def test_cells_of_images_without_a_seed_are_one_for_each_sequence(tmp_path):
     [
         ({"method": "nearest-fram"}, "methods.m.method: expected one of default, .*nearest-frame, got 'nearest"),
         ({"method": "pictures"}, "methods.m.method: expected one of"),
-        ({"preset": "nearest-frame"}, "methods.m.preset: expected one of default, .*preview, got"),
+        ({"preset": "nearest-frame"}, "methods.m.preset: expected one of default, .*deform3dgs.*, got"),
         ({"method": "nearest-frame", "preset": "paper"}, "methods.m: expected one of preset, method and pictures"),
         ({"method": "nearest-frame", "set": {"frames": 3}}, "methods.m.set: expected the name"),
         ({"method": "nearest-frame", "set": {"num_frames": "x"}}, "methods.m.num_frames: expected an integer"),

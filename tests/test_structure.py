@@ -16,7 +16,7 @@ FLOORS = [
     {"core", "compute"},
     {"system", "render", "priors", "footage"},
     {"data", "model"},
-    {"initialization", "evaluation", "visualization", "phantom", "tool_masks"},
+    {"initialization", "evaluation", "visualization", "phantom", "tool_masks", "radiance"},
     {"training", "doctor", "prepare", "check", "export", "view"},
     {"methods"},
     {"runs"},

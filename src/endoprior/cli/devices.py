@@ -12,10 +12,10 @@ from ..doctor.choice import Wanted, choose_here
 from ..system.console import say
 
 if TYPE_CHECKING:
-    from ..model.scene import Scene
+    from ..model.scene import RenderedScene
 
 
-def on_device(scene: Scene, wanted: Wanted, *, fp16_planes: bool = False) -> Scene:
+def on_device(scene: RenderedScene, wanted: Wanted, *, fp16_planes: bool = False) -> RenderedScene:
     """The scene on the chosen device. Prints the device and the reason, unless the user asked for the CPU.
 
     Args:

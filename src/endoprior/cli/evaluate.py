@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..data import FrameSequence
     from ..evaluation.context import Evaluation
     from ..evaluation.protocols.table import ProtocolName
-    from ..model.scene import Scene
+    from ..model.scene import RenderedScene
 
 
 BETTER = "\u2191 higher is better, \u2193 lower is better"
@@ -102,7 +102,7 @@ def run(argv: list[str]) -> None:
 
 
 def evaluate_run(
-    scene: Scene,
+    scene: RenderedScene,
     run: Path,
     data: Path,
     out: Path,

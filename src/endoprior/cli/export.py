@@ -14,7 +14,7 @@ from ..system.console import say
 from .help_page import Help
 from .parsing import parse
 from .progress import Counting
-from .trained_scene import open_scene, sequence_of
+from .trained_scene import open_gaussians, sequence_of
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
@@ -55,7 +55,7 @@ def run(argv: list[str]) -> None:
     from .output_paths import require_new_file
 
     options = ExportOptions(**{field.name: getattr(args, field.name) for field in fields(ExportOptions)})
-    scene = open_scene(args.run)
+    scene = open_gaussians(args.run)
     if not args.overwrite:
         require_new_file(args.out)
     options = _with_data(scene, args.run, args.out, options)

@@ -14,10 +14,10 @@ from ..system.console import say
 from .devices import on_device
 from .help_page import Help
 from .parsing import parse
-from .trained_scene import open_scene
+from .trained_scene import open_scene, reject_without_gaussians
 
 if TYPE_CHECKING:
-    from ..model.scene import Scene
+    from ..model.scene import RenderedScene
 
 
 @dataclass
@@ -73,11 +73,13 @@ def run(argv: list[str]) -> None:
     render(scene, args)
 
 
-def render(scene: Scene, args: Render) -> None:
+def render(scene: RenderedScene, args: Render) -> None:
     """Render the views selected by `args` and print the output paths."""
     from .output_paths import require_writable_folder
 
     require_writable_folder("OUT" if args.out else "RUN", args.out or args.run)
+    if args.layer != "color" or not args.highlights:
+        reject_without_gaussians(scene, args.run)
     scene = on_device(scene, args.device, fp16_planes=True)
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data

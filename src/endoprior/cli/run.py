@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from ..core.checks import input_error
+from ..core.methods import method_named
 from ..core.options import command_of
 from ..core.presets import PresetName, preset
 from ..core.shell import command
@@ -124,6 +126,9 @@ def job_of(args: Run, tell: Callable[[str], None]) -> Job:
     from ..pipeline import make_job
 
     cfg = replace(preset("preview" if args.preview else args.preset), seed=args.seed)
+    if not method_named(cfg.method).has_gaussians:
+        fix = f"`{command('prepare', args.video, 'DATA')}`, then `train`, `eval` and `render`."
+        raise input_error("--preset", "a method with Gaussians, which all steps need", args.preset, fix)
     cfg = with_device(cfg, args.device, tell)
     return make_job(args.video, args.out, args.config, cfg, preset=args.preset, preview=args.preview)
 

@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.checks import InputError, input_error
+from ..core.shell import command
 from ..system.console import say
 
 if TYPE_CHECKING:
     from ..data import FrameSequence
-    from ..model.scene import Scene
+    from ..model.scene import RenderedScene, Scene
 
 
-def open_scene(run: Path) -> Scene:
+def open_scene(run: Path) -> RenderedScene:
     """`load_scene` with an error that says what to type if the path is a sequence folder or a video.
 
     Raises:
@@ -30,7 +31,31 @@ def open_scene(run: Path) -> Scene:
         raise
 
 
-def sequence_of(scene: Scene, run: Path, data: Path | None, without: str) -> FrameSequence | None:
+def open_gaussians(run: Path) -> Scene:
+    """`open_scene` for what needs Gaussians.
+
+    Raises:
+        InputError: as `open_scene`, or the scene has none.
+    """
+    scene = open_scene(run)
+    reject_without_gaussians(scene, run)
+    return scene
+
+
+def reject_without_gaussians(scene: RenderedScene, run: Path) -> None:
+    """Reject a radiance field.
+
+    Raises:
+        InputError: the scene has no Gaussians.
+    """
+    from ..model.scene import Scene
+
+    if not isinstance(scene, Scene):
+        fix = f"`{command('render', run)}` makes images and a video of it."
+        raise input_error(run, "a scene of Gaussians", f"a radiance field ({scene.config.method})", fix)
+
+
+def sequence_of(scene: RenderedScene, run: Path, data: Path | None, without: str) -> FrameSequence | None:
     """The sequence of a run's scene, with the scene's poses; None, with a note, if it does not exist any more.
 
     Args:

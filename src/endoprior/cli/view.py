@@ -18,7 +18,7 @@ from ..system.console import say
 from .devices import on_device
 from .help_page import Help
 from .parsing import parse
-from .trained_scene import sequence_of
+from .trained_scene import open_gaussians, sequence_of
 
 if TYPE_CHECKING:
     from ..training.stage import StepReport
@@ -126,10 +126,9 @@ def open_viewable(
         if not highlights:
             raise input_error("--no-highlights", "a run folder", f"{path}, a sequence", "Leave it out.")
         return ViewableSequence(load_sequence(path)), None
-    from ..model.scene_file import load_scene
     from ..view.viewable_scene import ViewableScene
 
-    scene = load_scene(folder)
+    scene = open_gaussians(folder)
     originals = sequence_of(scene, folder, data, "there are no differences and tools to show")
     scene = on_device(scene, device, fp16_planes=True)
     if not highlights:

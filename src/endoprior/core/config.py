@@ -19,6 +19,7 @@ from .checks import InputError, check_range, read_ranges
 from .config_deformation import DeformationConfig
 from .config_io import from_dict, override, to_dict
 from .config_poses import PoseConfig
+from .config_radiance import RadianceConfig
 from .config_windows import WindowConfig
 from .methods import METHODS, OWN
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
@@ -338,6 +339,7 @@ class Config(Checked):
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     poses: PoseConfig = field(default_factory=PoseConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
+    radiance: RadianceConfig = field(default_factory=RadianceConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -20,6 +20,8 @@ METHODS = {
     "endogs": "endoprior.methods.endogs",
     "endo4dgs": "endoprior.methods.endo4dgs",
     "surgicalgaussian": "endoprior.methods.surgicalgaussian",
+    "endonerf": "endoprior.methods.endonerf",
+    "endosurf": "endoprior.methods.endosurf",
 }
 """Module of each method; its object is called `METHOD` there. The name is that of its preset, too."""
 

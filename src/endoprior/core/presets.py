@@ -9,6 +9,7 @@ from .checks import InputError
 from .config import Config, DataConfig, DensityConfig, InitConfig, OptimConfig, SalienceConfig, TemporalConfig
 from .config_deformation import DeformationConfig, HexPlaneConfig
 from .methods import METHODS, OWN, method_named
+from .presets_radiance import endonerf_published, endosurf_published
 
 
 def preset(name: str = "default", **changes: Any) -> Config:
@@ -21,7 +22,7 @@ def preset(name: str = "default", **changes: Any) -> Config:
     """
     if name not in preset_names():
         raise InputError(f"preset: expected one of {', '.join(preset_names())}; got {name!r}. Choose one of them.")
-    made = OWN_PRESETS[name]() if name in OWN_PRESETS else method_named(name).config()
+    made = PRESETS[name]() if name in PRESETS else method_named(name).config()
     return made.replace(changes) if changes else made
 
 
@@ -144,12 +145,14 @@ def preview() -> Config:
 
 
 OWN_PRESETS = {made.__name__: made for made in (default, best, paper, released, endogaussian, preview)}
-"""Those of our own method; every other method has one preset, of its name."""
+"""Those of our own method."""
+PRESETS = OWN_PRESETS | {"endonerf-published": endonerf_published, "endosurf-published": endosurf_published}
+"""Those that have a function; every other method than ours also has one of its name."""
 
 
 def preset_names() -> tuple[str, ...]:
     """Every name that `preset` knows."""
-    return (*OWN_PRESETS, *(name for name in METHODS if name != OWN))
+    return (*PRESETS, *(name for name in METHODS if name != OWN))
 
 
 PresetName = Literal[preset_names()]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data import FrameList, FrameSequence, Split
-from ..model.scene import Scene
+from ..model.scene import RenderedScene, Scene
 from ..system.atomic import write_json
 from .metrics import ScoreUnavailable, mean_over_frames
 from .rendered import Reconstruction, RenderedFrames, SceneFrames
@@ -24,7 +24,8 @@ OUTLIER_DB = 3.0
 EXACT = "infinite: the rendered frames equal the true ones exactly"
 """Why there is no PSNR where no frame has any error; black frames, for example."""
 NETWORKS_OFF = "network scores were not asked for"
-NO_SCENE = "needs the Gaussians of a scene; there are rendered images only"
+NO_SCENE = "needs a scene; there are rendered images only"
+NO_GAUSSIANS = "needs the Gaussians of a scene; this one has none"
 
 
 @dataclass
@@ -102,8 +103,8 @@ class EvaluationContext:
         return RenderedFrames(self.reconstruction, self.sequence, self.split)
 
     @property
-    def scene(self) -> Scene:
-        """The Gaussians and their motion, for scores that images do not have.
+    def rendered_scene(self) -> RenderedScene:
+        """What renders the tissue from any camera, for scores that the frames' own images do not have.
 
         Raises:
             ScoreUnavailable: only rendered images are scored.
@@ -111,6 +112,17 @@ class EvaluationContext:
         if not isinstance(self.reconstruction, SceneFrames):
             raise ScoreUnavailable(NO_SCENE)
         return self.reconstruction.scene
+
+    @property
+    def scene(self) -> Scene:
+        """The Gaussians and their motion, for scores of these.
+
+        Raises:
+            ScoreUnavailable: only rendered images are scored, or a scene without Gaussians.
+        """
+        if not isinstance(self.rendered_scene, Scene):
+            raise ScoreUnavailable(NO_GAUSSIANS)
+        return self.rendered_scene
 
     def add(self, name: str, value: float, reason: str = "not finite") -> None:
         """Record a score, or `reason` where it is not finite; an int stays one."""

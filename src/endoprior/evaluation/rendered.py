@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..core.checks import InputError
 from ..core.types import Camera
 from ..data import FrameSequence, Split
-from ..model.scene import Scene
+from ..model.scene import RenderedScene
 from ..system.memory import BoundedCache, cache_bytes
 from .metrics import ScoreUnavailable, to_uint8
 
@@ -21,7 +21,7 @@ Rendering = tuple[NDArray[np.float32], NDArray[np.float32] | None]
 
 
 class Reconstruction(Protocol):
-    """The result of a method, as it is scored. A `Scene` is one already: `SceneFrames`.
+    """The result of a method, as it is scored. `SceneFrames` makes one of a scene.
 
     It may have an attribute `provenance`, a dict in JSON's types, which is saved in `metrics.json` beside the scores.
     """
@@ -38,7 +38,7 @@ class Reconstruction(Protocol):
 class SceneFrames:
     """A scene, rendered at the times and from the cameras of a sequence."""
 
-    def __init__(self, scene: Scene, sequence: FrameSequence) -> None:
+    def __init__(self, scene: RenderedScene, sequence: FrameSequence) -> None:
         """Args: scene: what to render. sequence: times and cameras."""
         self.scene, self._sequence = scene, sequence
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..data import FrameSequence, Split
-from ..model.scene import Scene
+from ..model.scene import RenderedScene
 from ..system.devices import name_of
 from .context import Evaluation, EvaluationContext
 from .metrics import ScoreUnavailable
@@ -25,11 +25,11 @@ from .protocols.table import OURS, ProtocolName
 from .protocols.tags import tags_of
 from .registry import REGISTRY, SCORERS, Scorer, scorers
 from .rendered import Reconstruction, SceneFrames
-from .scorers.speed import FPS_RENDERS
+from .scorers.speed import FPS_RENDERS, LONGEST_SECONDS
 
 
 def evaluate(
-    scene: Scene | Reconstruction,
+    scene: RenderedScene | Reconstruction,
     sequence: FrameSequence,
     split: Split = "test",
     *,
@@ -42,8 +42,8 @@ def evaluate(
     """Score `scene` on a split of `sequence`: every score that docs/scores.md lists.
 
     Args:
-        scene: a trained scene, or anything that renders the frames of the sequence (`Reconstruction`). Without a scene
-            the scores that need its Gaussians are skipped.
+        scene: a trained scene, or anything that renders the frames of the sequence (`Reconstruction`). Scores that
+            need a scene, or its Gaussians, are skipped where there are none.
         networks: also compute the scores that need a network (RAFT, LPIPS). Their weights are looked for in
             `weights_dir`, then in `ENDOPRIOR_WEIGHTS`, then in torch's cache, and are downloaded at last.
         reading: how `sequence` was read, for the protocol; None: as the scene's config says, or the default.
@@ -53,7 +53,7 @@ def evaluate(
     Raises:
         InputError: the sequence is not the one the scene was trained on (the number of frames differs).
     """
-    is_scene = isinstance(scene, Scene)
+    is_scene = isinstance(scene, RenderedScene)
     if is_scene and len(sequence) != len(scene.cameras):
         frames = f"the {len(scene.cameras)} frames the scene was trained on"
         raise input_error(sequence.path, frames, str(len(sequence)), "pass the same sequence.")
@@ -121,8 +121,9 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
     }
 
 
-def _rendering(scene: Scene) -> dict[str, Any]:
+def _rendering(scene: RenderedScene) -> dict[str, Any]:
     return {
         "backend": scene.backend,
-        "fps": f"{FPS_RENDERS} renders of the sequence's frames, one after the other; {name_of(scene.device)}",
+        "fps": f"{FPS_RENDERS} renders of the sequence's frames, one after the other, or as many as end in "
+        f"{LONGEST_SECONDS:g} s; {name_of(scene.device)}",
     }

@@ -84,7 +84,7 @@ def work(job: Job) -> None:
     from ..data import load_sequence
     from ..evaluation.scoring import evaluate, scored_data
     from ..evaluation.true_masks import SCORES_FILE
-    from ..model.scene import Scene
+    from ..model.scene import RenderedScene
     from .method import PICTURES, REGISTRY
 
     method, folder = REGISTRY.load(job.method), Path(job.folder)
@@ -121,7 +121,7 @@ def work(job: Job) -> None:
     if origin := REGISTRY.origin(job.method):
         about = {"name": job.method, "package": origin, "options": job.options, "seed": job.seed}
         result.provenance["plugin"] = about
-    if isinstance(found, Scene) and not (run / "scene.safetensors").exists():
+    if isinstance(found, RenderedScene) and not (run / "scene.safetensors").exists():
         found.save(run / "scene.safetensors")
     result.save(folder)
     (run / "checkpoint.safetensors").unlink(missing_ok=True)  # large, and no longer needed

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..data import FrameSequence
     from ..training.trainer import Trainer
     from .motion import Motion
-    from .scene import Scene
+    from .scene import RenderedScene
     from .scene_facts import SceneFacts
 
 
@@ -30,6 +30,9 @@ class Method(ABC):
 
     background = (0.0, 0.0, 0.0)
     """Color behind everything, in [0, 1], in training and where its scenes are rendered."""
+
+    has_gaussians = True
+    """Whether its scenes consist of Gaussians: a `Scene`; else they are only a `RenderedScene`."""
 
     @abstractmethod
     def config(self) -> Config:
@@ -48,7 +51,7 @@ class Method(ABC):
         """The arrays that its scenes are saved as, beside the cameras; `N` Gaussians, if there are any."""
 
     @abstractmethod
-    def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> Scene:
+    def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> RenderedScene:
         """The scene whose arrays these are; they fit `schema`.
 
         Raises:

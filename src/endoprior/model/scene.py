@@ -56,8 +56,8 @@ class Shown:
     """In (0, 1]: 1 unless two windows overlap there. The weights of all windows add up to 1."""
 
 
-class Scene(ABC):
-    """Everything needed to render the tissue at any time from any viewpoint. Frame i of T was taken at time i / T."""
+class RenderedScene(ABC):
+    """What renders the tissue at any time from any viewpoint. Frame i of T was taken at time i / T."""
 
     config: Config
     cameras: tuple[Camera, ...]
@@ -65,6 +65,55 @@ class Scene(ABC):
     frames_per_second: float
     lengths_are_relative: bool
     """Whether the scale of the sequence's depth was assumed: lengths are then not in mm."""
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Device that holds the scene and renders it."""
+
+    @property
+    @abstractmethod
+    def backend(self) -> str:
+        """What renders it, in words."""
+
+    @abstractmethod
+    def to(
+        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
+    ) -> RenderedScene:
+        """This scene on a device; itself if it is there.
+
+        Args:
+            backend: renders Gaussians there; None: the one they were trained with, or gsplat on a GPU.
+            fp16_planes: HexPlane in half precision, half the memory and faster: for rendering, cannot be saved.
+        """
+
+    @abstractmethod
+    def save(self, path: Path) -> None:
+        """Write the scene as safetensors, completely or not at all."""
+
+    @abstractmethod
+    def render(self, time: float, camera: Camera | None = None) -> RenderedView:
+        """Render the scene at `time` in [0, 1], from `camera` or else the camera of the frame nearest in time.
+
+        Returns:
+            color (H, W, 3) in [0, 1], depth (H, W) mm as the sum of weight * z, alpha (H, W) in [0, 1], and
+            unclamped_color (H, W, 3).
+        Raises:
+            ValueError: time is not in [0, 1].
+        """
+
+    def render_many(self, times: list[float], cameras: list[Camera]) -> list[RenderedView]:
+        """`render` at several times, one camera each."""
+        return [self.render(time, camera) for time, camera in zip(times, cameras, strict=True)]
+
+    def camera_at(self, time: float) -> Camera:
+        """Camera of the frame nearest in time."""
+        return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
+
+
+class Scene(RenderedScene):
+    """A scene of Gaussians."""
+
     rendered_by: render.Backend | None
     """Rendering backend; None: the one it was trained with, where it can be used."""
 
@@ -73,25 +122,9 @@ class Scene(ABC):
     def windows(self) -> Sequence[Window]:
         """Its windows, in order; a window overlaps the next one only."""
 
-    @property
-    @abstractmethod
-    def device(self) -> torch.device:
-        """Device that holds the scene and renders it."""
-
     @abstractmethod
     def __len__(self) -> int:
         """Number of Gaussians in all windows."""
-
-    @abstractmethod
-    def to(
-        self, device: torch.device | str, *, backend: render.Backend | None = None, fp16_planes: bool = False
-    ) -> Scene:
-        """This scene on a device; itself if it is there.
-
-        Args:
-            backend: renders it there; None: the one it was trained with, or gsplat on a GPU.
-            fp16_planes: HexPlane in half precision, half the memory and faster: for rendering, cannot be saved.
-        """
 
     @abstractmethod
     def changed(self, change: Callable[[SingleScene, Window], SingleScene]) -> Scene:
@@ -179,10 +212,6 @@ class Scene(ABC):
             if backend is not None and (backend in render.ON_GPU) == on_gpu:
                 return backend
         return "gsplat" if on_gpu else "numba"
-
-    def camera_at(self, time: float) -> Camera:
-        """Camera of the frame nearest in time."""
-        return self.cameras[min(round(time * len(self.cameras)), len(self.cameras) - 1)]
 
 
 def faded_in(place: float) -> float:

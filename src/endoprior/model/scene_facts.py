@@ -16,7 +16,7 @@ from ..core.ranges import Checked, Range
 from ..core.types import Camera
 
 if TYPE_CHECKING:
-    from .scene import Scene
+    from .scene import RenderedScene
 
 LARGEST_SIDE = 2**16
 """Largest width or height of an image, px."""
@@ -43,7 +43,7 @@ class SceneFacts(Checked):
         check_range("trained_until", self.trained_until, self.trained_from, 1)
 
 
-def scene_facts(scene: Scene) -> dict[str, Any]:
+def scene_facts(scene: RenderedScene) -> dict[str, Any]:
     """What the metadata of every scene's file say."""
     first = scene.cameras[0]
     return {

@@ -20,7 +20,7 @@ from ..core.types import Camera
 from ..system.arrays_file import ArraySpec, load_arrays, rejecting
 from . import windowed_scene
 from .method import method_of
-from .scene import Scene
+from .scene import RenderedScene
 from .scene_facts import LARGEST_IMAGE, LARGEST_SIDE, MOST_GAUSSIANS, SceneFacts, camera_arrays, demand
 from .single_scene import FORMAT, SingleScene
 from .windowed_scene import Span, WindowedScene, window_file
@@ -35,7 +35,7 @@ LARGEST_DEVIATION = 5e-3
 """Largest entry of R R^T - I that still passes for a rotation; readers accept 1e-3 of R^T R."""
 
 
-def load_scene(path: str | Path) -> Scene:
+def load_scene(path: str | Path) -> RenderedScene:
     """Read a scene from a run folder or from the path of `scene.safetensors` itself.
 
     Raises:

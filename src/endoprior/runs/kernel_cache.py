@@ -20,6 +20,7 @@ from filelock import FileLock
 
 from ..core.config import Config
 from ..core.config_io import to_dict
+from ..model.method import method_of
 from ..render import ON_GPU
 
 PACKAGE = Path(__file__).parents[1]
@@ -34,7 +35,7 @@ def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
     Args:
         say: takes one line if kernels must be compiled, which takes about a minute.
     """
-    if cfg.render.backend in ON_GPU:  # which needs no Numba kernels
+    if cfg.render.backend in ON_GPU or not method_of(cfg).has_gaussians:  # which need no Numba kernels
         return
     key = _key(cfg)
     if key in _filled:

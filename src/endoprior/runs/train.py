@@ -11,7 +11,7 @@ from pathlib import Path
 from ..core.config import Config
 from ..data import FrameSequence, load_sequence
 from ..data.window_plan import look_through, plan_windows
-from ..model.scene import Scene
+from ..model.scene import RenderedScene
 from ..training.trainer import Observer
 from .observers import CHECKPOINT_SECONDS
 from .progress import is_watched, training_progress
@@ -31,7 +31,7 @@ def train(
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     on_step: Observer | None = None,
     progress: bool | None = None,
-) -> Scene:
+) -> RenderedScene:
     """Train one scene.
 
     Args:

@@ -10,7 +10,7 @@ from ..core.checks import InputError
 from ..core.config import Config
 from ..data import FrameSequence
 from ..model.method import method_of
-from ..model.scene import Scene
+from ..model.scene import RenderedScene
 from ..system.atomic import write_json, writing
 from ..system.file_lock import locked
 from ..training.divergence import Diverged
@@ -58,7 +58,7 @@ class TrainingRun:
             say(f"note: {warning}")
         self.trainer = method_of(cfg).trainer(sequence, cfg)
 
-    def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> Scene:
+    def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> RenderedScene:
         """Train to the end; `observers` are called after each iteration, in this order. See `runs.train`."""
         if self.out is None:
             self.trainer.start()

@@ -13,7 +13,7 @@ from .. import render
 from ..core.checks import InputError
 from ..core.config import Config
 from ..data import FrameSequence
-from ..model.scene import Scene
+from ..model.scene import RenderedScene
 from ..system.arrays_file import ArraySpec
 from .stage import Stage, StepReport, stage_length
 
@@ -68,7 +68,7 @@ class Trainer(ABC):
         """
 
     @abstractmethod
-    def scene(self) -> Scene:
+    def scene(self) -> RenderedScene:
         """The scene as it is now, on the CPU."""
 
     @abstractmethod

@@ -36,7 +36,7 @@ def compute(context: EvaluationContext) -> None:
     """Compare the cameras of all frames, whatever the split; nothing without the true path."""
     if context.true_path is None:
         return
-    scene = context.scene
+    scene = context.rendered_scene
     errors = metrics.trajectory_errors(
         camera_to_world(scene.cameras), context.true_path, with_scale=scene.lengths_are_relative
     )

@@ -41,7 +41,7 @@ def compute(context: EvaluationContext) -> None:
         return
     scene = None
     with context.skip_if_unavailable("right_psnr", "right_lpips"):  # rendered images: only the warp is scored
-        scene = context.scene
+        scene = context.rendered_scene
     lpips = squeeze_distance(context, "right_lpips") if scene else None
     rows: list[dict[str, float]] = []
     for frame in context.frames:

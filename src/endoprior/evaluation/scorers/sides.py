@@ -103,7 +103,7 @@ def veil(pair: SidePair) -> float:
 
 def _pairs(context: EvaluationContext) -> Iterator[SidePair]:
     """Every side camera in every frame of the split that has its truth."""
-    truth, scene = context.sequence.truth, context.scene
+    truth, scene = context.sequence.truth, context.rendered_scene
     for frame in context.frames:
         for name, pose in truth.side_poses.items():
             if (true := truth.side(name, frame.index)) is None:

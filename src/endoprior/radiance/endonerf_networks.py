@@ -1,0 +1,83 @@
+"""EndoNeRF's two networks: where a point was at time 0, and what is there."""
+
+from __future__ import annotations
+
+import torch
+from torch import Generator, Tensor, nn
+
+from .encoding import encoded, encoded_size
+from .layers import Linear
+
+POSITION, TIME, DIRECTION = 10, 10, 4
+"""Frequencies of each input."""
+LAYERS, WIDTH, SKIP = 8, 256, 5
+"""Hidden layers, their width, and the one that gets the encoded position again."""
+
+
+class _Trunk(nn.Module):
+    """Eight layers; the sixth gets the encoded position once more."""
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        position = encoded_size(3, POSITION)
+        widths = [inputs] + [WIDTH + (position if k == SKIP else 0) for k in range(1, LAYERS)]
+        self.layers = nn.ModuleList(Linear(width, WIDTH) for width in widths)
+
+    def forward(self, inputs: Tensor, position: Tensor) -> Tensor:
+        hidden = inputs
+        for k, layer in enumerate(self.layers):
+            if k == SKIP:
+                hidden = torch.cat([position, hidden], -1)
+            hidden = torch.relu(layer(hidden))
+        return hidden
+
+
+class TimeNetwork(nn.Module):
+    """Displacement of a point from its time to time 0; exactly 0 at time 0."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.trunk = _Trunk(encoded_size(3, POSITION) + encoded_size(1, TIME))
+        self.out = Linear(WIDTH, 3)
+
+    def forward(self, points: Tensor, time: float) -> Tensor:
+        """(P, 3) displacements of points (P, 3) at `time` in [0, 1]."""
+        if time == 0:
+            return torch.zeros_like(points)
+        position = encoded(points, POSITION)
+        at_time = encoded(points.new_tensor([[time]]), TIME).expand(len(points), -1)
+        return self.out(self.trunk(torch.cat([position, at_time], -1), position))
+
+
+class CanonicalNetwork(nn.Module):
+    """Density and color at time 0."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.trunk = _Trunk(encoded_size(3, POSITION))
+        self.density = Linear(WIDTH, 1)
+        self.feature = Linear(WIDTH, WIDTH)
+        self.view = Linear(WIDTH + encoded_size(3, DIRECTION), WIDTH // 2)
+        self.color = Linear(WIDTH // 2, 3)
+
+    def forward(self, points: Tensor, directions: Tensor) -> Tensor:
+        """Color in (0, 1), then density before its ReLU.
+
+        Args:
+            points: (P, 3) at time 0.
+            directions: (P, 3) unit directions of the rays.
+        Returns:
+            (P, 4).
+        """
+        position = encoded(points, POSITION)
+        hidden = self.trunk(position, position)
+        seen = torch.cat([self.feature(hidden), encoded(directions, DIRECTION)], -1)
+        color = torch.sigmoid(self.color(torch.relu(self.view(seen))))
+        return torch.cat([color, self.density(hidden)], -1)
+
+
+def start(network: nn.Module, generator: Generator) -> None:
+    """Give every layer its first values."""
+    for layer in network.modules():
+        if isinstance(layer, Linear):
+            layer.start(generator)
