@@ -62,7 +62,7 @@ def write_copy(
     left_out = set(sequence.mask_files) if chosen.masks == "found" else set()
     with whole_folder(copy) as temporary:
         for file in set(sequence.files) - left_out:
-            place = temporary / file.relative_to(sequence.path)
+            place = temporary / file.relative_to(sequence.path).as_posix()
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, place)
         if chosen.masks == "found":
