@@ -63,3 +63,5 @@ def test_every_method_can_be_found_and_names_itself():
             assert preset(name) == cfg
     with pytest.raises(InputError, match="method: expected one of"):
         Config(method="nerf")
+    with pytest.raises(InputError, match=r"init\.motion: expected rest with method endogs"):
+        preset("default", method="endogs")

@@ -18,6 +18,7 @@ from endoprior.core.config import Config
 from endoprior.core.presets import preset
 from endoprior.core.types import Frame
 from endoprior.data import FrameSequence, load_sequence
+from endoprior.evaluation import context
 from endoprior.evaluation.scorers import speed
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.scene_file import load_scene
@@ -247,6 +248,8 @@ def test_scores_that_need_gaussians_are_skipped(sequence: FrameSequence, monkeyp
         == found.skipped["num_gaussians"]
         == "needs the Gaussians of a scene; this one has none"
     )
+    for name in ("depth_instability_mm", "flow_error_dis_adjacent"):
+        assert found.skipped[name] == context.TOO_SLOW and name not in found.scores
     assert found.protocol["backend"] == "torch, 10 samples per ray"
 
 

@@ -347,6 +347,11 @@ class Config(Checked):
             raise InputError(
                 f"method: expected one of {', '.join(METHODS)}; got {self.method!r:.80}. Start from its preset."
             )
+        if self.init.motion == "flow" and self.method != OWN:
+            raise InputError(
+                f"init.motion: expected rest with method {self.method}; got flow, which only our own method can start "
+                f"from. Start from --preset {self.method}, or leave --method out."
+            )
         if self.init.motion == "flow" and self.deformation.kind != "basis":
             raise InputError(
                 f"init.motion: expected rest with deformation.kind {self.deformation.kind}; got flow, which only the "

@@ -25,6 +25,7 @@ EXACT = "infinite: the rendered frames equal the true ones exactly"
 """Why there is no PSNR where no frame has any error; black frames, for example."""
 NETWORKS_OFF = "network scores were not asked for"
 NO_SCENE = "needs a scene; there are rendered images only"
+TOO_SLOW = "needs every frame of the video, which a radiance field renders for hours on a CPU"
 NO_GAUSSIANS = "needs the Gaussians of a scene; this one has none"
 
 
@@ -96,6 +97,18 @@ class EvaluationContext:
     def frames(self) -> FrameList:
         """Frames of the split."""
         return self.sequence.frames(self.split)
+
+    @property
+    def video(self) -> FrameList:
+        """All frames of the sequence, for scores that render every one of them.
+
+        Raises:
+            ScoreUnavailable: that would take hours.
+        """
+        scene = self.reconstruction.scene if isinstance(self.reconstruction, SceneFrames) else None
+        if scene is not None and not isinstance(scene, Scene) and scene.device.type == "cpu":
+            raise ScoreUnavailable(TOO_SLOW)
+        return self.sequence.frames("video")
 
     @cached_property
     def rendered(self) -> RenderedFrames:

@@ -47,7 +47,7 @@ def compute(context: EvaluationContext) -> None:
     else:
         context.skip("flow_error", NETWORKS_OFF)
     with context.skip_if_unavailable("flow_error_dis_adjacent"):
-        _add(context, "flow_error_dis_adjacent", context.sequence.frames("video"), metrics.dis_flow)
+        _add(context, "flow_error_dis_adjacent", context.video, metrics.dis_flow)
 
 
 def _add(context: EvaluationContext, name: str, frames: Sequence[Frame], estimator: metrics.FlowEstimator) -> None:

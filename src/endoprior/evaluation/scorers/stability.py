@@ -23,6 +23,6 @@ def compute(context: EvaluationContext) -> None:
         metrics.depth_instability(
             context.rendered[a.index].depth, context.rendered[b.index].depth, a.tissue_mask, b.tissue_mask
         )
-        for a, b in pairwise(context.sequence.frames("video"))
+        for a, b in pairwise(context.video)
     ]
     context.add_mean("depth_instability_mm", values, "no two adjacent frames share rendered tissue")
