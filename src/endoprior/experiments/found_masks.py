@@ -26,7 +26,7 @@ def put_found_masks(sequence: FrameSequence, copy: Path) -> None:
     """
     found, with_tools = find_in_sequence(sequence.without_masks()), 0
     for file, (mask, tools) in zip(sequence.mask_files, found, strict=True):
-        place = copy / file.relative_to(sequence.path)
+        place = copy / file.relative_to(sequence.path).as_posix()
         place.parent.mkdir(exist_ok=True)
         write_mask(place, mask, sequence.mask_tool_value)
         with_tools += bool(tools.mask.any())
