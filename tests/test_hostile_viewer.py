@@ -222,12 +222,13 @@ def test_messages_that_no_browser_sends(viewer, good, orbit, capfd):
     time.sleep(0.5)
     stranger.socket.close()
     # True and 1 are values that some of them can have.
-    allowed = {"measure", "follow", "tool", "erase", "tracks", "frame", "since", "clip"}
+    switches = {"measure", "follow", "tool", "erase", "tracks", "correct"}
+    allowed = switches | {"frame", "since", "clip"}
     now = {name: getattr(viewer.panel, name).value for name in state}
     assert {name for name in state if state[name] != now[name]} <= allowed
     assert now["clip"] == state["clip"] and 0 <= now["frame"] <= 9
     assert resident_mb() - before < 100
-    for name in ("measure", "follow", "tool", "erase", "tracks"):
+    for name in switches:
         good.set(getattr(viewer.panel, name), False)
     if orbit:
         good.set(viewer.panel.camera, panels.ENDOSCOPE)

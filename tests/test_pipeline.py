@@ -198,7 +198,5 @@ def test_the_whole_run_says_first_how_long_it_takes(video, tmp_path, capsys, mon
     says = next(k for k, line in enumerate(lines) if line.startswith("This takes about"))
     starts = next(k for k, line in enumerate(lines) if line.startswith("1/6  prepare"))
     assert says < starts
-    assert lines[says + 1].startswith(
-        "If the camera moves, COLMAP takes up to about 1 min 30 s more; `--poses auto-own`"
-    )
+    assert lines[says + 1].startswith("If the camera moves, COLMAP takes up to about 90 s more; `--poses auto-own`")
     assert not (tmp_path / "out/.trial").exists()

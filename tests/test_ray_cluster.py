@@ -42,7 +42,7 @@ class FakeRay:
         self.calls += 1
         return self.calls
 
-    def wait(self, references, num_returns):
+    def wait(self, references, num_returns, timeout):
         return references[:1], references[1:]
 
     def get(self, reference):
@@ -115,3 +115,11 @@ def test_ray_that_is_not_installed(tiny_sequence, tmp_path, capsys, monkeypatch)
 def test_a_live_view_needs_a_training_in_this_process(tiny_sequence, tmp_path, capsys):
     assert main(["train", str(tiny_sequence), str(tmp_path / "out"), "--ray", "local", "--view"]) == 2
     assert "--view: expected a training in this process" in capsys.readouterr().err
+
+
+def test_a_signal_that_ray_swallowed_still_interrupts():
+    cluster = Cluster(FakeRay([2]), silent)
+    cluster.start("one", abs, 1)
+    cluster.interrupted = True
+    with pytest.raises(KeyboardInterrupt):
+        cluster.next()

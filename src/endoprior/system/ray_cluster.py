@@ -19,6 +19,8 @@ from ..core.extras import install_command
 
 CONNECT_SECONDS = 5.0
 """Longest time that a machine may take to answer."""
+SIGNAL_SECONDS = 1.0
+"""Longest time after which a signal whose exception was lost is noticed."""
 SAVE_SECONDS = 120.0
 """Longest time that interrupted calls may take to save their state."""
 HOST_AND_PORT = re.compile(r"(?:ray://)?\[?([^/\]]+)\]?:(\d+)")
@@ -50,6 +52,8 @@ class Cluster:
 
     def __init__(self, ray: Any, say: Callable[[str], None]) -> None:
         self._ray, self._say, self._running = ray, say, dict[Any, _Call]()
+        self.interrupted = False
+        """Whether a signal asked to stop."""
 
     @property
     def num_running(self) -> int:
@@ -91,7 +95,12 @@ class Cluster:
         """Wait for a call to end. One whose process dies is called again, as often as it may be."""
         errors = self._ray.exceptions
         while True:
-            (reference,), _ = self._ray.wait(list(self._running), num_returns=1)
+            ended: list[Any] = []
+            while not ended:
+                if self.interrupted:
+                    raise KeyboardInterrupt
+                ended, _ = self._ray.wait(list(self._running), num_returns=1, timeout=SIGNAL_SECONDS)
+            (reference,) = ended
             call = self._running.pop(reference)
             try:
                 return Ended(call.key, self._ray.get(reference))
@@ -158,7 +167,7 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
         raise input_error(f"--ray {address}", "a running cluster", got[:200], fix) from error
     cluster = Cluster(ray, say)
     try:
-        with _terminated_by_interrupt():
+        with _interrupted_by_signals(cluster):
             try:
                 yield cluster
             except BaseException:
@@ -175,16 +184,20 @@ def _reject_silent(address: str) -> None:
 
 
 @contextmanager
-def _terminated_by_interrupt() -> Iterator[None]:
-    """Treat the signals of schedulers and closing terminals as Ctrl-C: Ray ends the process on the first."""
+def _interrupted_by_signals(cluster: Cluster) -> Iterator[None]:
+    """Treat the signals of schedulers and closing terminals as Ctrl-C: Ray ends the process on the first.
+
+    What a handler raises can be lost inside of Ray, so `Cluster.interrupted` remembers it.
+    """
     if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
         yield
         return
 
     def interrupt(signum: int, frame: Any) -> None:
+        cluster.interrupted = True
         raise KeyboardInterrupt
 
-    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     previous = {number: signal.getsignal(number) for number in (getattr(signal, name) for name in names)}
     try:
         for number, handler in previous.items():
