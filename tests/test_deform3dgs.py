@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from method_runs import trained_and_resumed
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
@@ -13,8 +14,6 @@ from endoprior.methods.deform3dgs import COEFFICIENTS, METHOD
 from endoprior.methods.deform3dgs_points import first_points
 from endoprior.methods.learned_basis import value_at
 from endoprior.model.gaussians import create_gaussians
-from endoprior.model.scene_file import load_scene
-from endoprior.runs.train import train
 from endoprior.training.density import DensityStats
 from endoprior.training.drawn import Drawn
 from endoprior.training.frames import TrainingFrames
@@ -204,20 +203,5 @@ def test_equal_seeds_give_equal_points_and_no_depth_is_an_error():
 
 
 def test_it_trains_resumes_with_equal_bits_and_comes_back(tiny_sequence, tmp_path):
-    sequence = load_sequence(tiny_sequence, DataConfig())
-    cfg = tiny()
-    whole = train(sequence, cfg, tmp_path / "whole")
-
-    def stop(report, trainer):
-        if report.iteration == 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(sequence, cfg, tmp_path / "parts", on_step=stop)
-    train(sequence, cfg, tmp_path / "parts", resume=True)
-    scenes = [load_scene(tmp_path / name) for name in ("whole", "parts")]
-    for name, value in whole.gaussians.tensors.items():
-        for scene in scenes:
-            assert torch.equal(scene.gaussians[name], value), name
-    assert scenes[0].config.method == "deform3dgs" and scenes[0].field is None
-    assert torch.equal(scenes[0].render(0.5).color, whole.render(0.5).color)
+    scene = trained_and_resumed(load_sequence(tiny_sequence, DataConfig()), tiny(), tmp_path, stop_at=5)
+    assert scene.field is None
