@@ -20,7 +20,7 @@ from ..model.gaussians import Gaussians
 from ..model.motion import Motion
 from ..model.ops import ModelOps
 from ..training.gaussian_method import GaussianMethod
-from ..training.rates import Rate, log_linear
+from ..training.rates import Rate, rate_of
 from .deform3dgs_points import first_points
 from .learned_basis import value_at
 
@@ -90,10 +90,7 @@ class Deform3DGS(GaussianMethod):
 
     def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
         """See `GaussianMethod.rate`: coefficients learn as centers do."""
-        if name not in COEFFICIENTS:
-            return super().rate(name, cfg, SPATIAL_SCALE)
-        start, end, steps = cfg.optim.means_lr, cfg.optim.means_lr_final, cfg.optim.decay_iterations
-        return lambda iteration: SPATIAL_SCALE * log_linear(start, end, iteration, steps)
+        return rate_of("means" if name in COEFFICIENTS else name, cfg, SPATIAL_SCALE)
 
 
 METHOD = Deform3DGS()

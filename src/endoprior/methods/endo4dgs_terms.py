@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 
 from ..core.types import RenderOutput, Splats
 from ..model.gaussians import SH_C0
+from ..render.projection import rotation_matrices
 
 DEPTH_EPSILON = 1e-6
 LEAST_CONFIDENCE = 1e-6
@@ -52,13 +53,7 @@ def normals_of_depth(depth: Tensor) -> Tensor:
 
 def smallest_axes(splats: Splats) -> Tensor:
     """(N, 3) the axis of each Gaussian along which it is thinnest, in world axes."""
-    w, x, y, z = normalize(splats.quats, dim=-1).unbind(-1)
-    columns = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
-    axes = torch.stack([torch.stack(column, -1) for column in columns], 1)
+    axes = rotation_matrices(splats.quats).transpose(1, 2)
     return axes[torch.arange(len(axes), device=axes.device), splats.scales.argmin(1)]
 
 

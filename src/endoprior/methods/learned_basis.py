@@ -16,9 +16,6 @@ from torch.autograd.function import once_differentiable
 
 from . import learned_basis_numba
 
-SMALLEST_SQUARE = 1e-4
-"""Added to the squared width."""
-
 
 def value_at(weights: Tensor, centers: Tensor, widths: Tensor, time: float) -> Tensor:
     """f(t) of each Gaussian and channel, differentiable in the three coefficients.
@@ -31,7 +28,7 @@ def value_at(weights: Tensor, centers: Tensor, widths: Tensor, time: float) -> T
     """
     if weights.device.type == "cpu" and weights.dtype == torch.float32:
         return _Compiled.apply(weights, centers, widths, time)
-    ratio = (time - centers) ** 2 / (widths**2 + SMALLEST_SQUARE)
+    ratio = (time - centers) ** 2 / (widths**2 + float(learned_basis_numba.SMALLEST_SQUARE))
     return (weights * torch.exp(-(ratio**2))).sum(1)
 
 

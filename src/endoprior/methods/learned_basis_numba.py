@@ -7,7 +7,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 _CHUNK = 64  # Gaussians per task
-_SMALLEST_SQUARE = np.float32(1e-4)
+SMALLEST_SQUARE = np.float32(1e-4)
+"""Added to the squared width."""
 _REACH = np.float32(10.2)  # exp(-10.2^2) is below the smallest float32
 
 
@@ -40,7 +41,7 @@ def _reaches(n, b, centers, widths, time):
     for c in range(centers.shape[2]):
         away = time - centers[n, b, c]
         width = widths[n, b, c]
-        nearest = min(nearest, away * away / (width * width + _SMALLEST_SQUARE))
+        nearest = min(nearest, away * away / (width * width + SMALLEST_SQUARE))
     return nearest < _REACH
 
 
@@ -56,7 +57,7 @@ def _value_at(weights, centers, widths, time, out):
                 if _reaches(n, b, centers, widths, time):
                     for c in range(channels):
                         away, width = time - centers[n, b, c], widths[n, b, c]
-                        ratio = away * away / (width * width + _SMALLEST_SQUARE)
+                        ratio = away * away / (width * width + SMALLEST_SQUARE)
                         out[n, c] += weights[n, b, c] * np.exp(-ratio * ratio)
 
 
@@ -70,7 +71,7 @@ def _value_at_backward(weights, centers, widths, time, v_value, v_weights, v_cen
                 if _reaches(n, b, centers, widths, time):
                     for c in range(channels):
                         away, width = time - centers[n, b, c], widths[n, b, c]
-                        square = width * width + _SMALLEST_SQUARE
+                        square = width * width + SMALLEST_SQUARE
                         ratio = away * away / square
                         v_weight = v_value[n, c] * np.exp(-ratio * ratio)
                         v_ratio = -2 * ratio * weights[n, b, c] * v_weight

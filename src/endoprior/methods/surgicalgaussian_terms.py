@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, normalize
+from torch.nn.functional import conv2d
+
+from ..render.projection import rotation_matrices
 
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
@@ -38,13 +40,7 @@ def distance_change(before: Tensor, after: Tensor, neighbors: Tensor) -> Tensor:
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """(N, 6) upper triangle of R S S R^T, from quaternions (N, 4) of any length but zero and scales (N, 3)."""
-    w, x, y, z = normalize(quats, dim=-1).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    axes = torch.stack([torch.stack(row, -1) for row in rows], -2) * scales[:, None, :]
+    axes = rotation_matrices(quats) * scales[:, None, :]
     full = axes @ axes.transpose(1, 2)
     i, j = torch.triu_indices(3, 3, device=full.device)
     return full[:, i, j]
