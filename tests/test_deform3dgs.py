@@ -10,10 +10,12 @@ from endoprior.core.config import DataConfig
 from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame, RenderOutput
 from endoprior.data import load_sequence
-from endoprior.methods.deform3dgs import COEFFICIENTS, METHOD
+from endoprior.methods.deform3dgs import METHOD
 from endoprior.methods.deform3dgs_points import first_points
-from endoprior.methods.learned_basis import value_at
+from endoprior.methods.learned_basis import COEFFICIENTS, value_at
 from endoprior.model.gaussians import create_gaussians
+from endoprior.training.adam import AdamState
+from endoprior.training.adam_numba import adam_step, adam_unstored_step
 from endoprior.training.density import DensityStats
 from endoprior.training.drawn import Drawn
 from endoprior.training.frames import TrainingFrames
@@ -56,8 +58,8 @@ def test_channels_are_centers_then_rotation_then_scales():
     with torch.no_grad():
         gaussians["basis_weights"][0, 8] = torch.arange(10.0)  # centered at 0.5
     offsets = METHOD.motion(cfg).offsets(gaussians, None, 0.5, cfg, NUMBA.model)
-    assert offsets.means.tolist() == [[0, 1, 2]] and offsets.quats.tolist() == [[3, 4, 5, 6]]
-    assert offsets.log_scales.tolist() == [[7, 8, 9]]
+    found = torch.cat([offsets.means, offsets.quats, offsets.log_scales], 1)
+    torch.testing.assert_close(found, torch.arange(10.0)[None])
     chosen = METHOD.motion(cfg).offsets(gaussians, None, 0.5, cfg, NUMBA.model, torch.tensor([0, 0]))
     assert chosen.means.tolist() == [[0, 1, 2]] * 2
 
@@ -73,29 +75,48 @@ def test_a_basis_function_by_hand():
         assert float(value_at(weights, centers, widths, time)[0, 0]) == pytest.approx(expected, rel=1e-4, abs=1e-30)
 
 
+@pytest.mark.parametrize("num", [1, 5, 23])  # 170 coefficients each: lanes are left over
 @pytest.mark.parametrize("time", [0.0, 0.31, 1.0])
-def test_values_are_those_of_a_slow_loop(time):
-    weights, centers, widths = coefficients(5)
-    found = value_at(weights, centers, widths, time).detach()
-    arrays = [tensor.detach().numpy() for tensor in (weights, centers, widths)]
-    for n in range(5):
-        for c in range(10):
-            total = 0.0
-            for b in range(17):
-                w, mu, s = (float(array[n, b, c]) for array in arrays)
-                total += w * np.exp(-(((time - mu) ** 2 / (s * s + 1e-4)) ** 2))
-            assert float(found[n, c]) == pytest.approx(total, rel=1e-5, abs=1e-6)
+def test_values_are_those_of_a_slow_loop(time, num):
+    given = coefficients(num)
+    for sink in (None, []):
+        found = value_at(*given, time, sink).detach()
+        weights, centers, widths = (tensor.detach().double().numpy() for tensor in given)
+        ratio = (time - centers) ** 2 / (widths**2 + 1e-4)
+        expected = [[sum(weights[n, b, c] * np.exp(-(ratio[n, b, c] ** 2)) for b in range(17)) for c in range(10)]
+                    for n in range(num)]  # fmt: skip
+        torch.testing.assert_close(found.double(), torch.tensor(expected), rtol=1e-5, atol=1e-6)
 
 
-def test_gradients_are_those_of_autograd_and_of_central_differences():
-    compiled, double = coefficients(4), coefficients(4, dtype=torch.float64)
-    pull = torch.randn(4, 10, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    (value_at(*compiled, 0.3) * pull.float()).sum().backward()
-    (value_at(*double, 0.3) * pull).sum().backward()
-    for ours, theirs in zip(compiled, double, strict=True):
-        scale = float(theirs.grad.abs().max())
-        torch.testing.assert_close(ours.grad.double(), theirs.grad, rtol=1e-3, atol=1e-4 * scale)
+def test_gradients_are_those_of_central_differences():
     assert torch.autograd.gradcheck(lambda *c: value_at(*c, 0.3), coefficients(2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("num", [1, 23])
+@pytest.mark.parametrize("times", [(0.3,), (0.3, 0.35)])
+def test_a_step_with_unstored_gradients_is_one_with_those_of_autograd(times, num):
+    ours, theirs = coefficients(num), coefficients(num)
+    states = [[AdamState(tensor) for tensor in tensors] for tensors in (ours, theirs)]
+    random = torch.Generator().manual_seed(1)
+    for _ in range(3):
+        pulls = [torch.randn(num, 10, generator=random) for _ in times]
+        sink: list = []
+        sum((value_at(*ours, t, sink) * pull).sum() for t, pull in zip(times, pulls, strict=True)).backward()
+        assert [tensor.grad for tensor in ours] == [None] * 3
+        adam_unstored_step(states[0], ours, sink, 1e-2, 1e-15)
+        sum((value_at(*theirs, t) * pull).sum() for t, pull in zip(times, pulls, strict=True)).backward()
+        adam_step(states[1], theirs, 1e-2, 1e-15)
+        for tensor in theirs:
+            tensor.grad = None
+        for mine, other in zip(*states, strict=True):
+            scale = float(other.first.abs().max())
+            torch.testing.assert_close(mine.first, other.first, rtol=1e-3, atol=1e-5 * scale)
+            torch.testing.assert_close(mine.second, other.second, rtol=5e-3, atol=1e-9 * scale**2)
+            assert mine.steps == other.steps
+            mine.load(other.arrays())  # an epsilon of 1e-15 makes a step of any rounding: compare one step at a time
+    for mine, other, first in zip(ours, theirs, states[1], strict=True):
+        felt = first.first.abs() > 1e-4 * first.first.abs().max()
+        torch.testing.assert_close(mine[felt], other[felt], rtol=1e-3, atol=1e-4)
 
 
 # Rates, frames, growth.

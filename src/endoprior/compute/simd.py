@@ -21,6 +21,8 @@ add_operators(vector)
 splat, load, store = splat_of(vector), load_of(vector), store_of(vector)
 total = fold_of(vector, lambda builder, low, high: builder.fadd(low, high))
 """Sum of the lanes, halves first."""
+largest = fold_of(vector, choose(">"))
+"""The largest of the lanes; meaningless where one is NaN."""
 
 
 def _call(name: str) -> Any:
@@ -35,6 +37,7 @@ def _call(name: str) -> Any:
     return emit
 
 
+square_root = elementwise(vector, 1, _call("sqrt"))
 magnitude = elementwise(vector, 1, _call("fabs"))
 floor = elementwise(vector, 1, _call("floor"))
 fma = elementwise(vector, 3, _call("fma"))

@@ -22,15 +22,13 @@ from ..model.ops import ModelOps
 from ..training.gaussian_method import GaussianMethod
 from ..training.rates import Rate, rate_of
 from .deform3dgs_points import first_points
-from .learned_basis import value_at
+from .learned_basis import COEFFICIENTS, value_at
 
 NUM_BASES = 17
 """Basis functions of each Gaussian and channel."""
 CHANNELS = {"means": 3, "quats": 4, "log_scales": 3}
 """What moves, in the order of the channels."""
 FIRST_WIDTH = 0.01
-COEFFICIENTS = ("basis_weights", "basis_centers", "basis_widths")
-"""Names of the tensors, (N, 17, 10) each."""
 SPATIAL_SCALE = 10.0
 """Factor of the rates of centers and coefficients, whatever the camera does."""
 
@@ -59,7 +57,9 @@ class LearnedBasisMotion(Motion):
     ) -> Offsets:
         """See `Motion.offsets`."""
         coefficients = [gaussians[name] if chosen is None else gaussians[name][chosen] for name in COEFFICIENTS]
-        parts = value_at(*coefficients, time).split(list(CHANNELS.values()), 1)
+        # The temporal term moves chosen Gaussians to a second time; both gradients then add up in `.grad`.
+        sink = None if cfg.temporal.weight or chosen is not None else gaussians.motion_gradients
+        parts = value_at(*coefficients, time, sink).split(list(CHANNELS.values()), 1)
         return Offsets(**dict(zip(CHANNELS, parts, strict=True)))
 
 

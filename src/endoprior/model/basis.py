@@ -8,8 +8,10 @@ MICCAI 2024, use a basis of this kind per Gaussian.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -33,6 +35,37 @@ def basis_weights(time: float, cfg: BasisConfig) -> NDArray[np.float64]:
     sigma = cfg.relative_width / cfg.num_bases
     end = np.exp(-0.5 * SUPPORT**2)
     return np.maximum(0.0, (np.exp(-0.5 * (distance / sigma) ** 2) - end) / (1 - end))
+
+
+class UnstoredGradient(ABC):
+    """Gradient of tensors of the Gaussians at one time, never written to memory: Adam computes it as it uses it.
+
+    For tensors so large that writing and reading their gradient costs as much as the rest of the step. CPU.
+    """
+
+    names: ClassVar[tuple[str, ...]]
+    """The tensors; they have one learning rate."""
+    v_offsets: Tensor
+    """(N, channels) gradient of the offsets at the time."""
+
+    @staticmethod
+    @abstractmethod
+    def adam_step(
+        gradients: Sequence[Any],
+        tensors: Sequence[NDArray[np.float32]],
+        firsts: Sequence[NDArray[np.float32]],
+        seconds: Sequence[NDArray[np.float32]],
+        rate: np.float32,
+        root_scale: np.float32,
+        constants: tuple[np.float32, np.float32, np.float32],
+    ) -> None:
+        """One step of Adam in place, with the sum of `gradients`, all of this class.
+
+        Args:
+            tensors, firsts, seconds: the tensors as in `names`, and Adam's moments of each.
+            rate: learning rate / (1 - beta1^steps). root_scale: 1 / sqrt(1 - beta2^steps).
+            constants: beta1, beta2, epsilon.
+        """
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from torch import Tensor
 from ..core.config import Config
 from ..core.types import Splats
 from .attributes import attribute_shapes
-from .basis import RankOneGradient
+from .basis import RankOneGradient, UnstoredGradient
 from .deformation import Offsets
 from .method import motion_of
 
@@ -34,8 +34,8 @@ class Gaussians:
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
         self.tensors = {name: value.detach().contiguous().requires_grad_() for name, value in tensors.items()}
-        self.motion_gradients: list[RankOneGradient] = []
-        """Gradient of `motion` since the last optimizer step, one entry per time step."""
+        self.motion_gradients: list[RankOneGradient] | list[UnstoredGradient] = []
+        """Gradient of what moves them since the last optimizer step, one entry per time step."""
 
     def to(self, device: torch.device | str) -> Gaussians:
         """These Gaussians on a device; themselves if they are there."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..compute.fastmath import REORDERED
 from ..compute.simd import LANES, prefetch
-from ..model.basis import RankOneGradient
+from ..model.basis import RankOneGradient, UnstoredGradient
 from .adam import BETA1, BETA2, AdamState
 
 CHUNK = 128  # rows per task
@@ -50,6 +50,18 @@ def adam_basis_step(
     v_offsets = np.stack([gradient.v_offsets.numpy() for gradient in gradients])
     views = (param.detach().numpy(), weights, v_offsets, state.first.numpy(), state.second.numpy())
     _adam_outer(*views, begin, scaled, root_scale[:, 0], *_constants(epsilon))
+
+
+def adam_unstored_step(
+    states: list[AdamState], params: list[Tensor], gradients: list[UnstoredGradient], rate: float, epsilon: float
+) -> None:
+    """Like `adam_step`, with a gradient that is computed where it is used."""
+    for state in states:
+        state.steps += 1
+    rates, root_scale = _corrected(np.array([rate]), _counts(states[0]))
+    held = zip(*((param, state.first, state.second) for param, state in zip(params, states, strict=True)), strict=True)
+    arrays = [[tensor.detach().numpy() for tensor in tensors] for tensors in held]
+    gradients[0].adam_step(gradients, *arrays, rates[0], root_scale[0], _constants(epsilon))
 
 
 def _counts(state: AdamState) -> NDArray[np.int64]:

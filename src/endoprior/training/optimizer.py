@@ -8,9 +8,11 @@ from collections.abc import Callable
 from torch import Tensor
 
 from ..core.config import Config
+from ..model.basis import UnstoredGradient
 from ..model.field import Field
 from ..model.gaussians import Gaussians
 from .adam import AdamState
+from .adam_numba import adam_unstored_step
 from .divergence import LARGEST_GRADIENT
 from .ops import TrainingOps
 from .plane_adam import PlaneAdam
@@ -46,13 +48,21 @@ class Optimizer:
                 by_rate[self.rates[name](iteration)].append((self.states[name], param))
         for rate, group in by_rate.items():
             self._ops.adam_step([state for state, _ in group], [param for _, param in group], rate, epsilon, skip)
-        gradients = self.gaussians.motion_gradients
-        if gradients and self.gaussians["motion"].numel():
-            rates, tiny = motion_rates(self.cfg, iteration), self.cfg.optim.basis_epsilon
-            self._ops.adam_basis_step(self.states["motion"], self.gaussians["motion"], gradients, rates, tiny, skip)
+        if self.gaussians.motion_gradients and len(self.gaussians):
+            self._step_motion(iteration, skip)
         if self.planes and any(param.grad is not None for param in self.field.parameters.values()):
             self._ops.adam_planes_step(self.planes, self.rates[PLANES](iteration), skip)
         self._clear_dense()
+
+    def _step_motion(self, iteration: int, skip: Tensor | None) -> None:
+        gaussians, gradients = self.gaussians, self.gaussians.motion_gradients
+        if isinstance(gradients[0], UnstoredGradient):
+            names = gradients[0].names
+            states, params = [self.states[name] for name in names], [gaussians[name] for name in names]
+            adam_unstored_step(states, params, gradients, self.rates[names[0]](iteration), self.cfg.optim.epsilon)
+        else:
+            rates, epsilon = motion_rates(self.cfg, iteration), self.cfg.optim.basis_epsilon
+            self._ops.adam_basis_step(self.states["motion"], gaussians["motion"], gradients, rates, epsilon, skip)
 
     def count_unusable(self) -> dict[str, int | Tensor]:
         """How many entries of each gradient are not finite or too large to be squared, by name."""

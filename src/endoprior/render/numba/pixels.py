@@ -12,15 +12,14 @@ from math import log2
 import numpy as np
 from numba import njit
 
-from ...compute.simd import floor, fma, magnitude, scale_by_power_of_two, smaller, splat, where_ge
+from ...compute.exponential import power_of_two
+from ...compute.simd import fma, magnitude, smaller, splat, where_ge
 from ..constants import ALPHA_MAX, ALPHA_MIN, STOP_TRANSMITTANCE
 
 f4 = np.float32
 LOG2_ALPHA_MIN = f4(log2(ALPHA_MIN))
 LARGEST_ALPHA = f4(ALPHA_MAX)
 STOP = f4(STOP_TRANSMITTANCE)
-# Minimax fit of 2^f on [0, 1): relative error 9e-8 with these coefficients in float32.
-E0, E1, E2, E3, E4, E5 = (f4(c) for c in (0.99999993, 0.69315307, 0.24015361, 0.05582634, 0.00898931, 0.00187759))
 
 
 @njit(forceinline=True)
@@ -39,14 +38,7 @@ def blend(exponent, transmittance):
     All are vectors.
     """
     zero = splat(f4(0.0))
-    whole = floor(exponent)
-    f = exponent - whole
-    series = fma(splat(E5), f, splat(E4))
-    series = fma(series, f, splat(E3))
-    series = fma(series, f, splat(E2))
-    series = fma(series, f, splat(E1))
-    series = fma(series, f, splat(E0))
-    alpha = smaller(scale_by_power_of_two(series, whole), splat(LARGEST_ALPHA))
+    alpha = smaller(power_of_two(exponent), splat(LARGEST_ALPHA))
     alpha = where_ge(exponent, splat(LOG2_ALPHA_MIN), alpha, zero)
     behind = fma(-transmittance, alpha, transmittance)
     stop = splat(STOP)
