@@ -14,6 +14,7 @@ from .matrix import Matrix, commits_of, scores_of
 from .plots import budget_figure, curve_figure
 from .protocol_report import protocol_blocks, protocol_tables, protocol_values
 from .results import Results
+from .silent_rules import silent_rules
 from .spec import ClaimSpec, Spec
 from .statistics import MIN_PAIRS, Difference
 from .tables import csv_lines, latex, markdown, score_table
@@ -58,6 +59,7 @@ def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int
         *_head(matrix, "#" * level),
         *_tables(matrix, results, below),
         *_claims(results, below),
+        *_silent(matrix, below),
         *protocol_blocks(matrix, below),
         *_figure_links(matrix, folder, base, below),
     ]
@@ -172,6 +174,11 @@ def _claims(results: Results, mark: str) -> list[str]:
     return [f"{mark} Claims", "\n".join(lines), note]
 
 
+def _silent(matrix: Matrix, mark: str) -> list[str]:
+    lines = silent_rules(matrix)
+    return [f"{mark} Rules that never fired", "\n".join(f"- {line}." for line in lines)] if lines else []
+
+
 def sentence(results: Results, claim: ClaimSpec) -> str:
     """The claim in words."""
     ours, theirs = results.spec.label(claim.method), results.spec.label(claim.than)
@@ -239,6 +246,7 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
         "differences": differences,
         "gains_of_found_parts": gains_of_found,
         "claims": claims,
+        "silent_rules": silent_rules(matrix),
         "missing": missing,
     }
 
