@@ -65,6 +65,18 @@ class SequenceSpec:
 
 
 @dataclass(frozen=True)
+class MatchSpec:
+    """How the growth threshold of a method is found: by one of these. See `matched_count`."""
+
+    count_of: str = ""
+    """Method of the spec: end with as many Gaussians as it does, mean over seeds."""
+    growth: float = 0.0
+    """End with this many times the first Gaussians."""
+    value_of: str = ""
+    """Method of the spec with a search of its own: use the threshold that it finds."""
+
+
+@dataclass(frozen=True)
 class MethodSpec:
     """One method: a preset, a method of another package, or the images of another program; and its changes."""
 
@@ -82,6 +94,8 @@ class MethodSpec:
     """Config fields by dotted name, on top of the benchmark's own `set` and `set_for`."""
     label: str = ""
     """Name in tables; the method's own if empty."""
+    match: MatchSpec | None = None
+    """Search for `density.grow_threshold`, on each sequence with the first seed; the others use what is found."""
 
     @property
     def name(self) -> str:
@@ -160,9 +174,11 @@ class Spec:
         """Whether the options of a method are our `Config`, with budgets and the spec's `set`."""
         return isinstance(REGISTRY.load(self.methods[method].name).options, Config)
 
-    def config(self, method: str, sequence: str, budget: int | None, seed: int) -> Any:
+    def config(self, method: str, sequence: str, budget: int | None, seed: int, threshold: float | None = None) -> Any:
         """The full options of one cell: a `Config`, or the dataclass of a method that has options of its own.
 
+        Args:
+            threshold: of growth, of a method that has a `MatchSpec`; None is its own.
         Raises:
             InputError: an override names no field, or has a value of the wrong kind.
         """
@@ -180,6 +196,8 @@ class Spec:
             if budget is not None:
                 values["init"]["budget"] = budget
             values["seed"] = seed
+        if threshold is not None:
+            values["density"]["grow_threshold"] = threshold
         if chosen.pictures:
             folders = {"folder": chosen.pictures, "depth_folder": chosen.depth_pictures}
             values |= {name: self._folder(paths.get(sequence, ""), seed) for name, paths in folders.items()}
@@ -271,6 +289,9 @@ def _check(spec: Spec) -> None:
             raise input_error("set_for", f"one of {', '.join(known)}", f"{name!r}", "choose one.")
     for name, method in spec.methods.items():
         _check_method(spec, f"methods.{name}", method, known)
+    for name, method in spec.methods.items():
+        if method.match:
+            _check_match(spec, name, method.match)
     named = [spec.reference, *(name for claim in spec.claims for name in (claim.method, claim.than))]
     for name in named:
         if name not in spec.methods:
@@ -293,6 +314,23 @@ def _check(spec: Spec) -> None:
         if "poses" in found and spec.has_config(cell.method) and options.data.depth_unit_mm:
             fix = "write the unit to sequence.json as depth_scale."
             raise input_error(f"{where}.poses", "either estimated or data.depth_unit_mm", "both", fix)
+
+
+def _check_match(spec: Spec, name: str, match: MatchSpec) -> None:
+    where = f"methods.{name}.match"
+    if [bool(match.count_of), match.growth != 0, bool(match.value_of)].count(True) != 1:
+        raise input_error(where, "one of count_of, growth and value_of", "none or several", "keep one.")
+    if not spec.has_config(name):
+        raise input_error(where, "a method with our config", spec.methods[name].name, "remove match.")
+    if match.growth and not match.growth > 0:
+        raise input_error(f"{where}.growth", "a number above 0", f"{match.growth}", "correct it.")
+    if match.count_of and (match.count_of not in spec.methods or spec.methods[match.count_of].match):
+        choice = ", ".join(other for other, about in spec.methods.items() if not about.match)
+        raise input_error(f"{where}.count_of", f"one of {choice}", repr(match.count_of), "choose one.")
+    searched = [n for n, about in spec.methods.items() if about.match and not about.match.value_of]
+    if match.value_of and match.value_of not in searched:
+        choice = f"one of {', '.join(searched)}" if searched else "a method with a search"
+        raise input_error(f"{where}.value_of", choice, repr(match.value_of), "choose one.")
 
 
 def _check_method(spec: Spec, where: str, method: MethodSpec, known: list[str]) -> None:
