@@ -1,4 +1,4 @@
-"""One training iteration, from the choice of a frame to the update: read `TrainingStep.__call__` to follow it."""
+"""One training iteration, from the choice of a frame to the update: `TrainingStep.__call__` and `compare` show it."""
 
 from __future__ import annotations
 
@@ -53,6 +53,23 @@ class Batch:
     """(H, W) bool, its tissue."""
 
 
+@dataclass(frozen=True)
+class Compared:
+    """The forward pass of one iteration."""
+
+    iteration: int
+    rng: np.random.Generator
+    """Of this iteration."""
+    batch: Batch
+    splats: Splats
+    """The Gaussians at the frame, before a refined camera moves them."""
+    out: RenderOutput
+    twist: Tensor | None
+    """(6,) of the refined camera."""
+    terms: dict[str, Tensor]
+    """Weighted terms of the loss, () each."""
+
+
 @dataclass
 class TrainingStep:
     """Does one iteration after the other. What it needs beside the state does not change while training.
@@ -89,6 +106,27 @@ class TrainingStep:
             Diverged: no Gaussian is left, or a split would give one of infinite size.
         """
         began = clock.perf_counter()
+        done = self.compare(state)
+        sum(done.terms.values()).backward()
+
+        last = done.iteration == stage_length(self.cfg, state.stage)
+        densify = self.method.density_due(state.stage, done.iteration, last, self.cfg)
+        unusable, brightness = state.optimizer.count_unusable(), done.batch.frame.brightness
+        divergence = self.check.after_backward(done.iteration, done.terms, unusable, brightness, wait=densify or last)
+        event: dict[str, int] | None = None
+        if divergence is not None:
+            state.optimizer.drop_gradients()
+            state.iteration = divergence.last_good
+        else:
+            with torch.no_grad():
+                event = self._update(state, done, densify)
+            state.iteration = done.iteration
+        losses = {name: value.detach() for name, value in done.terms.items()}
+        seconds = clock.perf_counter() - began
+        return StepReport(state.stage, done.iteration, losses, len(state.gaussians), seconds, event, divergence)
+
+    def compare(self, state: GaussiansState) -> Compared:
+        """The forward pass of the next iteration, up to the terms of the loss; nothing is changed."""
         cfg, iteration, fine = self.cfg, state.iteration + 1, state.stage is Stage.FINE
         rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
         position = self.method.position(cfg.seed, state.stage, iteration, len(self.frames), rng)
@@ -130,36 +168,25 @@ class TrainingStep:
             terms |= temporal_terms(state, batch.frame, batch.before, splats.means, means_before, out, cfg, self.ops)
         if twist is not None:
             terms["poses"] = smoothness(state.poses.twists, batch.position, twist, cfg.poses)
-        sum(terms.values()).backward()
+        return Compared(iteration, rng, batch, splats, out, twist, terms)
 
-        last = iteration == stage_length(cfg, state.stage)
-        densify = self.method.density_due(state.stage, iteration, last, cfg)
-        divergence = self.check.after_backward(
-            iteration, terms, state.optimizer.count_unusable(), batch.frame.brightness, wait=densify or last
-        )
-        event: dict[str, int] | None = None
-        if divergence is not None:
-            state.optimizer.drop_gradients()
-            state.iteration = divergence.last_good
-        else:
-            with torch.no_grad():
-                self._observe(state, batch, out)
-                if state.depth_fit is not None and fine:
-                    depth_fit.update(state.depth_fit, batch.position, batch.frame, out)
-                state.optimizer.step(iteration, self.check.skip)
-                if twist is not None:
-                    self.poses.step(state.poses, batch.position, twist.grad, iteration)
-                if cfg.density.max_scale_share:
-                    log_scales = state.gaussians["log_scales"].detach()
-                    limit_scales(log_scales, splats.means, batch.frame.camera, cfg.density.max_scale_share)
-                if densify:
-                    event = self._densify(state, iteration, rng)
-                if self.method.reset_due(state.stage, iteration, cfg):
-                    reset_opacities(state.optimizer, RESET_OPACITY)
-            state.iteration = iteration
-        losses = {name: value.detach() for name, value in terms.items()}
-        seconds = clock.perf_counter() - began
-        return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, event, divergence)
+    def _update(self, state: GaussiansState, done: Compared, densify: bool) -> dict[str, int] | None:
+        """Apply the gradients of an iteration, then grow or prune; what density control did, if it did anything."""
+        cfg, batch, event = self.cfg, done.batch, None
+        self._observe(state, batch, done.out)
+        if state.depth_fit is not None and state.stage is Stage.FINE:
+            depth_fit.update(state.depth_fit, batch.position, batch.frame, done.out)
+        state.optimizer.step(done.iteration, self.check.skip)
+        if done.twist is not None:
+            self.poses.step(state.poses, batch.position, done.twist.grad, done.iteration)
+        if cfg.density.max_scale_share:
+            log_scales = state.gaussians["log_scales"].detach()
+            limit_scales(log_scales, done.splats.means, batch.frame.camera, cfg.density.max_scale_share)
+        if densify:
+            event = self._densify(state, done.iteration, done.rng)
+        if self.method.reset_due(state.stage, done.iteration, cfg):
+            reset_opacities(state.optimizer, RESET_OPACITY)
+        return event
 
     def _batch(self, iteration: int, position: int, fine: bool) -> Batch:
         """Training frame number `position`, at half resolution early in the fine stage."""
