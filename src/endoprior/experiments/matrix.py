@@ -119,15 +119,15 @@ def _jobs(
     for cell in cells(spec):
         if cell in matrix.missing:
             continue
-        method, reading = spec.methods[cell.method].name, spec.sequences[cell.sequence].reading
-        options = to_dict(spec.config(cell.method, cell.sequence, cell.budget, cell.seed))
+        method, reading = spec.methods[cell.method].name, spec.sequences[cell.sequence].reading_of(cell.fold)
+        options = to_dict(spec.config(cell.method, cell.sequence, cell.budget, cell.seed, cell.fold))
         try:
             made = _made_from(spec, cell, options)
         except InputError as error:
             matrix.missing[cell] = str(error)
             continue
         first, *others = known[cell.sequence]
-        facts = [options, first, spec.networks, SCORES_VERSION, *made, *others]
+        facts = [_identity(options, cell.fold), first, spec.networks, SCORES_VERSION, *made, *others]
         if spec.protocols:
             own_masks = matrix.data[cell.sequence] / "gt_masks"  # protocols may read them, methods need not
             facts.append([sorted(spec.protocols), fingerprint(own_masks) if own_masks.is_dir() else ""])
@@ -155,6 +155,14 @@ def _jobs(
     return jobs
 
 
+def _identity(options: dict[str, Any], fold: int) -> dict[str, Any]:
+    """The options that name a cell's folder: without the phase of the published split, which earlier cells lack."""
+    data = options.get("data")
+    if fold or not isinstance(data, dict):
+        return options
+    return options | {"data": {name: value for name, value in data.items() if name != "test_phase"}}
+
+
 def _made_from(spec: Spec, cell: Cell, options: dict[str, Any]) -> list[Any]:
     """What determines the result of a cell beside its options and its sequence; nothing for presets.
 
@@ -166,9 +174,9 @@ def _made_from(spec: Spec, cell: Cell, options: dict[str, Any]) -> list[Any]:
         if not options["folder"]:
             raise input_error(f"methods.{cell.method}.pictures", cell.sequence, "no entry", "name the folder.")
         folders = [Path(options[key]) for key in ("folder", "depth_folder") if options[key]]
-        return [method.name, *map(fingerprint, folders), spec.sequences[cell.sequence].reading]
+        return [method.name, *map(fingerprint, folders), spec.sequences[cell.sequence].reading_of(cell.fold)]
     if origin := REGISTRY.origin(method.name):
-        return [method.name, origin, cell.seed, spec.sequences[cell.sequence].reading]
+        return [method.name, origin, cell.seed, spec.sequences[cell.sequence].reading_of(cell.fold)]
     return []
 
 

@@ -54,7 +54,10 @@ def curve_figure(results: Results, matrix: Matrix, path: Path) -> None:
 
     def plot(axis: Axes, sequence: str) -> None:
         for method in spec.methods:
-            curves = [_curve(matrix.done.get(Cell(sequence, method, budget, seed))) for seed in spec.seeds]
+            curves = []
+            for seed in spec.seeds:  # every fold has held-out frames of its own
+                cells = [Cell(sequence, method, budget, seed, fold) for fold in spec.folds(sequence, method)]
+                curves.append({i: value for cell in cells for i, value in _curve(matrix.done.get(cell)).items()})
             known = [curve for curve in curves if curve]
             if known:
                 frames = sorted(set.intersection(*(set(curve) for curve in known)))

@@ -72,7 +72,11 @@ def _head(matrix: Matrix, mark: str) -> list[str]:
     if spec.about:
         lines.append(spec.about.strip())
     commits = ", ".join(commits_of(matrix)) or "none yet"
-    lines.append(f"{size}, seeds {seeds}; trained at commit {commits}. Mean ± standard deviation over seeds.")
+    over = "seeds"
+    if several := {name: about.folds for name, about in spec.sequences.items() if len(about.folds) > 1}:
+        size += "".join(f", folds {', '.join(map(str, folds))} of {name}" for name, folds in several.items())
+        over = "seeds of the mean over folds (which frame of every eight is held out)"
+    lines.append(f"{size}, seeds {seeds}; trained at commit {commits}. Mean ± standard deviation over {over}.")
     if matrix.missing:
         by_reason: dict[str, list[str]] = {}
         for cell, reason in matrix.missing.items():
@@ -96,6 +100,7 @@ def _protocol(matrices: list[Matrix], level: int) -> list[str]:
     hidden = ("frames", "data_fingerprint", "shrink", "tags")
     whole = max((scores_of(folder)["protocol"] for folder in folders), key=len)
     shown = {name: text for name, text in whole.items() if name not in hidden}
+    shown["split_rule"] = "; ".join(sorted({scores_of(folder)["protocol"]["split_rule"] for folder in folders}))
     return [f"{'#' * level} Protocol", "\n".join(f"- `{name}`: {text}" for name, text in shown.items())]
 
 
@@ -206,7 +211,8 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
     """Everything in the tables, for other programs."""
     spec = matrix.spec
     cells = [
-        {"sequence": c.sequence, "method": c.method, "budget": c.budget, "seed": c.seed, "folder": folder.name}
+        {"sequence": c.sequence, "method": c.method, "budget": c.budget, "seed": c.seed, "fold": c.fold}
+        | {"folder": folder.name}
         | scores_of(folder)
         for c, folder in matrix.done.items()
     ]

@@ -27,7 +27,7 @@ class Results:
     @staticmethod
     def of(matrix: Matrix, protocol: ProtocolName | None = None) -> Results:
         """Read the scores of all finished cells, in the order of the spec; those of another paper's `protocol`."""
-        order = sorted(matrix.done, key=lambda c: (c.sequence, c.budget or 0, c.method, c.seed))
+        order = sorted(matrix.done, key=lambda c: (c.sequence, c.budget or 0, c.method, c.seed, c.fold))
         stored = {cell: scores_of(matrix.done[cell]) for cell in order}
         own = {cell: about["protocols"][protocol] if protocol else about for cell, about in stored.items()}
         scores = {cell: about["scores"] for cell, about in own.items()}
@@ -38,25 +38,41 @@ class Results:
         return float(self.scores.get(cell, {}).get(score, math.nan))
 
     def summary(self, sequence: str, budget: int | None, method: str, score: str) -> Summary:
-        """Mean and standard deviation over seeds; scores of masks, which are found once, have no deviation."""
-        values = [self.value(Cell(sequence, method, budget, seed), score) for seed in self.spec.seeds]
+        """Mean and standard deviation over seeds of the mean over folds.
+
+        Scores of masks, which are found once, have no deviation.
+        """
+        values = [self._over_folds(sequence, budget, method, score, seed) for seed in self.spec.seeds]
         known = all_scores().get(score)
         return summary([*{*values}] if known and known.group == "masks" else values)
+
+    def _over_folds(self, sequence: str, budget: int | None, method: str, score: str, seed: int) -> float:
+        """Mean over the folds that have the score; NaN if a cell is missing, because folds are not equally hard."""
+        folds = [Cell(sequence, method, budget, seed, fold) for fold in self.spec.folds(sequence, method)]
+        complete = all(cell in self.scores for cell in folds)
+        return summary([self.value(cell, score) for cell in folds]).mean if complete else math.nan
 
     def gains(
         self, score: str, method: str, than: str, *, sequence: str | None = None, budget: int | None = None
     ) -> NDArray:
-        """(K,) paired `statistics.gains` over sequences, budgets and seeds, positive where `method` is better."""
-        pairs = [
-            (Cell(name, method, size, seed), Cell(name, than, size, seed))
-            for name in ([sequence] if sequence else self.spec.sequences)
+        """(K,) paired `statistics.gains` over sequences, budgets, seeds, folds; positive where `method` is better."""
+        names = [sequence] if sequence else self.spec.sequences
+        return self._gains(score, [p for name in names for p in self._pairs((name, method), (name, than), budget)])
+
+    def _pairs(
+        self, ours: tuple[str, str], theirs: tuple[str, str], budget: int | None = None
+    ) -> list[tuple[Cell, Cell]]:
+        """Cells of equal budget, seed and fold of two (sequence, method)."""
+        return [
+            (Cell(*ours, size, seed, fold), Cell(*theirs, size, seed, fold))
             for size in ((budget,) if budget else self.spec.budgets or (None,))
             for seed in self.spec.seeds
+            for fold in self.spec.folds(*ours)
+            if fold in self.spec.folds(*theirs)
         ]
-        return self._gains(score, pairs)
 
     def _gains(self, score: str, pairs: list[tuple[Cell, Cell]]) -> NDArray:
-        ours, theirs = np.array([[self.value(cell, score) for cell in pair] for pair in pairs]).T
+        ours, theirs = np.array([[self.value(cell, score) for cell in pair] for pair in pairs]).reshape(-1, 2).T
         return gains(score, ours, theirs)
 
     def difference(self, score: str, method: str, than: str, sequence: str | None = None) -> Difference:
@@ -69,12 +85,7 @@ class Results:
         Args:
             sequence, own: names of the sequence with found parts, and with its own.
         """
-        pairs = [
-            (Cell(sequence, method, size, seed), Cell(own, method, size, seed))
-            for size in self.spec.budgets or (None,)
-            for seed in self.spec.seeds
-        ]
-        return difference(self._gains(score, pairs))
+        return difference(self._gains(score, self._pairs((sequence, method), (own, method))))
 
     def check(self, claim: ClaimSpec, sequence: str | None = None) -> tuple[Difference, Verdict]:
         """Whether a claim holds, on one sequence or on all."""

@@ -19,6 +19,7 @@ from ..core.config_io import from_dict, override, to_dict
 from ..core.presets import PresetName
 from ..data.formats import REGISTRY as LAYOUTS
 from ..data.reading import read_text
+from ..data.sequence import TEST_EVERY
 from ..data.yaml_text import load_yaml
 from ..evaluation.protocols.table import ProtocolName
 from ..evaluation.registry import all_scores
@@ -52,11 +53,17 @@ class SequenceSpec:
     """`found`: train with tool masks found from the footage; the sequence's own ones are the truth of all scores."""
     poses: Literal["given", "estimated"] = "given"
     """`estimated`: train with a camera path estimated from the footage; the sequence's own one is that of scores."""
+    folds: tuple[int, ...] = (0,)
+    """Values of `data.test_phase`: every cell is trained and scored once for each, with other frames held out."""
 
     @property
     def reading(self) -> dict[str, Any]:
         """The fields of `DataConfig` that it sets."""
         return {"shrink": self.shrink, "first_frames": self.first_frames, "stride": self.stride, "format": self.format}
+
+    def reading_of(self, fold: int) -> dict[str, Any]:
+        """`reading` with the frames of a fold held out; fold 0, the published split, adds nothing."""
+        return self.reading | ({"test_phase": fold} if fold else {})
 
     @property
     def found_parts(self) -> dict[str, str]:
@@ -73,7 +80,7 @@ class MethodSpec:
     method: str = ""
     """A name that `endoprior plugins` lists."""
     pictures: dict[str, str] = field(default_factory=dict)
-    """Folder of rendered frames by sequence; as `SequenceSpec.path`, `{seed}` stands for the seed."""
+    """Folder of rendered frames by sequence; as `SequenceSpec.path`, `{seed}`, `{fold}` stand for seed and fold."""
     depth_pictures: dict[str, str] = field(default_factory=dict)
     """Folder of rendered depth by sequence."""
     depth_scale: float = 0.0
@@ -91,6 +98,10 @@ class MethodSpec:
     def differs_by_seed(self, sequence: str) -> bool:
         """Whether there is more than one result on a sequence: images without `{seed}` are one result."""
         return not self.pictures or "{seed}" in self.pictures.get(sequence, "")
+
+    def differs_by_fold(self, sequence: str) -> bool:
+        """Whether there is more than one fold of a sequence: images without `{fold}` are of one training."""
+        return not self.pictures or "{fold}" in self.pictures.get(sequence, "")
 
 
 @dataclass(frozen=True)
@@ -114,7 +125,7 @@ class ClaimSpec:
 
 @dataclass(frozen=True)
 class Spec:
-    """methods x sequences x budgets x seeds, one protocol."""
+    """methods x sequences x folds x budgets x seeds, one protocol."""
 
     title: str
     sequences: dict[str, SequenceSpec]
@@ -154,13 +165,19 @@ class Spec:
         """The sequence that differs from one with `found_parts` in having its own; None if there is none."""
         chosen = self.sequences[sequence]
         own = replace(chosen, masks="given", poses="given")
-        return next((name for name, other in self.sequences.items() if own == other != chosen), None)
+        others = {name: replace(other, folds=chosen.folds) for name, other in self.sequences.items()}
+        return next((name for name, other in others.items() if own == other != chosen), None)
+
+    def folds(self, sequence: str, method: str) -> tuple[int, ...]:
+        """The folds of a sequence that a method has results of."""
+        folds = self.sequences[sequence].folds
+        return folds if self.methods[method].differs_by_fold(sequence) else folds[:1]
 
     def has_config(self, method: str) -> bool:
         """Whether the options of a method are our `Config`, with budgets and the spec's `set`."""
         return isinstance(REGISTRY.load(self.methods[method].name).options, Config)
 
-    def config(self, method: str, sequence: str, budget: int | None, seed: int) -> Any:
+    def config(self, method: str, sequence: str, budget: int | None, seed: int, fold: int = 0) -> Any:
         """The full options of one cell: a `Config`, or the dataclass of a method that has options of its own.
 
         Raises:
@@ -176,19 +193,20 @@ class Spec:
         ):
             override(values, overrides, where)
         if has_config:
-            values["data"] |= self.sequences[sequence].reading
+            values["data"] |= self.sequences[sequence].reading | {"test_phase": fold}
             if budget is not None:
                 values["init"]["budget"] = budget
             values["seed"] = seed
         if chosen.pictures:
             folders = {"folder": chosen.pictures, "depth_folder": chosen.depth_pictures}
-            values |= {name: self._folder(paths.get(sequence, ""), seed) for name, paths in folders.items()}
+            values |= {name: self._folder(paths.get(sequence, ""), seed, fold) for name, paths in folders.items()}
             values |= {"depth_scale": chosen.depth_scale, "name": self.label(method)}
         return from_dict(type(options), values, f"methods.{method}")
 
-    def _folder(self, path: str, seed: int) -> str:
+    def _folder(self, path: str, seed: int, fold: int) -> str:
         """A folder of images; empty if there is none."""
-        return str(self.resolved(path.replace("{seed}", str(seed))).absolute()) if path else ""
+        named = path.replace("{seed}", str(seed)).replace("{fold}", str(fold))
+        return str(self.resolved(named).absolute()) if path else ""
 
     def resolved(self, path: str) -> Path:
         """A path of the spec: `~` and `$NAME` expanded, relative to the spec's folder."""
@@ -265,6 +283,10 @@ def _check(spec: Spec) -> None:
         if sequence.format != "auto" and sequence.format not in LAYOUTS.names():
             want = f"auto, {', '.join(LAYOUTS.names())}"
             raise input_error(f"sequences.{name}.format", want, repr(sequence.format), "see docs/datasets.md.")
+        folds = {fold for fold in sequence.folds if 0 <= fold < TEST_EVERY}
+        if not folds or len(folds) < len(sequence.folds):
+            want = f"different numbers from 0 to {TEST_EVERY - 1}"
+            raise input_error(f"sequences.{name}.folds", want, f"{list(sequence.folds)}", "correct them.")
     known = [name for name in REGISTRY.names() if name != PICTURES]
     for name in spec.set_for:
         if name not in known:
@@ -282,11 +304,12 @@ def _check(spec: Spec) -> None:
         raise input_error("protocols", "different names", ", ".join(spec.protocols), "remove one.")
     if not spec.seeds or len(set(spec.seeds)) < len(spec.seeds):
         raise input_error("seeds", "different numbers", f"{list(spec.seeds)}", "correct them.")
-    count = len(spec.seeds) * len(spec.sequences) * max(len(spec.budgets), 1) * len(spec.methods)
+    folds = sum(len(sequence.folds) for sequence in spec.sequences.values())
+    count = len(spec.seeds) * folds * max(len(spec.budgets), 1) * len(spec.methods)
     if count > MOST_CELLS:
         raise input_error("methods x sequences x budgets x seeds", f"at most {MOST_CELLS}", f"{count}", "split.")
     for cell in cells(spec):
-        options = spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
+        options = spec.config(cell.method, cell.sequence, cell.budget, cell.seed, cell.fold)
         found, where = spec.sequences[cell.sequence].found_parts, f"sequences.{cell.sequence}"
         if "masks" in found and spec.has_config(cell.method) and options.data.use_gt_masks:
             raise input_error(f"{where}.masks", "either found or gt_masks", "both", "remove data.use_gt_masks.")
@@ -320,23 +343,27 @@ class Cell:
     method: str
     budget: int | None
     seed: int
+    fold: int = 0
+    """`data.test_phase`: which frames are held out."""
 
     @property
     def name(self) -> str:
         """Unique within the matrix."""
         budget = "" if self.budget is None else f"@{self.budget}"
-        return f"{self.sequence}/{self.method}{budget}/seed{self.seed}"
+        fold = f"/fold{self.fold}" if self.fold else ""
+        return f"{self.sequence}/{self.method}{budget}/seed{self.seed}{fold}"
 
 
 def cells(spec: Spec) -> list[Cell]:
     """All cells; seeds vary slowest, so that an unfinished matrix has whole seeds."""
     return [
-        Cell(sequence, method, budget, seed)
+        Cell(sequence, method, budget, seed, fold)
         for seed in spec.seeds
-        for sequence in spec.sequences
+        for sequence, chosen in spec.sequences.items()
+        for fold in chosen.folds
         for budget in (spec.budgets or (None,))
         for method, about in spec.methods.items()
-        if seed == spec.seeds[0] or about.differs_by_seed(sequence)
+        if (seed == spec.seeds[0] or about.differs_by_seed(sequence)) and fold in spec.folds(sequence, method)
     ]
 
 
