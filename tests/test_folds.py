@@ -23,7 +23,7 @@ from endoprior.data import load_sequence
 from endoprior.data.formats import REGISTRY
 from endoprior.data.images import save_png
 from endoprior.data.window_plan import look_through
-from endoprior.experiments.matrix import KEY_DIGITS, SCORES_VERSION, run_matrix
+from endoprior.experiments.matrix import KEY_DIGITS, SCORES_VERSION, frames_of, run_matrix
 from endoprior.experiments.report import write_report
 from endoprior.experiments.results import Results
 from endoprior.experiments.spec import Cell, MethodSpec, SequenceSpec, Spec, cells, load_spec
@@ -142,7 +142,7 @@ def test_tables_are_of_the_mean_over_folds_and_differences_pair_folds():
     results = Results(SPEC, scores)
     of_a = results.summary("s", None, "a", "psnr")
     assert (of_a.mean, of_a.count) == (33, 2) and of_a.std == pytest.approx(np.sqrt(2))
-    assert results.gains("psnr", "b", "a", sequence="s").tolist() == [1, 2, 3, 4]
+    assert [float((p.ours - p.theirs)[0]) for p in results.pairs("psnr", "b", "a", sequence="s")] == [1, 2, 3, 4]
     assert results.difference("psnr", "b", "a", "s").count == 4
     # A fold that has not run: its seed would be the mean of other frames.
     del scores[Cell("s", "a", None, 1, 3)]
@@ -157,7 +157,7 @@ def test_tables_are_of_the_mean_over_folds_and_differences_pair_folds():
 def test_images_of_one_training_are_compared_in_its_fold():
     scores = {Cell("s", "a", None, 0, fold): {"psnr": 30.0 + fold} for fold in (0, 3)}
     results = Results(replace(SPEC, seeds=(0,)), scores | {Cell("s", "theirs", None, 0): {"psnr": 29.0}})
-    assert results.gains("psnr", "theirs", "a", sequence="s").tolist() == [-1.0]
+    assert [float((p.ours - p.theirs)[0]) for p in results.pairs("psnr", "theirs", "a", sequence="s")] == [-1.0]
 
 
 def test_own_and_found_parts_are_paired_though_folds_differ():
@@ -205,7 +205,10 @@ def test_a_benchmark_of_folds(tmp_path):
         assert not done.missing and len({*done.done.values()}) == 6
         frames = {fold: [1 + fold, 9 + fold] for fold in (0, 3)}
         for cell, folder in done.done.items():
-            assert json.loads((folder / "metrics.json").read_text())["protocol"]["frames"] == frames[cell.fold], cell
+            stored = json.loads((folder / "metrics.json").read_text())
+            assert stored["protocol"]["frames"] == frames[cell.fold], cell
+            flow = frames_of(folder)["flow_error_dis"]  # between the two test frames, at the first of them
+            assert flow == {frames[cell.fold][0]: stored["scores"]["flow_error_dis"]}
         names = {cell.method: folder.name for cell, folder in done.done.items() if not cell.fold}
         assert names["ours"] == former_name(spec, data, "ours")
         reading = spec.sequences["tiny"].reading
@@ -215,6 +218,7 @@ def test_a_benchmark_of_folds(tmp_path):
     text = (tmp_path / "out" / "results.md").read_text()
     assert "3 methods x 1 sequences, folds 0, 3 of tiny, seeds 0" in text
     assert "over seeds of the mean over folds (which frame of every eight is held out)" in text
+    assert "[95 % bootstrap interval over folds; of tissue PSNR also over their frames]" in text
     assert "- `split_rule`: test iff (i - 1) % 8 == 0; test iff (i - 1) % 8 == 3" in text
 
 

@@ -217,6 +217,16 @@ def commits_of(matrix: Matrix) -> list[str]:
     return sorted(commit or "unknown" for commit in commits)
 
 
+def frames_of(folder: Path) -> dict[str, dict[int, float]]:
+    """Values of single test frames of a finished cell, by score and index of the frame."""
+    file, found = folder / "per_frame.json", {}
+    for row in json.loads(file.read_text(encoding="utf-8")) if file.exists() else []:
+        for score, value in row.items():
+            if score not in ("index", "time"):
+                found.setdefault(score, {})[row["index"]] = value
+    return found
+
+
 def scores_of(folder: Path) -> dict[str, Any]:
     """`scores`, `skipped` and `protocol` of a finished cell."""
     return read_json(folder / "metrics.json")

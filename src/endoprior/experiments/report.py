@@ -133,8 +133,18 @@ def _differences(results: Results, sequence: str, than: str, changes: dict[str, 
     headings = [all_scores()[score].heading(sequence in results.relative) for score in known]
     rows = [[results.spec.label(method), *(change(s, row[s]) for s in known)] for method, row in changes.items()]
     lines = [["method", *headings], ["---"] * (len(known) + 1), *rows]
-    about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over seeds]:"
+    over = resampled(results, sequence, [s for s in known if any(row[s].over_frames for row in changes.values())])
+    about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over {over}]:"
     return [about, "\n".join("| " + " | ".join(line) + " |" for line in lines)]
+
+
+def resampled(results: Results, sequence: str, of_frames: list[str]) -> str:
+    """What intervals are over: `seeds and folds; for PSNR and SSIM also over frames`."""
+    spec = results.spec
+    levels = {"budgets": spec.budgets, "seeds": spec.seeds, "folds": spec.sequences[sequence].folds}
+    over = " and ".join(name for name, values in levels.items() if len(values) > 1) or "seeds"
+    labels = ", ".join(all_scores()[score].label for score in of_frames)
+    return f"{over}; of {labels} also over their frames" if labels else over
 
 
 def change(score: str, difference: Difference) -> str:
@@ -173,7 +183,8 @@ def _claims(results: Results, mark: str) -> list[str]:
             f"- {sentence(results, claim)}{source}: **{verdict}**, {change(claim.score, measured)}, "
             f"{measured.count} pairs{detail}."
         )
-    note = f"A verdict needs the whole interval on one side, and at least {MIN_PAIRS} pairs."
+    note = f"A verdict needs the whole interval on one side, and at least {MIN_PAIRS} pairs. "
+    note += "Intervals are over pairs and, where both methods have values of the same single frames, over these too."
     return [f"{mark} Claims", "\n".join(lines), note]
 
 
@@ -252,4 +263,4 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
 def _json(difference: Difference) -> dict[str, Any]:
     numbers = {"mean": difference.mean, "low": difference.low, "high": difference.high}
     finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-    return finite | {"pairs": difference.count}
+    return finite | {"pairs": difference.count, "over_frames": difference.over_frames}
