@@ -78,7 +78,7 @@ def test_report_has_tables_claims_and_pictures(finished):
     assert len(facts["cells"]) == 6 and len(facts["missing"]) == 6 and facts["claims"][0]["verdict"] == "holds"
     found = [cell["scores"]["psnr_tissue"] for cell in facts["cells"] if cell["method"] == "a"]
     lines = (out / "results.csv").read_text().splitlines()
-    assert f"tiny,a,,0,psnr_tissue,{found[0]!r}" in lines
+    assert f"tiny,a,,0,0,psnr_tissue,{found[0]!r}" in lines
     assert len(set(found)) == 3  # seeds differ
 
 
