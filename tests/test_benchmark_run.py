@@ -172,7 +172,7 @@ def test_killed_half_way_it_loses_no_finished_cell(tmp_path, how):
 def test_an_interrupted_cell_goes_on_to_the_same_scene(tmp_path):
     from endoprior.data import load_sequence
     from endoprior.experiments.matrix import run_matrix
-    from endoprior.experiments.spec import load_spec
+    from endoprior.experiments.spec_file import load_spec
     from endoprior.runs.train import train
 
     write_tiny_sequence(tmp_path / "tiny")

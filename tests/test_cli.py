@@ -89,7 +89,7 @@ def test_train_scores_and_reports_skipped_scores(run):
     metrics = json.loads((folder / "metrics.json").read_text())
     assert set(metrics) == {"protocol", "scores", "skipped"}
     expected = {"psnr", "psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis", "depth_instability_mm"}
-    expected |= {"num_gaussians", "num_low_prior", "num_low_opacity", "num_large_scale"}
+    expected |= {"num_gaussians", "gaussians_growth", "num_low_prior", "num_low_opacity", "num_large_scale"}
     expected |= {"fps", "fps_cached", "train_seconds", "iterations_per_second"}
     assert expected <= set(metrics["scores"])
     assert {"flow_error", "lpips"} <= set(metrics["skipped"])

@@ -23,11 +23,14 @@ from endoprior.data import load_sequence
 from endoprior.data.formats import REGISTRY
 from endoprior.data.images import save_png
 from endoprior.data.window_plan import look_through
+from endoprior.experiments.matched_count import search_thresholds
 from endoprior.experiments.matrix import KEY_DIGITS, SCORES_VERSION, frames_of, run_matrix
 from endoprior.experiments.report import write_report
 from endoprior.experiments.results import Results
-from endoprior.experiments.spec import Cell, MethodSpec, SequenceSpec, Spec, cells, load_spec
+from endoprior.experiments.spec import Cell, MatchSpec, MethodSpec, SequenceSpec, Spec, cells
+from endoprior.experiments.spec_file import load_spec
 from endoprior.export.time_steps import frame_indices
+from endoprior.runs.growth import Growth
 
 QUICK = "--iterations 6 --gaussians 200 --schedule.coarse-iterations 2 --no-networks".split()
 
@@ -130,7 +133,7 @@ def test_every_cell_exists_once_per_fold():
     assert Cell("s", "a", None, 1, 3) in found and Cell("one", "a", None, 1, 3) not in found
     assert [cell.fold for cell in found if cell.method == "theirs" and cell.sequence == "s"] == [0]
     assert Cell("s", "a", None, 1).name == "s/a/seed1" and Cell("s", "a", None, 1, 3).name == "s/a/seed1/fold3"
-    assert SPEC.config("a", "s", None, 0, 3).data.test_phase == 3
+    assert SPEC.config("a", "s", None, 0, fold=3).data.test_phase == 3
 
 
 def test_tables_are_of_the_mean_over_folds_and_differences_pair_folds():
@@ -228,3 +231,15 @@ def former_name(spec: Spec, data: Path, method: str, *more) -> str:
     options.get("data", {}).pop("test_phase", None)
     facts = [options, load_sequence(data).fingerprint(), False, SCORES_VERSION, *more]
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]
+
+
+def test_a_threshold_is_searched_in_the_first_fold():
+    sequences, trained = {"s": SequenceSpec(path="s", folds=(3, 5))}, []
+    methods = {"grown": MethodSpec(preset="endogaussian", match=MatchSpec(growth=1.3))}
+
+    def train(wanted):
+        trained.extend(wanted)
+        return dict.fromkeys(wanted, Growth(1000, 1300, 10, {}))
+
+    found = search_thresholds(replace(SPEC, sequences=sequences, methods=methods), lambda place: 0.0, train)
+    assert trained == [Cell("s", "grown", None, 0, 3)] and found["s", "grown", None].matched

@@ -118,10 +118,12 @@ def evaluate_run(
     """
     from ..data import load_sequence
     from ..evaluation.scoring import evaluate, scored_data
+    from ..runs.growth import growth_of
 
     sequence = load_sequence(data, scored_data(scene.config.data))
     result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir, protocols=protocols)
-    result.scores |= extra
+    growth = growth_of(run)
+    result.scores |= extra | ({"gaussians_growth": growth.ratio} if growth else {})
     save_and_print(result, sequence, out, split, run)
 
 

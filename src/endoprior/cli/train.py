@@ -136,10 +136,10 @@ def train_and_evaluate(
     seconds = clock.perf_counter() - began
     del training  # frees its cached frames; scoring loads its own
     done = _logged_seconds(out / "log.jsonl")
-    speed = {"train_seconds": seconds, "iterations_per_second": done}
+    speed = {} if resume else {"train_seconds": seconds, "iterations_per_second": done}
     scene = scene.to(device_for(cfg.render.backend))  # score on the training device
     try:
-        evaluate_run(scene, out, data, out, "test", networks, weights_dir, extra=speed if not resume else {})
+        evaluate_run(scene, out, data, out, "test", networks, weights_dir, extra=speed)
     except KeyboardInterrupt:
         say(f"Stopped; the trained scene is saved. Score it with `{command('eval', out)}`.")
         raise

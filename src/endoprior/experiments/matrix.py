@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 import time as clock
 from collections.abc import Callable
@@ -21,7 +22,9 @@ from ..core.config_io import to_dict
 from ..data.files import read_json
 from ..evaluation.pictures import fingerprint
 from ..evaluation.true_masks import SCORES_FILE
+from ..runs.growth import Growth, growth_of
 from .execute import Executor
+from .matched_count import Place, Search, search_thresholds
 from .method import REGISTRY
 from .spec import Cell, Spec, cells, sequence_folder
 from .worker import Job, finished
@@ -50,6 +53,14 @@ class Matrix:
     """Folder of each readable sequence that its cells are scored on."""
     relative: set[str] = field(default_factory=set)
     """Names of those whose depth has no known scale, so that lengths are not in mm."""
+    searches: dict[Place, Search] = field(default_factory=dict)
+    """What was found for methods with a search for their threshold."""
+
+    def mean_count(self, place: Place) -> float:
+        """Mean number of Gaussians at the end, over the finished seeds; NaN if there are none."""
+        folders = [f for cell, f in self.done.items() if (cell.sequence, cell.method, cell.budget) == place]
+        counts = [growth.last for folder in folders if (growth := growth_of(folder / "run"))]
+        return sum(counts) / len(counts) if counts else math.nan
 
 
 def run_matrix(
@@ -61,7 +72,7 @@ def run_matrix(
     weights_dir: Path | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Matrix:
-    """Run every cell that is not finished yet.
+    """Run every cell that is not finished yet; methods with a search for their threshold come after the others.
 
     Args:
         out: folder of the benchmark; its finished cells are kept if nothing that determines them has changed.
@@ -70,63 +81,110 @@ def run_matrix(
         progress: takes a line of text.
     """
     matrix = Matrix(spec, out)
-    jobs = _jobs(matrix, threads, weights_dir, progress, write=execute is not None)
-    total = len(cells(spec))
-    progress(f"{total} cells: {len(matrix.done)} done before, {len(jobs)} to run, {len(matrix.missing)} without data")
-    for name, reason in {cell.sequence: reason for cell, reason in matrix.missing.items()}.items():
-        progress(f"note: {name}: {reason}")
-    if execute is None:
-        matrix.missing |= {cell: "not run yet" for cell in jobs}
+    run = _Runner(matrix, execute, threads, weights_dir, progress)
+    own = [cell for cell in cells(spec) if not spec.methods[cell.method].match]
+    run.report(own)
+    run({cell: None for cell in own})
+    if len(own) == len(cells(spec)):
         return matrix
-    by_folder: dict[str, list[Cell]] = {}  # different methods can have equal configs
-    for cell, job in jobs.items():
-        by_folder.setdefault(job.folder, []).append(cell)
-    began, ended = clock.perf_counter(), 0
-    for outcome in execute([jobs[same[0]] for same in by_folder.values()]):
-        ended += 1
-        for cell in by_folder[outcome.job.folder]:
-            if outcome.failure:
-                matrix.missing[cell] = outcome.failure
-                matrix.failed += 1
-            else:
-                matrix.done[cell] = Path(outcome.job.folder)
-        left = (clock.perf_counter() - began) / ended * (len(by_folder) - ended)
-        result = f"failed: {outcome.failure}" if outcome.failure else f"done in {outcome.seconds:.0f} s"
-        progress(f"[{ended}/{len(by_folder)}] {outcome.job.name}: {result}; about {left / 60:.0f} min left")
+
+    def train(wanted: dict[Cell, float]) -> dict[Cell, Growth | str]:
+        run(dict(wanted))
+        none = "no Gaussians were counted"
+        return {cell: matrix.missing.pop(cell, "") or growth_of(matrix.done[cell] / "run") or none for cell in wanted}
+
+    matrix.searches = search_thresholds(spec, matrix.mean_count, train)
+    for place, search in matrix.searches.items():
+        of_place = [cell for cell in cells(spec) if (cell.sequence, cell.method, cell.budget) == place]
+        if search.failure:
+            matrix.missing |= {cell: search.failure for cell in of_place}
+        else:
+            run({cell: search.best[0] for cell in of_place})
     return matrix
 
 
-def _jobs(
-    matrix: Matrix, threads: int, weights_dir: Path | None, progress: Callable[[str], None], write: bool
-) -> dict[Cell, Job]:
-    """A job for each cell that is not finished; fills `done`, `missing`, `data` and `relative` of the matrix."""
-    spec, jobs = matrix.spec, {}
-    trained_on: dict[str, Path] = {}
-    known: dict[str, list[Any]] = {}  # what determines results on a sequence
-    for name in spec.sequences:
-        try:
-            sequence = _sequence(spec, name, matrix.out, write)
-            trained_on[name], known[name] = sequence.path, [sequence.fingerprint()]
-            if found := spec.sequences[name].found_parts:
-                copy = _changed_copy(spec, name, sequence.path, matrix.out, progress, write)
-                trained_on[name] = copy.path
-                known[name] += [copy.fingerprint()]
-                known[name] += [read_json(copy.path / SCORES_FILE)["scores"]] if "masks" in found else []
-            matrix.data[name] = sequence.path
-            matrix.relative |= {name} if sequence.depth_is_relative else set()
-        except InputError as error:
-            matrix.missing |= {cell: str(error) for cell in cells(spec) if cell.sequence == name}
-    for cell in cells(spec):
-        if cell in matrix.missing:
-            continue
+class _Runner:
+    """Finds finished cells and runs the others; what it learns goes to the matrix."""
+
+    def __init__(
+        self,
+        matrix: Matrix,
+        execute: Executor | None,
+        threads: int,
+        weights_dir: Path | None,
+        progress: Callable[[str], None],
+    ) -> None:
+        """Find the sequences; phantoms and changed copies are written if anything is to run."""
+        self.matrix, self.execute, self.threads, self.progress = matrix, execute, threads, progress
+        self.weights_dir = str(weights_dir.absolute()) if weights_dir else None
+        self.trained_on: dict[str, Path] = {}
+        self.known: dict[str, list[Any]] = {}  # what determines results on a sequence
+        self.unreadable: dict[str, str] = {}
+        write, spec = execute is not None, matrix.spec
+        for name in spec.sequences:
+            try:
+                sequence = _sequence(spec, name, matrix.out, write)
+                self.trained_on[name], self.known[name] = sequence.path, [sequence.fingerprint()]
+                if found := spec.sequences[name].found_parts:
+                    copy = _changed_copy(spec, name, sequence.path, matrix.out, progress, write)
+                    self.trained_on[name] = copy.path
+                    self.known[name] += [copy.fingerprint()]
+                    self.known[name] += [read_json(copy.path / SCORES_FILE)["scores"]] if "masks" in found else []
+                matrix.data[name] = sequence.path
+                matrix.relative |= {name} if sequence.depth_is_relative else set()
+            except InputError as error:
+                self.unreadable[name] = str(error)
+
+    def report(self, some: list[Cell]) -> None:
+        """Say how many of some cells there are to run."""
+        unread = sum(cell.sequence in self.unreadable for cell in some)
+        jobs = {cell: job for cell in some if isinstance(job := self._job(cell, None), Job)}
+        searched = len(cells(self.matrix.spec)) - len(some)
+        later = f", {searched} after a search for their threshold" if searched else ""
+        done = len(some) - unread - len(jobs)
+        self.progress(f"{len(some)} cells: {done} done before, {len(jobs)} to run, {unread} without data{later}")
+        for name, reason in self.unreadable.items():
+            self.progress(f"note: {name}: {reason}")
+
+    def __call__(self, thresholds: dict[Cell, float | None]) -> None:
+        """Run cells, each with a threshold of growth or its own."""
+        matrix, by_folder, jobs = self.matrix, {}, {}
+        for cell, threshold in thresholds.items():
+            job = self._job(cell, threshold)
+            if isinstance(job, Path):
+                matrix.done[cell] = job
+            elif isinstance(job, str):
+                matrix.missing[cell] = job
+            elif self.execute is None:
+                matrix.missing[cell] = "not run yet"
+            else:  # different methods can have equal configs
+                jobs[job.folder] = job
+                by_folder.setdefault(job.folder, []).append(cell)
+        began, ended = clock.perf_counter(), 0
+        for outcome in self.execute([*jobs.values()]) if jobs else ():
+            ended += 1
+            for cell in by_folder[outcome.job.folder]:
+                if outcome.failure:
+                    matrix.missing[cell] = outcome.failure
+                    matrix.failed += 1
+                else:
+                    matrix.done[cell] = Path(outcome.job.folder)
+            left = (clock.perf_counter() - began) / ended * (len(by_folder) - ended)
+            result = f"failed: {outcome.failure}" if outcome.failure else f"done in {outcome.seconds:.0f} s"
+            self.progress(f"[{ended}/{len(by_folder)}] {outcome.job.name}: {result}; about {left / 60:.0f} min left")
+
+    def _job(self, cell: Cell, threshold: float | None) -> Job | Path | str:
+        """The job of a cell; its folder if it is finished, and the reason if it cannot run."""
+        matrix, spec = self.matrix, self.matrix.spec
+        if reason := self.unreadable.get(cell.sequence):
+            return reason
         method, reading = spec.methods[cell.method].name, spec.sequences[cell.sequence].reading_of(cell.fold)
-        options = to_dict(spec.config(cell.method, cell.sequence, cell.budget, cell.seed, cell.fold))
+        options = to_dict(spec.config(cell.method, cell.sequence, cell.budget, cell.seed, threshold, cell.fold))
         try:
             made = _made_from(spec, cell, options)
         except InputError as error:
-            matrix.missing[cell] = str(error)
-            continue
-        first, *others = known[cell.sequence]
+            return str(error)
+        first, *others = self.known[cell.sequence]
         facts = [_identity(options, cell.fold), first, spec.networks, SCORES_VERSION, *made, *others]
         if spec.protocols:
             own_masks = matrix.data[cell.sequence] / "gt_masks"  # protocols may read them, methods need not
@@ -134,12 +192,11 @@ def _jobs(
         key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
         folder = (matrix.out / "cells" / key[:KEY_DIGITS]).absolute()
         if finished(folder, key):
-            matrix.done[cell] = folder
-            continue
-        jobs[cell] = Job(
+            return folder
+        return Job(
             name=cell.name,
             folder=str(folder),
-            data=str(trained_on[cell.sequence].absolute()),
+            data=str(self.trained_on[cell.sequence].absolute()),
             scored_on=str(matrix.data[cell.sequence].absolute()),
             found_parts=spec.sequences[cell.sequence].found_parts,
             method=method,
@@ -148,11 +205,10 @@ def _jobs(
             seed=cell.seed,
             key=key,
             networks=spec.networks,
-            weights_dir=str(weights_dir.absolute()) if weights_dir else None,
-            threads=threads,
+            weights_dir=self.weights_dir,
+            threads=self.threads,
             protocols=spec.protocols,
         )
-    return jobs
 
 
 def _identity(options: dict[str, Any], fold: int) -> dict[str, Any]:

@@ -10,10 +10,12 @@ from ..core.config_io import to_dict
 from ..evaluation.registry import all_scores
 from ..system.atomic import write_json, write_text
 from .image_grids import GRIDS, write_image_grids
+from .matched_count import matched_table
 from .matrix import Matrix, commits_of, scores_of
 from .plots import budget_figure, curve_figure
 from .protocol_report import protocol_blocks, protocol_tables, protocol_values
 from .results import Results
+from .silent_rules import silent_rules
 from .spec import ClaimSpec, Spec
 from .statistics import MIN_PAIRS, Difference
 from .tables import csv_lines, latex, markdown, score_table
@@ -58,6 +60,8 @@ def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int
         *_head(matrix, "#" * level),
         *_tables(matrix, results, below),
         *_claims(results, below),
+        *_searches(matrix, below),
+        *_silent(matrix, below),
         *protocol_blocks(matrix, below),
         *_figure_links(matrix, folder, base, below),
     ]
@@ -188,6 +192,18 @@ def _claims(results: Results, mark: str) -> list[str]:
     return [f"{mark} Claims", "\n".join(lines), note]
 
 
+def _searches(matrix: Matrix, mark: str) -> list[str]:
+    if not matrix.searches:
+        return []
+    about = "Searched with the first seed and fold; the others train with the threshold found."
+    return [f"{mark} Thresholds found", about, "\n".join(matched_table(matrix.spec, matrix.searches))]
+
+
+def _silent(matrix: Matrix, mark: str) -> list[str]:
+    lines = silent_rules(matrix)
+    return [f"{mark} Rules that never fired", "\n".join(f"- {line}." for line in lines)] if lines else []
+
+
 def sentence(results: Results, claim: ClaimSpec) -> str:
     """The claim in words."""
     ours, theirs = results.spec.label(claim.method), results.spec.label(claim.than)
@@ -256,11 +272,22 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
         "differences": differences,
         "gains_of_found_parts": gains_of_found,
         "claims": claims,
+        "silent_rules": silent_rules(matrix),
+        "thresholds": [
+            {"sequence": s, "method": m, "budget": b, "failure": search.failure, "target": _finite(search.target)}
+            | {"tried": [{"threshold": value, "gaussians": growth.last} for value, growth in search.tried]}
+            for (s, m, b), search in matrix.searches.items()
+        ],
         "missing": missing,
     }
 
 
 def _json(difference: Difference) -> dict[str, Any]:
     numbers = {"mean": difference.mean, "low": difference.low, "high": difference.high}
-    finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-    return finite | {"pairs": difference.count, "over_frames": difference.over_frames}
+    pairs = {"pairs": difference.count, "over_frames": difference.over_frames}
+    return {name: _finite(value) for name, value in numbers.items()} | pairs
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no NaN."""
+    return value if math.isfinite(value) else None

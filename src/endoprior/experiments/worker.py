@@ -85,6 +85,7 @@ def work(job: Job) -> None:
     from ..evaluation.scoring import evaluate, scored_data
     from ..evaluation.true_masks import SCORES_FILE
     from ..model.scene import RenderedScene
+    from ..runs.growth import growth_of
     from .method import PICTURES, REGISTRY
 
     method, folder = REGISTRY.load(job.method), Path(job.folder)
@@ -118,6 +119,8 @@ def work(job: Job) -> None:
         result.skipped["train_seconds"] = "the run was interrupted"
     else:
         result.scores["train_seconds"] = seconds
+    if growth := growth_of(run):
+        result.scores["gaussians_growth"] = growth.ratio
     if origin := REGISTRY.origin(job.method):
         about = {"name": job.method, "package": origin, "options": job.options, "seed": job.seed}
         result.provenance["plugin"] = about

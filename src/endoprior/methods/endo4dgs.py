@@ -109,7 +109,8 @@ class Endo4DGS(GaussianMethod):
         grow &= num + int(grow.sum()) <= cfg.density.max_gaussians and num < GROW_BELOW
         small = gaussians.scales.amax(-1) <= cfg.density.clone_extent * extent
         remove = (gaussians.opacities < cfg.density.prune_opacity) & (num > REMOVE_ABOVE)
-        return Plan(clone=grow & small & ~remove, split=grow & ~small, remove=remove & ~(grow & ~small))
+        split = grow & ~small
+        return Plan(clone=grow & small & ~remove, split=split, remove=remove & ~split, removed_by={"opacity": remove})
 
 
 METHOD = Endo4DGS()

@@ -104,15 +104,15 @@ class EndoGS(GaussianMethod):
         gradient, largest = stats.grad2d_ndc_sum / stats.num_seen.clamp(min=1), gaussians.scales.amax(-1)
         grow = gradient >= cfg.density.grow_threshold
         small = largest <= cfg.density.clone_extent * SPATIAL_SCALE
-        remove = torch.zeros_like(grow)
-        if iteration % PRUNE_EVERY == 0:
-            remove = gaussians.opacities < cfg.density.prune_opacity
-            if iteration > RESET_EVERY:
-                remove |= (stats.max_radius_px > MOST_RADIUS_PX) | (largest > MOST_SCALE_SHARE * SPATIAL_SCALE)
+        faint = gaussians.opacities < cfg.density.prune_opacity
+        large = (stats.max_radius_px > MOST_RADIUS_PX) | (largest > MOST_SCALE_SHARE * SPATIAL_SCALE)
+        large &= iteration > RESET_EVERY
+        remove = (faint | large) & (iteration % PRUNE_EVERY == 0)
         if len(grow) + int(grow.sum()) > cfg.density.max_gaussians:
             grow = torch.zeros_like(grow)
         split = grow & ~small
-        return Plan(clone=grow & small & ~remove, split=split, remove=remove & ~split)
+        rules = {"opacity": faint, "size": large}
+        return Plan(clone=grow & small & ~remove, split=split, remove=remove & ~split, removed_by=rules)
 
     def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
         """See `GaussianMethod.reset_due`; the first one belongs to the white background."""

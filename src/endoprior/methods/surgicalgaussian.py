@@ -148,7 +148,8 @@ class SurgicalGaussian(GaussianMethod):
             return planned
         large = gaussians.scales.amax(-1) > MOST_SCALE * UNIT_MM
         large = (large | (stats.max_radius_px > MOST_RADIUS_PX)) & ~planned.split
-        return Plan(clone=planned.clone & ~large, split=planned.split, remove=planned.remove | large)
+        rules = {**planned.removed_by, "size": large}
+        return Plan(clone=planned.clone & ~large, split=planned.split, remove=planned.remove | large, removed_by=rules)
 
     def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
         """See `GaussianMethod.reset_due`; the first one belongs to the white background."""

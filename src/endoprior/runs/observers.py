@@ -22,14 +22,14 @@ CHECKPOINT_SHARE = 0.05
 
 
 class LogWriter:
-    """Writes a line of JSON every `LOG_EVERY` iterations."""
+    """Writes a line of JSON every `LOG_EVERY` iterations, and after every event of density control."""
 
     def __init__(self, lines: TextIO) -> None:
         self._lines = lines
 
     def __call__(self, report: StepReport, trainer: Trainer) -> None:
         """See `Observer`."""
-        if report.iteration % LOG_EVERY == 0:
+        if report.iteration % LOG_EVERY == 0 or report.event:
             self._lines.write(json.dumps(_log_line(report)) + "\n")
 
 
@@ -60,7 +60,8 @@ class CheckpointWriter:
 
 def _log_line(report: StepReport) -> dict[str, Any]:
     line = {"stage": report.stage.name.lower(), "iteration": report.iteration, "num_gaussians": report.num_gaussians}
-    return line | {"terms": report.terms, "seconds": round(report.seconds, 4)}
+    event = {"event": report.event} if report.event else {}
+    return line | event | {"terms": report.terms, "seconds": round(report.seconds, 4)}
 
 
 def cut_log(log: Path, stage: Stage, iteration: int) -> None:

@@ -67,10 +67,13 @@ class _Lines:
         self.last = now
         rate = (done - self.done_before) / max(now - self.began, 1e-9)
         left = (total - done) / max(rate, 1e-9)
-        self.show(
-            f"{report.stage.name.lower()} {done}/{total}  {rate:.1f} it/s  {left:.0f} s left  "
-            f"color {report.terms['color']:.4f}  {report.num_gaussians} Gaussians"
-        )
+        self.show(f"{report.stage.name.lower()} {done}/{total}  {rate:.1f} it/s  {left:.0f} s left  {_facts(report)}")
+
+
+def _facts(report: StepReport) -> str:
+    """The loss of the color, and how many Gaussians there are; a radiance field has none."""
+    count = f"  {report.num_gaussians} Gaussians" if report.num_gaussians else ""
+    return f"color {report.terms['color']:.4f}{count}"
 
 
 @contextmanager
@@ -97,7 +100,7 @@ def _bar() -> Iterator[Observer]:
                 total=total,
                 description=report.stage.name.lower(),
                 rate=f"{1 / max(report.seconds, 1e-9):.0f} it/s",
-                facts=f"color {report.terms['color']:.4f}  {report.num_gaussians} Gaussians",
+                facts=_facts(report),
             )
 
         yield observer

@@ -5,7 +5,8 @@ Eqs. (7) and (8) and the pruning rule after them. `plan` only decides; `densify.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -77,6 +78,13 @@ class Plan:
     """(N,) bool: replaced by two smaller children."""
     remove: Tensor
     """(N,) bool: goes."""
+    removed_by: Mapping[str, Tensor] = field(default_factory=dict)
+    """(N,) bool by rule that can take Gaussians: those that it condemns, whatever becomes of them."""
+
+    def counts(self) -> dict[str, int]:
+        """How many are cloned and split, and how many each rule removes."""
+        rules = {f"removed_{rule}": self.remove & condemned for rule, condemned in self.removed_by.items()}
+        return {name: int(rows.sum()) for name, rows in {"cloned": self.clone, "split": self.split, **rules}.items()}
 
 
 def due(iteration: int, is_last_of_fine: bool, cfg: DensityConfig) -> bool:
@@ -119,7 +127,9 @@ def plan(stats: DensityStats, scales: Tensor, opacities: Tensor, extent: float, 
     if len(scales) + int(clone.sum()) + int(split.sum()) - int(remove.sum()) > cfg.max_gaussians:
         clone, split = torch.zeros_like(clone), torch.zeros_like(split)
         remove = faint | huge | distrusted
-    return Plan(clone=clone, split=split, remove=remove)
+    rules = {"opacity": faint} | ({"size": huge} if cfg.prune_max_scale_mm else {})
+    rules |= {"prior": distrusted} if cfg.prior_prune else {}
+    return Plan(clone=clone, split=split, remove=remove, removed_by=rules)
 
 
 def scene_extent(camera_centers: Tensor, points: Tensor, cfg: DensityConfig) -> float:

@@ -34,7 +34,10 @@ class StepReport:
     losses: Mapping[str, Tensor]
     """Weighted terms of the loss that took part, () each."""
     num_gaussians: int
+    """After the iteration; 0 for a radiance field."""
     seconds: float
+    event: Mapping[str, int] | None = None
+    """What density control did after the iteration, if it did anything: `Plan.counts`."""
     divergence: Divergence | None = None
     """Why training cannot continue, if it cannot; on a device it may concern an earlier iteration."""
 

@@ -137,6 +137,7 @@ class TrainingStep:
         divergence = self.check.after_backward(
             iteration, terms, state.optimizer.count_unusable(), batch.frame.brightness, wait=densify or last
         )
+        event: dict[str, int] | None = None
         if divergence is not None:
             state.optimizer.drop_gradients()
             state.iteration = divergence.last_good
@@ -152,13 +153,13 @@ class TrainingStep:
                     log_scales = state.gaussians["log_scales"].detach()
                     limit_scales(log_scales, splats.means, batch.frame.camera, cfg.density.max_scale_share)
                 if densify:
-                    self._densify(state, iteration, rng)
+                    event = self._densify(state, iteration, rng)
                 if self.method.reset_due(state.stage, iteration, cfg):
                     reset_opacities(state.optimizer, RESET_OPACITY)
             state.iteration = iteration
         losses = {name: value.detach() for name, value in terms.items()}
         seconds = clock.perf_counter() - began
-        return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, divergence)
+        return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, event, divergence)
 
     def _batch(self, iteration: int, position: int, fine: bool) -> Batch:
         """Training frame number `position`, at half resolution early in the fine stage."""
@@ -221,7 +222,7 @@ class TrainingStep:
             opacities = state.gaussians.opacities
             self.ops.add_score(state.stats, out, batch.prior, batch.prior_mask, opacities, scale, skip)
 
-    def _densify(self, state: GaussiansState, iteration: int, rng: np.random.Generator) -> None:
+    def _densify(self, state: GaussiansState, iteration: int, rng: np.random.Generator) -> dict[str, int]:
         gaussians = state.gaussians
         extent = density.scene_extent(self.camera_centers, gaussians["means"], self.cfg.density)
         planned = self.method.plan(state.stats, gaussians, extent, state.stage, iteration, self.cfg)
@@ -229,6 +230,7 @@ class TrainingStep:
             raise Diverged(f"expected Gaussians that explain the frames; all {len(planned.remove):,} faded. {ADVICE}")
         state.stats, parents = apply_plan(state.optimizer, planned, state.stats, rng)
         state.tracks = state.tracks and state.tracks.inherited(parents)
+        return planned.counts()
 
 
 def sh_degree(cfg: Config, stage: Stage, iteration: int) -> int:

@@ -16,6 +16,12 @@ SCORES = (
         "Gaussians of the scene, in all its windows.",
         group="model", hint="more are finer and slower",
     ),
+    # Commands that know the run folder add it: a scene does not know how it began.
+    Score(
+        "gaussians_growth", "Gaussians, end / start", "", None, 2,
+        "Gaussians after the training over those before it.",
+        "absolute", group="model", in_summary=False,
+    ),
     Score(
         "num_low_prior", "low prior", "", None, 0,
         f"Gaussians seen at least {LOW_PRIOR_OBSERVATIONS} times whose texture-prior score is below {LOW_PRIOR}.",
