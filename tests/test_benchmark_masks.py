@@ -24,7 +24,8 @@ from endoprior.experiments.matrix import Matrix, run_matrix, scores_of
 from endoprior.experiments.preset_method import PresetMethod
 from endoprior.experiments.report import write_report
 from endoprior.experiments.results import Results
-from endoprior.experiments.spec import Cell, SequenceSpec, load_spec
+from endoprior.experiments.spec import Cell, SequenceSpec
+from endoprior.experiments.spec_file import load_spec
 from endoprior.model.scene_file import load_scene
 from endoprior.tool_masks import FoundTools
 

@@ -10,7 +10,8 @@ from endoprior.core.checks import InputError
 from endoprior.experiments.matched_count import MOST_PROBES, Search, matched_table, next_threshold, search_thresholds
 from endoprior.experiments.matrix import run_matrix
 from endoprior.experiments.report import write_report
-from endoprior.experiments.spec import Cell, MatchSpec, MethodSpec, SequenceSpec, Spec, load_spec
+from endoprior.experiments.spec import Cell, MatchSpec, MethodSpec, SequenceSpec, Spec
+from endoprior.experiments.spec_file import load_spec
 from endoprior.runs.growth import Growth
 
 

@@ -20,7 +20,8 @@ from endoprior.experiments.execute import Outcome
 from endoprior.experiments.matrix import run_matrix
 from endoprior.experiments.method import REGISTRY
 from endoprior.experiments.report import write_report
-from endoprior.experiments.spec import cells, load_spec
+from endoprior.experiments.spec import cells
+from endoprior.experiments.spec_file import load_spec
 from endoprior.experiments.worker import work
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.training.gaussian_trainer import GaussianTrainer

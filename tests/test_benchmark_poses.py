@@ -21,7 +21,8 @@ from endoprior.experiments import found_masks
 from endoprior.experiments.matrix import run_matrix, scores_of
 from endoprior.experiments.preset_method import PresetMethod
 from endoprior.experiments.report import write_report
-from endoprior.experiments.spec import Cell, load_spec
+from endoprior.experiments.spec import Cell
+from endoprior.experiments.spec_file import load_spec
 from endoprior.prepare.camera_path import choose
 from endoprior.tool_masks import FoundTools
 

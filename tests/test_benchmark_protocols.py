@@ -18,7 +18,7 @@ from endoprior.data.images import save_png
 from endoprior.experiments.execute import Outcome
 from endoprior.experiments.matrix import run_matrix
 from endoprior.experiments.report import write_report
-from endoprior.experiments.spec import load_spec
+from endoprior.experiments.spec_file import load_spec
 from endoprior.experiments.worker import work
 
 

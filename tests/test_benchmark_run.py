@@ -78,7 +78,7 @@ def test_report_has_tables_claims_and_pictures(finished):
     assert len(facts["cells"]) == 6 and len(facts["missing"]) == 6 and facts["claims"][0]["verdict"] == "holds"
     found = [cell["scores"]["psnr_tissue"] for cell in facts["cells"] if cell["method"] == "a"]
     lines = (out / "results.csv").read_text().splitlines()
-    assert f"tiny,a,,0,psnr_tissue,{found[0]!r}" in lines
+    assert f"tiny,a,,0,0,psnr_tissue,{found[0]!r}" in lines
     assert len(set(found)) == 3  # seeds differ
 
 
@@ -172,7 +172,7 @@ def test_killed_half_way_it_loses_no_finished_cell(tmp_path, how):
 def test_an_interrupted_cell_goes_on_to_the_same_scene(tmp_path):
     from endoprior.data import load_sequence
     from endoprior.experiments.matrix import run_matrix
-    from endoprior.experiments.spec import load_spec
+    from endoprior.experiments.spec_file import load_spec
     from endoprior.runs.train import train
 
     write_tiny_sequence(tmp_path / "tiny")

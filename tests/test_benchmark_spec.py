@@ -11,7 +11,8 @@ import yaml
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.experiments.ready_specs import find_spec, spec_names, specs_of
-from endoprior.experiments.spec import Cell, cells, load_spec, sequence_folder
+from endoprior.experiments.spec import Cell, cells, sequence_folder
+from endoprior.experiments.spec_file import load_spec
 
 PLAIN = {
     "title": "two methods",

@@ -13,7 +13,7 @@ import pytest
 from endoprior.experiments.report import change
 from endoprior.experiments.results import Results
 from endoprior.experiments.spec import Cell, ClaimSpec, MethodSpec, SequenceSpec, Spec
-from endoprior.experiments.statistics import Difference, difference, gains, summary, verdict
+from endoprior.experiments.statistics import Difference, Pair, difference, gains, summary, verdict
 from endoprior.experiments.tables import csv_lines, latex, markdown, number, score_table
 
 
@@ -42,9 +42,14 @@ def test_changes_in_words():
     assert change("psnr", Difference(math.nan, math.nan, math.nan, 0)) == "-"
 
 
+def pairs(differences) -> list[Pair]:
+    """Pairs of one value each with these differences."""
+    return [Pair(np.array([value]), np.zeros(1)) for value in differences]
+
+
 def test_interval_of_two_pairs_are_the_pairs():
     """All resamples of two values: both low, mixed, both high, in the ratio 1 : 2 : 1."""
-    found = difference([0.1, 0.3])
+    found = difference("psnr", pairs([0.1, 0.3]))
     assert (found.mean, found.low, found.high, found.count) == pytest.approx((0.2, 0.1, 0.3, 2))
 
 
@@ -52,16 +57,18 @@ def test_interval_covers_the_mean_about_as_often_as_it_says():
     rng = np.random.default_rng(0)
     inside = 0
     for k in range(200):
-        found = difference(rng.normal(0.4, 1, 30), seed=k)
+        found = difference("psnr", pairs(rng.normal(0.4, 1, 30)), seed=k)
         inside += found.low <= 0.4 <= found.high
     assert 0.88 <= inside / 200 <= 0.99
 
 
 def test_few_pairs_say_nothing():
-    found = difference([0.2, math.nan])
+    found = difference("psnr", pairs([0.2, math.nan]))
     assert found.count == 1 and found.mean == 0.2 and math.isnan(found.low)
-    assert verdict(found, "better", 0) == verdict(difference([0.2, 0.3]), "better", 0) == "cannot be told"
-    assert verdict(difference([0.2, 0.3, 0.2]), "better", 0) == "holds"
+    assert (
+        verdict(found, "better", 0) == verdict(difference("psnr", pairs([0.2, 0.3])), "better", 0) == "cannot be told"
+    )
+    assert verdict(difference("psnr", pairs([0.2, 0.3, 0.2])), "better", 0) == "holds"
 
 
 @pytest.mark.parametrize(
@@ -144,7 +151,8 @@ def test_digits_follow_the_spread():
 def test_csv_has_every_value():
     rows = list(csv.DictReader(io.StringIO(csv_lines(results()))))
     assert len(rows) == 19
-    assert rows[0] == {"sequence": "s", "method": "a_1", "budget": "", "seed": "0", "score": "psnr", "value": "30"}
+    first = {"sequence": "s", "method": "a_1", "budget": "", "seed": "0", "fold": "0", "score": "psnr", "value": "30"}
+    assert rows[0] == first
 
 
 def test_a_claim_is_checked_on_pairs():

@@ -56,7 +56,7 @@ def run(argv: list[str]) -> int:
     from ..experiments.execute import local_executor, ray_executor
     from ..experiments.matrix import run_matrix
     from ..experiments.report import write_overview, write_report
-    from ..experiments.spec import load_spec
+    from ..experiments.spec_file import load_spec
     from ..system.file_lock import locked
     from .output_paths import require_writable_folder
 

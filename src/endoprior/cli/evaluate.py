@@ -191,7 +191,8 @@ def save_and_print(
     from .protocol_table import protocol_table
 
     file = result.save(out)
-    say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({BETTER})")
+    held_out = f"; {sequence.split_rule}" if sequence.test_phase else ""
+    say(f"\nscores of the {len(sequence.indices(split))} {split} frames ({BETTER}{held_out})")
     for line in score_table(result.scores, result.skipped, sequence.depth_is_relative):
         say(line)
     for line in protocol_table(result, sequence.depth_is_relative):

@@ -64,4 +64,4 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _line(label: str, values: list[str]) -> str:
-    return label.ljust(NAME) + "".join(value.ljust(WIDTH) for value in values)
+    return label.ljust(NAME) + "".join(value.ljust(WIDTH - 1) + " " for value in values)

@@ -54,6 +54,8 @@ class DataConfig(Checked):
     """Keep every n-th frame of the folder; 0 takes what is published for the dataset."""
     depth_unit_mm: Weight = 0.0
     """mm per unit of the stored depth; 0 takes what the folder or its format says."""
+    test_phase: Annotated[int, Range(0, 7)] = 0
+    """Which frame of every eight is held out: frame i if (i - 1) mod 8 is this. 0 is the published split."""
     eyes: Literal["left", "both"] = "left"
     """Eyes whose pictures are trained on, in turn at random; `both` needs the right ones (docs/scores.md)."""
 

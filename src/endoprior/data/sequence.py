@@ -1,6 +1,6 @@
 """A sequence of frames that are read when first used, and its split into training and test frames.
 
-`T` frames; every 8th frame, starting at frame 1, is a test frame.
+`T` frames; every 8th frame is a test frame, starting at frame 1, or later with another `test_phase`.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class FrameSequence:
         self._remarks = remarks or []
         self._masks = path / mask_folder
         self._cache: BoundedCache[Frame] = BoundedCache(cache_bytes(), _frame_bytes)
-        self._holds_out, self._first = False, 0
+        self._holds_out, self._first, self._test_phase = False, 0, 0
 
     @property
     def remarks(self) -> list[str]:
@@ -142,7 +142,7 @@ class FrameSequence:
         return self._cache.get(index, lambda: self._read_frame(index))
 
     def indices(self, split: Split) -> list[int]:
-        """Ascending frame indices of a split: `test` has (i - 1) % 8 == 0, `train` the others, `video` all.
+        """Ascending frame indices of a split: `test` has (i - 1) % 8 == `test_phase`, `train` the others, `video` all.
 
         Raises:
             ValueError: an unknown split.
@@ -152,7 +152,30 @@ class FrameSequence:
         return [i for i in range(len(self)) if split == "video" or self._is_test(i) == (split == "test")]
 
     def _is_test(self, index: int) -> bool:
-        return is_test_frame(self._first + index)
+        return is_test_frame(self._first + index, self._test_phase)
+
+    @property
+    def test_phase(self) -> int:
+        """Which frame of every eight is held out, 0..7; see `is_test_frame`."""
+        return self._test_phase
+
+    @property
+    def split_rule(self) -> str:
+        """Which frames are held out, in words; i counts from the first frame of the whole sequence."""
+        return f"test iff (i - 1) % {TEST_EVERY} == {self._test_phase}"
+
+    def with_test_phase(self, phase: int) -> FrameSequence:
+        """This sequence with another frame of every eight held out.
+
+        Raises:
+            InputError: it is too short, so that no frame would be held out.
+        """
+        view = copy(self)
+        view._test_phase = phase
+        if phase and not view.indices("test"):
+            expected = f"a phase that leaves a test frame of {len(self)} frames"
+            raise input_error("data.test_phase", expected, str(phase), "choose a lower one; 0 is the published split.")
+        return view
 
     def frames(self, split: Split) -> FrameList:
         """The frames of a split, decoded one by one as they are used."""
@@ -285,6 +308,6 @@ class FrameList(Sequence[Frame]):
         return self.sequence.frame(self.indices[position])
 
 
-def is_test_frame(index: int) -> bool:
-    """Whether a frame is held out: indices 1, 9, 17, ..."""
-    return (index - 1) % TEST_EVERY == 0
+def is_test_frame(index: int, phase: int = 0) -> bool:
+    """Whether a frame is held out: indices 1, 9, 17, ... and `phase` frames later; phase 7 has 0, 8, 16, ..."""
+    return (index - 1) % TEST_EVERY == phase

@@ -28,12 +28,13 @@ class Looks:
 
 
 def look_through(sequence: FrameSequence) -> Looks:
-    """Decode every training frame once; a held-out frame counts as the one before it."""
+    """Decode every training frame once; a held-out frame counts as the training frame before it, or the first one."""
     thumbnails = np.zeros((len(sequence), *THUMBNAIL[::-1], 3), np.float32)
     depth_mm = np.full(len(sequence), np.nan)
-    training = set(sequence.indices("train"))
+    training = sequence.indices("train")
+    known = set(training)
     for index in range(len(sequence)):
-        if index not in training:
+        if index not in known:
             if index:
                 thumbnails[index], depth_mm[index] = thumbnails[index - 1], depth_mm[index - 1]
             continue
@@ -42,6 +43,8 @@ def look_through(sequence: FrameSequence) -> Looks:
         thumbnails[index] = small.astype(np.float32) / 255
         measured = frame.depth[frame.depth_valid & frame.tissue_mask]
         depth_mm[index] = np.median(measured) if measured.size else np.nan
+    first = training[0]
+    thumbnails[:first], depth_mm[:first] = thumbnails[first], depth_mm[first]
     return Looks(thumbnails, depth_mm)
 
 

@@ -103,7 +103,7 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
     unit = "relative units: the depth's scale is assumed" if sequence.depth_is_relative else "mm"
     return {
         "split": split,
-        "split_rule": "test iff (i - 1) % 8 == 0",
+        "split_rule": sequence.split_rule,
         "frames": sequence.indices(split),
         "images": "8-bit round trip; psnr, ssim, lpips and flow on images multiplied by the tissue mask",
         "shrink": data.shrink,

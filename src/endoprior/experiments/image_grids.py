@@ -1,6 +1,6 @@
 """Figures of images side by side: frames with zooms, maps of depth instability, the prior and the Gaussians' density.
 
-`H, W` image size. All show the first seed at the last budget.
+`H, W` image size. All show the first seed and fold at the last budget.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ def scenes_of(matrix: Matrix, sequence: str) -> dict[str, Scene]:
     """The trained scene of every method that has one and whose cell is finished, by label."""
     spec = matrix.spec
     budget = spec.budgets[-1] if spec.budgets else None
-    folders = {m: matrix.done.get(Cell(sequence, m, budget, spec.seeds[0])) for m in spec.methods}
+    fold = spec.sequences[sequence].folds[0]
+    folders = {m: matrix.done.get(Cell(sequence, m, budget, spec.seeds[0], fold)) for m in spec.methods}
     runs = {m: folder / "run" for m, folder in folders.items() if folder}
     return {spec.label(m): load_scene(run) for m, run in runs.items() if (run / "scene.safetensors").exists()}
 
@@ -168,7 +169,7 @@ def write_image_grids(matrix: Matrix, folder: Path, kinds: set[str]) -> None:
         if not scenes:
             continue
         spec = matrix.spec.sequences[name]
-        sequence = load_sequence(data, DataConfig(**spec.reading))
+        sequence = load_sequence(data, DataConfig(**spec.reading_of(spec.folds[0])))
         for kind, make in GRIDS.items():
             if kind in kinds:
                 write_png(folder / f"{kind}-{name}.png", make(sequence, scenes))

@@ -83,12 +83,12 @@ def search_thresholds(
 
     Args:
         counts: mean number of Gaussians of a finished method without a search; NaN if there is none.
-        train: trains cells, of the first seed, with the thresholds given; their growth, or why there is none.
+        train: trains cells, of the first seed and fold, with the thresholds given; their growth, or why there is none.
     Returns:
         A search per place; those with `value_of` share that of another method.
     """
     found: dict[Place, Search] = {}
-    probes = {place: Cell(*place, spec.seeds[0]) for place in _places(spec)}
+    probes = {place: Cell(*place, spec.seeds[0], spec.sequences[place[0]].folds[0]) for place in _places(spec)}
     for place in probes:
         sequence, method, budget = place
         match = spec.methods[method].match

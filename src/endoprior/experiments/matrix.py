@@ -178,14 +178,14 @@ class _Runner:
         matrix, spec = self.matrix, self.matrix.spec
         if reason := self.unreadable.get(cell.sequence):
             return reason
-        method, reading = spec.methods[cell.method].name, spec.sequences[cell.sequence].reading
-        options = to_dict(spec.config(cell.method, cell.sequence, cell.budget, cell.seed, threshold))
+        method, reading = spec.methods[cell.method].name, spec.sequences[cell.sequence].reading_of(cell.fold)
+        options = to_dict(spec.config(cell.method, cell.sequence, cell.budget, cell.seed, threshold, cell.fold))
         try:
             made = _made_from(spec, cell, options)
         except InputError as error:
             return str(error)
         first, *others = self.known[cell.sequence]
-        facts = [options, first, spec.networks, SCORES_VERSION, *made, *others]
+        facts = [_identity(options, cell.fold), first, spec.networks, SCORES_VERSION, *made, *others]
         if spec.protocols:
             own_masks = matrix.data[cell.sequence] / "gt_masks"  # protocols may read them, methods need not
             facts.append([sorted(spec.protocols), fingerprint(own_masks) if own_masks.is_dir() else ""])
@@ -211,6 +211,14 @@ class _Runner:
         )
 
 
+def _identity(options: dict[str, Any], fold: int) -> dict[str, Any]:
+    """The options that name a cell's folder: without the phase of the published split, which earlier cells lack."""
+    data = options.get("data")
+    if fold or not isinstance(data, dict):
+        return options
+    return options | {"data": {name: value for name, value in data.items() if name != "test_phase"}}
+
+
 def _made_from(spec: Spec, cell: Cell, options: dict[str, Any]) -> list[Any]:
     """What determines the result of a cell beside its options and its sequence; nothing for presets.
 
@@ -222,9 +230,9 @@ def _made_from(spec: Spec, cell: Cell, options: dict[str, Any]) -> list[Any]:
         if not options["folder"]:
             raise input_error(f"methods.{cell.method}.pictures", cell.sequence, "no entry", "name the folder.")
         folders = [Path(options[key]) for key in ("folder", "depth_folder") if options[key]]
-        return [method.name, *map(fingerprint, folders), spec.sequences[cell.sequence].reading]
+        return [method.name, *map(fingerprint, folders), spec.sequences[cell.sequence].reading_of(cell.fold)]
     if origin := REGISTRY.origin(method.name):
-        return [method.name, origin, cell.seed, spec.sequences[cell.sequence].reading]
+        return [method.name, origin, cell.seed, spec.sequences[cell.sequence].reading_of(cell.fold)]
     return []
 
 
@@ -263,6 +271,16 @@ def commits_of(matrix: Matrix) -> list[str]:
     records = [folder / "run" / "config.json" for folder in matrix.done.values()]
     commits = {read_json(record).get("commit") for record in records if record.exists()}
     return sorted(commit or "unknown" for commit in commits)
+
+
+def frames_of(folder: Path) -> dict[str, dict[int, float]]:
+    """Values of single test frames of a finished cell, by score and index of the frame."""
+    file, found = folder / "per_frame.json", {}
+    for row in json.loads(file.read_text(encoding="utf-8")) if file.exists() else []:
+        for score, value in row.items():
+            if score not in ("index", "time"):
+                found.setdefault(score, {})[row["index"]] = value
+    return found
 
 
 def scores_of(folder: Path) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,7 @@ from matplotlib.figure import Figure
 
 from ..evaluation.registry import all_scores
 from ..system.atomic import whole_file
-from .matrix import Matrix
+from .matrix import Matrix, frames_of
 from .results import Results
 from .spec import Cell
 
@@ -54,7 +53,11 @@ def curve_figure(results: Results, matrix: Matrix, path: Path) -> None:
 
     def plot(axis: Axes, sequence: str) -> None:
         for method in spec.methods:
-            curves = [_curve(matrix.done.get(Cell(sequence, method, budget, seed))) for seed in spec.seeds]
+            curves = []
+            for seed in spec.seeds:  # every fold has held-out frames of its own
+                cells = [Cell(sequence, method, budget, seed, fold) for fold in spec.folds(sequence, method)]
+                folders = [matrix.done[cell] for cell in cells if cell in matrix.done]
+                curves.append({i: v for folder in folders for i, v in frames_of(folder).get(CURVE_SCORE, {}).items()})
             known = [curve for curve in curves if curve]
             if known:
                 frames = sorted(set.intersection(*(set(curve) for curve in known)))
@@ -64,14 +67,6 @@ def curve_figure(results: Results, matrix: Matrix, path: Path) -> None:
         axis.set_ylabel(all_scores()[CURVE_SCORE].heading())
 
     _panels(list(spec.sequences), plot, path)
-
-
-def _curve(folder: Path | None) -> dict[int, float]:
-    """Score by frame index."""
-    if folder is None:
-        return {}
-    rows = json.loads((folder / "per_frame.json").read_text(encoding="utf-8"))
-    return {row["index"]: row[CURVE_SCORE] for row in rows if CURVE_SCORE in row}
 
 
 def _flow_score(results: Results, sequence: str) -> str:

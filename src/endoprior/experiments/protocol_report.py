@@ -40,7 +40,7 @@ def protocol_blocks(matrix: Matrix, mark: str) -> list[str]:
 def protocol_values(matrix: Matrix) -> list[tuple[Any, ...]]:
     """Rows for `results.csv`; the score is named `endonerf/psnr`."""
     return [
-        (cell.sequence, cell.method, cell.budget or "", cell.seed, f"{name}/{score}", repr(value))
+        (cell.sequence, cell.method, cell.budget or "", cell.seed, cell.fold, f"{name}/{score}", repr(value))
         for name in matrix.spec.protocols
         for cell, scores in Results.of(matrix, name).scores.items()
         for score, value in scores.items()

@@ -76,7 +76,11 @@ def _head(matrix: Matrix, mark: str) -> list[str]:
     if spec.about:
         lines.append(spec.about.strip())
     commits = ", ".join(commits_of(matrix)) or "none yet"
-    lines.append(f"{size}, seeds {seeds}; trained at commit {commits}. Mean ± standard deviation over seeds.")
+    over = "seeds"
+    if several := {name: about.folds for name, about in spec.sequences.items() if len(about.folds) > 1}:
+        size += "".join(f", folds {', '.join(map(str, folds))} of {name}" for name, folds in several.items())
+        over = "seeds of the mean over folds (which frame of every eight is held out)"
+    lines.append(f"{size}, seeds {seeds}; trained at commit {commits}. Mean ± standard deviation over {over}.")
     if matrix.missing:
         by_reason: dict[str, list[str]] = {}
         for cell, reason in matrix.missing.items():
@@ -100,6 +104,7 @@ def _protocol(matrices: list[Matrix], level: int) -> list[str]:
     hidden = ("frames", "data_fingerprint", "shrink", "tags")
     whole = max((scores_of(folder)["protocol"] for folder in folders), key=len)
     shown = {name: text for name, text in whole.items() if name not in hidden}
+    shown["split_rule"] = "; ".join(sorted({scores_of(folder)["protocol"]["split_rule"] for folder in folders}))
     return [f"{'#' * level} Protocol", "\n".join(f"- `{name}`: {text}" for name, text in shown.items())]
 
 
@@ -132,8 +137,18 @@ def _differences(results: Results, sequence: str, than: str, changes: dict[str, 
     headings = [all_scores()[score].heading(sequence in results.relative) for score in known]
     rows = [[results.spec.label(method), *(change(s, row[s]) for s in known)] for method, row in changes.items()]
     lines = [["method", *headings], ["---"] * (len(known) + 1), *rows]
-    about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over seeds]:"
+    over = resampled(results, sequence, [s for s in known if any(row[s].over_frames for row in changes.values())])
+    about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over {over}]:"
     return [about, "\n".join("| " + " | ".join(line) + " |" for line in lines)]
+
+
+def resampled(results: Results, sequence: str, of_frames: list[str]) -> str:
+    """What intervals are over: `seeds and folds; for PSNR and SSIM also over frames`."""
+    spec = results.spec
+    levels = {"budgets": spec.budgets, "seeds": spec.seeds, "folds": spec.sequences[sequence].folds}
+    over = " and ".join(name for name, values in levels.items() if len(values) > 1) or "seeds"
+    labels = ", ".join(all_scores()[score].label for score in of_frames)
+    return f"{over}; of {labels} also over their frames" if labels else over
 
 
 def change(score: str, difference: Difference) -> str:
@@ -172,14 +187,15 @@ def _claims(results: Results, mark: str) -> list[str]:
             f"- {sentence(results, claim)}{source}: **{verdict}**, {change(claim.score, measured)}, "
             f"{measured.count} pairs{detail}."
         )
-    note = f"A verdict needs the whole interval on one side, and at least {MIN_PAIRS} pairs."
+    note = f"A verdict needs the whole interval on one side, and at least {MIN_PAIRS} pairs. "
+    note += "Intervals are over pairs and, where both methods have values of the same single frames, over these too."
     return [f"{mark} Claims", "\n".join(lines), note]
 
 
 def _searches(matrix: Matrix, mark: str) -> list[str]:
     if not matrix.searches:
         return []
-    about = "Searched with the first seed; the other seeds train with the threshold found."
+    about = "Searched with the first seed and fold; the others train with the threshold found."
     return [f"{mark} Thresholds found", about, "\n".join(matched_table(matrix.spec, matrix.searches))]
 
 
@@ -222,7 +238,8 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
     """Everything in the tables, for other programs."""
     spec = matrix.spec
     cells = [
-        {"sequence": c.sequence, "method": c.method, "budget": c.budget, "seed": c.seed, "folder": folder.name}
+        {"sequence": c.sequence, "method": c.method, "budget": c.budget, "seed": c.seed, "fold": c.fold}
+        | {"folder": folder.name}
         | scores_of(folder)
         for c, folder in matrix.done.items()
     ]
@@ -267,7 +284,8 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
 
 def _json(difference: Difference) -> dict[str, Any]:
     numbers = {"mean": difference.mean, "low": difference.low, "high": difference.high}
-    return {name: _finite(value) for name, value in numbers.items()} | {"pairs": difference.count}
+    pairs = {"pairs": difference.count, "over_frames": difference.over_frames}
+    return {name: _finite(value) for name, value in numbers.items()} | pairs
 
 
 def _finite(value: float) -> float | None:

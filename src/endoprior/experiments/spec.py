@@ -1,35 +1,21 @@
-"""What a benchmark compares: a YAML or TOML file, checked completely before anything runs."""
+"""What a benchmark compares; `spec_file` reads it."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-import re
-import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
-from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.config_io import from_dict, override, to_dict
-from ..core.presets import PresetName
-from ..data.formats import REGISTRY as LAYOUTS
-from ..data.reading import read_text
-from ..data.yaml_text import load_yaml
 from ..evaluation.protocols.table import ProtocolName
-from ..evaluation.registry import all_scores
 from ..phantom import PhantomConfig
 from .method import PICTURES, REGISTRY
 
 Expectation = Literal["better", "no worse", "no effect"]
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
-"""Names of methods and sequences become folders."""
-MOST_EXTENDED = 8
-MOST_CELLS = 100_000
 
 
 @dataclass(frozen=True)
@@ -52,11 +38,17 @@ class SequenceSpec:
     """`found`: train with tool masks found from the footage; the sequence's own ones are the truth of all scores."""
     poses: Literal["given", "estimated"] = "given"
     """`estimated`: train with a camera path estimated from the footage; the sequence's own one is that of scores."""
+    folds: tuple[int, ...] = (0,)
+    """Values of `data.test_phase`: every cell is trained and scored once for each, with other frames held out."""
 
     @property
     def reading(self) -> dict[str, Any]:
         """The fields of `DataConfig` that it sets."""
         return {"shrink": self.shrink, "first_frames": self.first_frames, "stride": self.stride, "format": self.format}
+
+    def reading_of(self, fold: int) -> dict[str, Any]:
+        """`reading` with the frames of a fold held out; fold 0, the published split, adds nothing."""
+        return self.reading | ({"test_phase": fold} if fold else {})
 
     @property
     def found_parts(self) -> dict[str, str]:
@@ -85,7 +77,7 @@ class MethodSpec:
     method: str = ""
     """A name that `endoprior plugins` lists."""
     pictures: dict[str, str] = field(default_factory=dict)
-    """Folder of rendered frames by sequence; as `SequenceSpec.path`, `{seed}` stands for the seed."""
+    """Folder of rendered frames by sequence; as `SequenceSpec.path`, `{seed}`, `{fold}` stand for seed and fold."""
     depth_pictures: dict[str, str] = field(default_factory=dict)
     """Folder of rendered depth by sequence."""
     depth_scale: float = 0.0
@@ -105,6 +97,10 @@ class MethodSpec:
     def differs_by_seed(self, sequence: str) -> bool:
         """Whether there is more than one result on a sequence: images without `{seed}` are one result."""
         return not self.pictures or "{seed}" in self.pictures.get(sequence, "")
+
+    def differs_by_fold(self, sequence: str) -> bool:
+        """Whether there is more than one fold of a sequence: images without `{fold}` are of one training."""
+        return not self.pictures or "{fold}" in self.pictures.get(sequence, "")
 
 
 @dataclass(frozen=True)
@@ -128,7 +124,7 @@ class ClaimSpec:
 
 @dataclass(frozen=True)
 class Spec:
-    """methods x sequences x budgets x seeds, one protocol."""
+    """methods x sequences x folds x budgets x seeds, one protocol."""
 
     title: str
     sequences: dict[str, SequenceSpec]
@@ -168,13 +164,27 @@ class Spec:
         """The sequence that differs from one with `found_parts` in having its own; None if there is none."""
         chosen = self.sequences[sequence]
         own = replace(chosen, masks="given", poses="given")
-        return next((name for name, other in self.sequences.items() if own == other != chosen), None)
+        others = {name: replace(other, folds=chosen.folds) for name, other in self.sequences.items()}
+        return next((name for name, other in others.items() if own == other != chosen), None)
+
+    def folds(self, sequence: str, method: str) -> tuple[int, ...]:
+        """The folds of a sequence that a method has results of."""
+        folds = self.sequences[sequence].folds
+        return folds if self.methods[method].differs_by_fold(sequence) else folds[:1]
 
     def has_config(self, method: str) -> bool:
         """Whether the options of a method are our `Config`, with budgets and the spec's `set`."""
         return isinstance(REGISTRY.load(self.methods[method].name).options, Config)
 
-    def config(self, method: str, sequence: str, budget: int | None, seed: int, threshold: float | None = None) -> Any:
+    def config(
+        self,
+        method: str,
+        sequence: str,
+        budget: int | None,
+        seed: int,
+        threshold: float | None = None,
+        fold: int = 0,
+    ) -> Any:
         """The full options of one cell: a `Config`, or the dataclass of a method that has options of its own.
 
         Args:
@@ -192,7 +202,7 @@ class Spec:
         ):
             override(values, overrides, where)
         if has_config:
-            values["data"] |= self.sequences[sequence].reading
+            values["data"] |= self.sequences[sequence].reading | {"test_phase": fold}
             if budget is not None:
                 values["init"]["budget"] = budget
             values["seed"] = seed
@@ -200,154 +210,19 @@ class Spec:
             values["density"]["grow_threshold"] = threshold
         if chosen.pictures:
             folders = {"folder": chosen.pictures, "depth_folder": chosen.depth_pictures}
-            values |= {name: self._folder(paths.get(sequence, ""), seed) for name, paths in folders.items()}
+            values |= {name: self._folder(paths.get(sequence, ""), seed, fold) for name, paths in folders.items()}
             values |= {"depth_scale": chosen.depth_scale, "name": self.label(method)}
         return from_dict(type(options), values, f"methods.{method}")
 
-    def _folder(self, path: str, seed: int) -> str:
+    def _folder(self, path: str, seed: int, fold: int) -> str:
         """A folder of images; empty if there is none."""
-        return str(self.resolved(path.replace("{seed}", str(seed))).absolute()) if path else ""
+        named = path.replace("{seed}", str(seed)).replace("{fold}", str(fold))
+        return str(self.resolved(named).absolute()) if path else ""
 
     def resolved(self, path: str) -> Path:
         """A path of the spec: `~` and `$NAME` expanded, relative to the spec's folder."""
         expanded = Path(os.path.expandvars(path)).expanduser()
         return expanded if expanded.is_absolute() else Path(self.folder) / expanded
-
-
-def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
-    """Read and check a spec.
-
-    Args:
-        path: `.yaml`, `.yml` or `.toml`.
-        data: folders of sequences by name; they override those of the file.
-    Raises:
-        InputError: naming the file, the field, what is expected and what is there.
-    """
-    values = _read(path)
-    try:
-        for name in ("title", "sequences", "methods"):
-            if not values.get(name):
-                raise input_error(name, "an entry", "none", "add it.")
-        spec = replace(from_dict(Spec, values, "spec"), folder=str(path.parent))
-        for name, folder in (data or {}).items():
-            if name not in spec.sequences:
-                raise InputError(f"--data {name}: expected one of {', '.join(spec.sequences)}. Fix: Correct the name.")
-            known = replace(spec.sequences[name], path=str(folder.absolute()), phantom=None)
-            spec = replace(spec, sequences=spec.sequences | {name: known})
-        _check(spec)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    return spec
-
-
-def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Entries of a file and the files it `extends`: later ones override, `set` and `set_for` are merged.
-
-    Raises:
-        InputError: a file cannot be read, or extends itself.
-    """
-    readers = {".yaml": load_yaml, ".yml": load_yaml, ".toml": tomllib.loads}
-    if path.suffix not in readers:
-        raise input_error(path, "a .yaml or .toml file", f"{path.suffix or 'no suffix'}", "rename it.")
-    text = read_text(path, "a readable file", "Correct the path.")
-    if path.resolve() in chain:
-        raise InputError(f"{path}: expected a file that does not extend itself. Fix: Remove one `extends`.")
-    if len(chain) >= MOST_EXTENDED:
-        raise InputError(f"{path}: expected at most {MOST_EXTENDED} files that extend each other. Fix: Merge some.")
-    try:
-        values = readers[path.suffix](text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # such as a number of 5000 digits
-        raise input_error(path, f"valid {path.suffix[1:]}", f"{error}", "correct it.") from None
-    extends = values.pop("extends", []) if isinstance(values, dict) else None
-    if not isinstance(extends, list) or not all(isinstance(name, str) for name in extends):
-        raise input_error(path, "named entries, `extends` a list of files", "something else", "correct it.")
-    merged: dict[str, Any] = {}
-    for part in [*(_read(path.parent / name, (*chain, path.resolve())) for name in extends), values]:
-        both = {k for k in ("set", "set_for") if isinstance(merged.get(k), dict) and isinstance(part.get(k), dict)}
-        merged |= {key: merged[key] | value if key in both else value for key, value in part.items()}
-    return merged
-
-
-def _check(spec: Spec) -> None:
-    for kind, names in (("sequences", spec.sequences), ("methods", spec.methods)):
-        for name in names:
-            if not NAME.fullmatch(name):
-                raise input_error(kind, "a name of letters, digits and . _ + -", f"{name!r}", "rename it.")
-        if len({name.lower() for name in names}) < len(names):  # figures have these names
-            raise input_error(kind, "names that differ in more than case", ", ".join(names), "rename one.")
-    for name, sequence in spec.sequences.items():
-        if bool(sequence.path) == (sequence.phantom is not None):
-            raise input_error(f"sequences.{name}", "either path or phantom", "both or none", "keep one.")
-        if sequence.phantom and (sequence.shrink > 1 or sequence.first_frames):
-            raise InputError(f"sequences.{name}: a phantom has its own size. Fix: Remove shrink and first_frames.")
-        if sequence.format != "auto" and sequence.format not in LAYOUTS.names():
-            want = f"auto, {', '.join(LAYOUTS.names())}"
-            raise input_error(f"sequences.{name}.format", want, repr(sequence.format), "see docs/datasets.md.")
-    known = [name for name in REGISTRY.names() if name != PICTURES]
-    for name in spec.set_for:
-        if name not in known:
-            raise input_error("set_for", f"one of {', '.join(known)}", f"{name!r}", "choose one.")
-    for name, method in spec.methods.items():
-        _check_method(spec, f"methods.{name}", method, known)
-    for name, method in spec.methods.items():
-        if method.match:
-            _check_match(spec, name, method.match)
-    named = [spec.reference, *(name for claim in spec.claims for name in (claim.method, claim.than))]
-    for name in named:
-        if name not in spec.methods:
-            raise input_error("claims, compare_with", f"one of {', '.join(spec.methods)}", f"{name!r}", "correct it.")
-    for name in (*spec.scores, *(claim.score for claim in spec.claims)):
-        if name not in all_scores():
-            raise input_error("scores, claims", "names of scores", f"{name!r}", "see docs/scores.md.")
-    if len(set(spec.protocols)) < len(spec.protocols):
-        raise input_error("protocols", "different names", ", ".join(spec.protocols), "remove one.")
-    if not spec.seeds or len(set(spec.seeds)) < len(spec.seeds):
-        raise input_error("seeds", "different numbers", f"{list(spec.seeds)}", "correct them.")
-    count = len(spec.seeds) * len(spec.sequences) * max(len(spec.budgets), 1) * len(spec.methods)
-    if count > MOST_CELLS:
-        raise input_error("methods x sequences x budgets x seeds", f"at most {MOST_CELLS}", f"{count}", "split.")
-    for cell in cells(spec):
-        options = spec.config(cell.method, cell.sequence, cell.budget, cell.seed)
-        found, where = spec.sequences[cell.sequence].found_parts, f"sequences.{cell.sequence}"
-        if "masks" in found and spec.has_config(cell.method) and options.data.use_gt_masks:
-            raise input_error(f"{where}.masks", "either found or gt_masks", "both", "remove data.use_gt_masks.")
-        if "poses" in found and spec.has_config(cell.method) and options.data.depth_unit_mm:
-            fix = "write the unit to sequence.json as depth_scale."
-            raise input_error(f"{where}.poses", "either estimated or data.depth_unit_mm", "both", fix)
-
-
-def _check_match(spec: Spec, name: str, match: MatchSpec) -> None:
-    where = f"methods.{name}.match"
-    if [bool(match.count_of), match.growth != 0, bool(match.value_of)].count(True) != 1:
-        raise input_error(where, "one of count_of, growth and value_of", "none or several", "keep one.")
-    if not spec.has_config(name):
-        raise input_error(where, "a method with our config", spec.methods[name].name, "remove match.")
-    if match.growth and not match.growth > 0:
-        raise input_error(f"{where}.growth", "a number above 0", f"{match.growth}", "correct it.")
-    if match.count_of and (match.count_of not in spec.methods or spec.methods[match.count_of].match):
-        choice = ", ".join(other for other, about in spec.methods.items() if not about.match)
-        raise input_error(f"{where}.count_of", f"one of {choice}", repr(match.count_of), "choose one.")
-    searched = [n for n, about in spec.methods.items() if about.match and not about.match.value_of]
-    if match.value_of and match.value_of not in searched:
-        choice = f"one of {', '.join(searched)}" if searched else "a method with a search"
-        raise input_error(f"{where}.value_of", choice, repr(match.value_of), "choose one.")
-
-
-def _check_method(spec: Spec, where: str, method: MethodSpec, known: list[str]) -> None:
-    if bool(method.preset) + bool(method.method) + bool(method.pictures) > 1:
-        raise input_error(where, "one of preset, method and pictures", "several", "keep one.")
-    for key, name, choice in (("preset", method.preset, PresetName.__args__), ("method", method.method, known)):
-        if name and name not in choice:
-            raise input_error(f"{where}.{key}", f"one of {', '.join(choice)}", f"{name!r}", "choose one.")
-    if not method.pictures and (method.depth_pictures or method.depth_scale):
-        raise input_error(where, "depth_pictures and depth_scale beside pictures", "no pictures", "add pictures.")
-    for key, folders in (("pictures", method.pictures), ("depth_pictures", method.depth_pictures)):
-        for name, path in folders.items():
-            if name not in spec.sequences:
-                choice = ", ".join(spec.sequences)
-                raise input_error(f"{where}.{key}", f"one of {choice}", f"{name!r}", "correct the name.")
-            if not path:
-                raise input_error(f"{where}.{key}.{name}", "a folder", "nothing", "name it or remove the entry.")
 
 
 @dataclass(frozen=True)
@@ -358,23 +233,27 @@ class Cell:
     method: str
     budget: int | None
     seed: int
+    fold: int = 0
+    """`data.test_phase`: which frames are held out."""
 
     @property
     def name(self) -> str:
         """Unique within the matrix."""
         budget = "" if self.budget is None else f"@{self.budget}"
-        return f"{self.sequence}/{self.method}{budget}/seed{self.seed}"
+        fold = f"/fold{self.fold}" if self.fold else ""
+        return f"{self.sequence}/{self.method}{budget}/seed{self.seed}{fold}"
 
 
 def cells(spec: Spec) -> list[Cell]:
     """All cells; seeds vary slowest, so that an unfinished matrix has whole seeds."""
     return [
-        Cell(sequence, method, budget, seed)
+        Cell(sequence, method, budget, seed, fold)
         for seed in spec.seeds
-        for sequence in spec.sequences
+        for sequence, chosen in spec.sequences.items()
+        for fold in chosen.folds
         for budget in (spec.budgets or (None,))
         for method, about in spec.methods.items()
-        if seed == spec.seeds[0] or about.differs_by_seed(sequence)
+        if (seed == spec.seeds[0] or about.differs_by_seed(sequence)) and fold in spec.folds(sequence, method)
     ]
 
 

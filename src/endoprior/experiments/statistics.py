@@ -1,16 +1,22 @@
 """Means, spreads, paired differences with a bootstrap interval, and verdicts on claims.
 
-`K` paired observations: the same sequence, budget and seed by two methods.
+`K` pairs: the same sequence, budget, seed and fold by two methods; `F` frames of a pair; `R` resamples.
+
+The interval resamples in two levels: pairs, and within each the frames it is the mean of. Pairs that show the same
+frames, those of other seeds, get the same draw of frames: a hard frame is hard for every seed, so that more seeds do
+not make up for few frames (Owen 2007, The pigeonhole bootstrap, https://doi.org/10.1214/07-AOAS122).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..evaluation.registry import all_scores
 
@@ -35,6 +41,18 @@ class Summary:
 
 
 @dataclass(frozen=True)
+class Pair:
+    """One score by two methods."""
+
+    ours: NDArray[np.float64]
+    """(F,) values of single frames, whose mean is the score; or (1,) the score, where there are none."""
+    theirs: NDArray[np.float64]
+    """(F,) of the same frames."""
+    frames: Hashable = None
+    """Which frames: pairs with equal ones show the same F frames."""
+
+
+@dataclass(frozen=True)
 class Difference:
     """Paired differences, positive where the first method is better; absolute or relative as `Score.compare` says."""
 
@@ -43,6 +61,8 @@ class Difference:
     """Lower end of the 95 % bootstrap interval of the mean; NaN for fewer than two pairs."""
     high: float
     count: int
+    over_frames: bool = False
+    """Whether the interval is over frames too."""
 
 
 def summary(values: ArrayLike) -> Summary:
@@ -53,7 +73,7 @@ def summary(values: ArrayLike) -> Summary:
 
 
 def gains(score: str, ours: ArrayLike, theirs: ArrayLike) -> np.ndarray:
-    """(K,) differences between ours and theirs, positive where ours is better; relative ones are shares of |theirs|.
+    """(..., K) differences of ours and theirs, positive where ours is better; relative ones are shares of |theirs|.
 
     There is no share of nothing: NaN where theirs is 0 and ours is not.
     """
@@ -65,16 +85,59 @@ def gains(score: str, ours: ArrayLike, theirs: ArrayLike) -> np.ndarray:
     return change if about.higher_is_better else -change
 
 
-def difference(values: ArrayLike, seed: int = 0) -> Difference:
-    """Mean of K paired differences, with the percentile bootstrap interval over pairs."""
-    values = np.asarray(values, float)
-    values = values[np.isfinite(values)]
+def difference(score: str, pairs: Sequence[Pair], seed: int = 0) -> Difference:
+    """Mean of the `gains` of pairs in a score, with the percentile bootstrap interval over pairs and their frames."""
+    values = gains(score, [pair.ours.mean() for pair in pairs], [pair.theirs.mean() for pair in pairs])
+    pairs, values = [pair for pair, value in zip(pairs, values, strict=True) if math.isfinite(value)], _finite(values)
+    over_frames = any(len(pair.ours) > 1 for pair in pairs)
     if len(values) < 2:
-        return Difference(float(values.mean()) if len(values) else math.nan, math.nan, math.nan, len(values))
-    resampled = np.random.default_rng(seed).integers(len(values), size=(RESAMPLES, len(values)))
+        mean = float(values.mean()) if len(values) else math.nan
+        return Difference(mean, math.nan, math.nan, len(values), over_frames)
+    same = _same_frames(pairs)
+    chosen, shares = _draws(seed, RESAMPLES, len(pairs), tuple(num for _, num in same))
+    redrawn = values[chosen]
+    if over_frames:
+        redrawn = np.take_along_axis(gains(score, *_over_frames(pairs, [*same.values()], shares)), chosen, 1)
+    means = _finite(redrawn.mean(1))  # frames can be drawn of which there is no share
     tail = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(values[resampled].mean(1), (tail, 100 - tail))
-    return Difference(float(values.mean()), float(low), float(high), len(values))
+    low, high = np.percentile(means, (tail, 100 - tail)) if len(means) else (math.nan, math.nan)
+    return Difference(float(values.mean()), float(low), float(high), len(values), over_frames)
+
+
+def _finite(values: NDArray) -> NDArray:
+    """The finite ones of (N,) values."""
+    return values[np.isfinite(values)]
+
+
+def _same_frames(pairs: Sequence[Pair]) -> dict[tuple[Hashable, int], list[int]]:
+    """The pairs that show the same frames, by these and their number."""
+    same: dict[tuple[Hashable, int], list[int]] = {}
+    for k, pair in enumerate(pairs):
+        same.setdefault((pair.frames, len(pair.ours)), []).append(k)
+    return same
+
+
+@lru_cache(maxsize=4)  # the scores of a table have the same draws
+def _draws(seed: int, resamples: int, num_pairs: int, nums: tuple[int, ...]) -> tuple[NDArray, list[NDArray]]:
+    """(R, K) pairs drawn with replacement; and for each of `nums` frames, (R, F) the share of draws of each frame."""
+    rng = np.random.default_rng(seed)
+    chosen, shares = rng.integers(num_pairs, size=(resamples, num_pairs)), []
+    for num in nums:
+        drawn = rng.integers(num, size=(resamples, num)) + num * np.arange(resamples)[:, None]
+        times = np.bincount(drawn.ravel(), minlength=num * resamples).reshape(resamples, num)
+        shares.append(times / num)
+    return chosen, shares
+
+
+def _over_frames(
+    pairs: Sequence[Pair], same: Sequence[list[int]], shares: Sequence[NDArray]
+) -> tuple[NDArray, NDArray]:
+    """(R, K) our and their means over the frames that are drawn, once for all pairs that show them."""
+    means = np.empty((2, len(pairs), RESAMPLES))
+    for members, share in zip(same, shares, strict=True):
+        means[0, members] = np.array([pairs[k].ours for k in members]) @ share.T
+        means[1, members] = np.array([pairs[k].theirs for k in members]) @ share.T
+    return means[0].T, means[1].T
 
 
 def verdict(measured: Difference, expect: str, by: float) -> Verdict:

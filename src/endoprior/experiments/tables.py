@@ -36,6 +36,8 @@ class Table:
 def score_table(results: Results, sequence: str, scores: Mapping[str, Score] | None = None, title: str = "") -> Table:
     """Mean and standard deviation over seeds of every score on one sequence; a row for each method and budget.
 
+    Of several folds it is their mean.
+
     Args:
         scores: columns, if there is any value; default: those of the spec.
         title: default: the name of the sequence.
@@ -130,9 +132,9 @@ def csv_lines(results: Results, more: Sequence[tuple[Any, ...]] = ()) -> str:
     """One line for each cell and score, then those of `more`."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["sequence", "method", "budget", "seed", "score", "value"])
+    writer.writerow(["sequence", "method", "budget", "seed", "fold", "score", "value"])
     for cell, scores in results.scores.items():
         for name, value in scores.items():
-            writer.writerow([cell.sequence, cell.method, cell.budget or "", cell.seed, name, repr(value)])
+            writer.writerow([cell.sequence, cell.method, cell.budget or "", cell.seed, cell.fold, name, repr(value)])
     writer.writerows(more)
     return text.getvalue()

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from ..core.checks import input_error
+from ..core.checks import input_error, read_ranges
+from ..core.config import DataConfig
 from ..core.types import Camera, Splats
 from ..data.sequence import Split, is_test_frame
 from ..model.one_color import one_color
@@ -56,13 +57,17 @@ def canonical(scene: Scene) -> Splats:
     return scene.windows[0].scene.canonical()
 
 
-def frame_indices(num_frames: int, split: Split) -> list[int]:
+def frame_indices(num_frames: int, split: Split, data: DataConfig) -> list[int]:
     """Ascending indices of the frames of a split, as `FrameSequence.indices` without a sequence.
 
+    Args:
+        data: how the sequence was read; its window and phase decide which frames were held out.
     Raises:
         InputError: the split is empty.
     """
-    indices = [i for i in range(num_frames) if split == "video" or is_test_frame(i) == (split == "test")]
+    first = min(read_ranges("data.window", data.window), default=0)
+    is_test = [is_test_frame(first + i, data.test_phase) for i in range(num_frames)]
+    indices = [i for i in range(num_frames) if split == "video" or is_test[i] == (split == "test")]
     if not indices:
         raise input_error("--split", "a split with frames", f"{split}, which has none", "choose another.")
     return indices
@@ -81,7 +86,7 @@ def selected_time_steps(scene: Scene, options: ExportOptions) -> list[TimeStep]:
     if options.times:
         return [TimeStep(f"{k:06d}", time) for k, time in enumerate(options.times)]
     total = len(scene.cameras)
-    return [TimeStep(f"{i:06d}", i / total, i) for i in frame_indices(total, options.split)]
+    return [TimeStep(f"{i:06d}", i / total, i) for i in frame_indices(total, options.split, scene.config.data)]
 
 
 def seconds_of_motion(scene: Scene, steps: list[TimeStep]) -> list[float]:

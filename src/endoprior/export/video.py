@@ -18,7 +18,7 @@ from .time_steps import frame_indices
 
 def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
     """H.264 mp4 at the sequence's frame rate."""
-    indices = frame_indices(len(scene.cameras), options.split)
+    indices = frame_indices(len(scene.cameras), options.split, scene.config.data)
 
     def images() -> Iterator[NDArray[np.uint8]]:
         for k, i in enumerate(indices):

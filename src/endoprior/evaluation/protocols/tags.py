@@ -41,8 +41,9 @@ def tags_of(
     kept, masked = rows_of(protocol, height, shrink)
     rows = f"0..{kept - 1} of {height}" if kept < height else f"all {height}"
     without = protocol.skips_first and 0 in context.sequence.indices(context.split)
+    phase = context.sequence.test_phase
     values = {
-        "split": f"{context.split}, {total} {'without 0' if without else 'frames'}",
+        "split": f"{context.split}{f' {phase}/8' if phase else ''}, {total} {'without 0' if without else 'frames'}",
         "saw_test_frames": (f"yes: {seen} of {total}" if seen else "no") if is_scene else "not known",
         "mask_folder": mask_folder or "none: by the reader",
         "rows": rows + (f", {masked} masked" if masked else ""),

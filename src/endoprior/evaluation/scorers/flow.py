@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -51,9 +52,16 @@ def compute(context: EvaluationContext) -> None:
 
 
 def _add(context: EvaluationContext, name: str, frames: Sequence[Frame], estimator: metrics.FlowEstimator) -> None:
-    """Add the mean error over pairs of neighbors in `frames`; two frames at a time, which bounds memory."""
+    """Add the mean error over pairs of neighbors in `frames`; two frames at a time, which bounds memory.
+
+    In `per_frame` a pair of the split stands at its first frame.
+    """
     errors: list[float] = []
     for pair in pairwise(frames):
         rendered, true = [context.rendered[frame.index].rgb_u8 for frame in pair], [frame.rgb_u8 for frame in pair]
         errors += list(metrics.flow_error(rendered, true, [frame.tissue_mask for frame in pair], estimator))
-    context.add_mean(name, errors, "no two neighboring frames share tissue")
+    reason = "no two neighboring frames share tissue"
+    if frames is context.frames:
+        context.add_frames([{name: error} for error in (*errors, math.nan)], reason)
+    else:
+        context.add_mean(name, errors, reason)

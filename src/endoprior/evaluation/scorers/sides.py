@@ -48,7 +48,7 @@ SCORES = (
         "absolute", group="depth", in_summary=False,
     ),
 )  # fmt: skip
-NO_TISSUE = "no side camera sees tissue that the endoscope sees"
+NO_TISSUE = "no side camera sees tissue that the endoscope sees, or these frames have no side views"
 
 
 @dataclass(frozen=True)
