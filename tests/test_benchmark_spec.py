@@ -184,6 +184,19 @@ def test_ready_specs_are_read_by_name(name):
         assert cells(spec) and spec.about
 
 
+@pytest.mark.parametrize("size", ["full", "sized"])
+def test_depth_flags_change_the_flags_and_nothing_else(size):
+    spec = load_spec(find_spec(f"{size}/depth_flags"))
+    flags = {"kept": (False, "legacy"), "centers": (True, "exact"), "both": (False, "exact")}
+    for base, changes in (("endogaussian", flags), ("paper", {"paper_flags": (True, "legacy")})):
+        for method, (lifted, offset) in changes.items():
+            for sequence in spec.sequences:
+                want = spec.config(base, sequence, None, 0).replace(
+                    {"data.lift_missing_depth": lifted, "init.pixel_offset": offset}
+                )
+                assert spec.config(method, sequence, None, 0) == want != spec.config(base, sequence, None, 0)
+
+
 def test_names_are_listed_and_win_over_paths(tmp_path, monkeypatch, capsys):
     names = spec_names()
     assert {"quick", "masks", "poses", "sized", "sized/phantom", "full", "full/methods"} <= {*names}
