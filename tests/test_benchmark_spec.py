@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import yaml
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.experiments.ready_specs import find_spec, spec_names, specs_of
-from endoprior.experiments.spec import Cell, cells, load_spec, sequence_folder
+from endoprior.experiments.spec import Cell, MethodSpec, cells, load_spec, sequence_folder
 
 PLAIN = {
     "title": "two methods",
@@ -182,6 +183,15 @@ def test_ready_specs_are_read_by_name(name):
     else:
         spec = load_spec(found)
         assert cells(spec) and spec.about
+
+
+@pytest.mark.parametrize("size", ["full", "sized"])
+def test_the_ladder_leads_from_endogaussian_to_released(size):
+    spec = load_spec(find_spec(f"{size}/ladder"))
+    for sequence in spec.sequences:
+        for step, name in (("base", "endogaussian"), ("temporal", "released")):
+            want = replace(spec, methods={step: MethodSpec(preset=name)}).config(step, sequence, None, 0)
+            assert spec.config(step, sequence, None, 0) == want
 
 
 @pytest.mark.parametrize("size", ["full", "sized"])
