@@ -14,6 +14,7 @@ from scipy.stats import chisquare
 from endoprior.core.checks import InputError
 from endoprior.core.config import InitConfig, PriorConfig, SalienceConfig, SpecularConfig
 from endoprior.core.geometry import project
+from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
 from endoprior.initialization.cleanup import PointCloud, merge_voxels, remove_outliers
@@ -234,6 +235,15 @@ def test_legacy_offset_is_half_a_pixel_up_left(mask):
     exact, legacy = (initial_points([frame], InitConfig(budget=80, pixel_offset=o)) for o in ("exact", "legacy"))
     shift = pixels_of(legacy, frame.camera) - pixels_of(exact, frame.camera)
     np.testing.assert_allclose(shift, -0.5, atol=2e-5)  # float32 points, as above
+
+
+@pytest.mark.parametrize(("name", "offset"), [("default", 0.5), ("paper", 0.5), ("released", 0), ("endogaussian", 0)])
+def test_pixels_that_presets_back_project(mask, name, offset):
+    """The programs of EndoGaussian and EndoPrior-GS take integer pixels; the equations say nothing."""
+    cfg = replace(preset(name).init, budget=80, cleanup=False)
+    frame = make_frame(mask)
+    pixels = pixels_of(initial_points([frame], cfg), frame.camera)
+    np.testing.assert_allclose(pixels - np.floor(pixels + 1e-3), offset, atol=2e-5)  # float32 points, as above
 
 
 def test_seed_decides(mask):

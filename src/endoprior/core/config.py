@@ -125,7 +125,7 @@ class InitConfig(Checked):
     outlier_std: Weight = 1.5
     """Points farther than mean + this many standard deviations are dropped."""
     pixel_offset: Literal["exact", "legacy"] = "exact"
-    """`legacy` back-projects integer pixels, half a pixel up and left of their centers (EndoGaussian)."""
+    """`legacy` back-projects integer pixels, half a pixel up and left of their centers (EndoGaussian, released)."""
     variance_factor: Annotated[float, Range(1e-12, 1e6)] = 1.0
     """Initial variance = this times the mean squared distance to the 3 nearest points (released code: 0.4)."""
     thickness: Annotated[float, Range(1e-3, 1)] = 1.0

@@ -39,6 +39,7 @@ def released() -> Config:
             adaptive_specular=True,
             salience_on_eroded_mask=True,
             cleanup=True,
+            pixel_offset="legacy",
             variance_factor=0.4,
         ),
         deformation=DeformationConfig(deform_opacity=True, hexplane=HexPlaneConfig(bias_init="zero")),
