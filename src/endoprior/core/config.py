@@ -87,7 +87,7 @@ class SalienceConfig(Checked):
     percentile: Percent = 99.0
     """p: the edge magnitude at this percentile of tissue pixels maps to 1."""
     border: Literal["reflect", "zero"] = "reflect"
-    """How the Sobel filter continues the image; `zero` makes every bright border an edge (released training code)."""
+    """How the Sobel filter continues the image in training; `zero` makes bright borders edges (released code)."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,8 @@ class InitConfig(Checked):
     """Raise tau_v to the 97th percentile of brightness in the eroded mask (released code)."""
     salience_on_eroded_mask: bool = False
     """Take the percentile of Eq. (5) over the eroded mask (released code)."""
+    salience_border: Literal["reflect", "zero"] = "reflect"
+    """How the Sobel filter continues the image while points are sampled; see `prior.salience.border`."""
     pool_fraction: Share = 0.01
     """Share of tissue pixels that each frame gives to EndoGaussian's pool."""
     cleanup: bool = False
