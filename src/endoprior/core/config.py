@@ -212,6 +212,8 @@ class TemporalConfig(Checked):
     """Require a projection onto tissue at both times; False: being rendered at time t is enough (released code)."""
     max_points: Count = 0
     """Gaussians sampled by weight for each iteration; 0 takes all that are eligible."""
+    refill: bool = False
+    """A heavy Gaussian can be hit twice: take the heaviest others until there are `max_points` (released code)."""
     min_points: Count = 128
     """With fewer eligible Gaussians the iteration has no temporal term."""
     gradient: Literal["both", "current"] = "both"

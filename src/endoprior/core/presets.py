@@ -50,6 +50,7 @@ def released() -> Config:
             min_valid=1,
             valid_at_both=False,
             max_points=1024,
+            refill=True,
             gradient="current",
         ),
         prior=replace(Config().prior, salience=SalienceConfig(border="zero")),
