@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,11 @@ import yaml
 
 from endoprior.cli import main
 from endoprior.core.checks import InputError
+from endoprior.core.presets import preset
+from endoprior.data.scared import dataset_number
 from endoprior.experiments.ready_specs import find_spec, spec_names, specs_of
-from endoprior.experiments.spec import Cell, cells, sequence_folder
-from endoprior.experiments.spec_file import load_spec
+from endoprior.experiments.spec import Cell, MethodSpec, cells, sequence_folder
+from endoprior.experiments.spec_file import load_spec, load_specs
 
 PLAIN = {
     "title": "two methods",
@@ -176,6 +179,16 @@ def test_unreadable_files_are_named(tmp_path):
         load_spec(written(tmp_path), {"x": tmp_path})
 
 
+def test_a_folder_of_specs_takes_folders_of_the_sequences_of_any(tmp_path):
+    paths = [written(tmp_path), tmp_path / "other.yaml"]
+    written(tmp_path, sequences={"ph": {"phantom": {"frames": 10}}}).rename(paths[1])
+    written(tmp_path)
+    first, second = load_specs(paths, {"clip": tmp_path / "mine"}).values()
+    assert first.sequences["clip"].path == str(tmp_path / "mine") and {*second.sequences} == {"ph"}
+    with pytest.raises(InputError, match="--data x: expected one of clip, ph"):
+        load_specs(paths, {"x": tmp_path})
+
+
 @pytest.mark.parametrize("name", spec_names())
 def test_ready_specs_are_read_by_name(name):
     if (found := find_spec(name)).is_dir():
@@ -183,6 +196,48 @@ def test_ready_specs_are_read_by_name(name):
     else:
         spec = load_spec(found)
         assert cells(spec) and spec.about
+
+
+@pytest.mark.parametrize("size", ["full", "sized"])
+def test_the_ladder_leads_from_endogaussian_to_released(size):
+    spec = load_spec(find_spec(f"{size}/ladder"))
+    for sequence in spec.sequences:
+        for step, name in (("base", "endogaussian"), ("temporal", "released")):
+            want = replace(spec, methods={step: MethodSpec(preset=name)}).config(step, sequence, None, 0)
+            assert spec.config(step, sequence, None, 0) == want
+
+
+def test_scared_has_the_settings_published_for_it():
+    """EndoGaussian's and the released code's; the paper says nothing but EndoGaussian's schedule."""
+    spec, methods = load_spec(find_spec("full/scared")), load_spec(find_spec("full/methods"))
+    assert {*methods.sequences} == {"pulling", "cutting"} and spec.methods == methods.methods
+    numbers = [dataset_number(spec.resolved(sequence.path)) for sequence in spec.sequences.values()]
+    assert numbers == [1, 2, 3, 6, 7], "the stride follows from the folder's name"
+    published = {
+        "deformation.hexplane.channels": 32,
+        "deformation.deform_scales": False,
+        "deformation.deform_quats": False,
+    }
+    shorter = published | {"schedule.fine_iterations": 2000, "optim.decay_iterations": 2000}
+    # The release trains as long as on EndoNeRF, does not clean up, and its pixels and principal point agree.
+    released = published | {"init.cleanup": False, "init.pixel_offset": "exact"}
+    for method, changes in (("endogaussian", shorter), ("paper", shorter), ("released", released), ("default", {})):
+        found = spec.config(method, "d1", None, 0)
+        assert found == replace(preset(method).replace(changes), data=found.data)
+        assert found.data.lift_missing_depth == preset(method).data.lift_missing_depth
+
+
+@pytest.mark.parametrize("size", ["full", "sized"])
+def test_depth_flags_change_the_flags_and_nothing_else(size):
+    spec = load_spec(find_spec(f"{size}/depth_flags"))
+    flags = {"kept": (False, "legacy"), "centers": (True, "exact"), "both": (False, "exact")}
+    for base, changes in (("endogaussian", flags), ("paper", {"paper_flags": (True, "legacy")})):
+        for method, (lifted, offset) in changes.items():
+            for sequence in spec.sequences:
+                want = spec.config(base, sequence, None, 0).replace(
+                    {"data.lift_missing_depth": lifted, "init.pixel_offset": offset}
+                )
+                assert spec.config(method, sequence, None, 0) == want != spec.config(base, sequence, None, 0)
 
 
 def test_names_are_listed_and_win_over_paths(tmp_path, monkeypatch, capsys):

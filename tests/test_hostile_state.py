@@ -276,7 +276,7 @@ def test_headers_with_flipped_bits_are_refused_or_drawn(scene, path):
     """What still loads has passed every check, so that drawing it is safe."""
     header, data, rng = bytearray(json.dumps(scene.header()).encode()), scene.data(), random.Random(0)
     drawn = 0
-    for _ in range(300):
+    for _ in range(1000):
         flipped = bytearray(header)
         for _ in range(rng.randint(1, 3)):
             flipped[rng.randrange(len(flipped))] ^= 1 << rng.randrange(8)
@@ -286,7 +286,7 @@ def test_headers_with_flipped_bits_are_refused_or_drawn(scene, path):
             if loaded.cameras[0].width * loaded.cameras[0].height < 1e5:
                 loaded.render(0.5)
                 drawn += 1
-    assert 0 < drawn < 300
+    assert 0 < drawn < 1000  # about one in a hundred still loads
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from scipy.stats import chisquare
 from endoprior.core.checks import InputError
 from endoprior.core.config import InitConfig, PriorConfig, SalienceConfig, SpecularConfig
 from endoprior.core.geometry import project
+from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
 from endoprior.initialization.cleanup import PointCloud, merge_voxels, remove_outliers
@@ -236,6 +237,15 @@ def test_legacy_offset_is_half_a_pixel_up_left(mask):
     np.testing.assert_allclose(shift, -0.5, atol=2e-5)  # float32 points, as above
 
 
+@pytest.mark.parametrize(("name", "offset"), [("default", 0.5), ("paper", 0.5), ("released", 0), ("endogaussian", 0)])
+def test_pixels_that_presets_back_project(mask, name, offset):
+    """The programs of EndoGaussian and EndoPrior-GS take integer pixels; the equations say nothing."""
+    cfg = replace(preset(name).init, budget=80, cleanup=False)
+    frame = make_frame(mask)
+    pixels = pixels_of(initial_points([frame], cfg), frame.camera)
+    np.testing.assert_allclose(pixels - np.floor(pixels + 1e-3), offset, atol=2e-5)  # float32 points, as above
+
+
 def test_seed_decides(mask):
     frames = [make_frame(mask, i) for i in range(3)]
     cfg = InitConfig(budget=100)
@@ -311,6 +321,19 @@ def test_released_options_change_the_weights(mask):
         np.testing.assert_array_equal(pixel_probability(frame, cfg, prior), want)
         results.append(want)
     assert not np.allclose(results[0], results[1]) and not np.allclose(results[0], results[2])
+
+
+def test_border_of_the_initialization_is_a_setting_of_its_own(mask):
+    """The released code pads with zero in training only."""
+    frame, released, results = make_frame(mask), preset("released"), []
+    for border in ("reflect", "zero"):
+        cfg = replace(InitConfig(), salience_border=border)
+        rho = joint_texture_prior(frame.rgb, mask, PriorConfig(salience=SalienceConfig(border=border)))
+        want = np.where(frame.depth_valid, sampling_distribution(rho, mask, cfg), 0)
+        np.testing.assert_array_equal(pixel_probability(frame, cfg, released.prior), want)
+        results.append(want)
+    assert not np.allclose(*results)
+    assert (released.init.salience_border, released.prior.salience.border) == ("reflect", "zero")
 
 
 def test_adaptive_threshold_never_falls(mask):

@@ -6,10 +6,12 @@ from typing import get_args
 
 import pytest
 import torch
-from render_scenes import agree, camera, compare, render_with_grads, splats
+from render_scenes import agree, camera, compare, one, render_with_grads, splats
 
 from endoprior import render
+from endoprior.render.constants import ALPHA_MAX
 
+CPU = [name for name in get_args(render.Backend) if name not in render.ON_GPU]
 FAST = [name for name in get_args(render.Backend) if name not in ("reference", *render.ON_GPU)]
 """Those on a GPU have files of their own."""
 
@@ -93,3 +95,26 @@ def test_gradients_reach_only_what_is_asked(backend):
         rendered.alpha.sum().backward()
         results[name] = opacities.grad
     agree(results[backend], results["reference"], 1e-5, "gradient of opacities")
+
+
+@pytest.mark.parametrize("backend", CPU)
+def test_no_gradient_where_alpha_is_capped(backend):
+    """docs/conventions.md: the published rasterizer lets it pass there, at the center of nearly opaque Gaussians."""
+    view = camera(1, 1, seed=None)  # one pixel, on which the Gaussian is centered: its alpha is its opacity
+    for opacity, capped in ((0.98, False), (0.995, True)):
+        scene = one(view, 0.5, 0.5, 40.0, scales=torch.full((1, 3), 1e3), opacities=torch.tensor([opacity]))
+        out, grads = render_with_grads(backend, scene, view)
+        assert out.alpha.item() == pytest.approx(min(opacity, ALPHA_MAX), abs=1e-5)
+        assert bool((grads["opacities"] == 0).all() and (grads["means2d"] == 0).all()) == capped
+
+
+@pytest.mark.parametrize("backend", CPU)
+def test_a_radius_is_zero_where_the_footprint_misses_the_image(backend):
+    """docs/conventions.md: the published rasterizer asks for the square of 3 sigma, which reaches farther for most."""
+    view = camera(seed=None)
+    # 1 px, seen at 24 degrees and blurred, is 1.22 px; opacity 0.1 falls to 1/255 at 2.54 of them, 3.12 px
+    for left_of_center, seen in ((3.0, True), (3.2, False), (3.6, False)):
+        scene = one(view, 0.5 - left_of_center, 10.5, 40.0, opacities=torch.tensor([0.1]))
+        out, grads = render_with_grads(backend, scene, view)
+        assert out.radii.tolist() == [4 if seen else 0]
+        assert bool((out.alpha > 0).any()) == seen == bool((grads["means2d"] != 0).any())

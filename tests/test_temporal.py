@@ -9,6 +9,7 @@ import torch
 from reference import temporal as reference
 
 from endoprior.core.config import TemporalConfig
+from endoprior.core.presets import preset
 from endoprior.training import temporal, temporal_numba, temporal_torch
 
 CFG = TemporalConfig()
@@ -61,6 +62,41 @@ def test_systematic_sample_follows_the_weights():
     chosen = temporal.systematic_sample(weights, 400)
     assert len(chosen) == 400 and len(set(chosen)) == 400
     assert (chosen >= 1000).mean() == pytest.approx(0.75, abs=0.01)  # evenly spaced marks: off by one at most
+
+
+def test_a_refilled_sample_is_the_literal_loop():
+    rng = np.random.default_rng(4)
+    for count in (1, 7, 60, 100):
+        weights = rng.random(120) ** 8  # a few hold most of the weight: several marks fall on each
+        weights[rng.random(120) < 0.2] = 0
+        chosen = temporal.systematic_sample(weights, count, refill=True)
+        assert chosen.tolist() == reference.refilled_sample(weights.tolist(), count)
+        assert len(chosen) == min(count, np.count_nonzero(weights))
+    assert len(temporal.systematic_sample(weights, 60)) < 60
+
+
+def test_relaxation_evaluates_eight_times():
+    score = np.linspace(0, 1, 30)  # thirty are never 256
+    steep = replace(CFG, adaptive_motion_weight=True, motion_threshold=0.9, motion_temperature=0.01)
+    weights = temporal.relaxed_motion_weight(score, steep)
+    seven_steps = temporal.motion_weight(score, 0.9 - 7 * 0.05, 0.01 * 1.5**7)
+    np.testing.assert_allclose(weights, np.where(seven_steps > 1e-4, seven_steps, 0), rtol=1e-9)
+    np.testing.assert_allclose(weights, reference.relaxed_weights(score.tolist(), 256, 0.9, 0.01), rtol=1e-9)
+
+
+def test_only_candidates_count_for_the_relaxation():
+    """Gaussians that were never observed have score 1 in `released`; they take no part, so they relax nothing."""
+    rng = np.random.default_rng(5)
+    score, eligible = rng.beta(2, 8, 3000), rng.random(3000) < 0.5
+    score[~eligible] = 1
+    cfg = preset("released").temporal
+    chosen, weights = temporal.choose(score, eligible, cfg)
+    alone, want = temporal.choose(score[eligible], np.ones(eligible.sum(), bool), cfg)
+    assert chosen.tolist() == np.flatnonzero(eligible)[alone].tolist() and len(chosen) == 1024
+    np.testing.assert_array_equal(weights, want)
+    relaxed = reference.relaxed_weights(score[eligible].tolist(), 256, 0.45, 0.08)
+    assert alone.tolist() == reference.refilled_sample(relaxed, 1024)
+    np.testing.assert_allclose(weights, np.array(relaxed)[alone], rtol=1e-9)
 
 
 def test_choose_needs_enough_points():

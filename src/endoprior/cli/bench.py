@@ -27,8 +27,8 @@ class Bench:
     spec: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="SPEC")]]
     """A .yaml or .toml file, a folder of them, or a name. quick: minutes. masks: given and found tool masks.
     poses: given and estimated camera path. sized: the paper's tables, for two cores. full: the same at full size.
-    One table: sized/NAME or full/NAME with budgets, compared, instability, ladder, matched, methods, primitives,
-    regime, temporal; and sized/phantom."""
+    One table: sized/NAME or full/NAME with budgets, compared, depth_flags, instability, ladder, matched, methods,
+    primitives, regime, temporal; sized/phantom; full/scared."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0
@@ -56,7 +56,7 @@ def run(argv: list[str]) -> int:
     from ..experiments.execute import local_executor, ray_executor
     from ..experiments.matrix import run_matrix
     from ..experiments.report import write_overview, write_report
-    from ..experiments.spec_file import load_spec
+    from ..experiments.spec_file import load_specs
     from ..system.file_lock import locked
     from .output_paths import require_writable_folder
 
@@ -68,7 +68,7 @@ def run(argv: list[str]) -> int:
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
     folders, source = _folders(args.data), find_spec(args.spec)
-    loaded = {path: load_spec(path, folders) for path in specs_of(source)}
+    loaded = load_specs(specs_of(source), folders)
     require_writable_folder("OUT", args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)

@@ -89,7 +89,7 @@ class SalienceConfig(Checked):
     percentile: Percent = 99.0
     """p: the edge magnitude at this percentile of tissue pixels maps to 1."""
     border: Literal["reflect", "zero"] = "reflect"
-    """How the Sobel filter continues the image; `zero` makes every bright border an edge (released training code)."""
+    """How the Sobel filter continues the image in training; `zero` makes bright borders edges (released code)."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,8 @@ class InitConfig(Checked):
     """Raise tau_v to the 97th percentile of brightness in the eroded mask (released code)."""
     salience_on_eroded_mask: bool = False
     """Take the percentile of Eq. (5) over the eroded mask (released code)."""
+    salience_border: Literal["reflect", "zero"] = "reflect"
+    """How the Sobel filter continues the image while points are sampled; see `prior.salience.border`."""
     pool_fraction: Share = 0.01
     """Share of tissue pixels that each frame gives to EndoGaussian's pool."""
     cleanup: bool = False
@@ -127,7 +129,7 @@ class InitConfig(Checked):
     outlier_std: Weight = 1.5
     """Points farther than mean + this many standard deviations are dropped."""
     pixel_offset: Literal["exact", "legacy"] = "exact"
-    """`legacy` back-projects integer pixels, half a pixel up and left of their centers (EndoGaussian)."""
+    """`legacy` back-projects integer pixels, half a pixel up and left of their centers (EndoGaussian, released)."""
     variance_factor: Annotated[float, Range(1e-12, 1e6)] = 1.0
     """Initial variance = this times the mean squared distance to the 3 nearest points (released code: 0.4)."""
     thickness: Annotated[float, Range(1e-3, 1)] = 1.0
@@ -212,6 +214,8 @@ class TemporalConfig(Checked):
     """Require a projection onto tissue at both times; False: being rendered at time t is enough (released code)."""
     max_points: Count = 0
     """Gaussians sampled by weight for each iteration; 0 takes all that are eligible."""
+    refill: bool = False
+    """A heavy Gaussian can be hit twice: take the heaviest others until there are `max_points` (released code)."""
     min_points: Count = 128
     """With fewer eligible Gaussians the iteration has no temporal term."""
     gradient: Literal["both", "current"] = "both"

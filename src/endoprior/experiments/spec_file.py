@@ -53,6 +53,20 @@ def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
     return spec
 
 
+def load_specs(paths: list[Path], data: dict[str, Path]) -> dict[Path, Spec]:
+    """Read and check specs, each with the folders in `data` of its own sequences.
+
+    Raises:
+        InputError: as `load_spec`; also for a name in `data` that is a sequence of none of them.
+    """
+    specs = {path: load_spec(path) for path in paths}
+    known = {name for spec in specs.values() for name in spec.sequences}
+    for path, spec in specs.items():
+        if own := {name: data[name] for name in data if name in spec.sequences or name not in known}:
+            specs[path] = load_spec(path, own)
+    return specs
+
+
 def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
     """Entries of a file and the files it `extends`: later ones override, `set` and `set_for` are merged.
 

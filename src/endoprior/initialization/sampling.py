@@ -50,7 +50,7 @@ def initial_points(
     Args:
         frames: F training frames (never test frames), each used once.
         cfg: sampler, budget, clean-up.
-        prior_cfg: parameters of the prior.
+        prior_cfg: parameters of the prior; its border rule is that of `cfg`.
         seed: equal seeds give equal points.
     Returns:
         At most B points in world axes; fewer after clean-up.
@@ -114,6 +114,7 @@ def pixel_probability(frame: Frame, cfg: InitConfig, prior_cfg: PriorConfig) -> 
         bright = float(np.percentile(frame.rgb.max(-1)[eroded], ADAPTIVE_PERCENTILE))
         threshold = max(prior_cfg.specular.value_threshold, bright)
         prior_cfg = replace(prior_cfg, specular=replace(prior_cfg.specular, value_threshold=threshold))
+    prior_cfg = replace(prior_cfg, salience=replace(prior_cfg.salience, border=cfg.salience_border))
     rho = joint_texture_prior(frame.rgb, eroded if cfg.salience_on_eroded_mask else frame.tissue_mask, prior_cfg)
     return np.where(has_surface(frame), sampling_distribution(rho, frame.tissue_mask, cfg), 0.0)
 

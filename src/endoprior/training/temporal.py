@@ -21,7 +21,7 @@ from .ops import TrainingOps
 
 MIN_WEIGHT = 1e-4
 """Motion weights up to this are treated as zero (released code)."""
-RELAX_TRIES, RELAX_THRESHOLD_STEP, RELAX_TEMPERATURE_FACTOR = 8, 0.05, 1.5
+EVALUATIONS, RELAX_THRESHOLD_STEP, RELAX_TEMPERATURE_FACTOR = 8, 0.05, 1.5
 RELAX_THRESHOLD_FLOOR, RELAX_TEMPERATURE_CAP = 0.25, 0.30
 
 
@@ -46,13 +46,14 @@ def effective_size(weights: NDArray) -> float:
 def relaxed_motion_weight(score: NDArray, cfg: TemporalConfig) -> NDArray:
     """Eq. (9), with tau_m lowered and gamma_m raised until enough Gaussians count (released code).
 
+    Args:
+        score: (N,) in [0, 1], of the candidates only: others must not count as effective.
     Returns:
         (N,) weights; those up to `MIN_WEIGHT` are 0.
     """
     threshold, temperature = cfg.motion_threshold, cfg.motion_temperature
-    tries = RELAX_TRIES if cfg.adaptive_motion_weight else 0
     weights = motion_weight(score, threshold, temperature)
-    for _ in range(tries):
+    for _ in range(EVALUATIONS - 1 if cfg.adaptive_motion_weight else 0):
         if effective_size(weights) >= cfg.min_effective:
             break
         threshold = max(threshold - RELAX_THRESHOLD_STEP, RELAX_THRESHOLD_FLOOR)
@@ -61,11 +62,12 @@ def relaxed_motion_weight(score: NDArray, cfg: TemporalConfig) -> NDArray:
     return np.where(weights > MIN_WEIGHT, weights, 0)
 
 
-def systematic_sample(weights: NDArray, count: int) -> NDArray[np.intp]:
+def systematic_sample(weights: NDArray, count: int, refill: bool = False) -> NDArray[np.intp]:
     """At most `count` distinct indices, spread evenly over the cumulative weight: no randomness, more where heavier.
 
     Args:
         weights: (N,) >= 0. count: > 0; if no more than this many weights are positive, all of them are taken.
+        refill: several marks can fall on a heavy index; take the heaviest of the others until there are `count`.
     Returns:
         (P,) increasing indices, P <= count.
     """
@@ -74,7 +76,12 @@ def systematic_sample(weights: NDArray, count: int) -> NDArray[np.intp]:
         return positive
     cumulative = np.cumsum(weights[positive], dtype=np.float64)
     marks = (np.arange(count) + 0.5) / count * cumulative[-1]
-    return positive[np.unique(np.searchsorted(cumulative, marks))]
+    hit = np.unique(np.searchsorted(cumulative, marks))
+    if refill and len(hit) < count:
+        others = np.setdiff1d(np.arange(len(positive)), hit, assume_unique=True)
+        heaviest = others[np.argsort(-weights[positive[others]], kind="stable")][: count - len(hit)]
+        hit = np.sort(np.concatenate([hit, heaviest]))
+    return positive[hit]
 
 
 def choose(score: NDArray, eligible: NDArray, cfg: TemporalConfig) -> tuple[NDArray[np.intp], NDArray]:
@@ -85,13 +92,13 @@ def choose(score: NDArray, eligible: NDArray, cfg: TemporalConfig) -> tuple[NDAr
     Returns:
         (P,) indices and (P,) weights; P = 0 when fewer than `least_points` qualify.
     """
+    candidates = np.flatnonzero(eligible)
+    score = score[candidates]
     weights = relaxed_motion_weight(score, cfg) if cfg.pair_weights else np.ones_like(score)
-    weights = np.where(eligible, weights, 0)
-    count = cfg.max_points or len(weights)
-    chosen = systematic_sample(weights, count)
+    chosen = systematic_sample(weights, cfg.max_points or len(weights), cfg.refill)
     if len(chosen) < least_points(cfg):
         chosen = chosen[:0]
-    return chosen, weights[chosen]
+    return candidates[chosen], weights[chosen]
 
 
 def least_points(cfg: TemporalConfig) -> int:
