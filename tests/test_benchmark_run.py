@@ -261,12 +261,13 @@ def test_a_folder_of_specs_shares_equal_cells(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_overview_can_be_published(finished, tmp_path):
+def test_a_report_can_be_published(finished, tmp_path):
     spec = importlib.util.spec_from_file_location("publish", Path(__file__).parents[1] / "bench" / "publish.py")
     publish = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(publish)
-    publish.publish(finished[1], tmp_path)
-    text = (tmp_path / "results.md").read_text()
-    links = publish.FIGURE.findall(text)
+    publish.publish(finished[1], "two", tmp_path)
+    links = publish.FIGURE.findall((tmp_path / "results" / "two.md").read_text())
     assert len(links) == 5
-    assert all(cv2.imread(str(tmp_path / link)) is not None for _, link in links)
+    assert all(cv2.imread(str(tmp_path / "results" / link)) is not None for _, link in links)
+    values = (tmp_path / "results" / "two.csv").read_text()
+    assert values == (finished[1] / "results.csv").read_text()
