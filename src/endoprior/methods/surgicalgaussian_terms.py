@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import cv2
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from ..render.projection import rotation_matrices
 
 WINDOW, SIGMA = 11, 1.5
+LINE = cv2.getGaussianKernel(WINDOW, SIGMA)
+"""(11, 1) the window along one axis."""
 C1, C2 = 0.01**2, 0.03**2
 TINY = 1e-20
 """Keeps the gradient of a length finite at 0."""
@@ -16,20 +22,37 @@ TINY = 1e-20
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity of two images (H, W, 3), (): Gaussian window of 11 px, zeros outside the frame."""
-    places = torch.arange(WINDOW, dtype=image.dtype, device=image.device) - WINDOW // 2
-    line = torch.exp(-0.5 * (places / SIGMA) ** 2)
-    line = line / line.sum()
-
-    def smooth(values: Tensor) -> Tensor:
-        rows = conv2d(values, line.view(1, 1, -1, 1), padding=(WINDOW // 2, 0))
-        return conv2d(rows, line.view(1, 1, 1, -1), padding=(0, WINDOW // 2))
-
-    a, b = image.permute(2, 0, 1)[:, None], target.permute(2, 0, 1)[:, None]
-    mean_a, mean_b = smooth(a), smooth(b)
-    variance_a, variance_b = smooth(a * a) - mean_a**2, smooth(b * b) - mean_b**2
-    covariance = smooth(a * b) - mean_a * mean_b
+    smooth = _Smoothed.apply if image.device.type == "cpu" else smoothed
+    mean_a, mean_b = smooth(image), smooth(target)
+    variance_a, variance_b = smooth(image * image) - mean_a**2, smooth(target * target) - mean_b**2
+    covariance = smooth(image * target) - mean_a * mean_b
     luminance = (2 * mean_a * mean_b + C1) / (mean_a**2 + mean_b**2 + C1)
     return (luminance * (2 * covariance + C2) / (variance_a + variance_b + C2)).mean()
+
+
+def smoothed(values: Tensor) -> Tensor:
+    """(H, W, 3) values weighted by the window around each pixel; zeros outside."""
+    line = torch.as_tensor(LINE, dtype=values.dtype, device=values.device)
+    rows = conv2d(values.permute(2, 0, 1)[:, None], line.view(1, 1, -1, 1), padding=(WINDOW // 2, 0))
+    return conv2d(rows, line.view(1, 1, 1, -1), padding=(0, WINDOW // 2))[:, 0].permute(1, 2, 0)
+
+
+class _Smoothed(torch.autograd.Function):
+    """`smoothed` by OpenCV, many times faster on a CPU. The window is symmetric, so it is its own gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        return _by_opencv(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_out: Tensor) -> Tensor:
+        return _by_opencv(v_out)
+
+
+def _by_opencv(values: Tensor) -> Tensor:
+    array = values.detach().contiguous().numpy()
+    return torch.from_numpy(cv2.sepFilter2D(array, -1, LINE, LINE, borderType=cv2.BORDER_CONSTANT))
 
 
 def distance_change(before: Tensor, after: Tensor, neighbors: Tensor) -> Tensor:
