@@ -108,7 +108,7 @@ def test_a_killed_worker_costs_its_window_only(trained, tmp_path):
         victim = process_training_in(out / "windows/001")
         assert victim != process.pid
         os.kill(victim, signal.SIGKILL)
-        said, _ = process.communicate(timeout=180)
+        said, _ = process.communicate(timeout=600)
     finally:
         process.kill()
     assert process.returncode == 0, said
@@ -135,7 +135,7 @@ def test_an_interrupted_cluster_saves_and_resumes_without_one(trained, tmp_path)
     try:
         wait_for_checkpoints(process, out, 0, 1)
         process.send_signal(signal.SIGINT)
-        said, _ = process.communicate(timeout=180)
+        said, _ = process.communicate(timeout=600)
     finally:
         process.kill()
     assert process.returncode == 130 and "the state is saved" in said and "--ray local`" in said
