@@ -26,8 +26,8 @@ FLOORS = [
 """Packages, lowest first. A package imports from floors below its own, never from its own or from above."""
 FLOOR_OF = {name: level for level, names in enumerate(FLOORS) for name in names}
 ROOT_FILES = {"__init__.py", "__main__.py", "py.typed"}
-CHECKED_PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")} - {ROOT / "docs" / "results.md"})
-"""Every page but the generated one."""
+CHECKED_PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")})
+"""Every page but the generated ones in docs/results/."""
 PRIVATE_WORDS = (
     "house", "storey", "desk", "mend", "crowd", "nobody", "dear", "bump", "refuse", "refusal", "judge", "half planes",
     "row form", "lacking",
