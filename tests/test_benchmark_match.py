@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import yaml
 from benchmark_runs import in_this_process
@@ -30,6 +31,12 @@ def tried_until_done(search: Search, curve) -> Search:
 def test_a_power_law_is_matched_in_a_few_trainings(slope, target):
     search = tried_until_done(Search(2e-4, target=target), lambda value: 20_000 * (value / 2e-4) ** -slope)
     assert search.matched and len(search.tried) <= 6
+
+
+def test_the_next_threshold_lies_inside_of_the_narrowest_bracket():
+    counts = {1e-4: 4000, 2e-4: 2000, 8e-4: 500, 4e-4: 900}
+    search = Search(1e-4, [(value, grown(last)) for value, last in counts.items()], target=1000)
+    assert next_threshold(search) == pytest.approx(2e-4 * 2 ** (np.log(2) / np.log(2000 / 900)), rel=1e-6)
 
 
 def test_a_curve_with_a_floor_ends_without_success():
