@@ -42,7 +42,9 @@ def test_a_plan_counts_what_each_rule_takes():
 def test_growth_is_that_of_all_windows_by_the_log(tmp_path):
     event = {"cloned": 2, "split": 0, "removed_prior": 0}
     text = line(10, 100, window=0) + line(20, 120, window=0, event=event) + line(10, 50, window=1)
-    (tmp_path / "log.jsonl").write_text(text + line(20, 60, window=1, event=event))
+    (tmp_path / "log.jsonl").write_text(
+        text + line(20, 60, window=1, event=event) + '{"stage": "fi'
+    )  # cut short by a crash
     found = growth_of(tmp_path)
     assert (found.first, found.last, found.num_events, found.ratio) == (150, 180, 2, 1.2)
     assert dict(found.changes) == {"cloned": 4, "split": 0, "removed_prior": 0}

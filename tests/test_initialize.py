@@ -324,14 +324,12 @@ def test_released_options_change_the_weights(mask):
 
 
 def test_border_of_the_initialization_is_a_setting_of_its_own(mask):
-    """The released code pads with zero in training only."""
     frame, released, results = make_frame(mask), preset("released"), []
     for border in ("reflect", "zero"):
         cfg = replace(InitConfig(), salience_border=border)
         rho = joint_texture_prior(frame.rgb, mask, PriorConfig(salience=SalienceConfig(border=border)))
-        want = np.where(frame.depth_valid, sampling_distribution(rho, mask, cfg), 0)
-        np.testing.assert_array_equal(pixel_probability(frame, cfg, released.prior), want)
-        results.append(want)
+        results.append(np.where(frame.depth_valid, sampling_distribution(rho, mask, cfg), 0))
+        np.testing.assert_array_equal(pixel_probability(frame, cfg, released.prior), results[-1])
     assert not np.allclose(*results)
     assert (released.init.salience_border, released.prior.salience.border) == ("reflect", "zero")
 

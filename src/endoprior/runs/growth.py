@@ -37,8 +37,11 @@ def growth_of(run: Path) -> Growth | None:
     last: dict[int, int] = {}
     num_events, changes = 0, Counter[str]()
     for text in log.read_text(encoding="utf-8").splitlines():
-        line = json.loads(text)
-        window, count = line.get("window", 0), line["num_gaussians"]
+        try:
+            line = json.loads(text)
+            window, count = line.get("window", 0), int(line["num_gaussians"])
+        except (ValueError, KeyError, TypeError, AttributeError):  # a line that a crash cut short
+            continue
         first.setdefault(window, count)
         last[window] = count
         if "event" in line:
