@@ -59,6 +59,7 @@ def test_the_field_is_its_formula():
         weight, bias = (field.heads.parameters[f"{layer}.{part}"] for part in ("weight", "bias"))
         values = values.relu() @ weight.T + bias
     expected = dict(zip(("means", "log_scales", "quats"), values[:, :10].split([3, 3, 4], 1), strict=True))
+    expected["means"] = 10 * expected["means"]  # mm
     expected |= {"opacity_logits": values[:, 10], "sh_dc": values[:, 11:14]}
     expected["sh_rest"] = values[:, 14:].reshape(9, 15, 3)
     for name, value in expected.items():
@@ -138,11 +139,11 @@ def test_depth_is_compared_without_its_scale():
 
 
 def test_rates_at_given_iterations():
-    for name, expected in {"network.0": 7.5e-5, "planes": 7.5e-4, "box": 7.5e-4}.items():
+    for name, expected in {"network.0": 7.5e-4, "planes": 7.5e-3, "box": 7.5e-2}.items():
         rate = METHOD.rate(name, CFG, 77.0)
         assert [rate(1), rate(60_000)] == pytest.approx([expected] * 2)
     means = METHOD.rate("means", CFG, 77.0)
-    assert means(0) == pytest.approx(8e-4) and means(60_000) == pytest.approx(0.76 * 8e-4, rel=5e-3)
+    assert means(0) == pytest.approx(8e-3) and means(60_000) == pytest.approx(0.76 * 8e-3, rel=5e-3)
     others = {"sh_dc": 2.5e-3, "sh_rest": 1.25e-4, "opacity_logits": 0.05, "log_scales": 5e-3, "quats": 1e-3}
     assert {name: METHOD.rate(name, CFG, 1.0)(9) for name in others} == others
 
@@ -163,7 +164,7 @@ def stats_of(gradients: list[float], radii: list[float]) -> DensityStats:
 
 
 def test_it_grows_often_prunes_seldom_and_resets():
-    scales = np.log([0.04, 0.06, 0.04, 0.6, 0.04])
+    scales = np.log([0.4, 0.6, 0.4, 6, 0.4])
     opacities = np.array([0.5, 0.5, 0.001, 0.5, 0.5])
     gaussians = create_gaussians(np.zeros((5, 3)), np.zeros((5, 3)), scales, CFG, opacities=opacities)
     stats = stats_of([2e-4, 2e-4, 0, 0, 0], [0, 0, 0, 0, 21])

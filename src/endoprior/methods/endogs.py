@@ -23,11 +23,15 @@ from ..training.losses_torch import total_variation
 from ..training.ops import TrainingOps
 from ..training.rates import Rate, rate_of
 from ..training.stage import Stage
-from .endogs_field import JointMotion
+from .endogs_field import UNIT_MM, JointMotion
 from .plane_terms import PlaneWeights, plane_term
 
 SPATIAL_SCALE = 5.0
-"""Factor of the rates of centers, network and planes; also the extent that parts clones from splits."""
+"""Factor of the rates of centers, network and planes; also the extent, in its unit, that parts clones from splits."""
+EXTENT_MM = SPATIAL_SCALE * UNIT_MM
+SHORTER = 10
+"""By how much the schedule is shorter than the published one, and the rates of network and planes are higher."""
+NETWORK_RATE, PLANES_RATE = SHORTER * 1.5e-5, SHORTER * 1.5e-4
 OFTEN_HIDDEN = 30.0
 """How much more a ray counts that a tool often hides."""
 DEPTH_WEIGHT, HUBER_DELTA, DEPTH_EPSILON = 0.5, 0.2, 1e-5
@@ -57,10 +61,10 @@ class EndoGS(GaussianMethod):
             temporal=TemporalConfig(weight=0.0),
             density=DensityConfig(stop_iteration=45_000, min_densify_weight=1.0, prior_prune=False),
             optim=OptimConfig(
-                network_lr=1.5e-5,
-                network_lr_final=1.5e-5,
-                planes_lr=1.5e-4,
-                planes_lr_final=1.5e-4,
+                network_lr=NETWORK_RATE,
+                network_lr_final=NETWORK_RATE,
+                planes_lr=PLANES_RATE,
+                planes_lr_final=PLANES_RATE,
                 decay_iterations=1_000_000,
             ),
             schedule=ScheduleConfig(coarse_iterations=1000, fine_iterations=5000, sh_every=1000),
@@ -72,7 +76,7 @@ class EndoGS(GaussianMethod):
 
     def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
         """See `GaussianMethod.rate`."""
-        return rate_of(name, cfg, SPATIAL_SCALE)
+        return rate_of(name, cfg, EXTENT_MM if name in ("means", "box") else SPATIAL_SCALE)
 
     def position(self, seed: int, stage: Stage, iteration: int, num_frames: int, rng: np.random.Generator) -> int:
         """See `GaussianMethod.position`."""
@@ -103,9 +107,9 @@ class EndoGS(GaussianMethod):
         """See `GaussianMethod.plan`: grow every time, prune seldom."""
         gradient, largest = stats.grad2d_ndc_sum / stats.num_seen.clamp(min=1), gaussians.scales.amax(-1)
         grow = gradient >= cfg.density.grow_threshold
-        small = largest <= cfg.density.clone_extent * SPATIAL_SCALE
+        small = largest <= cfg.density.clone_extent * EXTENT_MM
         faint = gaussians.opacities < cfg.density.prune_opacity
-        large = (stats.max_radius_px > MOST_RADIUS_PX) | (largest > MOST_SCALE_SHARE * SPATIAL_SCALE)
+        large = (stats.max_radius_px > MOST_RADIUS_PX) | (largest > MOST_SCALE_SHARE * EXTENT_MM)
         large &= iteration > RESET_EVERY
         remove = (faint | large) & (iteration % PRUNE_EVERY == 0)
         if len(grow) + int(grow.sum()) > cfg.density.max_gaussians:

@@ -20,6 +20,9 @@ from ..model.heads import LinearLayers
 from ..model.motion import HexPlaneMotion
 from ..model.ops import ModelOps
 
+UNIT_MM = 10.0
+"""Unit of length of what the network gives. COLMAP's, which is any; with this one a scene 10 cm wide has the extent 5
+that the release takes."""
 OUTPUTS = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1, "sh": 48}
 """What the head gives, in order."""
 
@@ -45,6 +48,7 @@ class JointField(HexPlaneField):
         for layer in ("second", "hidden", "output"):
             values = self.heads.linear(layer, relu(values))
         parts = dict(zip(OUTPUTS, values.split(list(OUTPUTS.values()), 1), strict=True))
+        parts["means"] = UNIT_MM * parts["means"]
         sh = parts.pop("sh").reshape(len(means), 16, 3)
         opacity = parts.pop("opacity_logits")[:, 0]
         return Offsets(**parts, opacity_logits=opacity, sh_dc=sh[:, 0], sh_rest=sh[:, 1:])
