@@ -15,7 +15,7 @@ from tiny_training import KINDS, losses_of, tiny_config
 
 from endoprior.compute.morton import morton_order
 from endoprior.core.checks import InputError
-from endoprior.core.config import Config
+from endoprior.core.config import Config, DataConfig
 from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.export import export
@@ -109,6 +109,15 @@ def test_resume_refuses_another_config_or_other_data(make_tiny_sequence, tmp_pat
         cfg = replace(cfg, seed=5)
     with pytest.raises(InputError, match=r"checkpoint\.safetensors"):
         train(load_sequence(other), cfg, tmp_path / "run", resume=True)
+
+
+def test_a_sequence_read_in_another_way_than_the_config_says_is_refused(tiny_sequence):
+    cfg = replace(tiny_config("basis", 1, 1), data=DataConfig(lift_missing_depth=True))
+    with pytest.raises(InputError, match=r"data\.lift_missing_depth: expected True, got a .* False\. Fix: `load"):
+        train(load_sequence(tiny_sequence), cfg)
+    with pytest.raises(InputError, match=r"data\.shrink: expected 1, got a sequence that was read with 2"):
+        train(load_sequence(tiny_sequence, DataConfig(shrink=2)), tiny_config("basis"))
+    assert len(train(load_sequence(tiny_sequence, replace(cfg.data, format="endonerf")), cfg))
 
 
 def test_a_used_folder_is_refused(tiny_sequence, tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from endoprior.core.config import Config
+from endoprior.core.config import Config, DataConfig
 from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.training.gaussian_trainer import GaussianTrainer
@@ -23,6 +23,7 @@ def tiny_config(kind: str, coarse: int = 6, fine: int = 14) -> Config:
         deformation = replace(deformation, hexplane=planes)
     return replace(
         cfg,
+        data=DataConfig(),
         init=replace(cfg.init, budget=300, cleanup=False),
         deformation=deformation,
         density=replace(cfg.density, start_iteration=2, every=4, grow_threshold=2e-3, score_mode="every"),

@@ -39,15 +39,17 @@ def load_sequence(
         raise input_error(path, "a sequence folder", got, "pass the folder that holds images/, masks/ and depth/.")
     name = find_format(path, cfg)
     if pose_axes == "opencv":
-        return _split(REGISTRY.load(name).load(path, cfg), cfg)
+        return _as_asked(REGISTRY.load(name).load(path, cfg), cfg)
     if name != "endonerf":
         raise ValueError(f"pose_axes must be opencv for the {name} layout, which defines it; got {pose_axes!r}")
-    return _split(load_endonerf(path, cfg, pose_axes=pose_axes), cfg)
+    return _as_asked(load_endonerf(path, cfg, pose_axes=pose_axes), cfg)
 
 
-def _split(sequence: FrameSequence, cfg: DataConfig) -> FrameSequence:
+def _as_asked(sequence: FrameSequence, cfg: DataConfig) -> FrameSequence:
     """The frames to use, and which of them are held out; here, so that readers of other packages cannot differ."""
-    return _window_of(sequence.with_test_phase(cfg.test_phase), cfg.window)
+    chosen = _window_of(sequence.with_test_phase(cfg.test_phase), cfg.window)
+    chosen.reading = cfg
+    return chosen
 
 
 def _window_of(sequence: FrameSequence, window: str) -> FrameSequence:

@@ -17,6 +17,7 @@ from typing import Literal, Protocol, overload
 import numpy as np
 
 from ..core.checks import input_error
+from ..core.config import DataConfig
 from ..core.types import Camera, Frame
 from ..footage.right_view import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
@@ -92,6 +93,8 @@ class FrameSequence:
         self._read_frame = read_frame
         self.files = list(files or [])
         """Every file that makes up the sequence."""
+        self.reading: DataConfig | None = None
+        """How `load_sequence` read it; None for a sequence that was made in another way."""
         self._remarks = remarks or []
         self._masks = path / mask_folder
         self._cache: BoundedCache[Frame] = BoundedCache(cache_bytes(), _frame_bytes)

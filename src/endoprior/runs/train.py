@@ -6,8 +6,10 @@ import logging
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import fields
 from pathlib import Path
 
+from ..core.checks import input_error
 from ..core.config import Config
 from ..data import FrameSequence, load_sequence
 from ..data.window_plan import look_through, plan_windows
@@ -35,7 +37,7 @@ def train(
     """Train one scene.
 
     Args:
-        sequence: from `load_sequence`; None with `resume`: the sequence of the run.
+        sequence: from `load_sequence`, read as `cfg.data` says; None with `resume`: the sequence of the run.
         cfg: from `preset`; None with `resume`: the config of the run.
         out: run folder for config, log, checkpoints and `scene.safetensors`; None keeps everything in memory.
         resume: continue the run in `out`, from its last checkpoint if there is one.
@@ -66,6 +68,15 @@ def _print_note(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def _check_reading(sequence: FrameSequence, cfg: Config) -> None:
+    """Raise InputError if the sequence was read in another way than the config says; both eyes are read in any case."""
+    for field in fields(cfg.data):
+        wanted, found = getattr(cfg.data, field.name), getattr(sequence.reading or cfg.data, field.name)
+        if wanted != found and field.name not in ("format", "eyes"):
+            got = f"a sequence that was read with {found!r}"
+            raise input_error(f"data.{field.name}", repr(wanted), got, "`load_sequence(DATA, config.data)`.")
+
+
 def start_run(
     sequence: FrameSequence,
     cfg: Config,
@@ -81,6 +92,7 @@ def start_run(
     Raises:
         InputError: see `train`.
     """
+    _check_reading(sequence, cfg)
     if cfg.windows.enabled:
         cameras = [sequence.camera(i) for i in range(len(sequence))]
         whole = sequence.part(0, len(sequence))  # with a cache of its own, which is freed
