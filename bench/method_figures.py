@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 import endoprior
 from endoprior.core.geometry import project
-from endoprior.core.types import Camera
 from endoprior.data import FrameSequence
 from endoprior.model.scene import Scene
 from endoprior.priors import joint_texture_prior, salience, specular_likelihood
 from endoprior.training.temporal import motion_weight
 from endoprior.view.view_settings import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
+from endoprior.visualization.camera_paths import turned
 
 PHANTOM = ("--frames", 24, "--width", 320, "--height", 256)
 FRAME = 12
@@ -109,16 +109,6 @@ def temporal(scene: Scene) -> None:
     axes[1].set_ylim(scene.cameras[0].height, 0)
     result.colorbar(dots, ax=axes[1])
     save(result, "temporal")
-
-
-def turned(camera: Camera, degrees: float, distance: float) -> Camera:
-    """`camera`, moved on a circle about the point `distance` mm ahead."""
-    angle = np.radians(degrees)
-    pose = np.eye(4)
-    pose[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
-    center = np.array([0, 0, distance])
-    pose[:3, 3] = center - pose[:3, :3] @ center
-    return replace(camera, world_to_camera=pose @ camera.world_to_camera)
 
 
 def sides(scene: Scene) -> None:

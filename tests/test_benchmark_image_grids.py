@@ -10,7 +10,14 @@ import pytest
 import torch
 
 from endoprior.core.types import Camera, Frame
-from endoprior.experiments.image_grids import center_density, frames_grid, instability_map, prior_grid, zoom_windows
+from endoprior.experiments.image_grids import (
+    center_density,
+    frames_grid,
+    instability_map,
+    prior_grid,
+    sides_grid,
+    zoom_windows,
+)
 
 WIDTH, HEIGHT = 80, 60
 
@@ -109,3 +116,14 @@ def test_grids_have_a_column_for_each_method():
     width, height = 6 * WIDTH, 6 * HEIGHT  # enlarged to 480 px
     assert frames_grid(FrameSequence(), scenes).shape == (4 * height, 3 * width, 3)
     assert prior_grid(FrameSequence(), scenes).shape == (height, 4 * width, 3)
+
+
+def test_sides_look_from_left_front_and_right():
+    height = 6 * HEIGHT
+    scenes = {"a": Still(np.zeros((1, 3))), "b": Still(np.zeros((1, 3)), shift_mm=2)}
+    found = sides_grid(FrameSequence(), scenes)
+    assert found.shape == (3 * height, 12 * WIDTH, 3)
+    # `Still` is brighter the further its camera stands to the left: 50 mm sin 15 degrees = 12.9 mm.
+    column = found[height // 2 :: height, 240, 0].astype(int)
+    assert column[1] == 128 and column[0] - column[1] == pytest.approx(255 * 0.129, abs=2)
+    assert column[2] - column[1] == pytest.approx(-255 * 0.129, abs=2)

@@ -1,4 +1,4 @@
-"""Figures of images side by side: frames with zooms, maps of depth instability, the prior and the Gaussians' density.
+"""Figures of images side by side: frames with zooms, views from the sides, depth instability, prior and density.
 
 `H, W` image size. All show the first seed and fold at the last budget.
 """
@@ -21,6 +21,7 @@ from ..data import FrameSequence, load_sequence
 from ..model.scene import Scene
 from ..model.scene_file import load_scene
 from ..priors import joint_texture_prior, specular_likelihood
+from ..visualization.camera_paths import tissue_distance, turned
 from ..visualization.image_tools import colorize, label, tile, to_u8, write_png
 from .matrix import Matrix
 from .spec import Cell
@@ -29,6 +30,8 @@ ZOOM = 4
 """A zoom window is this fraction of the frame's width and height."""
 DENSITY_SIGMA = 64
 """The density of centers is blurred by this fraction of the frame's width."""
+SIDES_DEG = (-15.0, 0.0, 15.0)
+"""From where `sides_grid` looks; 0 is the endoscope, more is to its right."""
 TILE_WIDTH_PX = 480
 """Narrower images are enlarged, so that their labels can be read."""
 INSTABILITY_FULL_SCALE_MM = 1.0
@@ -68,6 +71,19 @@ def frames_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np
             zoomed = cv2.resize(image[rows, cols], (width, height), interpolation=cv2.INTER_NEAREST)
             tiles.append(_labeled(zoomed, what))
     return tile(tiles, len(columns))
+
+
+def sides_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.uint8]:
+    """The middle test frame, turned about the tissue; a row for each angle, a column for each method."""
+    test = sequence.frames("test")
+    frame, tiles = test[len(test) // 2], []
+    for degrees in SIDES_DEG:
+        where = f"{abs(degrees):.0f} deg {'right' if degrees > 0 else 'left'}" if degrees else "endoscope"
+        for name, scene in scenes.items():
+            distance = tissue_distance(frame, float(_rendered(scene, frame).depth.median()))
+            out = scene.render(frame.time, turned(_camera(scene, frame), degrees, distance))
+            tiles.append(_labeled(to_u8(out.color.numpy()), f"{name}, {where}"))
+    return tile(tiles, len(scenes))
 
 
 def zoom_windows(frame: Frame) -> dict[str, tuple[slice, slice]]:
@@ -156,6 +172,7 @@ def _labeled(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
 
 GRIDS: dict[str, Callable[[FrameSequence, dict[str, Scene]], NDArray[np.uint8]]] = {
     "frames": frames_grid,
+    "sides": sides_grid,
     "instability": instability_grid,
     "prior": prior_grid,
 }

@@ -141,7 +141,7 @@ class Spec:
     scores: tuple[str, ...] = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis", "num_gaussians")
     """Columns of the tables."""
     claims: tuple[ClaimSpec, ...] = ()
-    figures: tuple[Literal["budgets", "curves", "frames", "instability", "prior"], ...] = ("curves", "frames")
+    figures: tuple[Literal["budgets", "curves", "frames", "instability", "prior", "sides"], ...] = ("curves", "frames")
     compare_with: str = ""
     """Reference of the paired differences; the first method if empty."""
     networks: bool = False

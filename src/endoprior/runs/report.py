@@ -18,7 +18,7 @@ from ..evaluation.registry import all_scores
 from ..model.scene import Scene
 from ..priors import joint_texture_prior
 from ..system.atomic import whole_file
-from ..visualization.camera_paths import turned
+from ..visualization.camera_paths import tissue_distance, turned
 from ..visualization.carried_texture import PaintedTissue
 from ..visualization.image_tools import colorize, to_u8
 from ..visualization.rendered_views import depth_span
@@ -109,8 +109,7 @@ def _image_rows(scene: Scene, sequence: FrameSequence) -> list[list[tuple[str, N
 def _side_row(scene: Scene, sequence: FrameSequence) -> list[tuple[str, NDArray[np.uint8]]]:
     frames = sequence.frames("test")
     frame = frames[(len(frames) - 1) // 2]
-    depths = frame.depth[frame.depth_valid & frame.tissue_mask]
-    distance = float(np.median(depths)) if depths.size else float(np.mean(depth_span(scene)))
+    distance = tissue_distance(frame, float(np.mean(depth_span(scene))))
     cells = []
     for degrees in TURNS_DEG:
         out = scene.render(frame.time, turned(frame.camera, degrees, distance))

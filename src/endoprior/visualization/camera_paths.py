@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
-from ..core.types import Camera
+from ..core.types import Camera, Frame
 from ..data.reading import read_text
 
 View = tuple[float, Camera]
@@ -40,6 +40,12 @@ def turned(camera: Camera, degrees: float, distance_mm: float) -> Camera:
     angle = np.deg2rad(degrees)
     position = distance_mm * np.array([np.sin(angle), 0, 1 - np.cos(angle)])
     return replace(camera, world_to_camera=_looking(position, distance_mm) @ camera.world_to_camera)
+
+
+def tissue_distance(frame: Frame, otherwise: float) -> float:
+    """Median measured depth of the tissue of a frame, mm; `otherwise` where none was measured."""
+    depths = frame.depth[frame.depth_valid & frame.tissue_mask]
+    return float(np.median(depths)) if depths.size else otherwise
 
 
 def _looking(position: NDArray, distance: float) -> NDArray:
