@@ -117,7 +117,7 @@ def sides(scene: Scene) -> None:
     distance = float(np.median(scene.render(at).depth.numpy()))
     result, axes = figure(len(TURNS_DEGREES), 2.1)
     for axis, degrees in zip(axes, TURNS_DEGREES, strict=True):
-        image = scene.render(at, turned(camera, degrees, distance)).color.numpy()
+        image = scene.render(at, turned(camera, -degrees, distance)).color.numpy()
         show(axis, image, f"turned by {degrees} degrees" if degrees else "endoscope's view")
     save(result, "sides")
 

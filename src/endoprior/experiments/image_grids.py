@@ -77,10 +77,10 @@ def sides_grid(sequence: FrameSequence, scenes: dict[str, Scene]) -> NDArray[np.
     """The middle test frame, turned about the tissue; a row for each angle, a column for each method."""
     test = sequence.frames("test")
     frame, tiles = test[len(test) // 2], []
+    distance = tissue_distance(frame, float(_rendered(next(iter(scenes.values())), frame).depth.median()))
     for degrees in SIDES_DEG:
         where = f"{abs(degrees):.0f} deg {'right' if degrees > 0 else 'left'}" if degrees else "endoscope"
         for name, scene in scenes.items():
-            distance = tissue_distance(frame, float(_rendered(scene, frame).depth.median()))
             out = scene.render(frame.time, turned(_camera(scene, frame), degrees, distance))
             tiles.append(_labeled(to_u8(out.color.numpy()), f"{name}, {where}"))
     return tile(tiles, len(scenes))
