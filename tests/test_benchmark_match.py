@@ -1,6 +1,7 @@
 """Counts that are matched: the search on known curves, what a spec may say, and cells that run with what it finds."""
 
 import math
+from shutil import rmtree
 
 import numpy as np
 import pytest
@@ -130,3 +131,7 @@ def test_a_benchmark_trains_with_what_it_finds(tmp_path):
     assert "## Thresholds found" in write_report(matrix, tmp_path / "out").read_text()
     again = run_matrix(spec, tmp_path / "out", None)
     assert again.done == matrix.done and again.searches == matrix.searches, "it finds the same, training nothing"
+    rmtree(matrix.done[Cell("p", "many", None, 0)])
+    left = run_matrix(spec, tmp_path / "out", None)
+    assert {cell.method for cell in left.done} == {"base"}, "a probe is not the method that was asked for"
+    assert {cell.name for cell in left.missing} == {Cell("p", "many", None, seed).name for seed in (0, 1)}

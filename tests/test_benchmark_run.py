@@ -68,14 +68,15 @@ def test_report_has_tables_claims_and_pictures(finished):
     text = (out / "results.md").read_text()
     assert text.startswith("# Tiny\n\nFor tests.")
     assert "| method | tissue PSNR, dB | depth RMSE, mm | Gaussians |" in text
-    assert "B is no worse than a in tissue PSNR, dB by more than 9 dB [a guess]: **holds**" in text
+    assert "B is no worse than a in tissue PSNR, dB by more than 9 dB [a guess]: tiny: **holds**" in text
     assert "No result for 6 cells" in text and "`absent/a/seed0`" in text and "no such folder" in text
     for name in ("budgets", "curves", "frames-tiny", "instability-tiny", "prior-tiny"):
         assert f"figures/{name}.png" in text
         assert cv2.imread(str(out / "figures" / f"{name}.png")).std() > 5
     assert r"\toprule" in (out / "results.tex").read_text()
     facts = json.loads((out / "results.json").read_text())
-    assert len(facts["cells"]) == 6 and len(facts["missing"]) == 6 and facts["claims"][0]["verdict"] == "holds"
+    assert len(facts["cells"]) == 6 and len(facts["missing"]) == 6
+    assert facts["claims"][0]["sequences"]["tiny"]["verdict"] == "holds"
     found = [cell["scores"]["psnr_tissue"] for cell in facts["cells"] if cell["method"] == "a"]
     lines = (out / "results.csv").read_text().splitlines()
     assert f"tiny,a,,0,0,psnr_tissue,{found[0]!r}" in lines

@@ -221,7 +221,7 @@ def test_a_benchmark_of_folds(tmp_path):
     text = (tmp_path / "out" / "results.md").read_text()
     assert "3 methods x 1 sequences, folds 0, 3 of tiny, seeds 0" in text
     assert "over seeds of the mean over folds (which frame of every eight is held out)" in text
-    assert "[95 % bootstrap interval over folds; of tissue PSNR also over their frames]" in text
+    assert "[95 % interval over seeds and, where scores have values of frames, these]" in text
     assert "- `split_rule`: test iff (i - 1) % 8 == 0; test iff (i - 1) % 8 == 3" in text
 
 

@@ -96,8 +96,9 @@ def run_matrix(
     matrix.searches = search_thresholds(spec, matrix.mean_count, train)
     for place, search in matrix.searches.items():
         of_place = [cell for cell in cells(spec) if (cell.sequence, cell.method, cell.budget) == place]
-        if search.failure:
+        if search.failure:  # the threshold of a probe is not the one that was asked for
             matrix.missing |= {cell: search.failure for cell in of_place}
+            matrix.done = {cell: folder for cell, folder in matrix.done.items() if cell not in of_place}
         else:
             run({cell: search.best[0] for cell in of_place})
     return matrix

@@ -17,7 +17,7 @@ from .protocol_report import protocol_blocks, protocol_tables, protocol_values
 from .results import Results
 from .silent_rules import silent_rules
 from .spec import ClaimSpec, Spec
-from .statistics import MIN_PAIRS, Difference
+from .statistics import Difference
 from .tables import csv_lines, latex, markdown, score_table
 
 SHOWN_NAMES = 6
@@ -137,18 +137,10 @@ def _differences(results: Results, sequence: str, than: str, changes: dict[str, 
     headings = [all_scores()[score].heading(sequence in results.relative) for score in known]
     rows = [[results.spec.label(method), *(change(s, row[s]) for s in known)] for method, row in changes.items()]
     lines = [["method", *headings], ["---"] * (len(known) + 1), *rows]
-    over = resampled(results, sequence, [s for s in known if any(row[s].over_frames for row in changes.values())])
-    about = f"Paired difference to {than}, positive where better, [95 % bootstrap interval over {over}]:"
+    over_frames = any(row[s].over_frames for row in changes.values() for s in known)
+    over = "seeds and, where scores have values of frames, these" if over_frames else "seeds"
+    about = f"Paired difference to {than}, positive where better, [95 % interval over {over}]:"
     return [about, "\n".join("| " + " | ".join(line) + " |" for line in lines)]
-
-
-def resampled(results: Results, sequence: str, of_frames: list[str]) -> str:
-    """What intervals are over: `seeds and folds; for PSNR and SSIM also over frames`."""
-    spec = results.spec
-    levels = {"budgets": spec.budgets, "seeds": spec.seeds, "folds": spec.sequences[sequence].folds}
-    over = " and ".join(name for name, values in levels.items() if len(values) > 1) or "seeds"
-    labels = ", ".join(all_scores()[score].label for score in of_frames)
-    return f"{over}; of {labels} also over their frames" if labels else over
 
 
 def change(score: str, difference: Difference) -> str:
@@ -174,21 +166,14 @@ def _claims(results: Results, mark: str) -> list[str]:
         return []
     lines = []
     for claim in results.spec.claims:
-        measured, verdict = results.check(claim)
-        parts = []
-        if len(results.spec.sequences) > 1:
-            for name in results.spec.sequences:
-                own, own_verdict = results.check(claim, name)
-                if own.count:
-                    parts.append(f"{name}: {own_verdict}, {change(claim.score, own)}")
-        detail = f" ({'; '.join(parts)})" if len(parts) > 1 else ""
+        found = results.check(claim)
+        parts = [f"{name}: **{said}**, {change(claim.score, own)}" for name, (own, said) in found.items()]
+        if len(found) > 1:
+            parts.append(f"together {change(claim.score, results.together(claim))}")
         source = f" [{claim.text}]" if claim.text else ""
-        lines.append(
-            f"- {sentence(results, claim)}{source}: **{verdict}**, {change(claim.score, measured)}, "
-            f"{measured.count} pairs{detail}."
-        )
-    note = f"A verdict needs the whole interval on one side, and at least {MIN_PAIRS} pairs. "
-    note += "Intervals are over pairs and, where both methods have values of the same single frames, over these too."
+        lines.append(f"- {sentence(results, claim)}{source}: {'; '.join(parts) or 'not measured'}.")
+    note = "A verdict needs the whole 95 % interval on one side. Intervals are over seeds (there is none for one) and, "
+    note += "where both methods have values of the same single frames, over these too."
     return [f"{mark} Claims", "\n".join(lines), note]
 
 
@@ -245,8 +230,8 @@ def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
     ]
     claims = []
     for claim in spec.claims:
-        measured, verdict = results.check(claim)
-        about = {"verdict": verdict, "difference": _json(measured), "sentence": sentence(results, claim)}
+        found = {name: {"verdict": said} | _json(own) for name, (own, said) in results.check(claim).items()}
+        about = {"sequences": found, "together": _json(results.together(claim)), "sentence": sentence(results, claim)}
         claims.append(to_dict(claim) | about)
     differences = [
         {"sequence": name, "method": method, "than": spec.reference, "score": score}

@@ -78,10 +78,10 @@ class Results:
         """Of frames where both have values of the same ones; else of the scores."""
         a, b = self._of_frames(ours, score), self._of_frames(theirs, score)
         if not a or a.keys() != b.keys():
-            return Pair(np.array([self.value(ours, score)]), np.array([self.value(theirs, score)]))
-        indices = tuple(sorted(a))
-        values = (np.array([of[i] for i in indices], float) for of in (a, b))
-        return Pair(*values, frames=(ours.sequence, indices))
+            a, b = {-1 - ours.fold: self.value(ours, score)}, {-1 - ours.fold: self.value(theirs, score)}
+        frames = tuple(sorted(a))
+        values = (np.array([of[i] for i in frames], float) for of in (a, b))
+        return Pair((ours.sequence, ours.budget), ours.seed, *values, frames)
 
     def _of_frames(self, cell: Cell, score: str) -> dict[int, float]:
         """Values of single frames; none where the score is not their mean, as a plugin's need not be."""
@@ -101,8 +101,16 @@ class Results:
         """
         return difference(score, self._pairs(score, (sequence, method), (own, method)))
 
-    def check(self, claim: ClaimSpec, sequence: str | None = None) -> tuple[Difference, Verdict]:
-        """Whether a claim holds, on one sequence or on all."""
-        pairs = self.pairs(claim.score, claim.method, claim.than, sequence=sequence, budget=claim.budget)
-        measured = difference(claim.score, pairs)
-        return measured, verdict(measured, claim.expect, claim.by)
+    def check(self, claim: ClaimSpec) -> dict[str, tuple[Difference, Verdict]]:
+        """What is measured of a claim, and whether it holds, on each sequence that has the score."""
+        found = {}
+        for name in self.spec.sequences:
+            pairs = self.pairs(claim.score, claim.method, claim.than, sequence=name, budget=claim.budget)
+            measured = difference(claim.score, pairs)
+            if measured.count:
+                found[name] = measured, verdict(measured, claim.expect, claim.by)
+        return found
+
+    def together(self, claim: ClaimSpec) -> Difference:
+        """What is measured of a claim on all sequences together."""
+        return difference(claim.score, self.pairs(claim.score, claim.method, claim.than, budget=claim.budget))

@@ -1,10 +1,16 @@
-"""Means, spreads, paired differences with a bootstrap interval, and verdicts on claims.
+"""Means, spreads, paired differences with an interval, and verdicts on claims.
 
-`K` pairs: the same sequence, budget, seed and fold by two methods; `F` frames of a pair; `R` resamples.
+A pair is one score of two methods on the same place (sequence and budget), seed and fold; `F` frames of a pair.
 
-The interval resamples in two levels: pairs, and within each the frames it is the mean of. Pairs that show the same
-frames, those of other seeds, get the same draw of frames: a hard frame is hard for every seed, so that more seeds do
-not make up for few frames (Owen 2007, The pigeonhole bootstrap, https://doi.org/10.1214/07-AOAS122).
+Seeds and frames are crossed: a seed trains once for each fold, and a frame that is hard is hard for every seed. So more
+folds do not make up for few seeds, nor more seeds for few frames. With the means of seeds m (S of them) and of frames u
+(U, each over all seeds), the variance of the mean difference is taken as
+
+    var(m) / S + var(u) / U
+
+which counts what belongs to both twice, and its degrees of freedom are those of Satterthwaite (1946,
+https://doi.org/10.2307/3002019). A score without values of frames has folds in their place. Places are those that the
+spec names, not drawn from others: their means are averaged, and their variances added.
 """
 
 from __future__ import annotations
@@ -12,22 +18,19 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import stdtrit
 
 from ..evaluation.registry import all_scores
 
 Verdict = Literal["holds", "does not hold", "cannot be told"]
 
 CONFIDENCE = 0.95
-RESAMPLES = 10_000
 NOTHING = 1e-12
 """Values up to this size count as 0 where a share is taken of them."""
-MIN_PAIRS = 3
-"""Fewer pairs give no verdict: the bootstrap interval of two pairs is the two values themselves."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +47,15 @@ class Summary:
 class Pair:
     """One score by two methods."""
 
+    place: Hashable
+    """What the spec fixes: sequence and budget."""
+    seed: int
     ours: NDArray[np.float64]
     """(F,) values of single frames, whose mean is the score; or (1,) the score, where there are none."""
     theirs: NDArray[np.float64]
     """(F,) of the same frames."""
-    frames: Hashable = None
-    """Which frames: pairs with equal ones show the same F frames."""
+    frames: tuple[Hashable, ...]
+    """(F,) which frame each value is of, the same for other seeds; the fold, where there are none."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +64,10 @@ class Difference:
 
     mean: float
     low: float
-    """Lower end of the 95 % bootstrap interval of the mean; NaN for fewer than two pairs."""
+    """Lower end of the 95 % interval of the mean; NaN where a place has fewer than two seeds."""
     high: float
     count: int
+    """Pairs that have the score."""
     over_frames: bool = False
     """Whether the interval is over frames too."""
 
@@ -85,59 +92,61 @@ def gains(score: str, ours: ArrayLike, theirs: ArrayLike) -> np.ndarray:
     return change if about.higher_is_better else -change
 
 
-def difference(score: str, pairs: Sequence[Pair], seed: int = 0) -> Difference:
-    """Mean of the `gains` of pairs in a score, with the percentile bootstrap interval over pairs and their frames."""
-    values = gains(score, [pair.ours.mean() for pair in pairs], [pair.theirs.mean() for pair in pairs])
-    pairs, values = [pair for pair, value in zip(pairs, values, strict=True) if math.isfinite(value)], _finite(values)
-    over_frames = any(len(pair.ours) > 1 for pair in pairs)
-    if len(values) < 2:
-        mean = float(values.mean()) if len(values) else math.nan
-        return Difference(mean, math.nan, math.nan, len(values), over_frames)
-    same = _same_frames(pairs)
-    chosen, shares = _draws(seed, RESAMPLES, len(pairs), tuple(num for _, num in same))
-    redrawn = values[chosen]
-    if over_frames:
-        redrawn = np.take_along_axis(gains(score, *_over_frames(pairs, [*same.values()], shares)), chosen, 1)
-    means = _finite(redrawn.mean(1))  # frames can be drawn of which there is no share
-    tail = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(means, (tail, 100 - tail)) if len(means) else (math.nan, math.nan)
-    return Difference(float(values.mean()), float(low), float(high), len(values), over_frames)
+def difference(score: str, pairs: Sequence[Pair]) -> Difference:
+    """Mean of the `gains` of pairs in a score, places counting alike, with its interval over seeds and frames."""
+    places: dict[Hashable, list[Pair]] = {}
+    for pair in pairs:
+        if math.isfinite(_gain(score, pair)):
+            places.setdefault(pair.place, []).append(pair)
+    if not places:
+        return Difference(math.nan, math.nan, math.nan, 0)
+    mean = float(np.mean([np.mean([_gain(score, pair) for pair in members]) for members in places.values()]))
+    half = _half_width([part for members in places.values() for part in _variances(score, members)], len(places))
+    members = [pair for of in places.values() for pair in of]
+    over_frames = any(len(pair.ours) > 1 for pair in members)
+    return Difference(mean, mean - half, mean + half, len(members), over_frames)
 
 
-def _finite(values: NDArray) -> NDArray:
-    """The finite ones of (N,) values."""
-    return values[np.isfinite(values)]
+def _gain(score: str, pair: Pair) -> float:
+    return float(gains(score, pair.ours.mean(), pair.theirs.mean()))
 
 
-def _same_frames(pairs: Sequence[Pair]) -> dict[tuple[Hashable, int], list[int]]:
-    """The pairs that show the same frames, by these and their number."""
-    same: dict[tuple[Hashable, int], list[int]] = {}
-    for k, pair in enumerate(pairs):
-        same.setdefault((pair.frames, len(pair.ours)), []).append(k)
-    return same
+def _variances(score: str, pairs: Sequence[Pair]) -> list[tuple[float, int]]:
+    """Variance of the mean gain of one place by seeds, and by frames; each with its degrees of freedom."""
+    of_seed: dict[Hashable, list[float]] = {}
+    of_frame: dict[Hashable, list[float]] = {}
+    for pair in pairs:
+        values = _gains_of_frames(score, pair)
+        of_seed.setdefault(pair.seed, []).append(float(values.mean()))
+        for frame, value in zip(pair.frames, values, strict=True):
+            of_frame.setdefault(frame, []).append(value)
+    return [_variance(of_seed), *([_variance(of_frame)] if len(of_frame) > 1 else [])]
 
 
-@lru_cache(maxsize=4)  # the scores of a table have the same draws
-def _draws(seed: int, resamples: int, num_pairs: int, nums: tuple[int, ...]) -> tuple[NDArray, list[NDArray]]:
-    """(R, K) pairs drawn with replacement; and for each of `nums` frames, (R, F) the share of draws of each frame."""
-    rng = np.random.default_rng(seed)
-    chosen, shares = rng.integers(num_pairs, size=(resamples, num_pairs)), []
-    for num in nums:
-        drawn = rng.integers(num, size=(resamples, num)) + num * np.arange(resamples)[:, None]
-        times = np.bincount(drawn.ravel(), minlength=num * resamples).reshape(resamples, num)
-        shares.append(times / num)
-    return chosen, shares
+def _variance(groups: dict[Hashable, list[float]]) -> tuple[float, int]:
+    """Variance of the mean of the means of groups, and its degrees of freedom; NaN for one group."""
+    means, count = [np.mean(group) for group in groups.values()], len(groups)
+    return (float(np.var(means, ddof=1)) / count if count > 1 else math.nan), count - 1
 
 
-def _over_frames(
-    pairs: Sequence[Pair], same: Sequence[list[int]], shares: Sequence[NDArray]
-) -> tuple[NDArray, NDArray]:
-    """(R, K) our and their means over the frames that are drawn, once for all pairs that show them."""
-    means = np.empty((2, len(pairs), RESAMPLES))
-    for members, share in zip(same, shares, strict=True):
-        means[0, members] = np.array([pairs[k].ours for k in members]) @ share.T
-        means[1, members] = np.array([pairs[k].theirs for k in members]) @ share.T
-    return means[0].T, means[1].T
+def _gains_of_frames(score: str, pair: Pair) -> NDArray[np.float64]:
+    """(F,) values whose mean is the gain of a pair: those of its frames; of a share, to first order in both means."""
+    about, mean = all_scores()[score], float(pair.theirs.mean())
+    if about.compare == "absolute":
+        return gains(score, pair.ours, pair.theirs)
+    if abs(mean) <= NOTHING:
+        return np.zeros_like(pair.ours)
+    first_order = (pair.ours - pair.ours.mean() / mean * pair.theirs) / abs(mean)
+    return _gain(score, pair) + (first_order if about.higher_is_better else -first_order)
+
+
+def _half_width(parts: Sequence[tuple[float, int]], num_places: int) -> float:
+    """Half of the interval of a mean over places, from variances with their degrees of freedom; NaN if one is."""
+    total = sum(of for of, _ in parts)
+    if not total > 0:
+        return total
+    degrees = total**2 / sum(of**2 / free for of, free in parts)
+    return float(stdtrit(degrees, (1 + CONFIDENCE) / 2)) * math.sqrt(total) / num_places
 
 
 def verdict(measured: Difference, expect: str, by: float) -> Verdict:
@@ -147,7 +156,7 @@ def verdict(measured: Difference, expect: str, by: float) -> Verdict:
         expect: `better`: at least `by` better; `no worse`: at most `by` worse; `no effect`: within `by` either way.
         by: >= 0, in the unit of the difference.
     """
-    if measured.count < MIN_PAIRS:
+    if not math.isfinite(measured.low):
         return "cannot be told"
     if expect == "no effect":
         inside, outside = -by <= measured.low and measured.high <= by, measured.high < -by or measured.low > by

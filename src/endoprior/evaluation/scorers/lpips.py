@@ -30,10 +30,11 @@ def compute(context: EvaluationContext) -> None:
     for name, backbone in (("lpips", "alex"), ("lpips_squeeze", "squeeze")):
         with context.skip_if_unavailable(name):
             distance = metrics.lpips_distance(backbone, context.weights_dir, download=backbone == "alex")
-            values = [
-                distance(context.rendered[frame.index].rgb, frame.rgb, frame.tissue_mask) for frame in context.frames
+            rows = [
+                {name: distance(context.rendered[frame.index].rgb, frame.rgb, frame.tissue_mask)}
+                for frame in context.frames
             ]
-            context.add_mean(name, values, "no tissue in the split")
+            context.add_frames(rows, "no tissue in the split")
 
 
 def squeeze_distance(context: EvaluationContext, name: str) -> Callable[..., float] | None:
