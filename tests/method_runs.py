@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -21,10 +22,11 @@ def trained_and_resumed(sequence: FrameSequence, cfg: Config, folder: Path, stop
 
     def stop(report, trainer):
         if report.stage is Stage.FINE and report.iteration == stop_at:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)  # Ctrl-C: the checkpoint of this iteration is written
 
     with pytest.raises(KeyboardInterrupt):
         train(sequence, cfg, folder / "parts", on_step=stop)
+    assert (folder / "parts" / "checkpoint.safetensors").is_file()
     train(sequence, cfg, folder / "parts", resume=True)
     for scene in (load_scene(folder / name) for name in ("whole", "parts")):
         assert scene.config.method == cfg.method

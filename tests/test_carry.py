@@ -116,6 +116,16 @@ def test_a_point_that_leaves_and_returns_is_visible_again():
     assert shown == [True, False, True, False, True, False, True, False, True]
 
 
+def test_a_surface_has_the_color_of_the_tissue_before_any_background(monkeypatch):
+    scene = moving_scene()
+    camera = scene.cameras[0]
+    black = render_surface(scene, 0.0, camera)
+    alpha = scene.render(0.0, camera).alpha.numpy()
+    assert ((alpha > 0.5) & (alpha < 0.95)).any(), "where the background shows through"
+    monkeypatch.setattr(type(scene), "background", (1.0, 1.0, 1.0))
+    assert render_surface(scene, 0.0, camera).color == pytest.approx(black.color, abs=1e-5)
+
+
 def test_pixels_on_the_border_and_beyond():
     mask = np.ones((48, 64), bool)
     mask[:, 0] = False

@@ -12,10 +12,13 @@ from tiny_training import KINDS, tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.core.config_deformation import HexPlaneConfig
+from endoprior.core.presets import preset
 from endoprior.data import load_sequence
+from endoprior.methods.own import OwnMethod
 from endoprior.model.hexplane import FRESH, TOUCHED, PlaneGrid
 from endoprior.model.scene_file import load_scene
 from endoprior.runs.train import train
+from endoprior.training import divergence
 from endoprior.training.divergence import (
     CHECK_EVERY,
     LARGEST_GRADIENT,
@@ -26,6 +29,7 @@ from endoprior.training.divergence import (
     unusable_numbers,
 )
 from endoprior.training.gaussian_trainer import GaussianTrainer
+from endoprior.training.losses_torch import color_l1
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.optimizer import Optimizer
 from endoprior.training.rates import rate_of
@@ -63,7 +67,33 @@ def test_images_no_better_than_black_are_noticed_and_dark_ones_are_not():
         assert good.see(0.3, 0.4) is None and dark.see(0.01, 0.01) is None
     for _ in range(WINDOW - 1):
         assert lost.see(0.4, 0.4) is None
-    assert "black" in lost.see(0.4, 0.4)
+    assert "background alone" in lost.see(0.4, 0.4)
+
+
+@pytest.mark.parametrize("name", ["default", "deform3dgs", "endogs", "endo4dgs", "surgicalgaussian"])
+def test_every_method_is_watched_by_its_error_on_tissue(tiny_sequence, name, monkeypatch):
+    """Whatever unit and region its own color term has; and an image of nothing but background ends the run."""
+    monkeypatch.setattr(divergence, "WINDOW", 4)
+    small = HexPlaneConfig(resolution=(6, 5, 4), time_resolution=7, channels=3, multires=(1, 2), width=8)
+    cfg = preset(name, iterations=9)
+    cfg = replace(
+        cfg,
+        schedule=replace(cfg.schedule, coarse_iterations=0, half_resolution_iterations=0),
+        deformation=replace(cfg.deformation, hexplane=replace(small, learn_box=cfg.deformation.hexplane.learn_box)),
+    )
+    trainer = GaussianTrainer(load_sequence(tiny_sequence), cfg)
+    trainer.start()
+    done = trainer.step_once.compare(trainer.state)
+    frame = done.batch.frame
+    expected = float(color_l1(done.out.color.detach(), frame.rgb, frame.tissue_mask))
+    assert float(done.color_error.detach()) == pytest.approx(expected, rel=1e-5)
+    with torch.no_grad():
+        trainer.state.gaussians["opacity_logits"].fill_(-40)
+    for _ in range(3):
+        trainer.step()
+    with pytest.raises(Diverged, match="background alone"):
+        trainer.step()
+    assert trainer.state.iteration == 3
 
 
 def state_of(trainer):
@@ -153,6 +183,17 @@ def test_a_scene_that_loses_every_gaussian_stops(tiny_sequence):
         train(load_sequence(tiny_sequence), cfg)
 
 
+def test_a_run_that_lost_every_gaussian_can_be_read_again(tiny_sequence, tmp_path):
+    cfg = tiny_config("basis", coarse=0)
+    cfg = replace(cfg, density=replace(cfg.density, prune_opacity=1.0, start_iteration=0, every=5))
+    with pytest.raises(Diverged, match=r"after iteration 5 .*faded"):
+        train(load_sequence(tiny_sequence), cfg, tmp_path / "run")
+    steps = []
+    with pytest.raises(Diverged, match=r"after iteration 10 .*faded"):
+        train(load_sequence(tiny_sequence), cfg, tmp_path / "run", resume=True, on_step=lambda r, _: steps.append(r))
+    assert [report.iteration for report in steps] == [6, 7, 8, 9]
+
+
 def test_steps_of_adam_are_bounded_as_the_guard_assumes():
     """The worst gradients for Adam: those that grow as Cauchy and Schwarz's equality asks, after a long silence."""
     moments, largest, last = np.zeros(2), 0.0, 3999
@@ -201,6 +242,22 @@ def test_a_late_check_finds_the_state_before_a_bad_gradient(tiny_sequence, kind,
     handle.remove()
     trainer.step()  # and it could go on
     assert not torch.equal(state_of(trainer)["sh_dc"], before["sh_dc"])
+
+
+def test_a_reset_of_opacities_waits_for_the_check(tiny_sequence, monkeypatch):
+    monkeypatch.setattr(OwnMethod, "reset_due", lambda self, stage, iteration, cfg: iteration == 3)
+    cfg = without_density_events(tiny_config("basis", coarse=0, fine=200))
+    trainer = GaussianTrainer(load_sequence(tiny_sequence), cfg)
+    trainer.start()
+    as_on_a_device(trainer)
+    for _ in range(2):
+        trainer.step()
+    before = state_of(trainer)
+    poison(trainer, "means", float("nan"))
+    with pytest.raises(Diverged, match="gradient of means"):
+        trainer.step()
+    after = state_of(trainer)
+    assert trainer.state.iteration == 2 and all(torch.equal(before[key], after[key]) for key in before)
 
 
 def test_the_last_iteration_and_a_checkpoint_wait_for_the_check(tiny_sequence):

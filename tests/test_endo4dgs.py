@@ -71,6 +71,16 @@ def test_gradient_correlation_is_that_of_numpy():
     assert float(none) == 0
 
 
+def test_flat_depth_has_a_finite_gradient():
+    slope = 0.25 * torch.arange(6.0).expand(5, 6)
+    curved, all_valid = torch.rand(5, 6, generator=torch.Generator().manual_seed(0)), torch.ones(5, 6, dtype=torch.bool)
+    for flat in (torch.full((5, 6), 40.0), 40 + slope):
+        for depth, target in ((flat, curved), (curved, flat), (flat, flat)):
+            depth = depth.clone().requires_grad_()
+            gradient_correlation(depth, target, all_valid).backward()
+            assert depth.grad.abs().max() < 1e7
+
+
 def test_normals_of_a_slanted_plane():
     v, u = np.mgrid[:5, :6]
     found = normals_of_depth(torch.from_numpy(10 + 0.5 * u - 0.25 * v))
@@ -121,6 +131,20 @@ def test_the_loss_by_hand(tiny_sequence):
     assert terms["depth"] == pytest.approx(0, abs=1e-6) and terms["gradient"] == pytest.approx(0, abs=1e-6)
     assert terms["confidence"] == pytest.approx(0.001 * (0.01 / 2), rel=1e-3)  # c = 1: MSE / 2, for color alone
     assert set(terms) == {"color", "depth", "gradient", "normal", "confidence"}
+
+
+def test_a_frame_without_tissue_has_finite_terms_and_gradients(tiny_sequence):
+    frame = TrainingFrames(load_sequence(tiny_sequence), CFG.prior).frame(0)
+    none = torch.zeros_like(frame.tissue_mask)
+    frame = replace(frame, tissue_mask=none, measured=none, num_measured=0)
+    color, depth = frame.rgb.requires_grad_(), frame.depth.requires_grad_()
+    out = RenderOutput(color, torch.ones_like(depth), depth, torch.zeros(1, 2), torch.zeros(1))
+    gray = create_gaussians(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4), CFG).splats(None, 0)
+    drawn = Drawn(Stage.COARSE, 1, 0, frame, None, None, None, gray, out, lambda splats: out, None)
+    terms = METHOD.terms(drawn, CFG, NUMBA)
+    sum(terms.values()).backward()
+    assert all(bool(value.isfinite()) for value in terms.values())
+    assert color.grad.isfinite().all() and depth.grad.isfinite().all()
 
 
 # Rates, growth.

@@ -127,6 +127,32 @@ def test_the_loss_by_hand(tiny_sequence):
     assert set(terms) == {"color", "depth", "tv"}
 
 
+def test_at_half_resolution_a_pixel_has_the_mean_weight_of_its_block(tiny_sequence):
+    frames = TrainingFrames(load_sequence(tiny_sequence), CFG.prior)
+    weight, frame = METHOD.context(frames, CFG), frames.frame(0, half=True)
+    out = RenderOutput(frame.rgb + 0.1, torch.ones(20, 24), frame.depth, torch.zeros(1, 2), torch.zeros(1))
+    drawn = Drawn(Stage.FINE, 1, 0, frame, None, random_field(), None, None, out, None, weight)
+    terms = METHOD.terms(drawn, CFG, NUMBA)
+    blocks = weight.reshape(20, 2, 24, 2).mean((1, 3))
+    assert float(terms["color"]) == pytest.approx(0.1 * float((blocks * frame.tissue_mask).mean()), rel=1e-4)
+
+
+def random_field(**planes) -> JointField:
+    """A small one around random points."""
+    cfg = replace(CFG, deformation=replace(CFG.deformation, hexplane=replace(SMALL, **planes)))
+    return METHOD.motion(cfg).field(torch.rand(20, 3, generator=torch.Generator().manual_seed(0)), cfg)
+
+
+def test_planes_are_regularized_whether_or_not_the_box_is_learned(tiny_sequence):
+    frame = TrainingFrames(load_sequence(tiny_sequence), CFG.prior).frame(0)
+    out = RenderOutput(frame.rgb, torch.ones(40, 48), frame.depth, torch.zeros(1, 2), torch.zeros(1))
+    for learn_box in (True, False):
+        field = random_field(learn_box=learn_box)
+        drawn = Drawn(Stage.FINE, 1, 0, frame, None, field, None, None, out, None, torch.ones(40, 48))
+        METHOD.terms(drawn, CFG, NUMBA)["planes"].backward()
+        assert field.grid.grads.any(), learn_box
+
+
 def test_depth_is_compared_without_its_scale():
     target = torch.tensor([[10.0, 20.0], [40.0, 0.0]])
     measured = target > 0
@@ -197,6 +223,16 @@ def test_the_optimizer_is_kept_and_a_reset_forgets_opacities(tiny_sequence, monk
     assert float(before.states["means"].steps) == steps + 1
     assert float(trainer.state.gaussians.opacities.detach().max()) <= 0.01 + 1e-6
     assert not before.states["opacity_logits"].first.any()
+
+
+def test_training_does_not_end_with_a_reset(tiny_sequence, monkeypatch):
+    monkeypatch.setattr(type(METHOD), "reset_due", lambda self, stage, iteration, cfg: iteration in (4, 7))
+    trainer = GaussianTrainer(load_sequence(tiny_sequence), tiny())
+    trainer.start()
+    seen = [(trainer.step(), float(trainer.state.gaussians.opacities.detach().max()))[1] for _ in range(11)]
+    assert trainer.finished
+    reset = [i for i, most in enumerate(seen, 1) if most <= 0.01 + 1e-6]
+    assert reset == [4, 8], "the last of the coarse stage; and fine iteration 4, but not 7, the last"
 
 
 def test_what_is_empty_is_white(tiny_sequence, tmp_path):

@@ -266,6 +266,12 @@ def test_files_that_are_no_files(tmp_path):
         load_scene(tmp_path / "folder.safetensors")
 
 
+def test_a_run_that_was_stopped_is_to_be_resumed(tmp_path):
+    (tmp_path / "config.json").touch()
+    with pytest.raises(InputError, match=r"expected a trained scene, got an unfinished run.*train --resume"):
+        load_scene(tmp_path)
+
+
 def test_a_file_of_holes_is_refused_by_its_size(scene, path):
     scene.write(path)
     os.truncate(path, 2**40)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 
 from endoprior.core.config_io import to_dict
+from endoprior.core.methods import METHODS, OWN, method_named
 from endoprior.core.presets import preset
 from endoprior.runs import kernel_cache
 from endoprior.runs.warm_up import shortened, tiny_sequence
@@ -51,6 +52,15 @@ def test_it_is_filled_once_for_what_needs_the_same_kernels(cold):
     assert len(asked) == 2
 
 
+def test_the_temporal_term_has_kernels_of_its_own(cold):
+    asked, _ = cold
+    paper = preset("paper")
+    either_end = replace(paper, temporal=replace(paper.temporal, valid_at_both=False))
+    for number, cfg in enumerate((preset("endogaussian"), paper, either_end), 1):
+        kernel_cache.fill(cfg)
+        assert len(asked) == number
+
+
 def test_a_warm_up_that_fails_is_tried_again_by_the_next_process(cold):
     asked, instead = cold
     instead.status = 1
@@ -60,7 +70,10 @@ def test_a_warm_up_that_fails_is_tried_again_by_the_next_process(cold):
     assert len(asked) == 2
 
 
-@pytest.mark.parametrize("name", ["default", "paper", "released", "endogaussian"])
+OTHERS = [name for name in METHODS if name != OWN and method_named(name).has_gaussians]
+
+
+@pytest.mark.parametrize("name", ["default", "paper", "released", "endogaussian", *OTHERS])
 def test_the_warm_up_reaches_every_part_of_a_preset(name):
     cfg = shortened(preset(name))
     trainer = GaussianTrainer(tiny_sequence(), cfg)
@@ -69,4 +82,11 @@ def test_the_warm_up_reaches_every_part_of_a_preset(name):
     while not trainer.finished:
         reports.append(trainer.step())
     assert len({report.num_gaussians for report in reports}) > 1
-    assert any("distance" in report.terms for report in reports) == (cfg.temporal.weight > 0)
+    regularized = cfg.temporal.weight > 0 or name == "surgicalgaussian"  # which has a term of that name in its loss
+    assert any("distance" in report.terms for report in reports) == regularized
+
+
+def test_the_warm_up_needs_no_right_eye():
+    cfg = preset("default")
+    warm = shortened(replace(cfg, data=replace(cfg.data, eyes="both")))
+    GaussianTrainer(tiny_sequence(), warm).start()

@@ -27,7 +27,8 @@ from endoprior.radiance.endonerf import EndoNeRF, depth_spread
 from endoprior.radiance.endosurf import EndoSurf
 from endoprior.radiance.frames import RayFrames, measured
 from endoprior.radiance.scene import RadianceScene
-from endoprior.runs.train import train
+from endoprior.runs.remote import train_here, trainings
+from endoprior.runs.train import start_run, train
 from endoprior.system.arrays_file import load_arrays, save_arrays
 from endoprior.training.divergence import Diverged
 from endoprior.training.radiance_trainer import RadianceTrainer
@@ -253,10 +254,11 @@ def test_scores_that_need_gaussians_are_skipped(sequence: FrameSequence, monkeyp
     assert found.protocol["backend"] == "torch, 10 samples per ray"
 
 
-def test_right_eyes_are_rejected(sequence: FrameSequence):
-    cfg = tiny("endonerf")
-    with pytest.raises(InputError, match=r"expected --data\.eyes left, got both"):
-        RadianceTrainer(sequence, replace(cfg, data=replace(cfg.data, eyes="both")), FIELDS["endonerf"])
+def test_it_trains_as_a_call_that_another_machine_can_do(sequence: FrameSequence, tmp_path: Path):
+    run = start_run(sequence, tiny("endonerf", 2), tmp_path / "run", say=[].append)
+    (training,) = trainings(run)
+    assert " Gaussians" not in str(train_here(training))
+    assert isinstance(load_scene(tmp_path / "run"), RadianceScene)
 
 
 def test_presets_of_both_sizes():

@@ -19,15 +19,17 @@ def test_by_hand():
     channels = 3 + 4 + 3 + 3 * cfg.deformation.basis.deform_color + cfg.deformation.deform_opacity
     motion = cfg.deformation.basis.num_bases * channels
     state = 3 * 4 * 300 * (per_gaussian + motion) + 2 * 4 * 300 * motion
-    assert least_bytes(cfg, 15, 48, 40) - LEAST_BYTES - PICTURE_BYTES * 48 * 40 >= state
-    assert least_bytes(cfg, 15, 48, 40) < LEAST_BYTES + PICTURE_BYTES * 48 * 40 + 2 * state
+    assert least_bytes(cfg, 300, 15, 48, 40) - LEAST_BYTES - PICTURE_BYTES * 48 * 40 >= state
+    assert least_bytes(cfg, 300, 15, 48, 40) < LEAST_BYTES + PICTURE_BYTES * 48 * 40 + 2 * state
 
 
 @pytest.mark.parametrize("name", ["default", "paper", "released", "endogaussian"])
 def test_more_of_anything_needs_no_less(name):
     cfg = preset(name).fitted(100)
-    base = least_bytes(cfg, 100, 640, 512)
-    assert least_bytes(cfg, 1000, 640, 512) >= base < least_bytes(cfg, 100, 1280, 1024)
+    num = cfg.init.budget
+    base = least_bytes(cfg, num, 100, 640, 512)
+    assert least_bytes(cfg, num, 1000, 640, 512) >= base < least_bytes(cfg, num, 100, 1280, 1024)
+    assert least_bytes(cfg, 2 * num, 100, 640, 512) > base
     assert 0.4e9 < base < 2.5e9
 
 
@@ -40,5 +42,7 @@ def test_too_little_is_refused_with_both_numbers_before_anything_is_made(tiny_se
         str(tiny_sequence) in text and "0.1 GB free" in text and "at least 0.3 GB" in text and "--data.shrink" in text
     )
     assert not (tmp_path / "run").exists()
+    with pytest.raises(InputError, match="48x40 px, at least"):  # no word on Gaussians, which it has not
+        train(load_sequence(tiny_sequence), preset("endonerf"), tmp_path / "run")
     monkeypatch.setattr(training_memory, "available_bytes", lambda: None)  # a system that does not say
     train(load_sequence(tiny_sequence), tiny_config("basis", 1, 1))

@@ -21,7 +21,7 @@ from ..model.motion import Motion
 from ..model.ops import ModelOps
 from ..training.gaussian_method import GaussianMethod
 from ..training.rates import Rate, rate_of
-from .deform3dgs_points import first_points
+from .deform3dgs_points import SHARE, first_points
 from .learned_basis import COEFFICIENTS, value_at
 
 NUM_BASES = 17
@@ -55,10 +55,9 @@ class LearnedBasisMotion(Motion):
         ops: ModelOps,
         chosen: Tensor | None = None,
     ) -> Offsets:
-        """See `Motion.offsets`."""
+        """See `Motion.offsets`. Unless some are chosen, the gradient goes to `gaussians.motion_gradients`."""
         coefficients = [gaussians[name] if chosen is None else gaussians[name][chosen] for name in COEFFICIENTS]
-        # The temporal term moves chosen Gaussians to a second time; both gradients then add up in `.grad`.
-        sink = None if cfg.temporal.weight or chosen is not None else gaussians.motion_gradients
+        sink = gaussians.motion_gradients if chosen is None else None
         parts = value_at(*coefficients, time, sink).split(list(CHANNELS.values()), 1)
         return Offsets(**dict(zip(CHANNELS, parts, strict=True)))
 
@@ -67,6 +66,8 @@ class Deform3DGS(GaussianMethod):
     """See `GaussianMethod`."""
 
     uses_prior = False
+    color_is_error = True
+    first_share = SHARE
     _motion = LearnedBasisMotion()
 
     def config(self) -> Config:

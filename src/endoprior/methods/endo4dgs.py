@@ -45,6 +45,7 @@ class Endo4DGS(GaussianMethod):
     """See `GaussianMethod`."""
 
     uses_prior = False
+    first_share = 1 / EVERY_PX**2
     _motion = HexPlaneMotion()
 
     def config(self) -> Config:
@@ -84,16 +85,14 @@ class Endo4DGS(GaussianMethod):
         facing = (normal_picture(drawn.splats, drawn.draw) * normals_of_depth(known)).sum(-1)
         trust = out.alpha[frame.tissue_mask]
         picture = confident_error(out.color[frame.tissue_mask], frame.rgb[frame.tissue_mask], trust)
+        surface = confident_error(depth[valid][:, None], target[valid][:, None], out.alpha[valid])
         terms = {
             "color": ((color - frame.rgb) * mask).abs().mean(),
             "depth": DEPTH_WEIGHT * (depth - target).abs().mean(),
             "gradient": GRADIENT_WEIGHT * gradient_correlation(out.depth, known, valid),
             "normal": NORMAL_WEIGHT * ((1 - facing) * frame.measured).abs().mean(),
-            "confidence": CONFIDENCE_WEIGHT * picture,
+            "confidence": CONFIDENCE_WEIGHT * picture + CONFIDENCE_WEIGHT * surface,
         }
-        if valid.any():
-            surface = confident_error(depth[valid][:, None], target[valid][:, None], out.alpha[valid])
-            terms["confidence"] = terms["confidence"] + CONFIDENCE_WEIGHT * surface
         if drawn.stage is Stage.FINE:
             terms["tv"] = TV_WEIGHT * (total_variation(color) + total_variation(out.depth * frame.tissue_mask))
             anchor = next(iter(drawn.field.parameters.values()))

@@ -14,6 +14,8 @@ from ..model.gaussians import SH_C0
 from ..render.projection import rotation_matrices
 
 DEPTH_EPSILON = 1e-6
+VARIANCE_EPSILON = 1e-12
+"""Keeps the gradient of a correlation finite where a depth is flat."""
 LEAST_CONFIDENCE = 1e-6
 """Confidence is at least this: its logarithm counts."""
 
@@ -35,7 +37,7 @@ def gradient_correlation(depth: Tensor, target: Tensor, valid: Tensor) -> Tensor
         return depth.sum() * 0
     a, b = (_squared_gradient(values)[counted] for values in (depth, target))
     a, b = a - a.mean(), b - b.mean()
-    return 1 - (a * b).sum() / ((a.square().sum() * b.square().sum()).sqrt() + 1e-12)
+    return 1 - (a * b).sum() / (a.square().sum() * b.square().sum() + VARIANCE_EPSILON).sqrt()
 
 
 def _squared_gradient(depth: Tensor) -> Tensor:
@@ -64,10 +66,12 @@ def normal_picture(splats: Splats, draw: Callable[[Splats], RenderOutput]) -> Te
 
 
 def confident_error(value: Tensor, target: Tensor, confidence: Tensor) -> Tensor:
-    """MSE / mean(2 c^2) + mean log c, ().
+    """MSE / mean(2 c^2) + mean log c, (); 0 without pixels.
 
     Args:
         value, target: (P, C) of the pixels that count. confidence: (P,) c.
     """
+    if not len(value):
+        return value.sum()
     c = confidence.clamp(min=LEAST_CONFIDENCE)
     return (value - target).square().mean() / (2 * c.square()).mean() + c.log().mean()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import huber_loss
+from torch.nn.functional import adaptive_avg_pool2d, huber_loss
 
 from ..core.config import Config, DensityConfig, InitConfig, OptimConfig, ScheduleConfig, TemporalConfig
 from ..core.config_deformation import DeformationConfig, HexPlaneConfig
@@ -91,14 +91,17 @@ class EndoGS(GaussianMethod):
     def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
         """See `GaussianMethod.terms`."""
         frame, out = drawn.frame, drawn.out
-        mask = frame.tissue_mask[..., None]
+        mask, weight = frame.tissue_mask[..., None], drawn.context
+        if weight.shape != frame.tissue_mask.shape:  # at half resolution
+            weight = adaptive_avg_pool2d(weight[None], frame.tissue_mask.shape)[0]
         terms = {
-            "color": ((out.color - frame.rgb).abs() * mask * drawn.context[..., None]).mean(),
+            "color": ((out.color - frame.rgb).abs() * mask * weight[..., None]).mean(),
             "depth": DEPTH_WEIGHT * depth_huber(out.depth, frame.depth, frame.measured),
             "tv": TV_WEIGHT * total_variation(out.color * ~mask),
         }
         if drawn.stage is Stage.FINE:
-            terms["planes"] = plane_term(drawn.field.grid, PLANES, drawn.field.box)
+            anchor = next(iter(drawn.field.parameters.values()))
+            terms["planes"] = plane_term(drawn.field.grid, PLANES, anchor)
         return terms
 
     def plan(

@@ -13,6 +13,8 @@ MOTIONS: dict[str, Motion] = {"hexplane": HexPlaneMotion(), "basis": BasisMotion
 class OwnMethod(GaussianMethod):
     """See `GaussianMethod`, whose defaults it consists of."""
 
+    color_is_error = True
+
     def config(self) -> Config:
         """See `Method.config`."""
         return default()

@@ -38,7 +38,7 @@ def plane_term(grid: PlaneGrid, weights: PlaneWeights, anchor: Tensor) -> Tensor
     """The weighted sum of the terms, (). Its backward pass adds the planes' gradient to `grid.grads`.
 
     Args:
-        anchor: any parameter of the field; it only ties the term to the graph.
+        anchor: any parameter of the field that is trained; it only ties the term to the graph.
     """
     return _PlaneTerm.apply(anchor, grid, weights)
 

@@ -94,6 +94,7 @@ class SurgicalGaussian(GaussianMethod):
     background = (1.0, 1.0, 1.0)
     uses_prior = False
     uses_radii = True
+    first_share = 1 / EVERY_PX**2
     _motion = NetworkMotion()
 
     def config(self) -> Config:

@@ -35,7 +35,6 @@ DECAY, DECAY_SHARE = 0.1, 2.5
 class EndoNeRF(RadianceField):
     """See the module."""
 
-    name = "endonerf"
     only_measured = False
 
     def __init__(self, cfg: RadianceConfig) -> None:

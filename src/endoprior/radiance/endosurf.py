@@ -49,7 +49,6 @@ class Probed:
 class EndoSurf(RadianceField):
     """See the module."""
 
-    name = "endosurf"
     only_measured = True
 
     def __init__(self, cfg: RadianceConfig) -> None:

@@ -41,7 +41,6 @@ class RadianceField(nn.Module, ABC):
     A new one has no values: `start` or `load_state_dict` gives them.
     """
 
-    name: ClassVar[str]
     only_measured: ClassVar[bool]
     """Whether rays are drawn only where there is a depth."""
 

@@ -58,7 +58,8 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
             raise InputError(
                 f"expected 0 to {length} as iteration of the {stage.name.lower()} stage; got {iteration!r:.80}."
             )
-        check_state(arrays, iteration)
+        before = stage_length(cfg, Stage.COARSE) if stage is Stage.FINE else 0  # a method may keep its optimizer
+        check_state(arrays, before + iteration)
         num_frames = len(trainer.sequence.indices("train"))
         axes = {name: spec.shape.index("F") for name, spec in trainer.schema().items() if "F" in spec.shape}
         counts = {name: arrays[name].shape[axis] for name, axis in axes.items()}
@@ -68,9 +69,11 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
     trainer.restore(stage, iteration, arrays)
 
 
-def check_state(arrays: Mapping[str, Tensor], iteration: int) -> None:
+def check_state(arrays: Mapping[str, Tensor], iterations: int) -> None:
     """Reject arrays of a checkpoint, finite and of the right shapes, that no training can produce.
 
+    Args:
+        iterations: of all stages so far.
     Raises:
         InputError: naming the array.
     """
@@ -78,7 +81,7 @@ def check_state(arrays: Mapping[str, Tensor], iteration: int) -> None:
         if name.startswith("stats.") or name.endswith((".second", ".exp_avg_sq")):
             valid, expected = bool((value >= 0).all()), "no negative number"
         elif name.endswith(".steps"):
-            valid, expected = bool(((value >= 0) & (value <= iteration)).all()), f"0 to {iteration} steps"
+            valid, expected = bool(((value >= 0) & (value <= iterations)).all()), f"0 to {iterations} steps"
         elif name == "tracks.rows":
             num = len(arrays["tracks.coefficients"])
             valid, expected = bool(((value >= 0) & (value < num)).all()), f"rows below {num}"

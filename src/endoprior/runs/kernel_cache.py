@@ -67,7 +67,8 @@ def _key(cfg: Config) -> str:
         name, facts = file.relative_to(PACKAGE).as_posix(), file.stat()
         digest.update(f"{name} {facts.st_size} {facts.st_mtime_ns}".encode())
     digest.update(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()} {sys.version}".encode())
-    parts = (cfg.method, cfg.deformation, cfg.render, cfg.schedule.sh_degree, cfg.init.motion, cfg.temporal.gradient)
+    temporal = (cfg.temporal.weight > 0, cfg.temporal.valid_at_both, cfg.temporal.gradient)
+    parts = (cfg.method, cfg.deformation, cfg.render, cfg.schedule.sh_degree, cfg.init.motion, *temporal)
     digest.update(json.dumps([to_dict(part) for part in parts]).encode())
     return digest.hexdigest()[:16]
 

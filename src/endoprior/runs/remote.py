@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..core.config import Config
 from ..data import load_sequence
-from ..model.scene import Scene
+from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
 from ..model.windowed_scene import window_file
 from ..render import ON_GPU
@@ -52,13 +52,15 @@ class Training:
 class Trained:
     """The result of a training; its scene is in the folder."""
 
-    num_gaussians: int
+    num_gaussians: int | None
+    """None for a scene that has none."""
     seconds: float
     notes: tuple[str, ...]
     """Lines for the user about the sequence."""
 
     def __str__(self) -> str:
-        return f"trained in {self.seconds:.0f} s, {self.num_gaussians:,} Gaussians"
+        count = "" if self.num_gaussians is None else f", {self.num_gaussians:,} Gaussians"
+        return f"trained in {self.seconds:.0f} s{count}"
 
 
 def trainings(run: TrainingRun | WindowedRun, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> list[Training]:
@@ -96,7 +98,7 @@ def train_here(training: Training) -> Trained:
     run = TrainingRun(sequence, training.cfg, training.folder, resume=resume, say=notes.append)
     scene = run.complete(checkpoint_seconds=training.checkpoint_seconds)
     found = tuple(note for note in notes if note.startswith("note: "))
-    return Trained(len(scene), clock.perf_counter() - began, found)
+    return Trained(len(scene) if isinstance(scene, Scene) else None, clock.perf_counter() - began, found)
 
 
 def start_training_on(cluster: Cluster, key: object, training: Training, cores: int) -> None:
@@ -110,7 +112,7 @@ def complete_on(
     run: TrainingRun | WindowedRun,
     say: Callable[[str], None],
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
-) -> Scene:
+) -> RenderedScene:
     """Train a run in a folder on a cluster; the scene is bit-identical to that of `run.complete()`.
 
     If a window fails, the others are trained nevertheless, so that resuming trains this one only.

@@ -13,7 +13,9 @@ from ..core.checks import input_error
 from ..core.config import Config
 from ..data import FrameSequence, load_sequence
 from ..data.window_plan import look_through, plan_windows
+from ..model.method import method_of
 from ..model.scene import RenderedScene
+from ..training.ignored_options import note_on_budget, reject_ignored_options
 from ..training.trainer import Observer
 from .observers import CHECKPOINT_SECONDS
 from .progress import is_watched, training_progress
@@ -92,11 +94,17 @@ def start_run(
     Raises:
         InputError: see `train`.
     """
+    reject_ignored_options(cfg)
+    if note := note_on_budget(cfg):
+        say(f"note: {note}")
     _check_reading(sequence, cfg)
     if cfg.windows.enabled:
         cameras = [sequence.camera(i) for i in range(len(sequence))]
         whole = sequence.part(0, len(sequence))  # with a cache of its own, which is freed
         plan = plan_windows(cameras, look_through(whole), cfg.windows)
+        if len(plan) > 1 and not method_of(cfg).has_gaussians:
+            want, got = f"False with method {cfg.method}, which trains one window", f"a plan of {len(plan)} windows"
+            raise input_error("windows.enabled", want, got, "Add --windows.no-enabled.")
         if len(plan) > 1:
             return WindowedRun(sequence, cfg, plan, out, resume=resume, say=say)
     return TrainingRun(sequence, cfg, out, resume=resume, say=say)

@@ -39,6 +39,7 @@ def shortened(cfg: Config) -> Config:
     """The config with a few iterations in which everything runs: stages, growth, temporal term, half resolution."""
     return replace(
         cfg,
+        data=replace(cfg.data, eyes="left"),
         init=replace(cfg.init, budget=400, cleanup=False, erosion_px=3),
         schedule=replace(cfg.schedule, coarse_iterations=2, fine_iterations=8, half_resolution_iterations=1),
         density=replace(cfg.density, start_iteration=0, every=3, grow_threshold=1e-7),

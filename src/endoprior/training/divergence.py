@@ -28,11 +28,11 @@ LARGEST_GRADIENT = 1e15
 CHECK_EVERY = 20
 """Iterations between two checks on a device: each check makes the host wait once."""
 WINDOW = 300
-"""Iterations over which images that are no better than black ones count as divergence."""
+"""Iterations over which images that are no better than empty ones count as divergence."""
 NO_BETTER = 0.95
-"""... when their color error is this share of black's."""
-DARK = 0.02
-"""Mean brightness of the frames, 0..1, below which black is a fair guess and nothing is concluded."""
+"""... when their color error is this share of that of the background alone."""
+ALIKE = 0.02
+"""Mean difference of frames and background, 0..1, below which that is a fair guess and nothing is concluded."""
 
 ADVICE = "Lower the learning rates (--optim...), or look for wrong depth and poses with `endoprior check`"
 
@@ -67,11 +67,11 @@ class _Numbers:
     """What an iteration is checked by; `values` may lie on a device."""
 
     iteration: int
-    brightness: float
+    empty_error: float
     terms: tuple[str, ...]
     gradients: tuple[str, ...]
     values: Tensor
-    """(terms + gradients,) weighted terms of the loss, then counts of unusable entries."""
+    """(terms + 1 + gradients,) weighted terms of the loss, the color error, then counts of unusable entries."""
 
 
 class DivergenceCheck:
@@ -89,7 +89,8 @@ class DivergenceCheck:
         iteration: int,
         terms: Mapping[str, Tensor],
         unusable: Mapping[str, int | Tensor],
-        brightness: float,
+        color_error: Tensor,
+        empty_error: float,
         *,
         wait: bool,
     ) -> Divergence | None:
@@ -98,14 +99,14 @@ class DivergenceCheck:
         Args:
             terms: weighted terms of the loss, () each.
             unusable: entries of each gradient that are not finite or beyond `LARGEST_GRADIENT`, by name.
-            brightness: see `Watch.see`.
+            color_error: (); empty_error: see `Watch.see`.
             wait: read the results now: what follows cannot be undone.
         """
         counts = [torch.as_tensor(count, dtype=torch.float64) for count in unusable.values()]
-        values = torch.stack([*(value.detach().double() for value in terms.values()), *counts])
-        self._pending.append(_Numbers(iteration, brightness, tuple(terms), tuple(unusable), values))
+        values = torch.stack([*(value.detach().double() for value in (*terms.values(), color_error)), *counts])
+        self._pending.append(_Numbers(iteration, empty_error, tuple(terms), tuple(unusable), values))
         if self.skip is not None:
-            usable = values.isfinite().all() & (values[len(terms) :] == 0).all()
+            usable = values.isfinite().all() & (values[len(terms) + 1 :] == 0).all()
             self.skip.copy_(torch.maximum(self.skip, (~usable).float()))
             if not wait and len(self._pending) < CHECK_EVERY:
                 return None
@@ -120,11 +121,11 @@ class DivergenceCheck:
         pending, self._pending = self._pending, []
         values = iter(torch.cat([each.values for each in pending]).tolist() if pending else [])
         for each in pending:
-            terms = {name: next(values) for name in each.terms}
+            terms, color_error = {name: next(values) for name in each.terms}, next(values)
             unusable = {name: int(next(values)) for name in each.gradients}
             reason, last_good = unusable_numbers(terms, unusable), each.iteration - 1
             if reason is None:
-                reason, last_good = self._watch.see(terms["color"], each.brightness), applied
+                reason, last_good = self._watch.see(color_error, each.empty_error), applied
             if reason is not None:
                 if self.skip is not None:
                     self.skip.zero_()  # who continues does so from the last good state
@@ -138,22 +139,22 @@ class Watch:
     def __init__(self) -> None:
         self._errors: deque[tuple[float, float]] = deque(maxlen=WINDOW)
 
-    def see(self, color_error: float, brightness: float) -> str | None:
+    def see(self, color_error: float, empty_error: float) -> str | None:
         """Take in one iteration.
 
         Args:
             color_error: mean absolute error of the image over tissue.
-            brightness: mean of the frame over tissue, in [0, 1]: the error that a black image has.
+            empty_error: that of an image that shows only the background, in [0, 1].
         Returns:
-            What is wrong, if over the last `WINDOW` iterations the images were no better than black ones.
+            What is wrong, if over the last `WINDOW` iterations the images were no better than empty ones.
         """
-        self._errors.append((color_error, brightness))
+        self._errors.append((color_error, empty_error))
         if len(self._errors) < WINDOW:
             return None
-        error, black = np.mean(self._errors, axis=0)
-        if black <= DARK or error < NO_BETTER * black:
+        error, empty = np.mean(self._errors, axis=0)
+        if empty <= ALIKE or error < NO_BETTER * empty:
             return None
         return (
             f"expected images that resemble the frames; over {WINDOW} iterations their mean color error was "
-            f"{error:.3g}, and black images would have {black:.3g}. {ADVICE}"
+            f"{error:.3g}, and the background alone would have {empty:.3g}. {ADVICE}"
         )

@@ -45,6 +45,11 @@ class GaussianMethod(Method):
     """The largest radius of each Gaussian on screen is kept, for `plan`."""
     keeps_optimizer = False
     """Adam's moments and steps go on from the coarse to the fine stage."""
+    color_is_error = False
+    """Its term `color` is the mean absolute error over tissue; else the divergence check has that computed."""
+    first_share = 0.0
+    """Share of the pixels of the first training frame, where it shows tissue with depth, that become Gaussians; 0: it
+    starts with `init.budget` of them."""
 
     def trainer(self, sequence: FrameSequence, cfg: Config) -> Trainer:
         """See `Method.trainer`."""
@@ -102,6 +107,14 @@ class GaussianMethod(Method):
     def reset_due(self, stage: Stage, iteration: int, cfg: Config) -> bool:
         """Whether opacities are lowered to 0.01 after this iteration."""
         return False
+
+    def empty_error(self, brightness: float) -> float:
+        """Mean absolute color error, over tissue, of an image of the background alone; at most that, if it is no gray.
+
+        Args:
+            brightness: mean color of the frame over tissue, in [0, 1].
+        """
+        return abs(sum(self.background) / 3 - brightness)
 
 
 def in_epochs(seed: int, stage: Stage, iteration: int, num_frames: int) -> int:

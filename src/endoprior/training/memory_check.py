@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ..core.checks import InputError
 from ..core.config import Config
 from ..data import FrameSequence
+from ..initialization.sampling import has_surface
 from ..model.method import method_of
 from ..system.memory import available_bytes
 
@@ -25,15 +28,26 @@ TRACK_BYTES = 64
 """Per point and frame while motion is fitted: pixel, position and offset in float64."""
 
 
-def least_bytes(cfg: Config, num_train: int, width: int, height: int) -> int:
+def first_count(sequence: FrameSequence, cfg: Config) -> int:
+    """Gaussians that training starts with, about; 0 for a method that has none."""
+    method = method_of(cfg)
+    if not method.has_gaussians:
+        return 0
+    if not method.first_share:
+        return cfg.init.budget
+    first = sequence.frame(sequence.indices("train")[0])
+    return round(method.first_share * np.count_nonzero(first.tissue_mask & has_surface(first)))
+
+
+def least_bytes(cfg: Config, num: int, num_train: int, width: int, height: int) -> int:
     """Memory that training needs beyond what the process uses already.
 
     Args:
         cfg: fitted to the sequence (`Config.fitted`).
+        num: first Gaussians.
         num_train: training frames.
         width, height: of a frame, px.
     """
-    num = cfg.init.budget
     sizes = {
         name: FLOAT * math.prod(num if length == "N" else length for length in spec.shape)
         for name, spec in method_of(cfg).schema(cfg).items()
@@ -54,12 +68,13 @@ def reject_too_large(sequence: FrameSequence, cfg: Config) -> None:
         InputError: it needs more than there is; with both numbers.
     """
     free = available_bytes()
-    camera, num_train = sequence.camera(0), len(sequence.indices("train"))
-    least = least_bytes(cfg.fitted(len(sequence)), num_train, camera.width, camera.height)
+    camera, num_train, num = sequence.camera(0), len(sequence.indices("train")), first_count(sequence, cfg)
+    least = least_bytes(cfg.fitted(len(sequence)), num, num_train, camera.width, camera.height)
     if free is None or least <= free:
         return
+    fewer = ", --gaussians" if num == cfg.init.budget else ""
     raise InputError(
-        f"{sequence.path}: expected memory for {len(sequence):,} frames of {camera.width}x{camera.height} px and "
-        f"{cfg.init.budget:,} Gaussians, at least {least / 1e9:.1f} GB; got {free / 1e9:.1f} GB free. Free some, or "
-        "ask for less: --data.shrink 2, --data.stride 2, --gaussians."
+        f"{sequence.path}: expected memory for {len(sequence):,} frames of {camera.width}x{camera.height} px"
+        f"{f' and {num:,} Gaussians' if num else ''}, at least {least / 1e9:.1f} GB; got {free / 1e9:.1f} GB free. "
+        f"Free some, or ask for less: --data.shrink 2, --data.stride 2{fewer}."
     )

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.checks import InputError, input_error
+from ..core.checks import InputError
 from ..core.config import Config
 from ..data import FrameSequence
 from ..model.scene_file import check_cameras
@@ -40,11 +40,8 @@ class RadianceTrainer(Trainer):
         Args:
             kind: the field to train.
         Raises:
-            InputError: the cameras cannot be used, the backend has no device here, or the config asks for what a
-                radiance field does not do.
+            InputError: the cameras cannot be used, or the backend has no device here.
         """
-        if cfg.data.eyes == "both":
-            raise input_error(kind.name, "--data.eyes left", "both", "leave --eyes out: it trains on the left eye.")
         self.sequence, self.cfg, self.kind = sequence, cfg.fitted(len(sequence)), kind
         self.device = device_for(cfg.render.backend)
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))

@@ -21,6 +21,7 @@ from .divergence import ADVICE, Diverged, DivergenceCheck
 from .drawn import Drawn
 from .frames import TrainingFrame, TrainingFrames
 from .gaussians_state import GaussiansState
+from .losses_torch import color_l1
 from .mask_doubt import MaskDoubt
 from .missed_tools import START
 from .ops import TrainingOps
@@ -68,6 +69,8 @@ class Compared:
     """(6,) of the refined camera."""
     terms: dict[str, Tensor]
     """Weighted terms of the loss, () each."""
+    color_error: Tensor
+    """() mean absolute color error over tissue, which the divergence check watches."""
 
 
 @dataclass
@@ -103,24 +106,32 @@ class TrainingStep:
         Where the report has a `divergence`, the state is the one after the last good iteration.
 
         Raises:
-            Diverged: no Gaussian is left, or a split would give one of infinite size.
+            Diverged: no Gaussian is left, or a split would give one of infinite size. The state is then the one before
+                density control.
         """
         began = clock.perf_counter()
         done = self.compare(state)
         sum(done.terms.values()).backward()
 
-        last = done.iteration == stage_length(self.cfg, state.stage)
+        fine, last = state.stage is Stage.FINE, done.iteration == stage_length(self.cfg, state.stage)
         densify = self.method.density_due(state.stage, done.iteration, last, self.cfg)
-        unusable, brightness = state.optimizer.count_unusable(), done.batch.frame.brightness
-        divergence = self.check.after_backward(done.iteration, done.terms, unusable, brightness, wait=densify or last)
+        # After the last iteration nothing would train the lowered opacities again.
+        reset = self.method.reset_due(state.stage, done.iteration, self.cfg) and not (fine and last)
+        divergence = self.check.after_backward(
+            done.iteration,
+            done.terms,
+            state.optimizer.count_unusable(),
+            done.color_error,
+            self.method.empty_error(done.batch.frame.brightness),
+            wait=densify or reset or last,
+        )
         event: dict[str, int] | None = None
         if divergence is not None:
             state.optimizer.drop_gradients()
             state.iteration = divergence.last_good
         else:
             with torch.no_grad():
-                event = self._update(state, done, densify)
-            state.iteration = done.iteration
+                event = self._update(state, done, densify, reset)
         losses = {name: value.detach() for name, value in done.terms.items()}
         seconds = clock.perf_counter() - began
         return StepReport(state.stage, done.iteration, losses, len(state.gaussians), seconds, event, divergence)
@@ -162,15 +173,20 @@ class TrainingStep:
             context=self.context,
         )
         terms = self.method.terms(drawn, cfg, self.ops)
+        color_error = (
+            terms["color"]
+            if self.method.color_is_error
+            else color_l1(out.color.detach(), counted.rgb, counted.tissue_mask)
+        )
         if offsets is not None and state.tracks is not None:
             terms |= self._track_terms(state, batch, offsets)
         if batch.before is not None:
             terms |= temporal_terms(state, batch.frame, batch.before, splats.means, means_before, out, cfg, self.ops)
         if twist is not None:
             terms["poses"] = smoothness(state.poses.twists, batch.position, twist, cfg.poses)
-        return Compared(iteration, rng, batch, splats, out, twist, terms)
+        return Compared(iteration, rng, batch, splats, out, twist, terms, color_error)
 
-    def _update(self, state: GaussiansState, done: Compared, densify: bool) -> dict[str, int] | None:
+    def _update(self, state: GaussiansState, done: Compared, densify: bool, reset: bool) -> dict[str, int] | None:
         """Apply the gradients of an iteration, then grow or prune; what density control did, if it did anything."""
         cfg, batch, event = self.cfg, done.batch, None
         self._observe(state, batch, done.out)
@@ -182,9 +198,10 @@ class TrainingStep:
         if cfg.density.max_scale_share:
             log_scales = state.gaussians["log_scales"].detach()
             limit_scales(log_scales, done.splats.means, batch.frame.camera, cfg.density.max_scale_share)
+        state.iteration = done.iteration  # what follows may raise, and must leave a state that can be resumed
         if densify:
             event = self._densify(state, done.iteration, done.rng)
-        if self.method.reset_due(state.stage, done.iteration, cfg):
+        if reset:
             reset_opacities(state.optimizer, RESET_OPACITY)
         return event
 
@@ -254,7 +271,8 @@ class TrainingStep:
         extent = density.scene_extent(self.camera_centers, gaussians["means"], self.cfg.density)
         planned = self.method.plan(state.stats, gaussians, extent, state.stage, iteration, self.cfg)
         if bool(planned.remove.all()):
-            raise Diverged(f"expected Gaussians that explain the frames; all {len(planned.remove):,} faded. {ADVICE}")
+            lost = f"after iteration {iteration} all {len(planned.remove):,} faded"
+            raise Diverged(f"expected Gaussians that explain the frames; {lost}. {ADVICE}")
         state.stats, parents = apply_plan(state.optimizer, planned, state.stats, rng)
         state.tracks = state.tracks and state.tracks.inherited(parents)
         return planned.counts()
