@@ -29,8 +29,8 @@ def calibrated(name: str, content: bytes | str) -> Build:
 
 
 def eyes(**changes: object) -> Build:
-    """A calibration of two eyes with some entries changed."""
-    return calibrated("c.json", json.dumps(EYES | changes))
+    """A calibration of two eyes with some entries changed; its layout is stated, for the video shows one camera."""
+    return calibrated("c.json", json.dumps(EYES | {"layout": "interlaced"} | changes))
 
 
 def beside(option: str, name: str, *steps: Step, more: str = "") -> Build:

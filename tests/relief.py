@@ -23,7 +23,7 @@ TEXTURE = smooth(900, 900, sigma=2.5)
 
 
 def lens(relative=False, baseline_mm=4.0):
-    return Lens.centered_at_half(MATRIX, relative, None if relative else baseline_mm)
+    return Lens.centered_at_half(MATRIX, WIDTH, relative, None if relative else baseline_mm)
 
 
 def height(x, y):

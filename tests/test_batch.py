@@ -137,6 +137,7 @@ def test_lines_of_a_list(tmp_path, make_tiny_sequence):
         ("DATA --resume\n", "line 1: --resume: expected options of what to train"),
         ("DATA --sed 3\n", "line 1: endoprior train"),
         ("DATA --end 3\n", "line 1: endoprior train"),
+        ("DATA --preset endonerf\n", "line 1: --preset: expected a method with Gaussians"),
     ],
 )
 def test_a_list_that_cannot_be_used(text, said, tiny_sequence, tmp_path, capsys):

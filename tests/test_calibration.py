@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from endoprior.core.checks import InputError
 from endoprior.prepare.calibration import check_pair
@@ -96,6 +97,24 @@ def test_one_camera(tmp_path):
     assert found.right is None and np.allclose(found.left.distortion, D1) and found.size is None
     with pytest.raises(InputError, match=r"expected both cameras, R and T, got one camera.*--layout mono"):
         check_pair(found, "c.yaml")
+
+
+@pytest.mark.parametrize(
+    "bent",
+    [
+        {"distortion_coefficients": D1},
+        {"dist": D1},
+        dict(zip(("k1", "k2", "p1", "p2", "k3"), D1, strict=True)),
+    ],
+)
+def test_distortion_next_to_single_numbers(tmp_path, bent):
+    path, numbers = tmp_path / "c.yaml", {"fx": 580, "fy": 582, "cx": 318.2, "cy": 255.1}
+    path.write_text(yaml.safe_dump(numbers | {name: np.asarray(value).tolist() for name, value in bent.items()}))
+    found = read_calibration(path)
+    assert np.allclose(found.left.distortion[:5], D1) and found.left.matrix[0, 2] == 318.7
+    with pytest.raises(InputError, match="k1 to be a number"):
+        path.write_text("{fx: 1, cx: 1, cy: 1, k1: x}")
+        read_calibration(path)
 
 
 def test_calibration_is_scaled_to_the_image_size(tmp_path):

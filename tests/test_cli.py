@@ -1,6 +1,7 @@
 """The command line: exit statuses, one-line error messages, and the main path from a folder to scores and a video."""
 
 import json
+import math
 import shutil
 
 import cv2
@@ -197,11 +198,22 @@ def test_render_of_chosen_times_and_a_camera_path(run, tmp_path, capsys):
     assert main(["render", str(folder), str(tmp_path / "b"), "--camera-path", str(path)]) == 0
     first, second = (cv2.imread(str(p)).astype(int) for p in sorted((tmp_path / "b" / "rgb").iterdir()))
     assert np.abs(first - second).mean() > 1, "moving the camera changed nothing"
-    moved[0, 0] = 2
-    path.write_text(json.dumps([{"time": 0.2, "world_to_camera": moved.tolist()}]))
-    capsys.readouterr()
-    assert main(["render", str(folder), str(tmp_path / "c"), "--camera-path", str(path)]) == 2
-    assert "path.json" in complaint(capsys)
+    stretched, unknown = np.diag([2.0, 1, 1, 1]), moved.copy()
+    unknown[0, 3] = math.nan
+    for matrix in (stretched.tolist(), unknown.tolist(), moved.ravel().tolist()):
+        path.write_text(json.dumps([{"time": 0.2, "world_to_camera": matrix}]))
+        capsys.readouterr()
+        assert main(["render", str(folder), str(tmp_path / "c"), "--camera-path", str(path)]) == 2
+        assert "path.json" in complaint(capsys)
+
+
+def test_a_scene_file_is_scored_beside_itself(run, tmp_path):
+    data, folder = run
+    (tmp_path / "sent").mkdir()
+    file = tmp_path / "sent/x.safetensors"
+    file.write_bytes((folder / "scene.safetensors").read_bytes())
+    assert main(["eval", str(file), "--data", str(data), "--no-networks"]) == 0
+    assert (tmp_path / "sent/metrics.json").exists()
 
 
 def test_render_writes_the_carried_grid_beside_the_input(run, tmp_path):

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from endoprior.cli import main
+from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.images import read_tool_mask
-from endoprior.data.mask_writing import replace_masks
+from endoprior.data.mask_writing import replace_masks, writable_masks
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.visualization.mask_sheet import mask_sheet
 
@@ -74,6 +75,48 @@ def test_a_folder_without_masks_gets_them(tmp_path):
     again = load_sequence(tmp_path, DataConfig())
     assert all((~again.frame(i).tissue_mask == mask).all() for i in range(3))
     assert not (tmp_path / "masks_before").exists()
+
+
+def forplane(folder):
+    """The layout whose left columns are cropped, with masks of the uncropped images."""
+    write(folder, "images", "masks", "gt_depth")
+    row = np.column_stack([np.eye(3), np.zeros(3), (48, 64, 70)]).ravel()
+    np.save(folder / "poses_bounds.npy", np.tile(np.append(row, (0, 1)), (3, 1)))
+
+
+def rectified(folder):
+    write(folder, "image01", "depth01")
+    (folder / "intrinsics.txt").write_text("70 0 32\n0 70 24\n0 0 1\n")
+
+
+def write(folder, *parts):
+    for part in parts:
+        (folder / part).mkdir(parents=True)
+        for i in range(3):
+            blank = np.zeros((48, 64, 3) if part.startswith("image") else (48, 64), np.uint8)
+            cv2.imwrite(str(folder / part / f"{i}.png"), blank)
+
+
+@pytest.mark.parametrize("make", [forplane, rectified])
+def test_a_dataset_whose_reader_takes_no_masks_of_this_size_stays_as_it_is(tmp_path, make, capsys, monkeypatch):
+    make(tmp_path / "DATA")
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    sequence = load_sequence(tmp_path / "DATA")
+    camera = sequence.camera(0)
+    with pytest.raises(InputError, match="one mask file per frame"):
+        replace_masks(sequence, dict.fromkeys(range(3), np.zeros((camera.height, camera.width), bool)))
+    monkeypatch.setattr("endoprior.tool_masks.sequence.find_in_sequence", lambda *args, **more: pytest.fail("searched"))
+    assert main(["masks", str(tmp_path / "DATA")]) == 2
+    assert "one mask file per frame" in capsys.readouterr().err
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+def test_new_masks_are_those_of_all_frames_at_full_size(tmp_path):
+    write(tmp_path, "images")
+    assert [file.name for file in writable_masks(load_sequence(tmp_path))] == ["0.png", "1.png", "2.png"]
+    for cfg in (DataConfig(shrink=2), DataConfig(first_frames=2), DataConfig(window="0-1")):
+        with pytest.raises(InputError, match="one mask file per frame"):
+            writable_masks(load_sequence(tmp_path, cfg))
 
 
 def test_the_sheet_tints_and_outlines_tools():

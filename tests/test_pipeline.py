@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from tiny_training import tiny_config
@@ -17,10 +18,15 @@ from endoprior.cli.run import resume_words
 from endoprior.cli.step_display import StepDisplay
 from endoprior.core.checks import InputError
 from endoprior.core.presets import preset
+from endoprior.data import load_sequence
+from endoprior.export.html import DEFAULT_TITLE
 from endoprior.model.scene_file import load_scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.pipeline import STEPS, make_job, notes_of, open_folder, problems, run_step
+from endoprior.pipeline.estimate import FRAMES as TRIAL_FRAMES
+from endoprior.pipeline.estimate import trial_options
 from endoprior.pipeline.steps import PREVIEW_TITLE
+from endoprior.prepare import prepare
 from endoprior.prepare.config import PrepareConfig
 from endoprior.system.atomic import write_json
 
@@ -139,6 +145,42 @@ def test_a_job_with_other_settings_does_not_take_the_folder(video, done, tmp_pat
         open_folder(replace(done, out=tmp_path))
 
 
+def test_the_trial_needs_no_files_for_its_few_frames(video, tmp_path):
+    for folder, value in (("masks", 0), ("depth", 70)):
+        (tmp_path / folder).mkdir()
+        for i in range(FRAMES):  # in order, by names without numbers
+            name = "a" * (i + 1)
+            cv2.imwrite(str(tmp_path / folder / f"{name}.png"), np.full((96, 128), value, np.uint8))
+    np.save(tmp_path / "poses.npy", np.tile(np.eye(4), (FRAMES, 1, 1)))
+    files = {"masks": str(tmp_path / "masks"), "depth": str(tmp_path / "depth"), "poses": str(tmp_path / "poses.npy")}
+    for relative in ("no", "disparity"):
+        options = PrepareConfig(**files, depth_unit_mm=1.0, depth_relative=relative, border="keep")
+        job = make_job(video, tmp_path / "out", options, tiny_config("basis"))
+        done = prepare(job.source, tmp_path / relative, trial_options(job))
+        assert done.num_frames == TRIAL_FRAMES < job.part.num_frames
+        assert load_sequence(done.out).frame(0).depth_valid.any()
+
+
+@pytest.mark.parametrize("option", ["calibration", "masks", "poses"])
+def test_a_job_whose_inputs_have_changed_does_not_take_the_folder(video, tmp_path, option):
+    given = tmp_path / "given"
+    file = given / "0.png" if option == "masks" else given
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(b"1")
+    value = given if option == "calibration" else str(given)
+    job = make_job(video, tmp_path / "out", PrepareConfig(**{option: value}), tiny_config("basis"), preview=True)
+    assert not open_folder(job) and open_folder(job)
+    file.write_bytes(b"22")
+    with pytest.raises(InputError, match=rf"got --{option}: given, which has changed\. Fix:"):
+        open_folder(job)
+    with pytest.raises(InputError, match=rf"got --{option}: stored .*given, given the default\. Fix:"):
+        open_folder(job_of(video, job.out))
+    stored = json.loads((job.out / "settings.json").read_text())
+    del stored["inputs"]  # as before this was compared
+    write_json(job.out / "settings.json", stored)
+    assert open_folder(job)
+
+
 @pytest.mark.slow
 def test_a_preview_says_that_it_is_one(video, done, tmp_path, monkeypatch):
     said = []
@@ -148,7 +190,7 @@ def test_a_preview_says_that_it_is_one(video, done, tmp_path, monkeypatch):
             (job.out / name).rename(tmp_path / name)
         for step in (STEPS[3], STEPS[5]):
             run_step(step, job, quiet)
-        said.append("Fall 7 (preview)" in job.player.read_text(encoding="utf-8"))
+        said.append(f"{DEFAULT_TITLE} (preview)" in job.player.read_text(encoding="utf-8"))
         for name in ("report.png", "player.html"):
             (tmp_path / name).replace(job.out / name)
     assert said == [PREVIEW_TITLE, True, False]
@@ -157,10 +199,10 @@ def test_a_preview_says_that_it_is_one(video, done, tmp_path, monkeypatch):
 def test_the_pages_name_every_file_that_names_the_video(done):
     files = [file for file in done.out.rglob("*") if file.is_file() and b"Fall 7" in file.read_bytes()]
     names = sorted(file.relative_to(done.out).as_posix() for file in files)
-    assert names == ["check.json", "data/prepare.json", "player.html", "settings.json"]
+    assert names == ["check.json", "data/prepare.json", "settings.json"]
     for page in ("README.md", "docs/run.md"):
         text = (ROOT / page).read_text(encoding="utf-8")
-        assert all(f"`{name}`" in text for name in names), page
+        assert all(f"`{name}`" in text for name in [*names, "notes.json"]), page  # a note may name it, too
 
 
 @pytest.mark.slow

@@ -110,6 +110,15 @@ def test_given_poses_scale_relative_depth(relative, tmp_path):
     assert described(folder)["sources"]["poses"] == "file"
 
 
+@pytest.mark.parametrize(("source", "kept"), [("file", True), ("SLAM", True), ("COLMAP", False)])
+def test_only_estimated_poses_are_replaced_without_a_copy(metric, tmp_path, source, kept):
+    folder = shutil.copytree(metric, tmp_path / "DATA")
+    facts = described(folder)
+    (folder / "sequence.json").write_text(json.dumps(facts | {"sources": facts["sources"] | {"poses": source}}))
+    assert main(["poses", str(folder), "--poses", "still"]) == 0
+    assert (folder / "poses_bounds_before.npy").exists() == kept
+
+
 def test_a_folder_without_poses(metric, tmp_path):
     folder = shutil.copytree(metric, tmp_path / "DATA")
     (folder / "poses_bounds.npy").unlink()

@@ -219,6 +219,15 @@ def test_inverted_masks_are_corrected(tmp_path, phantom):
         assert np.array_equal(mine.tissue_mask, true.tissue_mask)
 
 
+def test_masks_of_all_frames_fit_a_folder_that_lacks_some(tmp_path, phantom):
+    shutil.copytree(phantom / "images", tmp_path / "images")
+    (tmp_path / "images/000001.png").unlink()
+    done = prepare(tmp_path / "images", tmp_path / "out", options(phantom, layout="mono", depth="none"))
+    written = [cv2.imread(str(file), 0) for file in sorted((done.out / "masks").glob("*.png"))]
+    given = [cv2.imread(str(phantom / f"masks/{number:06d}.png"), 0) for number in (0, 2, 3, 4)]
+    assert all(np.array_equal(a, b) for a, b in zip(written, given, strict=True))
+
+
 def test_labels_are_blanked_and_only_the_record_names_the_video(tmp_path, phantom):
     cfg = options(phantom, layout="mono", blank=("10,20,50,15",))
     done = prepare(write_video(tmp_path / "SMITH_John.mkv", cameras(phantom)[0]), tmp_path / "out", cfg)
@@ -308,6 +317,11 @@ BAD = {
         "a folder with --depth",
     ),
     "no poses": lambda d, p: (p / "images", {"layout": "mono", "poses": "nowhere.npy"}, "camera poses"),
+    "blank outside": lambda d, p: (
+        p / "images",
+        {"layout": "mono", "blank": ("0,0,9,9", "250,0,9,9")},
+        "--blank: expected a rectangle within 256x192 px, got 250,0,9,9",
+    ),
     "crop outside": lambda d, p: (p / "images", {"layout": "mono", "crop": "0,0,999,9"}, "--crop"),
     "calibration of another camera": lambda d, p: (p / "images", {"layout": "side-by-side"}, "the same aspect ratio"),
 }

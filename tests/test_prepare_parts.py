@@ -68,6 +68,17 @@ def test_an_unknown_layout_is_an_error():
         find_layout(np.hstack([left, right]), None, False, "v")
 
 
+def test_one_camera_of_the_calibrated_size_is_not_taken_for_two():
+    left, right = pair()
+    with pytest.raises(InputError, match=r"v: expected two cameras in each frame, .* `--right VIDEO`"):
+        find_layout(left, stereo((96, 64)), False, "v")
+    half = np.hstack([cv2.resize(image, (48, 64), interpolation=cv2.INTER_AREA) for image in (left, right)])
+    assert find_layout(half, stereo((96, 64)), False, "v") == "side-by-side"  # then its aspect ratio is wrong
+    rows = left.copy()
+    rows[1::2] = right[1::2]
+    assert find_layout(rows, stereo((96, 64)), False, "v") == "interlaced"
+
+
 def geometry_of(size, calibration=None, **options):
     base = {"stereo": False, "name": "c", "field_of_view_degrees": 90.0, "max_width": 0}
     return make_geometry(size, calibration, **(base | options))
@@ -111,7 +122,7 @@ def test_masks_use_nearest_neighbor_at_either_size():
     geometry = geometry_of((200, 100), max_width=50)
     mask = np.random.default_rng(0).random((100, 200)) > 0.5
     assert geometry.size == (50, 25) and geometry.values(mask).shape == (25, 50) and geometry.values(mask).dtype == bool
-    small = np.zeros(geometry.size[::-1], np.float32)
+    small = np.zeros(geometry.size[::-1], np.float32)  # made on frames
     assert geometry.values(small) is small
 
 
@@ -149,8 +160,34 @@ def test_rectified_pair_has_equal_rows_and_the_true_disparity():
     both = inside[0] & inside[1]
     disparity = (rectified[0] - rectified[1])[both]
     assert both.sum() > 20 and np.abs(disparity[:, 1]).max() < 0.15
-    depth = geometry.matrix[0, 0] * geometry.baseline_mm / (disparity[:, 0] - geometry.center_shift_px)
+    depth = geometry.matrix[0, 0] * geometry.baseline_mm / disparity[:, 0]
     assert np.abs(depth / points[both, 2] - 1).max() < 0.03  # the rectified camera is turned by half a degree
+
+
+def test_a_pair_whose_images_have_their_centers_apart_is_shifted_together():
+    """Rows fit already; of a point infinitely far away both frames have the same column."""
+    left, right = (Intrinsics(np.array([[300.0, 0, cx], [0, 300, 120], [0, 0, 1]]), np.zeros(0)) for cx in (155, 171))
+    calibration = Calibration(left, right, np.eye(3), np.array([-4.0, 0, 0]))
+    geometry = geometry_of((320, 240), calibration, stereo=True)
+    columns = []
+    for camera in (left, right):
+        image = np.zeros((240, 320, 3), np.uint8)
+        at = int(camera.matrix[0, 2]) - 40
+        image[100:140, at - 3 : at + 3] = 200
+        seen = geometry.image(image, right=camera is right)[..., 0].astype(float)
+        columns.append((seen.sum(0) * (np.arange(seen.shape[1]) + 0.5)).sum() / seen.sum())
+    ray = geometry.matrix[0, 2] - 40 / 300 * geometry.matrix[0, 0]
+    assert np.allclose(columns, ray, atol=0.1) and geometry.baseline_mm == 4
+
+
+def test_masks_and_depth_of_the_source_are_undistorted_with_it():
+    bent = Intrinsics(np.array([[90.0, 0, 48], [0, 90, 32], [0, 0, 1]]), np.array([-0.3, 0, 0, 0]))
+    geometry, mask = geometry_of((96, 64), Calibration(bent)), np.zeros((64, 96), bool)
+    mask[5:20, 10:40] = True
+    assert geometry.size == (96, 64)
+    shown = geometry.image(np.repeat(np.uint8(255) * mask[..., None], 3, 2))[..., 0] > 127
+    assert (shown != mask).sum() > 30 and (geometry.values(mask) != shown).sum() < 10
+    assert set(np.unique(geometry.values(np.where(mask, np.float32(7), np.float32(3))))) == {3, 7}
 
 
 def test_a_rectangle_must_be_inside_the_image():
@@ -174,6 +211,27 @@ def test_files_are_matched_to_frames(tmp_path, names, indices, want):
         (tmp_path / f"{name}.png").touch()
     (tmp_path / "notes.txt").touch()
     assert {i: path.stem for i, path in match_files(tmp_path, (".png",), "masks", indices).items()} == want
+
+
+@pytest.mark.parametrize(
+    ("images", "files", "indices", "want"),
+    [
+        ([10, 11, 13], range(30), [0, 1, 2], [10, 11, 13]),  # by their numbers
+        ([10, 11, 13], [10, 11, 13], [1, 2], [11, 13]),  # as many as images: in order
+        (range(1, 9), range(8), [2, 3], [2, 3]),
+        (range(1, 9), range(1, 20), [2, 3], [3, 4]),
+        ([7, 7, 7], range(5), [0, 1], [0, 1]),  # one number says nothing
+    ],
+)
+def test_files_are_matched_to_the_numbers_of_images(tmp_path, images, files, indices, want):
+    for number in files:
+        (tmp_path / f"m{number:04d}.png").touch()
+    names = [f"{letter}{number}" for letter, number in zip("abcdefgh", images, strict=False)]
+    found = match_files(tmp_path, (".png",), "masks", indices, names)
+    assert [int(found[i].stem[1:]) for i in indices] == want
+    if want[0] == 10:
+        with pytest.raises(InputError, match="none numbered 40"):
+            match_files(tmp_path, (".png",), "masks", indices, [*names[:2], "c40"])
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,12 @@
 """`prepare.json`: what it holds, from frame to source, and damaged files. Ranges of frames as text."""
 
 import json
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from endoprior.check.remake import find_remakes
 from endoprior.core.checks import InputError, read_ranges
 from endoprior.core.config import DataConfig
 from endoprior.core.options import changed_options, command_of
@@ -33,10 +35,32 @@ def test_a_record_comes_back(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "is_text"),
+    [
+        ("Screen Recording 9.41\u202fAM.mp4", True),
+        ("手術\u30001.mp4", True),
+        ("a\xa0b.mp4", True),
+        ("caf\udce9.mp4", False),
+    ],
+)
+def test_names_of_videos_are_read_as_they_are(tiny_sequence, tmp_path, name, is_text):
+    video = tmp_path / name
+    with suppress(OSError):  # macOS has no names that are no text
+        video.touch()
+    record = PrepareRecord(str(video), {}, PLAIN.source_size, PLAIN.source_px)
+    record.save(tiny_sequence)
+    assert read_record(tiny_sequence) == record
+    remakes = find_remakes(load_sequence(tiny_sequence), {}, DataConfig())
+    assert bool(remakes.from_video) == is_text
+    assert remakes.best.command({}).encode("utf-8")  # can be printed
+
+
+@pytest.mark.parametrize(
     "change",
     [
         {"video": 3},
         {"video": "a\nb"},
+        {"video": "a\u2028b"},
         {"options": {"crop": ["1"]}},
         {"options": {"--crop": "1"}},
         {"options": {"--crop": ["\x1b[2J"]}},
@@ -90,3 +114,5 @@ def test_skipped_frames_are_counted_after_striding(tiny_sequence):
     assert sequence.fingerprint() != load_sequence(tiny_sequence).fingerprint()
     with pytest.raises(InputError, match=r"shorten data\.skip_frames"):
         load_sequence(tiny_sequence, DataConfig(skip_frames="1-16"))
+    with pytest.raises(InputError, match=r"data\.skip_frames: expected frames that leave some of 0 to 16, got 0-99\."):
+        load_sequence(tiny_sequence, DataConfig(skip_frames="0-99"))

@@ -11,6 +11,7 @@ import pytest
 from reader_checks import assert_rejected, edit_json, remark_with
 from sequence_edits import write
 
+from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.scared import dataset_number, disparity_to_depth, tissue_from_depth
@@ -158,6 +159,11 @@ def test_a_point_keeps_its_place_in_the_world(keyframe):
     point = np.array([3.0, -4, 60, 1])  # in the first camera, which is the world
     original = world_to_camera(7) @ np.linalg.inv(world_to_camera(0)) @ point
     np.testing.assert_allclose(seq.camera(7).world_to_camera @ point, original, atol=1e-10)
+
+
+def test_skipping_every_frame_is_an_error(keyframe):
+    with pytest.raises(InputError, match=r"data\.skip_frames: expected frames that leave some of 0 to 8, got 0-8\."):
+        load_sequence(keyframe, DataConfig(stride=1, skip_frames="0-8"))
 
 
 def test_fingerprint_follows_the_kept_frames(keyframe):

@@ -30,8 +30,8 @@ def flat(disparity: float) -> np.ndarray:
     return np.full((HEIGHT, WIDTH), disparity, np.float32)
 
 
-def measure(pair: tuple[np.ndarray, np.ndarray], shift: float = 0.0, **options: float):
-    return stereo_depth(*pair, FOCAL, BASELINE, StereoConfig(**options), shift)
+def measure(pair: tuple[np.ndarray, np.ndarray], **options: float):
+    return stereo_depth(*pair, FOCAL, BASELINE, StereoConfig(**options))
 
 
 @pytest.mark.parametrize("disparity", [6.0, 9.3, 12.5])
@@ -114,15 +114,6 @@ def test_highlights_halve_the_confidence():
     assert shiny[58:62, 90:98].max() <= 0.5 < plain[58:62, 90:98].min()
 
 
-def test_center_shift_is_subtracted():
-    depth = measure(cameras(flat(9.0 - 4.0), tissue()), shift=-4.0).depth
-    assert abs(np.median(depth[8:-8, 20:-8]) - PRODUCT / 9) < 0.5
-    # Rectified to converge: near tissue has negative disparity.
-    depth = measure(cameras(flat(9.0 - 14.0), tissue()), shift=-14.0).depth
-    assert abs(np.median(depth[8:-8, 8:-20]) - PRODUCT / 9) < 0.5
-    assert (depth[8:-8, -10:-7] > 0).all() and not depth[:, -4:].any()
-
-
 def test_depth_stays_in_range():
     depth = measure(cameras(flat(12.0), tissue()), near_mm=60, far_mm=200).depth  # the wall stands at 50 mm
     assert ((depth == 0) | ((depth >= 60) & (depth <= 200))).all()
@@ -196,9 +187,9 @@ def test_impossible_geometry_is_an_error():
     pair = cameras(flat(9.0), tissue())
     with pytest.raises(ValueError, match="far_mm"):
         stereo_depth(*pair, 1e5, BASELINE)
-    for focal, baseline, shift in ((np.nan, 4, 0), (150, np.nan, 0), (150, 0, 0), (150, 4, np.nan)):
+    for focal, baseline in ((np.nan, 4), (150, np.nan), (150, 0)):
         with pytest.raises(ValueError):
-            stereo_depth(*pair, focal, baseline, None, shift)
+            stereo_depth(*pair, focal, baseline)
 
 
 def test_temporal_median_reduces_noise_and_keeps_motion():

@@ -31,6 +31,8 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ffmpeg(*moving_pattern(4), *H264, folder / "b_frames.avi")
     ffmpeg("-i", whole, "-c", "copy", folder / "clock_of_600.avi")
     ffmpeg("-i", whole, "-c", "copy", folder / "whole.mkv")
+    ffmpeg("-itsoffset", "0.52", "-i", whole, "-c", "copy", folder / "late.mkv")
+    ffmpeg("-i", whole, "-c", "copy", "-output_ts_offset", "18000", folder / "late.ts")
     ffmpeg(*moving_pattern(1), "-c:v", "libvpx-vp9", "-b:v", "300k", folder / "whole.webm")
     return folder
 
@@ -46,6 +48,7 @@ INTACT = {
     "b_frames.avi": (100, ""),
     "clock_of_600.avi": (100, "announces 2400 images, 100 can be decoded"),
     "whole.mkv": (100, ""),
+    "late.mkv": (100, ""),
     "whole.webm": (25, ""),
 }
 """Number of images, and the note."""
@@ -58,6 +61,13 @@ def test_an_intact_file_is_used_to_its_end(clips, name):
     count, note = INTACT[name]
     assert len(seconds) == count and source.note == (note and f"{name} {note}")
     assert min(np.diff(seconds)) > 0.039  # in the order of their display: no image would be left out
+
+
+@pytest.mark.parametrize("name", ["whole.mp4", "late.mp4", "late.mkv", "late.ts", "whole.mkv"])
+def test_the_duration_counts_from_the_first_image(clips, name):
+    source = open_source(clips / name)
+    assert source.seconds == pytest.approx(4)
+    assert [image.seconds for image in source] == pytest.approx(np.arange(100) / 25)
 
 
 @pytest.mark.parametrize("name", ["b_frames.avi", "clock_of_600.avi"])

@@ -149,6 +149,11 @@ def test_a_video_follows_the_frames_or_the_saved_views():
     assert [place.frame for place in path] == [2, 3, 4, 5, 6, 5]
     assert [place.camera.center[0] for place in path] == pytest.approx([0, 2.5, 5, 7.5, 10, 0])
     assert len({(place.camera.width, place.camera.height) for place in path}) == 1
+    wide = replace(CAMERA, width=2 * CAMERA.width, height=2 * CAMERA.height, fy=2 * CAMERA.fy)
+    path = interpolate([PathPoint(0, CAMERA), PathPoint(2, wide), PathPoint(4, wide)])
+    assert {(place.camera.width, place.camera.height, place.camera.fy) for place in path} == {
+        (CAMERA.width, CAMERA.height, CAMERA.fy)
+    }, "views of browsers of other sizes"
 
 
 def test_the_nearest_point_is_on_top():
@@ -184,9 +189,11 @@ def test_an_occupied_address_is_an_error():
         taken.listen()
         with pytest.raises(InputError, match="--port 0"):
             check_address("127.0.0.1", taken.getsockname()[1])
-    for host, port in (("127.0.0.1", 70000), ("192.0.2.7", 0), ("no such host", 0), ("x" * 300, 0)):
-        with pytest.raises(InputError):
-            check_address(host, port)
+    with pytest.raises(InputError, match="--port"):
+        check_address("127.0.0.1", 70000)
+    for host in ("192.0.2.7", "no such host", "x" * 300):
+        with pytest.raises(InputError, match="Correct --host"):
+            check_address(host, 0)
     check_address("127.0.0.1", 0)
 
 

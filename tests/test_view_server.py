@@ -82,6 +82,14 @@ def test_the_image_equals_the_rendering_of_the_scene(scene):
     assert viewable.surface(settings, CAMERA)[24, 32] == pytest.approx(50, abs=1e-3)
 
 
+def test_so_it_does_on_the_white_background_of_some_methods(scene, monkeypatch):
+    black = scene.render(3 / NUM_FRAMES).color.numpy()
+    monkeypatch.setattr(type(scene), "background", (1.0, 1.0, 1.0))
+    white = scene.render(3 / NUM_FRAMES).color.numpy()
+    assert np.abs(white - black).max() > 0.01, "two levels of 255 and more"
+    assert np.array_equal(ViewableScene(scene, "wall").picture(ViewSettings(frame=3), CAMERA), to_u8(white))
+
+
 def test_the_slider_changes_the_image(viewer, client, scene):
     client.set(viewer.panel.frame, 5)
     expected = to_u8(scene.render(5 / NUM_FRAMES).color.numpy())

@@ -17,7 +17,7 @@ from ..core.types import Camera
 from ..data import FrameSequence
 from ..data.files import entries
 from ..data.load import find_format
-from ..data.prepare_record import PrepareRecord, read_record
+from ..data.prepare_record import SURROGATES, PrepareRecord, read_record
 
 FROM_FRAMES = ("endonerf", "plain")
 """Layouts whose files `prepare` reads with their meaning unchanged."""
@@ -50,7 +50,7 @@ class Remakes:
     record: PrepareRecord | None
     """Of the `prepare` that made the folder."""
     from_video: Remake | None
-    """Repeats that `prepare`; None if the video is not known or not there any more."""
+    """Repeats that `prepare`; None if the video is not known or not there any more, or its path is no text."""
     from_frames: Remake | None
     """Keeps frames, depth, masks and poses as they are; None for layouts that `prepare` would misread."""
 
@@ -86,7 +86,7 @@ def find_remakes(sequence: FrameSequence, described: Mapping[str, Any], cfg: Dat
     path = sequence.path
     record, out = read_record(path), _new_folder(path)
     from_video = from_frames = None
-    if record and Path(record.video).exists():
+    if record and SURROGATES not in record.categories and Path(record.video).exists():
         from_video = Remake(Path(record.video), out, record.options)
     if find_format(path, cfg) in FROM_FRAMES:
         options = _options_of_frames(path, sequence, described, cfg)

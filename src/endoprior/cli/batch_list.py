@@ -17,7 +17,7 @@ from ..pipeline import Entry, SequenceJob
 from .devices import with_device
 from .options import option_name
 from .parsing import parse
-from .run import HELP, Run, job_of
+from .run import HELP, Run, job_of, require_gaussians
 from .train import arguments
 
 NAME = re.compile(r"[^\W_][\w .+-]*")
@@ -110,6 +110,7 @@ def _job(line: Line, out: Path, tell: Callable[[str], None]) -> SequenceJob:
     if not is_sequence(line.path):
         return job_of(parse(Run, argv, "run", HELP), tell)
     args = arguments(argv)
+    require_gaussians(args.config, "`train`, `eval` and `render` one after the other.")
     return SequenceJob(line.path, out, with_device(args.config, args.device, tell), _typed(line.options))
 
 

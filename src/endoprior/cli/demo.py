@@ -43,9 +43,11 @@ def run(argv: list[str]) -> None:
     from ..runs.folder import prepare_run_folder
     from ..runs.report import write_report
     from .render import Render, render
+    from .run import require_gaussians
     from .train import train_and_evaluate
 
     phantom, cfg = PhantomConfig(frames=args.frames, seed=args.seed), replace(preset(args.preset), seed=args.seed)
+    require_gaussians(cfg, "Leave --preset out.")
     prepare_run_folder(args.out, resume=False)
     began = clock.perf_counter()
     data, folder = args.out / "sequence", args.out / "run"

@@ -92,13 +92,12 @@ def run(argv: list[str]) -> None:
         option = f"--{given[0].replace('_', '-')}"
         raise input_error(option, "--pictures beside it", "a run", f"Remove {option}, or add --pictures FOLDER.")
     scene = open_scene(args.run)
-    require_writable_folder(
-        "--out" if args.out else "RUN", args.out or (args.run if args.run.is_dir() else args.run.parent)
-    )
-    data = args.data or sequence_of_run(args.run)
+    run = args.run if args.run.is_dir() else args.run.parent
+    out = args.out or run
+    require_writable_folder("--out" if args.out else "RUN", out)
+    data = args.data or sequence_of_run(run)
     scene = on_device(scene, args.device)
-    out = args.out or args.run
-    evaluate_run(scene, args.run, data, out, args.split, args.networks, args.weights_dir, extra={}, protocols=protocols)
+    evaluate_run(scene, run, data, out, args.split, args.networks, args.weights_dir, extra={}, protocols=protocols)
 
 
 def evaluate_run(

@@ -45,13 +45,14 @@ def run(argv: list[str]) -> None:
     args = parse(Masks, argv, "masks", HELP)
     from ..core.config import DataConfig
     from ..data import load_sequence
-    from ..data.mask_writing import note_found_masks, replace_masks
+    from ..data.mask_writing import note_found_masks, replace_masks, writable_masks
     from ..system.atomic import write_json
     from ..tool_masks.sequence import find_in_sequence
     from ..visualization.image_tools import write_png
     from ..visualization.mask_sheet import mask_sheet
 
     sequence = load_sequence(args.data, DataConfig())
+    writable_masks(sequence)
     shown = set(spread(len(sequence), SHOWN))
     masks, rows, pictures, uncertain = {}, [], [], []
     with Counting() as progress:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from ..core.checks import input_error
+from ..core.config import Config
 from ..core.methods import method_named
 from ..core.options import command_of
 from ..core.presets import PresetName, preset
@@ -126,11 +127,19 @@ def job_of(args: Run, tell: Callable[[str], None]) -> Job:
     from ..pipeline import make_job
 
     cfg = replace(preset("preview" if args.preview else args.preset), seed=args.seed)
-    if not method_named(cfg.method).has_gaussians:
-        fix = f"`{command('prepare', args.video, 'DATA')}`, then `train`, `eval` and `render`."
-        raise input_error("--preset", "a method with Gaussians, which all steps need", args.preset, fix)
+    require_gaussians(cfg, f"`{command('prepare', args.video, 'DATA')}`, then `train`, `eval` and `render`.")
     cfg = with_device(cfg, args.device, tell)
     return make_job(args.video, args.out, args.config, cfg, preset=args.preset, preview=args.preview)
+
+
+def require_gaussians(cfg: Config, fix: str) -> None:
+    """Reject a method without Gaussians: the report and the player need them.
+
+    Raises:
+        InputError: with this `fix`.
+    """
+    if not method_named(cfg.method).has_gaussians:
+        raise input_error("--preset", "a method with Gaussians, which all steps need", cfg.method, fix)
 
 
 def _whole_command(job: Job) -> str:

@@ -32,11 +32,17 @@ def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1) -> list[int]:
         count: frames in the folder.
         cfg: `stride`, `first_frames`, which counts frames after striding, and `skip_frames`, which counts what is left.
         own_stride: the dataset's published stride, used where `cfg.stride` is 0.
+    Raises:
+        InputError: `skip_frames` leaves none.
     """
     kept = range(0, count, cfg.stride or own_stride)
     kept = kept[: cfg.first_frames] if cfg.first_frames else kept
     skipped = read_ranges("skip_frames", cfg.skip_frames)
-    return [frame for position, frame in enumerate(kept) if position not in skipped]
+    left = [frame for position, frame in enumerate(kept) if position not in skipped]
+    if kept and not left:
+        want = f"frames that leave some of 0 to {len(kept) - 1}"
+        raise input_error("data.skip_frames", want, cfg.skip_frames, "shorten it, or leave it out for all frames.")
+    return left
 
 
 def assemble(
@@ -54,6 +60,7 @@ def assemble(
     remarks: list[str] | None = None,
     mask_folder: str = "masks",
     mask_files: list[Path] | None = None,
+    new_mask_files: list[Path] | None = None,
     mask_tool_value: int = 255,
     depth_is_relative: bool = False,
     sources: dict[str, str] | None = None,
@@ -70,7 +77,7 @@ def assemble(
         clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where the extremes of depth are
             reliable, because it was measured or rendered.
         frames_per_second, truth, right_eye, remarks, mask_folder, depth_is_relative, sources: see `FrameSequence`.
-        mask_files, mask_tool_value: see `FrameSequence`; at full size.
+        mask_files, new_mask_files, mask_tool_value: see `FrameSequence`; at full size.
     Raises:
         InputError: fewer than 2 frames or no pixel would be left, or a camera has impossible numbers.
     """
@@ -97,6 +104,7 @@ def assemble(
         frames_per_second=frames_per_second,
         mask_folder=mask_folder,
         mask_files=mask_files if cfg.shrink == 1 else None,
+        new_mask_files=new_mask_files if cfg.shrink == 1 else None,
         mask_tool_value=mask_tool_value,
         images=images,
         files=[*images, *files, *(right_eye.files if right_eye else [])],

@@ -13,6 +13,7 @@ LEAST, MOST = 1e-6, 1e6
 TOOLS_FOUND = "tools found"
 """Part of the source of masks that a program found: "tools found in 70% of the samples", "no tools found"."""
 OWN_POSES, COLMAP_POSES = "our own tracks", "COLMAP"
+ESTIMATED_POSES = (OWN_POSES, COLMAP_POSES)
 """Sources of poses that a program found in the video."""
 FORMAT_VERSION = 1
 """Newest `format_version` this program can read; a file without one is of version 1."""

@@ -24,19 +24,14 @@ def replace_masks(sequence: FrameSequence, masks: Mapping[int, NDArray[np.bool_]
     """Write masks to their files. The first original of each is kept in a folder `masks_before` beside them.
 
     Args:
-        sequence: if it has no mask files yet, a folder `masks` is made; `masks` must then hold every frame.
+        sequence: if it has no mask files yet, their folder is made; `masks` must then hold every frame.
         masks: by frame, (H, W) True on tools.
     Raises:
-        InputError: the folder is read-only, the sequence is of a dataset without mask files, or the disk rejects a
-            file; masks written before it stay written.
+        InputError: as `writable_masks`, or the disk rejects a file; masks written before it stay written.
     """
-    files = sequence.mask_files or _new_files(sequence, len(masks))
+    files = writable_masks(sequence)
     folder = files[0].parent
     kept = folder.with_name(f"{folder.name}_before")
-    for place in (folder, folder.parent):
-        if place.exists() and not os.access(place, os.W_OK):
-            fix = "Copy the data folder to a place of your own, and use the copy."
-            raise input_error(place, "a folder that can be written", "a read-only one", fix)
     folder.mkdir(exist_ok=True)
     for frame, mask in masks.items():
         file, original = files[frame], kept / files[frame].name
@@ -46,6 +41,23 @@ def replace_masks(sequence: FrameSequence, masks: Mapping[int, NDArray[np.bool_]
         write_mask(file, mask, sequence.mask_tool_value)
     if kept.exists():
         write_json(kept / NOTE, changes(kept, folder, sequence.mask_tool_value))
+
+
+def writable_masks(sequence: FrameSequence) -> list[Path]:
+    """The PNG of each frame's mask; they need not exist yet. Called before long work, too.
+
+    Raises:
+        InputError: the layout does not read masks from files of the frames' size, or the folder is read-only.
+    """
+    files = sequence.mask_files or sequence.new_mask_files
+    if not files:
+        fix = "Convert it to a sequence folder, or make a video of it for `endoprior prepare`."
+        raise input_error(sequence.path, "a sequence folder with one mask file per frame", "another dataset", fix)
+    for place in (files[0].parent, files[0].parent.parent):
+        if place.exists() and not os.access(place, os.W_OK):
+            fix = "Copy the data folder to a place of your own, and use the copy."
+            raise input_error(place, "a folder that can be written", "a read-only one", fix)
+    return files
 
 
 def write_mask(file: Path, mask: NDArray[np.bool_], tool_value: int) -> None:
@@ -69,13 +81,6 @@ def note_found_masks(folder: Path, with_tools: float) -> None:
     described = read_description(path)
     source = f"{TOOLS_FOUND} in {with_tools:.0%} of the frames" if with_tools else f"no {TOOLS_FOUND}"
     write_json(path, described | {"sources": described.get("sources", {}) | {"masks": source}})
-
-
-def _new_files(sequence: FrameSequence, count: int) -> list[Path]:
-    if count != len(sequence.image_names):
-        fix = "Convert it to a sequence folder, or make a video of it for `endoprior prepare`."
-        raise input_error(sequence.path, "a sequence folder with one mask file per frame", "another dataset", fix)
-    return [sequence.path / "masks" / f"{name}.png" for name in sequence.image_names]
 
 
 def changes(kept: Path, folder: Path, tool_value: int) -> dict[str, dict[str, int]]:

@@ -60,6 +60,7 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
         remarks.append(f"{path}: no focal length given, {ASSUMED_FOCAL:g} image widths ({focal:g} px) are assumed")
     shape = (width, height, *intrinsics_of(path / "sequence.json", described, width, height, ASSUMED_FOCAL * width))
     kept = kept_frames(len(images), cfg)
+    new_masks = [] if masks or len(kept) < len(images) else [path / "masks" / f"{image.stem}.png" for image in images]
     size, tool_value = (width, height), described.get("mask_tool_value", 255)
     relative = described.get("depth_relative", not unit)
     right_eye = open_right_eye(path, images, kept, size, described, cfg.shrink, remarks, relative=relative)
@@ -84,6 +85,7 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
         remarks=remarks,
         mask_folder=mask_folder,
         mask_files=masks,
+        new_mask_files=new_masks,
         mask_tool_value=tool_value,
         depth_is_relative=relative,
         sources=described.get("sources"),

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -21,6 +22,10 @@ from .files import read_json
 
 RECORD = "prepare.json"
 OPTION = re.compile(r"--[a-z][a-z0-9.-]*")
+CONTROLS = {"Cc", "Zl", "Zp"}
+"""Unicode categories of characters that no path or option has: control characters and line separators."""
+SURROGATES = "Cs"
+"""That of bytes in a path that are no text: it can be opened, but not printed."""
 EDGE_POINTS = 65
 """Points along each edge of a rectangle that are taken to the source."""
 
@@ -41,6 +46,12 @@ class PrepareRecord:
     def save(self, folder: Path) -> None:
         """Write `prepare.json`."""
         write_json(folder / RECORD, asdict(self))
+
+    @property
+    def categories(self) -> set[str]:
+        """Unicode categories of all characters of the video's path and of the options."""
+        words = [self.video, *(word for words in self.options.values() for word in words)]
+        return {unicodedata.category(character) for word in words for character in word}
 
     def crop(self, left: float, top: float, right: float, bottom: float) -> tuple[int, int, int, int]:
         """x, y, width, height of the largest source rectangle that shows nothing outside a part of the frame.
@@ -77,9 +88,8 @@ def read_record(folder: Path) -> PrepareRecord | None:
         record = from_dict(PrepareRecord, read_json(file, fix), "record")
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
-    words = [record.video, *(word for words in record.options.values() for word in words)]
-    if not all(OPTION.fullmatch(name) for name in record.options) or not all(word.isprintable() for word in words):
-        raise input_error(file, "names of options and printable text", "something else", fix)
+    if not all(OPTION.fullmatch(name) for name in record.options) or record.categories & CONTROLS:
+        raise input_error(file, "names of options and text in one line", "something else", fix)
     shape = [len(record.source_px), *{len(row) for row in record.source_px}]
     pairs = all(len(point) == 2 for row in record.source_px for point in row)
     if len(shape) != 2 or min(shape) < 2 or not pairs or min(record.source_size) < 1:

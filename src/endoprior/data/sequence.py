@@ -21,7 +21,7 @@ from ..core.config import DataConfig
 from ..core.types import Camera, Frame
 from ..footage.right_view import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
-from .description import COLMAP_POSES, OWN_POSES, TOOLS_FOUND
+from .description import ESTIMATED_POSES, TOOLS_FOUND
 from .right_eye import RightEye
 from .truth import Truth
 
@@ -59,6 +59,7 @@ class FrameSequence:
         remarks: list[str] | None = None,
         mask_folder: str = "masks",
         mask_files: list[Path] | None = None,
+        new_mask_files: list[Path] | None = None,
         mask_tool_value: int = 255,
         depth_is_relative: bool = False,
         sources: dict[str, str] | None = None,
@@ -77,6 +78,7 @@ class FrameSequence:
             remarks: what is unusual but usable, one line each.
             mask_folder: name of the folder of the masks, for messages.
             mask_files: the PNG of each frame's mask at the size of the frame; None if there are no such files.
+            new_mask_files: where there are none: the PNG of each frame that becomes its mask if all of them are made.
             mask_tool_value: value of tools in these files, 255 or 0.
             depth_is_relative: the scale of depth is unknown or assumed, so that lengths are not in mm.
             sources: origin of each part, such as {"depth": "stereo"}.
@@ -89,6 +91,7 @@ class FrameSequence:
         self.image_names = [image.stem for image in images or []]
         """Name of each frame's color image, without its suffix; empty if frames are not files of their own."""
         self.mask_files, self.mask_tool_value = list(mask_files or []), mask_tool_value
+        self.new_mask_files = list(new_mask_files or [])
         self._cameras = cameras
         self._read_frame = read_frame
         self.files = list(files or [])
@@ -113,7 +116,7 @@ class FrameSequence:
     @property
     def poses_are_estimated(self) -> bool:
         """Whether a program found the camera's path in the video."""
-        return self.sources.get("poses") in (OWN_POSES, COLMAP_POSES)
+        return self.sources.get("poses") in ESTIMATED_POSES
 
     @property
     def mask_folder(self) -> str:
@@ -200,6 +203,7 @@ class FrameSequence:
         view._read_frame = lambda index: replace(self._read_frame(start + index), index=index, time=index / num)
         view._cache = BoundedCache(cache_bytes(), _frame_bytes)
         view.image_names, view.mask_files = self.image_names[start:stop], self.mask_files[start:stop]
+        view.new_mask_files = []  # the reader wants those of all frames
         view.truth, view.right_eye = None, self.right_eye and self.right_eye.part(start, stop)
         return view
 

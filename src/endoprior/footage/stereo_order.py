@@ -42,12 +42,11 @@ class StereoOrder:
         return self.exchanged > self.as_given + CLEARLY
 
 
-def stereo_order(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8], center_shift_px: float = 0.0) -> StereoOrder:
+def stereo_order(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> StereoOrder:
     """Match a rectified pair as given and swapped. In the correct order all disparities are positive.
 
     Args:
         left_u8, right_u8: (H, W, 3) rectified images, 0..255.
-        center_shift_px: cx_left - cx_right, the disparity of infinity, px.
     Returns:
         the share of pixels that pass the left-right consistency check, in either order.
     Raises:
@@ -58,8 +57,7 @@ def stereo_order(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8], center
     scale = min(1.0, LOOK_WIDTH / width)
     size = max(round(width * scale), 1), max(round(height * scale), 1)
     left, right = (cv2.resize(camera, size, interpolation=cv2.INTER_AREA) for camera in (left, right))
-    shift = center_shift_px * scale
-    return StereoOrder(_explained(left, right, shift), _explained(right, left, -shift))
+    return StereoOrder(_explained(left, right), _explained(right, left))
 
 
 def vertical_offset_px(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> float:
@@ -93,10 +91,9 @@ def _gray(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> tuple[NDAr
     return cv2.cvtColor(left_u8, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right_u8, cv2.COLOR_RGB2GRAY)
 
 
-def _explained(left: NDArray[np.uint8], right: NDArray[np.uint8], shift: float) -> float:
+def _explained(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float:
     """Share of the left image's pixels that pass the left-right consistency check with positive disparity."""
-    # Exclude the disparity of infinity, which black margins and burned-in text have in either order.
-    lowest = int(np.floor(shift)) + 1
-    highest = lowest + max(int(NEAREST_SHARE * left.shape[1]), 16)
-    apart = disagreement(*match_both_ways(left, right, lowest, highest, BLOCK_PX))
+    # Exclude 0, the disparity of infinity, which black margins and burned-in text have in either order.
+    highest = 1 + max(int(NEAREST_SHARE * left.shape[1]), 16)
+    apart = disagreement(*match_both_ways(left, right, 1, highest, BLOCK_PX))
     return float((apart <= AGREE_PX).mean())

@@ -44,7 +44,9 @@ def load_scene(path: str | Path) -> RenderedScene:
     path = Path(path)
     file = path / "scene.safetensors" if os.path.isdir(path) else path
     if not os.path.isfile(file):  # of a name too long for the system pathlib would raise
-        raise input_error(file, "a trained scene", "none", f"`{command('train', 'DATA', path)}`.")
+        stopped = os.path.isfile(path / "config.json")  # of a run, written first
+        finish = command("train", "--resume", path) if stopped else command("train", "DATA", path)
+        raise input_error(file, "a trained scene", "an unfinished run" if stopped else "none", f"`{finish}`.")
     arrays, about = load_arrays(file, {FORMAT: scene_schema, windowed_scene.FORMAT: index_schema}, NEXT_STEP)
     with rejecting(file, "a scene", NEXT_STEP):
         facts = from_dict(SceneFacts, {name: value for name, value in about.items() if name != "format"}, "about")

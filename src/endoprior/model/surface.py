@@ -22,7 +22,7 @@ class Surface:
     depth: NDArray[np.float32]
     """(H, W) z, mm; 0 where no surface is rendered."""
     color: NDArray[np.float32]
-    """(H, W, 3) in [0, 1], without the black background; 0 where no surface is rendered."""
+    """(H, W, 3) in [0, 1], without the background; 0 where no surface is rendered."""
     camera: Camera
 
 
@@ -31,7 +31,8 @@ def render_surface(scene: Scene, time: float, camera: Camera, min_alpha: float =
     out = scene.render(time, camera)
     alpha = out.alpha.cpu().numpy()
     opaque = alpha[..., None] >= min_alpha
-    color = np.where(opaque, out.color.cpu().numpy() / np.where(opaque, alpha[..., None], 1), 0)
+    behind = (1 - alpha[..., None]) * np.asarray(scene.background, np.float32)
+    color = np.where(opaque, (out.unclamped_color.cpu().numpy() - behind) / np.where(opaque, alpha[..., None], 1), 0)
     depth = expected_depth(out.depth.cpu().numpy(), alpha, min_alpha)
     return Surface(depth, color.clip(0, 1).astype(np.float32), camera)
 

@@ -21,8 +21,10 @@ from ..model.method import method_of
 from ..prepare import prepare
 from ..prepare.camera_path.choose import colmap_seconds
 from ..prepare.camera_path.sequence_path import METHODS, ONLY_IF_MOVING, WITHOUT_COLMAP
+from ..prepare.config import PrepareConfig
 from ..prepare.first_pass import SAMPLES
 from ..prepare.frames import REACH
+from ..prepare.record import names_path
 from ..prepare.source import open_source
 from ..training.trainer import Trainer
 from .job import Job
@@ -125,11 +127,7 @@ def scaled(trial: Trial, cfg: Config, num_frames: int, num_images: int, colmap: 
 
 def _measure(job: Job, folder: Path) -> Trial:
     """Do every step on the first frames, in `folder`."""
-    part = job.part
-    end = part.start + (FRAMES - 0.5) / part.frames_per_second
-    # On few frames COLMAP takes another time than its share: `seconds_of_colmap`.
-    poses = WITHOUT_COLMAP.get(job.prepare.poses, job.prepare.poses) if seconds_of_colmap(job) else job.prepare.poses
-    short = replace(job, out=folder, prepare=replace(job.prepare, end=min(end, job.prepare.end), poses=poses))
+    short = replace(job, out=folder, prepare=trial_options(job))
     folder.mkdir(parents=True)
     stamps = Stamps()
     source = open_source(job.source, job.prepare.folder_rate)
@@ -139,7 +137,7 @@ def _measure(job: Job, folder: Path) -> Trial:
     looked, followed = stamps.at["looking through"][0], stamps.at["following the camera"][0]
     learned, write = stamps.at["learning tools and light"][0], stamps.step("writing frames")
 
-    cfg = shortened(job.cfg, part.num_frames)
+    cfg = shortened(job.cfg, job.part.num_frames)
     trainer = method_of(cfg).trainer(load_sequence(short.data, cfg.data), cfg)
     start, _ = _timed(partial(_start, trainer))
     iterations = [_timed(trainer.step)[0] for _ in range(2 * ITERATIONS + 2)]
@@ -166,6 +164,19 @@ def _measure(job: Job, folder: Path) -> Trial:
         rendered_video=stamps.step("rendering"),
         player=player,
     )
+
+
+def trial_options(job: Job) -> PrepareConfig:
+    """Options of `prepare` for the first `FRAMES` frames, without the user's files, which fit all frames of the job."""
+    cfg, end = job.prepare, job.part.start + (FRAMES - 0.5) / job.part.frames_per_second
+    # On few frames COLMAP takes another time than its share: `seconds_of_colmap`.
+    poses = WITHOUT_COLMAP.get(cfg.poses, cfg.poses) if seconds_of_colmap(job) else cfg.poses
+    short = replace(cfg, end=min(end, cfg.end), poses=poses)
+    if names_path(cfg.poses):
+        short = replace(short, poses="still")
+    if names_path(cfg.masks):
+        short = replace(short, masks="none")
+    return replace(short, depth="shading", depth_relative="no") if names_path(cfg.depth) else short
 
 
 def shortened(cfg: Config, num_frames: int) -> Config:

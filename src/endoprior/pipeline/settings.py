@@ -11,7 +11,7 @@ from ..core.config_io import to_dict
 from ..core.options import command_of
 from ..data import load_sequence
 from ..data.files import read_json
-from ..prepare.first_pass import source_facts
+from ..prepare.first_pass import input_facts, source_facts
 from ..system.atomic import reject_occupied, write_json
 from .job import Job, SequenceJob
 
@@ -48,6 +48,7 @@ def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:
 
     Numbers that follow from the video and the options are named only if these are equal: after an update, for instance.
     """
+    stored = {"inputs": given.get("inputs")} | stored  # older settings have none
     if stored.keys() != given.keys() or not all(isinstance(stored[part], dict) for part in given):
         return ["settings of another version"]
     named = []
@@ -60,6 +61,8 @@ def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:
         if before.get(name) != now.get(name):
             texts = [_text(before.get(name), now.get(name)), _text(now.get(name), before.get(name))]
             named.append(f"{name}: stored {texts[0]}, given {texts[1]}")
+        elif (facts := given["inputs"].get(name)) and facts != stored["inputs"].get(name):
+            named.append(f"{name}: {facts['name']}, which has changed")
     before, now = _flat(stored["derived"]), _flat(given["derived"])
     changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     return named or [f"{name}: stored {before.get(name)}, given {now.get(name)}" for name in changed]
@@ -69,10 +72,11 @@ def _settings(job: SequenceJob) -> dict[str, Any]:
     """Everything that decides the results of a job."""
     if not isinstance(job, Job):
         facts = {"name": job.source.name, "fingerprint": load_sequence(job.source, job.cfg.data).fingerprint()}
-        return {"video": facts, "options": job.options, "derived": {"config": to_dict(job.cfg)}}
+        return {"video": facts, "inputs": {}, "options": job.options, "derived": {"config": to_dict(job.cfg)}}
     prepare = {name: repr(value) for name, value in vars(job.prepare).items()}
     derived = {"prepare": prepare, "config": to_dict(job.cfg)}
-    return {"video": source_facts(job.source), "options": job.options, "derived": derived}
+    inputs = input_facts(job.prepare)
+    return {"video": source_facts(job.source), "inputs": inputs, "options": job.options, "derived": derived}
 
 
 def _text(words: Any, others: Any) -> str:

@@ -18,7 +18,7 @@ from ..data.description import read_description
 from ..data.files import read_json
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
-from ..export.html import PageTooLarge, write_html
+from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
 from ..model.scene_file import load_scene
 from ..prepare import prepare
 from ..prepare.pipeline import Progress
@@ -156,7 +156,7 @@ def _player(job: SequenceJob, progress: Progress) -> list[str]:
     scene = load_scene(job.run)
     at_a_time = len(scene) / len(scene.windows)
     times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (at_a_time * LEAST_BYTES))
-    title = f"{job.source.stem} (preview)" if job.is_preview else job.source.stem
+    title = f"{DEFAULT_TITLE} (preview)" if job.is_preview else DEFAULT_TITLE  # never the name of the video
     while not job.player.exists():
         try:
             write_html(scene, job.player, title=title, times=times, max_bytes=PLAYER_BYTES)

@@ -46,15 +46,13 @@ class Calibration:
 
     @property
     def rectified(self) -> bool:
-        """Whether the images are rectified already."""
+        """Whether the images are rectified already, and by one camera matrix: disparity 0 is infinitely far."""
         if self.right is None or self.rotation is None or self.translation_mm is None:
             return False
         distorted = any(np.any(camera.distortion) for camera in (self.left, self.right))
         rotated = np.abs(self.rotation - np.eye(3)).max() > NEGLIGIBLE
         shifted = np.abs(self.translation_mm[1:]).max() > NEGLIGIBLE
-        same_focal = np.allclose(np.delete(self.left.matrix, 2, 1), np.delete(self.right.matrix, 2, 1))
-        same_row = np.isclose(self.left.matrix[1, 2], self.right.matrix[1, 2])
-        return bool(not (distorted or rotated or shifted) and same_focal and same_row)
+        return bool(not (distorted or rotated or shifted) and np.allclose(self.left.matrix, self.right.matrix))
 
     def for_size(self, width: int, height: int, name: str) -> Calibration:
         """The calibration scaled to another image size.

@@ -31,6 +31,8 @@ METERS_BELOW = 0.05
 
 MATRIX = ("k", "m", "cameramatrix", "mtx", "intrinsics", "intrinsic", "intrinsicmatrix", "cammatrix")
 DISTORTION = ("d", "dist", "distortion", "distcoeffs", "distcoeff", "distortioncoefficients", "distortioncoeffs")
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""One camera's distortion as single numbers, in OpenCV's order."""
 SIDES = (("left", "right"), ("l", "r"), ("1", "2"), ("0", "1"))
 ROTATION = ("r", "rotation", "rot", "rotationmatrix", "rstereo")
 TRANSLATION = ("t", "translation", "trans", "translationvector", "tvec", "tstereo")
@@ -52,6 +54,9 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     table = _read_table(path)
     table = {_plain(name): value for name, value in table.items()}
     size, layout = _size(table, path), table.get("layout") if isinstance(table.get("layout"), str) else None
+    if "k1" in table and np.ndim(table["k1"]) == 0:  # coefficients, not the matrices K1 and K2
+        table["d"] = [_number(table, name, path, 0.0) for name in COEFFICIENTS]
+        table = {name: value for name, value in table.items() if name not in COEFFICIENTS}
     # Files of this package count pixel centers from 0.5; OpenCV and all others count them from 0.
     offset = 0.5 - _number(table, "pixelcenter", path, 0.5 if path.name == "sequence.json" else 0.0)
     if "fcxleft" in table:
@@ -180,11 +185,11 @@ def _camera(table: Table, side: str, offset: float, path: Path) -> Intrinsics | 
     matrix = _find(table, spelled(MATRIX), path, (3, 3))
     if matrix is None:
         return None
-    distortion = _find(table, spelled(DISTORTION), path, (-1,))
-    return _checked(matrix, np.zeros(0) if distortion is None else distortion, offset, path)
+    return _checked(matrix, _find(table, spelled(DISTORTION), path, (-1,)), offset, path)
 
 
-def _checked(matrix: NDArray, distortion: NDArray, offset: float, path: Path) -> Intrinsics:
+def _checked(matrix: NDArray, distortion: NDArray | None, offset: float, path: Path) -> Intrinsics:
+    distortion = np.zeros(0) if distortion is None else distortion
     plausible = np.isfinite(matrix).all() and np.isfinite(distortion).all() and np.abs(matrix).max() < MOST_PX
     if not (plausible and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], (0, 0, 1))):
         raise input_error(path, "a camera matrix (fx 0 cx; 0 fy cy; 0 0 1)", str(matrix.tolist()), "Correct it.")
@@ -198,12 +203,12 @@ def _checked(matrix: NDArray, distortion: NDArray, offset: float, path: Path) ->
 
 
 def _plain_pinhole(table: Table, offset: float, path: Path) -> Intrinsics | None:
-    """A camera from fx, fy, cx, cy, as in `sequence.json`."""
+    """A camera from fx, fy, cx, cy, as in `sequence.json`, and its distortion."""
     if not {"fx", "cx", "cy"} <= table.keys():
         return None
     fx, cx, cy = (_number(table, name, path) for name in ("fx", "cx", "cy"))
     matrix = np.array([[fx, 0, cx], [0, _number(table, "fy", path, fx), cy], [0, 0, 1]])
-    return _checked(matrix, np.zeros(4), offset, path)
+    return _checked(matrix, _find(table, DISTORTION, path, (-1,)), offset, path)
 
 
 def _da_vinci_camera(table: Table, side: str, offset: float, path: Path) -> Intrinsics:

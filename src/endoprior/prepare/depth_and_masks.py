@@ -104,7 +104,7 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
 def _check_stereo(samples: list[MeasuredFrame], geometry: FrameGeometry, clip: Clip) -> list[str]:
     """Reject swapped cameras; return a note if the rows do not match."""
     middle = [frame for frame in samples if frame.right_u8 is not None][:: max(len(samples) // 3, 1)]
-    orders = [stereo_order(frame.rgb_u8, frame.right_u8, geometry.center_shift_px) for frame in middle]
+    orders = [stereo_order(frame.rgb_u8, frame.right_u8) for frame in middle]
     if sum(order.swapped for order in orders) > len(orders) / 2:
         fix = "Remove --swap-eyes." if clip.swap else "Add --swap-eyes."
         shares = f"{orders[0].exchanged:.0%} of the image matches swapped, {orders[0].as_given:.0%} as given"
@@ -143,8 +143,7 @@ def _measured_depth(kind: DepthKind, cfg: PrepareConfig, clip: Clip, first_pass:
 
         def match(frame: MeasuredFrame) -> Depth:
             assert frame.right_u8 is not None
-            pair = frame.rgb_u8, frame.right_u8
-            return stereo_depth(*pair, focal, baseline, cfg.stereo, geometry.center_shift_px).depth
+            return stereo_depth(frame.rgb_u8, frame.right_u8, focal, baseline, cfg.stereo).depth
 
         return match, "stereo: semi-global matching"
     if kind == "network":
@@ -152,7 +151,7 @@ def _measured_depth(kind: DepthKind, cfg: PrepareConfig, clip: Clip, first_pass:
 
         network = DepthNetwork(cfg.depth.partition(":")[2] or DEFAULT_MODEL)
         return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2"
-    files = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices)
+    files = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
     if cfg.depth_relative == "no" and not cfg.depth_unit_mm:
         fix = "`--depth-unit-mm 1` for mm, `0.01` for 0.01 mm, `1000` for m; or `--depth-relative depth`."
         raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.depth}", "none", fix)
@@ -218,7 +217,7 @@ def _tools(
             source,
             [f"masks: {source}. {hint}"],
         )
-    files = match_files(Path(cfg.masks), MASK_SUFFIXES, "masks", first_pass.indices)
+    files = match_files(Path(cfg.masks), MASK_SUFFIXES, "masks", first_pass.indices, first_pass.image_names)
 
     def high(frame: MeasuredFrame) -> Mask:
         return geometry.values(_of_either_size(read_user_mask, files[frame.index], geometry))

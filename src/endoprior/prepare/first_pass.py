@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..data.reading import kind_of
 from ..footage.border import Circle, Strips, find_outline
 from ..footage.optical_flow import MOTION_S
 from ..footage.overlays import find_static_overlays
 from ..footage.round_border import CERTAIN
 from .calibration import Calibration
 from .config import PrepareConfig, Rectangle, parse_rectangle
-from .frame_geometry import FrameGeometry, make_geometry
+from .frame_geometry import FrameGeometry, demand_within, make_geometry
+from .source import ImageFolder
 from .video_clip import Clip, EvenSample, SampledFrame
 
 SAMPLES = 24
@@ -33,6 +35,8 @@ class FirstPass:
     geometry: FrameGeometry
     notes: list[str] = field(default_factory=list)
     """Notes for the user, one line each."""
+    image_names: list[str] = field(default_factory=list)
+    """Of all images of a source folder, without suffixes; empty for a video."""
 
 
 def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | None, name: str) -> FirstPass:
@@ -66,6 +70,9 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         outline = find_outline(lefts)
         circle, strips, outside = outline.circle, outline.strips or None, outline.outside
         labels = [tuple(box) for box in find_static_overlays([_without(p, strips) for p in lefts])]
+    blank = [parse_rectangle(text, "--blank") for text in cfg.blank]
+    for rectangle in blank:
+        demand_within(rectangle, clip.camera_size, "--blank")
     geometry = make_geometry(
         clip.camera_size,
         calibration,
@@ -74,7 +81,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         field_of_view_degrees=cfg.field_of_view_degrees,
         max_width=cfg.max_width,
         crop=parse_rectangle(cfg.crop, "--crop") if cfg.crop else None,
-        blank=[*labels, *(parse_rectangle(text, "--blank") for text in cfg.blank)],
+        blank=[*labels, *blank],
         strips=strips,
         circle=circle,
         outside=outside,
@@ -85,7 +92,8 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
             f"no calibration; a field of view of {cfg.field_of_view_degrees:g} degrees is assumed "
             f"(f = {geometry.matrix[0, 0]:.0f} px). To change it: --calibration or --field-of-view-degrees."
         )
-    return FirstPass(indices, sample.kept, geometry, notes)
+    names = [file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else []
+    return FirstPass(indices, sample.kept, geometry, notes, names)
 
 
 def _without(image: NDArray[np.uint8], strips: Strips | None) -> NDArray[np.uint8]:
@@ -128,8 +136,17 @@ def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rect
     return notes
 
 
+def input_facts(cfg: PrepareConfig) -> dict[str, dict[str, object]]:
+    """Identity of each file and folder that an option names, by the option."""
+    named = {
+        "--right": cfg.right, "--calibration": cfg.calibration, "--stir": cfg.stir, "--masks": Path(cfg.masks),
+        "--depth": Path(cfg.depth), "--poses": Path(cfg.poses),
+    }  # fmt: skip
+    return {name: source_facts(path) for name, path in named.items() if path and kind_of(path) != "nothing"}
+
+
 def source_facts(path: Path) -> dict[str, object]:
     """Identity of a file or folder: its name, and the name, size and modification time of its files."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    files = sorted(path.iterdir()) if kind_of(path) == "a folder" else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.exists()]
     return {"name": path.name, "files": [list(entry) for entry in stats]}

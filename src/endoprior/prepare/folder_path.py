@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..data.description import intrinsics_of, read_description
+from ..data.description import ESTIMATED_POSES, intrinsics_of, read_description
 from ..data.endonerf import read_poses_bounds
 from ..data.files import demand_count, list_files
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask
@@ -77,6 +77,7 @@ def write_folder_path(
     fx, fy, cx, cy = intrinsics_of(
         folder / "sequence.json", described, width, height, _focal(folder, described, images)
     )
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     tool_value, relative = described.get("mask_tool_value", 255), described.get("depth_relative", False)
 
     def colors() -> Iterator[NDArray[np.uint8]]:
@@ -94,7 +95,7 @@ def write_folder_path(
         frame,
         lambda: (colors(), map(tissue, range(len(images)))),
         len(images),
-        Lens.centered_at_half(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), relative, described.get("baseline_mm")),
+        Lens.centered_at_half(matrix, width, relative, described.get("baseline_mm")),
         size,
         has_depth=True,
         refine_focal=sources.get("lens") in (ASSUMED, REFINED),
@@ -111,7 +112,7 @@ def write_folder_path(
     origin = sources | {"poses": STATIC} if path is None else sources_with(sources, path)
     more = facts | {"sources": origin, "unexplained_frames": unexplained}
     table = pose_table(new.camera_to_world, height, width, focal, bounds)
-    kept = replace_poses(folder, table, described | more, ours="poses" in sources)
+    kept = replace_poses(folder, table, described | more, ours=sources.get("poses") in ESTIMATED_POSES)
     if path is not None:
         write_json(folder / PATH_RECORD, record_of_path(path))
     return FolderPath(new.camera_to_world, relative, unexplained, kept, notes)

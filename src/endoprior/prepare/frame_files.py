@@ -10,18 +10,21 @@ from ..core.checks import input_error
 from ..data.files import natural_order
 
 
-def match_files(folder: Path, suffixes: Sequence[str], what: str, indices: Sequence[int]) -> dict[int, Path]:
+def match_files(
+    folder: Path, suffixes: Sequence[str], what: str, indices: Sequence[int], names: Sequence[str] = ()
+) -> dict[int, Path]:
     """A file for each selected frame of the source.
 
-    With as many files as frames, files are matched in natural order (2 before 10). Otherwise they are matched by the
-    last number in their names, counted from 0, or from 1 if no file has number 0. The selection may then be a part of
-    the frames that the folder covers.
+    With as many files as selected frames, or as images of the source folder, files are matched in natural order (2
+    before 10). Otherwise they are matched by the last number in their names: to that in the names of the images if each
+    of these has its own, else to positions in the source, counted from 0, or from 1 if no file has number 0.
 
     Args:
         folder: files of other types in it are ignored.
         suffixes: in lower case, with the dot.
         what: `masks` or `depth`, for error messages.
         indices: positions of the selected frames in the source, ascending.
+        names: of all images of a source folder, without suffixes; empty for a video.
     Raises:
         InputError: no folder, no files, two files with one number, or frames without a file.
     """
@@ -34,20 +37,29 @@ def match_files(folder: Path, suffixes: Sequence[str], what: str, indices: Seque
         raise input_error(folder, f"{what} ({', '.join(suffixes)})", "none", "Put one file per frame there.")
     if len(files) == len(indices):
         return dict(zip(indices, files, strict=True))
+    if len(files) == len(names):
+        return {index: files[index] for index in indices}
     counts = f"{len(files)} files for {len(indices)} frames"
     hint = "Add the missing files, or name each file by its frame number."
     by_number: dict[int, Path] = {}
     for file in files:
-        digits = re.findall(r"[0-9]+", file.stem)
-        if not digits:
+        if (number := _last_number(file.stem)) is None:
             raise input_error(folder, "one file per frame, or numbers in the names", f"{counts}, and {file.name}", hint)
-        if (number := int(digits[-1])) in by_number:
+        if number in by_number:
             both = f"{by_number[number].name} and {file.name}"
             raise input_error(folder, "one file per frame, or one per number", f"{counts}, and {both}", hint)
         by_number[number] = file
-    first = 0 if 0 in by_number else 1
-    missing = [str(index + first) for index in indices if index + first not in by_number]
+    numbers = [_last_number(name) for name in names]
+    if not numbers or None in numbers or len(set(numbers)) < len(numbers):
+        first = 0 if 0 in by_number else 1
+        numbers = range(first, indices[-1] + first + 1)
+    missing = [str(numbers[index]) for index in indices if numbers[index] not in by_number]
     if missing:
         some = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
         raise input_error(folder, "one file per frame", f"{counts}, none numbered {some}", hint)
-    return {index: by_number[index + first] for index in indices}
+    return {index: by_number[numbers[index]] for index in indices}
+
+
+def _last_number(name: str) -> int | None:
+    digits = re.findall(r"[0-9]+", name)
+    return int(digits[-1]) if digits else None

@@ -38,8 +38,6 @@ class FrameGeometry:
     """(3, 3) camera matrix K of the frames, px; the left-most pixel is centered at 0.5."""
     baseline_mm: float | None
     """None if monocular."""
-    center_shift_px: float
-    """cx_left - cx_right, px: the disparity of a point at infinity."""
     blank: NDArray[np.bool_]
     """(h, w) of the source: True where images are painted black."""
     inside: NDArray[np.bool_]
@@ -57,9 +55,9 @@ class FrameGeometry:
     def values(self, image: NDArray) -> NDArray:
         """A mask or depth map of the left source image (h, w), resampled to the frame (H, W) by nearest neighbor.
 
-        An array of the frame's size is returned as it is.
+        An array of the frame's size is returned as it is, unless the source has that size, too.
         """
-        if image.shape[:2] == self.size[::-1]:
+        if image.shape[:2] != self.source_size[::-1]:
             return image
         maps = self.maps[0]
         stored = image.astype(np.uint8) if image.dtype == bool else image
@@ -106,10 +104,8 @@ def make_geometry(
     width, height = size
     keep = np.ones((height, width), bool)
     if crop is not None:
+        demand_within(crop, size, "--crop")
         x, y, w, h = crop
-        if x + w > width or y + h > height:
-            hint = "Choose a rectangle inside one camera's image."
-            raise input_error("--crop", f"a rectangle within {width}x{height} px", ",".join(map(str, crop)), hint)
         keep[:] = False
         keep[y : y + h, x : x + w] = True
     if strips:
@@ -141,10 +137,15 @@ def make_geometry(
     shown = keep & ~painted
     shown = shown if maps[0] is None else cv2.remap(shown.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
     inside = _shrink(_cut(shown.astype(np.float32), cut), frame) > 0.999
-    shift_px = 0.0
-    if maps[0] is None and calibration is not None and calibration.right is not None and stereo:
-        shift_px = float(calibration.left.matrix[0, 2] - calibration.right.matrix[0, 2]) * scale[0, 0]
-    return FrameGeometry(size, maps, cut, frame, scale @ shift @ matrix, baseline, shift_px, painted, inside)
+    return FrameGeometry(size, maps, cut, frame, scale @ shift @ matrix, baseline, painted, inside)
+
+
+def demand_within(rectangle: Rectangle, size: tuple[int, int], option: str) -> None:
+    """Raise InputError unless a rectangle lies within an image of this (width, height), px."""
+    x, y, width, height = rectangle
+    if x + width > size[0] or y + height > size[1]:
+        want, hint = f"a rectangle within {size[0]}x{size[1]} px", "Choose a rectangle inside one camera's image."
+        raise input_error(option, want, ",".join(map(str, rectangle)), hint)
 
 
 def _assumed(width: int, height: int, circle: Circle | None, degrees: float) -> NDArray[np.float64]:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..core.checks import input_error, number_ranges
 from ..data import write_stir_tracks
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
-from ..data.reading import kind_of
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
 from .calibration_files import read_calibration
@@ -29,7 +28,7 @@ from .camera_path.sequence_path import (
 )
 from .config import PrepareConfig
 from .depth_and_masks import ChosenMethods, choose_methods
-from .first_pass import run_first_pass, source_facts
+from .first_pass import input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry
 from .frames import write_frames
 from .record import record_of
@@ -66,11 +65,9 @@ def prepare(
         InputError: the video, or a file named by an option, cannot be used; nothing is left behind.
     """
     cfg = cfg or PrepareConfig()
-    named = [video, cfg.right, cfg.calibration, cfg.stir, Path(cfg.masks), Path(cfg.depth), Path(cfg.poses)]
-    there = [path for path in named if path and kind_of(path) != "nothing"]
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
-    plan = {"config": repr(cfg), "sources": [source_facts(path) for path in there]}
+    plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
         calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
         clip = Clip(video, cfg, calibration)
@@ -148,7 +145,7 @@ def _camera_path(
         frame,
         lambda: ((read_color(files.file("images", i)) for i in range(files.count)), map(tissue, range(files.count))),
         files.count,
-        Lens.centered_at_half(matrix, meta.depth_relative, meta.baseline_mm),
+        Lens.centered_at_half(matrix, meta.width, meta.depth_relative, meta.baseline_mm),
         (meta.width, meta.height),
         has_depth=cfg.depth != "none",
         refine_focal=cfg.calibration is None,

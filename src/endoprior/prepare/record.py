@@ -30,14 +30,17 @@ def record_of(video: Path, cfg: PrepareConfig, geometry: FrameGeometry) -> Prepa
     return PrepareRecord(os.path.abspath(video), options, geometry.source_size, _source_px(geometry))
 
 
+def names_path(value: str) -> bool:
+    """Whether a value of --depth, --masks or --poses is a file or folder of the user."""
+    return value not in METHODS and value.partition(":")[0] != NETWORK
+
+
 def _absolute(value: str) -> str:
     """A method, or the absolute path of a file or folder."""
-    if value in METHODS:
-        return value
     method, colon, folder = value.partition(":")
     if method == NETWORK and colon:  # a folder, or the name of a network on a server
         return f"{NETWORK}:{os.path.abspath(folder) if os.path.isdir(folder) else folder}"
-    return os.path.abspath(value)
+    return os.path.abspath(value) if names_path(value) else value
 
 
 def _source_px(geometry: FrameGeometry) -> tuple[tuple[tuple[float, ...], ...], ...]:

@@ -25,6 +25,8 @@ LOST_SHARE, LOST_IMAGES = 0.02, 2
 """A video is truncated if more than this share of its duration and more than so many images are missing at its end."""
 AVI = "avi"
 """FFmpeg's name of the format that counts time in images and does not hold when they are shown."""
+STATES_END = ("matroska,webm", "nut")
+"""FFmpeg's names of the formats whose duration is the time of the end, however late the first image is shown."""
 RATES = (0.01, 100_000.0)
 """Plausible frame rates, 1/s; outside this range 25 is used."""
 
@@ -107,7 +109,8 @@ class Video:
             self.frames_per_second = rate if RATES[0] <= rate <= RATES[1] else 25.0
             self.num_frames = max(int(stream.frames), 0)
             self._announced_end = _announced_end(container)
-            self.seconds = self._announced_end or self.num_frames / self.frames_per_second
+            start = float((stream.start_time or 0) * stream.time_base)
+            self.seconds = max(self._announced_end - start, 0.0) or self.num_frames / self.frames_per_second
         first = next(iter(self), None)
         if first is None:
             raise input_error(path, "a video with images", "none that can be decoded", "Copy or export it again.")
@@ -194,7 +197,8 @@ def _announced_end(container: av.container.InputContainer) -> float:
         return float(((stream.start_time or 0) + stream.duration) * stream.time_base)
     # The duration of the file equals that of the images only if there is no other stream.
     if len(container.streams) == 1 and container.duration is not None:
-        return ((container.start_time or 0) + container.duration) / av.time_base
+        start = 0 if container.format.name in STATES_END else container.start_time or 0
+        return (start + container.duration) / av.time_base
     return 0.0
 
 

@@ -1,7 +1,6 @@
 """Depth from a rectified stereo pair. `H, W` image size.
 
-Disparity and depth: x_left - x_right = focal * baseline / z + center_shift, with center_shift = cx_left - cx_right, the
-difference of the principal points of the rectified cameras (often 0).
+Disparity and depth: x_left - x_right = focal * baseline / z. Both rectified cameras have the same camera matrix.
 """
 
 from __future__ import annotations
@@ -75,7 +74,6 @@ def stereo_depth(
     focal_px: float,
     baseline_mm: float,
     cfg: StereoConfig | None = None,
-    center_shift_px: float = 0.0,
 ) -> StereoDepth:
     """Depth of every pixel of the left image that passes the left-right consistency check.
 
@@ -87,7 +85,6 @@ def stereo_depth(
         focal_px: focal length of the rectified images, > 0.
         baseline_mm: distance between the cameras, > 0.
         cfg: range and thresholds.
-        center_shift_px: cx_left - cx_right, px.
     Returns:
         depth within [near_mm, far_mm], and confidence: the product of left-right consistency, texture and absence of
         highlights.
@@ -101,13 +98,11 @@ def stereo_depth(
     check_range("focal_px", focal_px, 1, 1e6)
     check_range("baseline_mm", baseline_mm, 1e-3, 1e4)
     width = left_u8.shape[1]
-    check_range("center_shift_px", center_shift_px, -width, width)
-    product = focal_px * baseline_mm
-    lowest = product / cfg.far_mm + center_shift_px
-    highest = min(product / cfg.near_mm + center_shift_px, width - 1)
+    product = np.float64(focal_px * baseline_mm)  # so that NumPy divides by float32 disparities in float64
+    lowest, highest = product / cfg.far_mm, min(product / cfg.near_mm, width - 1)
     if lowest > highest:
         raise ValueError(
-            f"far_mm must be more than {product / max(width - 1 - center_shift_px, 1e-6):.4g} for "
+            f"far_mm must be more than {product / max(width - 1, 1e-6):.4g} for "
             f"focal_px {focal_px:g}, baseline_mm {baseline_mm:g} and images {width} px wide, got {cfg.far_mm:g}"
         )
     left, right = (cv2.cvtColor(camera, cv2.COLOR_RGB2GRAY) for camera in (left_u8, right_u8))
@@ -125,8 +120,8 @@ def stereo_depth(
         support = np.isfinite(disparity) & ~filled
         confidence[filled] = _mean_around(confidence, support)[filled] / 2
     # This comparison also excludes NaN and disparities of the wrong sign.
-    valid = (disparity >= lowest) & (disparity <= product / cfg.near_mm + center_shift_px)
-    depth = np.divide(product, disparity - center_shift_px, out=np.zeros_like(disparity), where=valid)
+    valid = (disparity >= lowest) & (disparity <= product / cfg.near_mm)
+    depth = np.divide(product, disparity, out=np.zeros_like(disparity), where=valid)
     return StereoDepth(depth, np.where(valid, confidence, np.float32(0)))
 
 

@@ -85,7 +85,7 @@ def find_layout(
             return "side-by-side"
         if abs(across / down - 0.5) < 0.005:
             return "top-bottom"
-        if abs(across / down - 1) < 0.01:
+        if abs(across / down - 1) < 0.01 and "interlaced" in alike:
             return "interlaced"
     if alike:
         return alike[0]

@@ -6,6 +6,7 @@ or store parts of an upload that was not requested.
 
 from __future__ import annotations
 
+import errno
 import math
 import socket
 from collections.abc import Callable, Mapping
@@ -43,7 +44,9 @@ def check_address(host: str, port: int) -> None:
             trial.bind(found[4])
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise input_error(f"{host}:{port}", "a free address", reason, "`--port 0`.") from None
+        unknown = isinstance(error, (socket.gaierror, UnicodeError)) or error.errno == errno.EADDRNOTAVAIL
+        fix = "correct --host: an address of this machine." if unknown else "`--port 0`."
+        raise input_error(f"{host}:{port}", "a free address", reason, fix) from None
 
 
 def is_trusted(origin: str | None, asked_host: str | None, bound_host: str) -> bool:

@@ -177,7 +177,7 @@ class Viewer:
             handle.on_click(lambda event: ask(lambda: job(event.client)) if event.client is not None else None)
 
         on_change(lambda: self._go_to(controls.frame.value), controls.frame)
-        shown = controls.layer, controls.camera, controls.rendered_by, controls.rendered_as
+        shown = controls.layer, controls.camera, controls.riding, controls.rendered_by, controls.rendered_as
         on_change(
             self.read_panel, *shown, controls.tool, controls.tracks, controls.clip, controls.correct, controls.since
         )

@@ -37,15 +37,18 @@ def follow_frames(cameras: tuple[Camera, ...], free: Camera | None, rides_from: 
 
 
 def interpolate(places: list[PathPoint]) -> list[PathPoint]:
-    """A path through two or more views: every frame between them, linear positions, spherical rotations (slerp)."""
-    path = []
-    for a, b in pairwise(places):
+    """A path through two or more views: every frame between them, linear positions, spherical rotations (slerp).
+
+    Images have the size of the first view, whose height shows what the height of each view showed.
+    """
+    first, path = places[0].camera, []
+    same_size = [PathPoint(place.frame, _between(first, place.camera, 1.0)) for place in places]
+    for a, b in pairwise(same_size):
         steps = abs(b.frame - a.frame) or LEAST_STEPS
         shares = np.linspace(0, 1, steps, endpoint=False)
         frames = np.rint(a.frame + shares * (b.frame - a.frame)).astype(int)
         path += [PathPoint(int(i), _between(a.camera, b.camera, s)) for i, s in zip(frames, shares, strict=True)]
-    last = places[-1]
-    return [*path, PathPoint(last.frame, _between(places[0].camera, last.camera, 1.0))]
+    return [*path, same_size[-1]]
 
 
 def _between(a: Camera, b: Camera, share: float) -> Camera:

@@ -116,12 +116,11 @@ class ViewableScene:
     @torch.no_grad()
     def _draw(self, settings: ViewSettings, camera: Camera, values: Tensor | None = None) -> RenderOutput:
         """Render the selected Gaussians; `values` (N,) in [0, 1] become red, and green 1 where they are known."""
-        splats = self._splats(settings)
+        splats, behind = self._splats(settings), self.scene.background
         if values is not None:
-            splats = with_colors(splats, _value_colors(values))
-        return self._rasterize(
-            _clipped(splats, camera, settings.near, settings.far), camera, background=splats.means.new_zeros(3)
-        )
+            splats, behind = with_colors(splats, _value_colors(values)), (0.0, 0.0, 0.0)
+        clipped = _clipped(splats, camera, settings.near, settings.far)
+        return self._rasterize(clipped, camera, background=splats.means.new_tensor(behind))
 
     def _splats(self, settings: ViewSettings) -> Splats:
         splats = self._playback.splats(settings.frame)

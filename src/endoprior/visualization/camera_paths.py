@@ -89,8 +89,10 @@ def _view(entry: dict, cameras: tuple[Camera, ...]) -> View:
     if "world_to_camera" not in entry:
         return time, camera
     matrix = np.asarray(entry["world_to_camera"], np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError("world_to_camera is not a 4 x 4 matrix of finite numbers")
     rotation = matrix[:3, :3]
-    rigid = matrix.shape == (4, 4) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-    if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]) or np.linalg.det(rotation) < 0:
-        raise ValueError("world_to_camera is not a 4 x 4 rotation and translation")
+    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+    if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise ValueError("world_to_camera is not a rotation and translation")
     return time, replace(camera, world_to_camera=matrix)

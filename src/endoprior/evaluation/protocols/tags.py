@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ...model.method import method_of
 from ..context import EvaluationContext
 from ..rendered import SceneFrames
 from .table import Protocol
@@ -22,6 +23,7 @@ KEYS = {
     "depth": "depth",
 }
 """Tags, in order, and what tables call them."""
+BACKGROUNDS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
 NETWORKS = {"alex": "AlexNet", "vgg": "VGG16"}
 
 
@@ -35,7 +37,7 @@ def tags_of(
         mask_folder: `FrameSequence.mask_folder` of the masks in use.
         shrink: what the size of the frames was divided by.
     """
-    is_scene = isinstance(context.reconstruction, SceneFrames)
+    made, is_scene = context.reconstruction, isinstance(context.reconstruction, SceneFrames)
     seen, total = len({*indices} - {*context.sequence.indices("test")}), len(indices)
     height = context.sequence.camera(0).height
     kept, masked = rows_of(protocol, height, shrink)
@@ -47,7 +49,7 @@ def tags_of(
         "saw_test_frames": (f"yes: {seen} of {total}" if seen else "no") if is_scene else "not known",
         "mask_folder": mask_folder or "none: by the reader",
         "rows": rows + (f", {masked} masked" if masked else ""),
-        "background": "black" if is_scene else "of the images",
+        "background": BACKGROUNDS[method_of(made.scene.config).background] if is_scene else "of the images",
         "color": "8 bits" if protocol.rounded else "not rounded",
         "psnr_over": "all pixels" if protocol.over_frame else "tissue pixels",
         "psnr_mean": "all frames together" if protocol.pooled else "mean of frames",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,8 @@ class Lens:
 
     matrix: NDArray[np.float64]
     """(3, 3) K, px."""
+    width: int
+    """Of the image, px."""
     depth_is_relative: bool
     """Each frame's depth has a scale of its own."""
     baseline_mm: float | None = None
@@ -33,23 +35,23 @@ class Lens:
 
     @classmethod
     def centered_at_half(
-        cls, matrix: NDArray[np.float64], depth_is_relative: bool, baseline_mm: float | None = None
+        cls, matrix: NDArray[np.float64], width: int, depth_is_relative: bool, baseline_mm: float | None = None
     ) -> Lens:
         """From K with the left-most pixel centered at 0.5."""
         opencv = np.array(matrix, np.float64)
         opencv[:2, 2] -= 0.5
-        return cls(opencv, depth_is_relative, baseline_mm)
+        return cls(opencv, width, depth_is_relative, baseline_mm)
 
     def with_focal(self, factor: float) -> Lens:
         """The lens with both focal lengths multiplied."""
         matrix = self.matrix.copy()
         matrix[[0, 1], [0, 1]] *= factor
-        return Lens(matrix, self.depth_is_relative, self.baseline_mm)
+        return replace(self, matrix=matrix)
 
     @property
     def px(self) -> float:
         """Length of a pixel of an image 640 px wide, in px of this one: thresholds are multiples of it."""
-        return float(2 * self.matrix[0, 2] + 1) / 640
+        return self.width / 640
 
 
 @dataclass(frozen=True)
