@@ -242,7 +242,7 @@ def test_depth_flags_change_the_flags_and_nothing_else(size):
 
 def test_names_are_listed_and_win_over_paths(tmp_path, monkeypatch, capsys):
     names = spec_names()
-    assert {"quick", "masks", "poses", "sized", "sized/whole", "full", "full/methods"} <= {*names}
+    assert {"quick", "masks", "poses", "sized", "sized/whole_clip", "full", "full/methods"} <= {*names}
     assert not [name for name in names if "_small" in name], "it is only there to be extended"
     monkeypatch.chdir(tmp_path)
     written(tmp_path).rename("quick")

@@ -28,7 +28,7 @@ class Bench:
     """A .yaml or .toml file, a folder of them, or a name. quick: minutes. masks: given and found tool masks.
     poses: given and estimated camera path. sized: the paper's tables, for two cores. full: the same at full size.
     radiance: the two radiance fields, a day. One table: sized/NAME or full/NAME with budgets, compared, depth_flags,
-    growth, instability, ladder, matched, methods, primitives, regime, temporal; sized/whole;
+    growth, instability, ladder, matched, methods, primitives, regime, temporal; sized/whole_phantom; sized/whole_clip;
     full/radiance; full/scared."""
     out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
     """Folder for cells and reports; equal cells of several specs are run once."""

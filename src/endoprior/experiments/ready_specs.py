@@ -1,4 +1,4 @@
-"""The specs that come with the program. `endoprior bench` takes them by name: `quick`, `sized`, `sized/whole`."""
+"""The specs that come with the program. `endoprior bench` takes them by name: `quick`, `sized`, `sized/growth`."""
 
 from __future__ import annotations
 
