@@ -208,6 +208,17 @@ def test_depth_is_shown_near_bright_far_dark(scene, page, kept):
     assert not page.problems
 
 
+def test_what_is_behind_everything_has_the_color_of_the_method(browser, kept, monkeypatch):
+    white = random_scene(300, 2)
+    monkeypatch.setattr(Scene, "background", (1.0, 1.0, 1.0))
+    open_player(browser, write_html(white, kept / "white.html", times=[0.5]))
+    want = rendered(white, 0.5)
+    assert want.max() == 255 and np.abs(picture(browser, kept / "white.png") - want).mean() < 0.65
+    browser.click("#depth")
+    settle(browser)
+    assert picture(browser, kept / "white_depth.png")[0, 0].max() == 0
+
+
 @pytest.mark.slow
 def test_one_frame_is_a_still(scene, browser, kept):
     open_player(browser, write_html(scene, kept / "still.html", times=[0.5]))

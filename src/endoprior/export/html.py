@@ -146,6 +146,7 @@ def _about(scene: Scene, times: list[float]) -> dict[str, Any]:
         "width": cameras[0].width,
         "height": cameras[0].height,
         "cameras": rows,
+        "background": list(scene.background),
         "seconds": [time * len(scene.cameras) / scene.frames_per_second for time in times],
     }
 

@@ -127,6 +127,7 @@ class Painter {
     gl.disable(gl.BLEND);
     gl.useProgram(this.screen.program);
     gl.uniform1i(this.screen.places.depth, depth ? 1 : 0);
+    gl.uniform3fv(this.screen.places.background, this.about.background);
     gl.uniform3fv(this.screen.places.ramp, DEPTH_COLORS.flat().map((v) => v / 255));
     gl.bindTexture(gl.TEXTURE_2D, this.sum);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

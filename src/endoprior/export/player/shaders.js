@@ -118,12 +118,13 @@ precision highp float;
 precision highp sampler2D;
 uniform sampler2D drawn;
 uniform bool depth;
+uniform vec3 background;
 uniform vec3 ramp[${DEPTH_COLORS.length}];
 out vec4 shown;
 void main() {
   vec4 sum = texelFetch(drawn, ivec2(gl_FragCoord.xy), 0);
   if (!depth) {
-    shown = vec4(sum.rgb, 1.0);
+    shown = vec4(sum.rgb + (1.0 - sum.a) * background, 1.0);
     return;
   }
   float at = clamp(sum.r / max(sum.a, 1e-4), 0.0, 1.0) * float(${DEPTH_COLORS.length - 1});
