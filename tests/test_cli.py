@@ -207,6 +207,22 @@ def test_render_of_chosen_times_and_a_camera_path(run, tmp_path, capsys):
         assert "path.json" in complaint(capsys)
 
 
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        (("--camera-path", "p.json", "--times", "0.5"), "--times"),
+        (("--camera-path", "p.json", "--split", "test"), "--split"),
+        (("--camera-path", "p.json", "--camera", "sway"), "--camera"),
+        (("--times", "0.5", "--split", "train"), "--split"),
+    ],
+)
+def test_two_choices_of_what_to_render_are_rejected(run, tmp_path, capsys, given, named):
+    _, folder = run
+    assert main(["render", str(folder), str(tmp_path / "out"), *given]) == 2
+    assert f"{named}: expected one of {given[0]} and {named}, got both. Fix: Remove" in complaint(capsys)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_scene_file_is_scored_beside_itself(run, tmp_path):
     data, folder = run
     (tmp_path / "sent").mkdir()

@@ -44,7 +44,7 @@ class Render:
     camera: Literal["sequence", "sway"] = "sequence"
     """The sequence's own camera, or one that sways around it."""
     camera_path: Path | None = None
-    """JSON list of {"time", "world_to_camera"} to render instead of a split."""
+    """JSON list of {"time", "world_to_camera"} to render instead of a split; it has times and cameras of its own."""
     highlights: bool = True
     """`--no-highlights` shows the tissue below them, as other frames show it. Default: RUN/renders/no_highlights."""
     data: Path | None = None
@@ -68,9 +68,24 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Load the scene and render it."""
     args = parse(Render, argv, "render", HELP)
-
+    reject_two_choices(args)
     scene = open_scene(args.run)
     render(scene, args)
+
+
+def reject_two_choices(args: Render) -> None:
+    """One option alone says which times are rendered, and one from where.
+
+    Raises:
+        InputError: a second one was given; it would have no effect.
+    """
+    times, split, camera = args.times != (), args.split != Render.split, args.camera != Render.camera
+    path = args.camera_path is not None
+    pairs = {("--camera-path", "--times"): path and times, ("--camera-path", "--split"): path and split,
+             ("--camera-path", "--camera"): path and camera, ("--times", "--split"): times and split}  # fmt: skip
+    for (first, second), both in pairs.items():
+        if both:
+            raise input_error(second, f"one of {first} and {second}", "both", f"Remove {first} or {second}.")
 
 
 def render(scene: RenderedScene, args: Render) -> None:
