@@ -128,6 +128,15 @@ def test_a_run_where_a_sequence_is_expected(tmp_path, make_tiny_sequence, capsys
     assert "got a file of a run." in complaint(capsys, "check", run / "scene.safetensors")
 
 
+def test_a_stopped_run_in_windows_is_a_run(tmp_path, capsys):
+    run = tmp_path / "run"
+    (run / "windows" / "000").mkdir(parents=True)
+    (run / "config.json").write_text('{"data": {"path": "/the data"}}')
+    for command in ("check", "view"):
+        text = complaint(capsys, command, run)
+        assert f"got a run folder. Fix: `endoprior train --resume {run}` resumes the run; else" in text
+
+
 @pytest.mark.parametrize("command", ["eval", "render", "export"])
 def test_a_sequence_or_a_video_where_a_run_is_expected(tmp_path, make_tiny_sequence, frames, capsys, command):
     data, out = make_tiny_sequence("data"), []

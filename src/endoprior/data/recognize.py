@@ -18,6 +18,8 @@ from .video_files import STILL_SUFFIXES, VIDEO_SUFFIXES, is_video
 ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".7z", ".rar")
 CALIBRATIONS = (".ini", ".yaml", ".yml", ".npz")
 RUN_FILES = ("scene.safetensors", "checkpoint.safetensors", "log.jsonl")
+WINDOWS = "windows"
+"""Folder of a run in windows, which has none of these files before its last window is trained."""
 SIDE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
 """The word of a name that tells the left camera from the right one."""
 
@@ -32,7 +34,7 @@ def is_sequence(folder: Path) -> bool:
 
 def is_run(folder: Path) -> bool:
     """Whether `train` wrote a folder."""
-    return (folder / "config.json").is_file() and any((folder / name).is_file() for name in RUN_FILES)
+    return (folder / "config.json").is_file() and any((folder / name).exists() for name in (*RUN_FILES, WINDOWS))
 
 
 def not_a_sequence(path: Path) -> InputError | None:
