@@ -345,6 +345,18 @@ def test_lengths_of_relative_depth_are_not_called_mm(tiny_sequence):
     viewer.close()
 
 
+def test_a_window_of_other_length_is_shown_from_its_own_frames(scene):
+    viewer, shorter = Viewer(ViewableScene(scene, "first")), replace(scene, cameras=scene.cameras[:3])
+    viewer.panel.frame.value = 5
+    viewer.settings = replace(viewer.settings, frame=5, since=4)
+    for shown, last, settings in ((shorter, 2, (2, 2)), (scene, 5, (2, 2))):
+        viewer.show(ViewableScene(shown, "second"))
+        assert (viewer.settings.frame, viewer.settings.since) == settings
+        assert (viewer.panel.frame.value, viewer.panel.frame.max, viewer.panel.since.max) == (2, last, last)
+        assert "frame 2" in viewer.panel.status.content
+    viewer.close()
+
+
 def short_config() -> Config:
     """Few Gaussians, few iterations."""
     cfg = preset("default")

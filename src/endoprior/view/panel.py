@@ -110,9 +110,8 @@ class Panel:
         def allow(rule: Callable[[Any], bool], *handles: Any) -> None:
             found.update({control_id(handle): rule for handle in handles})
 
-        last, end = self.frame.max, self.clip_end
-        allow(lambda value: are_numbers([value], 1, last) and value >= 0, self.since)
-        allow(lambda value: are_numbers([value], 1, last) and value >= 0, self.frame)
+        end = self.clip_end
+        allow(lambda value: are_numbers([value], 1, self.frame.max) and value >= 0, self.since, self.frame)
         allow(lambda value: are_numbers(value, 2, end) and min(value) >= 0, self.clip)
         allow(lambda value: are_numbers([value], 1, self.radius.max) and value >= self.radius.min, self.radius)
         buttons = self.play, self.clear, self.table, self.screenshot, self.keep, self.forget, self.video
@@ -127,6 +126,13 @@ class Panel:
         """Whether the control with this id can have this value; False if there is no such control."""
         rule = self._rules.get(uuid)
         return rule is not None and rule(value)
+
+    def set_length(self, total: int, settings: ViewSettings) -> None:
+        """Offer this number of frames, and show the two of `settings`."""
+        self._total = total
+        for slider, value in ((self.frame, settings.frame), (self.since, settings.since)):
+            slider.value, slider.max = value, max(total - 1, 1)
+        self.frame.disabled = self.play.disabled = total < 2
 
     @property
     def rate(self) -> float:

@@ -111,7 +111,15 @@ class Viewer:
         return bool(self.server.get_clients())
 
     def show(self, viewable: Viewable) -> None:
-        """Show another state of the same scene, with the same frames and layers. Call it in the thread of `work`."""
+        """Show another state of the scene, with the same layers; its next window may have another number of frames.
+
+        Call it in the thread of `work`.
+        """
+        if (total := len(viewable.cameras)) != len(self.viewable.cameras):
+            frame, since = (min(value, total - 1) for value in (self.settings.frame, self.settings.since))
+            self.settings, self.kept_views = replace(self.settings, frame=frame, since=since), []
+            self.panel.set_length(total, self.settings)
+            self._restart_clock()
         self.viewable, self.tracks = viewable, DrawnTracks(viewable)
         self._version += 1
         self._clear_measurement()
