@@ -191,6 +191,9 @@ def test_render_of_chosen_times_and_a_camera_path(run, tmp_path, capsys):
     _, folder = run
     assert main(["render", str(folder), str(tmp_path / "a"), "--times", "0", "0.5", "--camera", "sway"]) == 0
     assert len(list((tmp_path / "a" / "rgb").iterdir())) == 2
+    assert "other images" not in capsys.readouterr().out
+    assert main(["render", str(folder), str(tmp_path / "a"), "--times", "0.5"]) == 0
+    assert "rgb before: 1" in capsys.readouterr().out
     moved = np.eye(4)
     moved[0, 3] = 2
     path = tmp_path / "path.json"

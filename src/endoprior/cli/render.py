@@ -143,4 +143,7 @@ def render(scene: RenderedScene, args: Render) -> None:
         else:
             support = SupportMap(scene, sequence.training_part)
             write_support_film(support, views, out, video, scene.frames_per_second, frames)
+    images = out / "rgb" if args.layer == "color" else out
+    if (others := len(list(images.glob("*.png"))) - len(views)) > 0:
+        say(f"note: other images were in {images} before: {others}")
     say(f"{len(views)} frames: {out}\nvideo: {video}")
