@@ -10,6 +10,7 @@ import pytest
 from doctor_machines import NO_GPU
 
 from endoprior.cli import COMMANDS, main
+from endoprior.cli.view import open_viewable
 
 QUICK = [
     "--init-budget", "300", "--schedule.coarse-iterations", "2", "--schedule.fine-iterations", "20",
@@ -226,13 +227,17 @@ def test_two_choices_of_what_to_render_are_rejected(run, tmp_path, capsys, given
     assert not (tmp_path / "out").exists()
 
 
-def test_a_scene_file_is_scored_beside_itself(run, tmp_path):
+def test_a_scene_file_is_used_beside_itself(run, tmp_path):
     data, folder = run
     (tmp_path / "sent").mkdir()
     file = tmp_path / "sent/x.safetensors"
     file.write_bytes((folder / "scene.safetensors").read_bytes())
     assert main(["eval", str(file), "--data", str(data), "--no-networks"]) == 0
-    assert (tmp_path / "sent/metrics.json").exists()
+    assert main(["render", str(file), "--times", "0.5"]) == 0
+    viewable, out = open_viewable(file, data)
+    assert viewable.has_tool and out == tmp_path / "sent" / "view"
+    beside = {"metrics.json", "per_frame.json", "renders", "video.mp4"}
+    assert {p.name for p in file.parent.iterdir()} == beside | {file.name}
 
 
 def test_render_writes_the_carried_grid_beside_the_input(run, tmp_path):

@@ -18,7 +18,7 @@ from .devices import on_device
 from .help_page import Help
 from .parsing import parse
 from .score_table import score_table
-from .trained_scene import open_scene
+from .trained_scene import folder_of, open_scene
 
 if TYPE_CHECKING:
     from ..data import FrameSequence
@@ -92,7 +92,7 @@ def run(argv: list[str]) -> None:
         option = f"--{given[0].replace('_', '-')}"
         raise input_error(option, "--pictures beside it", "a run", f"Remove {option}, or add --pictures FOLDER.")
     scene = open_scene(args.run)
-    run = args.run if args.run.is_dir() else args.run.parent
+    run = folder_of(args.run)
     out = args.out or run
     require_writable_folder("--out" if args.out else "RUN", out)
     data = args.data or sequence_of_run(run)

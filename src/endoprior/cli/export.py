@@ -14,7 +14,7 @@ from ..system.console import say
 from .help_page import Help
 from .parsing import parse
 from .progress import Counting
-from .trained_scene import open_gaussians, sequence_of
+from .trained_scene import folder_of, open_gaussians, sequence_of
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
@@ -76,8 +76,7 @@ def _with_data(scene: Scene, run: Path, out: Path, options: ExportOptions) -> Ex
 
     if "data" not in load_format(format_name(out, options)).options:
         return options
-    folder = run.parent if run.is_file() else run
-    sequence = sequence_of(scene, folder, options.data, "there are no tool masks, and tools hide no point")
+    sequence = sequence_of(scene, folder_of(run), options.data, "there are no tool masks, and tools hide no point")
     return replace(options, data=sequence and sequence.path)
 
 

@@ -14,7 +14,7 @@ from ..system.console import say
 from .devices import on_device
 from .help_page import Help
 from .parsing import parse
-from .trained_scene import open_scene, reject_without_gaussians
+from .trained_scene import folder_of, open_scene, reject_without_gaussians
 
 if TYPE_CHECKING:
     from ..model.scene import RenderedScene
@@ -92,7 +92,8 @@ def render(scene: RenderedScene, args: Render) -> None:
     """Render the views selected by `args` and print the output paths."""
     from .output_paths import require_writable_folder
 
-    require_writable_folder("OUT" if args.out else "RUN", args.out or args.run)
+    run = folder_of(args.run)
+    require_writable_folder("OUT" if args.out else "RUN", args.out or run)
     if args.layer != "color" or not args.highlights:
         reject_without_gaussians(scene, args.run)
     scene = on_device(scene, args.device, fp16_planes=True)
@@ -109,7 +110,7 @@ def render(scene: RenderedScene, args: Render) -> None:
     if bad := [t for t in args.times if not 0 <= t <= 1]:
         raise input_error("--times", "times in [0, 1]", str(bad[0]), "Correct it; frame i of T is at i / T.")
     if args.layer == "support" or not args.highlights or not (args.camera_path or args.times):
-        sequence = load_sequence(args.data or sequence_of_run(args.run), scored_data(scene.config.data))
+        sequence = load_sequence(args.data or sequence_of_run(run), scored_data(scene.config.data))
         if len(sequence) != total:
             fix = "`--data FOLDER` with the sequence of the run."
             raise input_error(sequence.path, f"{total} frames", str(len(sequence)), fix)
@@ -128,8 +129,8 @@ def render(scene: RenderedScene, args: Render) -> None:
         else:
             views = times_path(times, scene.cameras)
     beside = not args.highlights and not args.out  # what is there with highlights is kept
-    out = args.out or args.run / "renders"
-    video = (args.out or args.run) / ("video.mp4" if args.layer == "color" else f"{args.layer}.mp4")
+    out = args.out or run / "renders"
+    video = (args.out or run) / ("video.mp4" if args.layer == "color" else f"{args.layer}.mp4")
     if not args.out and out.is_symlink():  # in an untrusted run the link could point anywhere
         raise input_error(out, "a folder", "a link to one", "Remove the link, or pass OUT.")
     if beside:

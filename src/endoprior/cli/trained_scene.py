@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,11 @@ from ..system.console import say
 if TYPE_CHECKING:
     from ..data import FrameSequence
     from ..model.scene import RenderedScene, Scene
+
+
+def folder_of(run: Path) -> Path:
+    """The run folder: `run` itself, or the folder of a scene's file."""
+    return run.parent if os.path.isfile(run) else run  # pathlib raises for a name that is too long
 
 
 def open_scene(run: Path) -> RenderedScene:

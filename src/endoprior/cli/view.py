@@ -117,18 +117,19 @@ def open_viewable(
     from ..data import load_sequence
     from ..view.viewable_sequence import ViewableSequence
 
-    folder = path.parent if path.name == "scene.safetensors" else path
-    if not os.path.isfile(folder / "scene.safetensors"):  # pathlib raises for a name that is too long
+    file = path if path.suffix == ".safetensors" else path / "scene.safetensors"
+    folder = file.parent
+    if not os.path.isfile(file):  # pathlib raises for a name that is too long
         if (folder / "config.json").is_file() and (folder / "log.jsonl").is_file():
             again = command("train", "--resume", folder, "--view")
             fix = f"Wait until training is done. To see it before, stop it and run `{again}`."
-            raise input_error(folder / "scene.safetensors", "a trained scene", "none yet", fix)
+            raise input_error(file, "a trained scene", "none yet", fix)
         if not highlights:
             raise input_error("--no-highlights", "a run folder", f"{path}, a sequence", "Leave it out.")
         return ViewableSequence(load_sequence(path)), None
     from ..view.viewable_scene import ViewableScene
 
-    scene = open_gaussians(folder)
+    scene = open_gaussians(path)
     originals = sequence_of(scene, folder, data, "there are no differences and tools to show")
     scene = on_device(scene, device, fp16_planes=True)
     if not highlights:
@@ -138,4 +139,4 @@ def open_viewable(
             fix = "Name it: `--data FOLDER`."
             raise input_error("--no-highlights", "the sequence of the run", "none", fix)
         scene = without_highlights(scene, originals.training_part)
-    return ViewableScene(scene, str(folder), originals), folder / "view"
+    return ViewableScene(scene, str(path), originals), folder / "view"
