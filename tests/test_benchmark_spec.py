@@ -65,6 +65,16 @@ def test_settings_by_preset_and_factors(tmp_path):
     assert (theirs.schedule.fine_iterations, theirs.temporal.weight) == (9, 0.25)
 
 
+def test_a_claim_with_lists_is_one_for_each_score_and_method(tmp_path):
+    claims = [
+        {"score": ["psnr", "ssim"], "method": "ours", "than": ["base", "ours"], "by": 0.5},
+        {"score": "psnr", "method": "base", "than": "ours"},
+    ]
+    found = [(c.score, c.method, c.than, c.by) for c in load_spec(written(tmp_path, claims=claims)).claims]
+    assert found[:3] == [("psnr", "ours", "base", 0.5), ("psnr", "ours", "ours", 0.5), ("ssim", "ours", "base", 0.5)]
+    assert found[3:] == [("ssim", "ours", "ours", 0.5), ("psnr", "base", "ours", 0.0)]
+
+
 def test_a_file_extends_others(tmp_path):
     written(tmp_path)
     small = {"seeds": [5], "set": {"temporal.weight": 0.125}, "sequences": {"only": {"path": "here"}}}
@@ -158,6 +168,9 @@ def test_toml_says_the_same(tmp_path):
         ({"set": {"density.min_densify_weight": 3.0}}, "min_densify_weight must be in"),
         ({"scores": ["psnr", "speed"]}, "names of scores, got 'speed'"),
         ({"claims": [{"score": "speed", "method": "ours", "than": "base"}]}, "names of scores, got 'speed'"),
+        ({"claims": [{"score": [], "method": "ours", "than": "base"}]}, "claims.0.score: expected a name or a list of"),
+        ({"claims": {"score": "psnr"}}, "claims: expected a list"),
+        ({"claims": [{"score": "psnr", "method": "ours"}]}, "than: expected an entry, got none"),
         ({"compare_with": "them"}, "compare_with: expected one of base, ours"),
         ({"claims": [{"score": "psnr", "method": "ours", "than": "nobody"}]}, "expected one of base, ours"),
         ({"claims": [{"score": "psnr", "method": "ours", "than": "base", "expect": "magic"}]}, "expect: expected one"),

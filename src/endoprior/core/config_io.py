@@ -108,6 +108,9 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     if unknown:
         name = unknown[0] if unknown[0].isidentifier() else repr(unknown[0])
         raise input_error(f"{where}.{name[:80]}", f"one of {', '.join(hints)}", "no such field", "Correct the name.")
+    needed = [f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is dataclasses.MISSING]
+    if missing := [name for name in needed if name not in values]:
+        raise input_error(f"{where}.{missing[0]}", "an entry", "none", "add it.")
     built = {name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()}
     try:
         return cls(**built)

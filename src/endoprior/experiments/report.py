@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -164,14 +165,19 @@ def _amount(score: str, by: float) -> str:
 def _claims(results: Results, mark: str) -> list[str]:
     if not results.spec.claims:
         return []
-    lines = []
+    lines, missing = [], Counter()
     for claim in results.spec.claims:
         found = results.check(claim)
+        if not found:
+            missing[all_scores()[claim.score].heading(bool(results.relative))] += 1
+            continue
         parts = [f"{name}: **{said}**, {change(claim.score, own)}" for name, (own, said) in found.items()]
         if len(found) > 1:
             parts.append(f"together {change(claim.score, results.together(claim))}")
         source = f" [{claim.text}]" if claim.text else ""
-        lines.append(f"- {sentence(results, claim)}{source}: {'; '.join(parts) or 'not measured'}.")
+        lines.append(f"- {sentence(results, claim)}{source}: {'; '.join(parts)}.")
+    if missing:
+        lines.append(f"- Not measured: {'; '.join(f'{score} (claims: {n})' for score, n in missing.items())}.")
     note = "A verdict needs the whole 95 % interval on one side. Intervals are over seeds (there is none for one) and, "
     note += "where both methods have values of the same single frames, over these too."
     return [f"{mark} Claims", "\n".join(lines), note]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,8 @@ def load_spec(path: Path, data: dict[str, Path] | None = None) -> Spec:
         for name in ("title", "sequences", "methods"):
             if not values.get(name):
                 raise input_error(name, "an entry", "none", "add it.")
+        if isinstance(claims := values.get("claims"), list):
+            values["claims"] = [one for place, claim in enumerate(claims) for one in _single_claims(claim, place)]
         spec = replace(from_dict(Spec, values, "spec"), folder=str(path.parent))
         for name, folder in (data or {}).items():
             if name not in spec.sequences:
@@ -93,6 +96,17 @@ def _read(path: Path, chain: tuple[Path, ...] = ()) -> dict[str, Any]:
         both = {k for k in ("set", "set_for") if isinstance(merged.get(k), dict) and isinstance(part.get(k), dict)}
         merged |= {key: merged[key] | value if key in both else value for key, value in part.items()}
     return merged
+
+
+def _single_claims(claim: Any, place: int) -> list[Any]:
+    """A claim for each of its scores and each method that it is compared with: `score` and `than` may be lists."""
+    if not isinstance(claim, dict):
+        return [claim]
+    lists = {key: claim[key] for key in ("score", "than") if isinstance(claim.get(key), list)}
+    for key, names in lists.items():
+        if not names:
+            raise input_error(f"claims.{place}.{key}", "a name or a list of names", "an empty list", "add one.")
+    return [claim | dict(zip(lists, chosen, strict=True)) for chosen in product(*lists.values())]
 
 
 def _check(spec: Spec) -> None:
