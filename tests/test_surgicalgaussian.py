@@ -177,7 +177,7 @@ def test_growth_removal_and_resets():
     assert plan.clone.tolist() == [True, False, False, False, False] and not plan.remove.any()
     assert plan.split.tolist() == [False, True, False, False, False]
     later = METHOD.plan(stats, gaussians, 0.0, Stage.FINE, 3100, CFG)
-    assert later.remove.tolist() == [False, False, True, True, False]
+    assert later.remove.tolist() == [False, False, True, False, False], "a radius removes nothing"
     due = [i for i in (400, 500, 3000, 3100, 15_000) if METHOD.reset_due(Stage.FINE, i, CFG)]
     assert due == [500, 3000]
 

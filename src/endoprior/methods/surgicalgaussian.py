@@ -41,8 +41,11 @@ COLOR_SHARE, TV_WEIGHT, DEPTH_WEIGHT = 0.8, 0.02, 0.001
 DISTANCE_WEIGHT, SHAPE_WEIGHT, NUM_NEIGHBORS = 0.2, 40.0, 4
 """Weights of the sequence `cutting`; those of `pulling` are 0. The release asks for five neighbors and drops itself."""
 RESET_EVERY, FIRST_RESET = 3000, 500
-MOST_RADIUS_PX, MOST_SCALE = 20.0, 0.1
-"""After the first opacity reset larger Gaussians go; the scale in units of length."""
+MOST_SCALE = 0.1
+"""After the reset of opacities at 3,000 larger Gaussians go; units of length.
+
+The release also names a radius of 20 px, but radii are 0 whenever it compares them: growth, just before, clears them.
+"""
 SMALLEST_SCALE_MM = 1e-6
 NETWORK_LATER = 4 / 3
 """The network's rate decays over this many times the iterations of the centers'."""
@@ -93,7 +96,6 @@ class SurgicalGaussian(GaussianMethod):
 
     background = (1.0, 1.0, 1.0)
     uses_prior = False
-    uses_radii = True
     first_share = 1 / EVERY_PX**2
     _motion = NetworkMotion()
 
@@ -148,7 +150,7 @@ class SurgicalGaussian(GaussianMethod):
         if iteration <= RESET_EVERY:
             return planned
         large = gaussians.scales.amax(-1) > MOST_SCALE * UNIT_MM
-        large = (large | (stats.max_radius_px > MOST_RADIUS_PX)) & ~planned.split
+        large &= ~planned.split
         rules = {**planned.removed_by, "size": large}
         return Plan(clone=planned.clone & ~large, split=planned.split, remove=planned.remove | large, removed_by=rules)
 
