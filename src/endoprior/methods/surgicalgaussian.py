@@ -44,8 +44,8 @@ RESET_EVERY, FIRST_RESET = 3000, 500
 MOST_SCALE = 0.1
 """After the reset of opacities at 3,000 larger Gaussians go; units of length.
 
-The release also names a radius of 20 px. In the code that it descends from radii are 0 whenever they are compared, because
-growth, just before, clears them (docs/log.md); so it is left out.
+The release also names a radius of 20 px. In the code that it descends from radii are 0 whenever they are compared:
+growth, just before, clears them (docs/log.md). So it is left out.
 """
 SMALLEST_SCALE_MM = 1e-6
 NETWORK_LATER = 4 / 3
