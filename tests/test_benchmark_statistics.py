@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endoprior.experiments.report import change
+from endoprior.experiments.report import change, claims_section
 from endoprior.experiments.results import Results
 from endoprior.experiments.spec import Cell, ClaimSpec, MethodSpec, SequenceSpec, Spec
 from endoprior.experiments.statistics import Difference, Pair, difference, gains, summary, verdict
@@ -149,3 +149,12 @@ def test_a_claim_is_checked_on_each_sequence():
     found = {name: (said, own.count, own.mean) for name, (own, said) in both.check(claim).items()}
     assert found == {"s": ("holds", 3, 1.0), "t": ("does not hold", 3, -1.0)}
     assert both.together(claim).mean == 0 and both.together(claim).count == 6
+
+
+def test_claims_of_which_nothing_was_measured_are_one_line():
+    one = results()
+    others = [ClaimSpec(score, "b", "a_1") for score in ("ssim", "ssim", "depth_rmse_mm")]
+    _, lines, _ = claims_section(Results(replace(one.spec, claims=(*one.spec.claims, *others)), one.scores), "##")
+    held, missing = lines.split("\n")
+    assert held.startswith("- B & co") and held.endswith("s: **holds**, +1.00 dB [+1.00, +1.00].")
+    assert missing == "- Not measured: SSIM (claims: 2); depth RMSE, mm (claims: 1)."

@@ -202,7 +202,7 @@ def test_every_row_stays_together_through_a_plan(kind):
         value.data += 0 if name in ("means", "quats", "log_scales") else marks
         optimizer.states[name].first += marks + 1
     before = {name: value.detach().clone() for name, value in model.tensors.items()}
-    stats = DensityStats(*(torch.arange(6.0) + k for k in range(6)))
+    stats = DensityStats(*(torch.arange(6.0) + k for k in range(5)))
     flags = torch.eye(6, dtype=torch.bool)
     planned = Plan(clone=flags[1], split=flags[2], remove=flags[4])
     grown, returned = apply_plan(optimizer, planned, stats, np.random.default_rng(0))

@@ -34,7 +34,7 @@ def states(draw):
     seen, valid = rng.integers(0, 30, num), rng.integers(0, 60, num)
     gradient = rng.choice([0.0, 1e-30, 1e-4, 2e-4, 1.0, 1e30], num) * seen
     seen_opacity = rng.choice([0.0, 0.001, 0.5, 1.0], num) * valid
-    values = (gradient, seen, rng.random(num) * valid, valid, seen_opacity, np.zeros(num))
+    values = (gradient, seen, rng.random(num) * valid, valid, seen_opacity)
     stats = DensityStats(*(torch.tensor(np.asarray(v), dtype=torch.float32) for v in values))
     scales = torch.tensor(10.0 ** rng.uniform(-8, 8, (num, 1)) * rng.uniform(0.1, 1, (num, 3)), dtype=torch.float32)
     opacities = torch.tensor(rng.choice(draw(st.sampled_from([[0.0], [1.0], [0.0, 0.004, 0.3, 1.0]])), num)).float()

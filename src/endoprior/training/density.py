@@ -31,13 +31,11 @@ class DensityStats:
     """(N,) n_i: valid projections at which the score was sampled."""
     opacity_sum: Tensor
     """(N,) sum of the opacity at those projections."""
-    max_radius_px: Tensor
-    """(N,) largest radius on screen since the last event, for methods that prune by it; else 0."""
 
     @staticmethod
     def zeros(num: int, device: torch.device | str = "cpu") -> DensityStats:
         """Statistics of `num` Gaussians of which nothing is known."""
-        return DensityStats(*(torch.zeros(num, device=device) for _ in range(6)))
+        return DensityStats(*(torch.zeros(num, device=device) for _ in range(5)))
 
     def tensors(self) -> dict[str, Tensor]:
         """The sums by name."""
@@ -56,16 +54,6 @@ class DensityStats:
         """Forget the gradients of every Gaussian, as each density event does."""
         self.grad2d_ndc_sum.zero_()
         self.num_seen.zero_()
-        self.max_radius_px.zero_()
-
-    def add_radii(self, radii: Tensor, skip: Tensor | None) -> None:
-        """Keep the largest of the radii (N,), px, of one image.
-
-        Args:
-            skip: () float32 on a device; where it is 1 nothing changes.
-        """
-        seen = radii if skip is None else radii * (1 - skip)
-        torch.maximum(self.max_radius_px, seen.to(self.max_radius_px.dtype), out=self.max_radius_px)
 
 
 @dataclass(frozen=True)

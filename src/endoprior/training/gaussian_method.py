@@ -41,8 +41,6 @@ class GaussianMethod(Method):
 
     uses_prior = True
     """The texture prior of the frames is computed, for density control and the temporal term."""
-    uses_radii = False
-    """The largest radius of each Gaussian on screen is kept, for `plan`."""
     keeps_optimizer = False
     """Adam's moments and steps go on from the coarse to the fine stage."""
     color_is_error = False

@@ -259,8 +259,6 @@ class TrainingStep:
         """Add to the running statistics: the gradient always, the prior's score where there is a prior."""
         camera, skip = batch.frame.camera, self.check.skip
         self.ops.add_gradient(state.stats, out, camera.width, camera.height, skip)
-        if self.method.uses_radii:
-            state.stats.add_radii(out.radii, skip)
         if batch.prior is not None:
             scale = batch.prior.shape[1] / camera.width
             opacities = state.gaussians.opacities
