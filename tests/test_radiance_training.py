@@ -190,7 +190,7 @@ def test_scene_from_its_file_renders_alike(
     assert a.color.shape == (8, 10, 3) and a.depth.shape == a.alpha.shape == (8, 10)
     assert torch.equal(a.color, b.color) and torch.equal(a.depth, b.depth) and torch.equal(a.alpha, b.alpha)
     assert float(a.color.min()) >= 0 and float(a.color.max()) <= 1 and not a.color.requires_grad
-    monkeypatch.setattr("endoprior.radiance.scene.SAMPLES_AT_ONCE", 100)  # 8 rays at a time
+    monkeypatch.setattr("endoprior.radiance.scene.SAMPLES_AT_ONCE", {"cpu": 100})  # 8 rays at a time
     torch.testing.assert_close(loaded.render(0.4).color, a.color)
     assert loaded.to("cpu") is loaded and loaded.frames_per_second == 15
     with pytest.raises(ValueError, match="time must be"):

@@ -177,8 +177,10 @@ def test_growth_removal_and_resets():
     assert plan.split.tolist() == [False, True, False, False, False]
     later = METHOD.plan(stats, gaussians, 0.0, Stage.FINE, 3100, CFG)
     assert later.remove.tolist() == [False, False, True, False, False]
-    due = [i for i in (400, 500, 3000, 3100, 15_000) if METHOD.reset_due(Stage.FINE, i, CFG)]
-    assert due == [500, 3000]
+    published = CFG.replace({"density.stop_iteration": 15_000})
+    for cfg, wanted in ((published, [500, 3000]), (CFG, [500])):
+        assert [i for i in (400, 500, 3000, 3100, 15_000) if METHOD.reset_due(Stage.FINE, i, cfg)] == wanted
+    assert CFG.density.stop_iteration / CFG.schedule.fine_iterations == 15_000 / 40_000
 
 
 # All together.

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import relu
 
+from ..compute.relu_network import relu_network
 from ..core.config import Config
 from ..core.config_deformation import DeformationConfig
 from ..model.deformation import HexPlaneField, Offsets, num_features
@@ -44,9 +45,9 @@ class JointField(HexPlaneField):
 
     def offsets(self, means: Tensor, time: float, ops: ModelOps) -> Offsets:
         """See `HexPlaneField.offsets`."""
-        (values,) = self.trunk(means, (time,), ops)
-        for layer in ("second", "hidden", "output"):
-            values = self.heads.linear(layer, relu(values))
+        (trunk,) = self.trunk(means, (time,), ops)
+        layers = [self.heads.layer(name) for name in ("second", "hidden", "output")]
+        values = relu_network(relu(trunk), layers)
         parts = dict(zip(OUTPUTS, values.split(list(OUTPUTS.values()), 1), strict=True))
         parts["means"] = UNIT_MM * parts["means"]
         sh = parts.pop("sh").reshape(len(means), 16, 3)

@@ -101,11 +101,11 @@ class SurgicalGaussian(GaussianMethod):
     _motion = NetworkMotion()
 
     def config(self) -> Config:
-        """See `Method.config`. Published: 40,000 iterations, decay over 30,000."""
+        """See `Method.config`. Published: 40,000 iterations, growth before 15,000, decay over 30,000."""
         return Config(
             method="surgicalgaussian",
             temporal=TemporalConfig(weight=0.0),
-            density=DensityConfig(grow_threshold=3e-4, min_densify_weight=1.0, prior_prune=False),
+            density=DensityConfig(stop_iteration=1500, grow_threshold=3e-4, min_densify_weight=1.0, prior_prune=False),
             optim=OptimConfig(scales_lr=1e-3, decay_iterations=3000),
             schedule=ScheduleConfig(coarse_iterations=0, fine_iterations=4000, sh_every=1000),
         )

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
-from torch.nn.functional import linear, relu
 
+from ..compute.relu_network import relu_network
 from ..core.checks import InputError
 from ..model.field import Field
 
@@ -72,17 +72,15 @@ class TimeNetwork(Field):
 
     def __call__(self, places: Tensor, time: float) -> dict[str, Tensor]:
         """Offsets (N, outputs) of each head at places (N, 3) and a time."""
-        moment = encoded(places.new_full((len(places), 1), time), TIME_BANDS)
-        inputs = torch.cat([encoded(places, PLACE_BANDS), moment], -1)
-        values = inputs
-        for i in range(DEPTH):
-            values = relu(self._linear(f"layer.{i}", values))
-            if i == SKIP_AFTER:
-                values = torch.cat([inputs, values], -1)
-        return {name: self._linear(name, values) for name in HEADS}
+        at_time = encoded(places.new_full((len(places), 1), time), TIME_BANDS)
+        inputs = torch.cat([encoded(places, PLACE_BANDS), at_time], -1)
+        layers = [self._layer(f"layer.{i}") for i in range(DEPTH)]
+        heads = [torch.cat(parts) for parts in zip(*(self._layer(name) for name in HEADS), strict=True)]
+        offsets = relu_network(inputs, [*layers, (heads[0], heads[1])], skip=SKIP_AFTER + 1, repeated=INPUTS)
+        return dict(zip(HEADS, offsets.split(list(HEADS.values()), -1), strict=True))
 
-    def _linear(self, name: str, values: Tensor) -> Tensor:
-        return linear(values, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
+    def _layer(self, name: str) -> tuple[Tensor, Tensor]:
+        return self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
 
     @property
     def parameters(self) -> dict[str, Tensor]:

@@ -50,11 +50,15 @@ class LinearLayers:
     @property
     def trunk(self) -> tuple[Tensor, Tensor]:
         """Weight (W, F) and bias (W,) of the linear trunk; `ops.hexplane_linear` applies it to the features."""
-        return self.parameters["trunk.weight"], self.parameters["trunk.bias"]
+        return self.layer("trunk")
+
+    def layer(self, name: str) -> tuple[Tensor, Tensor]:
+        """Weight (outputs, inputs) and bias (outputs,) of a layer."""
+        return self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"]
 
     def linear(self, layer: str, inputs: Tensor) -> Tensor:
         """One linear layer by name."""
-        return linear(inputs, self.parameters[f"{layer}.weight"], self.parameters[f"{layer}.bias"])
+        return linear(inputs, *self.layer(layer))
 
 
 def head_shapes(num_features: int, width: int, outputs: dict[str, int]) -> dict[str, tuple[int, int]]:

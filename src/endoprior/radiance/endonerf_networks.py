@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Generator, Tensor, nn
 
+from ..compute.relu_network import relu_network
 from .encoding import encoded, encoded_size
 from .layers import Linear
 
@@ -23,13 +24,11 @@ class _Trunk(nn.Module):
         widths = [inputs] + [WIDTH + (position if k == SKIP else 0) for k in range(1, LAYERS)]
         self.layers = nn.ModuleList(Linear(width, WIDTH) for width in widths)
 
-    def forward(self, inputs: Tensor, position: Tensor) -> Tensor:
-        hidden = inputs
-        for k, layer in enumerate(self.layers):
-            if k == SKIP:
-                hidden = torch.cat([position, hidden], -1)
-            hidden = torch.relu(layer(hidden))
-        return hidden
+    def forward(self, inputs: Tensor, *heads: Linear) -> Tensor:
+        """What linear `heads` make of the last layer, side by side. The encoded position comes first in `inputs`."""
+        weight, bias = (torch.cat([getattr(head, name) for head in heads]) for name in ("weight", "bias"))
+        layers = [(layer.weight, layer.bias) for layer in self.layers]
+        return relu_network(inputs, [*layers, (weight, bias)], skip=SKIP, repeated=encoded_size(3, POSITION))
 
 
 class TimeNetwork(nn.Module):
@@ -46,7 +45,7 @@ class TimeNetwork(nn.Module):
             return torch.zeros_like(points)
         position = encoded(points, POSITION)
         at_time = encoded(points.new_tensor([[time]]), TIME).expand(len(points), -1)
-        return self.out(self.trunk(torch.cat([position, at_time], -1), position))
+        return self.trunk(torch.cat([position, at_time], -1), self.out)
 
 
 class CanonicalNetwork(nn.Module):
@@ -69,11 +68,10 @@ class CanonicalNetwork(nn.Module):
         Returns:
             (P, 4).
         """
-        position = encoded(points, POSITION)
-        hidden = self.trunk(position, position)
-        seen = torch.cat([self.feature(hidden), encoded(directions, DIRECTION)], -1)
-        color = torch.sigmoid(self.color(torch.relu(self.view(seen))))
-        return torch.cat([color, self.density(hidden)], -1)
+        features = self.trunk(encoded(points, POSITION), self.feature, self.density)
+        seen = torch.cat([features[:, :WIDTH], encoded(directions, DIRECTION)], -1)
+        layers = [(layer.weight, layer.bias) for layer in (self.view, self.color)]
+        return torch.cat([torch.sigmoid(relu_network(seen, layers)), features[:, WIDTH:]], -1)
 
 
 def start(network: nn.Module, generator: Generator) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
+from ..compute.relu_network import BLOCK_ROWS
 from ..core.config_radiance import RadianceConfig
 from . import endosurf_losses as loss
 from .compositing import Composited, composited, surface_alpha
@@ -155,8 +156,9 @@ class EndoSurf(RadianceField):
 
     @torch.no_grad()
     def distance(self, points: Tensor, time: float) -> Tensor:
-        """(P,) signed distance at points (P, 3) of the sphere, without gradient."""
-        return self.surface(points + self.deformation(points, time))[0]
+        """(P,) signed distance at points (P, 3) of the sphere, without gradient; in blocks, which fit into a cache."""
+        blocks = points.split(BLOCK_ROWS)
+        return torch.cat([self.surface(block + self.deformation(block, time))[0] for block in blocks])
 
     def distance_and_gradient(self, points: Tensor, time: float) -> tuple[Tensor, Tensor]:
         """(P,) signed distance and (P, 3) its gradient at the points' own time."""

@@ -13,6 +13,7 @@ from ..model.method import method_of
 from ..model.scene import RenderedScene
 from ..system.atomic import write_json, writing
 from ..system.file_lock import locked
+from ..system.heap import keep_freed_memory
 from ..training.divergence import Diverged
 from ..training.memory_check import reject_too_large
 from ..training.trainer import Observer
@@ -60,6 +61,7 @@ class TrainingRun:
 
     def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> RenderedScene:
         """Train to the end; `observers` are called after each iteration, in this order. See `runs.train`."""
+        keep_freed_memory()
         if self.out is None:
             self.trainer.start()
             self.trainer.run(list(observers))
