@@ -13,7 +13,7 @@ from ..model.method import method_of
 from ..model.scene import RenderedScene
 from ..system.atomic import write_json, writing
 from ..system.file_lock import locked
-from ..system.heap import keep_freed_memory
+from ..system.heap import freed_memory_kept
 from ..training.divergence import Diverged
 from ..training.memory_check import reject_too_large
 from ..training.trainer import Observer
@@ -59,9 +59,9 @@ class TrainingRun:
             say(f"note: {warning}")
         self.trainer = method_of(cfg).trainer(sequence, cfg)
 
+    @freed_memory_kept()
     def complete(self, *observers: Observer, checkpoint_seconds: float = CHECKPOINT_SECONDS) -> RenderedScene:
         """Train to the end; `observers` are called after each iteration, in this order. See `runs.train`."""
-        keep_freed_memory()
         if self.out is None:
             self.trainer.start()
             self.trainer.run(list(observers))
