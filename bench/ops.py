@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import common
@@ -12,8 +13,10 @@ import numpy as np
 import scenes
 import torch
 
+from endoprior.compute.relu_network import relu_network, relu_network_torch
 from endoprior.core.config_deformation import DeformationConfig
 from endoprior.core.presets import preset
+from endoprior.methods.time_network import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
 from endoprior.model.attributes import motion_shape
 from endoprior.model.basis import RankOneGradient, basis_offsets
 from endoprior.model.deformation import HexPlaneField
@@ -36,6 +39,8 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
     for num in common.nums(sizes):
         for name, steps in (("hexplane + trunk", hexplane), ("motion basis", basis), ("optimizer", optimizer)):
             measured += common.rows(name, common.race(steps(num, NUMBA), steps(num, TORCH)), num)
+        result = common.race(network(num, relu_network), network(num, relu_network_torch))
+        measured += common.rows("network of 8 x 256", result, num)
     for num in sorted({preset("default").temporal.max_points, *common.nums(sizes)}):
         other = temporal(num, TORCH) if num <= TORCH_MOST_PAIRS else None
         measured += common.rows("temporal term", common.race(temporal(num, NUMBA), other), num)
@@ -86,6 +91,21 @@ def basis(num: int, ops: TrainingOps) -> common.Steps:
         "forward": lambda _: basis_offsets(motion, TIME, cfg.deformation, ops.model, sink),
         "backward": backward,
         "update": update,
+    }
+
+
+def network(num: int, of: Callable[..., torch.Tensor]) -> common.Steps:
+    """The network that moves the Gaussians of `surgicalgaussian`; one of those of `endonerf` is alike."""
+    generator, layers = torch.Generator().manual_seed(0), []
+    for i in range(DEPTH):
+        shape = layer_shapes()[f"layer.{i}"]
+        weight, bias = (torch.randn(size, generator=generator) / 16 for size in (shape, shape[:1]))
+        layers.append((weight.requires_grad_(), bias.requires_grad_()))
+    inputs, cotangent = (torch.randn(num, width, generator=generator) for width in (INPUTS, WIDTH))
+    parameters = [each for layer in layers for each in layer]
+    return {
+        "forward": lambda _: of(inputs, layers, skip=SKIP_AFTER + 1, repeated=INPUTS),
+        "backward": lambda out: torch.autograd.grad(out, parameters, [cotangent]),
     }
 
 
