@@ -1,8 +1,8 @@
 """Linear layers with ReLU between them, a block of rows at a time on the CPU.
 
 Whole layers of tens of thousands of rows do not fit into a cache, and on a busy machine fresh memory for each of them
-costs as much as half of the matrix product. A block of rows goes through all layers while it is in the
-cache. Networks that need second derivatives cannot use this.
+costs as much as half of the matrix product. A block of rows goes through all layers while it is in the cache. Networks
+that need second derivatives cannot use this.
 
 N rows, I inputs.
 """

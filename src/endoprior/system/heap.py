@@ -1,8 +1,8 @@
 """Memory that training frees is kept for its next iteration instead of going back to the system.
 
 Every iteration allocates the same large arrays. By default the GNU C library maps those above 32 MB anew each time, and
-the system clears every page at its first use: half of the time of an iteration of `endosurf`, a fifth of `endogs`
-(docs/log.md). Its setting for the limit does not go higher, so mapping is switched off.
+the system clears every page at its first use: up to half of the time of an iteration of `endosurf`, a quarter of
+`endogs` (docs/log.md). Its setting for the limit does not go higher, so mapping is switched off.
 """
 
 from __future__ import annotations
