@@ -41,10 +41,12 @@ class Probed:
 
     distance: Tensor
     """(P,)."""
-    gradient: Tensor
-    """(P, 3) of the distance at the points' own time."""
+    slope: Tensor
+    """(P,) change of the distance along the ray, at the points' own time."""
     color: Tensor
     """(P, 3)."""
+    gradient: Tensor | None
+    """(P, 3) of the distance at the points' own time; None in rendering, where nothing needs it."""
 
 
 class EndoSurf(RadianceField):
@@ -128,10 +130,9 @@ class EndoSurf(RadianceField):
             points = (origins[:, None] + middles[..., None] * units[:, None]).flatten(0, 1)
         directions = units.repeat_interleave(s.shape[1], 0)
         probed = self.probe(points, directions, time)
-        slope = (probed.gradient * directions).sum(-1)
         sharpness = torch.exp(10 * self.sharpness)
         alpha = surface_alpha(
-            *(each.view_as(s) for each in (probed.distance, slope)), steps, sharpness, float(self.anneal)
+            *(each.view_as(s) for each in (probed.distance, probed.slope)), steps, sharpness, float(self.anneal)
         )
         return composited(alpha, probed.color.unflatten(0, s.shape), middles), probed, points
 
@@ -170,16 +171,18 @@ class EndoSurf(RadianceField):
     def probe(self, points: Tensor, directions: Tensor, time: float) -> Probed:
         """All networks at points (P, 3) that rays of unit directions (P, 3) pass."""
         trained = torch.is_grad_enabled()
+        points = points.detach().requires_grad_(trained)
+        moved, change = self.deformation.with_change(points, time, directions)
         with torch.enable_grad():
-            points = points.detach().requires_grad_()
-            moved, along = self.deformation.with_change(points, time, directions)
             canonical = points + moved
+            canonical = canonical if trained else canonical.requires_grad_()
             distance, features = self.surface(canonical)
-            (normals,) = self._gradient(distance.sum(), canonical, keep=True, create=trained)
-            (gradient,) = self._gradient(canonical, points, normals, keep=trained, create=trained)
-        along = directions + along
+            (normals,) = self._gradient(distance.sum(), canonical, keep=trained, create=trained)
+            gradient = self._gradient(canonical, points, normals)[0] if trained else None
+        along = directions + change
+        slope = (normals * along).sum(-1)
         along = along / (along.norm(dim=-1, keepdim=True) + 1e-10)
-        return Probed(distance, gradient, self.color(canonical, normals, along, features))
+        return Probed(distance, slope, self.color(canonical, normals, along, features), gradient)
 
     @staticmethod
     def _gradient(
