@@ -127,7 +127,13 @@ def test_field_has_the_gradient_of_its_own_distance():
         slow = (field.distance(x + step * axis, 0.4) - field.distance(x - step * axis, 0.4)) / (2 * step)
         torch.testing.assert_close(found.gradient @ axis, slow, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(field.distance_and_gradient(x, 0.4)[1], found.gradient)
-    torch.testing.assert_close(found.slope, (found.gradient * directions).sum(-1))
+    slope, parameters = (found.gradient * directions).sum(-1), list(field.deformation.parameters())
+    torch.testing.assert_close(found.slope, slope)
+    derivatives, slow = (
+        torch.autograd.grad(s.square().sum(), parameters, retain_graph=True) for s in (found.slope, slope)
+    )
+    for k in range(len(parameters)):  # what training gets from alpha
+        torch.testing.assert_close(derivatives[k], slow[k])
     assert found.color.shape == (10, 3)
     with torch.no_grad():  # as rendering does: the same, without what only training needs
         drawn = field.probe(x, directions, 0.4)

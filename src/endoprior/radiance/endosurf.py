@@ -174,8 +174,7 @@ class EndoSurf(RadianceField):
         points = points.detach().requires_grad_(trained)
         moved, change = self.deformation.with_change(points, time, directions)
         with torch.enable_grad():
-            canonical = points + moved
-            canonical = canonical if trained else canonical.requires_grad_()
+            canonical = (points + moved).requires_grad_()
             distance, features = self.surface(canonical)
             (normals,) = self._gradient(distance.sum(), canonical, keep=trained, create=trained)
             gradient = self._gradient(canonical, points, normals)[0] if trained else None
