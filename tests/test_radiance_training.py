@@ -30,6 +30,7 @@ from endoprior.radiance.scene import RadianceScene
 from endoprior.runs.remote import train_here, trainings
 from endoprior.runs.train import start_run, train
 from endoprior.system.arrays_file import load_arrays, save_arrays
+from endoprior.training import divergence
 from endoprior.training.divergence import Diverged
 from endoprior.training.radiance_trainer import RadianceTrainer
 from endoprior.training.stage import Stage
@@ -118,6 +119,22 @@ def test_divergence_leaves_the_state_alone(name: str, sequence: FrameSequence, m
         trainer.step()
     assert trainer.state.iteration == 1
     assert same(before, trainer.state.arrays())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rays_that_stay_black_end_the_run(name: str, sequence: FrameSequence, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(divergence, "WINDOW", 3)
+    trainer = started(sequence, name)
+    color = trainer.state.field.canonical.color if name == "endonerf" else trainer.state.field.color.layers[-1]
+    for _ in range(2):
+        with torch.no_grad():
+            color.bias.fill_(-1e3)
+        trainer.step()
+    with torch.no_grad():
+        color.bias.fill_(-1e3)
+    with pytest.raises(Diverged, match=r"background alone .* raise --radiance\.rays"):
+        trainer.step()
+    assert trainer.state.iteration == 2
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -36,6 +36,7 @@ class EndoNeRF(RadianceField):
     """See the module."""
 
     only_measured = False
+    color_term = staticmethod(endonerf_losses.color_term)
 
     def __init__(self, cfg: RadianceConfig) -> None:
         super().__init__(cfg)

@@ -17,6 +17,11 @@ def expected(view: Composited) -> Tensor:
     return 1 / (inverse + 1e-6)
 
 
+def color_term(color: Tensor, target: Tensor) -> Tensor:
+    """Mean squared error over rays and channels (N, 3)."""
+    return (color - target).square().mean()
+
+
 def terms(view: Composited, color: Tensor, depth: Tensor, measured: Tensor) -> dict[str, Tensor]:
     """Weighted terms, () each.
 
@@ -27,4 +32,4 @@ def terms(view: Composited, color: Tensor, depth: Tensor, measured: Tensor) -> d
     """
     apart = huber_loss(expected(view), depth, delta=HUBER_DELTA, reduction="none")
     share = torch.where(measured, apart, torch.zeros_like(apart)).sum() / measured.sum().clamp(min=1)
-    return {"color": (view.color - color).square().mean(), "depth": DEPTH_WEIGHT * share}
+    return {"color": color_term(view.color, color), "depth": DEPTH_WEIGHT * share}

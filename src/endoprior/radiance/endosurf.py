@@ -53,6 +53,7 @@ class EndoSurf(RadianceField):
     """See the module."""
 
     only_measured = True
+    color_term = staticmethod(loss.color_term)
 
     def __init__(self, cfg: RadianceConfig) -> None:
         super().__init__(cfg)

@@ -61,6 +61,11 @@ class RadianceField(nn.Module, ABC):
             rng: of this iteration; every random number comes from it.
         """
 
+    @staticmethod
+    @abstractmethod
+    def color_term(color: Tensor, target: Tensor) -> Tensor:
+        """The term `color` of `losses`, (), of rays that show `color` (N, 3) where the frame shows `target`."""
+
     @abstractmethod
     def render(self, rays: Rays, time: float) -> Composited:
         """What the rays show at `time` in [0, 1], depth in mm as the sum of weight * z; without gradients."""

@@ -32,9 +32,10 @@ WINDOW = 300
 NO_BETTER = 0.95
 """... when their color error is this share of that of the background alone."""
 ALIKE = 0.02
-"""Mean difference of frames and background, 0..1, below which that is a fair guess and nothing is concluded."""
+"""Error of the background alone below which that is a fair guess and nothing is concluded."""
 
 ADVICE = "Lower the learning rates (--optim...), or look for wrong depth and poses with `endoprior check`"
+"""For a method of Gaussians."""
 
 
 class Diverged(InputError):
@@ -50,16 +51,17 @@ class Divergence:
     """Iteration of the stage after which the state was left unchanged."""
 
 
-def unusable_numbers(terms: Mapping[str, float], unusable: Mapping[str, int]) -> str | None:
+def unusable_numbers(terms: Mapping[str, float], unusable: Mapping[str, int], advice: str = ADVICE) -> str | None:
     """What is wrong with the numbers of an iteration, if anything is.
 
     Args:
         terms: weighted terms of the loss.
         unusable: entries of each gradient that are not finite or beyond `LARGEST_GRADIENT`, by name.
+        advice: what to do.
     """
     found = [f"{name} {value}" for name, value in terms.items() if not math.isfinite(value)]
     found += [f"{count:,} unusable entries in the gradient of {name}" for name, count in unusable.items() if count]
-    return f"expected a finite loss and gradient; got {', '.join(found)}. {ADVICE}" if found else None
+    return f"expected a finite loss and gradient; got {', '.join(found)}. {advice}" if found else None
 
 
 @dataclass(frozen=True)
@@ -136,15 +138,16 @@ class DivergenceCheck:
 class Watch:
     """Notices a run that explains nothing: everything moved out of view, faded, or saturated."""
 
-    def __init__(self) -> None:
+    def __init__(self, advice: str = ADVICE) -> None:
+        self._advice = advice
         self._errors: deque[tuple[float, float]] = deque(maxlen=WINDOW)
 
     def see(self, color_error: float, empty_error: float) -> str | None:
         """Take in one iteration.
 
         Args:
-            color_error: mean absolute error of the image over tissue.
-            empty_error: that of an image that shows only the background, in [0, 1].
+            color_error: error of the image over tissue: mean absolute, or what else colors of 0 to 1 are compared by.
+            empty_error: that of an image that shows only the background.
         Returns:
             What is wrong, if over the last `WINDOW` iterations the images were no better than empty ones.
         """
@@ -156,5 +159,5 @@ class Watch:
             return None
         return (
             f"expected images that resemble the frames; over {WINDOW} iterations their mean color error was "
-            f"{error:.3g}, and the background alone would have {empty:.3g}. {ADVICE}"
+            f"{error:.3g}, and the background alone would have {empty:.3g}. {self._advice}"
         )

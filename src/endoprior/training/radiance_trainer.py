@@ -19,13 +19,16 @@ from ..radiance.rays import rays_of
 from ..radiance.refinement import due, refined
 from ..radiance.scene import RadianceScene
 from ..system.arrays_file import ArraySpec
-from .divergence import LARGEST_GRADIENT, Diverged, unusable_numbers
+from .divergence import LARGEST_GRADIENT, Diverged, Watch, unusable_numbers
 from .radiance_state import RadianceState, state_schema
 from .stage import Stage, StepReport, stage_length
 from .trainer import DEFAULT_FRAMES_PER_SECOND, Trainer, device_for
 
 BETAS, EPSILON = (0.9, 0.999), 1e-8
 """Adam's: torch's own, which both releases use."""
+ADVICE = (
+    "Lower --radiance.learning-rate, raise --radiance.rays, or look for wrong depth and poses with `endoprior check`"
+)
 
 
 class RadianceTrainer(Trainer):
@@ -51,6 +54,7 @@ class RadianceTrainer(Trainer):
             raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
         self.frames = RayFrames(sequence, only_measured=kind.only_measured)
         self.state: RadianceState | None = None
+        self._watch = Watch(ADVICE)
 
     def start(self) -> None:
         """See `Trainer.start`: measure the sequence and give the networks their first values."""
@@ -83,16 +87,22 @@ class RadianceTrainer(Trainer):
         """One iteration: rays of one frame, their terms, their gradients, a check, then Adam.
 
         Raises:
-            Diverged: the loss or a gradient is not finite. The state is the one before.
+            Diverged: the loss or a gradient is not finite, or rays have long been no better than black ones. The state
+                is the one before.
         """
         began, state, cfg = clock.perf_counter(), self.state, self.cfg
         iteration, share = state.iteration + 1, (state.iteration + 1) / stage_length(self.cfg, Stage.FINE)
         rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
         field, buffers = state.field, {name: value.clone() for name, value in state.field.named_buffers()}
-        terms = field.losses(self.batch(rng), share, rng)
+        batch = self.batch(rng)
+        terms = field.losses(batch, share, rng)
         state.optimizer.zero_grad(set_to_none=True)
         sum(terms.values()).backward()
-        reason = unusable_numbers({name: float(value.detach()) for name, value in terms.items()}, _unusable(field))
+        values = {name: float(value.detach()) for name, value in terms.items()}
+        reason = unusable_numbers(values, _unusable(field), ADVICE)
+        if reason is None:
+            black = field.color_term(torch.zeros_like(batch.color), batch.color)
+            reason = self._watch.see(values["color"], float(black))
         if reason is not None:
             state.optimizer.zero_grad(set_to_none=True)
             for name, value in field.named_buffers():
