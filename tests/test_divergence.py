@@ -68,6 +68,9 @@ def test_images_no_better_than_black_are_noticed_and_dark_ones_are_not():
     for _ in range(WINDOW - 1):
         assert lost.see(0.4, 0.4) is None
     assert "background alone" in lost.see(0.4, 0.4)
+    learning = Watch()
+    for step in range(3 * WINDOW):
+        assert learning.see(3.0 if step < WINDOW // 2 else 0.1, 0.4) is None, "a bad start is no divergence"
 
 
 @pytest.mark.parametrize("name", ["default", "deform3dgs", "endogs", "endo4dgs", "surgicalgaussian"])

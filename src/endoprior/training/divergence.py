@@ -155,7 +155,9 @@ class Watch:
         if len(self._errors) < WINDOW:
             return None
         error, empty = np.mean(self._errors, axis=0)
-        if empty <= ALIKE or error < NO_BETTER * empty:
+        # Every tenth counts: a bad start, such as gray for dark frames, must not outweigh what was learned since.
+        parts = [np.mean(part, axis=0) for part in np.array_split(np.array(self._errors), min(10, WINDOW))]
+        if empty <= ALIKE or any(part[0] < NO_BETTER * part[1] for part in parts):
             return None
         return (
             f"expected images that resemble the frames; over {WINDOW} iterations their mean color error was "
