@@ -108,6 +108,7 @@ def test_bad_matches_are_named(tmp_path, match, said):
 
 def test_a_benchmark_trains_with_what_it_finds(tmp_path):
     events = {"density.start_iteration": 2, "density.every": 2, "density.extent_mode": "scene"}
+    planes = {"deformation.hexplane.channels": 8, "deformation.hexplane.multires": [1]}
     values = {
         "title": "t",
         "sequences": {"p": {"phantom": {"frames": 9, "width": 64, "height": 64}}},
@@ -116,7 +117,7 @@ def test_a_benchmark_trains_with_what_it_finds(tmp_path):
             "many": PRESET | {"set": {"density.grow_threshold": 1e-9}, "match": {"count_of": "base"}},
         },
         "seeds": [0, 1],
-        "set": {"init.budget": 200, "schedule.coarse_iterations": 4, "schedule.fine_iterations": 8, **events},
+        "set": {"init.budget": 200, "schedule.coarse_iterations": 4, "schedule.fine_iterations": 8, **events, **planes},
         "scores": ["num_gaussians", "gaussians_growth"],
         "figures": [],
     }
