@@ -70,10 +70,17 @@ def trained(tmp_path_factory):
 
 
 def begin(*words: object) -> subprocess.Popen:
-    """Start the program, with as many threads of torch as here."""
+    """Start the program, with as many threads of torch as here; in the background of a script, which ignores SIGINT."""
     command = [sys.executable, "-m", "endoprior", *map(str, words)]
     environment = os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())}
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+    )
 
 
 def wait_for_checkpoints(process: subprocess.Popen, out: Path, *windows: int) -> None:
@@ -133,7 +140,7 @@ def test_an_interrupted_cluster_saves_and_resumes_without_one(trained, tmp_path)
         "train", data, out, "--config", config, "--no-networks", "--ray", "local", "--checkpoint-seconds", 0
     )
     try:
-        wait_for_checkpoints(process, out, 0)
+        wait_for_checkpoints(process, out, 0, 1)
         process.send_signal(signal.SIGINT)
         said, _ = process.communicate(timeout=600)
     finally:

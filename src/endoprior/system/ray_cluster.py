@@ -201,7 +201,7 @@ def _interrupted_by_signals(cluster: Cluster) -> Iterator[None]:
     previous = {number: signal.getsignal(number) for number in (getattr(signal, name) for name in names)}
     try:
         for number, handler in previous.items():
-            if handler is not signal.SIG_IGN:
+            if number == signal.SIGINT or handler is not signal.SIG_IGN:  # scripts start jobs that ignore SIGINT
                 signal.signal(number, interrupt)
         yield
     finally:
