@@ -77,6 +77,7 @@ def test_images_no_better_than_black_are_noticed_and_dark_ones_are_not():
 def test_every_method_is_watched_by_its_error_on_tissue(tiny_sequence, name, monkeypatch):
     """Whatever unit and region its own color term has; and an image of nothing but background ends the run."""
     monkeypatch.setattr(divergence, "WINDOW", 4)
+    monkeypatch.setattr(divergence, "PARTS", 1)
     small = HexPlaneConfig(resolution=(6, 5, 4), time_resolution=7, channels=3, multires=(1, 2), width=8)
     cfg = preset(name, iterations=9)
     cfg = replace(

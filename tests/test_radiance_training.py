@@ -124,6 +124,7 @@ def test_divergence_leaves_the_state_alone(name: str, sequence: FrameSequence, m
 @pytest.mark.parametrize("name", NAMES)
 def test_rays_that_stay_black_end_the_run(name: str, sequence: FrameSequence, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(divergence, "WINDOW", 3)
+    monkeypatch.setattr(divergence, "PARTS", 1)
     trainer = started(sequence, name)
     color = trainer.state.field.canonical.color if name == "endonerf" else trainer.state.field.color.layers[-1]
     for _ in range(2):

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from ..system.signals import stopping_signals
+
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
@@ -26,12 +28,10 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
     if threading.current_thread() is not threading.main_thread():  # only the main one may handle signals
         yield lambda: False
         return
-    asked = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
-    previous = {number: signal.getsignal(number) for number in asked}
+    previous = stopping_signals()
     try:
-        for number in asked:
-            if number == signal.SIGINT or previous[number] is not signal.SIG_IGN:  # `nohup` ignores SIGHUP on purpose
-                signal.signal(number, note)
+        for number in previous:
+            signal.signal(number, note)
         yield lambda: pressed
     finally:
         for number, handler in previous.items():

@@ -16,6 +16,7 @@ from typing import Any
 
 from ..core.checks import input_error
 from ..core.extras import install_command
+from .signals import stopping_signals
 
 CONNECT_SECONDS = 5.0
 """Longest time that a machine may take to answer."""
@@ -197,12 +198,10 @@ def _interrupted_by_signals(cluster: Cluster) -> Iterator[None]:
         cluster.interrupted = True
         raise KeyboardInterrupt
 
-    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    previous = {number: signal.getsignal(number) for number in (getattr(signal, name) for name in names)}
+    previous = stopping_signals()
     try:
-        for number, handler in previous.items():
-            if number == signal.SIGINT or handler is not signal.SIG_IGN:  # scripts start jobs that ignore SIGINT
-                signal.signal(number, interrupt)
+        for number in previous:
+            signal.signal(number, interrupt)
         yield
     finally:
         for number, handler in previous.items():

@@ -29,6 +29,8 @@ CHECK_EVERY = 20
 """Iterations between two checks on a device: each check makes the host wait once."""
 WINDOW = 300
 """Iterations over which images that are no better than empty ones count as divergence."""
+PARTS = 10
+"""... in each of so many parts of them: a bad start, such as gray for dark frames, must not outweigh what follows."""
 NO_BETTER = 0.95
 """... when their color error is this share of that of the background alone."""
 ALIKE = 0.02
@@ -149,15 +151,17 @@ class Watch:
             color_error: error of the image over tissue: mean absolute, or what else colors of 0 to 1 are compared by.
             empty_error: that of an image that shows only the background.
         Returns:
-            What is wrong, if over the last `WINDOW` iterations the images were no better than empty ones.
+            What is wrong, if over the last `WINDOW` iterations the images were no better than empty ones, in each of
+            their `PARTS`.
         """
         self._errors.append((color_error, empty_error))
         if len(self._errors) < WINDOW:
             return None
-        error, empty = np.mean(self._errors, axis=0)
-        # Every tenth counts: a bad start, such as gray for dark frames, must not outweigh what was learned since.
-        parts = [np.mean(part, axis=0) for part in np.array_split(np.array(self._errors), min(10, WINDOW))]
-        if empty <= ALIKE or any(part[0] < NO_BETTER * part[1] for part in parts):
+        errors = np.array(self._errors)
+        error, empty = errors.mean(0)
+        if empty <= ALIKE or error < NO_BETTER * empty:  # a part is better, then, too
+            return None
+        if any(part[:, 0].mean() < NO_BETTER * part[:, 1].mean() for part in np.array_split(errors, PARTS)):
             return None
         return (
             f"expected images that resemble the frames; over {WINDOW} iterations their mean color error was "
