@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from ..core.checks import input_error
 
@@ -14,6 +14,11 @@ MOVING_SHARE = 4
 """A camera that moves sees up to this many times as much tissue, which takes that much more memory."""
 WIDEST_MOVING = 0.75
 """Least focal length of a moving camera, as a share of the longer side of the image."""
+
+Instruments = Literal[
+    "graspers", "gray_blue", "black", "white_plastic", "steel", "gold", "green", "blue", "mixed"
+]  # fmt: skip
+Tissue = Literal["bowel", "pale", "fat", "purple", "liver", "warm", "smoke", "blood"]
 
 NARROW_PULL_MM = 15.0
 """Up to this pull, mm, the moved neighborhood keeps its size; beyond, it grows in proportion, or tissue would fold."""
@@ -37,6 +42,10 @@ class PhantomConfig:
     """Image height, 32..4096 px."""
     seed: int = 0
     """Seed of anatomy, texture, motion and noise. The same seed gives the same bytes."""
+    instruments: Instruments = "graspers"
+    """Family of the two tools, by their color; `mixed`: one each of two families, printed and worn."""
+    tissue: Tissue = "bowel"
+    """Kind of tissue and view: its color, vessels and gloss; `warm` light; `smoke` that comes and goes; `blood`."""
     camera: Literal["still", "inspect"] = "still"
     """`inspect`: the camera moves; every 300 frames or so it pans, turns, rolls, retreats, approaches and returns."""
     stereo: bool = False
@@ -87,6 +96,10 @@ class PhantomConfig:
             ("tracks", 1, 20000),
         ):
             _require(name, getattr(self, name), low, high)
+        for name, known in (("instruments", Instruments), ("tissue", Tissue)):
+            if getattr(self, name) not in get_args(known):
+                fix = "Choose one of these."
+                raise input_error(name, f"one of {', '.join(get_args(known))}", repr(getattr(self, name)), fix)
         moves = self.camera == "inspect"
         share = MOVING_SHARE if moves else 1
         if self.width * self.height * share > MOST_PIXELS:
@@ -107,6 +120,11 @@ class PhantomConfig:
     def has_regions(self) -> bool:
         """Whether tracks say which region they are in; without these options, files are those of earlier versions."""
         return self.slide_mm > 0 or self.smooth_share > 0 or self.pull_mm > NARROW_PULL_MM
+
+    @property
+    def has_kinds(self) -> bool:
+        """Whether tools or tissue are others than the default; without, files are those of earlier versions."""
+        return self.instruments != "graspers" or self.tissue != "bowel"
 
     @property
     def focal(self) -> float:

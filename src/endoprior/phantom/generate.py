@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,22 +12,23 @@ from numpy.typing import NDArray
 
 from ..data.sequence import is_test_frame
 from ..data.writer import SequenceMeta, SequenceWriter
-from .camera_path import CameraPath, build_camera_path, widened
+from .camera_path import build_camera_path, widened
 from .config import PhantomConfig
 from .eye import STILL, Eye
-from .instrument import render_tools
-from .motion import Motion, ToolPose, build_motion
-from .raster import FAR, rasterize, vertex_normals
+from .instrument_families import instruments_of
+from .motion import Motion, build_motion
+from .raster import rasterize
+from .scene import Moment, Scene
 from .sensor import develop, expose, exposure_gain, stereo_depth, vignette
-from .shading import shade
 from .side_views import side_eyes, side_picture
+from .smoke import Smoke
 from .surface import MARGIN, Plane, build_anatomy, build_plane, organs_at, soften
 from .texture import build_texture, smooth_patches
+from .tissue_looks import LOOKS
+from .views import render_tissue, render_view
 from .visibility import shown_elsewhere, visible_points
 
-SUPERSAMPLE = 2
-"""Image samples per pixel along each axis."""
-_NOTE = "synthetic (endoprior phantom, seed {seed}); truth/tissue is free of tools and of sensor noise"
+_NOTE = "synthetic (endoprior phantom, seed {seed}{kinds}); truth/tissue is free of tools and of sensor noise"
 _TEXELS = 1.8
 """Texels per pixel of the first image."""
 _FINER = 1.25
@@ -35,68 +36,6 @@ _FINER = 1.25
 where the tissue is nearest."""
 _LOOKS = 12
 """Views in each excursion in which tracked points are chosen."""
-
-
-@dataclass(frozen=True)
-class Scene:
-    """The static parts of one synthetic sequence."""
-
-    cfg: PhantomConfig
-    plane: Plane
-    motion: Motion
-    a: NDArray[np.float64]
-    """(MH, MW) plane coordinates of the mesh vertices, mm."""
-    b: NDArray[np.float64]
-    """(MH, MW) second plane coordinate, mm."""
-    height: NDArray[np.float32]
-    """(MH, MW) rest height of the vertices, mm."""
-    texture: NDArray[np.float32]
-    """(TH, TW, 7) material maps."""
-    path: CameraPath
-
-    def vertices(self, phase: float) -> NDArray[np.float64]:
-        """(MH, MW, 3) mesh in world axes, mm, at time `phase` in [0, 1]."""
-        moved = self.motion.displacement(self.a, self.b, phase)
-        return self.plane.lift(self.a + moved[..., 0], self.b + moved[..., 1], self.height + moved[..., 2])
-
-    def endoscope(self, phase: float) -> Eye:
-        """Its left camera in the world at time `phase`."""
-        return Eye.posed(self.path.camera_to_world(phase))
-
-
-@dataclass(frozen=True)
-class Moment:
-    """What moves, at one time, in the axes of the endoscope's left camera of that time."""
-
-    endoscope: Eye
-    """The left camera in the world."""
-    vertices: NDArray[np.float64]
-    """(MH, MW, 3) mesh, mm."""
-    normals: NDArray[np.float32]
-    """(MH, MW, 3) its unit normals."""
-    tools: tuple[ToolPose, ToolPose]
-    """In world axes."""
-
-    @staticmethod
-    def of(scene: Scene, phase: float) -> Moment:
-        """The scene at time `phase` in [0, 1]."""
-        endoscope = scene.endoscope(phase)
-        vertices = endoscope.sees(scene.vertices(phase))
-        return Moment(endoscope, vertices, vertex_normals(vertices), scene.motion.tools(phase))
-
-
-@dataclass(frozen=True)
-class RenderedView:
-    """The image of one camera at one time."""
-
-    tissue: NDArray[np.float32]
-    """(H, W, 3) linear radiance without tools."""
-    image: NDArray[np.float32]
-    """(H, W, 3) linear radiance with tools."""
-    tool_share: NDArray[np.float32]
-    """(H, W) share of each pixel that is covered by a tool, 0..1."""
-    tool_depth: NDArray[np.float32]
-    """(H, W) z of the nearest tool sample, mm; FAR where there is none."""
 
 
 def build_scene(cfg: PhantomConfig) -> Scene:
@@ -110,9 +49,22 @@ def build_scene(cfg: PhantomConfig) -> Scene:
     grid_v, grid_u = np.meshgrid(np.linspace(0, 1, down), np.linspace(0, 1, across), indexing="ij")
     a, b = plane.coordinates(grid_u, grid_v)
     spacing = float(np.diff(a[down // 2]).mean())
-    height = soften(organs_at(anatomy, a, b).height, spacing, 0.7)
-    texture = build_texture(plane, anatomy, *texels, cfg.smooth_share)
-    return Scene(cfg, plane, build_motion(cfg, plane, anatomy), a, b, height, texture, path)
+    look = LOOKS[cfg.tissue]
+    height = soften(organs_at(anatomy, a, b).height, spacing, look.blurred_mm)
+    texture = build_texture(plane, anatomy, *texels, cfg.smooth_share, look)
+    motion = build_motion(cfg, plane, anatomy)
+    if look.blurred_mm > LOOKS["bowel"].blurred_mm:
+        motion = _on_surface(motion, a, b, height)
+    tools = None if cfg.instruments == "graspers" else instruments_of(cfg.instruments, cfg.seed)
+    smoke = Smoke.of(cfg, look.smoke) if look.smoke > 0 else None
+    return Scene(cfg, plane, motion, a, b, height, texture, path, look, tools, smoke)
+
+
+def _on_surface(motion: Motion, a: NDArray, b: NDArray, height: NDArray) -> Motion:
+    """The motion with pulls that hold the mesh `a`, `b`, `height` (MH, MW), mm, where smoothing has lowered it."""
+    nearest = [np.argmin((a - pull.center[0]) ** 2 + (b - pull.center[1]) ** 2) for pull in motion.pulls]
+    pulls = [replace(pull, height=float(height.flat[k])) for pull, k in zip(motion.pulls, nearest, strict=True)]
+    return replace(motion, pulls=tuple(pulls))
 
 
 def grid_sizes(cfg: PhantomConfig, plane: Plane) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -130,51 +82,6 @@ def grid_sizes(cfg: PhantomConfig, plane: Plane) -> tuple[tuple[int, int], tuple
     across = round(grown * vertices)
     texels = round(grown * _TEXELS * cfg.width), round(grown * _TEXELS * cfg.height)
     return (across, round(across * cfg.height / cfg.width)), texels
-
-
-def render_view(scene: Scene, now: Moment, eye: Eye) -> RenderedView:
-    """Render the tissue and the tools of one moment from one camera."""
-    n = SUPERSAMPLE
-    tissue, z = _tissue_samples(scene, now, eye, eye.center)
-    assert z.max() < FAR, "the material ends inside the image"
-    center = eye.center.astype(np.float32)
-    color, depth = render_tools(now.tools, z, center, *_sample_grid(scene.cfg), now.endoscope)
-    is_tool = depth < FAR
-    image = np.where(is_tool[..., None], color, tissue)
-    pooled = [_pooled(x, scene.cfg) for x in (tissue, image, is_tool.astype(np.float32))]
-    nearest = np.minimum.reduce([depth[i::n, j::n] for i in range(n) for j in range(n)])
-    return RenderedView(*pooled, nearest)
-
-
-def render_tissue(scene: Scene, now: Moment, eye: Eye) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What a side camera sees of the tissue: (H, W, 3) its radiance towards the endoscope, and (H, W) its z, mm.
-
-    z is `FAR` where there is no tissue.
-    """
-    cfg = scene.cfg
-    z = rasterize(eye.sees(now.vertices), cfg.focal, cfg.center, cfg.width, cfg.height)[..., 2]
-    return _pooled(_tissue_samples(scene, now, eye, STILL.center)[0], cfg), z
-
-
-def _tissue_samples(
-    scene: Scene, now: Moment, eye: Eye, viewer: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(SH, SW, 3) radiance and (SH, SW) z of every sample."""
-    cfg, n = scene.cfg, SUPERSAMPLE
-    focal, center = _sample_grid(cfg)
-    hits = rasterize(eye.sees(now.vertices), focal, center, n * cfg.width, n * cfg.height)
-    axes = scene.plane.axes[:2] @ now.endoscope.turn
-    radiance = shade(hits, now.normals, scene.texture, axes, eye, viewer, focal, center, FAR)
-    return radiance, np.ascontiguousarray(hits[..., 2])
-
-
-def _sample_grid(cfg: PhantomConfig) -> tuple[float, tuple[float, float]]:
-    """Focal length and principal point, px of the samples."""
-    return SUPERSAMPLE * cfg.focal, (SUPERSAMPLE * cfg.center[0], SUPERSAMPLE * cfg.center[1])
-
-
-def _pooled(samples: NDArray[np.float32], cfg: PhantomConfig) -> NDArray[np.float32]:
-    return cv2.resize(samples, (cfg.width, cfg.height), interpolation=cv2.INTER_AREA)
 
 
 def choose_tracks(scene: Scene) -> NDArray[np.int64]:
@@ -226,6 +133,8 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
     - with `cfg.side_views` `truth/side/NAME/*.png` and `*.npy`: picture and depth of the side cameras in test frames,
       0 where the endoscope does not see the tissue; `truth/side/world_to_camera.json` has their poses (4, 4);
     - with `cfg.stereo` `right/*.png` and `calibration.json`;
+    - with `cfg.has_kinds` `truth/scene.json`: kinds of tools and tissue, names of the tools, and the density of smoke
+      in each frame, 0..1; `truth/tissue` shows the smoke too, the side cameras do not;
     - with a moving `cfg.camera` `truth/camera_to_world.npy` (T, 4, 4), mm, as in `poses_bounds.npy`.
 
     Args:
@@ -236,6 +145,7 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
         InputError: `out` is in use.
     """
     (cx, cy), focal = cfg.center, cfg.focal
+    kinds = f", instruments {cfg.instruments}, tissue {cfg.tissue}" if cfg.has_kinds else ""
     meta = SequenceMeta(
         width=cfg.width,
         height=cfg.height,
@@ -246,7 +156,7 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
         frames_per_second=cfg.frames_per_second,
         baseline_mm=cfg.baseline_mm,
         depth_source="synthetic stereo",
-        note=_NOTE.format(seed=cfg.seed),
+        note=_NOTE.format(seed=cfg.seed, kinds=kinds),
     )
     with SequenceWriter(out, meta) as writer:
         scene = build_scene(cfg)
@@ -262,7 +172,7 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
             view = render_view(scene, now, STILL)
             z = rasterize(now.vertices, focal, cfg.center, cfg.width, cfg.height)[..., 2]
             if gain is None:
-                gain, sides = exposure_gain(view.tissue), side_eyes(float(np.median(z))) if cfg.side_views else {}
+                gain, sides = _gain(view.tissue, scene), side_eyes(float(np.median(z))) if cfg.side_views else {}
             truth = develop(view.tissue, gain, lens)
             rng = np.random.default_rng([cfg.seed, 6, index])
             image = expose(develop(view.image, gain, lens), cfg.noise, rng)
@@ -306,6 +216,23 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
             writer.write_json("truth/side/world_to_camera.json", poses)
         if cfg.stereo:
             writer.write_json("calibration.json", _calibration(cfg))
+        if cfg.has_kinds:
+            writer.write_json("truth/scene.json", _description(scene))
+
+
+def _gain(tissue: NDArray[np.float32], scene: Scene) -> float:
+    """The exposure of the whole sequence, chosen from the tool-free radiance (H, W, 3) of its first frame."""
+    return exposure_gain(tissue) * scene.look.exposure
+
+
+def _description(scene: Scene) -> dict[str, object]:
+    """What is in the scene: kinds of tools and tissue, names of the tools, density of the smoke in each frame."""
+    cfg = scene.cfg
+    names = [tool.name for tool in scene.instruments] if scene.instruments else ["grasper", "grasper"]
+    described = {"instruments": cfg.instruments, "tools": names, "tissue": cfg.tissue}
+    if scene.smoke is not None:
+        described["smoke"] = [round(scene.smoke.density(k / (cfg.frames - 1)), 4) for k in range(cfg.frames)]
+    return described
 
 
 def _calibration(cfg: PhantomConfig) -> dict[str, object]:

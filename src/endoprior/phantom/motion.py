@@ -18,6 +18,9 @@ _BREATH_FRAMES = 40
 _PULL_FRAMES = 48
 _WIDE_MM, _NARROW_MM, _NARROW_SHARE = 14.0, 5.2, 0.45
 """A pull moves a broad neighborhood, plus a narrow peak around the jaws."""
+_NEARER, _HIGHER_MM = 0.3, 5.0
+"""Where the second tool of most families moves: at this share of the distance from the center of that of `graspers`,
+and so much nearer to the camera."""
 
 
 def smooth_step(low: float, high: float, x: float) -> float:
@@ -153,5 +156,7 @@ def build_motion(cfg: PhantomConfig, plane: Plane, anatomy: Anatomy) -> Motion:
             pulls.append(Pull(center, height, vector, k / cycles, 1 / cycles, width))
     hover = [-side * rng.uniform(17, 24), rng.uniform(8, 14), rng.uniform(21, 25)]
     hover += [rng.uniform(5, 9), rng.uniform(4, 7), rng.uniform(0, 6.3)]
+    if cfg.instruments != "graspers":
+        hover[0], hover[2] = _NEARER * hover[0], hover[2] + _HIGHER_MM  # thin tools would hardly be in the image
     motion = cfg.breathing_mm, cfg.slide_mm, tuple(pulls), np.array(idles), np.array(hover), side
     return Motion(plane, anatomy, cfg.frames, *motion)

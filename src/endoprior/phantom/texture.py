@@ -5,12 +5,16 @@ Letters: (TH, TW) texels; texel (i, j) is at g_u = (j + 0.5) / TW, g_v = (i + 0.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .blood import bled, blood_depth
 from .noise import cells, fractal
 from .surface import FLOOR, LIVER, Anatomy, Organs, Plane, organs_at, soften
+from .tissue_looks import LOOKS, TissueLook
 from .vessels import vessel_maps
 
 CHANNELS = 7
@@ -20,14 +24,6 @@ SMOOTHED = 0.92
 """Share of the color detail and of the fine relief that a smooth patch lacks."""
 PATCH_BLUR_MM = 6.0
 """Color detail smaller than this is taken out of smooth patches."""
-_LOOP = (0.74, 0.40, 0.38)
-_LOOP_PALE = (0.86, 0.60, 0.53)
-_LOOP_DUSKY = (0.56, 0.25, 0.31)
-_FLOOR = (0.74, 0.46, 0.45)
-_FAT = (0.88, 0.70, 0.46)
-_LIVER = (0.40, 0.16, 0.14)
-_TRUNK = (0.38, 0.10, 0.16)
-_TWIG = (0.56, 0.13, 0.14)
 
 
 def _linear(display: tuple[float, float, float]) -> NDArray[np.float32]:
@@ -53,7 +49,12 @@ def _patch_noise(a: NDArray, b: NDArray, seed: int) -> NDArray[np.float32]:
 
 
 def build_texture(
-    plane: Plane, anatomy: Anatomy, width: int, height: int, smooth_share: float = 0.0
+    plane: Plane,
+    anatomy: Anatomy,
+    width: int,
+    height: int,
+    smooth_share: float = 0.0,
+    look: TissueLook = LOOKS["bowel"],
 ) -> NDArray[np.float32]:
     """(TH, TW, CHANNELS) material maps for a grid of `height` x `width` texels."""
     grid_v, grid_u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
@@ -61,25 +62,32 @@ def build_texture(
     a, b = a.astype(np.float32), b.astype(np.float32)
     mm_per_texel = float(np.diff(a[height // 2]).mean())
     organs = organs_at(anatomy, a, b)
+    if look.blurred_mm > LOOKS["bowel"].blurred_mm:  # otherwise the mesh alone is smoothed, by less than matters here
+        organs = replace(organs, height=soften(organs.height, mm_per_texel, look.blurred_mm))
+    if look.cover == "liver":
+        organs = replace(organs, owner=np.full_like(organs.owner, LIVER))
     rng = np.random.default_rng([anatomy.seed, 3])
     trunks, twigs = vessel_maps(plane, a, b, organs, rng)
     seed = anatomy.seed + 100
     # Patches with hardly any texture: pale, vessel-free serosa.
     plain = _step(0.12, 0.42, fractal(a / 21, b / 21, 1, seed))
     wrinkles = _wrinkles(organs, a, b, seed)
-    albedo = _albedo(organs, a, b, plain, wrinkles, trunks, twigs, seed, rng, len(anatomy.paths))
-    relief = _relief(organs, a, b, wrinkles, trunks, seed) * (1 - 0.6 * plain)
+    albedo = _albedo(look, organs, a, b, plain, wrinkles, trunks, twigs, seed, rng, len(anatomy.paths))
+    relief = _relief(look, organs, a, b, wrinkles, trunks, seed) * (1 - 0.6 * plain)
     if smooth_share > 0:
         patches = smooth_patches(a, b, anatomy.seed, smooth_share)
         albedo += (SMOOTHED * patches)[..., None] * (_blurred(albedo, mm_per_texel) - albedo)
         relief = relief * (1 - SMOOTHED * patches)
+    wet = look.wet * np.clip(0.75 + 0.7 * fractal(a / 9, b / 9, 2, seed + 1), 0.25, 1)
+    if look.blood > 0:
+        albedo, relief, wet = bled(albedo, relief, wet, blood_depth(organs, a, b, mm_per_texel, seed, look.blood))
     smooth = soften(relief.astype(np.float32), mm_per_texel, 0.09)
     texture = np.zeros((height, width, CHANNELS), np.float32)
     texture[..., :3] = albedo
     # Texel spacing in b is that of a to within the plane's foreshortening, which np.gradient gets from b itself.
     texture[..., 3] = np.gradient(smooth, axis=1) / np.gradient(a, axis=1)
     texture[..., 4] = np.gradient(smooth, axis=0) / np.gradient(b, axis=0)
-    texture[..., 5] = np.clip(0.75 + 0.7 * fractal(a / 9, b / 9, 2, seed + 1), 0.25, 1)
+    texture[..., 5] = wet
     texture[..., 6] = _openness(organs.height, mm_per_texel)
     return texture
 
@@ -102,18 +110,29 @@ def _wrinkles(organs: Organs, a: NDArray, b: NDArray, seed: int) -> NDArray[np.f
 
 
 def _relief(
-    organs: Organs, a: NDArray, b: NDArray, wrinkles: NDArray, trunks: NDArray, seed: int
+    look: TissueLook, organs: Organs, a: NDArray, b: NDArray, wrinkles: NDArray, trunks: NDArray, seed: int
 ) -> NDArray[np.float32]:
     """Fine height in mm that bends normals only: creases, grain, raised vessels, liver lobules."""
     strength = 0.55 + 0.9 * np.clip(fractal(a / 13, b / 13, 2, seed + 6) + 0.35, 0, 1)
     grain = fractal(a / 0.62, b / 0.62, 2, seed + 7)
     swell = fractal(a / 4.5, b / 4.5, 2, seed + 8)
-    serosa = 0.34 * strength * wrinkles + 0.030 * grain + 0.3 * swell + 0.10 * trunks
+    serosa = 0.34 * look.creases * strength * wrinkles + 0.030 * grain + 0.3 * swell + 0.10 * trunks
     lobules = 0.06 * np.minimum(cells(a / 1.25, b / 1.25, seed + 9), 0.5) + 0.02 * grain + 0.1 * swell
+    if look.creases < 1:
+        lobules = look.creases * lobules
+    if look.cover == "fat":
+        serosa = 0.36 * _lumps(a, b, seed) + 0.45 * serosa
     return np.where(organs.owner == LIVER, lobules, serosa).astype(np.float32)
 
 
+def _lumps(a: NDArray, b: NDArray, seed: int) -> NDArray[np.float32]:
+    """In [0, 1]: 0 in the seams between lumps of fat about 4 mm wide, 1 inside them."""
+    bent = 1.2 * fractal(a / 5, b / 5, 2, seed + 30)
+    return _step(-0.1, 0.8, cells((a + bent) / 4.2, (b - bent) / 4.2, seed + 31)).astype(np.float32)
+
+
 def _albedo(
+    look: TissueLook,
     organs: Organs,
     a: NDArray,
     b: NDArray,
@@ -128,21 +147,26 @@ def _albedo(
     """(TH, TW, 3) linear color in [0, 1]."""
     mottle = fractal(a / 6, b / 6, 4, seed + 20)
     fine = fractal(a / 1.1, b / 1.1, 3, seed + 21)
-    loop, pale, dusky = _linear(_LOOP), _linear(_LOOP_PALE), _linear(_LOOP_DUSKY)
+    loop, pale, dusky = _linear(look.loop), _linear(look.loop_pale), _linear(look.loop_dusky)
     # Each loop has its own complexion between dusky and pale.
     complexion = np.concatenate([rng.uniform(-0.45, 0.35, max(64, loops)), [0, 0]]).astype(np.float32)[organs.owner]
     tone = np.clip(complexion - 0.12 + 0.95 * mottle, -1, 1)[..., None]
     color = loop + np.maximum(tone, 0) * (pale - loop) + np.maximum(-tone, 0) * (dusky - loop)
     fat_amount = _step(0.02, 0.34, fractal(a / 10, b / 10, 3, seed + 22)) * 0.85
-    floor = _linear(_FLOOR) + fat_amount[..., None] * (_linear(_FAT) - _linear(_FLOOR))
+    floor = _linear(look.floor) + fat_amount[..., None] * (_linear(look.fat) - _linear(look.floor))
     floor = floor * (1 + 0.25 * mottle[..., None])
     lobule = _step(0.0, 0.32, cells(a / 1.25, b / 1.25, seed + 9))
-    liver = _linear(_LIVER) * (0.72 + 0.38 * lobule + 0.35 * mottle)[..., None]
+    if look.creases < 1:
+        lobule = 1 - look.creases * (1 - lobule)
+    liver = _linear(look.liver) * (0.72 + 0.38 * lobule + 0.35 * mottle)[..., None]
     color = np.where((organs.owner == FLOOR)[..., None], floor, color)
     serosa = 1 + (1 - 0.75 * plain) * (0.26 * fine + 0.38 * wrinkles)
     color = color * serosa[..., None] + (0.25 * plain)[..., None] * (pale - color)
     shown = 1 - 0.8 * plain
-    for map_, ink, opacity in ((twigs, _TWIG, 0.62), (trunks, _TRUNK, 0.80)):
+    if look.cover == "fat":
+        seams = 1 - _lumps(a, b, seed)
+        color = color + (0.55 * seams)[..., None] * (dusky - color)
+    for map_, ink, opacity in ((twigs, look.twig, look.vessels[0]), (trunks, look.trunk, look.vessels[1])):
         color = color + (opacity * shown * map_)[..., None] * (_linear(ink) - color)
     color = np.where((organs.owner == LIVER)[..., None], liver, color)
     return np.clip(color, 0.004, 1).astype(np.float32)
