@@ -27,6 +27,8 @@ SMALL = PhantomConfig(frames=48, width=96, height=80, seed=3)
 FAMILIES = [name for name in get_args(Instruments) if name != "graspers"]
 ACROSS = ToolPose(np.array([-80.0, 0.0, 60.0]), np.array([20.0, 0.0, 60.0]), 0.3, 0.0)
 """A tool in the image's plane, from the left."""
+NEAR = ToolPose(np.array([72.0, 34.0, 20.0]), np.array([8.0, 6.0, 58.0]), 0.2, -0.5)
+"""A tool from the right that points away from the camera, as in the phantom."""
 DEFAULT_VIEW = [0.2440417, 0.07395053, 0.06650015, 0.18963233, 0.06541793, 0.05908938, 0.15120443, 43.639053]
 """Means of the frame in the middle before there were families: color of tissue and image, share and z of the tools."""
 DEFAULT_HOVER = [19.927946414384465, 12.826196800453241, 23.343324658019583]
@@ -96,8 +98,7 @@ def test_both_tools_are_seen_and_differ_in_shape(family):
 def test_nothing_is_cut_off_by_the_bounds(family):
     for tool in instruments_of(family, 0):
         wide = replace(tool, bound_mm=40.0, ball_mm=40.0, clear_mm=390.0)
-        for opening in (0.05, 0.65):
-            pose = replace(ACROSS, opening=opening, roll=0.4)
+        for pose in (replace(ACROSS, opening=0.05, roll=0.4), replace(NEAR, opening=0.65), NEAR):
             depth, want = (drawn(each, pose, size=(320, 384))[1] for each in (tool, wide))
             # Rays that graze a surface stop 0.012 mm from it at another place when they start elsewhere.
             assert (np.abs(depth - want) > 0.2).sum() < 0.005 * (want < FAR).sum(), tool.name
