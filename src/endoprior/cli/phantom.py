@@ -28,8 +28,17 @@ HELP = Help(
     examples=(("DATA",), ("DATA", "--frames", "16", "--width", "320", "--height", "256", "--stereo")),
     basics={
         "size": ("--frames", "--width", "--height", "--stereo"),
-        "scene": ("--seed", "--instruments", "--tissue", "--camera"),
-        "motion and noise": ("--breathing-mm", "--pull-mm", "--slide-mm", "--smooth-share", "--noise"),
+        "scene": (
+            "--seed",
+            "--instruments",
+            "--tissue",
+            "--camera",
+            "--breathing-mm",
+            "--pull-mm",
+            "--slide-mm",
+            "--smooth-share",
+            "--noise",
+        ),
     },
 )
 
