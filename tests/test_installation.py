@@ -20,7 +20,7 @@ def test_the_packages_of_an_optional_part_are_those_of_pyproject(extra):
     names = [re.match(r"[\w-]+", line)[0] for line in PROJECT["optional-dependencies"][extra]]
     constraints = "" if extra == "cuda" else "-c constraints.txt "  # gsplat keeps whichever torch is there
     assert install_command(extra) == f"pip install {constraints}{' '.join(names)}"
-    if extra in ("networks", "mono", "exr", "poses", "ray"):
+    if extra in ("networks", "mono", "exr", "poses", "ray", "tools"):
         assert f"`{install_command(extra)}`" in (ROOT / "docs" / "install.md").read_text()
 
 

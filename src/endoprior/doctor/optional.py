@@ -12,6 +12,7 @@ PARTS = {
     "networks": ("network scores", ("torchvision", "lpips")),
     "poses": ("camera path by COLMAP", ("pycolmap",)),
     "ray": ("benchmarks on a cluster", ("ray",)),
+    "tools": ("tool masks by SAM 2", ("transformers",)),
 }
 """Optional part -> what it is for, and what it imports."""
 OURS = ("ENDOPRIOR_WEIGHTS", "ENDOPRIOR_CACHE_GB")

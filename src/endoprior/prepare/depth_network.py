@@ -6,7 +6,6 @@ a model of the Hugging Face hub that is not in the library's cache: it then down
 
 from __future__ import annotations
 
-from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,14 +16,13 @@ from numpy.typing import NDArray
 
 from ..core.checks import check_shape, input_error
 from ..core.extras import install_command
+from .hub_model import FILES, find_model, first_line, import_transformers
 
 if TYPE_CHECKING:
     from torch.nn import Module
 
 DEFAULT_MODEL = "depth-anything/Depth-Anything-V2-Small-hf"
 """Name on the hub; about 100 MB, Apache-2.0."""
-FILES = ("config.json", "model.safetensors")
-"""Files of a model. Pickled weights are not read."""
 SHORT_SIDE_PX = 518
 """The image is resized so that its shorter side has this length, as in the training of the network."""
 MEAN, STD = np.array([0.485, 0.456, 0.406], np.float32), np.array([0.229, 0.224, 0.225], np.float32)
@@ -43,7 +41,7 @@ class DepthNetwork:
         if find_spec("transformers") is None:
             fix = f"`{install_command('mono')}`."
             raise input_error("--depth depth-anything", "the transformers package", "none", fix)
-        self._network = _load(name_or_folder, _find(str(name_or_folder)))
+        self._network = _load(name_or_folder)
         self._patch = int(self._network.config.patch_size)
 
     def inverse_depth(self, rgb_u8: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -71,62 +69,19 @@ class DepthNetwork:
         return cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def _find(name: str) -> Path:
-    """The folder with the model's files; downloads them if `name` is a hub model that is not cached."""
-    folder = Path(name).expanduser()
-    if folder.is_dir():
-        missing = [file for file in FILES if not (folder / file).is_file()]
-        if missing:
-            raise input_error(
-                folder, "a model's " + " and ".join(FILES), f"no {missing[0]}", "Download the model again."
-            )
-        return folder
+def _load(name: str | Path) -> Module:
+    """The network in evaluation mode."""
     hint = (
         f"Download {' and '.join(FILES)} of {DEFAULT_MODEL} on another machine, then `--depth depth-anything:FOLDER`."
     )
-    if name.count("/") != 1 or name.startswith((".", "/", "~")):
-        raise input_error(name, "a model folder or a name of the Hugging Face hub", "neither", hint)
-    from huggingface_hub import snapshot_download
-
-    # Request only the files that are needed; the loader of transformers requests more.
-    with suppress(Exception):
-        cached = Path(snapshot_download(name, allow_patterns=list(FILES), local_files_only=True))
-        if all((cached / file).is_file() for file in FILES):
-            return cached
+    folder = find_model(str(name), hint)
+    transformers = import_transformers("--depth depth-anything", "mono", "DepthAnythingForDepthEstimation")
     try:
-        fetched = Path(snapshot_download(name, allow_patterns=list(FILES)))
-    except Exception as error:  # the hub client's, its transport's and the system's errors share no other base
-        reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise input_error(name, "a model in the cache or a download", reason[0].removeprefix("Got: "), hint) from None
-    if not all((fetched / file).is_file() for file in FILES):
-        raise input_error(name, "a model's " + " and ".join(FILES), "other files", "Choose a model in this format.")
-    return fetched
-
-
-def _load(name: str | Path, folder: Path) -> Module:
-    """The network in `folder`, in evaluation mode."""
-    if find_spec("torchvision") is not None:
-        # transformers imports torchvision if it is installed, even one that does not fit the installed torch.
-        from ..evaluation.metrics.torchvision_compat import import_torchvision
-        from ..evaluation.metrics.weights import ScoreUnavailable
-
-        with suppress(ScoreUnavailable):
-            import_torchvision()
-    try:
-        from transformers import DepthAnythingForDepthEstimation
-    except Exception as error:  # the library raises what the packages that it imports raise, in sentences of its own
-        while error.__cause__:
-            error = error.__cause__
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        fix = f"`{install_command('mono')} torchvision`."  # an old or unfit torchvision is the usual reason
-        raise input_error("--depth depth-anything", "transformers that can be imported", reason, fix) from None
-    try:
-        network, report = DepthAnythingForDepthEstimation.from_pretrained(
+        network, report = transformers.DepthAnythingForDepthEstimation.from_pretrained(
             folder, local_files_only=True, use_safetensors=True, output_loading_info=True
         )
     except Exception as error:  # the library raises many types for a wrong file
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise input_error(name, "a Depth Anything model", reason, "Choose another model.") from None
+        raise input_error(name, "a Depth Anything model", first_line(error), "Choose another model.") from None
     if report["missing_keys"]:
         got = f"no weights for {sorted(report['missing_keys'])[0]} and {len(report['missing_keys']) - 1} more"
         raise input_error(name, "a Depth Anything model", got, "Choose another model.")

@@ -1,0 +1,155 @@
+"""SAM 2 (N. Ravi et al., 2024, Apache-2.0) as a segmenter that follows tools through a video. `H, W` image size.
+
+The network runs on this machine through the transformers library, on the GPU if torch has one. Frames are given to it
+one by one, so that it never holds the clip. The library's own preparation of images needs torchvision; these few lines
+do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import input_error
+from ..core.extras import install_command
+from .hub_model import FILES, find_model, first_line, import_transformers
+
+if TYPE_CHECKING:
+    from torch import Tensor
+    from torch.nn import Module
+
+SAM2 = "sam2"
+"""Value of `--masks` and of `--with`."""
+DEFAULT_MODEL = "facebook/sam2.1-hiera-tiny"
+"""Name on the hub; 156 MB, Apache-2.0."""
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""ImageNet statistics that normalize the input, colors in [0, 1]; the same for every SAM 2."""
+
+
+def is_sam2(value: str) -> bool:
+    """Whether a value of `--masks` or `--with` names this segmenter, rather than a folder."""
+    return value.partition(":")[0] == SAM2
+
+
+def open_sam2(value: str, option: str) -> Sam2:
+    """The segmenter that a value of an option names: `sam2`, `sam2:FOLDER` or `sam2:NAME`.
+
+    Args:
+        option: `--masks` or `--with`, for error messages.
+    Raises:
+        InputError: another value; transformers is not installed; the files cannot be had, or hold another network.
+    """
+    method, _, name = value.partition(":")
+    if method != SAM2:
+        raise input_error(option, f"{SAM2}, or {SAM2}:FOLDER", value, f"`{option} {SAM2}`.")
+    if find_spec("transformers") is None:
+        raise input_error(f"{option} {SAM2}", "the transformers package", "none", f"`{install_command('tools')}`.")
+    name = name or DEFAULT_MODEL
+    hint = f"Download {' and '.join(FILES)} of {DEFAULT_MODEL} on another machine, then `{option} {SAM2}:FOLDER`."
+    return Sam2(name, _load(name, option, hint))
+
+
+class Sam2:
+    """A SAM 2 network in memory, as a `VideoSegmenter`."""
+
+    def __init__(self, name: str, network: Module) -> None:
+        """Args: name: of the model. network: a `Sam2VideoModel` in evaluation mode."""
+        self.name = f"SAM 2 ({name})"
+        self.network = network
+        size = network.config.image_size
+        self.side_px = int(size if isinstance(size, int) else size[0])
+        """The network sees square images of this side."""
+
+    def begin(self) -> Sam2Chunk:
+        """A new chunk that remembers nothing."""
+        return Sam2Chunk(self)
+
+    def pixels(self, rgb_u8: NDArray[np.uint8]) -> Tensor:
+        """(1, 3, S, S) a frame (H, W, 3) as the network wants it."""
+        import torch
+
+        image = torch.from_numpy(np.ascontiguousarray(rgb_u8)).permute(2, 0, 1)[None].to(self._device)
+        image = _resized(image.float() / 255, self.side_px)
+        mean, std = (torch.tensor(each, device=self._device).view(1, 3, 1, 1) for each in (MEAN, STD))
+        return (image - mean) / std
+
+    def prompt(self, mask: NDArray[np.bool_]) -> Tensor:
+        """(1, 1, S, S) 0 or 1: a mask (H, W) as the network wants it."""
+        import torch
+
+        given = torch.from_numpy(mask.astype(np.float32))[None, None].to(self._device)
+        return (_resized(given, self.side_px) >= 0.5).float()
+
+    @property
+    def _device(self):
+        return next(self.network.parameters()).device
+
+
+class Sam2Chunk:
+    """What the network remembers of a few successive frames."""
+
+    def __init__(self, sam2: Sam2) -> None:
+        """Args: sam2: the network."""
+        import torch
+        from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
+
+        device = sam2.network.device
+        self._sam2, self._count = sam2, 0
+        self._session = Sam2VideoInferenceSession(
+            inference_device=device,
+            inference_state_device=device,
+            video_storage_device=device,
+            dtype=torch.float32,  # the default is its name, which newer versions of torch reject
+        )
+
+    def show(self, rgb_u8: NDArray[np.uint8], masks: Sequence[NDArray[np.bool_]]) -> None:
+        """Give a frame (H, W, 3) whose objects are known: (H, W) each, empty for one that is out of view."""
+        objects = list(range(len(masks)))
+        for each, mask in zip(objects, masks, strict=True):
+            self._session.add_mask_inputs(self._session.obj_id_to_idx(each), self._count, self._sam2.prompt(mask))
+        self._session.obj_with_new_inputs = objects
+        self._run(rgb_u8)
+
+    def follow(self, rgb_u8: NDArray[np.uint8]) -> list[NDArray[np.bool_]]:
+        """The same objects in the next frame (H, W, 3): (H, W) each."""
+        import torch.nn.functional as F
+
+        scores = F.interpolate(self._run(rgb_u8).float(), rgb_u8.shape[:2], mode="bilinear", align_corners=False)
+        return list((scores[:, 0] > 0).cpu().numpy())
+
+    def _run(self, rgb_u8: NDArray[np.uint8]) -> Tensor:
+        """(objects, 1, h, w) scores of the objects in the next frame, above 0 inside."""
+        done = self._sam2.network(inference_session=self._session, frame=self._sam2.pixels(rgb_u8))
+        # The features of a frame are kept in the session's memory; its pixels are not used again.
+        self._session.processed_frames[self._count] = None
+        self._count += 1
+        return done.pred_masks
+
+
+def _resized(image: Tensor, side: int) -> Tensor:
+    """(1, C, side, side): without aliasing, as in the training of the network."""
+    import torch.nn.functional as F
+
+    return F.interpolate(image, (side, side), mode="bilinear", align_corners=False, antialias=True)
+
+
+def _load(name: str, option: str, hint: str) -> Module:
+    """The network, on the GPU if there is one, in evaluation mode."""
+    import torch
+
+    transformers = import_transformers(f"{option} {SAM2}", "tools", "Sam2VideoModel")
+    folder = find_model(name, hint)
+    try:
+        network, report = transformers.Sam2VideoModel.from_pretrained(
+            folder, local_files_only=True, use_safetensors=True, output_loading_info=True
+        )
+    except Exception as error:  # the library raises many types for a wrong file
+        raise input_error(name, "a SAM 2 video model", first_line(error), "Choose another model.") from None
+    if report["missing_keys"]:
+        got = f"no weights for {sorted(report['missing_keys'])[0]} and {len(report['missing_keys']) - 1} more"
+        raise input_error(name, "a SAM 2 video model", got, "Choose another model.")
+    return network.eval().to("cuda" if torch.cuda.is_available() else "cpu")

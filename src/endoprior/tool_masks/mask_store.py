@@ -1,0 +1,55 @@
+"""Masks of a long clip in a folder: one small PNG per frame, and what has been done, so that work can be resumed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.images import read_tool_mask, save_png
+from ..system.atomic import whole_file, write_json
+
+STATE = "state.json"
+
+
+class MaskStore:
+    """Masks by frame; those that were never written are empty."""
+
+    def __init__(self, folder: Path, size: tuple[int, int]) -> None:
+        """Args: folder: made if needed. size: (width, height), px."""
+        self.folder, self._shape = folder, size[::-1]
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def get(self, index: int) -> NDArray[np.bool_]:
+        """(H, W) the mask of a frame."""
+        file = self._file(index)
+        return read_tool_mask(file) if file.exists() else np.zeros(self._shape, bool)
+
+    def put(self, index: int, mask: NDArray[np.bool_]) -> None:
+        """Write the mask (H, W) of a frame."""
+        with whole_file(self._file(index)) as temporary:
+            save_png(temporary, np.where(mask, 255, 0).astype(np.uint8))
+
+    def add(self, index: int, mask: NDArray[np.bool_]) -> None:
+        """Add the pixels of a mask (H, W) to that of a frame. To add them twice changes nothing."""
+        if mask.any():
+            self.put(index, self.get(index) | mask)
+
+    def _file(self, index: int) -> Path:
+        return self.folder / f"{index:06d}.png"
+
+
+def read_state(folder: Path) -> dict[str, Any]:
+    """What an interrupted run has done; empty before the first."""
+    try:
+        return json.loads((folder / STATE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def write_state(folder: Path, state: dict[str, Any]) -> None:
+    """Note what has been done."""
+    write_json(folder / STATE, state)
