@@ -10,7 +10,8 @@ import pytest
 from endoprior.core.checks import InputError
 from endoprior.evaluation.metrics.torchvision_compat import import_torchvision
 from endoprior.prepare import depth_network
-from endoprior.prepare.depth_network import FILES, DepthNetwork
+from endoprior.prepare.depth_network import DepthNetwork
+from endoprior.prepare.hub_model import FILES
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 # The library's own warnings are not ours to fix.
@@ -120,6 +121,7 @@ def test_a_hub_name_is_searched_in_the_cache_first(folder, monkeypatch):
         raise ConnectionError("no network\nsecond line")
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", fetch)
+    monkeypatch.setattr("huggingface_hub.HfApi.model_info", fetch)
     DepthNetwork("someone/model")
     assert asked == [True]
     with pytest.raises(InputError, match=r"someone/model.*no network") as caught:

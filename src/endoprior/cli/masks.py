@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -15,6 +17,14 @@ from ..system.console import say
 from .help_page import Help
 from .parsing import parse
 from .progress import Counting
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ..data import FrameSequence
+    from ..tool_masks import FoundTools
+    from ..tool_masks.sequence import Progress
 
 SHEET, SHARES = "tool_masks.png", "tool_masks.json"
 SHOWN, COLUMNS = 24, 6
@@ -35,9 +45,12 @@ class Masks:
     """Sequence folder."""
     refine: bool = False
     """The masks of DATA are right but miss parts, such as jaws: learn from them, and only add pixels."""
+    segmenter: Annotated[str | None, tyro.conf.arg(name="with", metavar="SEGMENTER")] = None
+    """`sam2`: SAM 2 follows the tools that are found first through the video. A folder of its weights, or the name of a
+    model, may follow after a colon."""
 
 
-HELP = Help(examples=(("DATA",), ("DATA", "--refine")))
+HELP = Help(examples=(("DATA",), ("DATA", "--refine"), ("DATA", "--with", "sam2")))
 
 
 def run(argv: list[str]) -> None:
@@ -47,23 +60,26 @@ def run(argv: list[str]) -> None:
     from ..data import load_sequence
     from ..data.mask_writing import note_found_masks, replace_masks, writable_masks
     from ..system.atomic import write_json
-    from ..tool_masks.sequence import find_in_sequence
+    from ..tool_masks.mask_store import MaskStore
     from ..visualization.image_tools import write_png
     from ..visualization.mask_sheet import mask_sheet
 
     sequence = load_sequence(args.data, DataConfig())
     writable_masks(sequence)
     shown = set(spread(len(sequence), SHOWN))
-    masks, rows, pictures, uncertain = {}, [], [], []
-    with Counting() as progress:
-        for i, (mask, found) in enumerate(find_in_sequence(sequence, refine=args.refine, progress=progress)):
-            masks[i], share = mask, float(found.mask.mean())
+    rows, pictures, uncertain = [], [], []
+    with TemporaryDirectory(prefix="endoprior-") as work, Counting() as progress:
+        camera = sequence.camera(0)
+        masks = MaskStore(Path(work) / "masks", (camera.width, camera.height))
+        for i, (mask, found) in enumerate(_found(sequence, args, Path(work) / "carried", progress)):
+            masks.put(i, mask)
+            share = float(found.mask.mean())
             rows.append({"frame": i, "share": share, "confidence": found.confidence})
             if found.uncertain:
                 uncertain.append(i)
             if i in shown:
                 pictures.append((sequence.frame(i).rgb_u8, found.mask, f"{i}: {share:.1%}"))
-    replace_masks(sequence, masks)
+        replace_masks(sequence, masks)
     write_png(args.data / SHEET, mask_sheet(pictures, COLUMNS, WIDTH_PX))
     write_json(args.data / SHARES, rows)
     with_tools = [row for row in rows if row["share"]]
@@ -72,3 +88,18 @@ def run(argv: list[str]) -> None:
     if uncertain:
         say(f"uncertain: frames {number_ranges(uncertain)}")
     say(f"look at {args.data / SHEET}; correct masks: {command('view', args.data)}")
+
+
+def _found(
+    sequence: FrameSequence, args: Masks, work: Path, progress: Progress
+) -> Iterator[tuple[NDArray[np.bool_], FoundTools]]:
+    """The masks and tools of every frame, found as the options say."""
+    from ..tool_masks.sequence import find_in_sequence
+
+    if args.segmenter is None:
+        return find_in_sequence(sequence, refine=args.refine, progress=progress)
+    from ..prepare.sam2 import open_sam2
+    from ..tool_masks.video_segmenter import segment_sequence
+
+    segmenter = open_sam2(args.segmenter, "--with")
+    return segment_sequence(sequence, segmenter, work, refine=args.refine, progress=progress)

@@ -70,6 +70,7 @@ def run(argv: list[str]) -> None:
     """Do every step, with one progress display."""
     args = parse(Run, argv, "run", HELP)
     from ..pipeline import STEPS, estimate, notes_of, open_folder, problems, run_step, seconds_if_moving
+    from ..prepare.sam2 import is_sam2
     from ..runs import kernel_cache
 
     began = clock.perf_counter()
@@ -85,6 +86,8 @@ def run(argv: list[str]) -> None:
         say("Estimating the time ...")
         seconds = estimate(job)
         say(f"This takes about {duration(sum(seconds.values()))}: {_seconds_words(seconds)}.")
+        if is_sam2(job.prepare.masks):
+            say("SAM 2 is not part of this estimate: without a GPU it may take much longer than all the rest.")
         if more := seconds_if_moving(job):
             say(f"If the camera moves, COLMAP takes up to about {duration(more)} more; `--poses auto-own` skips it.")
     display = StepDisplay([step.name for step in STEPS], seconds)

@@ -79,8 +79,13 @@ def note_found_masks(folder: Path, with_tools: float) -> None:
     """
     path = folder / "sequence.json"
     described = read_description(path)
-    source = f"{TOOLS_FOUND} in {with_tools:.0%} of the frames" if with_tools else f"no {TOOLS_FOUND}"
-    write_json(path, described | {"sources": described.get("sources", {}) | {"masks": source}})
+    sources = described.get("sources", {}) | {"masks": found_source(with_tools)}
+    write_json(path, described | {"sources": sources})
+
+
+def found_source(with_tools: float) -> str:
+    """The source of masks that a program found. Args: with_tools: share of the frames in which it found tools, 0..1."""
+    return f"{TOOLS_FOUND} in {with_tools:.0%} of the frames" if with_tools else f"no {TOOLS_FOUND}"
 
 
 def changes(kept: Path, folder: Path, tool_value: int) -> dict[str, dict[str, int]]:

@@ -84,12 +84,16 @@ class FrameFiles:
         self.write_image("images", rgb)
         self.write_image("masks", np.where(tool_mask, TOOL_VALUE, 0).astype(np.uint8))
         if depth is not None:
-            held = np.minimum(depth, 65535 * self.meta.depth_scale)
-            units = np.where(np.isfinite(depth) & (depth > 0), held, 0) / self.meta.depth_scale
-            self.write_image("depth", np.clip(np.round(units), 0, 65535).astype(np.uint16))
+            self.write_image("depth", self.depth_units(depth))
         if right is not None:
             self.write_image("right", right)
         self.count += 1
+
+    def depth_units(self, depth: NDArray[np.float32]) -> NDArray[np.uint16]:
+        """(H, W) depth as a file stores it; 0 where it is missing. Args: depth: (H, W) z in mm."""
+        held = np.minimum(depth, 65535 * self.meta.depth_scale)
+        units = np.where(np.isfinite(depth) & (depth > 0), held, 0) / self.meta.depth_scale
+        return np.clip(np.round(units), 0, 65535).astype(np.uint16)
 
     def write_image(self, folder: str, pixels: NDArray) -> None:
         """Write `pixels` as `folder`/NNNNNN.png, numbered like the frame that the next `add` appends.

@@ -25,6 +25,7 @@ from ..prepare.config import PrepareConfig
 from ..prepare.first_pass import SAMPLES
 from ..prepare.frames import REACH
 from ..prepare.record import names_path
+from ..prepare.sam2 import is_sam2
 from ..prepare.source import open_source
 from ..training.trainer import Trainer
 from .job import Job
@@ -176,6 +177,8 @@ def trial_options(job: Job) -> PrepareConfig:
         short = replace(short, poses="still")
     if names_path(cfg.masks):
         short = replace(short, masks="none")
+    if is_sam2(cfg.masks):
+        short = replace(short, masks="auto")
     return replace(short, depth="shading", depth_relative="no") if names_path(cfg.depth) else short
 
 

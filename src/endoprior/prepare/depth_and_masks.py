@@ -24,6 +24,7 @@ from .frame_files import match_files
 from .frame_geometry import FrameGeometry
 from .frames import Depth, FrameMethods, Mask, MeasuredFrame
 from .relative_depth import Kind, fit_reference, relative_to_mm
+from .sam2 import is_sam2
 from .shading import fit_shading
 from .stereo import stereo_depth
 from .video_clip import Clip
@@ -75,7 +76,7 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
     measure, source = (None, kind) if kind in ("none", "shading") else _measured_depth(kind, cfg, clip, first_pass)
     from ..tool_masks import ToolSample  # imports torch
 
-    nearness = measure if not relative and cfg.masks == "auto" else None
+    nearness = measure if not relative and (cfg.masks == "auto" or is_sam2(cfg.masks)) else None
     tool_samples = [
         ToolSample(frame.rgb_u8, geometry.inside, image, nearness(frame) if nearness else None)
         for frame, image in zip(samples, later, strict=True)
@@ -200,7 +201,7 @@ def _tools(
     geometry = first_pass.geometry
     if cfg.masks == "none":
         return lambda frame: np.zeros_like(geometry.inside), "none", []
-    if cfg.masks == "auto":
+    if cfg.masks == "auto" or is_sam2(cfg.masks):
         from ..tool_masks import fit_tools
 
         model = fit_tools(tool_samples)
@@ -215,7 +216,7 @@ def _tools(
         return (
             lambda frame: model.find(frame.rgb_u8, geometry.inside, frame.depth).mask,
             source,
-            [f"masks: {source}. {hint}"],
+            [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"],  # its own masks replace these
         )
     files = match_files(Path(cfg.masks), MASK_SUFFIXES, "masks", first_pass.indices, first_pass.image_names)
 

@@ -32,6 +32,7 @@ from .first_pass import input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry
 from .frames import write_frames
 from .record import record_of
+from .sam2 import is_sam2, open_sam2
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
@@ -67,6 +68,7 @@ def prepare(
     cfg = cfg or PrepareConfig()
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
+    segmenter = open_sam2(cfg.masks, "--masks") if is_sam2(cfg.masks) else None
     plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
         calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
@@ -89,20 +91,30 @@ def prepare(
         if files.count < 2:
             fix = "Change --start, --end or --drop-out-of-body."
             raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
+        carried_notes: list[str] = []
+        if segmenter is not None:
+            from .carried_masks import replace_by_carried  # imports torch
+
+            inside, shade = first_pass.geometry.inside, chosen.methods.shade
+            carried_notes = replace_by_carried(files, segmenter, inside, shade, progress)
         progress("following the camera", 0, files.count)
         path, motion_notes = _camera_path(cfg, files, lambda done: progress("following the camera", done, files.count))
         unexplained = unexplained_frames(path, (read_color(files.file("images", i)) for i in range(files.count)))
         if path is not None:
-            if meta.depth_relative:
+            if files.meta.depth_relative:
                 _scale_depth(files, path)
             focal = {"fx": meta.fx * path.focal_factor, "fy": meta.fy * path.focal_factor}
-            files.meta = replace(meta, **focal, sources=sources_with(meta.sources, path))
+            files.meta = replace(files.meta, **focal, sources=sources_with(files.meta.sources, path))
             files.write_json(PATH_RECORD, record_of_path(path))
+        if segmenter is not None:
+            from .carried_masks import remove_carried
+
+            remove_carried(files)
         files.finish(None if path is None else path.camera_to_world, unexplained)
         record_of(video, cfg, first_pass.geometry).save(folder)
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
-        notes = [*first_pass.notes, *chosen.notes, *motion_notes]
+        notes = [*first_pass.notes, *chosen.notes, *carried_notes, *motion_notes]
         if unexplained:
             frames = number_ranges(unexplained)
             notes.append(f"no camera pose, or another scene, in frames {frames}; --start and --end can leave them out")

@@ -14,11 +14,14 @@ from ..data.prepare_record import PrepareRecord
 from .config import PrepareConfig
 from .depth_and_masks import NETWORK
 from .frame_geometry import FrameGeometry
+from .sam2 import SAM2
 
 GRID_POINTS = 9
 """Points a side of the grid over a rectified frame; between them the rectification is nearly linear."""
-METHODS = ("auto", "none", "sgbm", "shading", "still", "auto-own", "estimate", "own", "colmap", NETWORK)
+METHODS = ("auto", "none", "sgbm", "shading", "still", "auto-own", "estimate", "own", "colmap", NETWORK, SAM2)
 """Values of --depth, --masks and --poses that are no paths."""
+NETWORKS = (NETWORK, SAM2)
+"""Methods that a folder of weights, or the name of a model, may follow after a colon."""
 
 
 def record_of(video: Path, cfg: PrepareConfig, geometry: FrameGeometry) -> PrepareRecord:
@@ -32,14 +35,14 @@ def record_of(video: Path, cfg: PrepareConfig, geometry: FrameGeometry) -> Prepa
 
 def names_path(value: str) -> bool:
     """Whether a value of --depth, --masks or --poses is a file or folder of the user."""
-    return value not in METHODS and value.partition(":")[0] != NETWORK
+    return value not in METHODS and value.partition(":")[0] not in NETWORKS
 
 
 def _absolute(value: str) -> str:
     """A method, or the absolute path of a file or folder."""
     method, colon, folder = value.partition(":")
-    if method == NETWORK and colon:  # a folder, or the name of a network on a server
-        return f"{NETWORK}:{os.path.abspath(folder) if os.path.isdir(folder) else folder}"
+    if method in NETWORKS and colon:  # a folder, or the name of a network on a server
+        return f"{method}:{os.path.abspath(folder) if os.path.isdir(folder) else folder}"
     return os.path.abspath(value) if names_path(value) else value
 
 

@@ -99,6 +99,8 @@ class Sam2Chunk:
 
         device = sam2.network.device
         self._sam2, self._count = sam2, 0
+        self.scores: Tensor | None = None
+        """(objects, 1, h, w) of the last frame, above 0 inside an object; h, w of the network."""
         self._session = Sam2VideoInferenceSession(
             inference_device=device,
             inference_state_device=device,
@@ -118,16 +120,17 @@ class Sam2Chunk:
         """The same objects in the next frame (H, W, 3): (H, W) each."""
         import torch.nn.functional as F
 
-        scores = F.interpolate(self._run(rgb_u8).float(), rgb_u8.shape[:2], mode="bilinear", align_corners=False)
+        self._run(rgb_u8)
+        scores = F.interpolate(self.scores.float(), rgb_u8.shape[:2], mode="bilinear", align_corners=False)
         return list((scores[:, 0] > 0).cpu().numpy())
 
-    def _run(self, rgb_u8: NDArray[np.uint8]) -> Tensor:
-        """(objects, 1, h, w) scores of the objects in the next frame, above 0 inside."""
+    def _run(self, rgb_u8: NDArray[np.uint8]) -> None:
+        """Give the network the next frame."""
         done = self._sam2.network(inference_session=self._session, frame=self._sam2.pixels(rgb_u8))
         # The features of a frame are kept in the session's memory; its pixels are not used again.
         self._session.processed_frames[self._count] = None
         self._count += 1
-        return done.pred_masks
+        self.scores = done.pred_masks
 
 
 def _resized(image: Tensor, side: int) -> Tensor:

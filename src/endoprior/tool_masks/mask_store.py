@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,28 @@ from ..system.atomic import whole_file, write_json
 STATE = "state.json"
 
 
-class MaskStore:
-    """Masks by frame; those that were never written are empty."""
+class MaskStore(Mapping[int, NDArray[np.bool_]]):
+    """Masks by frame; `mask` gives an empty one where none was written."""
 
     def __init__(self, folder: Path, size: tuple[int, int]) -> None:
         """Args: folder: made if needed. size: (width, height), px."""
         self.folder, self._shape = folder, size[::-1]
         folder.mkdir(parents=True, exist_ok=True)
 
-    def get(self, index: int) -> NDArray[np.bool_]:
-        """(H, W) the mask of a frame."""
+    def __getitem__(self, index: int) -> NDArray[np.bool_]:
+        file = self._file(index)
+        if not file.exists():
+            raise KeyError(index)
+        return read_tool_mask(file)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(sorted(int(file.stem) for file in self.folder.glob("*.png")))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def mask(self, index: int) -> NDArray[np.bool_]:
+        """(H, W) the mask of a frame; empty if none was written."""
         file = self._file(index)
         return read_tool_mask(file) if file.exists() else np.zeros(self._shape, bool)
 
@@ -36,7 +49,7 @@ class MaskStore:
     def add(self, index: int, mask: NDArray[np.bool_]) -> None:
         """Add the pixels of a mask (H, W) to that of a frame. To add them twice changes nothing."""
         if mask.any():
-            self.put(index, self.get(index) | mask)
+            self.put(index, self.mask(index) | mask)
 
     def _file(self, index: int) -> Path:
         return self.folder / f"{index:06d}.png"

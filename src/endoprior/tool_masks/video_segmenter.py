@@ -100,7 +100,7 @@ class _Clip:
 
     def result(self, index: int, refine: bool) -> tuple[NDArray[np.bool_], FoundTools]:
         """The masks of one frame, as `find_in_sequence` yields them."""
-        outside, own = self.outside.get(0), self.found.get(index)
+        outside, own = self.outside.mask(0), self.found.mask(index)
         mask = with_rim(self._carried(index, ROUNDS))
         if refine:
             mask |= ~self.sequence.frame(index).tissue_mask
@@ -112,11 +112,11 @@ class _Clip:
     def _carried(self, index: int, rounds: int) -> NDArray[np.bool_]:
         """(H, W) what the first `rounds` rounds carried to a frame."""
         empty = np.zeros((self.sequence.camera(0).height, self.sequence.camera(0).width), bool)
-        return np.any([empty, *(store.get(index) for store in self.rounds[:rounds])], axis=0)
+        return np.any([empty, *(store.mask(index) for store in self.rounds[:rounds])], axis=0)
 
     def _regions(self, index: int, number: int) -> list[NDArray[np.bool_]]:
         """Regions of a frame that earlier rounds do not cover."""
-        return sure_regions(self.found.get(index), self._carried(index, number) if number else None)
+        return sure_regions(self.found.mask(index), self._carried(index, number) if number else None)
 
     def _score(self, index: int, number: int) -> float:
         area = sum(int(region.sum()) for region in self._regions(index, number))
