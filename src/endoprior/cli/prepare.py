@@ -21,7 +21,7 @@ class Prepare:
     """Write a sequence folder from an endoscope video: rectified frames, depth, tool masks and camera poses.
 
     To resume after an interruption, run the same command again. Your video never leaves this computer. Of its metadata
-    only its path is kept, in OUT/prepare.json. `--depth depth-anything` and `--masks sam2` download networks.
+    only its path is kept, in OUT/prepare.json. `depth-anything` and `sam2` are downloaded.
     """
 
     video: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIDEO")]]

@@ -83,7 +83,7 @@ class PrepareConfig:
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
     masks: str = "auto"
-    """`auto` (found in the clip itself), `sam2[:WEIGHTS]` (and followed by SAM 2), `none`, or a folder of masks."""
+    """`auto` (found in the clip), `sam2[:WEIGHTS]` (SAM 2), `none`, or a folder of masks."""
     mask_tool_value: Literal["auto", "high", "low"] = "auto"
     """Which value marks tools in the mask folder."""
 
