@@ -176,7 +176,7 @@ def trial_options(job: Job) -> PrepareConfig:
     if names_path(cfg.poses):
         short = replace(short, poses="still")
     if names_path(cfg.masks):
-        short = replace(short, masks="none")
+        short = replace(short, masks="none", mask_labels="")
     if is_sam2(cfg.masks):
         short = replace(short, masks="auto")
     return replace(short, depth="shading", depth_relative="no") if names_path(cfg.depth) else short

@@ -84,6 +84,8 @@ class PrepareConfig:
 
     masks: str = "auto"
     """`auto` (found in the clip), `sam2[:WEIGHTS]` (SAM 2), `none`, or a folder of masks."""
+    mask_labels: str = ""
+    """Labels in the mask folder that are tools, such as `shaft,jaw`. Usually their names tell."""
     mask_tool_value: Literal["auto", "high", "low"] = "auto"
     """Which value marks tools in the mask folder."""
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_values
 from ..data.description import TOOLS_FOUND
-from ..data.mask_files import MASK_SUFFIXES, read_user_mask, tool_polarity
+from ..data.mask_files import tool_polarity
+from ..data.mask_folders import MaskFrame, open_mask_folder
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit
 from .config import PrepareConfig
 from .first_pass import FirstPass
-from .frame_files import match_files
+from .frame_files import match_files, match_names
 from .frame_geometry import FrameGeometry
 from .frames import Depth, FrameMethods, Mask, MeasuredFrame
 from .relative_depth import Kind, fit_reference, relative_to_mm
@@ -41,6 +42,7 @@ FEWEST_STEPS = 256
 """Depth with at most this many different values was stored in 8 bits."""
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
+A = TypeVar("A")
 Shade = Callable[[NDArray[np.uint8], Mask], Depth]
 
 
@@ -184,7 +186,7 @@ def _check_unit(samples: list[MeasuredFrame], depths: list[Depth], geometry: Fra
     return notes
 
 
-def _of_either_size(read: Callable[[Path, tuple[int, int]], NDArray], path: Path, geometry: FrameGeometry) -> NDArray:
+def _of_either_size(read: Callable[[A, tuple[int, int]], NDArray], path: A, geometry: FrameGeometry) -> NDArray:
     """Read a file that has the size of the source images or of the frames."""
     try:
         return read(path, geometry.source_size)
@@ -199,6 +201,8 @@ def _tools(
 ) -> tuple[Callable[[MeasuredFrame], Mask], str, list[str]]:
     """A function that returns the tool mask of a frame, the name of its source, and a note."""
     geometry = first_pass.geometry
+    if cfg.mask_labels and (cfg.masks in ("auto", "none") or is_sam2(cfg.masks)):
+        raise input_error("--mask-labels", "a folder with --masks", cfg.masks, "Remove --mask-labels.")
     if cfg.masks == "none":
         return lambda frame: np.zeros_like(geometry.inside), "none", []
     if cfg.masks == "auto" or is_sam2(cfg.masks):
@@ -218,14 +222,32 @@ def _tools(
             source,
             [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"],  # its own masks replace these
         )
-    files = match_files(Path(cfg.masks), MASK_SUFFIXES, "masks", first_pass.indices, first_pass.image_names)
+    return _user_masks(cfg, first_pass, samples)
+
+
+def _user_masks(
+    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
+) -> tuple[Callable[[MeasuredFrame], Mask], str, list[str]]:
+    """As `_tools`, from the user's files."""
+    path, geometry = Path(cfg.masks), first_pass.geometry
+    given = open_mask_folder(path, cfg.mask_labels)
+    names = [each.name for each in given.frames]
+    found = match_names(path, names, first_pass.indices, first_pass.image_names, in_order_only=given.in_order_only)
+
+    def read(each: MaskFrame, size: tuple[int, int]) -> Mask:
+        return each.read(size)
 
     def high(frame: MeasuredFrame) -> Mask:
-        return geometry.values(_of_either_size(read_user_mask, files[frame.index], geometry))
+        return geometry.values(_of_either_size(read, given.frames[found[frame.index]], geometry))
 
-    polarity = tool_polarity(cfg.mask_tool_value, [high(f) for f in samples], [f.rgb_u8 for f in samples])
-    tool_is_high = polarity.tool_is_high
-    return lambda frame: high(frame) == tool_is_high, "user's files", [f"masks: {polarity.reason}"]
+    notes = [f"masks: {given.note}"] if given.note else []
+    if given.tool_is_high is None or cfg.mask_tool_value != "auto":
+        polarity = tool_polarity(cfg.mask_tool_value, [high(f) for f in samples], [f.rgb_u8 for f in samples])
+        tool_is_high = polarity.tool_is_high
+        notes.append(f"masks: {polarity.reason}")
+    else:
+        tool_is_high = given.tool_is_high
+    return lambda frame: high(frame) == tool_is_high, "user's files", notes
 
 
 def _inside_body(images: list[NDArray[np.uint8]]) -> Callable[[NDArray[np.uint8]], bool]:

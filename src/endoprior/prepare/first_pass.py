@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -146,7 +147,21 @@ def input_facts(cfg: PrepareConfig) -> dict[str, dict[str, object]]:
 
 
 def source_facts(path: Path) -> dict[str, object]:
-    """Identity of a file or folder: its name, and the name, size and modification time of its files."""
-    files = sorted(path.iterdir()) if kind_of(path) == "a folder" else [path]
+    """Identity of a file or folder: its name, and the name, size and modification time of its files.
+
+    Files one folder further down count too: masks can have a folder per object or per video.
+    """
+    files = [path]
+    if kind_of(path) == "a folder":
+        inner = sorted(path.iterdir())
+        files = [
+            *inner,
+            *(
+                file
+                for each in inner
+                if each.is_dir() and os.access(each, os.R_OK | os.X_OK)
+                for file in sorted(each.iterdir())
+            ),
+        ]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.exists()]
     return {"name": path.name, "files": [list(entry) for entry in stats]}

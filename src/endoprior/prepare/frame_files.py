@@ -35,20 +35,41 @@ def match_files(
     files = sorted(found, key=natural_order)
     if not files:
         raise input_error(folder, f"{what} ({', '.join(suffixes)})", "none", "Put one file per frame there.")
+    found = match_names(folder, [file.name for file in files], indices, names)
+    return {index: files[position] for index, position in found.items()}
+
+
+def match_names(
+    folder: Path,
+    files: Sequence[str],
+    indices: Sequence[int],
+    names: Sequence[str] = (),
+    *,
+    in_order_only: bool = False,
+) -> dict[int, int]:
+    """The position in `files` for each selected frame of the source; as `match_files`.
+
+    Args:
+        files: file names in natural order.
+        in_order_only: the numbers in their names say nothing about frames.
+    """
     if len(files) == len(indices):
-        return dict(zip(indices, files, strict=True))
+        return dict(zip(indices, range(len(files)), strict=True))
     if len(files) == len(names):
-        return {index: files[index] for index in indices}
+        return {index: index for index in indices}
     counts = f"{len(files)} files for {len(indices)} frames"
+    if in_order_only:
+        hint = "Export one for each frame, or name each file by its frame number."
+        raise input_error(folder, "masks of as many tasks as frames", counts.replace("files", "tasks"), hint)
     hint = "Add the missing files, or name each file by its frame number."
-    by_number: dict[int, Path] = {}
-    for file in files:
-        if (number := _last_number(file.stem)) is None:
-            raise input_error(folder, "one file per frame, or numbers in the names", f"{counts}, and {file.name}", hint)
+    by_number: dict[int, int] = {}
+    for position, file in enumerate(files):
+        if (number := _last_number(Path(file).stem)) is None:
+            raise input_error(folder, "one file per frame, or numbers in the names", f"{counts}, and {file}", hint)
         if number in by_number:
-            both = f"{by_number[number].name} and {file.name}"
+            both = f"{files[by_number[number]]} and {file}"
             raise input_error(folder, "one file per frame, or one per number", f"{counts}, and {both}", hint)
-        by_number[number] = file
+        by_number[number] = position
     numbers = [_last_number(name) for name in names]
     if not numbers or None in numbers or len(set(numbers)) < len(numbers):
         first = 0 if 0 in by_number else 1

@@ -1,0 +1,84 @@
+"""Recognize a folder of masks by its files: SAM 2, CVAT, Label Studio, nerfstudio, or one plain file per frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...core.checks import input_error
+from ..files import entries, files_with, natural_order
+from ..mask_files import MASK_SUFFIXES
+from ..reading import kind_of
+from .cvat import segmentation_masks
+from .cvat_xml import annotations
+from .frames import MaskFolder, MaskFrame, union_of_files
+from .label_studio import brush_export
+from .labels import OPTION
+from .nerfstudio import ignore_masks
+from .sam2 import object_folders, palette_folder, sav_file
+
+__all__ = ["MaskFolder", "MaskFrame", "open_mask_folder"]
+
+
+def open_mask_folder(path: Path, labels: str = "") -> MaskFolder:
+    """The masks of a user, by frame. Nothing is decoded yet.
+
+    Args:
+        path: a folder, or the XML of CVAT or the JSON of SA-V.
+        labels: names of the labels that are tools, separated by commas; empty to tell by their names.
+    Raises:
+        InputError: no masks there, or labels that do not tell which are tools.
+    """
+    kind = kind_of(path)
+    if kind == "a file":
+        found = _in_file(path, labels)
+        if found is None:
+            fix = "Pass the folder that holds one file per frame."
+            raise input_error(path, "a folder of masks, CVAT's XML or SA-V's JSON", "a file", fix)
+        return found
+    if kind != "a folder":
+        fix = "Pass the folder that holds one file per frame."
+        raise input_error(path, "a folder of masks", "no such folder", fix)
+    return _in_folder(path, labels)
+
+
+def _in_folder(folder: Path, labels: str) -> MaskFolder:
+    named = segmentation_masks(folder, labels) or brush_export(folder, labels)
+    if named or (named := ignore_masks(folder)):
+        return _without_labels(named, labels) if named.tool_is_high is False else named
+    if found := palette_folder(folder, labels) or object_folders(folder, labels):
+        return found
+    files = files_with(folder, MASK_SUFFIXES)
+    if not files:
+        documents = files_with(folder, (".xml", ".json"))
+        read = [(file, found) for file in documents if (found := _in_file(file, labels))]
+        if len(read) > 1:
+            names = ", ".join(file.name for file, _ in read)
+            raise input_error(folder, "one file with annotations", names, f"Pass one of them, such as {read[0][0]}.")
+        if read:
+            return read[0][1]
+        inner = sorted((each for each in entries(folder) if each.is_dir() and each.name[0] != "."), key=natural_order)
+        # SAM 2 writes a folder per video.
+        with_masks = [each for each in inner if files_with(each, MASK_SUFFIXES) or object_folders(each, "")]
+        if len(with_masks) == 1:
+            return _in_folder(with_masks[0], labels)
+        if with_masks:
+            names = ", ".join(each.name for each in with_masks[:4])
+            raise input_error(folder, "the masks of one video", f"the folders {names}", f"Pass {with_masks[0]}.")
+    if not files:
+        fix = "Put one file per frame there."
+        raise input_error(folder, f"masks ({', '.join(MASK_SUFFIXES)})", "none", fix)
+    return _without_labels(MaskFolder([MaskFrame(file.name, union_of_files([file])) for file in files]), labels)
+
+
+def _in_file(file: Path, labels: str) -> MaskFolder | None:
+    """The masks in an XML or JSON file; None if it holds something else."""
+    readers = {".xml": annotations, ".json": sav_file}
+    reader = readers.get(file.suffix.lower())
+    return reader(file, labels) if reader else None
+
+
+def _without_labels(found: MaskFolder, labels: str) -> MaskFolder:
+    """The masks; an error if labels were asked for that such masks do not have."""
+    if labels:
+        raise input_error(OPTION, "masks with labels", "masks of one kind", f"Remove {OPTION}.")
+    return found

@@ -1,0 +1,467 @@
+"""Masks as other programs write them: each layout is written as that program does, and read back."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from video_files import write_video
+
+from endoprior.cli import main
+from endoprior.core.checks import InputError
+from endoprior.data.images import read_tool_mask
+from endoprior.data.mask_folders import open_mask_folder
+from endoprior.data.mask_folders.labels import tool_labels
+from endoprior.data.mask_folders.run_lengths import mask_of_coco, mask_of_runs
+from endoprior.prepare import PrepareConfig, prepare
+from endoprior.prepare.first_pass import source_facts
+
+SIZE = WIDTH, HEIGHT = 64, 48
+FRAMES = 4
+DAVIS = [0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0]
+"""Colors of objects 0 to 3."""
+
+
+def shaft(i):
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[: 20 + i, 5:15] = True
+    return mask
+
+
+def jaw(i):
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[20 + i : 30 + i, 3:20] = True
+    return mask
+
+
+def tissue(i):
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[:, 40:] = True
+    return mask
+
+
+def palette_png(file, labels, palette=DAVIS):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    image = Image.fromarray(labels.astype(np.uint8))
+    image.putpalette(palette)
+    image.save(file)
+
+
+def gray_png(file, values):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(file), values.astype(np.uint8))
+
+
+def objects(i):
+    """Object 1 is the shaft, 2 the jaw."""
+    return shaft(i) + 2 * jaw(i)
+
+
+def sam2_palette(folder):
+    for i in range(FRAMES):
+        palette_png(folder / f"{i:05d}.png", objects(i))
+
+
+def sam2_light_background(folder):
+    """Another palette: the background is white, an object is black."""
+    for i in range(FRAMES):
+        palette_png(folder / f"{i:05d}.png", objects(i), [255, 255, 255, 0, 0, 0, 0, 128, 0])
+
+
+def sam2_video(folder):
+    sam2_palette(folder / "my_video")
+
+
+def sam2_objects(folder):
+    """As `--per_obj_png_file`: values 0 and 1. The jaw is in view from frame 1 on; frame 0 has no file of it."""
+    for i in range(FRAMES):
+        palette_png(folder / "001" / f"{i:05d}.png", shaft(i))
+        if i:
+            palette_png(folder / "002" / f"{i:05d}.png", jaw(i))
+
+
+def sam2_video_objects(folder):
+    sam2_objects(folder / "my_video")
+
+
+def runs_of(pixels):
+    """Lengths of runs: outside first."""
+    changes = np.flatnonzero(np.diff(np.concatenate([[0], pixels.astype(int), [2]])))
+    return np.diff(np.concatenate([[0], changes])).tolist()
+
+
+def packed(runs):
+    """COCO's text of run lengths."""
+    text = ""
+    for i, run in enumerate(runs):
+        value = run - runs[i - 2] if i > 2 else run
+        more = True
+        while more:
+            bits, value = value & 31, value >> 5
+            more = value != (-1 if bits & 16 else 0)
+            text += chr(48 + bits + 32 * more)
+    return text
+
+
+def coco(mask):
+    return {"size": [HEIGHT, WIDTH], "counts": packed(runs_of(mask.T.ravel()))}
+
+
+def sav(folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    stored = {
+        "video_id": "sav_000001", "video_frame_count": float(FRAMES), "video_height": 48.0, "video_width": 64.0,
+        "masklet": [[coco(shaft(i)), coco(jaw(i))] for i in range(FRAMES)], "masklet_id": [0, 1],
+        "masklet_type": "manual",
+    }  # fmt: skip
+    (folder / "sav_000001_manual.json").write_text(json.dumps(stored))
+
+
+COLORS = {"background": (0, 0, 0), "shaft": (61, 61, 245), "jaw": (250, 50, 83), "tissue": (51, 221, 255)}
+
+
+def cvat(folder, colors=COLORS):
+    lines = ["# label:color_rgb:parts:actions"]
+    lines += [f"{name}:{','.join(map(str, color))}::" for name, color in colors.items()]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "labelmap.txt").write_text("\n".join(lines) + "\n")
+    (folder / "ImageSets" / "Segmentation").mkdir(parents=True)
+    names = [f"frame_{i:06d}" for i in range(FRAMES)]
+    (folder / "ImageSets" / "Segmentation" / "default.txt").write_text("\n".join(names) + "\n")
+    for i, name in enumerate(names):
+        image = np.full((HEIGHT, WIDTH, 3), colors["background"], np.uint8)
+        for label, part in (("tissue", tissue), ("shaft", shaft), ("jaw", jaw)):
+            image[part(i)] = colors[label]
+        for part in ("SegmentationClass", "SegmentationObject"):
+            gray_png(folder / part / f"{name}.png", image[..., ::-1])
+    return folder
+
+
+def cvat_green_background(folder):
+    cvat(folder, COLORS | {"background": (0, 128, 0)})
+
+
+def cvat_indices(folder):
+    cvat(folder)
+    for i in range(FRAMES):
+        indices = np.where(jaw(i), 2, np.where(shaft(i), 1, np.where(tissue(i), 3, 0)))
+        gray_png(folder / "SegmentationClass" / f"frame_{i:06d}.png", indices)
+
+
+def cvat_xml(folder):
+    """The shaft is a mask, the jaw a polygon, tissue a polygon below both."""
+    folder.mkdir(parents=True, exist_ok=True)
+    images = []
+    for i in range(FRAMES):
+        part = shaft(i)[: 20 + i, 5:15]
+        images.append(
+            f"""  <image id="{i}" name="clip/frame_{i:06d}.png" width="{WIDTH}" height="{HEIGHT}">
+    <polygon label="tissue" source="manual" occluded="0" points="40.00,0.00;64.00,0.00;64.00,48.00" z_order="0">
+    </polygon>
+    <mask label="shaft" source="manual" occluded="0" rle="{", ".join(map(str, runs_of(part.ravel())))}" left="5"
+     top="0" width="10" height="{20 + i}" z_order="1">
+    </mask>
+    <polygon label="jaw" source="manual" occluded="0" z_order="1"
+     points="3.00,{20 + i}.00;20.00,{20 + i}.00;20.00,{30 + i}.00;3.00,{30 + i}.00">
+    </polygon>
+    <box label="jaw" source="manual" occluded="0" xtl="1" ytl="1" xbr="5" ybr="5" z_order="0"></box>
+  </image>"""
+        )
+    labels = "".join(f"<label><name>{name}</name></label>" for name in ("shaft", "jaw", "tissue"))
+    (folder / "annotations.xml").write_text(
+        "<?xml version='1.0' encoding='utf-8'?>\n<annotations>\n  <version>1.1</version>\n"
+        f"  <meta><task><labels>{labels}</labels></task></meta>\n" + "\n".join(images) + "\n</annotations>\n"
+    )
+
+
+def label_studio(folder, suffix=".png", first=7):
+    """Task 8 has two regions of the shaft."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(FRAMES):
+        upper = shaft(i).copy()
+        upper[10:] = False
+        parts = {"Shaft-0": shaft(i), "Needle-driver-0": jaw(i), "tissue-0": tissue(i)}
+        if i == 1:
+            parts |= {"Shaft-0": upper, "Shaft-1": shaft(i) & ~upper}
+        for name, mask in parts.items():
+            file = folder / f"task-{first + i}-annotation-{50 + i}-by-1-tag-{name}"
+            if suffix == ".npy":
+                np.save(file, np.where(mask, 255, 0).astype(np.uint8))
+            else:
+                gray_png(file.with_name(file.name + suffix), 255 * mask)
+
+
+def label_studio_numpy(folder):
+    label_studio(folder, ".npy")
+
+
+def label_studio_twins(folder):
+    label_studio(folder, ".png")
+    label_studio(folder, ".npy")
+
+
+def nerfstudio(folder):
+    frames = []
+    for i in range(FRAMES):
+        keep = 255 * ~(shaft(i) | jaw(i))
+        gray_png(folder / "masks" / f"frame_{i + 1:05d}.png", keep)
+        gray_png(folder / "masks_2" / f"frame_{i + 1:05d}.png", keep[::2, ::2])
+        frames.append({"file_path": f"images/frame_{i + 1:05d}.png", "mask_path": f"masks/frame_{i + 1:05d}.png"})
+    (folder / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "frames": frames[::-1]}))
+
+
+def plain(folder):
+    for i in range(FRAMES):
+        gray_png(folder / f"m{i}.png", 255 * (shaft(i) | jaw(i)))
+
+
+LAYOUTS = {
+    sam2_palette: "SAM 2, palette images",
+    sam2_light_background: "SAM 2, palette images",
+    sam2_video: "SAM 2, palette images",
+    sam2_objects: "SAM 2, a folder per object",
+    sam2_video_objects: "SAM 2, a folder per object",
+    sav: "SA-V annotations",
+    cvat: "CVAT segmentation masks; tools: shaft, jaw; not tools: tissue",
+    cvat_green_background: "CVAT segmentation masks",
+    cvat_indices: "CVAT segmentation masks",
+    cvat_xml: "CVAT for images; tools: shaft, jaw; not tools: tissue; shapes left out: 4 of box",
+    label_studio: "Label Studio brush labels; tools: Needle-driver, Shaft; not tools: tissue; tasks are matched",
+    label_studio_numpy: "Label Studio brush labels",
+    label_studio_twins: "Label Studio brush labels",
+    nerfstudio: "nerfstudio masks; tools: where a mask is 0",
+    plain: "",
+}
+
+
+@pytest.mark.parametrize("write", LAYOUTS, ids=lambda write: write.__name__)
+def test_every_layout_gives_the_same_masks(tmp_path, write):
+    write(tmp_path / "given")
+    found = open_mask_folder(tmp_path / "given")
+    assert found.note.startswith(LAYOUTS[write]) and bool(found.note) == (write is not plain)
+    assert found.tool_is_high == {nerfstudio: False, plain: None}.get(write, True)
+    assert len(found.frames) == FRAMES
+    for i, frame in enumerate(found.frames):
+        want = shaft(i) | jaw(i) if i or write not in (sam2_objects, sam2_video_objects) else shaft(i)
+        mask = frame.read(SIZE)
+        mask = ~mask if found.tool_is_high is False else mask
+        if write is cvat_xml:  # a polygon has no exact pixels
+            assert (mask ^ want).sum() <= 2 * (10 + 17)
+        else:
+            assert (mask == want).all()
+        if write is not plain or i:
+            with pytest.raises(InputError, match=f"{WIDTH}x{HEIGHT}"):
+                frame.read((WIDTH + 2, HEIGHT))
+
+
+@pytest.mark.parametrize(
+    ("write", "labels", "want"),
+    [
+        (sam2_palette, "2", [jaw]),
+        (sam2_objects, "1", [shaft]),
+        (sav, "1", [jaw]),
+        (cvat, "jaw", [jaw]),
+        (cvat, "Tissue, shaft", [tissue, shaft]),
+        (cvat_xml, "shaft", [shaft]),
+        (label_studio, "needle-driver", [jaw]),
+    ],
+)
+def test_labels_can_be_chosen(tmp_path, write, labels, want):
+    write(tmp_path / "given")
+    frame = open_mask_folder(tmp_path / "given", labels).frames[1]
+    wanted = np.any([part(1) for part in want], axis=0)
+    if (write, labels) == (cvat, "Tissue, shaft"):
+        wanted &= ~jaw(1)  # painted over
+    assert (frame.read(SIZE) == wanted).all()
+
+
+PARTS = {
+    "SegmentationClass": cvat,
+    "annotations.xml": cvat_xml,
+    "sav_000001_manual.json": sav,
+    "masks": nerfstudio,
+    "masks_2": nerfstudio,
+}
+
+
+@pytest.mark.parametrize("inner", PARTS)
+def test_a_part_of_a_layout_is_enough(tmp_path, inner):
+    write = {"SegmentationClass": cvat, "annotations.xml": cvat_xml, "sav_000001_manual.json": sav}.get(
+        inner, nerfstudio
+    )
+    write(tmp_path / "given")
+    size = SIZE if inner != "masks_2" else (WIDTH // 2, HEIGHT // 2)
+    found, whole = (open_mask_folder(tmp_path / part) for part in (f"given/{inner}", "given"))
+    assert found.note == whole.note and found.tool_is_high == whole.tool_is_high
+    assert all((a.read(size) == b.read(size)).all() for a, b in zip(found.frames, whole.frames, strict=True))
+
+
+def test_images_of_a_cvat_task_without_a_shape_have_empty_masks(tmp_path):
+    folder = cvat(tmp_path / "given")
+    (folder / "SegmentationClass" / "frame_000002.png").unlink()
+    masks = [frame.read(SIZE) for frame in open_mask_folder(folder).frames]
+    assert [bool(mask.any()) for mask in masks] == [True, True, False, True]
+
+
+def test_frames_of_sav_are_numbered_by_the_video(tmp_path):
+    sav(tmp_path)
+    file = tmp_path / "sav_000001_manual.json"
+    stored = json.loads(file.read_text()) | {"video_frame_count": 13.0}
+    stored["masklet"][1][0] = None  # out of view
+    file.write_text(json.dumps(stored))
+    found = open_mask_folder(file)
+    assert [frame.name for frame in found.frames] == ["0.json", "3.json", "6.json", "9.json"]
+    assert (found.frames[1].read(SIZE) == jaw(1)).all() and "one frame in 3" in found.note
+
+
+@pytest.mark.parametrize(
+    ("labels", "tools"),
+    [
+        (["shaft", "tissue"], ["shaft"]),
+        (["Tool1", "tool2", "Background"], ["Tool1", "tool2"]),
+        (["Instruments"], ["Instruments"]),
+        (["blob"], ["blob"]),
+        (["blob", "ignore"], ["blob"]),
+        (["tissue forceps", "liver"], ["tissue forceps"]),
+        (["needleDriver", "no tool"], ["needleDriver"]),
+    ],
+)
+def test_labels_whose_names_tell(tmp_path, labels, tools):
+    assert tool_labels(tmp_path, labels, "") == tools
+
+
+@pytest.mark.parametrize("labels", [["red", "yellow"], ["shaft", "thing"], ["tissue"], ["tissue", "fat"]])
+def test_labels_whose_names_do_not_tell_are_named(tmp_path, labels):
+    with pytest.raises(InputError, match="labels whose names tell") as error:
+        tool_labels(tmp_path, labels, "")
+    assert ", ".join(labels) in str(error.value) and "`--mask-labels " in str(error.value)
+
+
+def test_run_lengths():
+    assert mask_of_runs([2, 3, 1, 1], 7).tolist() == [False, False, True, True, True, False, True]
+    assert mask_of_runs([0, 6, 1], 7).tolist() == [True] * 6 + [False]
+    rng = np.random.default_rng(0)
+    for share in (0.02, 0.5, 0.9):
+        mask = cv2.blur(rng.random((HEIGHT, WIDTH)), (9, 9)) > np.quantile(
+            cv2.blur(rng.random((48, 64)), (9, 9)), share
+        )
+        runs = runs_of(mask.T.ravel())
+        assert (mask_of_coco(packed(runs), (HEIGHT, WIDTH)) == mask).all()
+        assert (mask_of_coco(runs, (HEIGHT, WIDTH)) == mask).all()
+    for wrong in ("o", "\x01", packed([2, 3])):
+        with pytest.raises(ValueError):
+            mask_of_coco(wrong, (4, 4))
+
+
+def damaged_rle(folder):
+    cvat_xml(folder)
+    file = folder / "annotations.xml"
+    file.write_text(file.read_text().replace('rle="', 'rle="7, '))
+
+
+def edited(write, file, old, new):
+    def damage(folder):
+        write(folder)
+        text = (folder / file).read_text()
+        assert old in text
+        (folder / file).write_text(text.replace(old, new))
+
+    return damage
+
+
+def two_videos(folder):
+    sam2_palette(folder / "a")
+    sam2_palette(folder / "b")
+
+
+def foreign_color(folder):
+    cvat(folder)
+    gray_png(folder / "SegmentationClass" / "frame_000000.png", np.full((HEIGHT, WIDTH, 3), (3, 2, 1)))
+
+
+def nothing(folder):
+    folder.mkdir()
+
+
+BAD = {
+    "run lengths of": damaged_rle,
+    "a box outside": edited(cvat_xml, "annotations.xml", 'left="5"', 'left="60"'),
+    "the attribute 'top', got none": edited(cvat_xml, "annotations.xml", 'top="0"', ""),
+    "points that are not": edited(cvat_xml, "annotations.xml", "3.00,20.00;", "3.00;"),
+    "a document type": edited(cvat_xml, "annotations.xml", "<annotations>", "<!DOCTYPE a><annotations>"),
+    "CVAT's XML, got no element": edited(cvat_xml, "annotations.xml", "</annotations>", ""),
+    "tracks of a video": edited(cvat_xml, "annotations.xml", "image", "track"),
+    "label:red,green,blue": edited(cvat, "labelmap.txt", "61,61,245", "61"),
+    "only colors of labelmap.txt, got 1,2,3": foreign_color,
+    "run lengths that fill": edited(sav, "sav_000001_manual.json", '"counts": "', '"counts": "3'),
+    "a list of objects per frame": edited(sav, "sav_000001_manual.json", '"masklet": [[', '"masklet": [3, ['),
+    "the folders a, b": two_videos,
+    "got none": nothing,
+}
+
+
+@pytest.mark.parametrize("says", BAD)
+def test_damage_is_one_line_that_names_the_file(tmp_path, says):
+    BAD[says](tmp_path / "given")
+    with pytest.raises(InputError) as error:
+        for frame in open_mask_folder(tmp_path / "given").frames:
+            frame.read(SIZE)
+    text = str(error.value)
+    assert says in text and "\n" not in text and str(tmp_path) in text and "Fix: " in text
+
+
+@pytest.mark.parametrize(("write", "says"), [(plain, "masks of one kind"), (nerfstudio, "masks of one kind")])
+def test_labels_of_masks_without_labels_are_an_error(tmp_path, write, says):
+    write(tmp_path / "given")
+    with pytest.raises(InputError, match=f"--mask-labels: expected masks with labels, got {says}"):
+        open_mask_folder(tmp_path / "given", "shaft")
+    cvat(tmp_path / "cvat")
+    with pytest.raises(InputError, match=r"--mask-labels: .*\(shaft, jaw, tissue\), got grasper"):
+        open_mask_folder(tmp_path / "cvat", "grasper")
+
+
+def video(folder):
+    rng = np.random.default_rng(0)
+    wall = cv2.resize(rng.integers(90, 200, (6, 8, 3), np.uint8), SIZE)
+    images = [np.where((shaft(i) | jaw(i))[..., None], 120, wall).astype(np.uint8) for i in range(FRAMES)]
+    return write_video(folder / "v.mkv", images)
+
+
+OPTIONS = {"depth": "none", "poses": "still", "border": "keep"}
+
+
+@pytest.mark.parametrize("write", [sam2_objects, cvat, label_studio, nerfstudio, cvat_xml])
+def test_prepare_reads_them_and_says_what_it_recognized(tmp_path, write):
+    write(tmp_path / "given")
+    done = prepare(video(tmp_path), tmp_path / "out", PrepareConfig(masks=str(tmp_path / "given"), **OPTIONS))
+    assert any(note.startswith(f"masks: {LAYOUTS[write]}") for note in done.notes)
+    for i, file in enumerate(sorted((done.out / "masks").glob("*.png"))):
+        want = shaft(i) if write is sam2_objects and i == 0 else shaft(i) | jaw(i)
+        assert (read_tool_mask(file) ^ want).sum() <= (2 * 27 if write is cvat_xml else 0)
+
+
+def test_the_polarity_of_a_layout_can_be_overridden(tmp_path):
+    nerfstudio(tmp_path / "given")
+    cfg = PrepareConfig(masks=str(tmp_path / "given"), mask_tool_value="high", **OPTIONS)
+    done = prepare(video(tmp_path), tmp_path / "out", cfg)
+    assert (read_tool_mask(done.out / "masks" / "000001.png") == ~(shaft(1) | jaw(1))).all()
+
+
+def test_tasks_of_label_studio_must_be_as_many_as_frames(tmp_path, capsys):
+    label_studio(tmp_path / "given", first=0)
+    for file in (tmp_path / "given").glob("task-3-*"):
+        file.unlink()
+    words = ["prepare", str(video(tmp_path)), str(tmp_path / "out"), "--depth", "none", "--masks"]
+    assert main([*words, str(tmp_path / "given")]) == 2
+    error = capsys.readouterr().err
+    assert "expected masks of as many tasks as frames, got 3 tasks for 4 frames" in error and error.count("\n") == 1
+    assert main([*words, "none", "--mask-labels", "a"]) == 2
+    assert "--mask-labels: expected a folder with --masks, got none" in capsys.readouterr().err
+
+
+def test_a_changed_mask_in_an_inner_folder_changes_the_identity(tmp_path):
+    sam2_objects(tmp_path / "given")
+    before = source_facts(tmp_path / "given")
+    palette_png(tmp_path / "given" / "001" / "00002.png", jaw(0))
+    assert source_facts(tmp_path / "given") != before
