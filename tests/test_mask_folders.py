@@ -297,6 +297,13 @@ def test_a_part_of_a_layout_is_enough(tmp_path, inner):
     assert all((a.read(size) == b.read(size)).all() for a, b in zip(found.frames, whole.frames, strict=True))
 
 
+def test_palette_images_of_grays_are_plain_masks(tmp_path):
+    for i in range(FRAMES):
+        palette_png(tmp_path / f"{i:05d}.png", shaft(i), [255, 255, 255, 0, 0, 0])
+    found = open_mask_folder(tmp_path)
+    assert found.note == "" and found.tool_is_high is None and (found.frames[1].read(SIZE) == ~shaft(1)).all()
+
+
 def test_images_of_a_cvat_task_without_a_shape_have_empty_masks(tmp_path):
     folder = cvat(tmp_path / "given")
     (folder / "SegmentationClass" / "frame_000002.png").unlink()

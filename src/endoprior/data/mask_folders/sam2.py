@@ -31,7 +31,8 @@ def palette_folder(folder: Path, asked: str) -> MaskFolder | None:
     files = files_with(folder, MASK_SUFFIXES)
     if not files or not all(file.suffix.lower() == ".png" and file.stem.isdigit() for file in files):
         return None
-    if len(_palette(files[0])) < 2:
+    palette = _palette(files[0])
+    if len(palette) < 2 or not np.ptp(palette[:, :3], axis=1).any():  # grays are levels, not numbers of objects
         return None
     wanted = [int(name) for name in asked.split(",") if name.strip().isdigit()]
     if asked and not wanted:
