@@ -322,6 +322,16 @@ def test_frames_of_sav_are_numbered_by_the_video(tmp_path):
     assert (found.frames[1].read(SIZE) == jaw(1)).all() and "one frame in 3" in found.note
 
 
+@pytest.mark.parametrize("facts", [{"video_frame_count": float("nan")}, {"masklet_id": 7}, {"masklet_id": [1]}])
+def test_odd_facts_of_sav_are_left_out(tmp_path, facts):
+    sav(tmp_path)
+    file = tmp_path / "sav_000001_manual.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | facts))
+    found = open_mask_folder(file)
+    assert [frame.name for frame in found.frames] == [f"{i}.json" for i in range(FRAMES)]
+    assert found.note == "SA-V annotations; tools: objects 0, 1"
+
+
 @pytest.mark.parametrize(
     ("labels", "tools"),
     [
@@ -356,7 +366,7 @@ def test_run_lengths():
         runs = runs_of(mask.T.ravel())
         assert (mask_of_coco(packed(runs), (HEIGHT, WIDTH)) == mask).all()
         assert (mask_of_coco(runs, (HEIGHT, WIDTH)) == mask).all()
-    for wrong in ("o", "\x01", packed([2, 3])):
+    for wrong in ("o", "\x01", packed([2, 3]), [1 << 62, 1 << 62, 1 << 62, (1 << 62) + 16], [-1, 17]):
         with pytest.raises(ValueError):
             mask_of_coco(wrong, (4, 4))
 
@@ -400,6 +410,7 @@ BAD = {
     "CVAT's XML, got no element": edited(cvat_xml, "annotations.xml", "</annotations>", ""),
     "tracks of a video": edited(cvat_xml, "annotations.xml", "image", "track"),
     "label:red,green,blue": edited(cvat, "labelmap.txt", "61,61,245", "61"),
+    "label:red,green,blue:parts:actions, got shaft:999": edited(cvat, "labelmap.txt", "61,61,245", "999,61,245"),
     "only colors of labelmap.txt, got 1,2,3": foreign_color,
     "run lengths that fill": edited(sav, "sav_000001_manual.json", '"counts": "', '"counts": "3'),
     "a list of objects per frame": edited(sav, "sav_000001_manual.json", '"masklet": [[', '"masklet": [3, ['),

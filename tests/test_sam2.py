@@ -19,6 +19,7 @@ from endoprior.data.images import read_tool_mask
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.prepare import PrepareConfig, carried_masks, pipeline, prepare, sam2
 from endoprior.prepare.hub_model import FILES
+from endoprior.prepare.record import names_path
 from endoprior.prepare.sam2 import DEFAULT_MODEL, is_sam2, open_sam2
 from endoprior.tool_masks.carry import carry
 
@@ -263,6 +264,7 @@ def test_without_the_package_its_name_is_said(monkeypatch, option):
 
 def test_a_value_is_a_method_or_a_folder():
     assert is_sam2("sam2") and is_sam2("sam2:a/b") and not is_sam2("./sam2") and not is_sam2("auto")
+    assert not names_path("sam2") and not names_path("sam2:a/b") and names_path("./sam2")
 
 
 def test_importing_the_module_loads_neither_torch_nor_transformers():

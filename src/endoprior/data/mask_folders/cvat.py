@@ -54,6 +54,8 @@ def read_labelmap(file: Path) -> dict[str, Color]:
         try:
             name, color, *_ = line.rsplit(":", 3) if line.count(":") >= 3 else line.split(":")
             red, green, blue = (int(part) for part in color.split(","))
+            if not all(0 <= value <= 255 for value in (red, green, blue)):
+                raise ValueError
         except ValueError:
             raise input_error(file, "label:red,green,blue:parts:actions", line[:60], HINT) from None
         found[name.strip()] = red, green, blue

@@ -18,7 +18,10 @@ def mask_of_runs(runs: Sequence[int], num_pixels: int) -> NDArray[np.bool_]:
         ValueError: a negative length, or lengths that do not fill the mask.
     """
     lengths = np.asarray(runs, np.int64)
-    if lengths.ndim != 1 or (lengths < 0).any() or int(lengths.sum()) != num_pixels or num_pixels > MOST_PIXELS:
+    if num_pixels > MOST_PIXELS or lengths.ndim != 1:
+        raise ValueError(f"run lengths of {num_pixels} px")
+    # Each alone, too: the sum of huge numbers can wrap around.
+    if ((lengths < 0) | (lengths > num_pixels)).any() or int(lengths.sum()) != num_pixels:
         raise ValueError(f"run lengths of {int(lengths.sum())} px for {num_pixels} px")
     return np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
 

@@ -23,6 +23,8 @@ from .run_lengths import mask_of_coco
 
 PALETTE_IMAGE = 3
 """Color type in the header of a PNG."""
+MOST_FRAMES = 10_000_000
+"""Of a video."""
 HINT = "Write it with the program of SA-V, or pass masks as PNG."
 
 
@@ -75,12 +77,14 @@ def sav_file(file: Path, asked: str) -> MaskFolder | None:
     if not masklets or not all(isinstance(frame, list) for frame in masklets):
         raise input_error(file, "masklet to hold a list of objects per frame", "something else", HINT)
     count = max(len(frame) for frame in masklets)
-    ids = [str(each) for each in stored.get("masklet_id") or range(count)]
+    given = stored.get("masklet_id")
+    ids = [str(each) for each in (given if isinstance(given, list) and len(given) == count else range(count))]
     tools = chosen_objects(file, ids, asked)
     wanted = [i for i, name in enumerate(ids) if name in tools]
     # Every fourth frame of the video is annotated: the number of a mask is that of its frame in the video.
     total = stored.get("video_frame_count")
-    step = max(1, round(total / len(masklets))) if isinstance(total, int | float) else 1
+    known = isinstance(total, int | float) and 0 < total < MOST_FRAMES
+    step = max(1, round(total / len(masklets))) if known else 1
 
     def reader(frame: list[Any]):
         return lambda size: union((_sav_mask(file, frame[i], size) for i in wanted if i < len(frame)), size)
@@ -96,7 +100,7 @@ def _sav_mask(file: Path, code: Any, size: Size) -> Mask:
         return np.zeros(size[::-1], bool)
     try:
         mask = mask_of_coco(code["counts"], code["size"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise input_error(file, "run lengths that fill a mask", str(error) or type(error).__name__, HINT) from None
     demand_size(file, (mask.shape[1], mask.shape[0]), size)
     return mask
