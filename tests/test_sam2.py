@@ -66,7 +66,7 @@ def test_a_model_folder_follows_objects_in_both_directions(model, monkeypatch):
         assert len({int(mask.sum()) for mask in found.values()}) > 9, "it looks at the frames"
         again = dict(carry(segmenter, images.__getitem__, order, regions))
         assert all((again[i] == found[i]).all() for i in found), "the same again"
-    assert str(model) in segmenter.name
+    assert segmenter.name == "SAM 2", "the folder may name a person, and the name is written to sequence.json"
 
 
 @needs_transformers
@@ -113,6 +113,7 @@ def test_the_command_replaces_masks(model, phantom, tmp_path, capsys):
     assert len(json.loads((folder / "tool_masks.json").read_text())) == FRAMES
     assert "following tools" in capsys.readouterr().out
     assert load_sequence(folder).masks_are_found
+    assert load_sequence(folder).sources["masks"].endswith("of the frames, followed by SAM 2")
 
 
 @pytest.mark.parametrize("value", ["sam3", "./masks", "sam"])
@@ -235,7 +236,7 @@ def test_a_download_says_its_size_and_license_first(model, monkeypatch, capsys):
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", fetch)
     monkeypatch.setattr("huggingface_hub.HfApi.model_info", facts)
-    open_sam2("sam2:someone/sam", "--with")
+    assert open_sam2("sam2:someone/sam", "--with").name == "SAM 2 (someone/sam)"
     assert asked == [True, False]
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from ..data import FrameSequence
     from ..tool_masks import FoundTools
+    from ..tool_masks.carry import VideoSegmenter
     from ..tool_masks.sequence import Progress
 
 SHEET, SHARES = "tool_masks.png", "tool_masks.json"
@@ -59,6 +60,7 @@ def run(argv: list[str]) -> None:
     from ..core.config import DataConfig
     from ..data import load_sequence
     from ..data.mask_writing import note_found_masks, replace_masks, writable_masks
+    from ..prepare.sam2 import open_sam2
     from ..system.atomic import write_json
     from ..tool_masks.mask_store import MaskStore
     from ..visualization.image_tools import write_png
@@ -71,7 +73,9 @@ def run(argv: list[str]) -> None:
     with TemporaryDirectory(prefix="endoprior-") as work, Counting() as progress:
         camera = sequence.camera(0)
         masks = MaskStore(Path(work) / "masks", (camera.width, camera.height))
-        for i, (mask, found) in enumerate(_found(sequence, args, Path(work) / "carried", progress)):
+        segmenter = None if args.segmenter is None else open_sam2(args.segmenter, "--with")
+        found_frames = _found(sequence, segmenter, args.refine, Path(work) / "carried", progress)
+        for i, (mask, found) in enumerate(found_frames):
             masks.put(i, mask)
             share = float(found.mask.mean())
             rows.append({"frame": i, "share": share, "confidence": found.confidence})
@@ -83,7 +87,7 @@ def run(argv: list[str]) -> None:
     write_png(args.data / SHEET, mask_sheet(pictures, COLUMNS, WIDTH_PX))
     write_json(args.data / SHARES, rows)
     with_tools = [row for row in rows if row["share"]]
-    note_found_masks(args.data, len(with_tools) / len(rows))
+    note_found_masks(args.data, len(with_tools) / len(rows), segmenter.name if segmenter else "")
     say(f"tools in {len(with_tools)} of {len(rows)} frames, at most {max(row['share'] for row in rows):.1%} of a frame")
     if uncertain:
         say(f"uncertain: frames {number_ranges(uncertain)}")
@@ -91,15 +95,13 @@ def run(argv: list[str]) -> None:
 
 
 def _found(
-    sequence: FrameSequence, args: Masks, work: Path, progress: Progress
+    sequence: FrameSequence, segmenter: VideoSegmenter | None, refine: bool, work: Path, progress: Progress
 ) -> Iterator[tuple[NDArray[np.bool_], FoundTools]]:
-    """The masks and tools of every frame, found as the options say."""
+    """The masks and tools of every frame: our own, or those of a segmenter that our own prompt."""
     from ..tool_masks.sequence import find_in_sequence
 
-    if args.segmenter is None:
-        return find_in_sequence(sequence, refine=args.refine, progress=progress)
-    from ..prepare.sam2 import open_sam2
+    if segmenter is None:
+        return find_in_sequence(sequence, refine=refine, progress=progress)
     from ..tool_masks.video_segmenter import segment_sequence
 
-    segmenter = open_sam2(args.segmenter, "--with")
-    return segment_sequence(sequence, segmenter, work, refine=args.refine, progress=progress)
+    return segment_sequence(sequence, segmenter, work, refine=refine, progress=progress)

@@ -71,21 +71,23 @@ def write_mask(file: Path, mask: NDArray[np.bool_], tool_value: int) -> None:
         save_png(temporary, np.where(mask == (tool_value == 255), 255, 0).astype(np.uint8))
 
 
-def note_found_masks(folder: Path, with_tools: float) -> None:
+def note_found_masks(folder: Path, with_tools: float, followed_by: str = "") -> None:
     """Note in `sequence.json` of a sequence folder that a program found its masks.
 
     Args:
         with_tools: share of the frames in which it found tools, 0..1.
+        followed_by: the segmenter that followed them through the video, if any.
     """
     path = folder / "sequence.json"
     described = read_description(path)
-    sources = described.get("sources", {}) | {"masks": found_source(with_tools)}
+    sources = described.get("sources", {}) | {"masks": found_source(with_tools, followed_by)}
     write_json(path, described | {"sources": sources})
 
 
-def found_source(with_tools: float) -> str:
-    """The source of masks that a program found. Args: with_tools: share of the frames in which it found tools, 0..1."""
-    return f"{TOOLS_FOUND} in {with_tools:.0%} of the frames" if with_tools else f"no {TOOLS_FOUND}"
+def found_source(with_tools: float, followed_by: str = "") -> str:
+    """The source of masks that a program found; the arguments are those of `note_found_masks`."""
+    found = f"{TOOLS_FOUND} in {with_tools:.0%} of the frames" if with_tools else f"no {TOOLS_FOUND}"
+    return f"{found}, followed by {followed_by}" if followed_by else found
 
 
 def changes(kept: Path, folder: Path, tool_value: int) -> dict[str, dict[str, int]]:

@@ -58,7 +58,7 @@ def replace_by_carried(
             depth = np.where(inside, shade(read_color(files.file("images", i)), ~mask), np.float32(0))
             save_png(files.file("depth", i), files.depth_units(depth))
     with_tools = sum(share > 0 for share in state["shares"])
-    source = f"{found_source(with_tools / files.count)}, followed by {segmenter.name}"
+    source = found_source(with_tools / files.count, segmenter.name)
     files.meta = replace(files.meta, sources=files.meta.sources | {"masks": source})
     notes = [f"masks: {source}. Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."]
     if state["uncertain"]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,16 +51,17 @@ def open_sam2(value: str, option: str) -> Sam2:
         raise input_error(f"{option} {SAM2}", "the transformers package", "none", f"`{install_command('tools')}`.")
     name = name or DEFAULT_MODEL
     hint = f"Download {' and '.join(FILES)} of {DEFAULT_MODEL} on another machine, then `{option} {SAM2}:FOLDER`."
-    return Sam2(name, _load(name, option, hint))
+    # What `sequence.json` says of its masks holds no path, which may name a person.
+    shown = "SAM 2" if Path(name).expanduser().is_dir() else f"SAM 2 ({name})"
+    return Sam2(shown, _load(name, option, hint))
 
 
 class Sam2:
     """A SAM 2 network in memory, as a `VideoSegmenter`."""
 
     def __init__(self, name: str, network: Module) -> None:
-        """Args: name: of the model. network: a `Sam2VideoModel` in evaluation mode."""
-        self.name = f"SAM 2 ({name})"
-        self.network = network
+        """Args: name: for the user. network: a `Sam2VideoModel` in evaluation mode."""
+        self.name, self.network = name, network
         size = network.config.image_size
         self.side_px = int(size if isinstance(size, int) else size[0])
         """The network sees square images of this side."""
