@@ -103,17 +103,6 @@ def write_tiny_sequence(
 
 
 @pytest.fixture(autouse=True, scope="session")
-def small_tool_network() -> Iterator[pytest.MonkeyPatch]:
-    """`prepare` trains a network for its masks: a tiny one and two steps are enough where masks are not the subject.
-
-    `undo()` of the value makes it as large as for a user, and `shrink_tool_network` small again.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        shrink_tool_network(patch)
-        yield patch
-
-
-@pytest.fixture(autouse=True, scope="session")
 def few_vessels() -> Iterator[None]:
     """To grow the vessels of a phantom takes longer than all the rest of a small one."""
     with pytest.MonkeyPatch.context() as patch:
@@ -146,11 +135,3 @@ def page(browser: Page, player: Path) -> Page:
 
     open_player(browser, player)
     return browser
-
-
-def shrink_tool_network(patch: pytest.MonkeyPatch) -> None:
-    """Fewer steps and weights, smaller images."""
-    patch.setattr("endoprior.tool_masks.model.STEPS", 2)
-    patch.setattr("endoprior.tool_masks.model.FEATURES_PX", 192)
-    patch.setattr("endoprior.tool_masks.network.CHANNELS", (4, 4, 4, 4))
-    patch.setattr("endoprior.tool_masks.network.LONG_SIDE_PX", 96)

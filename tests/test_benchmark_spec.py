@@ -255,7 +255,7 @@ def test_depth_flags_change_the_flags_and_nothing_else(size):
 
 def test_names_are_listed_and_win_over_paths(tmp_path, monkeypatch, capsys):
     names = spec_names()
-    assert {"quick", "masks", "poses", "sized", "sized/whole_clip", "full", "full/methods"} <= {*names}
+    assert {"quick", "found_masks", "poses", "sized", "sized/whole_clip", "full", "full/methods"} <= {*names}
     assert not [name for name in names if "_small" in name], "it is only there to be extended"
     monkeypatch.chdir(tmp_path)
     written(tmp_path).rename("quick")
@@ -270,5 +270,8 @@ def test_names_are_listed_and_win_over_paths(tmp_path, monkeypatch, capsys):
 def test_neither_a_name_nor_a_path_is_one_line_with_the_names(tmp_path, capsys, spec):
     assert main(["bench", spec, str(tmp_path / "out")]) == 2
     text = capsys.readouterr().err
-    assert text.startswith(f"endoprior: {spec}: expected a file, a folder or one of full,") and "quick" in text
+    assert (
+        text.startswith(f"endoprior: {spec}: expected a file, a folder or one of found_masks, full,")
+        and "quick" in text
+    )
     assert text.count("\n") == 1 and not (tmp_path / "out").exists()

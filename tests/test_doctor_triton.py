@@ -93,7 +93,7 @@ def test_without_a_gpu_nothing_is_recommended():
     assert not report.works and report.next_step == "nothing to install. Everything runs on the CPU."
     text = "\n".join(table(report))
     assert text.startswith("This computer can train and render. GPU: none found; everything runs on the CPU.\n\n")
-    assert "missing" not in text and "wrong" not in text and len(text.splitlines()) <= 17
+    assert "missing" not in text and "wrong" not in text and len(text.splitlines()) <= 18
     gpu = [" ".join(line.split()) for line in text.splitlines() if "GPU" in line][1:]
     assert gpu == ["optional GPU none found; start a container with `--gpus all` to use the host's GPU"]
     assert not any(name in text for name in ("nvcc", "C compiler", "Triton"))

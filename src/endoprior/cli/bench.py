@@ -13,6 +13,7 @@ import tyro
 from ..core.checks import input_error
 from ..experiments.ready_specs import find_spec, specs_of
 from ..system.console import say
+from . import bench_masks
 from .help_page import Help
 from .parsing import parse
 
@@ -25,8 +26,9 @@ class Bench:
     """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
 
     spec: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="SPEC")]]
-    """A .yaml or .toml file, a folder of them, or a name. quick: minutes. masks: given and found tool masks.
-    poses: given and estimated camera path. sized: the paper's tables, for two cores. full: the same at full size.
+    """A .yaml or .toml file, a folder of them, or a name. quick: minutes. masks: the network that finds tools, on
+    frames that it has not seen (`endoprior bench masks --help`). found_masks: given and found tool masks. poses: given
+    and estimated camera path. sized: the paper's tables, for two cores. full: the same at full size.
     radiance: the two radiance fields, a day. One table: sized/NAME or full/NAME with budgets, compared, depth_flags,
     growth, instability, ladder, matched, methods, primitives, regime, temporal; sized/whole_phantom; sized/whole_clip;
     full/radiance; full/scared."""
@@ -53,6 +55,8 @@ HELP = Help(
 
 def run(argv: list[str]) -> int:
     """Run the matrix and write its report; 1 if a cell failed."""
+    if argv[:1] == ["masks"]:
+        return bench_masks.run(argv[1:])
     args = parse(Bench, argv, "bench", HELP)
     from ..experiments.execute import local_executor, ray_executor
     from ..experiments.matrix import run_matrix

@@ -136,7 +136,7 @@ def _measure(job: Job, folder: Path) -> Trial:
     prepare(short.source, short.data, short.prepare, stamps)
     prepared = clock.perf_counter()
     looked, followed = stamps.at["looking through"][0], stamps.at["following the camera"][0]
-    learned, write = stamps.at["learning tools and light"][0], stamps.step("writing frames")
+    learned, write = stamps.at["looking at tools and light"][0], stamps.step("writing frames")
 
     cfg = shortened(job.cfg, job.part.num_frames)
     trainer = method_of(cfg).trainer(load_sequence(short.data, cfg.data), cfg)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +29,6 @@ from .sam2 import is_sam2
 from .shading import fit_shading
 from .stereo import stereo_depth
 from .video_clip import Clip
-
-if TYPE_CHECKING:
-    from ..tool_masks import ToolSample
 
 FITTED_SAMPLES = 16
 """Number of frames to which the tool and shading models are fitted."""
@@ -66,24 +63,16 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
         InputError: a folder named by an option cannot be used, or an option needs a second camera.
     """
     geometry, step = first_pass.geometry, max(len(first_pass.samples) // FITTED_SAMPLES, 1)
-    samples, later = [], []
+    samples = []
     for sampled in first_pass.samples[::step]:
         frame = sampled.frame
         right = None if frame.right is None else geometry.image(frame.right, right=True)
         samples.append(MeasuredFrame(0, frame.index, geometry.image(frame.left), right, None))
-        later.append(None if sampled.later is None else geometry.image(sampled.later))
     notes = _check_stereo(samples, geometry, clip) if clip.stereo else []
     kind = _depth_kind(cfg, clip)
     relative = kind in ("shading", "network") or cfg.depth_relative != "no"
     measure, source = (None, kind) if kind in ("none", "shading") else _measured_depth(kind, cfg, clip, first_pass)
-    from ..tool_masks import ToolSample  # imports torch
-
-    nearness = measure if not relative and (cfg.masks == "auto" or is_sam2(cfg.masks)) else None
-    tool_samples = [
-        ToolSample(frame.rgb_u8, geometry.inside, image, nearness(frame) if nearness else None)
-        for frame, image in zip(samples, later, strict=True)
-    ]
-    tools, mask_source, mask_note = _tools(cfg, first_pass, samples, tool_samples)
+    tools, mask_source, mask_note = _tools(cfg, first_pass, samples)
     notes += mask_note
     shade: Shade | None = None
     if relative:
@@ -197,7 +186,7 @@ def _of_either_size(read: Callable[[A, tuple[int, int]], NDArray], path: A, geom
 
 
 def _tools(
-    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame], tool_samples: list[ToolSample]
+    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
 ) -> tuple[Callable[[MeasuredFrame], Mask], str, list[str]]:
     """A function that returns the tool mask of a frame, the name of its source, and a note."""
     geometry = first_pass.geometry
@@ -206,22 +195,19 @@ def _tools(
     if cfg.masks == "none":
         return lambda frame: np.zeros_like(geometry.inside), "none", []
     if cfg.masks == "auto" or is_sam2(cfg.masks):
-        from ..tool_masks import fit_tools
+        from ..tool_masks import ToolFinder  # imports torch
 
-        model = fit_tools(tool_samples)
-        source = f"{TOOLS_FOUND} in {model.detected_share:.0%} of the samples"
+        finder = ToolFinder()
+        found = [finder.find(sample.rgb_u8, geometry.inside) for sample in samples]
+        share = sum(bool(tools.mask.any()) for tools in found) / max(len(found), 1)
+        source = f"{TOOLS_FOUND} in {share:.0%} of the samples" if share else f"no {TOOLS_FOUND}"
         hint = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
-        if unsure := sum(found.uncertain for found in model.in_samples):
-            doubt = f"Unsure in {unsure} of {len(model.in_samples)} samples"
-            hint = f"{doubt}: `endoprior masks DATA` lists such frames. {hint}"
-        if not model.detected_share:
-            source = f"no {TOOLS_FOUND}"
+        if not share:
             hint = "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
-        return (
-            lambda frame: model.find(frame.rgb_u8, geometry.inside, frame.depth).mask,
-            source,
-            [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"],  # its own masks replace these
-        )
+        if unsure := sum(tools.uncertain for tools in found):
+            hint = f"Unsure in {unsure} of {len(found)} samples: `endoprior masks DATA` lists such frames. {hint}"
+        notes = [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"]  # its own masks replace these
+        return lambda frame: finder.find(frame.rgb_u8, geometry.inside).mask, source, notes
     return _user_masks(cfg, first_pass, samples)
 
 

@@ -75,7 +75,7 @@ def prepare(
         clip = Clip(video, cfg, calibration)
         progress("looking through", 0, clip.source.num_frames)
         first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
-        progress("learning tools and light", 0, len(first_pass.indices))
+        progress("looking at tools and light", 0, len(first_pass.indices))
         chosen = choose_methods(cfg, clip, first_pass)
         meta = _meta(clip, first_pass.geometry, chosen, calibrated=calibration is not None)
         parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]

@@ -1,5 +1,5 @@
-"""Find surgical tools in the frames of one clip, without a trained network: the clip itself is the training data."""
+"""Find surgical tools in the frames of a clip, with a small network that comes with the program."""
 
-from .model import FoundTools, ToolModel, ToolSample, fit_tools
+from .finder import FoundTools, ToolFinder
 
-__all__ = ["FoundTools", "ToolModel", "ToolSample", "fit_tools"]
+__all__ = ["FoundTools", "ToolFinder"]

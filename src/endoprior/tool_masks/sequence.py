@@ -12,11 +12,10 @@ from ..core.spread import spread
 from ..core.types import Frame
 from ..data import FrameSequence
 from ..footage.border import find_outline, masked_border
-from ..footage.optical_flow import MOTION_S
-from .model import FoundTools, ToolSample, fit_tools
+from .finder import FoundTools, ToolFinder
 
 SAMPLES = 16
-"""Number of frames that the model is fitted to."""
+"""Number of frames from which the border of the view is taken."""
 Progress = Callable[[str, int, int], None]
 
 
@@ -26,26 +25,16 @@ def find_in_sequence(
     """Find the tools of every frame, in order.
 
     Args:
-        refine: the masks of the sequence are right but incomplete: learn tools from them too, and only add pixels.
+        refine: the masks of the sequence are right but incomplete: only add pixels, in regions that touch them.
         progress: called with the name of the step, the number of frames done, and their total.
     Yields:
         (H, W) True on everything that is not tissue, as a mask file stores it; and the tools of the frame.
     """
-    total = len(sequence)
-    chosen = spread(total, SAMPLES)
-    ahead = max(1, round(MOTION_S * (sequence.frames_per_second or 10.0)))
-    frames = [sequence.frame(i) for i in chosen]
-    view = view_of(frames)
-    samples = []
-    for i, frame in zip(chosen, frames, strict=True):
-        later = sequence.frame(i + ahead).rgb_u8 if i + ahead < total else None
-        given = ~frame.tissue_mask & view if refine else None
-        samples.append(ToolSample(frame.rgb_u8, view, later, _depth(sequence, frame), given))
-    progress("learning tools", 0, total)
-    model = fit_tools(samples)
+    total, finder = len(sequence), ToolFinder()
+    view = view_of([sequence.frame(i) for i in spread(total, SAMPLES)])
     for i in range(total):
         frame = sequence.frame(i)
-        found = model.find(frame.rgb_u8, view, _depth(sequence, frame))
+        found = finder.find(frame.rgb_u8, view)
         if refine:
             found = FoundTools(_added(~frame.tissue_mask & view, found.mask), found.confidence)
         progress("finding tools", i + 1, total)
@@ -58,11 +47,6 @@ def view_of(frames: list[Frame]) -> NDArray[np.bool_]:
     outline = find_outline(images)
     masked = masked_border(outline, images, (frame.tissue_mask for frame in frames))
     return ~(outline.in_strip | outline.outside | masked)
-
-
-def _depth(sequence: FrameSequence, frame: Frame) -> NDArray[np.float32] | None:
-    """Measured depth; relative depth comes from images, which say nothing about a mirror."""
-    return None if sequence.depth_is_relative or not frame.depth_valid.any() else frame.depth
 
 
 def _added(given: NDArray[np.bool_], found: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -13,24 +13,24 @@ from torch import Tensor
 from ..core.spread import spread
 from ..data import FrameSequence
 from ..system.memory import BoundedCache, cache_bytes
-from ..tool_masks.colors import FEATURES_PX, ClipColors, first_guess
+from ..tool_masks import ToolFinder
 from ..tool_masks.sequence import view_of
 from .frames import TrainingFrame
 from .missed_tools import SURELY_TISSUE, WORK_PX, missed_tools
 
 SAMPLES = 12
-"""Frames from which the colors of the clip and the border of its view are taken."""
+"""Frames from which the border of the view is taken."""
 
 
 class MaskDoubt:
     """Takes pixels that show a tool in spite of the mask out of a training frame."""
 
     def __init__(self, sequence: FrameSequence) -> None:
-        """Measure the colors of the training frames of `sequence`, and the border of their view."""
+        """Find the border of the view in the training frames of `sequence`."""
         indices = sequence.indices("train")
         frames = [sequence.frame(indices[k]) for k in spread(len(indices), SAMPLES)]
         self._sequence, self._view = sequence, view_of(frames)
-        self._clip = ClipColors.of([frame.rgb_u8 for frame in frames], [self._view] * len(frames))
+        self._finder = ToolFinder()
         self._tissue: BoundedCache[NDArray[np.bool_]] = BoundedCache(cache_bytes() // 4, lambda found: found.nbytes)
 
     def counted(self, frame: TrainingFrame, color: Tensor) -> TrainingFrame:
@@ -51,11 +51,9 @@ class MaskDoubt:
         return replace(frame, tissue_mask=frame.tissue_mask & keep, measured=measured, num_measured=int(measured.sum()))
 
     def _surely_tissue(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_]:
-        """(h, w) True where the color of the frame is surely that of tissue; `size` is (w, h)."""
-        features_size = self._size(FEATURES_PX)
-        rgb_u8 = _resized(self._sequence.frame(index).rgb_u8, features_size)
-        guess = first_guess(rgb_u8, _resized_mask(self._view, features_size), self._clip)
-        return cv2.resize(guess, size, interpolation=cv2.INTER_AREA) < SURELY_TISSUE
+        """(h, w) True where the tool network is sure of tissue; `size` is (w, h)."""
+        log_odds = self._finder.log_odds(self._sequence.frame(index).rgb_u8, self._view, mirrored=False)
+        return _resized(log_odds, size) < SURELY_TISSUE
 
     def _size(self, longer_px: int) -> tuple[int, int]:
         """(w, h) with that longer side: one for a frame at full and at half resolution, which round differently."""

@@ -3,7 +3,7 @@
 Found masks miss jaws, blurred ends, and tools that are there for a moment. Trained as tissue, they become a ghost. The
 scene is shared by all frames, so a few frames of a tool do not change it much at first: the error of the rendered
 image shows the tool. Where the error stays far above that of the frame, in a region that continues a masked tool or
-enters from the border as tools do, and whose color is not surely that of tissue, pixels do not count in this
+enters from the border as tools do, and of which the tool network is not sure of tissue, pixels do not count in this
 iteration. The decision is made anew each time a frame is drawn: no state, and what the scene learns to explain counts
 again.
 
@@ -34,7 +34,7 @@ GAP_PX = 6
 HIGHLIGHT = (0.5, 0.7)
 """Smallest color channel from which, and up to which, an error counts less: highlights move on tissue too."""
 SURELY_TISSUE = -3.0
-"""Log-odds of a tool, from color, below which a pixel always counts."""
+"""Log-odds of a tool below which a pixel always counts."""
 
 
 def missed_tools(
@@ -50,7 +50,7 @@ def missed_tools(
         rendered, rgb: (h, w, 3) color in [0, 1].
         tissue_mask: (h, w) True on tissue, as the mask has it.
         view: (h, w) True inside the endoscope's image.
-        surely_tissue: (h, w) True where the color is that of tissue.
+        surely_tissue: (h, w) True where the tool network is sure of tissue.
     """
     if not tissue_mask.any():
         return np.zeros_like(tissue_mask)
@@ -66,7 +66,8 @@ def missed_tools(
         return np.zeros_like(tissue_mask)
     body = (seed > 0) | (possible & (cv2.dilate(seed, disk(NEAR_PX)) > 0))
     tools = view & ~tissue_mask
-    closed = filled(cv2.morphologyEx((body | tools).astype(np.uint8), cv2.MORPH_CLOSE, disk(GAP_PX)))
+    closed = cv2.morphologyEx((body | tools).astype(np.uint8), cv2.MORPH_CLOSE, disk(GAP_PX))
+    closed = filled(closed, closed.size)
     added = closed & tissue_mask & (cv2.dilate(body.astype(np.uint8), disk(GAP_PX)) > 0)
     added = cv2.morphologyEx(added.astype(np.uint8), cv2.MORPH_OPEN, disk(2)) > 0
     entering = entering_regions((added | tools).astype(np.uint8), view) & added

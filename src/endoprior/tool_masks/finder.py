@@ -1,0 +1,98 @@
+"""Find the tools in the frames of one clip.
+
+`network` gives each pixel of a frame the log-odds of a tool; `regions` turns them into masks. Nothing is fitted to the
+clip, so a tool that rests in every frame is found as well as one that moves. The masks are a starting point: correct
+them in the viewer, or pass your own. `H, W` image size, `h, w` size of the network's image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..core.checks import check_shape
+from .network import LONG_SIDE_PX, MULTIPLE, ToolNetwork, network_input
+from .regions import tool_regions
+from .weights import shipped_network
+
+MAYBE = 0.25
+"""Pixels of a higher probability may be a tool: they count in the confidence."""
+UNCERTAIN = 0.5
+"""Masks of a lower confidence should be looked at."""
+LEAST_DOUBT = 0.004
+"""Share of the view that must be in doubt in a frame without a mask before the frame is uncertain."""
+
+
+@dataclass(frozen=True)
+class FoundTools:
+    """The tools of one frame."""
+
+    mask: NDArray[np.bool_]
+    """(H, W) True on the tools."""
+    confidence: float
+    """0..1: how far the probabilities of all pixels that may be a tool are from one half, on average; 1 if there are
+    none."""
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether the mask should be looked at."""
+        return self.confidence < UNCERTAIN
+
+
+class ToolFinder:
+    """Finds the tools of single frames."""
+
+    def __init__(self, network: ToolNetwork | None = None) -> None:
+        """Take a network in place of the one that comes with the program."""
+        self._network = network or shipped_network()
+
+    def log_odds(
+        self, rgb_u8: NDArray[np.uint8], view: NDArray[np.bool_], mirrored: bool = True
+    ) -> NDArray[np.float32]:
+        """(h, w) log-odds of a tool, at `LONG_SIDE_PX`.
+
+        Args:
+            rgb_u8: (H, W, 3) color, 0..255.
+            view: (H, W) True inside the endoscope's image.
+            mirrored: mean over the frame and its three mirror images, which is steadier and takes four times as long.
+        Raises:
+            ValueError: shapes that do not match.
+        """
+        check_shape("rgb_u8:H,W,3 view:H,W", rgb_u8=rgb_u8, view=view)
+        w, h = network_size(view.shape)
+        small = cv2.resize(rgb_u8, (w, h), interpolation=cv2.INTER_AREA)
+        image = torch.from_numpy(network_input(small, _resized(view, (w, h))))
+        flips = ((), (-1,), (-2,), (-1, -2)) if mirrored else ((),)
+        images = torch.nn.functional.pad(
+            torch.stack([image.flip(flip) for flip in flips]), (0, -w % MULTIPLE, 0, -h % MULTIPLE)
+        )
+        with torch.inference_mode():
+            found = self._network(images.contiguous(memory_format=torch.channels_last))[:, :h, :w]
+        return torch.stack([one.flip(flip) for one, flip in zip(found, flips, strict=True)]).mean(0).numpy()
+
+    def find(self, rgb_u8: NDArray[np.uint8], view: NDArray[np.bool_]) -> FoundTools:
+        """Find the tools of one frame; arguments and errors as in `log_odds`."""
+        if not view.any():
+            return FoundTools(np.zeros_like(view), 1.0)
+        probability = 1 / (1 + np.exp(-self.log_odds(rgb_u8, view)))
+        small = _resized(view, probability.shape[::-1])
+        mask = tool_regions(probability * small, small)
+        maybe = probability[(mask | (probability > MAYBE)) & small]
+        enough = mask.any() or maybe.size > LEAST_DOUBT * small.sum()
+        confidence = float(np.abs(2 * maybe - 1).mean()) if enough else 1.0
+        large = cv2.resize(mask.astype(np.float32), view.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        return FoundTools((large > 0.5) & view, confidence)
+
+
+def network_size(shape: tuple[int, int]) -> tuple[int, int]:
+    """(w, h) of the network's image for frames of (H, W)."""
+    scale = LONG_SIDE_PX / max(shape)
+    return max(1, round(shape[1] * scale)), max(1, round(shape[0] * scale))
+
+
+def _resized(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0

@@ -1,0 +1,138 @@
+"""What happens between tissue and file: smoke, lens, exposure, white balance, border, noise, compression, overlays.
+
+`h, w` image size. Colors in [0, 1], sRGB. Lengths in px of an image whose longer side is 256 px.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from .noise import Field, fractal_field, log_uniform, smooth_field
+
+
+def random_view(rng: Generator, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """(h, w) True inside the endoscope's image: whole, round, oval, octagonal, cut off, or between black strips."""
+    h, w = size
+    y, x = np.mgrid[:h, :w].astype(np.float32)
+    kind = rng.choice(4, p=[0.62, 0.22, 0.06, 0.1])
+    view = np.ones(size, bool)
+    if kind == 0:
+        return view
+    middle_x, middle_y = w / 2 + rng.normal(0, 0.06) * w, h / 2 + rng.normal(0, 0.06) * h
+    radius = rng.uniform(0.42, 0.72) * max(h, w)
+    dx, dy = np.abs(x - middle_x), np.abs(y - middle_y) * np.float32(rng.uniform(0.85, 1.2))
+    if kind == 1:
+        return np.hypot(dx, dy) < radius
+    if kind == 2:
+        return (dx < radius * 0.85) & (dy < radius * 0.75) & (dx + dy < radius * rng.uniform(1.1, 1.35))
+    strip = int(rng.uniform(0.02, 0.15) * w)
+    view[:, :strip] = view[:, w - strip :] = False
+    if rng.random() < 0.4:
+        view &= dy < h * rng.uniform(0.35, 0.5)
+    return view
+
+
+def photographed(rng: Generator, scene: Field, view: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """(h, w, 3), 0..255: the scene (h, w, 3) as a file shows it; black beyond the view."""
+    size = scene.shape[:2]
+    image = scene.astype(np.float32)
+    if rng.random() < 0.25:
+        image = _smoked(rng, image)
+    if rng.random() < 0.5:
+        image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.8))
+    if rng.random() < 0.08:
+        image = _moved(rng, image)
+    if rng.random() < 0.3:
+        small = rng.uniform(0.5, 0.85)
+        image = cv2.resize(cv2.resize(image, None, fx=small, fy=small, interpolation=cv2.INTER_AREA), size[::-1])
+    image = _toned(rng, np.maximum(image, 0))
+    if rng.random() < 0.4:
+        radius = rng.uniform(0.7, 2.5)
+        image = image + rng.uniform(0.3, 2) * (image - cv2.GaussianBlur(image, (0, 0), radius))
+    if rng.random() < 0.6:
+        noise = rng.standard_normal(image.shape, np.float32)
+        image = image + np.float32(log_uniform(rng, 0.003, 0.05)) * noise
+    image_u8 = (np.clip(image, 0, 1) * 255).astype(np.uint8)
+    if rng.random() < 0.08:
+        _label(rng, image_u8)
+    image_u8[~view] = rng.integers(0, 12)
+    if rng.random() < 0.6:
+        quality = int(rng.uniform(25, 95))
+        image_u8 = cv2.imdecode(cv2.imencode(".jpg", image_u8, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], 1)
+    return image_u8
+
+
+def _smoked(rng: Generator, image: Field) -> Field:
+    size = image.shape[:2]
+    share = np.clip(rng.uniform(0.05, 0.7) * (1 + 0.6 * fractal_field(rng, size, log_uniform(rng, 40, 200), 4)), 0, 0.8)
+    tint = np.array([1, rng.uniform(0.75, 1.02), rng.uniform(0.6, 1.05)], np.float32) * np.float32(
+        rng.uniform(0.35, 0.9)
+    )
+    return image + share[..., None] * (tint - image)
+
+
+def _moved(rng: Generator, image: Field) -> Field:
+    return cv2.filter2D(image, -1, motion_kernel(rng))
+
+
+def motion_kernel(rng: Generator) -> Field:
+    """The path of a moving camera or tool: a line of 3 to 12 px."""
+    size = int(rng.integers(3, 13))
+    path = np.zeros((size, size), np.float32)
+    cv2.line(path, (0, int(rng.integers(size))), (size - 1, int(rng.integers(size))), 1.0)
+    return (path if rng.random() < 0.5 else path.T) / path.sum()
+
+
+def _toned(rng: Generator, image: Field) -> Field:
+    """Exposure, white balance, saturation, hue, contrast, vignette, and how the sensor saturates."""
+    h, w = image.shape[:2]
+    gray = image.mean(-1, keepdims=True)
+    image = gray + np.float32(rng.uniform(0.6, 1.4)) * (image - gray)
+    balance = rng.normal(0, 0.08 if rng.random() < 0.75 else 0.18, 3)
+    balance -= balance.mean()
+    image = np.maximum(image, 0) * np.exp(rng.normal(0, 0.22) + balance).astype(np.float32)
+    if rng.random() < 0.04:  # narrow-band light, a failed white balance
+        image = np.ascontiguousarray(image[..., rng.permutation(3)])
+    if rng.random() < 0.3:  # a color matrix: other primaries, a shift of hue
+        matrix = np.eye(3) + rng.normal(0, 0.05, (3, 3))
+        image = np.maximum(image @ (matrix / matrix.sum(1, keepdims=True)).T.astype(np.float32), 0)
+    if rng.random() < 0.6:
+        y, x = np.mgrid[:h, :w].astype(np.float32)
+        off = ((x / w - rng.uniform(0.35, 0.65)) ** 2 + (y / h - rng.uniform(0.35, 0.65)) ** 2) * 4
+        image = image * (1 - rng.uniform(0, 0.7) * np.clip(off, 0, 1.35))[..., None]
+    if rng.random() < 0.12:  # a spot in which the lamp overexposes
+        y, x = np.mgrid[:h, :w].astype(np.float32)
+        radius = rng.uniform(15, 70)
+        off = ((x - rng.uniform(0, w)) ** 2 + (y - rng.uniform(0, h)) ** 2) / radius**2
+        image = image * np.exp(rng.uniform(0.4, 1.8) * np.exp(-off / 2))[..., None]
+    image = image ** np.float32(np.exp(rng.normal(0, 0.15)))
+    knee = np.float32(rng.uniform(0.6, 1))
+    above = np.maximum(image - knee, 0) / np.maximum(1 - knee, np.float32(1e-3))
+    return np.where(image > knee, knee + (1 - knee) * (1 - np.exp(-above)), image)
+
+
+def _label(rng: Generator, image_u8: NDArray[np.uint8]) -> None:
+    """Draw text, a frame or a ruler of the recorder into the image: no tool."""
+    h, w = image_u8.shape[:2]
+    color = ((255, 255, 255), (50, 255, 50), (255, 255, 25), (50, 125, 255))[rng.integers(4)]
+    for _ in range(rng.integers(1, 4)):
+        at = int(rng.uniform(0, 0.8) * w), int(rng.uniform(0.05, 1) * h)
+        if rng.random() < 0.6:
+            text = "".join(rng.choice(list("0123456789:/.ABCDEFLRTX ")) for _ in range(rng.integers(2, 14)))
+            cv2.putText(image_u8, text, at, cv2.FONT_HERSHEY_SIMPLEX, rng.uniform(0.25, 0.6), color, 1, cv2.LINE_AA)
+        else:
+            end = int(at[0] + rng.integers(10, 90)), int(at[1] + rng.integers(10, 90))
+            cv2.rectangle(image_u8, at, end, color, int(rng.integers(1, 3)))
+
+
+def shadowed(rng: Generator, tissue: Field, covered: Field) -> Field:
+    """(h, w, 3) tissue in the shadow of an instrument that covers (h, w)."""
+    shift = np.float32([[1, 0, rng.normal(0, 8)], [0, 1, rng.normal(0, 8)]])
+    shadow = cv2.warpAffine(covered, shift, covered.shape[::-1])
+    width = int(log_uniform(rng, 2, 20))
+    shadow = cv2.blur(cv2.blur(shadow, (width, width)), (width, width))
+    uneven = np.clip(1 + 0.4 * smooth_field(rng, covered.shape, 50), 0, 1.5)
+    return tissue * (1 - np.clip(rng.uniform(0.2, 0.8) * shadow * uneven, 0, 0.95))[..., None]

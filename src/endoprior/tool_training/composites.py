@@ -1,0 +1,174 @@
+"""Examples for the network that finds tools: tissue, instruments over it, seen through a camera; and what is what.
+
+`h, w` is `SIZE`. Labels: 0 tissue and everything that is no tool, 1 tool, `IGNORED` where it cannot be told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from .camera import motion_kernel, photographed, random_view, shadowed
+from .foreign_bodies import gauze, needle, ribbed_tube
+from .instruments import instrument
+from .noise import Field, fractal_field, log_uniform
+from .parts import Canvas
+from .tissue import tissue
+
+SIZE = (160, 192)
+"""(h, w) of an example."""
+IGNORED = 255
+REAL = 0.55
+"""Share of the examples on real frames, where there are any."""
+NUMBER = (0.22, 0.4, 0.28, 0.1)
+"""Probability of 0 to 3 instruments."""
+
+
+@dataclass(frozen=True)
+class LabeledFrame:
+    """One real frame with its labels."""
+
+    rgb_u8: NDArray[np.uint8]
+    """(H, W, 3), 0..255."""
+    label: NDArray[np.uint8]
+    """(H, W) 0, 1 or `IGNORED`."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """One image and what it shows."""
+
+    rgb_u8: NDArray[np.uint8]
+    """(h, w, 3), 0..255."""
+    view: NDArray[np.bool_]
+    """(h, w) True inside the endoscope's image."""
+    label: NDArray[np.uint8]
+    """(h, w) 0, 1 or `IGNORED`."""
+
+
+def examples(rng: Generator, frames: Sequence[Sequence[LabeledFrame]], number: int = 2) -> list[Example]:
+    """Paint one scene and photograph it `number` times, with another camera, mirrored or not.
+
+    Args:
+        frames: the real frames of each set that may be used; without any, all tissue is procedural.
+    """
+    scene, label, view = _scene(rng, frames)
+    made = []
+    for _ in range(number):
+        flip = (slice(None, None, rng.choice((-1, 1))), slice(None, None, rng.choice((-1, 1))))
+        rgb_u8 = photographed(rng, np.ascontiguousarray(scene[flip]), view[flip])
+        made.append(Example(rgb_u8, view[flip], np.where(view, label, IGNORED).astype(np.uint8)[flip]))
+    return made
+
+
+def _scene(
+    rng: Generator, frames: Sequence[Sequence[LabeledFrame]]
+) -> tuple[Field, NDArray[np.uint8], NDArray[np.bool_]]:
+    """(h, w, 3) tissue with bodies over it, its labels, and the view."""
+    real = bool(frames) and rng.random() < REAL
+    scene, label, view = _real_scene(rng, frames) if real else _procedural_scene(rng)
+    if real and rng.random() < 0.25:  # as it is: real tools, or tissue without any
+        return scene, label, view
+    if rng.random() < 0.12:
+        scene, label = _placed(rng, scene, label, gauze(rng, scene, view))
+    if rng.random() < 0.08:
+        scene, label = _placed(rng, scene, label, ribbed_tube(rng, scene, view))
+    if frames and rng.random() < 0.25:
+        scene, label = _transferred(rng, scene, label, frames)
+    for _ in range(rng.choice(4, p=NUMBER)):
+        scene, label = _placed(rng, scene, label, instrument(rng, scene, view))
+    if rng.random() < 0.04:
+        scene, label = _placed(rng, scene, label, needle(rng, scene, view))
+    return scene, label, view
+
+
+def _procedural_scene(rng: Generator) -> tuple[Field, NDArray[np.uint8], NDArray[np.bool_]]:
+    return tissue(rng, SIZE), np.zeros(SIZE, np.uint8), random_view(rng, SIZE)
+
+
+def _real_scene(
+    rng: Generator, frames: Sequence[Sequence[LabeledFrame]]
+) -> tuple[Field, NDArray[np.uint8], NDArray[np.bool_]]:
+    """A part of a real frame, mirrored and turned."""
+    scene, label = _cropped(rng, _any(rng, frames))
+    view = random_view(rng, SIZE) if rng.random() < 0.3 else np.ones(SIZE, bool)
+    dark = cv2.erode((scene.max(-1) < 0.1).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return scene, np.where(view, label, IGNORED).astype(np.uint8), view & ~(dark & (label == IGNORED))
+
+
+def _any(rng: Generator, frames: Sequence[Sequence[LabeledFrame]]) -> LabeledFrame:
+    """A frame of any set; sets count alike, however many frames they have."""
+    chosen = frames[rng.integers(len(frames))]
+    return chosen[rng.integers(len(chosen))]
+
+
+def _cropped(rng: Generator, frame: LabeledFrame) -> tuple[Field, NDArray[np.uint8]]:
+    height, width = frame.label.shape
+    turned = rng.random() < 0.3
+    aspect = (SIZE[0] / SIZE[1]) ** (-1 if turned else 1) * log_uniform(rng, 0.8, 1.25)
+    w = min(width, height / aspect) * rng.uniform(0.45, 1) ** 0.7
+    h = w * aspect
+    x, y = rng.uniform(0, width - w), rng.uniform(0, height - h)
+    box = np.s_[int(y) : int(y + h), int(x) : int(x + w)]
+    image, label = frame.rgb_u8[box], frame.label[box]
+    if turned:
+        image, label = np.rot90(image), np.rot90(label)
+    if rng.random() < 0.5:
+        image, label = image[:, ::-1], label[:, ::-1]
+    if rng.random() < 0.5:
+        image, label = image[::-1], label[::-1]
+    image = cv2.resize(np.ascontiguousarray(image), SIZE[::-1], interpolation=cv2.INTER_AREA)
+    label = cv2.resize(np.ascontiguousarray(label), SIZE[::-1], interpolation=cv2.INTER_NEAREST)
+    return image.astype(np.float32) / 255, label
+
+
+def _transferred(
+    rng: Generator, scene: Field, label: NDArray[np.uint8], frames: Sequence[Sequence[LabeledFrame]]
+) -> tuple[Field, NDArray[np.uint8]]:
+    """Tools of a real frame cut out and put over the scene, in another light."""
+    image, tools = _cropped(rng, _any(rng, frames))
+    if not (tools == 1).any():
+        return scene, label
+    image = image * np.exp(rng.normal(0, 0.25) + rng.normal(0, 0.08, 3)).astype(np.float32)
+    if rng.random() < 0.3:
+        gray = image.mean(-1, keepdims=True)
+        image = gray * np.exp(rng.normal(0, 0.3, 3)).astype(np.float32)  # colored or gray instruments of that shape
+    share = (tools == 1).astype(np.float32)
+    canvas = Canvas(scene, share, image, share, share)
+    return _placed(rng, scene, label, canvas, blurred=False)
+
+
+def _placed(
+    rng: Generator, scene: Field, label: NDArray[np.uint8], canvas: Canvas, blurred: bool = True
+) -> tuple[Field, NDArray[np.uint8]]:
+    """The painted body over the scene: behind tissue in places, with its shadow, blurred by focus and motion."""
+    covered, outline, color = canvas.covered, canvas.outline, canvas.color
+    if rng.random() < 0.12:  # tissue in front of a part of it
+        field = fractal_field(rng, SIZE, log_uniform(rng, 25, 90), 4)
+        hidden = np.clip((field - rng.uniform(0.3, 1.2)) * 8, 0, 1)
+        covered, outline = covered * (1 - hidden), outline * (1 - hidden)
+    if rng.random() < 0.15:  # blood and tissue on it
+        spots = np.clip(fractal_field(rng, SIZE, log_uniform(rng, 5, 25), 3) - rng.uniform(0.5, 1.5), 0, 1)
+        red = np.array([rng.uniform(0.2, 0.7), rng.uniform(0, 0.25), rng.uniform(0, 0.25)], np.float32)
+        color = color + (spots * np.float32(rng.uniform(0.3, 1)))[..., None] * (red - color)
+    if rng.random() < 0.5:
+        scene = shadowed(rng, scene, covered)
+    image = color * covered[..., None]
+    if blurred:
+        focus = rng.uniform(0.3, 0.9) if rng.random() < 0.75 else rng.uniform(0.9, 3)
+        image, covered, outline = (cv2.GaussianBlur(x, (0, 0), focus) for x in (image, covered, outline))
+        if rng.random() < 0.1:
+            path = motion_kernel(rng)
+            image, covered, outline = (cv2.filter2D(x, -1, path) for x in (image, covered, outline))
+    else:
+        soft = rng.uniform(0.5, 1.2)
+        wide = cv2.GaussianBlur(covered, (0, 0), soft)
+        image, covered = color * wide[..., None], wide
+    scene = scene * (1 - covered[..., None]) + image
+    label = np.where(covered > 0.5, 1, np.where(outline > 0.5, IGNORED, label)).astype(np.uint8)
+    return scene, label

@@ -1,0 +1,100 @@
+"""Paint what is no tissue and no instrument on a shaft: gauze, ribbed tubes, needles with thread.
+
+`h, w` image size. Colors in [0, 1], sRGB. Lengths in px of an image whose longer side is 256 px.
+"""
+
+from __future__ import annotations
+
+import colorsys
+
+import cv2
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from .materials import coated, colored, steel
+from .noise import Field, fractal_field, log_uniform, smooth_field
+from .parts import Canvas, Part, canvas_over, paint
+
+
+def gauze(rng: Generator, tissue: Field, view: NDArray[np.bool_]) -> Canvas:
+    """A dressing, sponge or drape along a part of the border of the view: gray, rough or woven, no shine."""
+    h, w = view.shape
+    y, x = np.mgrid[:h, :w].astype(np.float32)
+    angle, depth = rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.5) * min(h, w)
+    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    reach = (abs(cos) * w + abs(sin) * h) / 2
+    inward = reach - ((x - w / 2) * cos + (y - h / 2) * sin)  # from the border that it lies along
+    along = (y - h / 2) * cos - (x - w / 2) * sin
+    edge = depth + rng.uniform(0, 0.4) * depth * smooth_field(rng, (h, w), rng.uniform(30, 120))
+    edge = edge + rng.normal(0, 0.25) * along + rng.normal(0, 0.001) * along**2
+    edge = edge + rng.uniform(0.5, 2.5) * fractal_field(rng, (h, w), 8, 2)
+    covered = np.clip(edge - inward + 0.5, 0, 1).astype(np.float32)
+    tone = colorsys.hsv_to_rgb(rng.uniform(0.05, 0.6), rng.uniform(0.0, 0.3), rng.uniform(0.15, 0.95))
+    surface = 1 + np.float32(rng.uniform(0.05, 0.35)) * fractal_field(rng, (h, w), rng.uniform(2.5, 6), 2)
+    if rng.random() < 0.5:
+        period, turn = log_uniform(rng, 3, 9), rng.uniform(0, np.pi)
+        first = np.sin((x * np.cos(turn) + y * np.sin(turn) + smooth_field(rng, (h, w), 20) * 3) * 2 * np.pi / period)
+        second = np.sin((y * np.cos(turn) - x * np.sin(turn) + smooth_field(rng, (h, w), 20) * 3) * 2 * np.pi / period)
+        surface = surface * (1 + rng.uniform(0.05, 0.3) * first * second)
+    surface = surface * (1 + rng.uniform(0, 0.35) * fractal_field(rng, (h, w), 60, 3))
+    rim = 1 - rng.uniform(0, 0.7) * np.exp(-np.abs(edge - inward) / rng.uniform(2, 12))
+    color = np.array(tone, np.float32) * np.clip(surface * rim, 0.05, 2)[..., None]
+    if rng.random() < 0.3:  # soaked with blood
+        wet = np.clip(fractal_field(rng, (h, w), 40, 4) - rng.uniform(0.2, 1.2), 0, 1)[..., None]
+        color = color + wet * (np.array([0.45, 0.05, 0.05], np.float32) - color)
+    canvas = canvas_over(tissue, np.ones((h, w), np.float32))
+    canvas.color[:], canvas.covered[:], canvas.outline[:] = color, covered, covered
+    return canvas
+
+
+def ribbed_tube(rng: Generator, tissue: Field, view: NDArray[np.bool_]) -> Canvas:
+    """A tube of an intubation or a drain: wide, often ribbed, from the border."""
+    h, w = view.shape
+    angle = rng.uniform(0, 2 * np.pi)
+    along = np.array([np.cos(angle), np.sin(angle)], np.float32)
+    middle = np.array([w / 2, h / 2], np.float32) + rng.normal(0, 0.2, 2).astype(np.float32) * (w, h)
+    width, length = log_uniform(rng, 25, 110), float(np.hypot(h, w))
+    material = (steel, lambda r: coated(r, 0.3, 1), lambda r: coated(r, 0.02, 0.4), colored)[rng.integers(4)](rng)
+    canvas = canvas_over(tissue, np.full((h, w), rng.uniform(0.5, 1.3), np.float32))
+    start = (middle - along * length * rng.uniform(0.9, 1.2)).astype(np.float32)
+    taper = rng.uniform(0.6, 1.3)
+    ribs = rng.uniform(0.05, 0.35) if rng.random() < 0.75 else 0.0
+    bend = rng.normal(0, 0.08)
+    paint(
+        rng,
+        canvas,
+        Part(start, along, length, (width, width * taper), material, 0, bend, bool(rng.random() < 0.5), None, ribs),
+    )
+    return canvas
+
+
+def needle(rng: Generator, tissue: Field, view: NDArray[np.bool_]) -> Canvas:
+    """A bent needle and its thread, anywhere in the view."""
+    h, w = view.shape
+    canvas = canvas_over(tissue, np.ones((h, w), np.float32))
+    y, x = rng.uniform(0.15, 0.85, 2) * (h, w)
+    radius, first = log_uniform(rng, 8, 40), rng.uniform(0, 360)
+    arc = cv2.ellipse2Poly(
+        (int(x), int(y)), (int(radius), int(radius * rng.uniform(0.4, 1))), 0, 0, int(rng.uniform(90, 200)), 4
+    )
+    turn = np.deg2rad(first)
+    points = (arc - (x, y)) @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + (x, y)
+    _line(canvas, points, rng.uniform(1.5, 4), np.full(3, rng.uniform(0.4, 1), np.float32), rng)
+    tone = rng.choice([0, 1, 2])
+    color = (np.array([0.35, 0.15, 0.55]), np.full(3, rng.uniform(0.02, 0.2)), np.array([0.2, 0.4, 0.75]))[tone]
+    steps = np.cumsum(rng.normal(0, 1, (40, 2)).cumsum(0) * rng.uniform(0.3, 1.2), 0)
+    _line(canvas, points[-1] + steps, rng.uniform(1, 2.2), color.astype(np.float32), rng)
+    return canvas
+
+
+def _line(canvas: Canvas, points: NDArray, width: float, color: Field, rng: Generator) -> None:
+    """A line of that width; lines are thinner than cv2's whole pixels, so they are drawn at four times the size."""
+    h, w = canvas.covered.shape
+    large = np.zeros((4 * h, 4 * w), np.uint8)
+    cv2.polylines(large, [np.round(points * 4).astype(np.int32)], False, 255, max(round(width * 4), 1))
+    share = cv2.resize(large, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    shine = np.clip(1 + 0.6 * smooth_field(rng, (h, w), 12), 0.3, 2.5)
+    canvas.color[:] += share[..., None] * (color * shine[..., None] - canvas.color)
+    np.maximum(canvas.covered, share, out=canvas.covered)
+    np.maximum(canvas.outline, share, out=canvas.outline)
