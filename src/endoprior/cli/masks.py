@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..data import FrameSequence
-    from ..tool_masks import FoundTools
+    from ..data.found_tools import FoundTools
     from ..tool_masks.carry import VideoSegmenter
     from ..tool_masks.sequence import Progress
 
-SHEET, SHARES = "tool_masks.png", "tool_masks.json"
+SHEET = "tool_masks.png"
 SHOWN, COLUMNS = 24, 6
 """Number of frames on the sheet, and of its columns."""
 WIDTH_PX = 320
@@ -59,9 +59,9 @@ def run(argv: list[str]) -> None:
     args = parse(Masks, argv, "masks", HELP)
     from ..core.config import DataConfig
     from ..data import load_sequence
+    from ..data.found_tools import FrameRow, uncertain_frames, write_rows
     from ..data.mask_writing import note_found_masks, replace_masks, writable_masks
     from ..prepare.sam2 import open_sam2
-    from ..system.atomic import write_json
     from ..tool_masks.mask_store import MaskStore
     from ..visualization.image_tools import write_png
     from ..visualization.mask_sheet import mask_sheet
@@ -69,7 +69,7 @@ def run(argv: list[str]) -> None:
     sequence = load_sequence(args.data, DataConfig())
     writable_masks(sequence)
     shown = set(spread(len(sequence), SHOWN))
-    rows, pictures, uncertain = [], [], []
+    rows, pictures = list[FrameRow](), []
     with TemporaryDirectory(prefix="endoprior-") as work, Counting() as progress:
         camera = sequence.camera(0)
         masks = MaskStore(Path(work) / "masks", (camera.width, camera.height))
@@ -77,19 +77,16 @@ def run(argv: list[str]) -> None:
         found_frames = _found(sequence, segmenter, args.refine, Path(work) / "carried", progress)
         for i, (mask, found) in enumerate(found_frames):
             masks.put(i, mask)
-            share = float(found.mask.mean())
-            rows.append({"frame": i, "share": share, "confidence": found.confidence})
-            if found.uncertain:
-                uncertain.append(i)
+            rows.append(FrameRow.of(i, found))
             if i in shown:
-                pictures.append((sequence.frame(i).rgb_u8, found.mask, f"{i}: {share:.1%}"))
+                pictures.append((sequence.frame(i).rgb_u8, found.mask, f"{i}: {rows[i].share:.1%}"))
         replace_masks(sequence, masks)
     write_png(args.data / SHEET, mask_sheet(pictures, COLUMNS, WIDTH_PX))
-    write_json(args.data / SHARES, rows)
-    with_tools = [row for row in rows if row["share"]]
+    write_rows(args.data, rows)
+    with_tools = [row for row in rows if row.share]
     note_found_masks(args.data, len(with_tools) / len(rows), segmenter.name if segmenter else "")
-    say(f"tools in {len(with_tools)} of {len(rows)} frames, at most {max(row['share'] for row in rows):.1%} of a frame")
-    if uncertain:
+    say(f"tools in {len(with_tools)} of {len(rows)} frames, at most {max(row.share for row in rows):.1%} of a frame")
+    if uncertain := uncertain_frames(rows):
         say(f"uncertain: frames {number_ranges(uncertain)}")
     say(f"look at {args.data / SHEET}; correct masks: {command('view', args.data)}")
 

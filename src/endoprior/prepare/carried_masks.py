@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import number_ranges
 from ..core.config import DataConfig
 from ..data import load_sequence
+from ..data.found_tools import FrameRow, write_rows
 from ..data.images import read_color, save_png
 from ..data.mask_writing import found_source, write_mask
 from ..data.writer import TOOL_VALUE, FrameFiles
@@ -49,7 +49,7 @@ def replace_by_carried(
     work = files.folder / WORK
     store = MaskStore(work / "masks", (files.meta.width, files.meta.height))
     state = read_state(work)
-    if "shares" not in state:
+    if "rows" not in state:
         state = _carry(files, segmenter, work, store, progress)
     for i in range(files.count):
         mask = store.mask(i) | ~inside
@@ -57,13 +57,12 @@ def replace_by_carried(
         if shade is not None:
             depth = np.where(inside, shade(read_color(files.file("images", i)), ~mask), np.float32(0))
             save_png(files.file("depth", i), files.depth_units(depth))
-    with_tools = sum(share > 0 for share in state["shares"])
+    rows = [FrameRow(**row) for row in state["rows"]]
+    write_rows(files.folder, rows)
+    with_tools = sum(row.share > 0 for row in rows)
     source = found_source(with_tools / files.count, segmenter.name)
     files.meta = replace(files.meta, sources=files.meta.sources | {"masks": source})
-    notes = [f"masks: {source}. Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."]
-    if state["uncertain"]:
-        notes.append(f"masks: uncertain in frames {number_ranges(state['uncertain'])}")
-    return notes
+    return [f"masks: {source}. Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."]
 
 
 def remove_carried(files: FrameFiles) -> None:
@@ -72,14 +71,12 @@ def remove_carried(files: FrameFiles) -> None:
 
 
 def _carry(files: FrameFiles, segmenter: VideoSegmenter, work: Path, store: MaskStore, progress: Progress) -> dict:
-    """Let the segmenter go over the frames, and note the share of tools in each."""
+    """Let the segmenter go over the frames, and note what it found in each."""
     files.finish()  # a reader needs the description; it is written again at the end
-    shares, uncertain = [], []
+    rows = []
     sequence = load_sequence(files.folder, DataConfig(format="plain"))
     for i, (mask, found) in enumerate(segment_sequence(sequence, segmenter, work / "work", progress=progress)):
         store.put(i, mask)
-        shares.append(float(found.mask.mean()))
-        if found.uncertain:
-            uncertain.append(i)
-    write_state(work, {"shares": shares, "uncertain": uncertain})
+        rows.append(asdict(FrameRow.of(i, found)))
+    write_state(work, {"rows": rows})
     return read_state(work)

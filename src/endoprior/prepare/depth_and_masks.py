@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_values
 from ..data.description import TOOLS_FOUND
+from ..data.found_tools import FoundTools
 from ..data.mask_files import tool_polarity
 from ..data.mask_folders import MaskFrame, open_mask_folder
 from ..footage.changes import COLOR_DISTANCE, color_share
@@ -40,6 +41,7 @@ FEWEST_STEPS = 256
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
 A = TypeVar("A")
+Tools = Callable[[MeasuredFrame], FoundTools]
 Shade = Callable[[NDArray[np.uint8], Mask], Depth]
 
 
@@ -54,6 +56,8 @@ class ChosenMethods:
     """Whether the scale of the depth is assumed."""
     notes: list[str]
     """Notes for the user, one line each."""
+    finds_tools: bool = False
+    """Whether our own finder makes the masks, so that each frame has a confidence."""
 
 
 def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> ChosenMethods:
@@ -76,7 +80,10 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
     notes += mask_note
     shade: Shade | None = None
     if relative:
-        images, usable = [frame.rgb_u8 for frame in samples], [geometry.inside & ~tools(frame) for frame in samples]
+        images, usable = (
+            [frame.rgb_u8 for frame in samples],
+            [geometry.inside & ~tools(frame).mask for frame in samples],
+        )
         if measure is None:
             shade = fit_shading(images, usable, cfg.working_distance_mm).depth
         else:
@@ -90,7 +97,7 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
     wanted = _inside_body([frame.rgb_u8 for frame in samples]) if cfg.drop_out_of_body else lambda rgb_u8: True
     methods = FrameMethods(measure, shade, tools, kind == "sgbm", wanted)
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
-    return ChosenMethods(methods, sources, relative, notes)
+    return ChosenMethods(methods, sources, relative, notes, finds_tools=cfg.masks == "auto")
 
 
 def _check_stereo(samples: list[MeasuredFrame], geometry: FrameGeometry, clip: Clip) -> list[str]:
@@ -185,15 +192,13 @@ def _of_either_size(read: Callable[[A, tuple[int, int]], NDArray], path: A, geom
         raise
 
 
-def _tools(
-    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
-) -> tuple[Callable[[MeasuredFrame], Mask], str, list[str]]:
-    """A function that returns the tool mask of a frame, the name of its source, and a note."""
+def _tools(cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]) -> tuple[Tools, str, list[str]]:
+    """A function that returns the tools of a frame, the name of its source, and a note."""
     geometry = first_pass.geometry
     if cfg.mask_labels and (cfg.masks in ("auto", "none") or is_sam2(cfg.masks)):
         raise input_error("--mask-labels", "a folder with --masks", cfg.masks, "Remove --mask-labels.")
     if cfg.masks == "none":
-        return lambda frame: np.zeros_like(geometry.inside), "none", []
+        return lambda frame: FoundTools(np.zeros_like(geometry.inside), 1.0), "none", []
     if cfg.masks == "auto" or is_sam2(cfg.masks):
         from ..tool_masks import ToolFinder  # imports torch
 
@@ -204,16 +209,14 @@ def _tools(
         hint = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
         if not share:
             hint = "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
-        if unsure := sum(tools.uncertain for tools in found):
-            hint = f"Unsure in {unsure} of {len(found)} samples: `endoprior masks DATA` lists such frames. {hint}"
         notes = [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"]  # its own masks replace these
-        return lambda frame: finder.find(frame.rgb_u8, geometry.inside).mask, source, notes
+        return lambda frame: finder.find(frame.rgb_u8, geometry.inside), source, notes
     return _user_masks(cfg, first_pass, samples)
 
 
 def _user_masks(
     cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
-) -> tuple[Callable[[MeasuredFrame], Mask], str, list[str]]:
+) -> tuple[Tools, str, list[str]]:
     """As `_tools`, from the user's files."""
     path, geometry = Path(cfg.masks), first_pass.geometry
     given = open_mask_folder(path, cfg.mask_labels)
@@ -233,7 +236,7 @@ def _user_masks(
         notes.append(f"masks: {polarity.reason}")
     else:
         tool_is_high = given.tool_is_high
-    return lambda frame: high(frame) == tool_is_high, "user's files", notes
+    return lambda frame: FoundTools(high(frame) == tool_is_high, 1.0), "user's files", notes
 
 
 def _inside_body(images: list[NDArray[np.uint8]]) -> Callable[[NDArray[np.uint8]], bool]:

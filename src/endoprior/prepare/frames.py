@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.found_tools import FoundTools
 from ..data.writer import FrameFiles
 from .frame_geometry import FrameGeometry
 from .stereo import temporal_median
@@ -44,8 +45,8 @@ class FrameMethods:
     """Depth that needs no mask: stereo, files, a network."""
     shade: Callable[[NDArray[np.uint8], Mask], Depth] | None
     """Depth from the shading of an image inside a mask."""
-    tools: Callable[[MeasuredFrame], Mask]
-    """(H, W) True on the tools of a frame."""
+    tools: Callable[[MeasuredFrame], FoundTools]
+    """The tools of a frame; those that the user gives have confidence 1."""
     filter_in_time: bool
     """Whether to filter depth over neighboring frames."""
     wanted: Callable[[NDArray[np.uint8]], bool]
@@ -95,11 +96,13 @@ def write_frames(
     files: FrameFiles,
     *,
     keep_right: bool,
+    on_tools: Callable[[int, FoundTools], None] = lambda position, found: None,
     on_frame: Callable[[int], None] = lambda count: None,
 ) -> None:
     """Write every wanted frame that `files` does not have yet.
 
     Args:
+        on_tools: called with the position of each frame and its tools before its files are written.
         on_frame: called after each frame with the number of frames written.
     """
     done = files.count
@@ -111,7 +114,9 @@ def write_frames(
         depth = frame.depth
         if methods.filter_in_time:
             depth = temporal_median([other.depth for other in window])
-        tools = methods.tools(frame) | ~geometry.inside
+        found = methods.tools(frame)
+        on_tools(frame.position, found)
+        tools = found.mask | ~geometry.inside
         if methods.shade:
             depth = methods.shade(frame.rgb_u8, ~tools)
         if depth is not None:

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error, number_ranges
+from ..core.shell import command
 from ..data import write_stir_tracks
+from ..data.found_tools import FrameRow, RowLog, read_rows, uncertain_frames
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
@@ -79,19 +81,27 @@ def prepare(
         chosen = choose_methods(cfg, clip, first_pass)
         meta = _meta(clip, first_pass.geometry, chosen, calibrated=calibration is not None)
         parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
-        files = FrameFiles(folder, meta, frames_done(folder, parts))
+        found = RowLog(folder)
+        done = frames_done(folder, parts)
+        if chosen.finds_tools:
+            done = min(done, len(found.rows))
+            found.cut(done)
+        files = FrameFiles(folder, meta, done)
         write_frames(
             clip.stereo_frames(clip.selection()),
             first_pass.geometry,
             chosen.methods,
             files,
             keep_right=cfg.keep_right,
+            on_tools=lambda i, tools: found.add(FrameRow.of(i, tools)) if chosen.finds_tools else None,
             on_frame=lambda done: progress("writing frames", done, len(first_pass.indices)),
         )
         if files.count < 2:
             fix = "Change --start, --end or --drop-out-of-body."
             raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
         carried_notes: list[str] = []
+        if chosen.finds_tools:
+            found.finish()
         if segmenter is not None:
             from .carried_masks import replace_by_carried  # imports torch
 
@@ -110,11 +120,15 @@ def prepare(
             from .carried_masks import remove_carried
 
             remove_carried(files)
+        found.remove()
         files.finish(None if path is None else path.camera_to_world, unexplained)
         record_of(video, cfg, first_pass.geometry).save(folder)
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
         notes = [*first_pass.notes, *chosen.notes, *carried_notes, *motion_notes]
+        if uncertain := uncertain_frames(read_rows(folder)):
+            frames = number_ranges(uncertain)
+            notes.append(f"masks: unsure in frames {frames}. To look and correct: {command('view', out)}")
         if unexplained:
             frames = number_ranges(unexplained)
             notes.append(f"no camera pose, or another scene, in frames {frames}; --start and --end can leave them out")

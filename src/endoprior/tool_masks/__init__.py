@@ -1,5 +1,6 @@
 """Find surgical tools in the frames of a clip, with a small network that comes with the program."""
 
-from .finder import FoundTools, ToolFinder
+from ..data.found_tools import FoundTools
+from .finder import ToolFinder
 
 __all__ = ["FoundTools", "ToolFinder"]

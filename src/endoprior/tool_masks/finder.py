@@ -7,40 +7,21 @@ them in the viewer, or pass your own. `H, W` image size, `h, w` size of the netw
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..core.checks import check_shape
+from ..data.found_tools import FoundTools
 from .network import LONG_SIDE_PX, MULTIPLE, ToolNetwork, network_input
 from .regions import tool_regions
 from .weights import shipped_network
 
 MAYBE = 0.25
 """Pixels of a higher probability may be a tool: they count in the confidence."""
-UNCERTAIN = 0.5
-"""Masks of a lower confidence should be looked at."""
 LEAST_DOUBT = 0.004
 """Share of the view that must be in doubt in a frame without a mask before the frame is uncertain."""
-
-
-@dataclass(frozen=True)
-class FoundTools:
-    """The tools of one frame."""
-
-    mask: NDArray[np.bool_]
-    """(H, W) True on the tools."""
-    confidence: float
-    """0..1: how far the probabilities of all pixels that may be a tool are from one half, on average; 1 if there are
-    none."""
-
-    @property
-    def uncertain(self) -> bool:
-        """Whether the mask should be looked at."""
-        return self.confidence < UNCERTAIN
 
 
 class ToolFinder:

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from ..core.spread import spread
 from ..core.types import Frame
 from ..data import FrameSequence
+from ..data.found_tools import FoundTools
 from ..footage.border import find_outline, masked_border
-from .finder import FoundTools, ToolFinder
+from .finder import ToolFinder
 
 SAMPLES = 16
 """Number of frames from which the border of the view is taken."""

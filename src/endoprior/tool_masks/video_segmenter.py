@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data import FrameSequence
-from . import FoundTools
+from ..data.found_tools import FoundTools
 from .carry import VideoSegmenter, carry
 from .mask_store import MaskStore, read_state, write_state
 from .prompts import Prompt, choose_prompts, sure_regions, with_rim

@@ -1,0 +1,161 @@
+"""The tools that a program found in each frame, and how sure it was: `tool_masks.json` in a sequence folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import InputError, input_error
+from ..system.atomic import write_json
+from .reading import read_text
+
+FILE = "tool_masks.json"
+UNCERTAIN = 0.5
+"""Masks of a lower confidence should be looked at."""
+WANTED = "a list of frame, share and confidence"
+FIX = "remove the file, or find the tools again: `endoprior masks DATA`."
+
+
+@dataclass(frozen=True)
+class FoundTools:
+    """The tools of one frame."""
+
+    mask: NDArray[np.bool_]
+    """(H, W) True on the tools."""
+    confidence: float
+    """0..1: how far the probabilities of all pixels that may be a tool are from one half, on average; 1 if there are
+    none."""
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether the mask should be looked at."""
+        return self.confidence < UNCERTAIN
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """What `FILE` holds of one frame."""
+
+    frame: int
+    """Its place in the whole sequence, from 0."""
+    share: float
+    """Of the image that is tool, 0..1."""
+    confidence: float
+    """As in `FoundTools`."""
+
+    @classmethod
+    def of(cls, frame: int, found: FoundTools) -> FrameRow:
+        """The row of a frame in which `found` was found."""
+        return cls(frame, float(found.mask.mean()), float(found.confidence))
+
+
+def write_rows(folder: Path, rows: Iterable[FrameRow]) -> None:
+    """Write the rows of a sequence folder."""
+    write_json(folder / FILE, [asdict(row) for row in rows])
+
+
+def read_rows(folder: Path) -> list[FrameRow]:
+    """The rows of a sequence folder; none if no program found its tools.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    file = folder / FILE
+    return [_row(file, value) for value in _entries(file)] if file.is_file() else []
+
+
+def drop_rows(folder: Path, frames: Iterable[int]) -> None:
+    """Remove the rows of frames whose masks a person has corrected: they are not in doubt any more.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    corrected = set(frames)
+    if rows := read_rows(folder):
+        write_rows(folder, [row for row in rows if row.frame not in corrected])
+
+
+def uncertain_frames(rows: Iterable[FrameRow]) -> list[int]:
+    """The frames whose masks should be looked at."""
+    return [row.frame for row in rows if row.confidence < UNCERTAIN]
+
+
+def confidence_of(rows: Iterable[FrameRow], places: Sequence[int]) -> NDArray[np.float64]:
+    """(T,) confidence of frames at these places of the whole sequence; NaN where it is unknown."""
+    known = {row.frame: row.confidence for row in rows}
+    return np.array([known.get(place, np.nan) for place in places], np.float64)
+
+
+class RowLog:
+    """Rows of a folder that is being written, one line each, so that an interrupted run need not find them again."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = folder / f"{FILE}l"
+        self.rows: list[FrameRow] = self._read()
+
+    def cut(self, count: int) -> None:
+        """Keep the rows of the first `count` frames: the others, and a line cut short, will be written again."""
+        self.rows = self.rows[:count]
+        self._file.write_text("".join(map(_line, self.rows)), encoding="utf-8", newline="\n")
+
+    def add(self, row: FrameRow) -> None:
+        """Append a row; it is on the disk before the files of its frame are."""
+        self.rows.append(row)
+        with self._file.open("a", encoding="utf-8", newline="\n") as lines:
+            lines.write(_line(row))
+
+    def finish(self) -> None:
+        """Write `FILE`."""
+        write_rows(self._file.parent, self.rows)
+
+    def remove(self) -> None:
+        """Remove the lines; the folder is complete without them."""
+        self._file.unlink(missing_ok=True)
+
+    def _read(self) -> list[FrameRow]:
+        """The rows of an interrupted run, up to the first line that is not complete."""
+        rows: list[FrameRow] = []
+        if not self._file.is_file():
+            return rows
+        for line in self._file.read_text(encoding="utf-8", errors="replace").splitlines():
+            try:
+                row = FrameRow(**json.loads(line))
+            except (ValueError, TypeError):
+                return rows
+            if row.frame != len(rows):
+                return rows
+            rows.append(row)
+        return rows
+
+
+def _line(row: FrameRow) -> str:
+    return json.dumps(asdict(row)) + "\n"
+
+
+def _entries(file: Path) -> list[Any]:
+    try:
+        values = json.loads(read_text(file, WANTED, FIX))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise input_error(file, WANTED, str(error).split("\n")[0], FIX) from None
+    if not isinstance(values, list):
+        raise input_error(file, WANTED, type(values).__name__, FIX)
+    return values
+
+
+def _row(file: Path, value: Any) -> FrameRow:
+    try:
+        row = FrameRow(**value)
+        usable = type(row.frame) is int and row.frame >= 0 and 0 <= row.share <= 1 and 0 <= row.confidence <= 1
+    except TypeError:
+        usable = False
+    if not usable:
+        raise input_error(file, WANTED, f"{value!r:.80}", FIX)
+    return row
