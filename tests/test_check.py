@@ -18,9 +18,11 @@ from endoprior.check.report import as_json, table
 from endoprior.cli import main
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
+from endoprior.data.found_tools import FrameRow, write_rows
 from endoprior.footage.border import Circle
 from endoprior.footage.units import guess_unit
 from endoprior.phantom import PhantomConfig, write_phantom
+from endoprior.view.mask_edits import MaskEdits
 
 FRAMES, WIDTH, HEIGHT = 12, 256, 192
 
@@ -50,6 +52,31 @@ def stereo(whole: Path, tmp_path: Path) -> Path:
 def data(whole: Path, tmp_path: Path) -> Path:
     """A copy of the phantom's left camera to break."""
     return Path(shutil.copytree(whole, tmp_path / "data", ignore=shutil.ignore_patterns("right")))
+
+
+def test_frames_of_uncertain_masks_are_named_and_shown(data, tmp_path, monkeypatch):
+    confidence = [0.9, 0.4, 0.8, 0.3] + [0.45 + 0.001 * i for i in range(5)] + [0.9] * 3
+    write_rows(data, [FrameRow(i, 0.1, value) for i, value in enumerate(confidence)])
+    titles = []
+    monkeypatch.setattr(Axes, "set_title", lambda self, text, **style: titles.append(text))
+    sequence = load_sequence(data)
+    facts = measure(sequence)
+    found = find(facts)
+    (finding,) = (finding for finding in found if finding.code == "uncertain-masks")
+    assert finding.frames == (1, 3, 4, 5, 6, 7, 8) and "frames 1, 3-8" in finding.what
+    assert f"endoprior view {data}" in finding.fix
+    draw_check(sequence, facts, found, tmp_path / "unsure.png")
+    shown = [title for title in titles if "unsure" in title]
+    assert shown == [f"frame {i}: unsure, {confidence[i]:.2f}" for i in (3, 1, 4, 5, 6, 7)]
+    strided = measure(load_sequence(data, DataConfig(stride=3)))
+    assert np.allclose(strided.masks.confidence, confidence[::3])
+    # A correction in the viewer ends the doubt.
+    edits = MaskEdits(sequence)
+    for frame in finding.frames:
+        edits.begin()
+        edits.draw(frame, [(20, 20)], 3, True)
+    edits.save()
+    assert "uncertain-masks" not in findings(data)
 
 
 def findings(folder: Path) -> dict[str, Finding]:

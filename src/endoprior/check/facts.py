@@ -19,6 +19,7 @@ from ..core.spread import spread
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..data.description import read_description
+from ..data.found_tools import UNCERTAIN, confidence_of, read_rows
 from ..data.window_plan import look_through, plan_windows
 from ..footage.border import find_outline, masked_border
 from ..footage.camera_motion import CameraMotion, camera_motion
@@ -51,11 +52,18 @@ class MaskFacts:
     """(T,) share of tool pixels inside the masked border."""
     polarity: Polarity
     """Polarity of the masks as read: `tool_is_high` False means that tissue and tool are swapped."""
+    confidence: NDArray[np.float64]
+    """(T,) how sure the program was that found them, 0..1; NaN where no program did, or a person corrected them."""
 
     @property
     def inverted(self) -> bool:
         """Whether tissue and tool are certainly swapped."""
         return not self.polarity.tool_is_high and self.polarity.certainty >= CERTAIN
+
+    @property
+    def uncertain(self) -> tuple[int, ...]:
+        """Frames whose masks should be looked at, ascending."""
+        return tuple(int(i) for i in np.flatnonzero(self.confidence < UNCERTAIN))
 
     @property
     def reason(self) -> str:
@@ -132,7 +140,9 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
     outline = find_outline(images)
     masked = masked_border(outline, images, (frame.tissue_mask for frame in frames))
     view = max(int((~masked).sum()), 1)
-    masks = MaskFacts(np.array([1 - frame.tissue_mask.sum() / view for frame in frames]), polarity)
+    masks = MaskFacts(
+        np.array([1 - frame.tissue_mask.sum() / view for frame in frames]), polarity, _confidence(sequence)
+    )
     tissue = [masks.tissue(frame) for frame in samples]
     step = -(-count // MOTION_FRAMES)
     followed = [sequence.frame(i) for i in range(0, count, step)]
@@ -163,6 +173,18 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         data=cfg,
         remakes=find_remakes(sequence, described, cfg),
     )
+
+
+def _confidence(sequence: FrameSequence) -> NDArray[np.float64]:
+    """(T,) confidence of each frame's mask; NaN where it is unknown.
+
+    The rows count the frames of the folder; of those that are read, the number in the image's name tells which it is.
+    """
+    rows, names = read_rows(sequence.path), sequence.image_names
+    if len(rows) == len(sequence):
+        return confidence_of(rows, range(len(sequence)))
+    numbered = len(names) == len(sequence) and all(name.isdecimal() for name in names)
+    return confidence_of(rows, [int(name) for name in names]) if numbered else np.full(len(sequence), np.nan)
 
 
 def _camera_path(cameras: list[Camera]) -> tuple[float, float]:

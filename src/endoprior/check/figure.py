@@ -29,6 +29,10 @@ from .report import table, unit_reason
 
 SHOWN = 4
 """Number of frames shown."""
+MOST_UNSURE = 6
+"""Largest number of frames shown whose masks are uncertain."""
+UNSURE_HEIGHT = 2.2
+"""Of their row in the figure, inches."""
 RULER_MM = 10.0
 """Length of the ruler, at the median depth of the frame."""
 TOOL_COLOR, BORDER_COLOR, FLAG_COLOR = "#ff3b30", "#ffd60a", "#d62728"
@@ -43,7 +47,8 @@ def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], p
     """Write the figure as a PNG file.
 
     Rows: frames with tools outlined in red and borders in yellow; their depth; depth histogram and curves over time,
-    with the frames of findings marked; initial points from the camera and from the side, and the findings.
+    with the frames of findings marked; initial points from the camera and from the side, and the findings; the frames
+    whose masks are least certain, if there are uncertain ones.
 
     Args:
         sequence: the measured sequence.
@@ -51,14 +56,16 @@ def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], p
         path: the file; written completely or not at all.
     """
     # Use a canvas directly: selecting a Matplotlib backend would change the whole process.
-    figure = Figure(figsize=(15, 14), layout="constrained", dpi=100)
+    unsure = least_certain(facts)
+    figure = Figure(figsize=(15, 14 + UNSURE_HEIGHT * bool(unsure)), layout="constrained", dpi=100)
     FigureCanvasAgg(figure)
     camera = facts.camera
     # A file name may hold bytes that are not text, and characters that Matplotlib would parse as formulas.
     name = os.fsencode(facts.path.name).decode("utf-8", "backslashreplace")
     title = f"{name}   {facts.frames} frames of {camera.width} x {camera.height} px"
     figure.suptitle(title, fontsize=13, parse_math=False)
-    images, curves, space = figure.subfigures(3, 1, height_ratios=[5.6, 3.4, 4.8])
+    heights = [5.6, 3.4, 4.8, *([UNSURE_HEIGHT] if unsure else [])]
+    images, curves, space, *rest = figure.subfigures(len(heights), 1, height_ratios=heights)
     _draw_frames(images, [sequence.frame(i) for i in spread(len(sequence), SHOWN)], facts)
     left, right = curves.subfigures(1, 2, width_ratios=[1, 2.4])
     _draw_histogram(left.subplots(), facts)
@@ -66,6 +73,8 @@ def draw_check(sequence: FrameSequence, facts: Facts, findings: list[Finding], p
     axes = space.subplots(1, 3, width_ratios=[1, 1.15, 1.45])
     _draw_cloud(axes[0], axes[1], facts)
     _draw_findings(axes[2], facts, findings)
+    if unsure:
+        _draw_unsure(rest[0], [sequence.frame(i) for i in unsure], facts)
     with whole_file(path) as temporary:
         figure.savefig(temporary)
 
@@ -98,6 +107,21 @@ def _draw_frames(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
     )
     bar.set_label(f"depth, {length_unit(facts.depth.relative)}", fontsize=8)
     bar.ax.tick_params(labelsize=8)
+
+
+def least_certain(facts: Facts) -> list[int]:
+    """Frames whose masks are uncertain, the least certain first; at most `MOST_UNSURE`."""
+    return sorted(facts.masks.uncertain, key=lambda i: (facts.masks.confidence[i], i))[:MOST_UNSURE]
+
+
+def _draw_unsure(part: SubFigure, frames: list[Frame], facts: Facts) -> None:
+    """Frames with their masks outlined and their confidence."""
+    axes = part.subplots(1, MOST_UNSURE, squeeze=False)[0]
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, frame in zip(axes, frames, strict=False):  # fewer frames leave places empty
+        axis.imshow(_outlined(frame, facts.border.masked))
+        axis.set_title(f"frame {frame.index}: unsure, {facts.masks.confidence[frame.index]:.2f}", fontsize=9)
 
 
 def _outlined(frame: Frame, border: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -18,7 +18,17 @@ from ..core.presets import preset
 from ..core.types import Camera
 from ..footage.camera_motion import MOVING_FRACTION
 from .facts import Facts
-from .fixes import detect_tools, in_stored_px, longest_part, mask_tools, measure_depth_again, set_values, skip, train
+from .fixes import (
+    correct_masks,
+    detect_tools,
+    in_stored_px,
+    longest_part,
+    mask_tools,
+    measure_depth_again,
+    set_values,
+    skip,
+    train,
+)
 from .remake import field_of_view, swapped
 
 Severity = Literal["error", "warning", "note"]
@@ -102,6 +112,12 @@ def _masks(facts: Facts) -> Iterator[Finding]:
         only = ": the masks cover only the border" if facts.border.masked.any() else ""
         what = f"no tools were found{only}; if tools are in view, they become tissue"
         yield Finding("tool-fraction", "warning", what, f"nothing if no tool is in view; else {mask_tools(facts)}")
+
+
+def _uncertain(facts: Facts) -> Iterator[Finding]:
+    if unsure := facts.masks.uncertain:
+        what = f"the program that found the tools is unsure in {_frames(unsure)}"
+        yield Finding("uncertain-masks", "warning", what, correct_masks(facts), unsure)
 
 
 def _depth(facts: Facts) -> Iterator[Finding]:
@@ -275,6 +291,7 @@ def _reader_notes(facts: Facts) -> Iterator[Finding]:
 
 CHECKS: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
     _masks,
+    _uncertain,
     _depth,
     _border,
     _stereo,

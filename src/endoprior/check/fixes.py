@@ -8,6 +8,7 @@ from typing import Any
 
 from ..core.checks import number_ranges, read_ranges
 from ..core.options import changed_options, command_of
+from ..core.shell import command
 from .facts import Facts
 
 MEASURED_DEPTH = dict.fromkeys(("--depth", "--depth-unit-mm", "--depth-relative"))
@@ -70,6 +71,11 @@ def mask_tools(facts: Facts) -> str:
         return painted
     given = facts.remakes.best.command({"--masks": ("FOLDER",), "--mask-tool-value": None})
     return f"{painted}, or {given} with a mask for each frame in FOLDER"
+
+
+def correct_masks(facts: Facts) -> str:
+    """The command that shows masks and takes corrections."""
+    return f"look at them and correct them: `{command('view', facts.path)}`"
 
 
 def in_stored_px(facts: Facts, *values: float) -> list[int]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import number_ranges
 from ..data import FrameSequence
+from ..data.found_tools import drop_rows
 from ..data.mask_writing import replace_masks
 from ..footage.carry_masks import CarriedEdit, carry_mask_edit
 
@@ -86,6 +87,8 @@ class MaskEdits:
     def save(self) -> list[int]:
         """Write every changed mask to its file, keep the original once, and note what changed. Returns the frames.
 
+        Their confidence in `tool_masks.json` is removed: a person has looked at them.
+
         Raises:
             InputError: the folder is read-only, or the disk rejects a file; masks written before it stay written.
         """
@@ -93,6 +96,7 @@ class MaskEdits:
         if not frames:
             return []
         replace_masks(self._sequence, {frame: self.tool(frame) for frame in frames})
+        drop_rows(self._sequence.path, frames)
         for frame in frames:
             self._saved.pop(frame, None)
             if frame in self._state.masks:
