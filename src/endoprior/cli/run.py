@@ -72,6 +72,7 @@ def run(argv: list[str]) -> None:
     from ..pipeline import STEPS, estimate, notes_of, open_folder, problems, run_step, seconds_if_moving
     from ..prepare.sam2 import is_sam2
     from ..runs import kernel_cache
+    from ..runs.missed_tools import missed_tools_line
 
     began = clock.perf_counter()
     job = job_of(args, say)
@@ -113,6 +114,8 @@ def run(argv: list[str]) -> None:
     ):
         say(f"  {what:<8}{path}")
     for line in problems(job):
+        say(line)
+    if line := missed_tools_line(job.run, job.data):
         say(line)
     say(f"Turn and measure it: {command('view', job.run)}")
     if args.preview:

@@ -114,6 +114,7 @@ def train_and_evaluate(
         ray: address of a Ray cluster that trains; None trains in this process.
     """
     from ..data import load_sequence
+    from ..runs.missed_tools import missed_tools_line
     from ..runs.remote import complete_on
     from ..runs.train import start_run
     from ..system.ray_cluster import connected
@@ -140,6 +141,8 @@ def train_and_evaluate(
     scene = scene.to(device_for(cfg.render.backend))  # score on the training device
     try:
         evaluate_run(scene, out, data, out, "test", networks, weights_dir, extra=speed)
+        if line := missed_tools_line(out, data):
+            say(line)
     except KeyboardInterrupt:
         say(f"Stopped; the trained scene is saved. Score it with `{command('eval', out)}`.")
         raise

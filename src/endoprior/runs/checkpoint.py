@@ -82,6 +82,8 @@ def check_state(arrays: Mapping[str, Tensor], iterations: int) -> None:
             valid, expected = bool((value >= 0).all()), "no negative number"
         elif name.endswith(".steps"):
             valid, expected = bool(((value >= 0) & (value <= iterations)).all()), f"0 to {iterations} steps"
+        elif name == "left_out":
+            valid, expected = bool(((value >= 0) & (value <= 1)).all()), "shares"
         elif name == "tracks.rows":
             num = len(arrays["tracks.coefficients"])
             valid, expected = bool(((value >= 0) & (value < num)).all()), f"rows below {num}"

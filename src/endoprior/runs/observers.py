@@ -12,6 +12,7 @@ from ..system.atomic import write_text
 from ..training.stage import Stage, StepReport
 from ..training.trainer import Trainer
 from .checkpoint import save_checkpoint
+from .missed_tools import KEY
 
 LOG_EVERY = 10
 """Iterations between two lines of `log.jsonl`."""
@@ -22,14 +23,14 @@ CHECKPOINT_SHARE = 0.05
 
 
 class LogWriter:
-    """Writes a line of JSON every `LOG_EVERY` iterations, and after every event of density control."""
+    """Writes a line of JSON every `LOG_EVERY` iterations, after events of density control, and at the end."""
 
     def __init__(self, lines: TextIO) -> None:
         self._lines = lines
 
     def __call__(self, report: StepReport, trainer: Trainer) -> None:
         """See `Observer`."""
-        if report.iteration % LOG_EVERY == 0 or report.event:
+        if report.iteration % LOG_EVERY == 0 or report.event or report.missed_tool_frames is not None:
             self._lines.write(json.dumps(_log_line(report)) + "\n")
 
 
@@ -61,7 +62,8 @@ class CheckpointWriter:
 def _log_line(report: StepReport) -> dict[str, Any]:
     line = {"stage": report.stage.name.lower(), "iteration": report.iteration, "num_gaussians": report.num_gaussians}
     event = {"event": report.event} if report.event else {}
-    return line | event | {"terms": report.terms, "seconds": round(report.seconds, 4)}
+    missed = {} if report.missed_tool_frames is None else {KEY: report.missed_tool_frames}
+    return line | event | missed | {"terms": report.terms, "seconds": round(report.seconds, 4)}
 
 
 def cut_log(log: Path, stage: Stage, iteration: int) -> None:

@@ -26,7 +26,7 @@ from ..model.method import method_of
 from ..model.scene_file import check_cameras
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import ArraySpec, part
-from . import depth_fit
+from . import depth_fit, left_out
 from .density import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
@@ -102,7 +102,8 @@ class GaussianTrainer(Trainer):
         num = len(self.sequence.indices("train"))
         poses = PoseState.at_start(num) if self.step_once.poses else None
         fit = depth_fit.at_start(num) if self.fits_depth else None
-        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, poses, fit)
+        shares = left_out.at_start(num) if self.step_once.doubt else None
+        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, poses, fit, shares)
 
     @property
     def fits_depth(self) -> bool:
@@ -116,7 +117,8 @@ class GaussianTrainer(Trainer):
         held = part(arrays, "tracks.")
         poses = PoseState(**part(arrays, "poses.")) if self.step_once.poses else None
         tracks = StartTracks(**held).to(self.device) if held else None
-        self._enter(stage, gaussians, field and field.to(self.device), tracks, poses, arrays.get("depth_fit"))
+        of_frames = arrays.get("depth_fit"), arrays.get("left_out")
+        self._enter(stage, gaussians, field and field.to(self.device), tracks, poses, *of_frames)
         self.state.iteration = iteration
         self.state.optimizer.load_state_arrays(part(arrays, "optimizer."))
         self.state.stats = DensityStats(
@@ -131,16 +133,17 @@ class GaussianTrainer(Trainer):
         tracks: StartTracks | None,
         poses: PoseState | None,
         fit: Tensor | None,
+        shares: Tensor | None,
     ) -> None:
         rate_of = partial(self.method.rate, cfg=self.cfg, spatial_scale=self.spatial_scale)
         optimizer = Optimizer(gaussians, field, self.cfg, rate_of, self.ops)
         stats = DensityStats.zeros(len(gaussians), self.device)
-        self.state = GaussiansState(stage, 0, gaussians, field, optimizer, stats, tracks, poses, fit)
+        self.state = GaussiansState(stage, 0, gaussians, field, optimizer, stats, tracks, poses, fit, shares)
 
     def schema(self) -> dict[str, ArraySpec]:
         """See `Trainer.schema`."""
         return state_schema(self.method.motion(self.cfg), self.cfg) | frame_schema(
-            refined=self.step_once.poses is not None, fitted=self.fits_depth
+            refined=self.step_once.poses is not None, fitted=self.fits_depth, doubted=self.step_once.doubt is not None
         )
 
     def step(self) -> StepReport:
@@ -151,7 +154,8 @@ class GaussianTrainer(Trainer):
         """
         state = self.state
         if state.stage is Stage.COARSE and state.iteration >= stage_length(self.cfg, Stage.COARSE):
-            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, state.poses, state.depth_fit)
+            of_frames = state.poses, state.depth_fit, state.left_out
+            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, *of_frames)
             if self.method.keeps_optimizer:
                 self.state.optimizer = state.optimizer
         report = self.step_once(self.state)

@@ -13,6 +13,7 @@ from ..model.motion import Motion
 from ..model.schema import gaussians_schema
 from ..system.arrays_file import ArraySpec
 from .density import DensityStats
+from .left_out import VISITS
 
 
 def state_schema(motion: Motion, cfg: Config) -> dict[str, ArraySpec]:
@@ -35,17 +36,21 @@ def state_schema(motion: Motion, cfg: Config) -> dict[str, ArraySpec]:
     return model | found | _track_schema(cfg)
 
 
-def frame_schema(*, refined: bool, fitted: bool) -> dict[str, ArraySpec]:
+def frame_schema(*, refined: bool, fitted: bool, doubted: bool) -> dict[str, ArraySpec]:
     """What is found of each training frame.
 
     Args:
-        refined: its pose. fitted: how its depth fits.
+        refined: its pose. fitted: how its depth fits. doubted: how much of it was left out as a missed tool.
     """
     specs = {}
     if refined:
         specs = {f"poses.{name}": ArraySpec("float64", ("F", 6)) for name in ("twists", "first", "second", "accepted")}
         specs["poses.steps"] = ArraySpec("int64", ("F",))
-    return specs | ({"depth_fit": ArraySpec("float64", ("F", 2))} if fitted else {})
+    if fitted:
+        specs["depth_fit"] = ArraySpec("float64", ("F", 2))
+    if doubted:
+        specs["left_out"] = ArraySpec("float32", ("F", VISITS))
+    return specs
 
 
 def _track_schema(cfg: Config) -> dict[str, ArraySpec]:

@@ -33,6 +33,9 @@ class GaussiansState:
     depth_fit: Tensor | None = None
     """(F, 2) scale and shift of each training frame's inverse depth, where depth is relative."""
 
+    left_out: Tensor | None = None
+    """(F, VISITS) share of the view that was left out as a missed tool in the last visits of each training frame."""
+
     def arrays(self) -> dict[str, Tensor]:
         """Every tensor by the name that it has in a checkpoint."""
         arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
@@ -44,6 +47,8 @@ class GaussiansState:
             arrays |= {f"poses.{name}": value for name, value in self.poses.tensors().items()}
         if self.depth_fit is not None:
             arrays["depth_fit"] = self.depth_fit
+        if self.left_out is not None:
+            arrays["left_out"] = self.left_out
         if self.field is not None:
             arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
         return arrays

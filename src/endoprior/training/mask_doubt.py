@@ -50,6 +50,13 @@ class MaskDoubt:
         measured = frame.measured & keep
         return replace(frame, tissue_mask=frame.tissue_mask & keep, measured=measured, num_measured=int(measured.sum()))
 
+    def share(self, frame: TrainingFrame, counted: TrainingFrame) -> float:
+        """Share of the view, 0..1, that `counted` leaves out of the frame from which it was made."""
+        if counted is frame:
+            return 0.0
+        left_out = float((frame.tissue_mask & ~counted.tissue_mask).float().mean())
+        return min(left_out / max(float(self._view.mean()), 1e-6), 1.0)
+
     def _surely_tissue(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_]:
         """(h, w) True where the tool network is sure of tissue; `size` is (w, h)."""
         log_odds = self._finder.log_odds(self._sequence.frame(index).rgb_u8, self._view, mirrored=False)

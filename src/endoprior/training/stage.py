@@ -41,6 +41,9 @@ class StepReport:
     divergence: Divergence | None = None
     """Why training cannot continue, if it cannot; on a device it may concern an earlier iteration."""
 
+    missed_tool_frames: tuple[int, ...] | None = None
+    """After the last iteration: frames of the sequence whose masks likely miss a tool; None if masks are trusted."""
+
     @cached_property
     def terms(self) -> dict[str, float]:
         """`losses` as numbers; the host waits for the device."""

@@ -15,7 +15,7 @@ from ..core.config import Config
 from ..core.types import RenderOutput, Splats
 from ..model.deformation import HexPlaneField, Offsets
 from ..render import Rasterizer
-from . import density, depth_fit
+from . import density, depth_fit, left_out
 from .densify import apply_plan, reset_opacities
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .drawn import Drawn
@@ -71,6 +71,8 @@ class Compared:
     """Weighted terms of the loss, () each."""
     color_error: Tensor
     """() mean absolute color error over tissue, which the divergence check watches."""
+    left_out: float | None
+    """Share of the view that does not count because it shows a missed tool; None where that was not asked."""
 
 
 @dataclass
@@ -134,7 +136,10 @@ class TrainingStep:
                 event = self._update(state, done, densify, reset)
         losses = {name: value.detach() for name, value in done.terms.items()}
         seconds = clock.perf_counter() - began
-        return StepReport(state.stage, done.iteration, losses, len(state.gaussians), seconds, event, divergence)
+        missed = None
+        if fine and last and state.left_out is not None:
+            missed = left_out.missed_tool_frames(state.left_out, self.frames.indices)
+        return StepReport(state.stage, done.iteration, losses, len(state.gaussians), seconds, event, divergence, missed)
 
     def compare(self, state: GaussiansState) -> Compared:
         """The forward pass of the next iteration, up to the terms of the loss; nothing is changed."""
@@ -154,9 +159,10 @@ class TrainingStep:
         )
         out = draw(posed)
         out.means2d.retain_grad()
-        counted = batch.frame
+        counted, share = batch.frame, None
         if self.doubt and fine and not right and iteration > START * stage_length(cfg, Stage.FINE):
             counted = self.doubt.counted(counted, out.color)
+            share = self.doubt.share(batch.frame, counted)
         if state.depth_fit is not None and fine:
             counted = depth_fit.fitted(counted, state.depth_fit[batch.position])
         drawn = Drawn(
@@ -184,7 +190,7 @@ class TrainingStep:
             terms |= temporal_terms(state, batch.frame, batch.before, splats.means, means_before, out, cfg, self.ops)
         if twist is not None:
             terms["poses"] = smoothness(state.poses.twists, batch.position, twist, cfg.poses)
-        return Compared(iteration, rng, batch, splats, out, twist, terms, color_error)
+        return Compared(iteration, rng, batch, splats, out, twist, terms, color_error, share)
 
     def _update(self, state: GaussiansState, done: Compared, densify: bool, reset: bool) -> dict[str, int] | None:
         """Apply the gradients of an iteration, then grow or prune; what density control did, if it did anything."""
@@ -192,6 +198,8 @@ class TrainingStep:
         self._observe(state, batch, done.out)
         if state.depth_fit is not None and state.stage is Stage.FINE:
             depth_fit.update(state.depth_fit, batch.position, batch.frame, done.out)
+        if state.left_out is not None and done.left_out is not None:
+            left_out.record(state.left_out, batch.position, done.left_out)
         state.optimizer.step(done.iteration, self.check.skip)
         if done.twist is not None:
             self.poses.step(state.poses, batch.position, done.twist.grad, done.iteration)

@@ -1,0 +1,47 @@
+"""In which frames a training met tools that the masks miss, by its log."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from ..core.checks import number_ranges
+from ..core.shell import command
+from .folder import CONFIG, LOG
+
+KEY = "missed_tool_frames"
+"""In the last line of the log, in the protocol of `metrics.json` and in `StepReport`."""
+
+
+def missed_tools_of(run: Path) -> list[int] | None:
+    """Frames of the sequence, ascending, in a run folder; None where training trusted the masks, or has no log."""
+    log = run / LOG
+    if not log.is_file():
+        return None
+    starts, found = _window_starts(run), None
+    for text in log.read_text(encoding="utf-8").splitlines():
+        try:
+            line = json.loads(text)
+            frames, first = line[KEY], starts[line["window"]] if "window" in line else 0
+            found = (found or set()) | {first + int(frame) for frame in frames}
+        except (ValueError, KeyError, TypeError, IndexError):  # most lines; or one that a crash cut short
+            continue
+    return None if found is None else sorted(found)
+
+
+def missed_tools_line(run: Path, data: Path) -> str:
+    """What to tell the user of a run on the sequence folder `data`; empty if nothing is likely missed."""
+    frames = missed_tools_of(run)
+    if not frames:
+        return ""
+    words = f"frame{'s' if len(frames) > 1 else ''} {number_ranges(frames)}"
+    return f"Tools are likely missed in {words}. To look and correct: `{command('view', data)}`, then train again."
+
+
+def _window_starts(run: Path) -> list[int]:
+    """First frame of each window; none for a run of one window."""
+    try:
+        plan = json.loads((run / CONFIG).read_text(encoding="utf-8")).get("windows", [])
+        return [int(start) for start, _ in plan]
+    except (OSError, ValueError, TypeError, AttributeError):
+        return []
