@@ -36,6 +36,7 @@ DECISIONS = {
     "no-points": "masks or depth are wrong in a way that the figure shows",
     "reader": "the note itself says what is unusual",
     "windows": "nothing is wrong",
+    "uncertain-masks": "only a person sees which pixels are tool",
 }
 """Problems that no command solves, with the reason."""
 
