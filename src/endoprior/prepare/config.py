@@ -83,7 +83,7 @@ class PrepareConfig:
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
     masks: str = "auto"
-    """`auto` (found in the clip), `sam2[:WEIGHTS]` (SAM 2), `none`, or a folder of masks."""
+    """`auto` (found in the frames), `sam2`, `none`, or a folder of masks."""
     mask_labels: str = ""
     """Labels in the mask folder that are tools, such as `shaft,jaw`. Usually their names tell."""
     mask_tool_value: Literal["auto", "high", "low"] = "auto"
