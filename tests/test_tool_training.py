@@ -9,8 +9,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save
 
+from endoprior.core.checks import InputError
+from endoprior.tool_masks.network import ToolNetwork
+from endoprior.tool_masks.weights import network_from_file
 from endoprior.tool_training import benchmark, composites
+from endoprior.tool_training import fit as fit_module
 from endoprior.tool_training.benchmark import Counts, TestFrame, count, pictures, score_set
 from endoprior.tool_training.camera import photographed, random_view
 from endoprior.tool_training.composites import IGNORED, SIZE, LabeledFrame, examples
@@ -48,7 +53,11 @@ def test_tissue_is_an_image(seed):
     assert image.shape == (70, 90, 3) and image.min() >= 0 and image.max() <= 1 and image.std() > 0.01
 
 
-@pytest.mark.parametrize("paint", [instrument, gauze, ribbed_tube, needle])
+def tube(rng, scene, view):
+    return ribbed_tube(rng, scene)[1]
+
+
+@pytest.mark.parametrize("paint", [instrument, gauze, tube, needle])
 def test_bodies_are_painted_inside_of_what_they_cover(paint):
     shares = []
     for seed in range(12):
@@ -93,13 +102,34 @@ def test_two_photographs_show_one_scene():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_beyond_the_view_it_is_black(seed):
-    rng = np.random.default_rng(seed)
-    view = random_view(rng, SIZE)
+def test_beyond_the_view_nothing_of_the_scene_is_seen(seed):
+    view = random_view(np.random.default_rng(seed), SIZE)
     assert view.mean() > 0.3
-    image = photographed(rng, np.full((*SIZE, 3), 0.5, np.float32), view)
-    far = ~(cv2.dilate(view.astype(np.uint8), np.ones((17, 17), np.uint8)) > 0)  # JPEG blocks reach over the border
-    assert not far.any() or image[far].max() < 30
+    dark, light = (
+        photographed(np.random.default_rng(seed), np.full((*SIZE, 3), level, np.float32), view) for level in (0.2, 0.8)
+    )
+    far = ~(cv2.dilate(view.astype(np.uint8), np.ones((33, 33), np.uint8)) > 0)  # JPEG blocks reach over the border
+    assert (dark != light).any() and (dark == light)[far].all()
+
+
+def test_some_borders_are_not_told_and_what_is_beyond_them_is_no_tool():
+    told, untold = 0, 0
+    for seed in range(60):
+        for one in examples(np.random.default_rng(seed), [], 1):
+            if not one.view.all():
+                told += 1
+                assert (one.label[~one.view] == IGNORED).all()
+            elif (one.rgb_u8.max(-1) < 16).mean() > 0.1 and not one.label[0, 0]:
+                untold += 1
+    assert told > 5 and untold > 2
+
+
+def test_the_lumen_around_a_tube_is_dark_and_the_rest_as_it_was():
+    scene = np.full((*SIZE, 3), 0.5, np.float32)
+    made = [ribbed_tube(np.random.default_rng(seed), scene)[0] for seed in range(20)]
+    darker = [image for image in made if (image < 0.2).any()]
+    assert 5 < len(darker) < 20
+    assert all(image.max() <= 0.5 for image in darker) and np.mean([(x > 0.45).mean() for x in darker]) > 0.4
 
 
 def test_the_loss_by_hand():
@@ -144,6 +174,25 @@ def test_training_learns_and_resumes_bit_identically(tmp_path, monkeypatch):
         train(tmp_path / "b", stop=12)  # after the checkpoint of step 6 was written
     resumed = train(tmp_path / "b").state_dict()
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+
+
+def test_training_goes_on_from_given_weights():
+    start = ToolNetwork()
+    with torch.no_grad():
+        start.out[0].bias.fill_(3.0)
+    state = fit_module._State.new(start)
+    assert all((old == new).all() for old, new in zip(start.parameters(), state.averaged.parameters(), strict=True))
+    assert state.step == 0 and state.network is not start
+
+
+@pytest.mark.parametrize("content", [None, b"nothing", save({"down.0.0.0.weight": torch.zeros(2)})])
+def test_weights_that_are_none_end_in_one_line(tmp_path, content):
+    file = tmp_path / "weights.safetensors"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(InputError, match="weights") as error:
+        network_from_file(file)
+    assert "\n" not in str(error.value)
 
 
 def test_counts_by_hand():

@@ -29,6 +29,8 @@ class BenchMasks:
     """Training steps of each network, of 16 images each."""
     seed: int = 0
     """Seed of weights and examples."""
+    start: Path | None = None
+    """Weights file that the network of all sets is trained on from; the other networks start from nothing."""
     write_weights: Path | None = None
     """Also write the weights of the network that was trained with all sets to this file."""
 
@@ -46,18 +48,20 @@ def run(argv: list[str]) -> int:
         fix = "ENDOPRIOR_DATA=FOLDER with bowel_lift/, vocalfolds/, mono_endo.mp4 and wild/ (docs/tool_network.md)."
         raise input_error("ENDOPRIOR_DATA", "the folder of the clips", repr(str(root)), f"Set {fix}")
     from ..system.file_lock import locked
-    from ..tool_training.leave_one_out import ALL, rows, weights_file
+    from ..tool_masks.weights import network_from_file
+    from ..tool_training.leave_one_out import ALL, Training, rows, weights_file
     from ..tool_training.report import write_report
     from .output_paths import require_writable_folder
 
     require_writable_folder("OUT", args.out)
+    start = network_from_file(args.start) if args.start else None
     args.out.mkdir(parents=True, exist_ok=True)
     with locked(args.out, args.out / ".lock"):
         table = []
-        for row in rows(args.out, root, args.steps, args.seed, say):
+        for row in rows(args.out, root, Training(args.steps, args.seed, start), say):
             say(f"{row.name}: {', '.join(f'{k} {v:.3f}' for k, v in row.score.total.scores().items())}")
             table.append(row)
-        report = write_report(args.out, table, {"steps": args.steps, "seed": args.seed})
+        report = write_report(args.out, table, {"steps": args.steps, "seed": args.seed, "start": args.start})
         if args.write_weights:
             args.write_weights.write_bytes(weights_file(args.out, ALL).read_bytes())
     say(f"report: {report}")

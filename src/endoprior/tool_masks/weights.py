@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from ..core.checks import input_error
@@ -33,6 +34,21 @@ def shipped_network() -> ToolNetwork:
     if digest != SHA256:
         raise input_error(FILE, f"a file with SHA-256 {SHA256[:12]}...", f"{digest[:12]}...", fix)
     return network_from(data)
+
+
+def network_from_file(path: Path) -> ToolNetwork:
+    """A network for inference from a weights file that a user names.
+
+    Raises:
+        InputError: it cannot be read, or holds something else.
+    """
+    fix = "Name a file that `endoprior bench masks --write-weights` wrote."
+    try:
+        return network_from(path.read_bytes())
+    except OSError as error:
+        raise input_error(path, "a weights file", f"{error.strerror}", fix) from None
+    except (SafetensorError, RuntimeError, AttributeError) as error:
+        raise input_error(path, "the weights of a tool network", f"{str(error).splitlines()[0]:.80}", fix) from None
 
 
 def network_from(data: bytes) -> ToolNetwork:

@@ -17,7 +17,7 @@ def random_view(rng: Generator, size: tuple[int, int]) -> NDArray[np.bool_]:
     """(h, w) True inside the endoscope's image: whole, round, oval, octagonal, cut off, or between black strips."""
     h, w = size
     y, x = np.mgrid[:h, :w].astype(np.float32)
-    kind = rng.choice(4, p=[0.62, 0.22, 0.06, 0.1])
+    kind = rng.choice(4, p=[0.55, 0.22, 0.13, 0.1])
     view = np.ones(size, bool)
     if kind == 0:
         return view
@@ -27,7 +27,8 @@ def random_view(rng: Generator, size: tuple[int, int]) -> NDArray[np.bool_]:
     if kind == 1:
         return np.hypot(dx, dy) < radius
     if kind == 2:
-        return (dx < radius * 0.85) & (dy < radius * 0.75) & (dx + dy < radius * rng.uniform(1.1, 1.35))
+        wide, high = rng.uniform(0.42, 0.6, 2) * (w, h)
+        return (dx < wide) & (dy < high) & (dx / wide + dy / high < rng.uniform(1.3, 1.8))
     strip = int(rng.uniform(0.02, 0.15) * w)
     view[:, :strip] = view[:, w - strip :] = False
     if rng.random() < 0.4:
@@ -39,7 +40,7 @@ def photographed(rng: Generator, scene: Field, view: NDArray[np.bool_]) -> NDArr
     """(h, w, 3), 0..255: the scene (h, w, 3) as a file shows it; black beyond the view."""
     size = scene.shape[:2]
     image = scene.astype(np.float32)
-    if rng.random() < 0.25:
+    if rng.random() < 0.3:
         image = _smoked(rng, image)
     if rng.random() < 0.5:
         image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.8))
@@ -56,18 +57,34 @@ def photographed(rng: Generator, scene: Field, view: NDArray[np.bool_]) -> NDArr
         noise = rng.standard_normal(image.shape, np.float32)
         image = image + np.float32(log_uniform(rng, 0.003, 0.05)) * noise
     image_u8 = (np.clip(image, 0, 1) * 255).astype(np.uint8)
-    if rng.random() < 0.08:
+    if rng.random() < 0.1:
         _label(rng, image_u8)
-    image_u8[~view] = rng.integers(0, 12)
+    image_u8 = _bordered(rng, image_u8, view)
     if rng.random() < 0.6:
         quality = int(rng.uniform(25, 95))
         image_u8 = cv2.imdecode(cv2.imencode(".jpg", image_u8, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], 1)
     return image_u8
 
 
+def _bordered(rng: Generator, image_u8: NDArray[np.uint8], view: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """(h, w, 3) black, gray or the room beside the view; its rim may be soft and dark."""
+    if view.all():
+        return image_u8
+    inside = view.astype(np.float32)
+    if rng.random() < 0.5:
+        distance = cv2.distanceTransform(view.astype(np.uint8), cv2.DIST_L2, 3)
+        inside *= np.clip(distance / rng.uniform(1, 14), 0, 1) ** rng.uniform(0.4, 1.5)
+    beyond = np.full(3, rng.integers(0, 12) if rng.random() < 0.8 else rng.integers(12, 60), np.float32)
+    if rng.random() < 0.15:  # the room, or light that the lens scatters
+        glow = np.clip(smooth_field(rng, view.shape, log_uniform(rng, 10, 60)) - rng.uniform(0, 1.5), 0, 2)
+        beyond = beyond + glow[..., None] * rng.uniform(10, 90, 3).astype(np.float32)
+    return (beyond + inside[..., None] * (image_u8 - beyond)).clip(0, 255).astype(np.uint8)
+
+
 def _smoked(rng: Generator, image: Field) -> Field:
     size = image.shape[:2]
-    share = np.clip(rng.uniform(0.05, 0.7) * (1 + 0.6 * fractal_field(rng, size, log_uniform(rng, 40, 200), 4)), 0, 0.8)
+    dense = rng.uniform(0.05, 0.7) if rng.random() < 0.7 else rng.uniform(0.5, 0.85)
+    share = np.clip(dense * (1 + 0.6 * fractal_field(rng, size, log_uniform(rng, 40, 200), 4)), 0, 0.88)
     tint = np.array([1, rng.uniform(0.75, 1.02), rng.uniform(0.6, 1.05)], np.float32) * np.float32(
         rng.uniform(0.35, 0.9)
     )
@@ -103,9 +120,9 @@ def _toned(rng: Generator, image: Field) -> Field:
         y, x = np.mgrid[:h, :w].astype(np.float32)
         off = ((x / w - rng.uniform(0.35, 0.65)) ** 2 + (y / h - rng.uniform(0.35, 0.65)) ** 2) * 4
         image = image * (1 - rng.uniform(0, 0.7) * np.clip(off, 0, 1.35))[..., None]
-    if rng.random() < 0.12:  # a spot in which the lamp overexposes
+    if rng.random() < 0.2:  # a spot in which the lamp overexposes
         y, x = np.mgrid[:h, :w].astype(np.float32)
-        radius = rng.uniform(15, 70)
+        radius = log_uniform(rng, 12, 110)
         off = ((x - rng.uniform(0, w)) ** 2 + (y - rng.uniform(0, h)) ** 2) / radius**2
         image = image * np.exp(rng.uniform(0.4, 1.8) * np.exp(-off / 2))[..., None]
     image = image ** np.float32(np.exp(rng.normal(0, 0.15)))

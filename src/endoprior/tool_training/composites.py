@@ -27,6 +27,8 @@ REAL = 0.55
 """Share of the examples on real frames, where there are any."""
 NUMBER = (0.22, 0.4, 0.28, 0.1)
 """Probability of 0 to 3 instruments."""
+UNTOLD = 0.35
+"""Share of the borders of which the network is not told: not every border is found, and what is dark is no tool."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Example:
     rgb_u8: NDArray[np.uint8]
     """(h, w, 3), 0..255."""
     view: NDArray[np.bool_]
-    """(h, w) True inside the endoscope's image."""
+    """(h, w) True inside the endoscope's image, as far as the network is told."""
     label: NDArray[np.uint8]
     """(h, w) 0, 1 or `IGNORED`."""
 
@@ -62,7 +64,10 @@ def examples(rng: Generator, frames: Sequence[Sequence[LabeledFrame]], number: i
     for _ in range(number):
         flip = (slice(None, None, rng.choice((-1, 1))), slice(None, None, rng.choice((-1, 1))))
         rgb_u8 = photographed(rng, np.ascontiguousarray(scene[flip]), view[flip])
-        made.append(Example(rgb_u8, view[flip], np.where(view, label, IGNORED).astype(np.uint8)[flip]))
+        told, beyond = view[flip], IGNORED
+        if rng.random() < UNTOLD:
+            told, beyond = np.ones(SIZE, bool), 0
+        made.append(Example(rgb_u8, told, np.where(view, label, beyond).astype(np.uint8)[flip]))
     return made
 
 
@@ -74,10 +79,11 @@ def _scene(
     scene, label, view = _real_scene(rng, frames) if real else _procedural_scene(rng)
     if real and rng.random() < 0.25:  # as it is: real tools, or tissue without any
         return scene, label, view
-    if rng.random() < 0.12:
-        scene, label = _placed(rng, scene, label, gauze(rng, scene, view))
     if rng.random() < 0.08:
-        scene, label = _placed(rng, scene, label, ribbed_tube(rng, scene, view))
+        scene, tube = ribbed_tube(rng, scene)
+        scene, label = _placed(rng, scene, label, tube)
+    if rng.random() < 0.14:
+        scene, label = _placed(rng, scene, label, gauze(rng, scene, view))
     if frames and rng.random() < 0.25:
         scene, label = _transferred(rng, scene, label, frames)
     for _ in range(rng.choice(4, p=NUMBER)):
@@ -160,7 +166,7 @@ def _placed(
         scene = shadowed(rng, scene, covered)
     image = color * covered[..., None]
     if blurred:
-        focus = rng.uniform(0.3, 0.9) if rng.random() < 0.75 else rng.uniform(0.9, 3)
+        focus = (rng.uniform(0.3, 0.9), rng.uniform(0.9, 3), rng.uniform(3, 7))[rng.choice(3, p=[0.72, 0.22, 0.06])]
         image, covered, outline = (cv2.GaussianBlur(x, (0, 0), focus) for x in (image, covered, outline))
         if rng.random() < 0.1:
             path = motion_kernel(rng)

@@ -71,6 +71,7 @@ def fit(
     steps: int,
     seed: int = 0,
     *,
+    start: ToolNetwork | None = None,
     checkpoint: Path | None = None,
     workers: int = 1,
     report: Callable[[int, float], None] = lambda step, loss: None,
@@ -79,12 +80,13 @@ def fit(
 
     Args:
         frames: the real frames of each set; may be empty.
+        start: the network to train on from; without one, weights are random.
         checkpoint: file of the state, written every `REPORTED` steps; if it is there, training resumes from it.
         workers: processes that make examples.
         report: called every `REPORTED` steps with the step and the mean loss since the last call.
     """
     torch.manual_seed(seed)
-    state = _State.new()
+    state = _State.new(start)
     if checkpoint is not None and checkpoint.exists():
         state.load(checkpoint)
     todo = range(state.step * SCENES, steps * SCENES)
@@ -156,8 +158,10 @@ class _State:
     step: int = 0
 
     @staticmethod
-    def new() -> _State:
+    def new(start: ToolNetwork | None) -> _State:
         network = ToolNetwork().to(memory_format=torch.channels_last)
+        if start is not None:
+            network.load_state_dict(start.state_dict())
         optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
         return _State(network, copy.deepcopy(network), optimizer)
 

@@ -46,7 +46,8 @@ def _lamp(rng: Generator, size: tuple[int, int]) -> Field:
     slope_x, slope_y = rng.normal(0, 0.5, 2)
     light = 1 + slope_x * (x / size[1] - 0.5) + slope_y * (y / size[0] - 0.5)
     light = light + rng.uniform(0, 0.3) * smooth_field(rng, size, 60)
-    return (np.clip(light, 0.15, 3) * log_uniform(rng, 0.5, 1.7)).astype(np.float32)
+    strength = log_uniform(rng, 0.5, 1.7) if rng.random() < 0.85 else log_uniform(rng, 1.7, 4)  # overexposed
+    return (np.clip(light, 0.15, 3) * strength).astype(np.float32)
 
 
 def _entry(rng: Generator, view: NDArray[np.bool_]) -> tuple[Point, Point]:

@@ -37,9 +37,17 @@ def weights_file(out: Path, left_out: str) -> Path:
     return out / "networks" / f"{left_out if left_out == ALL else f'without_{left_out}'}.safetensors"
 
 
-def network_without(
-    out: Path, root: Path, left_out: str, steps: int, seed: int, say: Callable[[str], None]
-) -> ToolNetwork:
+@dataclass(frozen=True)
+class Training:
+    """How each network is trained."""
+
+    steps: int
+    seed: int
+    start: ToolNetwork | None = None
+    """Where the network that sees all sets starts. The others start from nothing: it may know their set."""
+
+
+def network_without(out: Path, root: Path, left_out: str, how: Training, say: Callable[[str], None]) -> ToolNetwork:
     """The network that has not seen a set; trained if its weights are not in `out` yet, resumed if interrupted."""
     file = weights_file(out, left_out)
     if not file.exists():
@@ -48,10 +56,11 @@ def network_without(
         checkpoint = file.with_suffix(".checkpoint")
         network = fit(
             training_frames(root, names),
-            steps,
-            seed,
+            how.steps,
+            how.seed,
+            start=how.start if left_out == ALL else None,
             checkpoint=checkpoint,
-            report=lambda step, loss: say(f"{file.stem}: step {step} of {steps}, loss {loss:.3f}"),
+            report=lambda step, loss: say(f"{file.stem}: step {step} of {how.steps}, loss {loss:.3f}"),
         )
         with whole_file(file) as temporary:
             temporary.write_bytes(weights_of(network))
@@ -59,16 +68,16 @@ def network_without(
     return network_from(file.read_bytes())
 
 
-def rows(out: Path, root: Path, steps: int, seed: int, say: Callable[[str], None]) -> Iterator[Row]:
+def rows(out: Path, root: Path, how: Training, say: Callable[[str], None]) -> Iterator[Row]:
     """Every line of the table, in its order: the sets, then the families of the phantom."""
     for name in SETS:
         left_out = name if name in TRAINED else ALL
-        finder = ToolFinder(network_without(out, root, left_out, steps, seed, say))
+        finder = ToolFinder(network_without(out, root, left_out, how, say))
         frames = list(test_frames(root, name))
         yield Row(name, left_out, score_set(finder, frames))
         for part in SPLIT.get(name, ()):
             yield Row(f"{name}: {part}", left_out, score_set(finder, _of(frames, part)), is_part=True)
-    finder = ToolFinder(network_without(out, root, ALL, steps, seed, say))
+    finder = ToolFinder(network_without(out, root, ALL, how, say))
     for name, phantom in phantom_sets().items():
         yield Row(name, ALL, score_set(finder, phantom_frames(out / "phantoms", phantom)))
 

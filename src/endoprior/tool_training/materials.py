@@ -6,7 +6,7 @@ Colors in [0, 1], sRGB.
 from __future__ import annotations
 
 import colorsys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
@@ -38,7 +38,7 @@ def steel(rng: Generator) -> Material:
     return Material(
         color,
         rng.uniform(0.3, 1),
-        rng.uniform(0, 0.75),
+        rng.uniform(0, 0.75) if rng.random() < 0.8 else rng.uniform(0.75, 1),
         rng.uniform(0.2, 1.4),
         rng.uniform(0.04, 0.4),
         rng.uniform(0, 0.25),
@@ -68,12 +68,15 @@ def colored(rng: Generator) -> Material:
         (rng.uniform(0, 1), 0.1, 0.9),
     )[rng.choice(6, p=[0.25, 0.2, 0.28, 0.15, 0.06, 0.06])]
     rgb = colorsys.hsv_to_rgb(hue, rng.uniform(pale, strong), rng.uniform(0.25, 1))
-    return _plastic(rng, np.array(rgb, np.float32))
+    color = np.array(rgb, np.float32)
+    if rng.random() < 0.25:  # anodized, or gilded: colored metal
+        return replace(steel(rng), color=color)
+    return _plastic(rng, color)
 
 
 def shaft_material(rng: Generator) -> Material:
     """Of a shaft: steel, black, gray, gray-blue, white, or colored."""
-    kind = rng.choice(6, p=[0.2, 0.24, 0.16, 0.18, 0.1, 0.12])
+    kind = rng.choice(6, p=[0.2, 0.22, 0.15, 0.17, 0.1, 0.16])
     if kind == 0:
         return steel(rng)
     if kind == 3:

@@ -32,12 +32,12 @@ class Palette:
     def of(rng: Generator) -> Palette:
         """A random one."""
         _, _, pale, strong = HUES[rng.choice(4, p=OFTEN)]
-        return Palette(rng.uniform(pale, strong))
+        return Palette(rng.uniform(pale, strong) * (1 if rng.random() < 0.93 else 0.4))
 
     def tone(self, rng: Generator, dark: float = DARK_ORGANS) -> Field:
         """(3,) RGB of an organ."""
         low, high, _, _ = HUES[rng.choice(4, p=OFTEN)]
-        saturation = float(np.clip(self.saturation * rng.uniform(0.7, 1.35), 0.08, 0.95))
+        saturation = float(np.clip(self.saturation * rng.uniform(0.7, 1.35), 0.05, 0.95))
         value = rng.uniform(0.03, 0.25) if rng.random() < dark else rng.uniform(0.3, 0.95)
         return np.array(colorsys.hsv_to_rgb(rng.uniform(low, high) % 1, saturation, value), np.float32)
 
@@ -57,6 +57,8 @@ def tissue(rng: Generator, size: tuple[int, int]) -> Field:
     image = _lit(rng, image)
     if rng.random() < 0.35:
         image = _with_cavity(rng, image)
+    if rng.random() < 0.12:
+        image = _with_debris(rng, image)
     return np.clip(image, 0, 1)
 
 
@@ -130,6 +132,15 @@ def _with_cavity(rng: Generator, image: Field) -> Field:
         wet = np.clip(fractal_field(rng, size, log_uniform(rng, 4, 16), 3) - rng.uniform(1.2, 2.2), 0, 1)
         inside = inside + (wet * np.float32(rng.uniform(0.2, 0.9)))[..., None]
     return image + dark[..., None] * (inside - image)
+
+
+def _with_debris(rng: Generator, image: Field) -> Field:
+    """Flakes, stool, bubbles and mucus, pale or dark, alone or in swarms."""
+    size = image.shape[:2]
+    flakes = fractal_field(rng, size, log_uniform(rng, 4, 14), 3) + smooth_field(rng, size, log_uniform(rng, 30, 120))
+    share = np.clip((flakes - rng.uniform(1.6, 2.6)) * rng.uniform(1, 6), 0, 1) * np.float32(rng.uniform(0.4, 1))
+    tone = colorsys.hsv_to_rgb(rng.uniform(0.06, 0.16), rng.uniform(0.05, 0.6), rng.uniform(0.2, 0.95))
+    return image + share[..., None] * (np.array(tone, np.float32) - image)
 
 
 def _lit(rng: Generator, albedo: Field) -> Field:
