@@ -15,7 +15,6 @@ from endoprior.core.checks import InputError
 from endoprior.tool_masks.network import ToolNetwork
 from endoprior.tool_masks.weights import network_from_file
 from endoprior.tool_training import benchmark, composites
-from endoprior.tool_training import fit as fit_module
 from endoprior.tool_training.benchmark import Counts, TestFrame, count, pictures, score_set
 from endoprior.tool_training.camera import photographed, random_view
 from endoprior.tool_training.composites import IGNORED, SIZE, LabeledFrame, examples
@@ -180,9 +179,9 @@ def test_training_goes_on_from_given_weights():
     start = ToolNetwork()
     with torch.no_grad():
         start.out[0].bias.fill_(3.0)
-    state = fit_module._State.new(start)
-    assert all((old == new).all() for old, new in zip(start.parameters(), state.averaged.parameters(), strict=True))
-    assert state.step == 0 and state.network is not start
+    same = fit([], 0, start=start, workers=0)
+    assert same is not start
+    assert all((old == new).all() for old, new in zip(start.parameters(), same.parameters(), strict=True))
 
 
 @pytest.mark.parametrize("content", [None, b"nothing", save({"down.0.0.0.weight": torch.zeros(2)})])
