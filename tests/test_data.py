@@ -289,11 +289,36 @@ def test_remarks(tiny_sequence):
     write(tiny_sequence / "depth/000003.png", np.zeros((40, 48), np.uint16))
     (tiny_sequence / "depth/000016.png").rename(tiny_sequence / "depth/000018.png")
     describe(tiny_sequence, fx=None)
-    change_poses(tiny_sequence, lambda p: np.where(np.arange(17) == 4, 512, p))
+    change_poses(tiny_sequence, lambda p: np.where(np.isin(np.arange(17), (4, 9)), 2 * p, p))
     remarks = load_sequence(tiny_sequence).validate()
-    for part in ("000018.png: matched by order", "79% of all pixels are masked", "1 frames have no depth", "48x512 px"):
+    for part in (
+        "000018.png: matched by order",
+        "79% of all pixels are masked",
+        "1 frames have no depth",
+        "for 96x80 px",
+    ):
         assert sum(part in remark for remark in remarks) == 1
     assert len(remarks) == 4 and not any("\n" in remark for remark in remarks)
+
+
+@pytest.mark.parametrize("times", [2, 0.25])
+def test_focal_length_of_another_size_is_scaled(tiny_sequence, times):
+    describe(tiny_sequence, fx=None, fy=None)
+    before = load_sequence(tiny_sequence).camera(0)
+    change_poses(tiny_sequence, lambda p: np.where(np.isin(np.arange(17), (4, 9)), times * p, p))
+    after = load_sequence(tiny_sequence).camera(0)
+    assert (after.fx, after.fy) == pytest.approx((before.fx / times, before.fx / times))
+    assert (after.cx, after.cy) == (before.cx, before.cy) == (24, 20)
+
+
+@pytest.mark.parametrize("stored", [(512, 48), (0, 0), (-40, -48)])
+def test_a_stored_size_of_another_shape_is_rejected(tiny_sequence, stored):
+    describe(tiny_sequence, fx=None)
+    height, width = stored
+    row = np.arange(17)
+    change_poses(tiny_sequence, lambda p: np.where(row == 4, height, np.where(row == 9, width, p)))
+    with pytest.raises(InputError, match=rf"48x40 px, or that shape, got {width}x{height}"):
+        load_sequence(tiny_sequence)
 
 
 def test_real_clip(real_clip):

@@ -38,6 +38,13 @@ def world_to_camera(frame):
     return pose
 
 
+def turn_slightly(frame):
+    """The world-to-camera of a camera that goes forward, aside and turns."""
+    pose = turn(1.5 * frame) @ turn(frame, 0)
+    pose[:3, 3] = (frame, 0.5 * frame, -6 * frame)
+    return pose
+
+
 RECTIFICATION = turn(3, 2)[:3, :3]
 
 
@@ -92,6 +99,9 @@ def test_published_stride_and_its_override(keyframe):
         ("dataset_2/keyframe_1", 2, 9),
         ("scared/dataset3/keyframe_2", 3, 3),
         ("d6k1", 6, 2),
+        ("dataset_1_keyframe_1", 1, 5),
+        ("dataset_7_keyframe_1/half", 7, 2),
+        ("dataset3_keyframe2", 3, 3),
         ("dataset_4/keyframe_1", 4, 9),
     ],
 )
@@ -133,14 +143,57 @@ def test_mask_closes_gaps_of_the_width_over_128():
     assert mask[:, :50].all() and mask.mean() > 0.99
 
 
-def test_version_1_camera(keyframe):
+def test_version_1_camera_is_that_of_q_and_without_a_right_camera_poses_are_not_turned(keyframe):
     seq = load_sequence(keyframe)
     camera = seq.camera(2)  # frame 4 of the folder
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 31, 13.75, 10)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 30, 13.75, 10)
     np.testing.assert_allclose(seq.camera(0).world_to_camera, np.eye(4), atol=1e-12)  # float64 rounding
     want = world_to_camera(4) @ np.linalg.inv(world_to_camera(0))
     np.testing.assert_allclose(camera.world_to_camera, want, atol=1e-12)
-    assert remark_with(keyframe, "version 1")
+    assert remark_with(keyframe, "not turned")
+
+
+@pytest.mark.parametrize("column", [False, True])
+@pytest.mark.parametrize("alpha", [0, 0.7])
+def test_static_points_land_on_themselves(tmp_path, column, alpha):
+    """Two raw cameras that squint look at points; images are rectified as the public scripts do it."""
+    size, rng = (640, 512), np.random.default_rng(0)
+    left = np.array([[520.0, 0, 300], [0, 522, 260], [0, 0, 1]])
+    right = np.array([[518.0, 0, 345], [0, 519, 251], [0, 0, 1]])
+    turn, shift = cv2.Rodrigues(np.array([0.01, -0.03, 0.02]))[0], np.array([[-4.2], [0.05], [-0.1]])
+    r1, _, p1, _, q, _, _ = cv2.stereoRectify(left, None, right, None, size, turn, shift, alpha=alpha)
+    assert abs(p1[0, 2] - left[0, 2]) > 5  # where the raw principal point is wrong
+    points = rng.uniform((-15, -12, 60), (15, 12, 90), (20, 3))  # in the world, mm
+    poses = [turn_slightly(i) for i in range(3)]
+    keyframe = write_keyframe(tmp_path / "dataset_2" / "keyframe_1", frames=3)
+    for i, pose in enumerate(poses):
+        raw = {"KL": left, "KR": right, "R": turn, "T": shift if column else shift[:, 0]}
+        raw = {key: value.tolist() for key, value in raw.items()}
+        edit_json(
+            frame(keyframe, "frame_data", ".json", i), **{"camera-calibration": raw, "camera-pose": pose.tolist()}
+        )
+        edit_json(frame(keyframe, "reprojection_data", ".json", i), **{"reprojection-matrix": q.tolist()})
+    seq = load_sequence(keyframe)
+    assert not remark_with(keyframe, "not turned")
+
+    def rectified(pose):
+        """(P, 2) where the points are in the rectified image, integer centers, and their depth there."""
+        at = (points @ pose[:3, :3].T + pose[:3, 3]) @ r1.T
+        return (at[:, :2] / at[:, 2:]) * p1[0, 0] + p1[:2, 2], at[:, 2]
+
+    places, depth = rectified(poses[0])
+    camera = seq.camera(0)
+    lifted = (
+        np.column_stack(
+            [(places[:, 0] + 0.5 - camera.cx) / camera.fx, (places[:, 1] + 0.5 - camera.cy) / camera.fy, np.ones(20)]
+        )
+        * depth[:, None]
+    )
+    for i in (1, 2):
+        to = seq.camera(i)
+        moved = lifted @ to.world_to_camera[:3, :3].T + to.world_to_camera[:3, 3]
+        found = np.column_stack([moved[:, 0] / moved[:, 2] * to.fx + to.cx, moved[:, 1] / moved[:, 2] * to.fy + to.cy])
+        np.testing.assert_allclose(found - 0.5, rectified(poses[i])[0], atol=1e-6)
 
 
 def test_version_2_camera_is_the_rectified_one(tmp_path):
@@ -151,7 +204,7 @@ def test_version_2_camera_is_the_rectified_one(tmp_path):
     rotate[:3, :3] = RECTIFICATION
     want = rotate @ world_to_camera(3) @ np.linalg.inv(rotate @ world_to_camera(0))
     np.testing.assert_allclose(camera.world_to_camera, want, atol=1e-12)
-    assert not remark_with(keyframe, "version 1")
+    assert not remark_with(keyframe, "not turned")
 
 
 def test_a_point_keeps_its_place_in_the_world(keyframe):
@@ -190,6 +243,7 @@ def bad_geometry(key, value):
     return lambda f: edit_json(frame(f, "reprojection_data", ".json"), **{key: value})
 
 
+RAW = {"KL": KL.tolist(), "KR": KL.tolist(), "R": np.eye(3).tolist()}
 RECORD, GEOMETRY = "frame_data/frame_data000002.json", "reprojection_data/frame_data000002.json"
 BAD = {
     "raw": (lambda f: shutil.rmtree(f / "data/disparity"), "data/disparity", "no such folder"),
@@ -200,11 +254,12 @@ BAD = {
         "frame_data000002 is in one",
     ),
     "no pose": (bad_record("camera-pose", None), RECORD, "camera-pose, 4x4 numbers, got no such key"),
-    "no calibration": (bad_record("camera-calibration", None), RECORD, "camera-calibration.KL"),
-    "calibration text": (bad_record("camera-calibration", {"KL": "x"}), RECORD, "camera-calibration.KL"),
+    "calibration text": (bad_record("camera-calibration", dict.fromkeys("KL KR R T".split(), "x")), RECORD, "n.KL"),
+    "right camera": (bad_record("camera-calibration", RAW | {"T": [0, 0, 0]}), RECORD, "T of 0 mm"),
+    "shift": (bad_record("camera-calibration", RAW | {"T": [1, 2]}), RECORD, "T, 1x3 numbers"),
     "pose NaN": (nan_pose, RECORD, "NaN or infinity"),
     "pose scaled": (bad_record("camera-pose", (2 * np.eye(4)).tolist()), "data/frame_data", "rotations in camera-pose"),
-    "focal zero": (bad_record("camera-calibration", {"KL": np.zeros((3, 3)).tolist()}), RECORD, "focal lengths > 0"),
+    "focal zero": (bad_geometry("reprojection-matrix", np.eye(4).tolist()), GEOMETRY, "focal lengths > 0"),
     "no Q": (bad_geometry("reprojection-matrix", None), GEOMETRY, "reprojection-matrix"),
     "Q of other shape": (bad_geometry("reprojection-matrix", [[1]]), GEOMETRY, "got shape (1, 1)"),
     "version 3": (bad_geometry("schema_version", 3), GEOMETRY, "schema_version 1 or 2, got 3"),

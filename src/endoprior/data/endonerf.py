@@ -26,6 +26,8 @@ from .sequence import FrameSequence
 from .truth import Truth
 
 POSES_HINT = "write one row of 17 numbers per frame: 3x5 [R | t | (H, W, focal)], near, far."
+ROUNDED_PX = 1.0
+"""Scaled images may differ from the exact shape by rounding."""
 STILL_HINT = f"{POSES_HINT[:-1]}; for a static camera, set data.format to plain."
 
 
@@ -124,6 +126,30 @@ def read_poses_bounds(path: Path, num_frames: int) -> NDArray[np.float64]:
     return poses
 
 
+def focal_at(path: Path, stored: NDArray[np.float64], width: int, height: int, remarks: list[str]) -> float:
+    """Focal length, px, of images of that size, from the (height, width, focal) of `poses_bounds.npy`.
+
+    Files often hold the size of the original video beside smaller images; then the focal length is scaled, and a remark
+    says so.
+
+    Raises:
+        InputError: not above 0, or the stored size has another shape, so that the images were cut.
+    """
+    old_height, old_width, focal = stored
+    if focal <= 0:
+        raise input_error(path, "a focal length > 0 px", f"{focal:g}", "correct row 0, column 14.")
+    if (old_width, old_height) == (width, height):
+        return float(focal)
+    got, scale = f"{old_width:g}x{old_height:g}", width / old_width if old_width > 0 else 0.0
+    if abs(scale * old_height - height) > ROUNDED_PX or not scale:
+        fix = "write the size and focal length of these images there, or fx, fy, cx, cy into sequence.json."
+        raise input_error(path, f"the size of the images, {width}x{height} px, or that shape", got, fix)
+    remarks.append(
+        f"{path}: its focal length, {focal:g} px, is for {got} px; scaled to {focal * scale:g} px for {width}x{height}"
+    )
+    return float(focal * scale)
+
+
 def _cameras(
     poses: NDArray[np.float64],
     described: dict[str, Any],
@@ -134,15 +160,10 @@ def _cameras(
     remarks: list[str],
 ) -> list[Camera]:
     """One camera per frame. Intrinsics come from `sequence.json` where it has them, else from row 0 of the poses."""
-    stored_height, stored_width, focal = poses[0, :, 4]
-    if "fx" not in described and focal <= 0:
-        raise input_error(path / "poses_bounds.npy", "a focal length > 0 px", f"{focal:g}", "correct row 0, column 14.")
+    focal = 0.0
+    if "fx" not in described:
+        focal = focal_at(path / "poses_bounds.npy", poses[0, :, 4], width, height, remarks)
     intrinsics = intrinsics_of(path / "sequence.json", described, width, height, focal)
-    if "fx" not in described and (stored_width, stored_height) != (width, height):
-        remarks.append(
-            f"{path / 'poses_bounds.npy'}: its focal length is for {stored_width:g}x{stored_height:g} px, "
-            f"the images are {width}x{height}; it is used unchanged"
-        )
     flip = np.array([1.0, 1.0, 1.0] if pose_axes == "opencv" else [1.0, -1.0, -1.0])
     return [Camera(width, height, *intrinsics, world_to_camera(pose[:, :3] * flip, pose[:, 3])) for pose in poses]
 

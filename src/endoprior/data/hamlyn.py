@@ -14,7 +14,7 @@ from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import read_depth_file
-from .endonerf import read_poses_bounds
+from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, demand_count, list_files, read_table, unequal_names
 from .formats import Format
 from .images import read_color, read_tool_mask
@@ -59,10 +59,12 @@ def _load_forplane(path: Path, cfg: DataConfig) -> FrameSequence:
     if width <= CROP_LEFT_PX:
         raise input_error(images[0], f"more than {CROP_LEFT_PX} columns", f"{width}", "pass images of full size.")
     # All rows must be finite, but only size and focal length are used: Forplane's camera is static.
-    _, _, focal = read_poses_bounds(path / "poses_bounds.npy", len(images))[0, :, 4]
-    if focal <= 0:
-        raise input_error(path / "poses_bounds.npy", "a focal length > 0 px", f"{focal:g}", "correct row 0, column 14.")
-    remarks = unequal_names(images, masks) + unequal_names(images, depths)
+    stored = read_poses_bounds(path / "poses_bounds.npy", len(images))[0, :, 4]
+    remarks: list[str] = []
+    # Some files hold the size after the crop, which leaves the focal length as it is.
+    across = width - CROP_LEFT_PX if stored[1] == width - CROP_LEFT_PX else width
+    focal = focal_at(path / "poses_bounds.npy", stored, across, height, remarks)
+    remarks += unequal_names(images, masks) + unequal_names(images, depths)
     remarks.append(f"{path}: {CROP_LEFT_PX} empty columns at the left are cropped, as in Forplane")
     if not cfg.depth_unit_mm:
         remarks.append(f"{path / depth_folder}: its unit is not documented, mm assumed; set data.depth_unit_mm")

@@ -1,7 +1,8 @@
 """Reader of processed SCARED keyframes: rectified left images, disparity, calibration and pose of every frame.
 
-There are two versions of processed data. Version 1 (EndoGaussian, EndoSurf) keeps the raw camera `KL` and pose beside
-rectified images. Version 2 (EndoPrior-GS) stores its own rectification, which is then applied to camera and pose.
+Images are rectified; calibration and pose in `frame_data` are those before rectification. There are two versions of
+processed data. Version 1 (EndoGaussian, EndoSurf) stores Q alone, which holds the rectified camera; the rotation of the
+rectification is computed from the raw stereo calibration. Version 2 (EndoPrior-GS) stores rotation and camera.
 Pixel centers of these calibrations are integers, ours are halves: 0.5 is added to principal points.
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -33,6 +34,8 @@ NEAR_MM, FAR_MM = 0.03, 300.0
 """Depth outside this range counts as missing. The near end is the published one, though probably a typo for 30."""
 FOLDERS = {"left_finalpass": ".png", "disparity": ".tiff", "reprojection_data": ".json"}
 HINT = "process the keyframe first, see docs/datasets.md."
+RAW_STEREO = ("KL", "KR", "R", "T")
+"""Raw camera matrices, and the pose of the right camera, in `camera-calibration` of a frame."""
 VERSION_2 = ("left_rectification_rotation", "left_projection_matrix", "reprojection_matrix")
 
 
@@ -67,22 +70,22 @@ def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
     height, width = read_color(images[0]).shape[:2]
     size = (width, height)
     geometry = [_geometry(*files, size) for files in zip(records, geometries, strict=True)]
-    versions = sorted({version for *_, version in geometry})
+    versions = sorted({one.version for one in geometry})
     if len(versions) > 1:
         hint = "process all frames by the same program."
         raise input_error(data / "reprojection_data", "files of one version", "versions 1 and 2", hint)
-    if versions == [1]:
-        remarks.append(f"{data}: version 1, whose camera and pose are those of the images before rectification")
-    to_camera = np.stack([pose for _, pose, _, _ in geometry])
+    if not all(one.is_turned for one in geometry):
+        remarks.append(f"{data}: no stereo calibration (KR, R, T): poses are not turned by the rectification")
+    to_camera = np.stack([one.world_to_camera for one in geometry])
     demand_rotations(data / "frame_data", to_camera[:, :3, :3], "camera-pose", HINT)
     first_to_world = np.linalg.inv(to_camera[0])
     cameras = [
         Camera(width, height, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, pose @ first_to_world)
-        for k, pose, _, _ in geometry
+        for k, pose in ((one.matrix, one.world_to_camera) for one in geometry)
     ]
 
     def decode(index: int) -> Pixels:
-        depth = disparity_to_depth(read_values(disparities[index], size), geometry[index][2])
+        depth = disparity_to_depth(read_values(disparities[index], size), geometry[index].reprojection)
         return read_color(images[index], size), tissue_from_depth(depth), depth
 
     return assemble(
@@ -127,32 +130,63 @@ def tissue_from_depth(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 def dataset_number(path: Path) -> int | None:
     """The k of `dataset_k` among a path's folders, or of a name like `d1k1`; None without one."""
     for part in reversed(path.resolve().parts):
-        if match := re.fullmatch(r"dataset_?(\d+)|d(\d+)_?k\d+", part.lower()):
-            return int(match[1] or match[2])
+        if match := re.fullmatch(r"dataset_?(\d+)([_-]?keyframe_?\d+)?|d(\d+)[_-]?k\d+", part.lower()):
+            return int(match[1] or match[3])
     return None
 
 
-def _geometry(
-    record: Path, geometry: Path, size: tuple[int, int]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], int]:
-    """(3, 3) camera matrix, (4, 4) world-to-camera, (4, 4) Q and the version of one frame."""
+class _Geometry(NamedTuple):
+    """Of one frame after rectification."""
+
+    matrix: NDArray[np.float64]
+    """(3, 3) camera matrix, integer pixel centers."""
+    world_to_camera: NDArray[np.float64]
+    """(4, 4), mm."""
+    reprojection: NDArray[np.float64]
+    """(4, 4) Q."""
+    version: int
+    is_turned: bool
+    """Whether the rotation of the rectification is known."""
+
+
+def _geometry(record: Path, geometry: Path, size: tuple[int, int]) -> _Geometry:
     about, stored = read_json(record, HINT), read_json(geometry, HINT)
     pose = read_matrix(record, about, "camera-pose", (4, 4))
     version = _version(geometry, stored)
     if version == 1:
-        intrinsics = read_matrix(record, about, "camera-calibration.KL", (3, 3))
         reprojection = read_matrix(geometry, stored, "reprojection-matrix", (4, 4))
+        focal, cx, cy = reprojection[2, 3], -reprojection[0, 3], -reprojection[1, 3]
+        matrix = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
+        rotation = _rectifying_rotation(record, about, size)
     else:
         rotation = read_matrix(geometry, stored, VERSION_2[0], (3, 3))
-        intrinsics = read_matrix(geometry, stored, VERSION_2[1], (3, 4))[:, :3]
+        matrix = read_matrix(geometry, stored, VERSION_2[1], (3, 4))[:, :3]
         reprojection = read_matrix(geometry, stored, VERSION_2[2], (4, 4))
         if stored.get("image_size", list(size)) != list(size):
             got = f"{stored['image_size']}"
             raise input_error(geometry, f"image_size {list(size)} like the image", got, HINT)
-        pose = np.block([[rotation, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]) @ pose
-    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
-        raise input_error(record, "focal lengths > 0 px", f"{intrinsics[0, 0]:g}, {intrinsics[1, 1]:g}", HINT)
-    return intrinsics, pose, reprojection, version
+    if min(matrix[0, 0], matrix[1, 1]) <= 0:
+        got = f"{matrix[0, 0]:g}, {matrix[1, 1]:g}"
+        raise input_error(geometry, "focal lengths > 0 px", got, HINT)
+    if rotation is not None:
+        pose[:3] = rotation @ pose[:3]
+    return _Geometry(matrix, pose, reprojection, version, rotation is not None)
+
+
+def _rectifying_rotation(record: Path, about: dict[str, Any], size: tuple[int, int]) -> NDArray[np.float64] | None:
+    """(3, 3) from axes of the raw left camera to those of the rectified one; None if the right camera is not known.
+
+    Bouguet's method, as `cv2.stereoRectify` has it: it follows from the pose of the right camera alone.
+    """
+    calibration = about.get("camera-calibration")
+    if not isinstance(calibration, dict) or any(key not in calibration for key in RAW_STEREO):
+        return None
+    left, right, turn = (read_matrix(record, about, f"camera-calibration.{key}", (3, 3)) for key in RAW_STEREO[:3])
+    flat = {"T": np.ravel(calibration["T"])[None].tolist()}  # in a row or in a column
+    shift = read_matrix(record, flat, "T", (1, 3))[0]
+    if not shift.any():
+        raise input_error(record, "a right camera beside the left one", "T of 0 mm", HINT)
+    return cv2.stereoRectify(left, None, right, None, size, turn, shift[:, None])[0]
 
 
 def _version(path: Path, stored: dict[str, Any]) -> int:
