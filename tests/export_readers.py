@@ -44,6 +44,40 @@ def read_spz(data: bytes) -> dict[str, np.ndarray]:
     }
 
 
+def read_compressed_ply(data: bytes) -> dict[str, np.ndarray]:
+    """Decode PlayCanvas' compressed PLY, in the order of the file."""
+    header, body = data.split(b"end_header\n", 1)
+    lines = header.decode().splitlines()
+    elements = {line.split()[1]: int(line.split()[2]) for line in lines if line.startswith("element")}
+    num, chunks = elements["vertex"], elements["chunk"]
+    assert chunks == -(-num // 256) and lines[1] == "format binary_little_endian 1.0"
+    ranges = np.frombuffer(body, "<f4", chunks * 18).reshape(chunks, 18)[np.arange(num) // 256].astype(float)
+    packed = np.frombuffer(body, "<u4", num * 4, chunks * 72).reshape(num, 4).astype(np.int64)
+    width = sum("f_rest" in line for line in lines)
+    rest = np.frombuffer(body, np.uint8, offset=chunks * 72 + num * 16).reshape(num, width)
+
+    def three(words, at):
+        shares = np.stack([(words >> 21) / 2047, (words >> 11 & 1023) / 1023, (words & 2047) / 2047], 1)
+        return ranges[:, at : at + 3] * (1 - shares) + ranges[:, at + 3 : at + 6] * shares
+
+    quats = np.zeros((num, 4))
+    for row, word in enumerate(packed[:, 1]):
+        others = np.array([(word >> shift & 1023) / 1023 - 0.5 for shift in (20, 10, 0)]) * np.sqrt(2)
+        kept = [i for i in range(4) if i != word >> 30]
+        quats[row, kept] = others
+        quats[row, word >> 30] = np.sqrt(max(0, 1 - (others**2).sum()))
+    color = np.stack([packed[:, 3] >> 24, packed[:, 3] >> 16 & 255, packed[:, 3] >> 8 & 255], 1) / 255
+    color = ranges[:, 12:15] * (1 - color) + ranges[:, 15:18] * color
+    return {
+        "means": three(packed[:, 0], 0),
+        "quats": quats,
+        "scales": np.exp(three(packed[:, 2], 6)),
+        "dc": (color - 0.5) / 0.28209479177387814,
+        "opacities": (packed[:, 3] & 255) / 255,
+        "rest": (rest * (8 / 255) - 4).reshape(num, 3, width // 3).transpose(0, 2, 1),
+    }
+
+
 def read_glb(data: bytes, folder: Path) -> tuple[GLTF2, dict[str, np.ndarray]]:
     """The document and the arrays of its only primitive."""
     file = folder / "a.glb"

@@ -83,7 +83,7 @@ def test_canonical_is_what_the_scene_stores(run, tmp_path):
     assert np.array_equal(positions(tmp_path / "b.ply"), scene.at(0.35).means.numpy())
 
 
-@pytest.mark.parametrize("name", ["ply", "splat", "spz", "gltf", "points"])
+@pytest.mark.parametrize("name", ["ply", "compressed_ply", "splat", "spz", "gltf", "points"])
 def test_scenes_where_nothing_but_the_centers_moves(tmp_path, name):
     """What no deformation touches is the trained tensor itself."""
     scene = moving_scene()
@@ -193,7 +193,12 @@ def test_a_name_without_a_known_suffix_lists_the_formats(run, tmp_path, capsys, 
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("a.ply", (), "{count} Gaussians; for colored points: --format points; for a mesh: --format mesh"),
+        (
+            "a.ply",
+            (),
+            "{count} Gaussians; for compressed Gaussians: --format compressed_ply; for colored points: --format points;"
+            " for a mesh: --format mesh",
+        ),
         ("a.glb", (), "{count} Gaussians; for a moving mesh: --format animation"),
         ("a.obj", (), "a mesh"),
         ("a.ply", ("--format", "mesh"), "a mesh"),

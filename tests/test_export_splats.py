@@ -7,13 +7,14 @@ import io
 import numpy as np
 import pytest
 import torch
-from export_readers import read_glb, read_splat, read_spz
+from export_readers import read_compressed_ply, read_glb, read_splat, read_spz
 from export_scenes import covariances, random_splats
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from endoprior.core.checks import InputError
 from endoprior.core.types import Splats
+from endoprior.export.compressed_ply import encode_compressed_ply
 from endoprior.export.gltf import encode_glb
 from endoprior.export.ply import encode_ply
 from endoprior.export.splat import encode_splat
@@ -117,6 +118,40 @@ def test_spz_of_a_large_scene_keeps_its_positions():
     assert found["bits"] == 9 and found["means"][0] == pytest.approx([9000, -8000, 5], abs=1 / 1024)
     with pytest.raises(InputError, match="finite"):
         encode_spz(one_splat(means=[[np.inf, 0.0, 0.0]]))
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_compressed_ply_within_its_precision(degree):
+    splats = random_splats(600, degree=degree)
+    found = read_compressed_ply(encode_compressed_ply(splats))
+    means = splats.means.numpy()
+    row = np.abs(found["means"][:, None] - means[None]).sum(-1).argmin(1)  # the file has another order
+    assert sorted(row) == list(range(600))
+    span = float(np.ptp(means, axis=0).max())
+    assert found["means"] == pytest.approx(means[row], abs=0.51 * span / 1023)
+    assert np.log(found["scales"]) == pytest.approx(splats.scales.log().numpy()[row], abs=0.01)
+    assert found["opacities"] == pytest.approx(splats.opacities.numpy()[row], abs=0.5 / 255 + 1e-6)
+    assert found["dc"] == pytest.approx(splats.sh[:, 0].numpy()[row], abs=0.03)
+    assert found["rest"] == pytest.approx(splats.sh[:, 1:].numpy()[row], abs=4 / 255 + 1e-6)
+    axes = np.array([[4.0, 2.0, 1.0]])
+    wanted = covariances(splats.quats.double().numpy()[row], axes)
+    assert covariances(found["quats"], axes) == pytest.approx(wanted, abs=0.06)
+
+
+def test_compressed_ply_of_one_and_of_none():
+    found = read_compressed_ply(encode_compressed_ply(one_splat(means=[[1.0, -2.0, 70.0]], opacities=[1.0])))
+    assert found["means"] == pytest.approx(np.array([[1, -2, 70]]), abs=1e-4) and found["opacities"] == [1]
+    nothing = Splats(**{name: value[:0] for name, value in one_splat().tensors.items()})
+    assert not len(read_compressed_ply(encode_compressed_ply(nothing))["means"])
+    with pytest.raises(InputError, match="finite"):
+        encode_compressed_ply(one_splat(means=[[np.nan, 0.0, 0.0]]))
+
+
+def test_neighbors_share_a_chunk_of_a_compressed_ply():
+    """Chunks of a curve are small; those of the order in the scene span everything."""
+    found = read_compressed_ply(encode_compressed_ply(random_splats(4096)))["means"]
+    volume = np.prod([np.ptp(part, axis=0) for part in found.reshape(16, 256, 3)], axis=1)
+    assert np.median(volume) < 0.2 * np.prod(np.ptp(found, axis=0))
 
 
 @pytest.mark.parametrize("degree", range(4))

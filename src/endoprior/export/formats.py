@@ -25,6 +25,7 @@ Progress = Callable[[int, int], None]
 
 FORMATS = (
     "ply",
+    "compressed_ply",
     "splat",
     "spz",
     "gltf",
