@@ -137,8 +137,8 @@ def test_the_slider_and_the_keys_choose_the_frame(scene, page, kept):
     after = picture(page, kept / "last.png")
     assert np.abs(after - before).mean() > 3
     assert np.abs(after - rendered(scene, (NUM_FRAMES - 1) / NUM_FRAMES)).mean() < 0.65
-    assert page.evaluate("counter.textContent + ', ' + seconds.textContent") == "Frame 6 / 6, 0.50 s"
-    assert page.evaluate("slider.getAttribute('aria-valuetext')") == "Frame 6 / 6, 0.50 s"
+    assert page.evaluate("counter.textContent + ', ' + seconds.textContent") == "Frame 5 of 6, 0.50 s"
+    assert page.evaluate("slider.getAttribute('aria-valuetext')") == "Frame 5 of 6, 0.50 s"
     page.press("ArrowLeft")
     settle(page, NUM_FRAMES - 2)
     page.press("Home")
@@ -226,7 +226,7 @@ def test_one_frame_is_a_still(scene, browser, kept):
     assert browser.evaluate("[slider.disabled, play.disabled, counter.textContent, seconds.textContent]") == [
         True,
         True,
-        "Frame 1 / 1",
+        "Frame 0 of 1",
         "0.30 s",
     ]
     browser.press(" ")

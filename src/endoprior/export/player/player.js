@@ -135,7 +135,7 @@ function advance(seconds) {
 }
 
 function tellWhere() {
-  const counter = `Frame ${state.frame + 1} / ${numFrames}`;
+  const counter = `Frame ${state.frame} of ${numFrames}`; // from 0, as every command and the viewer count
   const seconds = `${about.seconds[state.frame].toFixed(2)} s`;
   byId("counter").textContent = counter;
   byId("seconds").textContent = seconds;
