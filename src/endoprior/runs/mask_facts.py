@@ -1,4 +1,4 @@
-"""What a training found out about tool masks: how far tools color the pixels around them, and where they miss a tool."""
+"""What a training found out about tool masks: how far tools color pixels around them, and where they miss a tool."""
 
 from __future__ import annotations
 
