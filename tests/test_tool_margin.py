@@ -130,6 +130,8 @@ def test_what_lies_beyond_the_view_does_not_count():
     one, other = (reach_of(some, tissue, view) for some in (images, poisoned))
     assert one.margin_px == other.margin_px == 0 and one.num_points == other.num_points > LEAST_POINTS
     assert np.array_equal(one.shares, other.shares)
+    view[:, EDGE + 10 :] = False  # now every normal leaves the view
+    assert reach_of(images, tissue, view).num_points == 0
 
 
 @pytest.mark.parametrize(
