@@ -111,8 +111,9 @@ def test_a_shadow_beside_a_dark_tool_is_no_tool():
 
 def test_where_nothing_can_be_measured_no_margin_is_made():
     tissue = tissue_from(EDGE - 3)
-    gray = as_u8(np.full((*tissue.shape, 3), 90) + np.random.default_rng(0).normal(0, 3, (*tissue.shape, 3)))
-    for images, masks in (([gray], tissue), (several(), np.ones_like(tissue)), (several(), np.zeros_like(tissue))):
+    faint = np.full((*tissue.shape, 3), 100, np.uint8)
+    faint[:, :EDGE] += 10  # 17 levels away
+    for images, masks in (([faint] * 4, tissue), (several(), tissue | True), (several(), tissue & False)):
         reach = reach_of(images, masks)
         assert reach.num_points < LEAST_POINTS and reach.margin_px == 0 and not reach.shares.any()
     assert color_reach([], tissue).margin_px == 0
