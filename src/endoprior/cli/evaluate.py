@@ -118,14 +118,13 @@ def evaluate_run(
     from ..data import load_sequence
     from ..evaluation.scoring import evaluate, scored_data
     from ..runs.growth import growth_of
-    from ..runs.missed_tools import KEY, missed_tools_of
+    from ..runs.mask_facts import mask_facts
 
     sequence = load_sequence(data, scored_data(scene.config.data))
     result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir, protocols=protocols)
     growth = growth_of(run)
     result.scores |= extra | ({"gaussians_growth": growth.ratio} if growth else {})
-    if (missed := missed_tools_of(run)) is not None:
-        result.protocol[KEY] = missed
+    result.protocol |= mask_facts(run)
     save_and_print(result, sequence, out, split, run)
 
 

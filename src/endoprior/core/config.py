@@ -178,6 +178,8 @@ class LossConfig(Checked):
     """Weight of the distance to the tracks of `init.motion flow`, where the flow found them; 0 switches it off."""
     trust_masks: bool = True
     """Tool masks are right. If not, and a program found them, what looks like a missed tool is left out."""
+    tool_margin: Literal["none", "measured"] = "none"
+    """`measured`: as many pixels around tools are left out as their color reaches beyond the masks, on this clip."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal, Protocol, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
@@ -218,8 +219,17 @@ class FrameSequence:
 
     def without_masks(self) -> FrameSequence:
         """This sequence with its masks hidden: every pixel counts as tissue."""
+        return self.with_tissue(lambda frame: np.ones_like(frame.tissue_mask))
+
+    def with_tissue(self, tissue_of: Callable[[Frame], NDArray[np.bool_]]) -> FrameSequence:
+        """This sequence with other tissue masks: `tissue_of` gives that of a frame, (H, W), from the frame as it is."""
+
+        def read(index: int) -> Frame:
+            frame = self._read_frame(index)
+            return replace(frame, tissue_mask=tissue_of(frame))
+
         view = copy(self)
-        view._read_frame = lambda index: _all_tissue(self._read_frame(index))
+        view._read_frame = read
         view._cache = BoundedCache(cache_bytes(), _frame_bytes)
         return view
 
@@ -277,10 +287,6 @@ class FrameSequence:
         if empty:
             remarks.append(f"{self.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")
         return remarks
-
-
-def _all_tissue(frame: Frame) -> Frame:
-    return replace(frame, tissue_mask=np.ones_like(frame.tissue_mask))
 
 
 def _contents(frame: Frame) -> tuple[float, bool, bool]:

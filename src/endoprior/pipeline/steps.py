@@ -23,7 +23,7 @@ from ..model.scene_file import load_scene
 from ..prepare import prepare
 from ..prepare.pipeline import Progress
 from ..runs.folder import CHECKPOINT, CONFIG
-from ..runs.missed_tools import KEY, missed_tools_of
+from ..runs.mask_facts import mask_facts
 from ..runs.report import write_report
 from ..runs.train import start_run
 from ..runs.training_run import TrainingRun
@@ -124,8 +124,7 @@ def _score(job: SequenceJob, progress: Progress) -> list[str]:
     scene = load_scene(job.run)
     sequence = _frames_of(job, scene.config)
     result = evaluate(scene, sequence, networks=False)
-    if (missed := missed_tools_of(job.run)) is not None:
-        result.protocol[KEY] = missed
+    result.protocol |= mask_facts(job.run)
     result.save(job.run)
     write_report(scene, sequence, job.run, job.report, PREVIEW_TITLE if job.is_preview else "")
     known = [all_scores()[name] for name in SHOWN_SCORES if name in result.scores]

@@ -14,6 +14,7 @@ from ..model.scene import RenderedScene
 from ..system.atomic import write_json, writing
 from ..system.file_lock import locked
 from ..system.heap import freed_memory_kept
+from ..tool_masks.margin import with_tool_margin
 from ..training.divergence import Diverged
 from ..training.memory_check import reject_too_large
 from ..training.trainer import Observer
@@ -22,6 +23,7 @@ from .checkpoint import load_checkpoint, save_checkpoint
 from .folder import CHECKPOINT, CONFIG, LOCK, LOG, SCENE, prepare_run_folder, reject_unusable_folder
 from .identity import reject_other_start
 from .interrupt import deferred_interrupt
+from .mask_facts import MARGIN, margin_note
 from .observers import CHECKPOINT_SECONDS, CheckpointWriter, LogWriter, cut_log
 from .provenance import run_facts
 
@@ -55,6 +57,11 @@ class TrainingRun:
         reject_too_large(sequence, cfg)
         kernel_cache.fill(cfg, say)
         say(f"{sequence.path}: {len(sequence)} frames; backend {cfg.render.backend}")
+        self.tool_margin_px: int | None = None
+        """Pixels around tool masks that are left out; None where that was not asked."""
+        if cfg.loss.tool_margin == "measured":
+            sequence, self.tool_margin_px = with_tool_margin(sequence)
+            say(margin_note(self.tool_margin_px))
         for warning in sequence.validate():
             say(f"note: {warning}")
         self.trainer = method_of(cfg).trainer(sequence, cfg)
@@ -92,7 +99,8 @@ class TrainingRun:
             reject_other_start(about, trainer.cfg, fingerprint, trainer.sequence.path)
         elif self.resume:
             raise InputError(f"{checkpoint}: expected a checkpoint to resume from; found none. Start without --resume.")
-        write_json(about, run_facts(trainer.sequence, trainer.cfg, fingerprint))
+        facts = run_facts(trainer.sequence, trainer.cfg, fingerprint)
+        write_json(about, facts if self.tool_margin_px is None else facts | {MARGIN: self.tool_margin_px})
         if trainer.state is None:
             trainer.start()
         cut_log(out / LOG, trainer.state.stage, trainer.state.iteration)
