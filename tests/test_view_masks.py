@@ -209,11 +209,9 @@ def test_a_click_finds_a_tool_in_all_frames_over_the_protocol(tiny_sequence, cap
         client.set(panel.find, False)
         client.click(0.3, 0.3)  # paints again
         wait_until(lambda: edits.unsaved == [0])
-        painted = np.argwhere(edits.tool(0) & ~before)[0]
         client.set(panel.find, True)
-        client.click((painted[1] + 0.5) / width, 0.3)
         client.click(0.3, 0.3)
-        wait_until(lambda: "a masked pixel" in "".join(capfd.readouterr().err))
+        wait_until(lambda: "a masked pixel" in capfd.readouterr().err)
         assert client.connected and edits.unsaved == [0]
         client.socket.close()
 

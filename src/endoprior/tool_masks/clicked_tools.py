@@ -20,11 +20,13 @@ from .examples import Classifier, Examples, clicked_region, examples_of, fit
 from .feature_maps import feature_map
 from .finder import ToolFinder, full_size, network_image, small_view
 from .logistic import probability
-from .regions import disk, tool_regions
+from .regions import tool_regions
 from .sequence import SAMPLES, view_of
 
 TAUGHT = 12
 """Number of frames, besides the clicked ones, from which examples are taken."""
+LEAST_PART_PX = 12
+"""Smaller parts are left out: single pixels of the rims of known tools, which would change the masks of all frames."""
 Mask = NDArray[np.bool_]
 
 
@@ -125,15 +127,18 @@ def _steps(
 def found_parts(features: NDArray[np.float32], view: Mask, known: Mask, classifier: Classifier) -> Mask:
     """(h, w) what the classifier finds beside the known tools of a frame.
 
-    Known tools count as certain, so that a part which touches one enters the view with it. Their rim is no part: what
-    is thinner than 3 px is left out.
+    Known tools count as certain, so that a part which touches one enters the view with it.
 
     Args:
         features: (h, w, k).
         view, known: (h, w) True inside the endoscope's image, and on tools that are masked.
     """
     found = np.where(known, 1, probability(classifier.log_odds(features)) * view).astype(np.float32)
-    return cv2.morphologyEx((tool_regions(found, view) & ~known).astype(np.uint8), cv2.MORPH_OPEN, disk(1)) > 0
+    parts = (tool_regions(found, view) & ~known).astype(np.uint8)
+    _, label, stats, _ = cv2.connectedComponentsWithStats(parts, connectivity=8)
+    keep = stats[:, cv2.CC_STAT_AREA] >= LEAST_PART_PX
+    keep[0] = False
+    return keep[label]
 
 
 def _look(
