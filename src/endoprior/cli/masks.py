@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
@@ -138,7 +138,7 @@ def _add_clicked(args: Masks) -> None:
         replace_masks(sequence, masks)
     write_png(args.data / SHEET, mask_sheet(pictures, COLUMNS, WIDTH_PX))
     if rows := read_rows(args.data):
-        write_rows(args.data, [replace(row, share=min(row.share + changed.get(row.frame, 0), 1)) for row in rows])
+        write_rows(args.data, [row.with_added(changed.get(row.frame, 0.0)) for row in rows])
     frames = [i for i, share in changed.items() if share]
     say(f"added in {len(frames)} of {len(sequence)} frames, at most {max(changed.values(), default=0):.1%} of a frame")
     if frames:
