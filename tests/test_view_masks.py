@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,6 +16,8 @@ from endoprior.core.checks import InputError
 from endoprior.data import load_sequence, mask_writing
 from endoprior.tool_masks.clicked_tools import SearchStep, ToolClick, check_clicks
 from endoprior.view import layers
+from endoprior.view.job_queue import JobQueue
+from endoprior.view.mask_editor import MaskEditor
 from endoprior.view.mask_edits import MaskEdits, stroke
 from endoprior.view.server import Viewer
 from endoprior.view.view_settings import ViewSettings
@@ -216,27 +219,50 @@ def test_a_click_finds_a_tool_in_all_frames_over_the_protocol(tiny_sequence, cap
         client.socket.close()
 
 
-def test_between_two_frames_of_a_search_other_jobs_run_and_undo_stops_it(tiny_sequence, monkeypatch):
-    viewable, _ = open_viewable(tiny_sequence, None)
+def test_between_two_frames_of_a_search_other_jobs_run_and_undo_stops_it(edits, monkeypatch):
     found_in(monkeypatch, {0: np.s_[5:9, 5:9]}, [])
-    viewer = Viewer(viewable)
-    try:
-        viewer._editor.find(0, (3.0, 3.0))
-        assert "1 of" in viewer.panel.corrected.content
-        viewer.work()
-        assert "2 of" in viewer.panel.corrected.content  # one frame a turn, then the page is drawn
-        viewer._editor.undo()
-        for _ in range(3):
-            viewer.work()
-        assert viewer.panel.corrected.content == "Stopped." and viewable.mask_edits.unsaved == []
-        viewer._editor.find(0, (3.0, 3.0))
-        viewer._editor.find(0, (3.0, 3.0))  # takes the place of the first
-        for _ in range(2 * len(viewable.cameras)):
-            viewer.work()
-        assert viewable.mask_edits.unsaved == [0]
-        assert viewable.mask_edits.undo() and not viewable.mask_edits.undo()
-    finally:
-        viewer.close()
+    jobs, controls, turns = JobQueue(), SimpleNamespace(corrected=SimpleNamespace(content="")), []
+    editor = MaskEditor(edits, controls, None, jobs, lambda client, screen: None, lambda: None)
+
+    def work() -> None:
+        """One turn of the viewer: it draws after it."""
+        for job in jobs.take(0):
+            job()
+            turns.append(controls.corrected.content)
+
+    editor.find(0, (3.0, 3.0))
+    jobs.put(lambda: None)  # a browser asks for something
+    assert "1 of" in controls.corrected.content
+    work()
+    assert len(turns) == 2 and "2 of" in turns[-1]  # one frame of the search, and what the browser asked for
+    editor.undo()
+    for _ in range(3):
+        work()
+    assert controls.corrected.content == "Stopped." and edits.unsaved == []
+    editor.find(0, (3.0, 3.0))
+    editor.find(0, (3.0, 3.0))  # takes the place of the first
+    while "Found in frame 0." not in controls.corrected.content:
+        work()
+    work()
+    assert edits.unsaved == [0] and not jobs.take(0)
+    assert edits.undo() and not edits.undo()
+
+
+def test_an_error_ends_a_search(edits, monkeypatch):
+    jobs, controls = JobQueue(), SimpleNamespace(corrected=SimpleNamespace(content=""))
+    editor = MaskEditor(edits, controls, None, jobs, lambda client, screen: None, lambda: None)
+
+    def broken(*args):
+        yield SearchStep(1, 9)
+        raise OSError("no such frame")
+
+    monkeypatch.setattr("endoprior.view.mask_edits.find_clicked", broken)
+    editor.find(0, (3.0, 3.0))
+    with pytest.raises(OSError, match="no such frame"):
+        [job() for job in jobs.take(0)]
+    assert controls.corrected.content == "" and not jobs.take(0)
+    editor.undo()
+    assert controls.corrected.content == "Nothing to undo."
 
 
 def test_painting_carrying_undoing_and_saving_over_the_protocol(tiny_sequence, capfd):
