@@ -25,8 +25,8 @@ from .sequence import SAMPLES, view_of
 
 TAUGHT = 12
 """Number of frames, besides the clicked ones, from which examples are taken."""
-LEAST_PART_PX = 12
-"""Smaller parts are left out: single pixels of the rims of known tools, which would change the masks of all frames."""
+LEAST_PART_PX = 30
+"""Smaller parts are left out: pieces of the rims of known tools, which would change the masks of all frames."""
 Mask = NDArray[np.bool_]
 
 
