@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,7 +14,10 @@ from view_client import Client, at_work
 from endoprior.cli.view import open_viewable
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence, mask_writing
+from endoprior.tool_masks.clicked_tools import SearchStep, ToolClick, check_clicks
 from endoprior.view import layers
+from endoprior.view.job_queue import JobQueue
+from endoprior.view.mask_editor import MaskEditor
 from endoprior.view.mask_edits import MaskEdits, stroke
 from endoprior.view.server import Viewer
 from endoprior.view.view_settings import ViewSettings
@@ -153,6 +157,112 @@ def test_only_folders_with_mask_files_can_be_corrected(tiny_sequence):
     viewable = ViewableSequence(load_sequence(tiny_sequence))
     assert viewable.mask_edits is None
     Viewer(viewable).close()
+
+
+def found_in(monkeypatch, frames: dict[int, tuple[slice, slice]], clicks: list) -> None:
+    """Replace the search by one that finds a box in these frames."""
+
+    def steps(sequence, click, tool, finder=None):
+        check_clicks(sequence, click, tool)
+        clicks.extend(click)
+        return one_by_one(sequence, tool)
+
+    def one_by_one(sequence, tool):
+        total = len(sequence)
+        for i in range(total):
+            added = np.zeros(tool(i).shape, bool)
+            if i in frames:
+                added[frames[i]] = True
+            yield SearchStep(i + 1, total, i, added)
+
+    monkeypatch.setattr("endoprior.view.mask_edits.find_clicked", steps)
+
+
+def test_a_search_is_one_edit_that_can_be_undone_and_saved(edits, monkeypatch, tiny_sequence):
+    found_in(monkeypatch, {1: np.s_[5:9, 5:9], 3: np.s_[5:9, 30:35]}, [])
+    before = [edits.tool(i) for i in range(4)]
+    steps = list(edits.find(ToolClick(1, 6, 6)))
+    assert edits.unsaved == []  # searching changes nothing
+    edits.add({step.frame: step.added for step in steps if step.added.any()})
+    assert edits.unsaved == [1, 3] and edits.tool(3)[6, 32] and (edits.tool(1) >= before[1]).all()
+    assert edits.undo() and edits.unsaved == [] and not edits.undo()
+    edits.add({3: steps[3].added})
+    assert edits.save() == [3] and tool(tiny_sequence / "masks", "000003.png")[6, 32]
+
+
+def test_a_click_finds_a_tool_in_all_frames_over_the_protocol(tiny_sequence, capfd, monkeypatch):
+    viewable, _ = open_viewable(tiny_sequence, None)
+    clicks: list = []
+    found_in(monkeypatch, {0: np.s_[5:9, 5:9], 2: np.s_[5:9, 30:35]}, clicks)
+    with at_work(Viewer(viewable)) as viewer:
+        panel, edits = viewer.panel, viewable.mask_edits
+        client = Client(viewer.port)
+        client.send_camera()
+        client.set(panel.correct, True)
+        client.set(panel.find, True)
+        client.image()
+        before = edits.tool(0)
+        client.click(0.3, 0.3)
+        wait_until(lambda: "Found in frames 0, 2." in panel.corrected.content)
+        height, width = before.shape
+        assert (clicks[0].frame, clicks[0].x) == (0, pytest.approx(0.3 * width, abs=2)) and clicks[0].y < 0.4 * height
+        assert edits.unsaved == [0, 2] and edits.tool(2)[6, 32] and "Not saved" in panel.corrected.content
+        client.set(panel.undo, True)
+        wait_until(lambda: not edits.unsaved)
+        client.set(panel.find, False)
+        client.click(0.3, 0.3)  # paints again
+        wait_until(lambda: edits.unsaved == [0])
+        client.set(panel.find, True)
+        client.click(0.3, 0.3)
+        wait_until(lambda: "a masked pixel" in capfd.readouterr().err)
+        assert client.connected and edits.unsaved == [0]
+        client.socket.close()
+
+
+def test_between_two_frames_of_a_search_other_jobs_run_and_undo_stops_it(edits, monkeypatch):
+    found_in(monkeypatch, {0: np.s_[5:9, 5:9]}, [])
+    jobs, controls, turns = JobQueue(), SimpleNamespace(corrected=SimpleNamespace(content="")), []
+    editor = MaskEditor(edits, controls, None, jobs, lambda client, screen: None, lambda: None)
+
+    def work() -> None:
+        """One turn of the viewer: it draws after it."""
+        for job in jobs.take(0):
+            job()
+            turns.append(controls.corrected.content)
+
+    editor.find(0, (3.0, 3.0))
+    jobs.put(lambda: None)  # a browser asks for something
+    assert "1 of" in controls.corrected.content
+    work()
+    assert len(turns) == 2 and "2 of" in turns[-1]  # one frame of the search, and what the browser asked for
+    editor.undo()
+    for _ in range(3):
+        work()
+    assert controls.corrected.content == "Stopped." and edits.unsaved == []
+    editor.find(0, (3.0, 3.0))
+    editor.find(0, (3.0, 3.0))  # takes the place of the first
+    while "Found in frame 0." not in controls.corrected.content:
+        work()
+    work()
+    assert edits.unsaved == [0] and not jobs.take(0)
+    assert edits.undo() and not edits.undo()
+
+
+def test_an_error_ends_a_search(edits, monkeypatch):
+    jobs, controls = JobQueue(), SimpleNamespace(corrected=SimpleNamespace(content=""))
+    editor = MaskEditor(edits, controls, None, jobs, lambda client, screen: None, lambda: None)
+
+    def broken(*args):
+        yield SearchStep(1, 9)
+        raise OSError("no such frame")
+
+    monkeypatch.setattr("endoprior.view.mask_edits.find_clicked", broken)
+    editor.find(0, (3.0, 3.0))
+    with pytest.raises(OSError, match="no such frame"):
+        [job() for job in jobs.take(0)]
+    assert controls.corrected.content == "" and not jobs.take(0)
+    editor.undo()
+    assert controls.corrected.content == "Nothing to undo."
 
 
 def test_painting_carrying_undoing_and_saving_over_the_protocol(tiny_sequence, capfd):

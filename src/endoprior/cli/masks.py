@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ..core.checks import number_ranges
+from ..core.checks import input_error, number_ranges
 from ..core.shell import command
 from ..core.spread import spread
 from ..system.console import say
@@ -49,14 +49,26 @@ class Masks:
     segmenter: Annotated[str | None, tyro.conf.arg(name="with", metavar="SEGMENTER")] = None
     """`sam2`: SAM 2 follows the tools that are found first through the video. A folder of its weights, or the name of a
     model, may follow after a colon."""
+    tool: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FRAME,X,Y ...")] = ()
+    """Points on tools that the masks of DATA miss: the frame, from 0, and px of the image. Such tools are found in all
+    frames; pixels are only added."""
 
 
-HELP = Help(examples=(("DATA",), ("DATA", "--refine"), ("DATA", "--with", "sam2")))
+HELP = Help(examples=(("DATA",), ("DATA", "--refine"), ("DATA", "--with", "sam2"), ("DATA", "--tool", "12,310,205")))
 
 
 def run(argv: list[str]) -> None:
     """Find tools and write their masks."""
     args = parse(Masks, argv, "masks", HELP)
+    if args.tool:
+        _add_clicked(args)
+    else:
+        _find_all(args)
+    say(f"look at {args.data / SHEET}; correct masks: {command('view', args.data)}")
+
+
+def _find_all(args: Masks) -> None:
+    """Find the tools of every frame."""
     from ..core.config import DataConfig
     from ..data import load_sequence
     from ..data.found_tools import FrameRow, uncertain_frames, write_rows
@@ -88,7 +100,49 @@ def run(argv: list[str]) -> None:
     say(f"tools in {len(with_tools)} of {len(rows)} frames, at most {max(row.share for row in rows):.1%} of a frame")
     if uncertain := uncertain_frames(rows):
         say(f"uncertain: frames {number_ranges(uncertain)}")
-    say(f"look at {args.data / SHEET}; correct masks: {command('view', args.data)}")
+
+
+def _add_clicked(args: Masks) -> None:
+    """Add the tools at the points of `--tool` to the masks of all frames."""
+    if args.refine or args.segmenter is not None:
+        other = "--refine" if args.refine else "--with"
+        raise input_error("--tool", f"no {other}", other, f"Find the tools first: `endoprior masks DATA {other}`.")
+    from ..core.config import DataConfig
+    from ..data import load_sequence
+    from ..data.found_tools import read_rows, write_rows
+    from ..data.mask_writing import replace_masks, writable_masks
+    from ..tool_masks.clicked_tools import find_clicked, parse_click
+    from ..tool_masks.mask_store import MaskStore
+    from ..visualization.image_tools import write_png
+    from ..visualization.mask_sheet import mask_sheet
+
+    sequence = load_sequence(args.data, DataConfig())
+    writable_masks(sequence)
+    clicks = [parse_click(text, "--tool") for text in args.tool]
+    shown = {*spread(len(sequence), SHOWN), *(click.frame for click in clicks)}
+    changed, pictures = dict[int, float](), []
+    with TemporaryDirectory(prefix="endoprior-") as work, Counting() as progress:
+        camera = sequence.camera(0)
+        masks = MaskStore(Path(work), (camera.width, camera.height))
+        for step in find_clicked(sequence, clicks, lambda i: ~sequence.frame(i).tissue_mask):
+            progress("finding the tool", step.done, step.total)
+            if step.added is None:
+                continue
+            i, frame = step.frame, sequence.frame(step.frame)
+            mask = ~frame.tissue_mask | step.added
+            if step.added.any() or not sequence.mask_files:
+                masks.put(i, mask)
+                changed[i] = float(step.added.mean())
+            if i in shown:
+                pictures.append((frame.rgb_u8, mask, f"{i}: +{step.added.mean():.1%}"))
+        replace_masks(sequence, masks)
+    write_png(args.data / SHEET, mask_sheet(pictures, COLUMNS, WIDTH_PX))
+    if rows := read_rows(args.data):
+        write_rows(args.data, [row.with_added(changed.get(row.frame, 0.0)) for row in rows])
+    frames = [i for i, share in changed.items() if share]
+    say(f"added in {len(frames)} of {len(sequence)} frames, at most {max(changed.values(), default=0):.1%} of a frame")
+    if frames:
+        say(f"changed: frames {number_ranges(frames)}")
 
 
 def _found(

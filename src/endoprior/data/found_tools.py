@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,16 +48,22 @@ class FrameRow:
     """Of the image that is tool, 0..1."""
     confidence: float
     """As in `FoundTools`."""
+    moves_unmasked: bool = False
+    """Whether something enters the view and moves that the mask does not cover; stored only where it is True."""
 
     @classmethod
     def of(cls, frame: int, found: FoundTools) -> FrameRow:
         """The row of a frame in which `found` was found."""
         return cls(frame, float(found.mask.mean()), float(found.confidence))
 
+    def with_added(self, share: float) -> FrameRow:
+        """The row when a share of the image, 0..1, is added to the mask."""
+        return replace(self, share=min(self.share + share, 1.0), moves_unmasked=self.moves_unmasked and not share)
+
 
 def write_rows(folder: Path, rows: Iterable[FrameRow]) -> None:
     """Write the rows of a sequence folder."""
-    write_json(folder / FILE, [asdict(row) for row in rows])
+    write_json(folder / FILE, [_stored(row) for row in rows])
 
 
 def read_rows(folder: Path) -> list[FrameRow]:
@@ -79,6 +85,17 @@ def drop_rows(folder: Path, frames: Iterable[int]) -> None:
     corrected = set(frames)
     if rows := read_rows(folder):
         write_rows(folder, [row for row in rows if row.frame not in corrected])
+
+
+def mark_moving(folder: Path, frames: Iterable[int]) -> None:
+    """Note the frames in which something moves that no mask covers.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    moving = set(frames)
+    if moving and (rows := read_rows(folder)):
+        write_rows(folder, [replace(row, moves_unmasked=row.frame in moving) for row in rows])
 
 
 def uncertain_frames(rows: Iterable[FrameRow]) -> list[int]:
@@ -135,7 +152,11 @@ class RowLog:
 
 
 def _line(row: FrameRow) -> str:
-    return json.dumps(asdict(row)) + "\n"
+    return json.dumps(_stored(row)) + "\n"
+
+
+def _stored(row: FrameRow) -> dict[str, Any]:
+    return {name: value for name, value in asdict(row).items() if name != "moves_unmasked" or value}
 
 
 def _entries(file: Path) -> list[Any]:
@@ -154,6 +175,7 @@ def _row(file: Path, value: Any) -> FrameRow:
     try:
         row = FrameRow(**value)
         usable = type(row.frame) is int and row.frame >= 0 and 0 <= row.share <= 1 and 0 <= row.confidence <= 1
+        usable = usable and isinstance(row.moves_unmasked, bool)
     except TypeError:
         usable = False
     if not usable:

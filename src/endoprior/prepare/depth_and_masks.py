@@ -68,8 +68,7 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
     """
     geometry, step = first_pass.geometry, max(len(first_pass.samples) // FITTED_SAMPLES, 1)
     samples = []
-    for sampled in first_pass.samples[::step]:
-        frame = sampled.frame
+    for frame in first_pass.samples[::step]:
         right = None if frame.right is None else geometry.image(frame.right, right=True)
         samples.append(MeasuredFrame(0, frame.index, geometry.image(frame.left), right, None))
     notes = _check_stereo(samples, geometry, clip) if clip.stereo else []

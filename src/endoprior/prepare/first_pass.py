@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..data.reading import kind_of
 from ..footage.border import Circle, Strips, find_outline
-from ..footage.optical_flow import MOTION_S
 from ..footage.overlays import find_static_overlays
 from ..footage.round_border import CERTAIN
 from .calibration import Calibration
 from .config import PrepareConfig, Rectangle, parse_rectangle
 from .frame_geometry import FrameGeometry, demand_within, make_geometry
 from .source import ImageFolder
-from .video_clip import Clip, EvenSample, SampledFrame
+from .video_clip import Clip, EvenSample, StereoFrame
 
 SAMPLES = 24
 """Number of frames used to detect borders, labels, tools and lighting."""
@@ -31,7 +30,7 @@ class FirstPass:
 
     indices: list[int]
     """Positions of the selected frames in the source."""
-    samples: list[SampledFrame]
+    samples: list[StereoFrame]
     """At most `SAMPLES` of them, evenly spaced."""
     geometry: FrameGeometry
     notes: list[str] = field(default_factory=list)
@@ -49,7 +48,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         InputError: too few or too many frames, or a file is damaged.
     """
     selection = clip.selection()
-    sample = EvenSample(SAMPLES, ahead=max(1, round(MOTION_S * clip.frames_per_second)))
+    sample = EvenSample(SAMPLES)
     indices: list[int] = []
     path = str(clip.source.path)
     for stereo_frame in clip.stereo_frames(selection):
@@ -62,7 +61,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
     if len(indices) < 2:
         hint = "Check --start, --end and --frames-per-second."
         raise input_error(path, "at least 2 frames in the selection", str(len(indices)), hint)
-    lefts = [sampled.frame.left for sampled in sample.kept]
+    lefts = [frame.left for frame in sample.kept]
     notes = [source.note for source in (clip.source, clip.second) if source and source.note]
     notes += _timing_notes(selection.gaps, selection.uneven_steps, len(indices))
     strips = circle = outside = None

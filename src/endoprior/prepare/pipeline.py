@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.checks import input_error, number_ranges
 from ..core.shell import command
 from ..data import write_stir_tracks
-from ..data.found_tools import FrameRow, RowLog, read_rows, uncertain_frames
+from ..data.found_tools import FrameRow, RowLog, mark_moving, read_rows, uncertain_frames
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
@@ -35,6 +35,7 @@ from .frame_geometry import FrameGeometry
 from .frames import write_frames
 from .record import record_of
 from .sam2 import is_sam2, open_sam2
+from .unmasked_motion import frames_with_unmasked_motion
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
@@ -107,6 +108,8 @@ def prepare(
 
             inside, shade = first_pass.geometry.inside, chosen.methods.shade
             carried_notes = replace_by_carried(files, segmenter, inside, shade, progress)
+        moving = _unmasked(files, first_pass.geometry.inside) if chosen.finds_tools or segmenter is not None else []
+        mark_moving(folder, moving)
         progress("following the camera", 0, files.count)
         path, motion_notes = _camera_path(cfg, files, lambda done: progress("following the camera", done, files.count))
         unexplained = unexplained_frames(path, (read_color(files.file("images", i)) for i in range(files.count)))
@@ -129,10 +132,24 @@ def prepare(
         if uncertain := uncertain_frames(read_rows(folder)):
             frames = number_ranges(uncertain)
             notes.append(f"masks: unsure in frames {frames}. To look and correct: {command('view', out)}")
+        if moving:
+            what = f"in frames {number_ranges(moving)}, something moves that no mask covers"
+            notes.append(f"masks: tools are likely missed: {what}. To look and correct: {command('view', out)}")
         if unexplained:
             frames = number_ranges(unexplained)
             notes.append(f"no camera pose, or another scene, in frames {frames}; --start and --end can leave them out")
     return Prepared(out, files.count, first_pass.geometry.size, notes)
+
+
+def _unmasked(files: FrameFiles, inside: NDArray[np.bool_]) -> list[int]:
+    """Written frames in which something moves that no mask covers."""
+    return frames_with_unmasked_motion(
+        files.count,
+        files.meta.frames_per_second,
+        lambda i: read_color(files.file("images", i)),
+        lambda i: read_tool_mask(files.file("masks", i)),
+        inside,
+    )
 
 
 def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, calibrated: bool) -> SequenceMeta:

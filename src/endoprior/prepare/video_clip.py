@@ -99,33 +99,19 @@ class Clip:
         return StereoFrame(image.index, first, second)
 
 
-@dataclass
-class SampledFrame:
-    """A frame of the sample, and one a little later, which shows its motion."""
-
-    frame: StereoFrame
-    later: NDArray[np.uint8] | None
-    """(h, w, 3) left image, None if the stream ends before."""
-    later_at: int
-    """Position of the later frame in the stream."""
-
-
 class EvenSample:
     """Keeps a few frames, evenly spaced, of a stream of unknown length."""
 
-    def __init__(self, most: int, ahead: int) -> None:
-        """Args: most: number of frames to keep; at least half of it for a long stream. ahead: of the later frames."""
-        self.kept: list[SampledFrame] = []
-        self._most, self._ahead, self._step, self._seen = most, ahead, 1, 0
+    def __init__(self, most: int) -> None:
+        """Args: most: number of frames to keep; at least half of it for a long stream."""
+        self.kept: list[StereoFrame] = []
+        self._most, self._step, self._seen = most, 1, 0
 
     def add(self, stereo_frame: StereoFrame) -> None:
         """Add the next frame of the stream."""
-        for sampled in self.kept:
-            if sampled.later_at == self._seen:
-                sampled.later = stereo_frame.left
         if self._seen % self._step == 0:
             if len(self.kept) == self._most:
                 self.kept, self._step = self.kept[::2], 2 * self._step
             if self._seen % self._step == 0:
-                self.kept.append(SampledFrame(stereo_frame, None, self._seen + self._ahead))
+                self.kept.append(stereo_frame)
         self._seen += 1

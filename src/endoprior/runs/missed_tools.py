@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from ..core.checks import number_ranges
+from ..core.checks import InputError, number_ranges
 from ..core.shell import command
+from ..data.found_tools import read_rows
 from .folder import CONFIG, LOG
 
 KEY = "missed_tool_frames"
@@ -30,12 +31,24 @@ def missed_tools_of(run: Path) -> list[int] | None:
 
 
 def missed_tools_line(run: Path, data: Path) -> str:
-    """What to tell the user of a run on the sequence folder `data`; empty if nothing is likely missed."""
-    frames = missed_tools_of(run)
+    """What to tell the user of a run on the sequence folder `data`; empty if nothing is likely missed.
+
+    It names the frames in which `prepare` saw something move that no mask covers, too; none where training trusted the
+    masks.
+    """
+    met = missed_tools_of(run)
+    frames = [] if met is None else sorted({*met, *_moving(data)})
     if not frames:
         return ""
     words = f"frame{'s' if len(frames) > 1 else ''} {number_ranges(frames)}"
     return f"Tools are likely missed in {words}. To look and correct: `{command('view', data)}`, then train again."
+
+
+def _moving(data: Path) -> list[int]:
+    try:
+        return [row.frame for row in read_rows(data) if row.moves_unmasked]
+    except InputError:  # training is done; a damaged list must not look like its failure
+        return []
 
 
 def _window_starts(run: Path) -> list[int]:

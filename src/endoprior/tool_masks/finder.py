@@ -43,10 +43,8 @@ class ToolFinder:
         Raises:
             ValueError: shapes that do not match.
         """
-        check_shape("rgb_u8:H,W,3 view:H,W", rgb_u8=rgb_u8, view=view)
-        w, h = network_size(view.shape)
-        small = cv2.resize(rgb_u8, (w, h), interpolation=cv2.INTER_AREA)
-        image = torch.from_numpy(network_input(small, _resized(view, (w, h))))
+        image = torch.from_numpy(network_image(rgb_u8, view))
+        h, w = image.shape[1:]
         flips = ((), (-1,), (-2,), (-1, -2)) if mirrored else ((),)
         images = torch.nn.functional.pad(
             torch.stack([image.flip(flip) for flip in flips]), (0, -w % MULTIPLE, 0, -h % MULTIPLE)
@@ -60,13 +58,12 @@ class ToolFinder:
         if not view.any():
             return FoundTools(np.zeros_like(view), 1.0)
         probability = 1 / (1 + np.exp(-self.log_odds(rgb_u8, view)))
-        small = _resized(view, probability.shape[::-1])
+        small = small_view(view)
         mask = tool_regions(probability * small, small)
         maybe = probability[(mask | (probability > MAYBE)) & small]
         enough = mask.any() or maybe.size > LEAST_DOUBT * small.sum()
         confidence = float(np.abs(2 * maybe - 1).mean()) if enough else 1.0
-        large = cv2.resize(mask.astype(np.float32), view.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        return FoundTools((large > 0.5) & view, confidence)
+        return FoundTools(full_size(mask, view.shape) & view, confidence)
 
 
 def network_size(shape: tuple[int, int]) -> tuple[int, int]:
@@ -75,5 +72,18 @@ def network_size(shape: tuple[int, int]) -> tuple[int, int]:
     return max(1, round(shape[1] * scale)), max(1, round(shape[0] * scale))
 
 
-def _resized(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+def network_image(rgb_u8: NDArray[np.uint8], view: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(6, h, w) what the network sees of a frame; arguments and errors as in `ToolFinder.log_odds`."""
+    check_shape("rgb_u8:H,W,3 view:H,W", rgb_u8=rgb_u8, view=view)
+    small = cv2.resize(rgb_u8, network_size(view.shape), interpolation=cv2.INTER_AREA)
+    return network_input(small, small_view(view))
+
+
+def small_view(view: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w) of the view (H, W)."""
+    return cv2.resize(view.astype(np.uint8), network_size(view.shape), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def full_size(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """(H, W) of a mask (h, w)."""
+    return cv2.resize(mask.astype(np.float32), shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5

@@ -6,13 +6,15 @@ beyond the farthest distance that browsers render, is such an object: always und
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ..core.checks import number_ranges
+from ..tool_masks.clicked_tools import SearchStep, ToolClick
 from .access_control import BRUSH_NODE
 from .job_queue import JobQueue
-from .mask_edits import MaskEdits, carried_text
+from .mask_edits import MaskEdits, Masks, carried_text
 
 if TYPE_CHECKING:
     import viser
@@ -50,6 +52,7 @@ class MaskEditor:
         self._last: dict[int, Spot] = {}
         """Where each browser's stroke is."""
         self._listens = False
+        self._search: _Search | None = None
         self._say("")
 
     def listen(self, active: bool) -> None:
@@ -98,8 +101,11 @@ class MaskEditor:
             del self._last[event.client_id]
 
     def _dab(self, event: viser.SceneClickEvent, erasing_key: bool) -> None:
-        """A stroke of one point."""
+        """A stroke of one point, or a search for the tool there."""
         if self._listens and (here := self._spot(event.client, event.screen_pos)) is not None:
+            if self._controls.find.value:
+                self.find(*here)
+                return
             self.edits.begin()
             self._draw(here[0], [here[1]], erasing_key)
 
@@ -108,10 +114,46 @@ class MaskEditor:
         self.edits.draw(frame, points, self._controls.radius.value, paint)
         self._say("")
 
+    # Searching. A frame is searched in a job of its own, so that the page stays responsive between two of them.
+
+    def find(self, frame: int, place: tuple[float, float]) -> None:
+        """Search all frames for the tool at a place (x, y) of a mask, px, in place of a search that is on.
+
+        Raises:
+            InputError: that place is masked already.
+        """
+        self._search = _Search(self.edits.find(ToolClick(frame, *place)))
+        self._continue(self._search)
+
+    def _continue(self, search: _Search) -> None:
+        """Search one more frame, unless the search was stopped; when all are, add what was found."""
+        if search is not self._search:
+            return
+        try:
+            step = next(search.steps, None)
+        except Exception:  # shown by the viewer; the search is over
+            self._search = None
+            self._say("")
+            raise
+        if step is not None:
+            if step.added is not None and step.added.any():
+                search.added[step.frame] = step.added
+            self._controls.corrected.content = f"Finding the tool: {step.done} of {step.total}. *Undo* stops."
+            self._jobs.put(lambda: self._continue(search), surely=True)
+            return
+        self._search = None
+        if search.added:
+            self.edits.add(search.added)
+        self._say(f"Found in {_frames(sorted(search.added))}." if search.added else "Nothing was found.")
+
     # Buttons.
 
     def undo(self) -> None:
-        """Go back by one stroke or one carrying."""
+        """Stop a search, or go back by one stroke, one carrying or one search."""
+        if self._search is not None:
+            self._search = None
+            self._say("Stopped.")
+            return
         self._say("" if self.edits.undo() else "Nothing to undo.")
 
     def carry(self, frame: int) -> None:
@@ -136,6 +178,15 @@ class MaskEditor:
             lines.append(f"Not saved: {_frames(unsaved)}.")
         self._controls.corrected.content = "  \n".join(lines)
         self._changed()
+
+
+@dataclass(frozen=True)
+class _Search:
+    """A search for a clicked tool."""
+
+    steps: Iterator[SearchStep]
+    added: Masks = field(default_factory=dict)
+    """(H, W) by frame, of what was found so far."""
 
 
 def _frames(numbers: list[int]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar, overload
 
@@ -15,6 +15,7 @@ from ..data import FrameSequence
 from ..data.found_tools import drop_rows
 from ..data.mask_writing import replace_masks
 from ..footage.carry_masks import CarriedEdit, carry_mask_edit
+from ..tool_masks.clicked_tools import SearchStep, ToolClick, find_clicked
 
 MOST_UNDO = 100
 """Number of steps that can be undone."""
@@ -77,8 +78,22 @@ class MaskEdits:
             self._state = _State(self._state.masks | done.masks, uncarried)
         return done
 
+    def find(self, click: ToolClick) -> Iterator[SearchStep]:
+        """Search every frame for the tool at a click that the masks miss; give what is found to `add`.
+
+        Raises:
+            InputError: the click is not in the image, or on a mask.
+        """
+        return find_clicked(self._sequence, [click], self.tool)
+
+    def add(self, added: Masks) -> None:
+        """Add pixels to the masks of some frames, as one step. Strokes that were not carried yet stay so."""
+        self.begin()
+        masks = {i: self.tool(i) | mask for i, mask in added.items()}
+        self._state = _State({**self._state.masks, **masks}, self._state.uncarried)
+
     def undo(self) -> bool:
-        """Go back by one stroke or one carrying; False if there is none."""
+        """Go back by one stroke, one carrying or one search; False if there is none."""
         if not self._undo:
             return False
         *self._undo, self._state = self._undo

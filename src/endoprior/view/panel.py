@@ -79,6 +79,8 @@ class Panel:
             self.correct = gui.add_checkbox("Correct by painting", False)
             self.erase = gui.add_checkbox("Erase", False, hint="Or hold Shift.")
             self.radius = gui.add_slider("Brush radius, px", 1, max(width // 8, 2), 1, max(width // 50, 1))
+            hint = "Click on a tool that the masks miss: it is found in all frames."
+            self.find = gui.add_checkbox("Click finds a tool", False, hint=hint)
             self.undo = gui.add_button("Undo")
             self.carry = gui.add_button("Carry to other frames", hint="Moves the correction along with the image.")
             self.save_masks = gui.add_button("Save masks")
@@ -117,6 +119,7 @@ class Panel:
         buttons = self.play, self.clear, self.table, self.screenshot, self.keep, self.forget, self.video
         buttons += self.undo, self.carry, self.save_masks, self.clear_tracks
         switches = self.tool, self.riding, self.tracks, self.follow, self.measure, self.correct, self.erase
+        switches += (self.find,)
         allow(lambda value: isinstance(value, bool), *switches, *buttons)
         for handle in (self.speed, self.layer, self.camera, self.rendered_by, self.rendered_as, self.quantity):
             allow(lambda value, names=handle.options: isinstance(value, str) and value in names, handle)

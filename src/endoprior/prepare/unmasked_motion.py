@@ -1,0 +1,122 @@
+"""Tools that the masks likely miss: what enters the view and moves against its surroundings, and no mask covers.
+
+Two frames a tenth of a second apart are compared. The motion of the background, by a camera or by breathing, is smooth:
+a quadratic function of the position explains it, fitted so that what moves otherwise hardly counts. A tool that moves
+differs from it by far, and enters from the border end first; so does little else. A tool that rests, or that moves with
+the camera, is not seen this way.
+
+`H, W` size of the frames, `h, w` of the resized images, about 160 px on their shorter side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import check_shape
+from ..core.spread import spread
+from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
+from ..tool_masks.regions import disk, entering_regions
+
+COMPARED = 24
+"""Number of frames that are compared with a later one."""
+SIDE_PX = 160
+RETURN_PX, RETURN_SHARE = 0.7, 0.1
+"""Forward and backward flow agree if they differ by at most this, px, plus this share of the step."""
+LEAST_AGREEING = 0.8
+"""Share of the tissue where they must agree. Where haze or darkness leaves less to follow, nothing can be said."""
+LEAST_PX, TIMES_MEDIAN = 2.0, 8.0
+"""Least difference from the background motion, px, and as a multiple of that of the median pixel. At 1.5 and 5, frames
+without tools are named in fetoscopy and colonoscopy."""
+NEAR_TOOL_PX = 8
+"""Motion this near to a mask is that of its tool, or of tissue that it pulls."""
+LEAST_SHARE = 0.01
+"""Smaller regions, as a share of the view, are not reported."""
+SMOOTH_PX = 2.0
+ROUNDS, EVERY = 8, 7
+"""Rounds of the robust fit; every so many pixels take part in it."""
+Mask = NDArray[np.bool_]
+
+
+def frames_with_unmasked_motion(
+    count: int,
+    frames_per_second: float,
+    color: Callable[[int], NDArray[np.uint8]],
+    tool: Callable[[int], Mask],
+    view: Mask,
+) -> list[int]:
+    """Of a few frames, spread over a sequence of `count`, those of `moves_unmasked`.
+
+    Args:
+        color, tool: give the image (H, W, 3) of a frame, and (H, W) True on its tools.
+        view: (H, W) True inside the endoscope's image.
+    """
+    ahead = max(1, round(MOTION_S * frames_per_second))
+    compared = spread(count - ahead, COMPARED) if count > ahead else []
+    # What a tool covers or uncovers has no flow: it counts as masked where the tool is in either frame.
+    return [i for i in compared if moves_unmasked(color(i), color(i + ahead), view, (tool(i) | tool(i + ahead)) & view)]
+
+
+def moves_unmasked(first: NDArray[np.uint8], later: NDArray[np.uint8], view: Mask, tool: Mask) -> bool:
+    """Whether something enters the view of the first frame, moves against its surroundings, and is not masked.
+
+    Args:
+        first, later: (H, W, 3) about 0.1 s apart.
+        view: (H, W) True inside the endoscope's image.
+        tool: (H, W) True on the masked tools of either frame.
+    Raises:
+        ValueError: shapes that do not match.
+    """
+    check_shape("first:H,W,3 later:H,W,3 view:H,W tool:H,W", first=first, later=later, view=view, tool=tool)
+    shrink = max(1, min(view.shape) // SIDE_PX)
+    before, after = gray_for_flow(first, shrink), gray_for_flow(later, shrink)
+    if min(before.shape) < MIN_SIZE_PX:
+        return False
+    view, tool = (_resized(mask, before.shape) for mask in (view, tool))
+    forward, backward = flow_pair(before, after)
+    background = (cv2.erode(view.astype(np.uint8), disk(3)) > 0) & ~tool
+    if not background.any() or _agree(forward, backward)[background].mean() < LEAST_AGREEING:
+        return False
+    difference, usual = difference_from_background(forward, background)
+    most = max(TIMES_MEDIAN * usual, LEAST_PX)
+    near = cv2.dilate(tool.astype(np.uint8), disk(NEAR_TOOL_PX)) > 0
+    moving = (cv2.GaussianBlur(difference, (0, 0), SMOOTH_PX) > most) & view & ~near
+    moving = cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, disk(3))
+    return bool(entering_regions(moving, view).sum() > LEAST_SHARE * view.sum())
+
+
+def difference_from_background(flow: NDArray[np.float32], background: Mask) -> tuple[NDArray[np.float32], float]:
+    """(h, w) px by which flow differs from a smooth motion that explains most of the background; and the median there.
+
+    Args:
+        flow: (h, w, 2) px.
+        background: (h, w) True where tissue is seen.
+    """
+    height, width = background.shape
+    y, x = (each.ravel() for each in np.mgrid[:height, :width] / np.array([height, width])[:, None, None] - 0.5)
+    terms, moved = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1), flow.reshape(-1, 2)
+    some = np.flatnonzero(background)[::EVERY]
+    weight = np.ones(len(some))
+    for _ in range(ROUNDS):
+        weighted = terms[some] * weight[:, None]
+        normal = weighted.T @ terms[some] + 1e-6 * np.eye(terms.shape[1])
+        coefficients = np.linalg.solve(normal, weighted.T @ moved[some])
+        left = np.hypot(*(moved[some] - terms[some] @ coefficients).T)
+        weight = 1 / (1 + (left / max(1.5 * np.median(left), 0.1)) ** 2)
+    difference = np.hypot(*(moved - terms @ coefficients).T).reshape(height, width)
+    return difference.astype(np.float32), float(np.median(left))
+
+
+def _agree(forward: NDArray[np.float32], backward: NDArray[np.float32]) -> Mask:
+    """(h, w) True where the way back leads to the start."""
+    y, x = np.mgrid[: forward.shape[0], : forward.shape[1]].astype(np.float32)
+    there = x + forward[..., 0], y + forward[..., 1]
+    back = cv2.remap(backward, *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.linalg.norm(forward + back, axis=-1) < RETURN_PX + RETURN_SHARE * np.linalg.norm(forward, axis=-1)
+
+
+def _resized(mask: Mask, shape: tuple[int, int]) -> Mask:
+    return cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
