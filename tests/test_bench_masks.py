@@ -15,7 +15,7 @@ from endoprior.tool_masks import weights
 from endoprior.tool_training import footage, leave_one_out
 from endoprior.tool_training.benchmark import Counts, SetScore
 from endoprior.tool_training.composites import IGNORED
-from endoprior.tool_training.leave_one_out import Row, network_without, weights_file
+from endoprior.tool_training.leave_one_out import Row, Training, network_without, weights_file
 from endoprior.tool_training.report import write_report
 
 
@@ -73,8 +73,17 @@ def test_a_network_is_trained_once(sets, tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(leave_one_out, "fit", lambda *a, **b: calls.append(a) or weights.ToolNetwork())
     for _ in range(2):
-        network_without(tmp_path, tmp_path, "first", 1, 0, print)
+        network_without(tmp_path, tmp_path, "first", Training(1, 0), print)
     assert len(calls) == 1 and weights_file(tmp_path, "first").name == "without_first.safetensors"
+
+
+def test_only_the_network_of_all_sets_starts_from_given_weights(sets, tmp_path, monkeypatch):
+    starts = []
+    monkeypatch.setattr(leave_one_out, "fit", lambda *a, start, **b: starts.append(start) or weights.ToolNetwork())
+    given = weights.ToolNetwork()
+    for left_out in ("first", "all"):
+        network_without(tmp_path, tmp_path, left_out, Training(1, 0, given), print)
+    assert starts == [None, given]
 
 
 def test_the_table_names_worst_and_mean(tmp_path):

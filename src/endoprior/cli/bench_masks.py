@@ -61,7 +61,8 @@ def run(argv: list[str]) -> int:
         for row in rows(args.out, root, Training(args.steps, args.seed, start), say):
             say(f"{row.name}: {', '.join(f'{k} {v:.3f}' for k, v in row.score.total.scores().items())}")
             table.append(row)
-        report = write_report(args.out, table, {"steps": args.steps, "seed": args.seed, "start": args.start})
+        settings = {"steps": args.steps, "seed": args.seed, "start": args.start.name if args.start else "nothing"}
+        report = write_report(args.out, table, settings)
         if args.write_weights:
             args.write_weights.write_bytes(weights_file(args.out, ALL).read_bytes())
     say(f"report: {report}")
