@@ -105,7 +105,8 @@ def decode(
     Raises:
         av.error.FFmpegError: the file cannot be read on.
     """
-    track.thread_type = "NONE" if one_thread else "AUTO"
+    if not track.codec_context.is_open:
+        track.thread_type = "NONE" if one_thread else "AUTO"
     images = _with_damage(container, track, lost)
     return images if weave else _deinterlaced(images)
 
