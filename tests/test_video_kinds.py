@@ -108,6 +108,24 @@ def test_joined_streams_follow_each_other(tmp_path):
             assert len(source.times) == 30 and source.seconds == pytest.approx(30 / 25)
 
 
+def test_what_is_behind_the_first_of_joined_mp4_files_is_named(tmp_path):
+    parts = [encode(tmp_path / f"{i}.mp4", smooth(5 + i)) for i in range(3)]
+    (tmp_path / "all.mp4").write_bytes(b"".join(part.read_bytes() for part in parts))
+    source = open_source(tmp_path / "all.mp4")
+    assert len(list(source)) == 5 and source.notes == ["all.mp4: of 3 joined files only the first is used"]
+
+
+def test_images_that_a_folder_has_besides_are_counted(tmp_path):
+    for index, image in enumerate(smooth(3)):
+        assert cv2.imwritemulti(str(tmp_path / f"{index}.tif"), [image, image, image])
+    (tmp_path / "x.webp").touch()
+    source = open_source(tmp_path)
+    assert len(list(source)) == 3 and source.notes == [
+        f"{tmp_path.name}: 1 images of other kinds (.webp) are not used",
+        f"{tmp_path.name}: only the first image of each TIFF is used; 6 more are not",
+    ]
+
+
 def test_a_pause_keeps_the_frame_rate_and_all_images(tmp_path):
     times = [*range(12), *range(400, 412)]
     source = open_source(encode(tmp_path / "pause.mp4", smooth(24), times=times))

@@ -57,6 +57,22 @@ def is_animated_webp(path: Path) -> bool:
     return head[:4] == b"RIFF" and head[8:16] == b"WEBPVP8X" and bool(head[20] & 2)
 
 
+def num_joined_mp4(path: Path) -> int:
+    """How many MP4 or MOV files were written one after the other into this one; FFmpeg reads only the first."""
+    count, at, size = 0, 0, path.stat().st_size
+    with path.open("rb") as file:
+        while at + 8 <= size:
+            file.seek(at)
+            head = file.read(16).ljust(16, b"\0")
+            length = int.from_bytes(head[:4], "big")
+            count += head[4:8] == b"ftyp"
+            length = int.from_bytes(head[8:16], "big") if length == 1 else length
+            if length < 8:  # up to the end of the file
+                break
+            at += length
+    return count
+
+
 def what_it_is(path: Path) -> str:
     """What a file is that FFmpeg takes for no video of `CONTAINERS`, in words; empty if unknown."""
     head = _head(path)

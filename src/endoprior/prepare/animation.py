@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL.Image import DecompressionBombError, Image
+from PIL.Image import open as open_image
 
 from ..core.checks import input_error
 from ..data.images import MOST_PIXELS
@@ -25,9 +26,9 @@ class Animation:
         """Read the durations; raises InputError if the file cannot be read."""
         self.path = path
         try:
-            with Image.open(path) as file:
+            with open_image(path) as file:
                 shown, size = [_shown(file, index) for index in range(file.n_frames)], file.size
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        except (OSError, ValueError, SyntaxError, DecompressionBombError) as error:
             raise input_error(path, "a video", str(error).split("\n")[0], "Copy or export it again.") from None
         self.num_frames, (self.width, self.height) = len(shown), size
         if self.height * self.width > MOST_PIXELS:
@@ -38,7 +39,7 @@ class Animation:
         self.frames_per_second = usual_rate(self.times, [])
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        with Image.open(self.path) as file:
+        with open_image(self.path) as file:
             for index, time in enumerate(self.times):
                 file.seek(index)
                 yield SourceFrame(index, time, np.array(file.convert("RGB")))
@@ -48,7 +49,7 @@ class Animation:
         return [image.rgb_u8 for image in islice(self, 0, None, max(self.num_frames // count, 1))]
 
 
-def _shown(file: Image.Image, index: int) -> float:
+def _shown(file: Image, index: int) -> float:
     """How long an image is shown, s. Pillow knows it when the image is decoded."""
     file.seek(index)
     file.load()

@@ -42,6 +42,9 @@ class ImageFolder:
         if self._others:
             kinds = ", ".join(sorted({file.suffix for file in self._others}))
             found.append(f"{self.path.name}: {len(self._others)} images of other kinds ({kinds}) are not used")
+        stacks = [file for file in self.files if file.suffix.lower() in (".tif", ".tiff")]
+        if pages := sum(max(cv2.imcount(str(file)) - 1, 0) for file in stacks):
+            found.append(f"{self.path.name}: only the first image of each TIFF is used; {pages} more are not")
         if self._bits != 8:
             what = f"{self._bits} of 16 bits are in use, which become 0 to 255"
             found.append(f"{self.path.name}: images of 16 bits a channel: {what}")

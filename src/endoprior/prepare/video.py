@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..data.images import MOST_PIXELS
-from ..data.video_files import open_container, what_it_is
+from ..data.video_files import num_joined_mp4, open_container, what_it_is
 from .decoding import AVI, DecodedImage, Undecodable, choose_track, decode, is_cover, packet_times
 from .source_frame import SourceFrame
 from .timeline import Timeline, usual_rate
@@ -60,7 +60,9 @@ class Video:
             self.num_frames = max(int(track.frames), 0)
             self._announced_end = _announced_end(container, track)
             self._aspect = _pixel_aspect(track)
-            self._tracks = _other_tracks(container, track)
+            self._unused = _other_tracks(container, track)
+            joined = num_joined_mp4(path) if "mp4" in container.format.name else 1
+            self._unused += [f"{path.name}: of {joined} joined files only the first is used"] if joined > 1 else []
             self.clock_is_arbitrary = container.format.name in ARBITRARY_CLOCKS
         self.start = 0.0
         first = next(iter(self), None)
@@ -78,7 +80,7 @@ class Video:
     @property
     def notes(self) -> list[str]:
         """What is particular about the file, one line each; of its images after a complete iteration."""
-        name, notes = self.path.name, list(self._tracks)
+        name, notes = self.path.name, list(self._unused)
         if self.pixel_aspect != 1:
             width, height = self._size
             aspect = f"{self._aspect.numerator}:{self._aspect.denominator}"
@@ -218,7 +220,7 @@ class Video:
             unlisted = isinstance(error, av.error.ArgumentError)
             got = "a file of another kind" if unlisted else getattr(error, "strerror", None) or str(error)
             got = what_it_is(self.path) or got
-            hint = "Pass its folder." if got == "one image" else "Copy or export it again."
+            hint = "Pass a folder with one file for each image." if got == "one image" else "Copy or export it again."
             raise input_error(self.path, "a video file", got, hint) from None
         with container:
             track = choose_track(container)
