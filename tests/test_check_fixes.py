@@ -36,6 +36,8 @@ DECISIONS = {
     "no-points": "masks or depth are wrong in a way that the figure shows",
     "reader": "the note itself says what is unusual",
     "windows": "nothing is wrong",
+    "video": "the note itself says what is particular about the video",
+    "dark-images": "the missing bits are not in the images any more",
     "uncertain-masks": "only a person sees which pixels are tool",
 }
 """Problems that no command solves, with the reason."""

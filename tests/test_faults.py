@@ -231,7 +231,7 @@ def test_a_film_that_was_cut_short_is_noticed(tmp_path, monkeypatch):
 
         def close_and_cut():
             close()
-            os.truncate(name, os.path.getsize(name) - 200)  # the table at its end is missing
+            os.truncate(name, os.path.getsize(name) - 200)  # the last image is not complete
 
         writer.close = close_and_cut
         return writer

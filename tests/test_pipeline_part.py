@@ -20,29 +20,34 @@ from endoprior.prepare.source import SourceFrame
 WHOLE = (0.0, math.inf)
 
 
+def even(seconds, rate=25.0):
+    """Times of the images of a video without pauses."""
+    return [i / rate for i in range(round(seconds * rate))]
+
+
 def test_a_long_video_is_used_to_its_end():
-    part = choose_part(300.0, 25.0, 0.0, *WHOLE, most=10_000, usual=300)
+    part = choose_part(even(300.0), 25.0, 0.0, *WHOLE, most=10_000, usual=300)
     assert part.is_whole and part.frames_per_second == 12.5 and part.num_frames == 3750
 
 
 def test_a_short_video_is_used_as_it_is():
-    part = choose_part(10.0, 25.0, 0.0, *WHOLE, most=300)
+    part = choose_part(even(10.0), 25.0, 0.0, *WHOLE, most=300)
     assert (part.frames_per_second, part.num_frames, part.end, part.is_whole) == (25.0, 250, math.inf, True)
 
 
 def test_a_longer_video_first_loses_frames_in_between():
-    part = choose_part(20.0, 25.0, 0.0, *WHOLE, most=300)
+    part = choose_part(even(20.0), 25.0, 0.0, *WHOLE, most=300)
     assert (part.frames_per_second, part.num_frames, part.is_whole) == (12.5, 250, True)
 
 
 def test_a_long_video_then_loses_its_end():
-    part = choose_part(300.0, 25.0, 0.0, *WHOLE, most=300)
+    part = choose_part(even(300.0), 25.0, 0.0, *WHOLE, most=300)
     assert (part.frames_per_second, part.num_frames, part.is_whole) == (12.5, 300, False)
     assert part.end == pytest.approx(299.5 / 12.5)
 
 
 def test_the_choices_of_the_user_stay():
-    part = choose_part(300.0, 25.0, 25.0, 10.0, 12.0, most=300)
+    part = choose_part(even(300.0), 25.0, 25.0, 10.0, 12.0, most=300)
     assert (part.frames_per_second, part.start, part.end, part.num_frames) == (25.0, 10.0, 12.0, 50)
 
 
@@ -51,30 +56,31 @@ def test_the_choices_of_the_user_stay():
 @pytest.mark.parametrize("end", [2.5, 3.99, 4.0, math.inf])
 @pytest.mark.parametrize("most", [20, 60, 300])
 def test_it_has_as_many_frames_as_prepare_selects(start, wanted_rate, end, most):
-    part = choose_part(10.0, 25.0, wanted_rate, start, end, most)
+    part = choose_part(even(10.0), 25.0, wanted_rate, start, end, most)
     images = [SourceFrame(i, i / 25, np.empty((1, 1, 3), np.uint8)) for i in range(250)]
     selected = list(FrameSelection(part.frames_per_second, part.start, part.end, 25.0).pick(images))
     assert part.num_frames == len(selected) <= most
 
 
 def test_the_frame_at_half_a_step_before_the_end_counts():
-    assert choose_part(10.0, 25.0, 0.0, 0.0, 2.5, most=300).num_frames == 63
+    assert choose_part(even(10.0), 25.0, 0.0, 0.0, 2.5, most=300).num_frames == 63
 
 
 @pytest.mark.parametrize("rate", [1.0, 8.0, 10.0, 24.0, 29.97, 60.0, 1000.0])
 @pytest.mark.parametrize("num_frames", [0, 2, 59, 60, 61, 1000])
 def test_a_part_never_has_too_many_frames_nor_too_low_a_rate(rate, num_frames):
-    part = choose_part(num_frames / rate, rate, 0.0, *WHOLE, most=60)
+    part = choose_part(even(num_frames / rate, rate), rate, 0.0, *WHOLE, most=60)
     assert part.num_frames <= 60
     assert part.frames_per_second >= min(rate, 10.0)
     if math.isfinite(part.end):
         assert math.floor((part.end - part.start) * part.frames_per_second) + 1 <= 60
 
 
-def test_a_video_of_unknown_length_is_limited_too():
-    part = choose_part(0, 25.0, 0.0, *WHOLE, most=60)
-    assert not part.is_whole
-    assert part.num_frames == 60
+def test_a_pause_costs_no_frames():
+    times = [*even(2.0), *(60.0 + time for time in even(2.0))]
+    assert choose_part(times, 25.0, 0.0, *WHOLE, most=100) == Part(25.0, 0.0, math.inf, 100, True)
+    part = choose_part(times, 25.0, 25.0, *WHOLE, most=60)
+    assert part == Part(25.0, 0.0, 60 + 9.5 / 25, 60, False)
 
 
 def test_times_are_those_of_evenly_spaced_frames():

@@ -51,32 +51,32 @@ def test_the_layout_is_detected():
     rows[::2], rows[1::2] = left, right
     frames = {"side-by-side": np.hstack([left, right]), "top-bottom": np.vstack([left, right]), "interlaced": rows}
     for layout, frame in frames.items():
-        assert find_layout(frame, stereo(), False, "v") == layout  # by what it shows
+        assert find_layout([frame], stereo(), False, "v") == layout  # by what it shows
     for layout in ("side-by-side", "top-bottom"):
-        assert find_layout(np.zeros_like(frames[layout]), stereo((96, 64)), False, "v") == layout  # by its size
-    assert find_layout(left, stereo(layout="left camera top-bottom"), False, "v") == "top-bottom"  # by what is said
-    assert find_layout(left, None, False, "v") == "mono" and find_layout(left, None, True, "v") == "two-files"
+        assert find_layout([np.zeros_like(frames[layout])], stereo((96, 64)), False, "v") == layout  # by its size
+    assert find_layout([left], stereo(layout="left camera top-bottom"), False, "v") == "top-bottom"  # by what is said
+    assert find_layout([left], None, False, "v") == "mono" and find_layout([left], None, True, "v") == "two-files"
 
 
 def test_an_unknown_layout_is_an_error():
     left, right = pair()
     with pytest.raises(InputError, match=r"v: expected two cameras in each frame, got 96x64 px.*--layout"):
-        find_layout(smooth(64, 96), stereo((50, 60)), False, "v")
+        find_layout([smooth(64, 96)], stereo((50, 60)), False, "v")
     with pytest.raises(
         InputError, match=r"expected a calibration for a stereo video, got none, and a side-by-side frame"
     ):
-        find_layout(np.hstack([left, right]), None, False, "v")
+        find_layout([np.hstack([left, right])], None, False, "v")
 
 
 def test_one_camera_of_the_calibrated_size_is_not_taken_for_two():
     left, right = pair()
     with pytest.raises(InputError, match=r"v: expected two cameras in each frame, .* `--right VIDEO`"):
-        find_layout(left, stereo((96, 64)), False, "v")
+        find_layout([left], stereo((96, 64)), False, "v")
     half = np.hstack([cv2.resize(image, (48, 64), interpolation=cv2.INTER_AREA) for image in (left, right)])
-    assert find_layout(half, stereo((96, 64)), False, "v") == "side-by-side"  # then its aspect ratio is wrong
+    assert find_layout([half], stereo((96, 64)), False, "v") == "side-by-side"  # then its aspect ratio is wrong
     rows = left.copy()
     rows[1::2] = right[1::2]
-    assert find_layout(rows, stereo((96, 64)), False, "v") == "interlaced"
+    assert find_layout([rows], stereo((96, 64)), False, "v") == "interlaced"
 
 
 def geometry_of(size, calibration=None, **options):

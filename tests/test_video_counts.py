@@ -59,7 +59,7 @@ def test_an_intact_file_is_used_to_its_end(clips, name):
     source = open_source(clips / name)
     seconds = [image.seconds for image in source]
     count, note = INTACT[name]
-    assert len(seconds) == count and source.note == (note and f"{name} {note}")
+    assert len(seconds) == count and source.notes == ([f"{name} {note}"] if note else [])
     assert min(np.diff(seconds)) > 0.039  # in the order of their display: no image would be left out
 
 
@@ -106,7 +106,7 @@ def test_the_loss_of_the_last_image_is_noted(clips, tmp_path, name, share):
     cut.write_bytes(content[: int(share * len(content))])
     source = open_source(cut)
     assert len(list(source)) == 24
-    assert source.note == f"{name} announces 25 images, 24 can be decoded; the last 0.04 s are missing"
+    assert source.notes == [f"{name} announces 25 images, 24 can be decoded; the last 0.04 s are missing"]
 
 
 def test_prepare_reports_both_numbers(clips, tmp_path):

@@ -8,6 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import imageio_ffmpeg
 import numpy as np
 
@@ -41,3 +42,31 @@ def ffmpeg(*words: str | Path) -> Path:
 def moving_pattern(seconds: float) -> list[str]:
     """Input of ffmpeg: a moving pattern of 96x80 px at 25 frames per second."""
     return ["-f", "lavfi", "-i", f"testsrc2=size=96x80:rate=25:duration={seconds:g}"]
+
+
+def smooth(count, height=64, width=96, seed=0, step=2):
+    """(H, W, 3) images of a texture that moves by `step` px a frame."""
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.random((height, width + step * count, 3)).astype(np.float32), (0, 0), 1.5)
+    noise = (255 * (noise - noise.min()) / np.ptp(noise)).astype(np.uint8)
+    return [np.ascontiguousarray(noise[:, step * i : step * i + width]) for i in range(count)]
+
+
+def encode(path, images, codec="libx264", pixels="yuv420p", options=None, times=None, rate=25, **context):
+    """Write a video; `times` in 1/rate s."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt, stream.options = pixels, options or ({"crf": "10"} if codec == "libx264" else {})
+        for name, value in context.items():
+            setattr(stream.codec_context, name, value)
+        for index, image in enumerate(images):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts, frame.time_base = (index if times is None else times[index]), Fraction(1, rate)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def psnr(a, b):
+    return 10 * np.log10(255**2 / max(np.mean((a.astype(float) - b) ** 2), 1e-3))

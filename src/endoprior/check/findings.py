@@ -49,6 +49,8 @@ USUAL_FOCAL = 0.9
 """Focal length of a usual endoscope, image widths: 58 degrees."""
 ITERATION_S, USUAL_PIXELS, FIXED_SHARE = 0.09, 640 * 512, 0.3
 """Seconds of a training iteration at this size of the image, and the share that does not depend on it."""
+DARK = 0.05
+"""Images with a smaller mean, of 1, are nearly black."""
 DEPTH_JUMP = 0.2
 """Change of the log median depth between two frames that is too large for tissue motion."""
 
@@ -256,10 +258,26 @@ def _changes(facts: Facts) -> Iterator[Finding]:
         if frames:
             severity: Severity = "error" if code == "scene-cut" else "warning"
             yield Finding(code, severity, f"{what} {_frames(frames)}", longest_part(facts, frames), frames)
-    odd = tuple(sorted({*changes.blurred, *changes.off_color}))
+    # Frames that `prepare` marked count from the first one of the folder.
+    whole = facts.data == DataConfig(shrink=facts.data.shrink)
+    marked = facts.described.get("unexplained_frames", []) if whole else []
+    odd = tuple(sorted({*changes.blurred, *changes.off_color, *marked}))
     if odd:
-        what = f"blurred, covered or outside the body: {_frames(odd)}"
+        reasons = "blurred, covered or outside the body" + (", damaged, or without a camera pose" if marked else "")
+        what = f"{reasons}: {_frames(odd)}"
         yield Finding("unexplained-frames", "warning", what, skip(facts, odd), odd)
+
+
+def _video(facts: Facts) -> Iterator[Finding]:
+    """What `prepare` found particular about the video, and images that are nearly black."""
+    brightness = float(np.median(facts.changes.brightness))
+    if brightness < DARK:
+        what = f"the images are nearly black: their mean is {255 * brightness:.0f} of 255"
+        yield Finding("dark-images", "warning", what, "export them again, with all values from 0 to 255 in use")
+    record = facts.remakes.record
+    for note in record.video_notes if record else ():
+        fix = "nothing if you expect this; else copy or export the video again"
+        yield Finding("video", "note", note, fix)
 
 
 def _stereo(facts: Facts) -> Iterator[Finding]:
@@ -298,6 +316,7 @@ CHECKS: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
     _motion,
     _windows,
     _changes,
+    _video,
     _size,
     _points,
     _reader_notes,

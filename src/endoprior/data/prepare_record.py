@@ -42,6 +42,8 @@ class PrepareRecord:
     """(width, height) of one camera's image in the source, px: what `--crop` and `--blank` count."""
     source_px: tuple[tuple[tuple[float, ...], ...], ...]
     """(R, C, 2) x, y in that image, px, of an even grid over the frame, from corner to corner; R, C at least 2."""
+    video_notes: tuple[str, ...] = ()
+    """What is particular about the video, and which of its images were not used, one line each."""
 
     def save(self, folder: Path) -> None:
         """Write `prepare.json`."""
@@ -49,8 +51,8 @@ class PrepareRecord:
 
     @property
     def categories(self) -> set[str]:
-        """Unicode categories of all characters of the video's path and of the options."""
-        words = [self.video, *(word for words in self.options.values() for word in words)]
+        """Unicode categories of all characters of the video's path, of the options and of the notes."""
+        words = [self.video, *self.video_notes, *(word for words in self.options.values() for word in words)]
         return {unicodedata.category(character) for word in words for character in word}
 
     def crop(self, left: float, top: float, right: float, bottom: float) -> tuple[int, int, int, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time as clock
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,6 +30,7 @@ from ..prepare.sam2 import is_sam2
 from ..prepare.source import open_source
 from ..training.trainer import Trainer
 from .job import Job
+from .part import end_of_first
 from .steps import STEPS, run_step
 
 FRAMES = 10
@@ -75,8 +77,8 @@ def estimate(job: Job) -> dict[str, float]:
     shutil.rmtree(folder, ignore_errors=True)
     try:
         source = open_source(job.source, job.prepare.folder_rate)
-        end = job.part.start + (job.part.num_frames - 0.5) / job.part.frames_per_second
-        images = round(end * source.frames_per_second)
+        end = end_of_first(source.times, source.frames_per_second, job.part, job.part.num_frames)
+        images = bisect_left(source.times, end)
         colmap = 0.0 if job.prepare.poses in ONLY_IF_MOVING else seconds_of_colmap(job)
         seconds = scaled(_measure(job, folder), job.cfg, job.part.num_frames, images, colmap)
         return {name: RESERVE * value for name, value in seconds.items()}
@@ -169,7 +171,8 @@ def _measure(job: Job, folder: Path) -> Trial:
 
 def trial_options(job: Job) -> PrepareConfig:
     """Options of `prepare` for the first `FRAMES` frames, without the user's files, which fit all frames of the job."""
-    cfg, end = job.prepare, job.part.start + (FRAMES - 0.5) / job.part.frames_per_second
+    cfg, source = job.prepare, open_source(job.source, job.prepare.folder_rate)
+    end = end_of_first(source.times, source.frames_per_second, job.part, FRAMES)
     # On few frames COLMAP takes another time than its share: `seconds_of_colmap`.
     poses = WITHOUT_COLMAP.get(cfg.poses, cfg.poses) if seconds_of_colmap(job) else cfg.poses
     short = replace(cfg, end=min(end, cfg.end), poses=poses)

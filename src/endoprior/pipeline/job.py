@@ -111,7 +111,7 @@ def make_job(
     source = open_source(video, prepare.folder_rate)
     rate = source.frames_per_second
     most, usual = (PREVIEW_FRAMES, PREVIEW_FRAMES) if preview else (MOST_FRAMES, USUAL_FRAMES)
-    part = choose_part(source.seconds, rate, prepare.frames_per_second, prepare.start, prepare.end, most, usual)
+    part = choose_part(source.times, rate, prepare.frames_per_second, prepare.start, prepare.end, most, usual)
     width = min(prepare.max_width or PREVIEW_WIDTH, PREVIEW_WIDTH) if preview else prepare.max_width
     poses = WITHOUT_COLMAP["auto"] if preview and prepare.poses == "auto" else prepare.poses
     chosen = replace(prepare, frames_per_second=part.frames_per_second, end=part.end, max_width=width, poses=poses)

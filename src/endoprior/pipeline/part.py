@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -34,7 +34,13 @@ class Part:
 
 
 def choose_part(
-    seconds: float, rate: float, wanted_rate: float, start: float, end: float, most: int, usual: int | None = None
+    times: Sequence[float],
+    rate: float,
+    wanted_rate: float,
+    start: float,
+    end: float,
+    most: int,
+    usual: int | None = None,
 ) -> Part:
     """The first part of a video that has at most `most` frames.
 
@@ -42,29 +48,40 @@ def choose_part(
 
     Args:
         usual: None: `most`.
-        seconds: duration of the video; 0 if unknown.
-        rate: of the video, 1/s.
+        times: when each image of the video is shown, s, ascending.
+        rate: usual one of the video, 1/s.
         wanted_rate: rate that the user chose, 1/s; 0 for none.
         start, end: times that the user chose; the end may be infinite.
     """
-    images = round(seconds * rate) if seconds else sys.maxsize
 
-    def num_frames(used: float, end: float, most: int) -> int:
-        """Number of frames, up to `most`, that `prepare` selects if the time steps of the video are even."""
-        # One image earlier: the grid takes an image that is up to half a step too early.
-        times = (_Image(i / rate) for i in range(max(math.floor(start * rate) - 1, 0), images))
-        return sum(1 for _ in islice(FrameSelection(used, start, end, rate).pick(times), most))
+    def chosen(used: float, most: int) -> list[float]:
+        """Times of the frames, up to `most`, that `prepare` selects."""
+        picked = FrameSelection(used, start, end, rate).pick(map(_Image, times))
+        return [image.seconds for image in islice(picked, most)]
 
     every = 1
     if not wanted_rate:
         most_skipped, usual = max(math.floor(rate / LEAST_RATE), 1), usual or most
-        every = max(math.ceil(num_frames(rate, end, most_skipped * usual) / usual), 1)
+        every = max(math.ceil(len(chosen(rate, most_skipped * usual)) / usual), 1)
     used = wanted_rate or rate / every
-    if (count := num_frames(used, end, most + 1)) <= most:
-        return Part(used, start, end, count, True)
-    # Frames lie on the grid start, start + 1 / used, ...: half a step keeps rounding from adding one.
-    end = start + (most - 0.5) / used
-    return Part(used, start, end, num_frames(used, end, most), False)
+    frames = chosen(used, most + 1)
+    if len(frames) <= most:
+        return Part(used, start, end, len(frames), True)
+    end = end_after(frames[most - 1], start, used)
+    return Part(used, start, end, sum(time < end - 1e-9 for time in frames), False)
+
+
+def end_after(time: float, start: float, rate: float) -> float:
+    """The `--end` that keeps the frame at a time and none after it, on the grid start, start + 1 / rate, ..."""
+    # Half a step keeps rounding from adding one.
+    return start + (round((time - start) * rate) + 0.5) / rate
+
+
+def end_of_first(times: Sequence[float], source_rate: float, part: Part, count: int) -> float:
+    """The `--end` of the first `count` frames of a part, or of all if it has fewer. Args: as `choose_part`."""
+    selection = FrameSelection(part.frames_per_second, part.start, part.end, source_rate)
+    picked = [image.seconds for image in islice(selection.pick(map(_Image, times)), count)]
+    return end_after(picked[-1], part.start, part.frames_per_second) if picked else part.end
 
 
 @dataclass(frozen=True)

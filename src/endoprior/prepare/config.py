@@ -53,7 +53,7 @@ class PrepareConfig:
     end: float = math.inf
     """End time, seconds; not included. inf is the end of the video."""
     frames_per_second: float = 0.0
-    """Frame rate of the output; 0 uses every frame of the source."""
+    """Frame rate of the output; 0 is the usual rate of the source."""
     folder_rate: float = 25.0
     """Frame rate of a folder of images, 1/s."""
     max_frames: int = 10_000

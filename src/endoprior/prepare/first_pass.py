@@ -17,11 +17,14 @@ from ..footage.round_border import CERTAIN
 from .calibration import Calibration
 from .config import PrepareConfig, Rectangle, parse_rectangle
 from .frame_geometry import FrameGeometry, demand_within, make_geometry
+from .frame_selection import FrameSelection
 from .source import ImageFolder
 from .video_clip import Clip, EvenSample, StereoFrame
 
 SAMPLES = 24
 """Number of frames used to detect borders, labels, tools and lighting."""
+DARK = 40.0
+"""Images whose brightest percent of values is below this are nearly black."""
 
 
 @dataclass
@@ -34,7 +37,11 @@ class FirstPass:
     """At most `SAMPLES` of them, evenly spaced."""
     geometry: FrameGeometry
     notes: list[str] = field(default_factory=list)
-    """Notes for the user, one line each."""
+    """Notes for the user on borders and the lens, one line each."""
+    video_notes: list[str] = field(default_factory=list)
+    """What is particular about the video and which of its images are not used, one line each."""
+    damaged: frozenset[int] = frozenset()
+    """Those of `indices` whose images are damaged."""
     image_names: list[str] = field(default_factory=list)
     """Of all images of a source folder, without suffixes; empty for a video."""
 
@@ -47,23 +54,16 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
     Raises:
         InputError: too few or too many frames, or a file is damaged.
     """
-    selection = clip.selection()
-    sample = EvenSample(SAMPLES)
-    indices: list[int] = []
-    path = str(clip.source.path)
-    for stereo_frame in clip.stereo_frames(selection):
-        sample.add(stereo_frame)
-        indices.append(stereo_frame.index)
-        if len(indices) > cfg.max_frames:
-            got = f"{clip.source.num_frames or 'more'} in the file"
-            hint = "Choose a part with --start and --end, lower --frames-per-second, or raise --max-frames."
-            raise input_error(path, f"at most {cfg.max_frames} frames", got, hint)
+    look = _look_through(clip, cfg)
+    if clip.was_damaged:
+        look = _look_through(clip, cfg)  # now by one thread, which finds all damage
+    indices, sample = look.indices, look.sample
     if len(indices) < 2:
         hint = "Check --start, --end and --frames-per-second."
-        raise input_error(path, "at least 2 frames in the selection", str(len(indices)), hint)
+        raise input_error(str(clip.source.path), "at least 2 frames in the selection", str(len(indices)), hint)
     lefts = [frame.left for frame in sample.kept]
-    notes = [source.note for source in (clip.source, clip.second) if source and source.note]
-    notes += _timing_notes(selection.gaps, selection.uneven_steps, len(indices))
+    video_notes = [*clip.notes, *_timing_notes(look.selection, cfg), *_brightness_notes(lefts)]
+    notes: list[str] = []
     strips = circle = outside = None
     labels: list[Rectangle] = []
     if cfg.border == "auto":
@@ -93,7 +93,35 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
             f"(f = {geometry.matrix[0, 0]:.0f} px). To change it: --calibration or --field-of-view-degrees."
         )
     names = [file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else []
-    return FirstPass(indices, sample.kept, geometry, notes, names)
+    return FirstPass(indices, sample.kept, geometry, notes, video_notes, look.damaged, names)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What one iteration over the clip has seen."""
+
+    indices: list[int]
+    damaged: frozenset[int]
+    sample: EvenSample
+    selection: FrameSelection
+
+
+def _look_through(clip: Clip, cfg: PrepareConfig) -> _Look:
+    """Decode the selected frames once; raises InputError if they are too many."""
+    selection = clip.selection()
+    sample = EvenSample(SAMPLES)
+    indices: list[int] = []
+    damaged: set[int] = set()
+    for stereo_frame in clip.stereo_frames(selection):
+        sample.add(stereo_frame)
+        indices.append(stereo_frame.index)
+        if stereo_frame.damaged:
+            damaged.add(stereo_frame.index)
+        if len(indices) > cfg.max_frames:
+            got = f"{clip.source.num_frames or 'more'} in the file"
+            hint = "Choose a part with --start and --end, lower --frames-per-second, or raise --max-frames."
+            raise input_error(str(clip.source.path), f"at most {cfg.max_frames} frames", got, hint)
+    return _Look(indices, frozenset(damaged), sample, selection)
 
 
 def _without(image: NDArray[np.uint8], strips: Strips | None) -> NDArray[np.uint8]:
@@ -107,13 +135,26 @@ def _without(image: NDArray[np.uint8], strips: Strips | None) -> NDArray[np.uint
     return clean
 
 
-def _timing_notes(gaps: int, uneven: int, count: int) -> list[str]:
-    notes = []
-    if uneven > max(2, 0.02 * count):
+def _timing_notes(selection: FrameSelection, cfg: PrepareConfig) -> list[str]:
+    notes, uneven = [], selection.uneven_steps
+    if uneven > max(2, 0.02 * selection.taken):
         notes.append(f"variable frame rate: {uneven} uneven time steps; frames were selected on an even time grid")
-    if gaps:
-        notes.append(f"{gaps} steps of the time grid have no frame and are left out")
+    if selection.gaps:
+        notes.append(f"{selection.gaps} steps of the time grid have no frame and are left out")
+    if selection.between:
+        every = f"{selection.taken + selection.between} images in the time range are not used"
+        hint = "" if cfg.frames_per_second else ". To use more of them: a higher --frames-per-second"
+        rate = f"a frame every {1000 / selection.frames_per_second:.4g} ms is taken"
+        notes.append(f"{selection.between} of {every}: {rate}{hint}")
     return notes
+
+
+def _brightness_notes(images: list[NDArray[np.uint8]]) -> list[str]:
+    """A note if the brightest parts of most images are nearly black."""
+    brightest = float(np.median([np.percentile(image, 99) for image in images]))
+    if brightest >= DARK:
+        return []
+    return [f"the images are nearly black: their brightest parts have {brightest:.0f} of 255. Export them brighter"]
 
 
 def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:

@@ -1,7 +1,8 @@
 """Selects which images of a video become frames: a time range at an even frame rate.
 
 For a video of variable frame rate, each step of an even time grid takes the image that was on screen at that time. No
-image is used twice: where the source has a gap, the grid step is left out and counted.
+image is used twice: where the source has a gap, the grid step is left out and counted. Images between two steps are
+left out and counted, too.
 """
 
 from __future__ import annotations
@@ -44,13 +45,15 @@ class FrameSelection:
     """Grid steps without an image."""
     uneven_steps: int = field(default=0, init=False)
     """Time steps of the source that differ from the nominal one."""
+    between: int = field(default=0, init=False)
+    """Images within the time range that are not used."""
 
     def pick(self, images: Iterable[Image]) -> Iterator[Image]:
         """The images on the grid, in order; stops at `end`."""
         step = 1 / self.frames_per_second
         nominal = 1 / self.source_rate if self.source_rate else step
         tolerance = 0.5 * min(step, nominal)
-        self.taken = self.gaps = self.uneven_steps = 0
+        self.taken = self.gaps = self.uneven_steps = self.between = 0
         slot, before = 0, None
         for image in images:
             if image.seconds >= self.end - 1e-9:
@@ -59,6 +62,7 @@ class FrameSelection:
                 self.uneven_steps += 1
             before = image.seconds
             if image.seconds < self.start + slot * step - tolerance:
+                self.between += image.seconds >= self.start - tolerance
                 continue
             reached = max(math.floor((image.seconds - self.start + tolerance) / step + 1e-9), slot)
             self.gaps += reached - slot if self.taken else 0

@@ -76,6 +76,7 @@ def prepare(
     with work_folder(out, plan) as folder:
         calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
         clip = Clip(video, cfg, calibration)
+        calibration = clip.calibration
         progress("looking through", 0, clip.source.num_frames)
         first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
         progress("looking at tools and light", 0, len(first_pass.indices))
@@ -88,7 +89,7 @@ def prepare(
             done = min(done, len(found.rows))
             found.cut(done)
         files = FrameFiles(folder, meta, done)
-        write_frames(
+        used = write_frames(
             clip.stereo_frames(clip.selection()),
             first_pass.geometry,
             chosen.methods,
@@ -112,7 +113,8 @@ def prepare(
         mark_moving(folder, moving)
         progress("following the camera", 0, files.count)
         path, motion_notes = _camera_path(cfg, files, lambda done: progress("following the camera", done, files.count))
-        unexplained = unexplained_frames(path, (read_color(files.file("images", i)) for i in range(files.count)))
+        damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
+        unexplained = _unexplained(path, files, damaged)
         if path is not None:
             if files.meta.depth_relative:
                 _scale_depth(files, path)
@@ -125,18 +127,21 @@ def prepare(
             remove_carried(files)
         found.remove()
         files.finish(None if path is None else path.camera_to_world, unexplained)
-        record_of(video, cfg, first_pass.geometry).save(folder)
+        video_notes = [*first_pass.video_notes, *_damage_notes(damaged)]
+        if outside := len(first_pass.indices) - len(used):
+            video_notes.append(f"{outside} frames without the color of the inside of a body are left out")
+        record_of(video, cfg, first_pass.geometry, video_notes).save(folder)
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
-        notes = [*first_pass.notes, *chosen.notes, *carried_notes, *motion_notes]
+        notes = [*video_notes, *first_pass.notes, *chosen.notes, *carried_notes, *motion_notes]
         if uncertain := uncertain_frames(read_rows(folder)):
             frames = number_ranges(uncertain)
             notes.append(f"masks: unsure in frames {frames}. To look and correct: {command('view', out)}")
         if moving:
             what = f"in frames {number_ranges(moving)}, something moves that no mask covers"
             notes.append(f"masks: tools are likely missed: {what}. To look and correct: {command('view', out)}")
-        if unexplained:
-            frames = number_ranges(unexplained)
+        if others := sorted({*unexplained} - {*damaged}):
+            frames = number_ranges(others)
             notes.append(f"no camera pose, or another scene, in frames {frames}; --start and --end can leave them out")
     return Prepared(out, files.count, first_pass.geometry.size, notes)
 
@@ -150,6 +155,27 @@ def _unmasked(files: FrameFiles, inside: NDArray[np.bool_]) -> list[int]:
         lambda i: read_tool_mask(files.file("masks", i)),
         inside,
     )
+
+
+def _unexplained(path: CameraPath | None, files: FrameFiles, damaged: list[int]) -> list[int]:
+    """Damaged frames, and those without a pose or of another scene than the frames that are not damaged."""
+    whole = sorted({*range(files.count)} - {*damaged})
+    if len(whole) < files.count / 2:  # too few to tell which scene is the usual one
+        return damaged
+    lost = unexplained_frames(None, (read_color(files.file("images", i)) for i in whole))
+    without_pose = [] if path is None else np.flatnonzero(~path.explained).tolist()
+    return sorted({*damaged, *without_pose, *(whole[i] for i in lost)})
+
+
+def _damage_notes(damaged: list[int]) -> list[str]:
+    """A note about frames whose bytes are damaged."""
+    if not damaged:
+        return []
+    frames = number_ranges(damaged)
+    return [
+        f"damaged in the video, or predicted from damaged images before the next key frame: frames {frames}. They are "
+        "unexplained_frames of sequence.json; leave them out with --start and --end, or copy the video again"
+    ]
 
 
 def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, calibrated: bool) -> SequenceMeta:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -24,13 +25,17 @@ NETWORKS = (NETWORK, SAM2)
 """Methods that a folder of weights, or the name of a model, may follow after a colon."""
 
 
-def record_of(video: Path, cfg: PrepareConfig, geometry: FrameGeometry) -> PrepareRecord:
-    """The record of a folder made from `video` with these options."""
+def record_of(
+    video: Path, cfg: PrepareConfig, geometry: FrameGeometry, video_notes: Sequence[str] = ()
+) -> PrepareRecord:
+    """The record of a folder made from `video` with these options. Args: video_notes: what `check` repeats."""
     options = changed_options(cfg)
     for name in ("--depth", "--masks", "--poses"):
         if name in options:
             options[name] = (_absolute(options[name][0]),)
-    return PrepareRecord(os.path.abspath(video), options, geometry.source_size, _source_px(geometry))
+    return PrepareRecord(
+        os.path.abspath(video), options, geometry.source_size, _source_px(geometry), tuple(video_notes)
+    )
 
 
 def names_path(value: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import cv2
@@ -14,6 +15,8 @@ from .calibration import Calibration
 Layout = Literal["auto", "mono", "side-by-side", "top-bottom", "interlaced", "two-files"]
 LOOK_ALIKE = 0.8
 """Correlation above which the halves of a frame are two views of the same scene."""
+CONTENT = 3.0
+"""Least standard deviation, levels of 255, of a frame that shows something, in each of its rows and columns."""
 
 
 def split_cameras(frame: NDArray[np.uint8], layout: Layout) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
@@ -55,21 +58,24 @@ def camera_size(width: int, height: int, layout: Layout) -> tuple[int, int]:
 
 
 def find_layout(
-    frame: NDArray[np.uint8], calibration: Calibration | None, has_second_source: bool, name: str
+    frames: Sequence[NDArray[np.uint8]], calibration: Calibration | None, has_second_source: bool, name: str
 ) -> Layout:
-    """Detect the layout from the image size of the calibration and from the content of one frame.
+    """Detect the layout from the image size of the calibration and from the content of a few frames.
 
     Args:
-        frame: (H, W, 3), one frame of the source.
+        frames: (H, W, 3) each, from all parts of the source. Black, uniform and striped ones say nothing; of the
+            others, more than half must have the layout.
         name: of the source, for the error message.
     Raises:
         InputError: the layout cannot be detected.
     """
     if has_second_source:
         return "two-files"
-    height, width = frame.shape[:2]
+    height, width = frames[0].shape[:2]
+    telling = [frame for frame in frames if _shows_something(frame)]
     stereo = calibration is not None and calibration.right is not None
-    alike: list[Layout] = [kind for kind in ("side-by-side", "top-bottom", "interlaced") if _alike(frame, kind)]
+    kinds: tuple[Layout, ...] = ("side-by-side", "top-bottom", "interlaced")
+    alike = [kind for kind in kinds if sum(_alike(frame, kind) for frame in telling) > len(telling) / 2]
     if not stereo:
         if alike and alike[0] != "interlaced":
             hint = f"`--calibration FILE --layout {alike[0]}`, or `--layout mono` if there is one camera."
@@ -91,6 +97,13 @@ def find_layout(
         return alike[0]
     hint = "`--layout side-by-side`, `top-bottom` or `interlaced`, or `--right VIDEO` for a second video."
     raise input_error(name, "two cameras in each frame", f"{width}x{height} px without a known layout", hint)
+
+
+def _shows_something(frame: NDArray[np.uint8]) -> bool:
+    """Whether a frame varies within its rows and within its columns, unlike a black one or color bars."""
+    small = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), (96, 64), interpolation=cv2.INTER_AREA)
+    small = small.astype(np.float32)
+    return bool(min(np.median(small.std(0)), np.median(small.std(1))) > CONTENT)
 
 
 def _alike(frame: NDArray[np.uint8], layout: Layout) -> bool:

@@ -1,0 +1,219 @@
+"""Decode a video file image by image: which track, when each image is shown, which are damaged, no combed rows."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+import av
+import av.filter
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.stream import VideoStream
+
+AVI = "avi"
+"""FFmpeg's name of the format that counts time in images and does not hold when they are shown."""
+DEFAULT, ATTACHED_PICTURE, TIMED_THUMBNAILS = 0x1, 0x400, 0x800
+"""FFmpeg's bits of what a track is for."""
+SHORT = 0.5
+"""A track that lasts a smaller share of the longest one is a preview."""
+
+
+@dataclass(frozen=True)
+class DecodedImage:
+    """One image as the decoder gives it."""
+
+    frame: av.VideoFrame
+    seconds: float | None
+    """Time in the file; None if it has no times."""
+    damaged: bool
+    """Bytes of it, or of an image that it was predicted from, are missing or wrong."""
+    interlaced: bool
+    """Whether the file says that its even and odd rows were taken at different times."""
+    turns: int
+    """Quarter turns, counterclockwise, that bring it upright."""
+
+
+@dataclass
+class Undecodable:
+    """Counts images that are in the file and cannot be decoded."""
+
+    count: int = 0
+
+
+def choose_track(container: InputContainer) -> VideoStream | None:
+    """The track of the video itself: not a cover, a single image or a preview. None if none can be decoded.
+
+    Of several tracks, the one with the most pixels is taken, then the one that the file prefers, then the first.
+    """
+    tracks = [track for track in container.streams.video if track.codec_context is not None]
+    longest = max((float(track.duration * track.time_base) for track in tracks if track.duration), default=0.0)
+
+    def rank(track: VideoStream) -> tuple[bool, bool, bool, int, bool]:
+        is_short = bool(track.duration) and float(track.duration * track.time_base) < SHORT * longest
+        size = (track.codec_context.width or 0) * (track.codec_context.height or 0)
+        return not is_cover(track), track.frames != 1, not is_short, size, bool(int(track.disposition) & DEFAULT)
+
+    return max(tracks, key=rank, default=None)
+
+
+def is_cover(track: VideoStream) -> bool:
+    """Whether a track is a picture that belongs to the file, such as a cover."""
+    return bool(int(track.disposition) & (ATTACHED_PICTURE | TIMED_THUMBNAILS))
+
+
+def packet_times(container: InputContainer, track: VideoStream) -> list[float | None]:
+    """The time of every image that is shown, in their order, s; None where there is none. Decodes nothing.
+
+    A file has its images in the order of decoding. Where the times of decoding start again, another part begins; within
+    a part, the images are shown in the order of their times.
+    """
+    parts: list[list[int | None]] = [[]]
+    last: int | None = None
+    try:
+        for packet in container.demux(track):
+            if not packet.size or packet.is_discard:
+                continue
+            if packet.dts is not None:
+                if last is not None and packet.dts < last:
+                    parts.append([])
+                last = packet.dts
+            parts[-1].append(packet.pts if packet.pts is not None else packet.dts)
+    except av.error.FFmpegError:  # the decoder meets it, too, and says what is missing
+        pass
+    in_order = [
+        ticks
+        for part in parts
+        for ticks in [*sorted(each for each in part if each is not None), *(each for each in part if each is None)]
+    ]
+    return [None if ticks is None else float(ticks * track.time_base) for ticks in in_order]
+
+
+def decode(
+    container: InputContainer, track: VideoStream, lost: Undecodable, *, one_thread: bool = False, weave: bool = False
+) -> Iterator[DecodedImage]:
+    """The images in the order in which they are shown.
+
+    Args:
+        lost: its count grows with each image that cannot be decoded.
+        one_thread: slower; with threads, FFmpeg does not report all damage, and not always the same.
+        weave: keep the rows of interlaced images as they are.
+    Raises:
+        av.error.FFmpegError: the file cannot be read on.
+    """
+    if not track.codec_context.is_open:
+        track.thread_type = "NONE" if one_thread else "AUTO"
+    images = _with_damage(container, track, lost)
+    return images if weave else _deinterlaced(images)
+
+
+def _with_damage(container: InputContainer, track: VideoStream, lost: Undecodable) -> Iterator[DecodedImage]:
+    """The images as stored.
+
+    AVI holds the times at which images are decoded, not those at which they are shown. The decoder puts the images in
+    order, and the n-th one gets the n-th time.
+
+    An image that is damaged damages those that are predicted from it, which the decoder does not report: all up to the
+    next key frame.
+    """
+    is_avi, decode_times = container.format.name == AVI, deque()
+    incomplete: set[int | None] = set()
+    spoiled = False
+    for packet, following in _with_following(container.demux(track)):
+        if is_avi and packet.dts is not None:
+            decode_times.append(packet.dts)
+        if packet.is_corrupt and not _is_before_joint(packet, following):
+            incomplete.add(packet.pts)
+        try:
+            frames = packet.decode()
+        except av.error.FFmpegError:
+            lost.count += 1
+            spoiled = True
+            if is_avi and packet.dts is not None:
+                decode_times.pop()
+            continue
+        for frame in frames:
+            ticks = frame.pts
+            if is_avi:
+                ticks = decode_times.popleft() if decode_times else None
+            own = frame.is_corrupt or (frame.pts is not None and frame.pts in incomplete)
+            incomplete.discard(frame.pts)
+            spoiled = own or (spoiled and not frame.key_frame)
+            seconds = None if ticks is None else float(ticks * track.time_base)
+            turns = round(getattr(frame, "rotation", 0) / 90) % 4  # some cameras store it as metadata
+            yield DecodedImage(frame, seconds, spoiled, frame.interlaced_frame, turns)
+
+
+def _with_following(packets: Iterator[av.Packet]) -> Iterator[tuple[av.Packet, list[av.Packet]]]:
+    """Each packet, and the two after it, fewer at the end."""
+    window: deque[av.Packet] = deque()
+    for packet in packets:
+        window.append(packet)
+        if len(window) > 2:
+            yield window.popleft(), list(window)
+    while window:
+        yield window.popleft(), list(window)
+
+
+def _is_before_joint(packet: av.Packet, following: list[av.Packet]) -> bool:
+    """Whether the next part of a joined file begins. FFmpeg then takes the end of the last part for a loss."""
+    return packet.dts is not None and any(each.dts is not None and each.dts < packet.dts for each in following)
+
+
+def _deinterlaced(images: Iterator[DecodedImage]) -> Iterator[DecodedImage]:
+    """From the first interlaced image on, each such image gets the rows of one field, and those between made anew."""
+    rows: _MissingRows | None = None
+    for image in images:
+        if rows is None and not image.interlaced:
+            yield image
+            continue
+        if rows is None or not rows.takes(image):
+            yield from rows.rest() if rows else ()
+            rows = _MissingRows(image)
+        yield from rows.add(image)
+    yield from rows.rest() if rows else ()
+
+
+class _MissingRows:
+    """FFmpeg's bwdif: one image out for each one in, a little later. Images that are not interlaced stay."""
+
+    def __init__(self, image: DecodedImage) -> None:
+        frame = image.frame
+        self._kind = frame.width, frame.height, frame.format.name
+        self._waiting: deque[DecodedImage] = deque()
+        self._graph = av.filter.Graph()
+        source = self._graph.add_buffer(
+            width=frame.width, height=frame.height, format=frame.format, time_base=frame.time_base or Fraction(1, 25)
+        )
+        rows, sink = self._graph.add("bwdif", "mode=send_frame:deint=interlaced"), self._graph.add("buffersink")
+        source.link_to(rows)
+        rows.link_to(sink)
+        self._graph.configure()
+
+    def takes(self, image: DecodedImage) -> bool:
+        """Whether an image is of the same kind as the first one."""
+        return (image.frame.width, image.frame.height, image.frame.format.name) == self._kind
+
+    def add(self, image: DecodedImage) -> Iterator[DecodedImage]:
+        """The images that are complete after one more."""
+        self._waiting.append(image)
+        self._graph.push(image.frame)
+        yield from self._pull()
+
+    def rest(self) -> Iterator[DecodedImage]:
+        """The images that were still waiting for their successors."""
+        self._graph.push(None)
+        yield from self._pull()
+
+    def _pull(self) -> Iterator[DecodedImage]:
+        while self._waiting:
+            try:
+                frame = self._graph.pull()
+            except (av.error.BlockingIOError, av.error.EOFError):
+                return
+            before = self._waiting.popleft()
+            yield DecodedImage(frame, before.seconds, before.damaged, before.interlaced, before.turns)

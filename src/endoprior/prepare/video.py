@@ -1,0 +1,266 @@
+"""A video file as a source: decoded by FFmpeg through PyAV, upright, of square pixels, in the order of display."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from itertools import islice
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import input_error
+from ..data.images import MOST_PIXELS
+from ..data.video_files import num_joined_mp4, open_container, what_it_is
+from .decoding import AVI, DecodedImage, Undecodable, choose_track, decode, is_cover, packet_times
+from .source_frame import SourceFrame
+from .timeline import Timeline, usual_rate
+
+LOST_SHARE, LOST_IMAGES = 0.02, 2
+"""A video is truncated if more than this share of its duration and more than so many images are missing at its end."""
+STATES_END = ("matroska,webm", "nut")
+"""FFmpeg's names of the formats whose duration is the time of the end, however late the first image is shown."""
+ARBITRARY_CLOCKS = ("mpegts", "mpeg")
+"""FFmpeg's names of the formats whose times do not count from the start of the recording."""
+PIXEL_ASPECTS = (0.25, 4.0)
+"""Plausible width of a pixel, in heights."""
+LOOKED_AT = 300
+"""Most images that are decoded to reach the time of a glimpse: as many as between two key frames."""
+
+
+class Video:
+    """A video file. Metadata (names, dates, places) is not read."""
+
+    weave: bool = False
+    """Keep the rows of interlaced images as they are: they are those of two cameras."""
+    was_damaged: bool = False
+    """Whether an iteration has met damage. From then on, one thread decodes: it reports all damage."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file and decode the first image; raises InputError if that fails."""
+        self.path = path
+        self._size: tuple[int, int] | None = None
+        self._found: list[str] = []
+        if path.stat().st_size == 0:
+            raise input_error(path, "a video file", "an empty file", "Copy it again.")
+        with self._open() as (container, track):
+            stated = [float(rate) for rate in (track.average_rate, track.guessed_rate) if rate]
+            packets = packet_times(container, track)
+            self.frames_per_second = usual_rate([time for time in packets if time is not None], stated)
+            self._step = 1 / self.frames_per_second
+            along = Timeline(self._step).along((None, time) for time in packets)
+            times = [time for _, time in along]
+            self.times: list[float] = sorted(time - times[0] for time in times) if times else []
+            """Time of each image since the first one, s, before any is decoded."""
+            self.num_frames = max(int(track.frames), 0)
+            self._announced_end = _announced_end(container, track)
+            self._aspect = _pixel_aspect(track)
+            self._unused = _other_tracks(container, track)
+            joined = num_joined_mp4(path) if "mp4" in container.format.name else 1
+            self._unused += [f"{path.name}: of {joined} joined files only the first is used"] if joined > 1 else []
+            self.clock_is_arbitrary = container.format.name in ARBITRARY_CLOCKS
+        self.start = 0.0
+        first = next(iter(self), None)
+        if first is None:
+            raise input_error(path, "a video with images", "none that can be decoded", "Copy or export it again.")
+        self.height, self.width = first.rgb_u8.shape[:2]
+        lasts = max(self._announced_end - self.start, 0.0)
+        self.seconds = max(lasts, self.times[-1] + self._step if self.times else 0.0)
+
+    @property
+    def pixel_aspect(self) -> Fraction:
+        """Width of a stored pixel divided by its height. The images of the source have square pixels."""
+        return self._aspect if self._shown_width(self._size[0]) != self._size[0] else Fraction(1)
+
+    @property
+    def notes(self) -> list[str]:
+        """What is particular about the file, one line each; of its images after a complete iteration."""
+        name, notes = self.path.name, list(self._unused)
+        if self.pixel_aspect != 1:
+            width, height = self._size
+            aspect = f"{self._aspect.numerator}:{self._aspect.denominator}"
+            stored, shown = f"{width}x{height}", f"{self._shown_width(width)}x{height}"
+            notes.append(f"{name}: pixels are not square ({aspect}); {stored} px become {shown} px")
+        elif self._aspect == 0:
+            notes.append(f"{name}: the stated aspect ratio of pixels is not plausible and is ignored")
+        return notes + self._found
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        timeline, lost = Timeline(self._step), Undecodable()
+        began, last, shown_until = None, 0.0, 0.0
+        index = interlaced = 0
+        broken = ""
+        with self._open() as (container, track):
+            try:
+                images = decode(container, track, lost, one_thread=self.was_damaged, weave=self.weave)
+                for image, seconds in timeline.along((image, image.seconds) for image in images):
+                    began = seconds if began is None else began
+                    self.start = began
+                    last = max(last, seconds)
+                    own = float((image.frame.duration or 0) * (image.frame.time_base or 0))
+                    shown_until = max(shown_until, seconds + max(self._step, own))
+                    interlaced += image.interlaced
+                    self.was_damaged |= image.damaged
+                    yield SourceFrame(index, seconds - began, self._rgb(image, index), image.damaged)
+                    index += 1
+            except av.error.FFmpegError as error:
+                broken = error.strerror or str(error)
+        self.was_damaged |= lost.count > 0
+        self._found = self._check_end(index, began or 0.0, last, shown_until, broken)
+        self._found += self._oddities(timeline, lost.count, interlaced)
+
+    def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
+        """A few images (H, W, 3) from the whole time range, with all their rows; at least one."""
+        end = min(end, self.seconds)
+        wanted = [start + (i + 0.5) / count * max(end - start, 0.0) for i in range(count)]
+        if len(self.times) > LOOKED_AT:
+            with self._open() as (container, track):
+                found = [self._glimpse(container, track, time) for time in wanted]
+            if any(image is not None for image in found):
+                return [image for image in found if image is not None]
+        with self._open() as (container, track):
+            images = decode(container, track, Undecodable(), weave=True)
+            positions = {bisect_left(self.times, time) for time in wanted} if self.times else {0}
+            positions = {min(position, LOOKED_AT - 1) for position in positions} | {0}
+            return [
+                self._rgb(image, index) for index, image in enumerate(islice(images, LOOKED_AT)) if index in positions
+            ]
+
+    def _glimpse(self, container: av.container.InputContainer, track: av.VideoStream, time: float) -> NDArray | None:
+        """The image at a time since the first one; None if the file cannot be searched."""
+        at, image = time + self.start, None
+        try:
+            container.seek(int(at / track.time_base), stream=track)
+            for image in islice(decode(container, track, Undecodable(), weave=True), LOOKED_AT):
+                if image.seconds is None or image.seconds >= at - self._step / 2:
+                    break
+        except av.error.FFmpegError:
+            pass
+        return None if image is None else self._rgb(image, 0)
+
+    def _rgb(self, image: DecodedImage, index: int) -> NDArray[np.uint8]:
+        """(H, W, 3) upright image of square pixels."""
+        width, height = image.frame.width, image.frame.height
+        self._demand_size(width, height, index)
+        rgb_u8 = image.frame.to_ndarray(format="rgb24")
+        if (shown := self._shown_width(width)) != width:
+            how = cv2.INTER_CUBIC if shown > width else cv2.INTER_AREA
+            rgb_u8 = cv2.resize(rgb_u8, (shown, height), interpolation=how)
+        return np.ascontiguousarray(np.rot90(rgb_u8, image.turns))
+
+    def _shown_width(self, width: int) -> int:
+        """Width of an image of square pixels. It is even, so that the halves of a stereo image stay halves."""
+        shown = width * self._aspect
+        return width if self._aspect == 0 or abs(shown - width) < 1 else 2 * round(shown / 2)
+
+    def _check_end(self, count: int, began: float, last: float, shown_until: float, broken: str) -> list[str]:
+        """Reject a truncated file, and note a smaller difference from what the file announces.
+
+        The number of images that a file announces proves nothing: trimmed MP4 files count images that are not shown,
+        AVI files count repetitions. The time at which the last image ends is right in both.
+
+        Args:
+            count: number of images that were decoded.
+            began, last, shown_until: start of the first image, start and end of the last one, s.
+            broken: message of the decoder if it could not go on.
+        """
+        step, duration = self._step, self._announced_end - began
+        missing = self._announced_end - shown_until
+        known = self._announced_end > 0
+        if (broken and not known) or missing > max(LOST_SHARE * duration, LOST_IMAGES * step):
+            raise input_error(
+                self.path,
+                f"{duration / step if known else self.num_frames:.0f} images",
+                f"{count}, then {broken or 'the end: the file is truncated'}",
+                f"Copy it again, or use its first part with `--end {last - began:.2f}`.",
+            )
+        ends_early = missing > 0.75 * step
+        if not (ends_early or broken or self.num_frames not in (0, count)):
+            return []
+        end = f"; the last {missing:.2f} s are missing" if ends_early else ""
+        announced = self.num_frames or round(duration / step)
+        return [f"{self.path.name} announces {announced} images, {count} can be decoded{end}"]
+
+    def _oddities(self, timeline: Timeline, lost: int, interlaced: int) -> list[str]:
+        """Notes about what a complete iteration has met."""
+        name, notes = self.path.name, []
+        if lost:
+            notes.append(f"{name}: damaged images that cannot be decoded and are left out: {lost}")
+        if timeline.restarts:
+            notes.append(
+                f"{name}: joined of {timeline.restarts + 1} parts, each with times of its own; they follow each other"
+            )
+        if timeline.misplaced:
+            notes.append(f"{name}: times in disorder, images that are shown too late: {timeline.misplaced}")
+        if interlaced and not self.weave:
+            notes.append(f"{name}: {interlaced} images are interlaced; one field of each is used, with its rows filled")
+        return notes
+
+    def _demand_size(self, width: int, height: int, index: int) -> None:
+        """Reject images that are too large, and a size that changes within the video."""
+        if max(width, self._shown_width(width)) * height > MOST_PIXELS:
+            hint = "Export the video at a smaller size."
+            raise input_error(self.path, f"images of at most {MOST_PIXELS // 1_000_000} Mpx", f"{width}x{height}", hint)
+        self._size = self._size or (width, height)
+        if (width, height) != self._size:
+            want, got = "{}x{} px as in the first image".format(*self._size), f"{width}x{height} in image {index}"
+            raise input_error(self.path, want, got, "Cut the video there, or export it at one size.")
+
+    @contextmanager
+    def _open(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+        try:
+            container = open_container(self.path)
+        except (av.error.FFmpegError, OSError, UnicodeError) as error:
+            # FFmpeg raises ArgumentError for a format that is not in the list.
+            unlisted = isinstance(error, av.error.ArgumentError)
+            got = "a file of another kind" if unlisted else getattr(error, "strerror", None) or str(error)
+            got = what_it_is(self.path) or got
+            hint = "Pass a folder with one file for each image." if got == "one image" else "Copy or export it again."
+            raise input_error(self.path, "a video file", got, hint) from None
+        with container:
+            track = choose_track(container)
+            if track is None:
+                got = "images in an unknown format" if container.streams.video else "a file without images"
+                raise input_error(self.path, "a video", got, "Check the path, or export it as H.264.")
+            track.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
+            yield container, track
+
+
+def _announced_end(container: av.container.InputContainer, track: av.VideoStream) -> float:
+    """Time at which the last image of a complete file ends, s; 0 if unknown."""
+    if container.format.name == AVI and track.frames:  # FFmpeg shortens the duration of a truncated file
+        return float(track.frames * track.time_base)
+    if track.duration is not None:
+        return float(((track.start_time or 0) + track.duration) * track.time_base)
+    # The duration of the file equals that of the images only if there is no other stream.
+    if len(container.streams) == 1 and container.duration is not None:
+        start = 0 if container.format.name in STATES_END else container.start_time or 0
+        return (start + container.duration) / av.time_base
+    return 0.0
+
+
+def _pixel_aspect(track: av.VideoStream) -> Fraction:
+    """Width of a pixel divided by its height; 1 if unknown, 0 if not plausible."""
+    aspect = track.sample_aspect_ratio or Fraction(1)
+    return aspect if PIXEL_ASPECTS[0] <= aspect <= PIXEL_ASPECTS[1] else Fraction(0)
+
+
+def _other_tracks(container: av.container.InputContainer, used: av.VideoStream) -> list[str]:
+    """A note if there are other tracks of images than the one that is used."""
+    others = [track for track in container.streams.video if track.index != used.index and not is_cover(track)]
+    if not others:
+        return []
+
+    def words(track: av.VideoStream) -> str:
+        context = track.codec_context
+        size = f"{context.width}x{context.height} px" if context else "of an unknown format"
+        return f"{size}{f', {track.frames} images' if track.frames else ''}"
+
+    left_out = "; ".join(map(words, others))
+    name = Path(container.name.removeprefix("file:")).name
+    return [f"{name}: of {len(others) + 1} video tracks, only one is used ({words(used)}), not: {left_out}"]

@@ -1,0 +1,251 @@
+"""Kinds of videos that are read wrong easily: each image of the file becomes the right frame, or is counted."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from video_files import encode, psnr, smooth, write_video
+
+from endoprior.core.checks import InputError
+from endoprior.data.recognize import is_video
+from endoprior.prepare.source import open_source
+from endoprior.prepare.timeline import Timeline, usual_rate
+
+# --- Pixels
+
+
+@pytest.mark.parametrize(("aspect", "shown"), [(Fraction(4, 3), 128), (Fraction(8, 9), 86), (Fraction(1), 96)])
+def test_pixels_become_square(tmp_path, aspect, shown):
+    images = smooth(3)
+    source = open_source(encode(tmp_path / "a.mp4", images, sample_aspect_ratio=aspect))
+    found = list(source)
+    assert (source.width, source.height) == found[0].rgb_u8.shape[1::-1] == (shown, 64)
+    back = cv2.resize(found[0].rgb_u8, (96, 64), interpolation=cv2.INTER_AREA)
+    assert psnr(back, images[0]) > 25
+    said = [f"a.mp4: pixels are not square ({aspect.numerator}:{aspect.denominator}); 96x64 px become {shown}x64 px"]
+    assert source.notes == (said if shown != 96 else [])
+
+
+def test_an_impossible_pixel_aspect_is_ignored_and_said(tmp_path):
+    source = open_source(encode(tmp_path / "a.mp4", smooth(3), sample_aspect_ratio=Fraction(8, 1)))
+    assert source.width == 96 and source.notes == [
+        "a.mp4: the stated aspect ratio of pixels is not plausible and is ignored"
+    ]
+
+
+@pytest.mark.parametrize("first", ["tff", "bff"])
+def test_interlaced_images_are_not_combed(tmp_path, first):
+    fields = [cv2.GaussianBlur(image, (0, 0), 2) for image in smooth(24, step=3)]
+    woven = []
+    for early, late in zip(fields[::2], fields[1::2], strict=True):
+        woven.append(early.copy())
+        part = np.s_[1::2] if first == "tff" else np.s_[::2]
+        woven[-1][part] = late[part]
+    options = {"crf": "8", "flags": "+ilme+ildct", "x264-params": f"{first}=1"}
+    source = open_source(encode(tmp_path / "i.mp4", woven, options=options, pixels="yuv444p"))
+    found = [image.rgb_u8 for image in source]
+    assert len(found) == 12
+    for image, combed, *times in zip(found[1:-1], woven[1:-1], fields[2:-2:2], fields[3:-2:2], strict=True):
+        assert max(psnr(image, field) for field in times) > max(psnr(combed, field) for field in times) + 10
+    assert source.notes == ["i.mp4: 12 images are interlaced; one field of each is used, with its rows filled"]
+    source.weave = True  # rows of two cameras
+    assert psnr(next(iter(source)).rgb_u8, woven[0]) > 35
+
+
+def test_progressive_images_pass_unchanged(tmp_path):
+    images = smooth(4)
+    found = list(open_source(write_video(tmp_path / "a.mkv", images)))
+    assert all(np.array_equal(image.rgb_u8, want) for image, want in zip(found, images, strict=True))
+
+
+def test_the_bits_in_use_fill_the_range(tmp_path):
+    images = smooth(3)
+    for bits in (8, 10, 12, 16):
+        folder = tmp_path / str(bits)
+        folder.mkdir()
+        for index, image in enumerate(images):
+            stored = image if bits == 8 else image.astype(np.uint16) << (bits - 8)
+            cv2.imwrite(str(folder / f"{index}.png"), stored[..., ::-1])
+        source = open_source(folder)
+        assert all(np.array_equal(image.rgb_u8, want) for image, want in zip(source, images, strict=True))
+        what = f"{bits}: images of 16 bits a channel: {bits} of 16 bits are in use, which become 0 to 255"
+        assert source.notes == ([what] if bits > 8 else [])
+
+
+def test_the_brightest_image_decides_about_the_bits(tmp_path):
+    dark, bright = np.full((32, 32, 3), 600, np.uint16), np.full((32, 32, 3), 65535, np.uint16)
+    for index, image in enumerate([dark, dark, bright]):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), image)
+    assert [int(image.rgb_u8[0, 0, 0]) for image in open_source(tmp_path)] == [2, 2, 255]
+
+
+# --- Time
+
+
+def test_joined_streams_follow_each_other(tmp_path):
+    images = smooth(30)
+    for ending, codec, options in (("ts", "libx264", {"crf": "10", "g": "6"}), ("mpg", "mpeg2video", {"b": "4000000"})):
+        for shortest in (10, 20):
+            parts = [
+                encode(tmp_path / f"{i}.{ending}", part, codec, options=options)
+                for i, part in enumerate((images[:shortest], images[shortest:]))
+            ]
+            both = tmp_path / f"both.{ending}"
+            both.write_bytes(b"".join(part.read_bytes() for part in parts))
+            source = open_source(both)
+            found = list(source)
+            assert [image.seconds for image in found] == pytest.approx(np.arange(30) / 25)
+            assert min(psnr(image.rgb_u8, want) for image, want in zip(found, images, strict=True)) > 25
+            assert not any(image.damaged for image in found)
+            assert (
+                f"both.{ending}: joined of 2 parts, each with times of its own; they follow each other" in source.notes
+            )
+            assert len(source.times) == 30 and source.seconds == pytest.approx(30 / 25)
+
+
+def test_what_is_behind_the_first_of_joined_mp4_files_is_named(tmp_path):
+    parts = [encode(tmp_path / f"{i}.mp4", smooth(5 + i)) for i in range(3)]
+    (tmp_path / "all.mp4").write_bytes(b"".join(part.read_bytes() for part in parts))
+    source = open_source(tmp_path / "all.mp4")
+    assert len(list(source)) == 5 and source.notes == ["all.mp4: of 3 joined files only the first is used"]
+
+
+def test_images_that_a_folder_has_besides_are_counted(tmp_path):
+    for index, image in enumerate(smooth(3)):
+        assert cv2.imwritemulti(str(tmp_path / f"{index}.tif"), [image, image, image])
+    (tmp_path / "x.webp").touch()
+    source = open_source(tmp_path)
+    assert len(list(source)) == 3 and source.notes == [
+        f"{tmp_path.name}: 1 images of other kinds (.webp) are not used",
+        f"{tmp_path.name}: only the first image of each TIFF is used; 6 more are not",
+    ]
+
+
+def test_a_pause_keeps_the_frame_rate_and_all_images(tmp_path):
+    times = [*range(12), *range(400, 412)]
+    source = open_source(encode(tmp_path / "pause.mp4", smooth(24), times=times))
+    assert source.frames_per_second == pytest.approx(25)
+    assert source.times == pytest.approx(np.array(times) / 25)
+    assert [image.seconds for image in source] == pytest.approx(np.array(times) / 25)
+
+
+def test_times_only_increase_but_for_single_ones_in_disorder():
+    def along(times):
+        line = Timeline(1.0)
+        return [round(time, 6) for _, time in line.along((None, time) for time in times)], line.restarts, line.misplaced
+
+    assert along([0, 1, 2, 3]) == ([0, 1, 2, 3], 0, 0)
+    assert along([7, 8, 0, 1, 2, 0, 1]) == ([7, 8, 9, 10, 11, 12, 13], 2, 0)
+    assert along([0, 1, 5, 2, 6]) == ([0, 1, 5, 2, 6], 0, 1)
+    assert along([0, 1, 1, 2]) == ([0, 1, 1, 2], 0, 1)
+    assert along([None, None, None]) == ([0, 1, 2], 0, 0)
+    assert along([0, 0, 0]) == ([0, 1, 2], 2, 0)
+
+
+def test_the_usual_rate_is_that_of_most_steps():
+    assert usual_rate(np.arange(9) / 25, [12.0]) == pytest.approx(25)
+    assert usual_rate(np.round(np.arange(90) / 30 * 1.001, 3), [30000 / 1001]) == 30000 / 1001  # a file counts ms
+    assert usual_rate([0, 0.04, 9.0, 9.04, 0.0, 0.04], [0.5]) == pytest.approx(25)
+    assert usual_rate([], [600.0]) == 600 and usual_rate([], []) == usual_rate([0.0], [1e9]) == 25
+
+
+# --- Damage
+
+
+def test_damage_is_known_up_to_the_next_key_frame(tmp_path):
+    images = smooth(24, 96, 128)
+    whole = encode(tmp_path / "whole.ts", images, options={"crf": "14", "g": "12", "bf": "0"})
+    content = whole.read_bytes()
+    packets = [content[i : i + 188] for i in range(0, len(content), 188)]
+    kept = [packet for i, packet in enumerate(packets) if not 0.3 < i / len(packets) < 0.4]
+    (tmp_path / "lost.ts").write_bytes(b"".join(kept))
+    source = open_source(tmp_path / "lost.ts")
+    list(source)
+    assert source.was_damaged
+    found = list(source)  # by one thread
+    quality = {round(image.seconds * 25): psnr(image.rgb_u8, images[round(image.seconds * 25)]) for image in found}
+    damaged = {round(image.seconds * 25) for image in found if image.damaged}
+    assert damaged and max(damaged) < 12 and all(q > 25 for at, q in quality.items() if at not in damaged)
+    assert not open_source(whole).was_damaged and not any(image.damaged for image in open_source(whole))
+
+
+def test_an_image_that_cannot_be_decoded_does_not_end_the_video(tmp_path):
+    images = smooth(12)
+    path = encode(tmp_path / "a.mov", images, "png", "rgb24")
+    content = bytearray(path.read_bytes())
+    places = [i for i in range(len(content)) if content[i : i + 4] == b"\x89PNG"]
+    content[places[5] : places[5] + 8] = bytes(8)
+    path.write_bytes(content)
+    source = open_source(path)
+    list(source)
+    assert source.was_damaged
+    found = list(source)  # by one thread
+    assert [round(image.seconds * 25) for image in found] == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11]
+    assert np.array_equal(found[5].rgb_u8, images[6])
+    assert "a.mov: damaged images that cannot be decoded and are left out: 1" in source.notes
+
+
+# --- Tracks and files
+
+
+def tracks(path, *sizes):
+    """A video with a track for each (width, height, number of images)."""
+    with av.open(str(path), "w") as container:
+        streams = []
+        for width, height, count in sizes:
+            stream = container.add_stream("libx264", rate=25)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            streams.append((stream, smooth(count, height, width)))
+        for stream, images in streams:
+            for image in images:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            container.mux(stream.encode())
+    return path
+
+
+def test_the_track_of_the_video_is_used(tmp_path):
+    source = open_source(tracks(tmp_path / "a.mp4", (80, 64, 24), (160, 128, 24)))
+    assert (source.width, len(list(source))) == (160, 24)
+    said = "only one is used (160x128 px, 24 images), not: 80x64 px, 24 images"
+    assert source.notes == [f"a.mp4: of 2 video tracks, {said}"]
+    assert open_source(tracks(tmp_path / "b.mp4", (320, 256, 1), (160, 128, 24))).width == 160  # a cover
+    assert open_source(tracks(tmp_path / "c.mp4", (320, 256, 4), (160, 128, 24))).width == 160  # a preview
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pixels"),
+    [("a.y4m", "wrapped_avframe", "yuv444p"), ("a.mjpeg", "mjpeg", "yuvj444p"), ("a.apng", "apng", "rgb24")],
+)
+def test_plain_streams_of_images_are_videos(tmp_path, name, codec, pixels):
+    images = smooth(6)
+    path = encode(tmp_path / name, images, codec, pixels)
+    assert is_video(path)
+    found = list(open_source(path))
+    assert min(psnr(image.rgb_u8, want) for image, want in zip(found, images, strict=True)) > 28
+
+
+def test_an_animated_webp_is_a_video(tmp_path):
+    images = smooth(6)
+    path = tmp_path / "a.webp"
+    first, *others = map(Image.fromarray, images)
+    first.save(path, save_all=True, append_images=others, duration=[40, 40, 200, 40, 40, 40], lossless=True)
+    assert is_video(path)
+    source = open_source(path)
+    found = list(source)
+    assert all(np.array_equal(image.rgb_u8, want) for image, want in zip(found, images, strict=True))
+    assert [image.seconds for image in found] == pytest.approx([0, 0.04, 0.08, 0.28, 0.32, 0.36])
+    assert source.frames_per_second == pytest.approx(25)
+
+
+def test_what_is_no_video_is_named(tmp_path):
+    (tmp_path / "a.m3u8").write_text("#EXTM3U\n#EXTINF:4,\nhttp://localhost/a.ts\n")
+    (tmp_path / "a.ffconcat").write_text("ffconcat version 1.0\nfile /etc/hostname\n")
+    cv2.imwrite(str(tmp_path / "a.png"), smooth(1)[0])
+    for name, what in (("a.m3u8", "a playlist"), ("a.ffconcat", "a playlist"), ("a.png", "one image")):
+        with pytest.raises(InputError, match=rf"{name}: expected a video file, got {what}"):
+            open_source(tmp_path / name)
