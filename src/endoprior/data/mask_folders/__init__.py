@@ -6,7 +6,8 @@ from pathlib import Path
 
 from ...core.checks import input_error
 from ..files import entries, files_with, natural_order
-from ..mask_files import MASK_SUFFIXES
+from ..mask_files import MASK_SUFFIXES, demand_known, rule_of_files
+from ..mask_values import name
 from ..reading import kind_of
 from .cvat import segmentation_masks
 from .cvat_xml import annotations
@@ -67,7 +68,17 @@ def _in_folder(folder: Path, labels: str) -> MaskFolder:
     if not files:
         fix = "Put one file per frame there."
         raise input_error(folder, f"masks ({', '.join(MASK_SUFFIXES)})", "none", fix)
-    return _without_labels(MaskFolder([MaskFrame(file.name, union_of_files([file])) for file in files]), labels)
+    return _plain(folder, files, labels)
+
+
+def _plain(folder: Path, files: list[Path], labels: str) -> MaskFolder:
+    """One file per frame; labels in them are tools where their values or the user tell."""
+    rule = rule_of_files(files, labels)
+    example = name(rule.labels[-1]) if rule.labels else ""
+    demand_known(folder, rule, f"name those of tools, such as `{OPTION} {example}`.")
+    frames = [MaskFrame(file.name, union_of_files([file], rule)) for file in files]
+    hint = f"; others: `{OPTION} {example}`" if rule.labels and not labels else ""
+    return MaskFolder(frames, rule.note + hint, True if rule.labels else None)
 
 
 def _in_file(file: Path, labels: str) -> MaskFolder | None:
