@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..data.files import entries, natural_order
+from ..data.files import files_with
 from ..data.images import MOST_PIXELS, decode_image
 from ..data.reading import kind_of
+from ..data.series import one_per_frame
 from ..data.video_files import STILL_SUFFIXES, open_container
 
 LOST_SHARE, LOST_IMAGES = 0.02, 2
@@ -61,13 +62,10 @@ def open_source(path: Path, frames_per_second: float = 25.0) -> Source:
 class ImageFolder:
     """Images of one size, in the order of the numbers in their names."""
 
-    note = ""
-
     def __init__(self, path: Path, frames_per_second: float) -> None:
-        """List the folder; raises InputError if it has no images."""
+        """List the folder; raises InputError if it has no images, or several of each frame."""
         self.path, self.frames_per_second = path, frames_per_second
-        found = (file for file in entries(path) if file.suffix.lower() in STILL_SUFFIXES and file.name[0] != ".")
-        self.files = sorted(found, key=natural_order)
+        self.files, self.note = one_per_frame(path, files_with(path, STILL_SUFFIXES), "images")
         if not self.files:
             raise input_error(path, "images (PNG, JPEG, TIFF, BMP) or a video file", "none", "Check the path.")
         self.num_frames, self.seconds = len(self.files), len(self.files) / frames_per_second

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import input_error
+from ..file_names import sorting_keys
 from ..mask_files import read_user_mask
 from ..mask_values import HighValues
 
@@ -40,6 +41,12 @@ class MaskFolder:
     """Whether high values mark tools; None where the format does not tell."""
     in_order_only: bool = False
     """The numbers in the names are not those of frames: masks belong to frames in order, if there are as many."""
+
+
+def sorted_frames(frames: Sequence[MaskFrame]) -> list[MaskFrame]:
+    """The frames in natural order of their names."""
+    keys = sorting_keys([Path(frame.name).stem for frame in frames])
+    return [frames[i] for i in sorted(range(len(frames)), key=keys.__getitem__)]
 
 
 def union_of_files(files: Sequence[Path], rule: HighValues | None = None) -> Callable[[Size], Mask]:
