@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
-from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_values
+from ..core.spread import spread
+from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
+from ..data.depth_fill import is_measured
 from ..data.description import TOOLS_FOUND
 from ..data.found_tools import FoundTools
 from ..data.frame_files import match_files, match_names
@@ -36,8 +38,6 @@ FITTED_SAMPLES = 16
 MAX_ROW_OFFSET_PX = 1.5
 """If the rows of the two cameras are further apart, stereo matching is poor."""
 NETWORK = "depth-anything"
-FEWEST_STEPS = 256
-"""Depth with at most this many different values was stored in 8 bits."""
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
 A = TypeVar("A")
@@ -160,8 +160,14 @@ def _measured_depth(
         fix = "`--depth-unit-mm 1` for mm, `0.01` for 0.01 mm, `1000` for m; or `--depth-relative depth`."
         raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.depth}", "none", fix)
 
+    if cfg.depth_relative == "no":
+        some = spread(len(first_pass.indices), FITTED_SAMPLES)
+        notes += _check_stored([read_stored(files[first_pass.indices[i]]) for i in some])
+
     def read(path: Path, size: tuple[int, int]) -> NDArray:
         if cfg.depth_relative != "no":
+            if cfg.depth_relative == "depth":
+                return read_depth_file(path, 1.0, size, relative=True)
             return read_values(path, size)
         return read_depth_file(path, cfg.depth_unit_mm, size)
 
@@ -181,9 +187,19 @@ def _check_unit(samples: list[MeasuredFrame], depths: list[Depth], geometry: Fra
     if guess.unit in ("m", "0.01 mm"):
         fix = f"The values look like {guess.unit}: multiply --depth-unit-mm by {guess.mm_per_unit:g}."
         raise input_error("--depth-unit-mm", "tissue 20 to 250 mm away", f"{guess.median:g} mm in {folder}", fix)
-    notes = [] if guess.unit == "mm" else [f"the depth unit may be wrong: {guess.reason}. Check --depth-unit-mm."]
-    if max(len(np.unique(depth)) for depth in depths) <= FEWEST_STEPS:
+    return [] if guess.unit == "mm" else [f"the depth unit may be wrong: {guess.reason}. Check --depth-unit-mm."]
+
+
+def _check_stored(images: list[NDArray]) -> list[str]:
+    """Notes on the numbers (H, W) of some depth files: 8 bits, and what stands for missing depth."""
+    notes = []
+    if all(image.dtype == np.uint8 for image in images):
         notes.append("the depth has at most 256 steps: 8-bit files are too coarse for motion in mm. Use 16-bit files.")
+    filled = [np.isfinite(image) & (image > 0) & ~is_measured(image) for image in images]
+    if any(each.any() for each in filled):
+        least = min(float(image[each].min()) for image, each in zip(images, filled, strict=True) if each.any())
+        share = float(np.mean([each.mean() for each in filled]))
+        notes.append(f"depth: numbers from {least:g} on are far above the rest and count as missing, {share:.1%} of it")
     return notes
 
 
