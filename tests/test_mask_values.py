@@ -73,6 +73,7 @@ EXACT = {
     "a faint part": (lambda i: 255 * shaft(i) + 127 * jaw(i), tool),
     "a part in one frame": (lambda i: 255 * shaft(i) + 60 * (jaw(i) if i == 1 else 0), lambda i: tool(i) if i == 1
                             else shaft(i)),
+    "a thin part": (lambda i: 2 * tool(i) + (dilated(tool(i), 1) & ~tool(i)), lambda i: dilated(tool(i), 1)),
     "1 and 255, by frame": (lambda i: (255 if i else 1) * tool(i), tool),
     "1 and 2": (lambda i: 1 + tool(i).astype(int), tool),
     "40 instances": (lambda i: np.where(tool(i), 10 + np.arange(96) // 2, 0), tool),
