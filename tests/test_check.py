@@ -369,6 +369,9 @@ def test_findings_from_edited_facts(facts):
     assert [f.what for f in much] == ["70% of the pixels inside the border are tool"]
     cut = find(replace(facts, changes=replace(facts.changes, cuts=(3,))))
     assert [f.fix for f in cut] == [f"`endoprior train {facts.path} RUN --data.skip-frames 0-2`"]
+    for left in (0, 1):  # a command that leaves out (nearly) all frames would only fail
+        (odd,) = find(replace(facts, changes=replace(facts.changes, blurred=tuple(range(FRAMES - left)))))
+        assert odd.fix == f"look at the images in {facts.path}: they may not be one video of one scene"
 
 
 def test_command_prints_and_writes_figure_and_json(data, capsys):

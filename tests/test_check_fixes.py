@@ -167,6 +167,15 @@ def sparse(data):
     edit(data / "depth", lambda depth, _: depth * keep)
 
 
+def filled(data):
+    def fill(depth: np.ndarray, position: int) -> np.ndarray:
+        if position in (3, 4):
+            depth[20:60, 20:60] = np.arange(30000, 34000, 100)
+        return depth
+
+    edit(data / "depth", fill)
+
+
 def jumps(data):
     edit(data / "depth", lambda depth, i: depth * np.uint16(2 if i == 9 else 1))
 
@@ -263,6 +272,7 @@ SLOW = [
     ("no-depth-frames", gaps_in_depth, 1),
     ("depth-sparse", sparse, 1),
     ("depth-jumps", jumps, 1),
+    ("depth-far", filled, 1),
     ("round-border", round_image, 1),
     ("burned-in-text", labelled, 1),
     ("camera-moves", pan, 1),

@@ -81,7 +81,6 @@ AT_LOAD = {
     "a file": (lambda f: (shutil.rmtree(f), f.write_text("")), "tiny", "got a file"),
     "no images": (remove("images"), "images", "no such folder"),
     "no masks": (remove("masks"), "masks", "no such folder"),
-    "no depth": (remove("depth"), "depth", "no such folder"),
     "empty images": (empty("images"), "images", "got none"),
     "empty depth": (empty("depth"), "depth", "got none"),
     "jpeg": (jpeg_only, "images", "only .jpg"),

@@ -12,7 +12,7 @@ from plyfile import PlyData
 
 from endoprior.core.checks import InputError
 from endoprior.core.types import Camera
-from endoprior.export.mesh import depth_grid
+from endoprior.export.mesh import depth_grid, split_at_touching_corners
 from endoprior.export.mesh_files import encode_mesh
 from endoprior.export.tsdf import fused_mesh, viewpoints
 from endoprior.model.surface import Surface, render_surface
@@ -147,3 +147,35 @@ def test_ply_mesh_by_a_second_reader(triangle_mesh):
     data = PlyData.read(io.BytesIO(encode_mesh(vertices, triangles, colors, "ply", "opencv")))
     assert np.array_equal(np.stack(data["face"]["vertex_indices"]), triangles)
     assert np.array_equal(np.column_stack([data["vertex"][c] for c in ("red", "green", "blue")]), colors)
+
+
+def fans(triangles, vertex):
+    """How many groups of triangles around a vertex hang together by edges; a slow loop."""
+    left = [set(map(int, triangle)) - {vertex} for triangle in triangles if vertex in triangle]
+    count = 0
+    while left:
+        count, group = count + 1, left.pop()
+        while joined := [other for other in left if other & group]:
+            for other in joined:
+                left.remove(other)
+                group |= other
+    return count
+
+
+def test_triangles_that_touch_in_a_corner_get_a_vertex_each():
+    bow_tie = np.array([[0, 1, 2], [2, 3, 4], [3, 5, 4]], np.int32)
+    old, new = split_at_touching_corners(bow_tie)
+    assert old.tolist() == [0, 1, 2, 2, 3, 4, 5] and (old[new] == bow_tie).all() and new.max() == 6
+    whole = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
+    old, new = split_at_touching_corners(whole)
+    assert old.tolist() == [0, 1, 2, 3] and (new == whole).all()
+    assert split_at_touching_corners(np.zeros((0, 3), np.int32))[1].shape == (0, 3)
+
+
+def test_no_vertex_of_a_grid_joins_two_surfaces():
+    """Depth with random holes has many such corners."""
+    camera = Camera(24, 20, 30.0, 30.0, 12.0, 10.0, np.eye(4))
+    depth = np.where(np.random.default_rng(0).random((20, 24)) < 0.25, 0, 50).astype(np.float32)
+    mesh = depth_grid(Surface(depth, np.zeros((20, 24, 3), np.float32), camera), 1, 5.0)
+    assert all(fans(mesh.triangles, vertex) == 1 for vertex in range(len(mesh.vertices)))
+    assert len(np.unique(mesh.vertices, axis=0)) < len(mesh.vertices)

@@ -1,7 +1,9 @@
 """Measures over time: closed forms first, then a scene whose motion is known, then the files."""
 
+import base64
 import csv
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -200,6 +202,49 @@ def test_the_colored_surfaces_hold_the_values(growing, exported):
     assert cv2.imread(str(exported / "measures.png")).std() > 20
 
 
+def vtp(path):
+    """The arrays of a .vtp file, by name, as VTK's documentation of its XML files says."""
+    (piece,) = ElementTree.parse(path).getroot().iter("Piece")
+    found = {}
+    for array in piece.iter("DataArray"):
+        data = base64.b64decode(array.text)
+        assert int.from_bytes(data[:8], "little") == len(data) - 8
+        values = np.frombuffer(data[8:], {"Float32": "<f4", "Int32": "<i4"}[array.get("type")])
+        found[array.get("Name")] = values.reshape(-1, int(array.get("NumberOfComponents", 1))).squeeze()
+    assert len(found["Points"]) == int(piece.get("NumberOfPoints"))
+    assert len(found["offsets"]) == int(piece.get("NumberOfPolys")) == len(found["connectivity"]) / 3
+    return found
+
+
+def test_the_surface_over_time_has_its_values_for_vtk(growing, exported):
+    sets = list(ElementTree.parse(exported / "surface.pvd").getroot().iter("DataSet"))
+    assert [each.get("file") for each in sets] == [f"surface/{i:06d}.vtp" for i in range(2, 9)]
+    assert [float(each.get("timestep")) for each in sets] == pytest.approx([i / 25 for i in range(2, 9)])
+    first, last = (vtp(exported / each.get("file")) for each in (sets[0], sets[-1]))
+    assert not first["displacement"].any() and np.nanmax(np.abs(first["stretch"] - 1)) < 1e-5
+    vertex = PlyData.read(str(exported / "stretch.ply"))["vertex"]
+    assert first["Points"] == pytest.approx(np.stack([vertex[axis] for axis in "xyz"], 1), abs=1e-4)
+    assert last["displacement"] == pytest.approx(vertex["displacement"], abs=1e-5)
+    np.testing.assert_allclose(last["stretch"], vertex["stretch"], rtol=1e-6)
+    wide = np.ptp(last["Points"][:, 0]) / np.ptp(first["Points"][:, 0])
+    assert wide == pytest.approx(along_x(growing, 2, 8), rel=0.02)
+    assert last["offsets"][-1] == len(last["connectivity"]) and last["connectivity"].max() < len(last["Points"])
+
+
+def test_vtk_finds_the_values(exported):
+    vtk = pytest.importorskip("vtk", reason="THE SURFACES ARE NOT READ BY VTK: `pip install vtk`")
+    reader = vtk.vtkXMLPolyDataReader()
+    reader.SetFileName(str(exported / "surface/000008.vtp"))
+    reader.Update()
+    found, values = reader.GetOutput(), vtp(exported / "surface/000008.vtp")
+    assert found.GetPointData().GetScalars().GetName() == "displacement"
+    assert found.GetNumberOfPolys() == len(values["offsets"])
+    for name in ("displacement", "stretch"):
+        array = found.GetPointData().GetArray(name)
+        got = [array.GetValue(i) for i in range(0, array.GetNumberOfValues(), 50)]
+        np.testing.assert_allclose(got, values[name][::50])
+
+
 def test_without_points_there_is_no_table_and_relative_lengths_are_not_mm(growing, tmp_path):
     replace(growing, lengths_are_relative=True).save(tmp_path / "run/scene.safetensors")
     assert main(["export", str(tmp_path / "run"), str(tmp_path / "out"), "--format", "measures"]) == 0
@@ -207,7 +252,10 @@ def test_without_points_there_is_no_table_and_relative_lengths_are_not_mm(growin
         "displacement.ply",
         "measures.png",
         "stretch.ply",
+        "surface",
+        "surface.pvd",
     ]
+    assert b"unit rel." in (tmp_path / "out" / "surface/000009.vtp").read_bytes()
     assert b"unit rel." in (tmp_path / "out" / "stretch.ply").read_bytes()
 
 

@@ -8,7 +8,6 @@ from endoprior.core.checks import InputError
 from endoprior.footage.border import Circle, Strips
 from endoprior.prepare.calibration import Calibration, Intrinsics
 from endoprior.prepare.config import PrepareConfig, parse_rectangle
-from endoprior.prepare.frame_files import match_files
 from endoprior.prepare.frame_geometry import make_geometry
 from endoprior.prepare.frames import REACH, MeasuredFrame, with_neighbors
 from endoprior.prepare.stereo_layout import find_layout, split_cameras
@@ -195,60 +194,6 @@ def test_a_rectangle_must_be_inside_the_image():
         geometry_of((100, 80), crop=(50, 50, 60, 10))
     with pytest.raises(InputError, match="--blank: expected x,y,width,height in px, got '1,2,3'"):
         parse_rectangle("1,2,3", "--blank")
-
-
-@pytest.mark.parametrize(
-    ("names", "indices", "want"),
-    [
-        (["a", "b", "c"], [4, 6, 9], {4: "a", 6: "b", 9: "c"}),
-        (["m2", "m10", "m1"], [0, 1, 2], {0: "m1", 1: "m2", 2: "m10"}),
-        ([f"m{i}" for i in range(9)], [3, 5], {3: "m3", 5: "m5"}),
-        ([f"m{i}" for i in range(1, 9)], [3, 5], {3: "m4", 5: "m6"}),
-    ],
-)
-def test_files_are_matched_to_frames(tmp_path, names, indices, want):
-    for name in names:
-        (tmp_path / f"{name}.png").touch()
-    (tmp_path / "notes.txt").touch()
-    assert {i: path.stem for i, path in match_files(tmp_path, (".png",), "masks", indices).items()} == want
-
-
-@pytest.mark.parametrize(
-    ("images", "files", "indices", "want"),
-    [
-        ([10, 11, 13], range(30), [0, 1, 2], [10, 11, 13]),  # by their numbers
-        ([10, 11, 13], [10, 11, 13], [1, 2], [11, 13]),  # as many as images: in order
-        (range(1, 9), range(8), [2, 3], [2, 3]),
-        (range(1, 9), range(1, 20), [2, 3], [3, 4]),
-        ([7, 7, 7], range(5), [0, 1], [0, 1]),  # one number says nothing
-    ],
-)
-def test_files_are_matched_to_the_numbers_of_images(tmp_path, images, files, indices, want):
-    for number in files:
-        (tmp_path / f"m{number:04d}.png").touch()
-    names = [f"{letter}{number}" for letter, number in zip("abcdefgh", images, strict=False)]
-    found = match_files(tmp_path, (".png",), "masks", indices, names)
-    assert [int(found[i].stem[1:]) for i in indices] == want
-    if want[0] == 10:
-        with pytest.raises(InputError, match="none numbered 40"):
-            match_files(tmp_path, (".png",), "masks", indices, [*names[:2], "c40"])
-
-
-@pytest.mark.parametrize(
-    ("names", "says"),
-    [
-        ([], "got none"),
-        (["m0", "m1"], "none numbered 2"),
-        (["m1", "n1"], "m1.png and n1.png"),
-        (["x", "y"], "and x.png"),
-    ],
-)
-def test_files_that_do_not_match_are_named(tmp_path, names, says):
-    for name in names:
-        (tmp_path / f"{name}.png").touch()
-    with pytest.raises(InputError) as error:
-        match_files(tmp_path, (".png",), "masks", [0, 1, 2])
-    assert says in str(error.value) and "\n" not in str(error.value)
 
 
 def test_a_work_folder_survives_crashes(tmp_path):

@@ -17,6 +17,7 @@ from sequence_edits import describe
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
+from endoprior.data.depth_fill import is_measured
 from endoprior.data.writer import SequenceMeta, SequenceWriter
 
 UNCLIPPED = DataConfig(depth_clip_low_percentile=0, depth_clip_high_percentile=100)
@@ -58,9 +59,10 @@ def written(folder: Path, meta, frames, poses):
 
 
 def stored_depth(depth, scale):
-    """mm that 16 bits of `scale` mm each can hold; 0 where there is no depth."""
-    units = np.where(np.isfinite(depth) & (depth > 0), depth, 0) / np.float32(scale)
-    return np.clip(np.round(units), 0, 65535).astype(np.float64) * scale
+    """mm that 16 bits of `scale` mm each can hold; 0 where there is no depth, or it is too far."""
+    units = np.round(np.where(np.isfinite(depth) & (depth > 0), depth, 0) / np.float32(scale))
+    units = np.where(units < 65535, units, 0)
+    return np.where(is_measured(units), units, 0).astype(np.float64) * scale
 
 
 @examples(25)

@@ -42,6 +42,8 @@ LOOKS = {
     "endonerf": ("images/0.png", "masks/0.png", "depth/0.png", "poses_bounds.npy"),
     "endonerf without images": ("poses_bounds.npy",),
     "endonerf without poses": ("images/0.png", "masks/0.png", "depth/0.png"),
+    "endonerf without depth": ("images/0.png", "masks/0.png", "poses_bounds.npy"),
+    "no_depth": ("images/0.png", "masks/0.png", "poses_bounds.npy", "sequence.json"),
     "plain": ("images/0.jpg",),
     "plain with depth": ("images/0.png", "masks/0.png", "depth/0.npy"),
 }
@@ -69,7 +71,7 @@ def test_option_wins_over_what_the_folder_looks_like(tmp_path, name):
 
 
 def test_unknown_folder_is_described(tmp_path):
-    known = "scared, c3vd, stir, stereomis, hamlyn, endonerf, plain"
+    known = "scared, c3vd, stir, stereomis, hamlyn, no_depth, endonerf, plain"
     assert_rejected(tmp_path, tmp_path.name, f"the layouts {known}, got an empty folder. Fix: See docs/datasets.md.")
     touch(tmp_path, *"abcdef", "g/x", ".hidden")
     assert_rejected(tmp_path, tmp_path.name, "got a, b, c, d, e and 2 more")

@@ -17,7 +17,7 @@ import yaml
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import numpy_files, reading
-from endoprior.data.files import natural_order
+from endoprior.data.files import in_order
 from endoprior.data.image_header import is_whole, stored_size
 from endoprior.data.numpy_files import read_numpy
 from endoprior.data.reading import kind_of, read_bytes, read_text
@@ -168,5 +168,5 @@ def test_a_benchmark_cell_that_cannot_be_read_is_not_finished(tmp_path, name, co
 
 def test_files_are_ordered_whatever_their_digits_are():
     names = ["a10.png", "a2.png", "a²1.png", "a٣.png", "10.png", "²"]
-    ordered = [path.name for path in sorted(map(Path, names), key=natural_order)]
+    ordered = [path.name for path in in_order(map(Path, names))]
     assert ordered.index("a2.png") < ordered.index("a10.png") and len(ordered) == len(names)

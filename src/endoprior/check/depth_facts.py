@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.config import DataConfig
 from ..core.types import Frame
 from ..data import FrameSequence
-from ..footage.units import UnitGuess, guess_unit
+from ..footage.units import FAR_MM, UnitGuess, guess_unit
 
 BINS = 80
 """Number of histogram bins."""
@@ -28,6 +28,8 @@ class DepthFacts:
     """(T,) share of tissue pixels with depth; 0 in a frame without tissue."""
     median: NDArray[np.float64]
     """(T,) median depth on tissue; NaN in a frame without any."""
+    far: NDArray[np.float64]
+    """(T,) share of the tissue pixels with depth that are farther than `FAR_MM`; 0 in a frame without any."""
     low: float
     """1st percentile on tissue; 0 without depth."""
     high: float
@@ -63,13 +65,14 @@ def measure_depth(
         described: content of `sequence.json`.
         cfg: options with which the sequence was opened.
     """
-    coverage, median = [], []
+    coverage, median, far = [], [], []
     for index in range(len(sequence)):
         frame = sequence.frame(index)
         on_tissue = frame.depth_valid & frame.tissue_mask
         coverage.append(float(on_tissue.sum() / max(frame.tissue_mask.sum(), 1)))
         values = frame.depth[on_tissue][::EVERY]
         median.append(float(np.median(values)) if len(values) else float("nan"))
+        far.append(float((frame.depth[on_tissue] > FAR_MM).mean()) if len(values) else 0.0)
     values = np.concatenate([f.depth[f.depth_valid & mask][::EVERY] for f, mask in zip(samples, tissue, strict=True)])
     low, high = (float(v) for v in np.percentile(values, (1, 99))) if len(values) else (0.0, 0.0)
     margin = 0.1 * (high - low) or 0.1 * high or 1.0
@@ -78,6 +81,7 @@ def measure_depth(
     return DepthFacts(
         np.array(coverage),
         np.array(median),
+        np.array(far),
         low,
         high,
         edges,

@@ -17,6 +17,7 @@ from ..core.geometry import length_unit
 from ..core.presets import preset
 from ..core.types import Camera
 from ..footage.camera_motion import MOVING_FRACTION
+from ..footage.units import FAR_MM
 from .facts import Facts
 from .fixes import (
     correct_masks,
@@ -51,6 +52,8 @@ ITERATION_S, USUAL_PIXELS, FIXED_SHARE = 0.09, 640 * 512, 0.3
 """Seconds of a training iteration at this size of the image, and the share that does not depend on it."""
 DARK = 0.05
 """Images with a smaller mean, of 1, are nearly black."""
+FAR_SHARE = 1e-3
+"""A larger share of the tissue beyond the reach of an endoscope is a filling of holes, or a wrong depth."""
 DEPTH_JUMP = 0.2
 """Change of the log median depth between two frames that is too large for tissue motion."""
 
@@ -147,6 +150,12 @@ def _depth(facts: Facts) -> Iterator[Finding]:
         fix = "nothing for rendering; for lengths in mm use a stereo video or measured depth"
         yield Finding("relative-depth", "note", "the scale of the depth is unknown or assumed", fix)
     yield from _unit(facts)
+    beyond = tuple(int(i) for i in np.flatnonzero(depth.far > FAR_SHARE))
+    if beyond and unit.unit == "mm" and not depth.relative:
+        share = float(depth.far[list(beyond)].mean())
+        what = f"depth beyond {FAR_MM:g} mm on {share:.1%} of the tissue with depth in {_frames(beyond)}"
+        fix = f"store 0 where depth is missing, in {path}/depth{f', or {again} measures it again' if again else ''}"
+        yield Finding("depth-far", "warning", what, fix, beyond)
     steps = np.abs(np.diff(np.log(np.where(depth.median > 0, depth.median, np.nan))))
     usual = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     jumps = tuple(int(i) + 1 for i in np.flatnonzero(steps > max(DEPTH_JUMP, 6 * usual)))

@@ -11,6 +11,8 @@ from ..core.options import changed_options, command_of
 from ..core.shell import command
 from .facts import Facts
 
+FEWEST_FRAMES = 2
+"""One to train and one to test."""
 MEASURED_DEPTH = dict.fromkeys(("--depth", "--depth-unit-mm", "--depth-relative"))
 """Options of depth that comes from files; without them `prepare` measures it."""
 
@@ -29,7 +31,9 @@ def train(facts: Facts, **changes: Any) -> str:
 
 
 def skip(facts: Facts, frames: tuple[int, ...]) -> str:
-    """The command that trains without some frames, numbered as in this check."""
+    """The command that trains without some frames, numbered as in this check; a look at the files if few are left."""
+    if facts.frames - len(set(frames)) < FEWEST_FRAMES:
+        return f"look at the images in {facts.path}: they may not be one video of one scene"
     before = read_ranges("skip_frames", facts.data.skip_frames)
     # Positions of the frames of this check among those that it would have without `skip_frames`.
     places = [place for place in range(facts.frames + len(before)) if place not in before]

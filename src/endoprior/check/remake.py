@@ -19,7 +19,7 @@ from ..data.files import entries
 from ..data.load import find_format
 from ..data.prepare_record import SURROGATES, PrepareRecord, read_record
 
-FROM_FRAMES = ("endonerf", "plain")
+FROM_FRAMES = ("endonerf", "no_depth", "plain")
 """Layouts whose files `prepare` reads with their meaning unchanged."""
 MOST_FRAMES = 10_000
 """Number of frames that `prepare` accepts without `--max-frames`."""

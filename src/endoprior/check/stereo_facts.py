@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..data import FrameSequence
-from ..data.files import natural_order
+from ..data.files import in_order
 from ..data.images import read_color
 from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
 
@@ -39,7 +39,7 @@ def measure_stereo(sequence: FrameSequence) -> StereoFacts | None:
     Raises:
         InputError: a right image cannot be read, or has another size.
     """
-    files = sorted((sequence.path / "right").glob("*.png"), key=natural_order)
+    files = in_order((sequence.path / "right").glob("*.png"))
     camera, count = sequence.camera(0), len(sequence)
     if len(files) != count or read_color(files[0]).shape[:2] != (camera.height, camera.width):
         return None  # shrunk, or only a part of the folder: the matching of images to frames is unknown

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.extras import install_command
-from .images import MOST_PIXELS, decode_image, describe_pixels, single_channel
+from .depth_fill import is_measured
+from .images import MOST_PIXELS, decode_image, single_channel
 from .numpy_files import read_only_array
 from .reading import demand_file
 
@@ -17,25 +18,33 @@ DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
 """Suffixes of the files this module reads, in lower case."""
 
 
-def read_depth_file(path: Path, mm_per_unit: float = 1.0, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+def read_depth_file(
+    path: Path, mm_per_unit: float = 1.0, size: tuple[int, int] | None = None, *, relative: bool = False
+) -> NDArray[np.float32]:
     """Read a depth image.
 
     Args:
         path: PNG or TIFF (8 or 16 bit, TIFF also float), NPY, NPZ with one array, or EXR with one channel.
         mm_per_unit: mm per stored unit.
         size: (width, height) it must have, px; None accepts any.
+        relative: the depth is only scaled, see `is_measured`.
     Returns:
-        (H, W) depth, mm; 0 where the file has NaN, infinity, 0 or less.
+        (H, W) depth, mm; 0 where it is missing (`is_measured`).
     Raises:
         InputError: unreadable, of another size or kind, or EXR without the OpenEXR package.
     """
-    depth = read_values(path, size) * np.float32(mm_per_unit)
-    with np.errstate(invalid="ignore"):  # NaN compares as missing
-        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+    stored = read_stored(path, size)
+    depth = _as_float32(stored) * np.float32(mm_per_unit)
+    return np.where(is_measured(stored, relative=relative) & np.isfinite(depth), depth, np.float32(0))
 
 
 def read_values(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
-    """(H, W) numbers of a one-channel file as they are stored; kinds, `size` and errors as `read_depth_file`."""
+    """(H, W) numbers of a one-channel file, none of them missing; kinds, `size` and errors as `read_depth_file`."""
+    return _as_float32(read_stored(path, size))
+
+
+def read_stored(path: Path, size: tuple[int, int] | None = None) -> NDArray:
+    """(H, W) numbers of a one-channel file in their own type; kinds, `size` and errors as `read_depth_file`."""
     suffix = path.suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
         raise input_error(path, f"one of {', '.join(DEPTH_SUFFIXES)}", suffix or "no suffix", "convert the file.")
@@ -45,21 +54,28 @@ def read_values(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.f
         pixels = _read_exr(path)
     else:
         pixels = single_channel(path, decode_image(path, size))
-    if pixels.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
-        kind = describe_pixels(pixels) if pixels.dtype.kind in "iuf" else str(pixels.dtype)
-        raise input_error(path, "8-bit, 16-bit or float values", kind, "save it as float or 16-bit.")
+    if pixels.dtype.kind not in "iuf":
+        raise input_error(path, "integers or floats", str(pixels.dtype), "save it as float or 16-bit.")
     if size is not None and pixels.shape != (size[1], size[0]):
         got = f"{pixels.shape[1]}x{pixels.shape[0]}"
         raise input_error(path, f"{size[0]}x{size[1]} px like the first image", got, "bring all files to one size.")
+    return pixels
+
+
+def _as_float32(stored: NDArray) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinity, which is missing
-        return pixels.astype(np.float32)
+        return stored.astype(np.float32)
 
 
 def _read_numpy(path: Path) -> NDArray:
-    """The (H, W) array of an .npy file, or of an .npz file that holds nothing else; no pickles."""
+    """The (H, W) array of an .npy file, or of an .npz file that holds nothing else; no pickles.
+
+    Axes of length 1 in front of the others or behind them are dropped.
+    """
     hint = "write it again with numpy.save."
     array = read_only_array(path, hint)
-    array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+    while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):
+        array = array[0] if array.shape[0] == 1 else array[..., 0]
     if array.ndim != 2:
         raise input_error(path, "an array of shape (H, W)", f"shape {array.shape}", hint)
     return array

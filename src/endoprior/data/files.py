@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
+from .file_names import sorting_keys
 from .reading import ACCESS_HINT, read_text
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -29,10 +31,12 @@ def entries(folder: Path) -> list[Path]:
         raise input_error(folder, "a readable folder", error.strerror or str(error), ACCESS_HINT) from None
 
 
-def natural_order(file: Path) -> list[int | str]:
-    """Sorting key of a file name: runs of digits compare as numbers, 2 before 10."""
-    # Splitting at digits alternates text and number, so that equal positions always compare.
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", file.name))]
+def in_order(files: Iterable[Path]) -> list[Path]:
+    """The files of a folder in natural order of their names: 2 before 10, and 0.04 before 0.2 where they are times."""
+    listed = list(files)
+    keys = sorting_keys([file.stem for file in listed])
+    pairs = zip(keys, [file.suffix for file in listed], listed, strict=True)
+    return [file for _, _, file in sorted(pairs, key=lambda pair: pair[:2])]
 
 
 def files_with(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -42,7 +46,7 @@ def files_with(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
         InputError: the folder is not readable.
     """
     usable = [file for file in entries(folder) if file.suffix.lower() in suffixes and not file.name.startswith(".")]
-    return sorted(usable, key=natural_order)
+    return in_order(usable)
 
 
 def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str = "") -> list[Path]:
@@ -66,7 +70,7 @@ def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str
         other = sorted({file.suffix for file in everything if file.suffix})
         got = f"none (only {', '.join(other)})" if other else "none"
         raise input_error(folder, f"{kind} files", got, f"put one {kind} per frame there.")
-    return sorted(files, key=natural_order)
+    return in_order(files)
 
 
 def demand_count(files: list[Path], folder: Path, count: int) -> None:

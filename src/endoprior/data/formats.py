@@ -23,6 +23,7 @@ FORMATS = (
     "stir",
     "stereomis",  # before EndoNeRF, whose layout it extends
     "hamlyn",  # likewise
+    "no_depth",
     "endonerf",
     "plain",  # last: it recognizes every folder with images
 )

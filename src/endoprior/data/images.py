@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from .image_header import is_whole, stored_size
+from .depth_fill import is_measured
+from .image_header import TIFF_STARTS, TURNED, is_whole, orientation, stored_size
 from .reading import read_bytes
 
 MOST_PIXELS = 64_000_000
@@ -66,14 +67,15 @@ def read_depth(path: Path, scale: float = 1.0, size: tuple[int, int] | None = No
         scale: mm per unit of the file.
         size: (width, height) it must have, px; None accepts any.
     Returns:
-        (H, W) depth, mm; 0 where the file has 0.
+        (H, W) depth, mm; 0 where the file has 0, and with 16 bits what else stands for missing (`is_measured`).
     Raises:
         InputError: unreadable, of another size or depth.
     """
     pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype not in (np.uint8, np.uint16):
         raise input_error(path, "an 8-bit or 16-bit depth image", describe_pixels(pixels), "save it as 16-bit PNG.")
-    return pixels.astype(np.float32) * np.float32(scale)
+    depth = pixels.astype(np.float32) * np.float32(scale)
+    return depth if pixels.dtype == np.uint8 else np.where(is_measured(pixels), depth, np.float32(0))
 
 
 def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray:
@@ -84,7 +86,7 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
         size: (width, height) it must have, px; None accepts any.
         flags: of `cv2.imdecode`: as stored, or converted.
     Returns:
-        The array, (H, W) or (H, W, C) with channels in OpenCV's order (blue first).
+        The array, (H, W) or (H, W, C) with channels in OpenCV's order (blue first), upright: turned as EXIF says.
     Raises:
         InputError: unreadable, of another format, truncated, of more than `MOST_PIXELS`, or of another size.
     """
@@ -96,17 +98,31 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
         raise input_error(path, f"an image of at most {MOST_PIXELS // 1_000_000} Mpx", got, "scale it down.")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below replaces its messages
     try:
-        pixels = cv2.imdecode(encoded, flags) if header_size and is_whole(data) else None
+        whole = header_size and is_whole(data)
+        pixels = cv2.imdecode(encoded, flags | cv2.IMREAD_IGNORE_ORIENTATION) if whole else None
     except cv2.error:
         pixels = None
     if pixels is None:
         got = f"{encoded.size} bytes that cannot be decoded"
         raise input_error(path, "an image (PNG, JPEG, TIFF, BMP, WebP)", got, "write the file again.")
+    if not data.startswith(TIFF_STARTS):  # OpenCV turns TIFF whatever it is told
+        pixels = _upright(pixels, orientation(data))
     got = (pixels.shape[1], pixels.shape[0])
     if size is not None and got != size:
         want, fix = f"{size[0]}x{size[1]} px like the first image", "bring all images, masks and depth to one size."
         raise input_error(path, want, f"{got[0]}x{got[1]}", fix)
     return pixels
+
+
+def _upright(pixels: NDArray, orientation: int) -> NDArray:
+    """Stored pixels as they are shown. Args: orientation: 1 to 8, as EXIF counts them."""
+    if orientation in TURNED:
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return np.ascontiguousarray(pixels)
 
 
 def save_png(path: Path, pixels: NDArray, compression: int = 1) -> None:

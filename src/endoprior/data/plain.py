@@ -1,4 +1,4 @@
-"""Reader of plain folders: images of a static camera, with masks and depth if there are any."""
+"""Reader of plain folders: images, with masks, depth and poses if there are any; else the camera is static."""
 
 from __future__ import annotations
 
@@ -11,13 +11,18 @@ from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import DEPTH_SUFFIXES, read_depth_file
 from .description import check_frames, intrinsics_of, read_description
-from .files import IMAGE_SUFFIXES, demand_count, list_files, unequal_names
+from .endonerf import read_poses_bounds
+from .files import IMAGE_SUFFIXES, list_files
 from .formats import Format
+from .frame_files import match_names
 from .images import read_color, read_tool_mask
-from .poses import identity_poses
+from .poses import identity_poses, world_to_camera
 from .right_eye import open_right_eye
 from .sequence import FrameSequence
+from .series import Kind, one_per_frame
 
+FACTS = ("sequence.json", "poses_bounds.npy")
+"""Files beside those of the frames."""
 ASSUMED_FOCAL = 0.9
 """Focal length in image widths if none is given: a field of view of 58 degrees, typical of endoscopes."""
 
@@ -34,17 +39,16 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
     Raises:
         InputError: no images, numbers of files that differ, or files that cannot be used.
     """
-    images = list_files(path / "images", IMAGE_SUFFIXES, "plain")
+    listed = list_files(path / "images", IMAGE_SUFFIXES, "plain")
+    images, note = one_per_frame(path / "images", listed, "images")
     mask_folder = "gt_masks" if cfg.use_gt_masks else "masks"
     # A folder that the user names must exist.
     masked = cfg.use_gt_masks or (path / mask_folder).is_dir()
     masks = list_files(path / mask_folder, (".png",), "plain") if masked else []
     depths = list_files(path / "depth", DEPTH_SUFFIXES, "plain") if (path / "depth").is_dir() else []
-    remarks = [f"{path}: no camera poses, the camera is assumed to be static"]
-    for files, folder in ((masks, mask_folder), (depths, "depth")):
-        if files:
-            demand_count(files, path / folder, len(images))
-            remarks += unequal_names(images, files)
+    remarks = [note] if note else []
+    masks = _of_images(path / mask_folder, masks, "masks", images, remarks)
+    depths = _of_images(path / "depth", depths, "depth", images, remarks)
     described = read_description(path / "sequence.json")
     remarks += check_frames(path / "sequence.json", described, len(images))
     if not masks:
@@ -55,11 +59,16 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
     if depths and not unit:
         remarks.append(f"{path / 'depth'}: no unit given, mm assumed; set data.depth_unit_mm")
     height, width = read_color(images[0]).shape[:2]
-    if "fx" not in described:
-        focal = ASSUMED_FOCAL * width
-        remarks.append(f"{path}: no focal length given, {ASSUMED_FOCAL:g} image widths ({focal:g} px) are assumed")
-    shape = (width, height, *intrinsics_of(path / "sequence.json", described, width, height, ASSUMED_FOCAL * width))
     kept = kept_frames(len(images), cfg)
+    focal, poses = ASSUMED_FOCAL * width, identity_poses(len(images))
+    if (path / "poses_bounds.npy").exists():
+        stored = read_poses_bounds(path / "poses_bounds.npy", len(images))
+        focal, poses = float(stored[0, 2, 4]), [world_to_camera(pose[:, :3], pose[:, 3]) for pose in stored]
+    else:
+        remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
+        if "fx" not in described:
+            remarks.append(f"{path}: no focal length given, {ASSUMED_FOCAL:g} image widths ({focal:g} px) are assumed")
+    shape = (width, height, *intrinsics_of(path / "sequence.json", described, width, height, focal))
     new_masks = [] if masks or len(kept) < len(images) else [path / "masks" / f"{image.stem}.png" for image in images]
     size, tool_value = (width, height), described.get("mask_tool_value", 255)
     relative = described.get("depth_relative", not unit)
@@ -76,10 +85,10 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
     return assemble(
         path,
         cfg,
-        [Camera(*shape, pose) for pose in identity_poses(len(kept))],
+        [Camera(*shape, poses[i]) for i in kept],
         decode,
         images=images,
-        files=[*masks, *depths, *([path / "sequence.json"] if described else [])],
+        files=[*masks, *depths, *(path / name for name in FACTS if (path / name).exists())],
         frames_per_second=float(rate) / (cfg.stride or 1) if rate is not None else None,
         right_eye=right_eye,
         remarks=remarks,
@@ -90,6 +99,19 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
         depth_is_relative=relative,
         sources=described.get("sources"),
     )
+
+
+def _of_images(folder: Path, files: list[Path], kind: Kind, images: list[Path], remarks: list[str]) -> list[Path]:
+    """The file of each image, of all that a folder has; none of none."""
+    if not files:
+        return []
+    files, note = one_per_frame(folder, files, kind)
+    matched = match_names(folder, [file.name for file in files], range(len(images)), [image.stem for image in images])
+    unused = len(files) - len(images)
+    remarks += [note] if note else []
+    remarks += [f"{folder}: {matched.rule}"] if "in order" in matched.rule else []
+    remarks += [f"{folder}: {unused} files of other frames are not used"] if unused else []
+    return [files[position] for position in matched.files.values()]
 
 
 FORMAT = Format(is_plain, load_plain)

@@ -19,6 +19,8 @@ from ..system.atomic import reject_occupied, whole_folder
 from .images import decode_image, save_png
 from .pose_writing import depth_bounds, pose_table
 
+FARTHEST_UNIT = 65534
+"""Of the depth files; 65535 stands for missing depth in the files of many programs."""
 TOOL_VALUE = 255
 """Value of tool pixels in `masks/`; tissue is 0."""
 
@@ -90,10 +92,9 @@ class FrameFiles:
         self.count += 1
 
     def depth_units(self, depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-        """(H, W) depth as a file stores it; 0 where it is missing. Args: depth: (H, W) z in mm."""
-        held = np.minimum(depth, 65535 * self.meta.depth_scale)
-        units = np.where(np.isfinite(depth) & (depth > 0), held, 0) / self.meta.depth_scale
-        return np.clip(np.round(units), 0, 65535).astype(np.uint16)
+        """(H, W) depth as a file stores it; 0 where it is missing or too far. Args: depth: (H, W) z in mm."""
+        units = np.round(np.where(np.isfinite(depth) & (depth > 0), depth, 0) / self.meta.depth_scale)
+        return np.where(units <= FARTHEST_UNIT, units, 0).astype(np.uint16)
 
     def write_image(self, folder: str, pixels: NDArray) -> None:
         """Write `pixels` as `folder`/NNNNNN.png, numbered like the frame that the next `add` appends.

@@ -18,7 +18,7 @@ from ..data import FrameSequence
 from ..data.description import read_description
 from ..data.files import IMAGE_SUFFIXES, files_with
 from ..data.images import read_color
-from ..data.mask_files import MASK_SUFFIXES, read_user_mask, tool_polarity
+from ..data.mask_files import MASK_SUFFIXES, demand_known, read_user_mask, rule_of_files, tool_polarity
 from ..data.reading import kind_of
 from ..system.atomic import write_json
 from .mask_scores import NO_VALUE, TIP, TOLERANCE, MaskCounts, count, counted_pixels
@@ -66,12 +66,16 @@ class TrueMasks:
         """Frames that have a true mask, ascending."""
         camera = sequence.camera(0)
         self._size = camera.width, camera.height
+        self._rule = rule_of_files(files)
+        demand_known(self.folder, self._rule, "save masks of tools alone, with 255 on tools.")
         if self.folder != folder:
             self._tool_is_high = read_description(folder / "sequence.json").get("mask_tool_value", 255) == 255
             self.polarity = f"{'high' if self._tool_is_high else 'low'} values mark tools, as in every sequence folder"
+        elif self._rule.labels:
+            self._tool_is_high, self.polarity = True, self._rule.note
         else:
             some = [self.indices[i] for i in spread(len(self.indices), SAMPLES)]
-            highs = [read_user_mask(self._files[i], self._size) for i in some]
+            highs = [read_user_mask(self._files[i], self._size, self._rule) for i in some]
             polarity = tool_polarity("auto", highs, [sequence.frame(i).rgb_u8 for i in some])
             self._tool_is_high, self.polarity = polarity.tool_is_high, polarity.reason
 
@@ -81,7 +85,7 @@ class TrueMasks:
         Raises:
             InputError: the file cannot be used, or has another size than the frames.
         """
-        return read_user_mask(self._files[index], self._size) == self._tool_is_high
+        return read_user_mask(self._files[index], self._size, self._rule) == self._tool_is_high
 
 
 def _demand_same_frames(folder: Path, frames: Sequence[int], sequence: FrameSequence) -> None:

@@ -106,6 +106,8 @@ def _export_time_steps(scene: Scene, out: Path, options: ExportOptions, chosen: 
                 (folder / f"{step.name}{suffix}").write_bytes(content)
             written.append({"files": [f"{step.name}{suffix}" for suffix in contents], **step.facts()})
             progress(k + 1, len(steps))
+        if not chosen.has_index:
+            return
         relative = scene.lengths_are_relative
         units: Mapping[str, Any] = chosen.index_facts or {"axes": options.frame, "unit": length_unit(relative)}
         facts = {"lengths_are_relative": relative, "frames_per_second": scene.frames_per_second}

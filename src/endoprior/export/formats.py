@@ -63,6 +63,8 @@ class Format:
     """What --frame stands for where it is not given."""
     holds: str = ""
     """What is in a file, in plain words: `a mesh`; `endoprior export` says it of what it wrote."""
+    has_index: bool = True
+    """Whether a folder of its files also holds `index.json`; False where each file says itself what it is."""
     index_facts: Mapping[str, Any] | None = None
     """What `index.json` says of the files' units, for a format without axes in mm."""
 

@@ -23,10 +23,14 @@ from .mesh import Mesh, depth_grid
 from .options import ExportOptions
 from .ply import ply_bytes, vertex_table
 from .tracks import back_projected, read_query_points
+from .vtk_files import pvd_bytes, vtp_bytes
+
+SURFACES = "surface"
+"""Name of the series for ParaView, and of the folder of its files."""
 
 
 def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
-    """Write `displacement.ply`, `stretch.ply` and `measures.png`; with points also `measures.csv`.
+    """Write the surface over time, `displacement.ply`, `stretch.ply`, `measures.png`; with points `measures.csv`.
 
     Raises:
         InputError: a frame is not in the sequence, the file of points cannot be read, or a point or the whole frame
@@ -54,8 +58,20 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             "--from-frame", "a frame that shows tissue", f"{since}", "choose another, or lower --min-alpha."
         )
     motion = SurfaceMotion(scene, since, options.min_alpha)
-    maps = _maps(scene, mesh, motion, until)
+    frames = list(range(min(since, until), max(since, until) + 1))
+    surfaces = _carried(scene, mesh, motion, frames)
+    shown = surfaces.values(frames.index(until))
+    spans = (displacement_span, stretch_span)
+    maps = {name: _Map(one, span(one)) for (name, one), span in zip(shown.items(), spans, strict=True)}
     with whole_folder(out) as folder:
+        (folder / SURFACES).mkdir()
+        for k, frame in enumerate(frames):
+            place, about = points_in_axes(surfaces.positions[k], options.frame), f"axes {options.frame}, unit {unit}"
+            content = vtp_bytes(place, mesh.triangles, surfaces.values(k), about)
+            (folder / SURFACES / f"{frame:06d}.vtp").write_bytes(content)
+            progress(k, len(frames))
+        files = [f"{SURFACES}/{frame:06d}.vtp" for frame in frames]
+        (folder / f"{SURFACES}.pvd").write_bytes(pvd_bytes(files, [frame / rate for frame in frames]))
         for name, one in maps.items():
             (folder / f"{name}.ply").write_bytes(_colored_mesh(mesh, maps, one, options.frame, unit))
         figure = MeasuresFigure(f"frame {since} to frame {until}", with_curves=options.points is not None)
@@ -77,7 +93,23 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         for place, (title, one) in enumerate(zip(titles, maps.values(), strict=True), 1):
             figure.show_map(place, title, on_image, mesh.triangles, one.values, one.span)
         figure.save(folder / "measures.png")
-    progress(1, 1)
+    progress(len(frames), len(frames))
+
+
+@dataclass(frozen=True)
+class _Surfaces:
+    """The vertices of a mesh at `T` frames."""
+
+    positions: NDArray[np.float32]
+    """(T, V, 3) world axes, mm."""
+    displacement: NDArray
+    """(T, V) straight distance from where they were in the first one, mm."""
+    stretch: NDArray
+    """(T, V) largest principal stretch since then; NaN where unknown."""
+
+    def values(self, k: int) -> dict[str, NDArray]:
+        """(V,) values at frame k, by name."""
+        return {"displacement": self.displacement[k], "stretch": self.stretch[k]}
 
 
 @dataclass(frozen=True)
@@ -88,16 +120,12 @@ class _Map:
     span: tuple[float, float]
 
 
-def _maps(scene: Scene, mesh: Mesh, motion: SurfaceMotion, until: int) -> dict[str, _Map]:
-    """Displacement and stretch of the vertices from the frame of `motion` to frame `until`."""
-    times = [frame / len(scene.cameras) for frame in (motion.since, until)]
-    moved = carry_points(scene, mesh.vertices, np.zeros(len(mesh.vertices), np.intp), times)[1]
-    displacement = distance(moved, mesh.vertices)
-    stretch = motion.stretch(mesh.vertices.astype(np.float64), [until])[0]
-    return {
-        "displacement": _Map(displacement, displacement_span(displacement)),
-        "stretch": _Map(stretch, stretch_span(stretch)),
-    }
+def _carried(scene: Scene, mesh: Mesh, motion: SurfaceMotion, frames: list[int]) -> _Surfaces:
+    """The vertices of the mesh of the frame of `motion`, carried to other frames."""
+    times = [frame / len(scene.cameras) for frame in (motion.since, *frames)]
+    moved = carry_points(scene, mesh.vertices, np.zeros(len(mesh.vertices), np.intp), times)[1:]
+    displacement = np.stack([distance(there, mesh.vertices) for there in moved])
+    return _Surfaces(moved, displacement, motion.stretch(mesh.vertices.astype(np.float64), frames))
 
 
 def _colored_mesh(mesh: Mesh, maps: dict[str, _Map], shown: _Map, axes: Axes, unit: str) -> bytes:

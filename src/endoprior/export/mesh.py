@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ..core.checks import input_error
 from ..core.geometry import back_project, length_unit, pixel_centers
@@ -78,14 +80,40 @@ def depth_grid(surface: Surface, step: int, max_slope: float) -> Mesh:
     a, b, c, d = numbers[:-1, :-1], numbers[:-1, 1:], numbers[1:, :-1], numbers[1:, 1:]
     triangles = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
     triangles = triangles[_is_continuous(depth.ravel(), pixels.reshape(-1, 2), triangles, surface.camera.fx, max_slope)]
-    used, renumbered = np.unique(triangles, return_inverse=True)
+    used, triangles = split_at_touching_corners(triangles)
     vertices = back_project(pixels.reshape(-1, 2)[used].astype(np.float64), depth.ravel()[used], surface.camera)
     colors = surface.color[::step, ::step].reshape(-1, 3)[used]
     return Mesh(
         vertices.astype(np.float32),
-        renumbered.reshape(-1, 3).astype(np.int32),
+        triangles,
         np.rint(colors * 255).astype(np.uint8),
     )
+
+
+def split_at_touching_corners(triangles: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    """A vertex of its own for each fan of triangles: fans that touch in a corner alone are no surface there.
+
+    Args:
+        triangles: (F, 3) vertex numbers; no edge has more than two triangles.
+    Returns:
+        (V,) old number of each new vertex, ascending, and (F, 3) the triangles in new numbers.
+    """
+    if not len(triangles):
+        return np.zeros(0, np.intp), triangles.astype(np.int32)
+    corners = np.arange(triangles.size).reshape(-1, 3)
+    starts, ends = triangles.ravel(), np.roll(triangles, -1, 1).ravel()
+    # Of each edge, the corners at its smaller and its larger vertex number.
+    here, there = corners.ravel(), np.roll(corners, -1, 1).ravel()
+    smaller, larger = np.where(starts < ends, (here, there), (there, here))
+    order = np.lexsort((np.maximum(starts, ends), np.minimum(starts, ends)))
+    low, high = np.minimum(starts, ends)[order], np.maximum(starts, ends)[order]
+    shared = np.flatnonzero((low[1:] == low[:-1]) & (high[1:] == high[:-1]))
+    one = np.concatenate([smaller[order][shared], larger[order][shared]])
+    other = np.concatenate([smaller[order][shared + 1], larger[order][shared + 1]])
+    links = coo_array((np.ones(len(one), bool), (one, other)), shape=(triangles.size, triangles.size))
+    _, fan = connected_components(links, directed=False)
+    pairs, renumbered = np.unique(np.stack([starts, fan], 1), axis=0, return_inverse=True)
+    return pairs[:, 0].astype(np.intp), renumbered.reshape(-1, 3).astype(np.int32)
 
 
 def _is_continuous(

@@ -22,13 +22,15 @@ _TYPES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
 
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
-    """The PLY file of one time step."""
-    unit = length_unit(scene.lengths_are_relative)
-    return {".ply": encode_ply(step.plain_splats(scene, options.frame), options.frame, unit)}
+    """The PLY file of one time step. It says which one it is, because no other file may lie beside it."""
+    unit, facts = length_unit(scene.lengths_are_relative), step.facts()
+    when = [f"{name} {value}" for name, value in facts.items() if value is not None] or ["canonical"]
+    when += [f"frames_per_second {scene.frames_per_second:g}"] if scene.frames_per_second else []
+    return {".ply": encode_ply(step.plain_splats(scene, options.frame), options.frame, unit, ", ".join(when))}
 
 
-def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm") -> bytes:
-    """Binary PLY with one vertex per Gaussian, all properties float32.
+def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", when: str = "") -> bytes:
+    """Binary PLY with one vertex per Gaussian, all properties float32. Args: when: a comment on the time.
 
     x y z (mm), nx ny nz (0), f_dc_0..2, f_rest_0.. (all of red, then green, then blue, each in the order of
     docs/format.md), opacity (logit), scale_0..2 (log of mm), rot_0..3 (w, x, y, z, of length 1).
@@ -45,7 +47,7 @@ def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm") -> bytes
     columns |= {f"scale_{i}": np.log(splats.scales.numpy()[:, i].clip(1e-30)) for i in range(3)}
     rotations = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     columns |= {f"rot_{i}": rotations[:, i] for i in range(4)}
-    return ply_bytes(vertex_table(columns), axes, unit)
+    return ply_bytes(vertex_table(columns), axes, unit, comment=when)
 
 
 def vertex_table(columns: dict[str, NDArray]) -> NDArray:
@@ -57,7 +59,9 @@ def vertex_table(columns: dict[str, NDArray]) -> NDArray:
     return table
 
 
-def ply_bytes(vertices: NDArray, axes: Axes, unit: str, triangles: NDArray[np.int32] | None = None) -> bytes:
+def ply_bytes(
+    vertices: NDArray, axes: Axes, unit: str, triangles: NDArray[np.int32] | None = None, comment: str = ""
+) -> bytes:
     """A little-endian binary PLY file.
 
     Args:
@@ -65,8 +69,10 @@ def ply_bytes(vertices: NDArray, axes: Axes, unit: str, triangles: NDArray[np.in
         axes: named in a comment; `SPACE=LPS` or `SPACE=RAS` is what 3D Slicer looks for.
         unit: of lengths, named in the same comment.
         triangles: (F, 3) vertex numbers.
+        comment: one more line of text.
     """
     lines = ["ply", "format binary_little_endian 1.0", f"comment axes {axes}, unit {unit}"]
+    lines += [f"comment {comment}"] if comment else []
     lines += [f"comment SPACE={axes.upper()}"] if axes in ("lps", "ras") else []
     lines += [f"element vertex {len(vertices)}"]
     lines += [f"property {_TYPES[vertices.dtype[name].str.lstrip('|')]} {name}" for name in vertices.dtype.names]
@@ -79,4 +85,10 @@ def ply_bytes(vertices: NDArray, axes: Axes, unit: str, triangles: NDArray[np.in
     return ("\n".join([*lines, "end_header"]) + "\n").encode() + body
 
 
-FORMAT = Format(suffixes=(".ply",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, holds="Gaussians")
+FORMAT = Format(
+    suffixes=(".ply",),
+    options=(*TIME_STEP_OPTIONS, "canonical"),
+    files=files,
+    holds="Gaussians",
+    has_index=False,  # SuperSplat plays a folder as a sequence only if it holds nothing else
+)

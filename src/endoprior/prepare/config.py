@@ -85,7 +85,7 @@ class PrepareConfig:
     masks: str = "auto"
     """`auto` (found in the frames), `sam2`, `none`, or a folder of masks."""
     mask_labels: str = ""
-    """Labels in the mask folder that are tools, such as `shaft,jaw`. Usually their names tell."""
+    """Labels in the mask folder that are tools: names such as `shaft,jaw`, values such as `1,3`. Usually they tell."""
     mask_tool_value: Literal["auto", "high", "low"] = "auto"
     """Which value marks tools in the mask folder."""
 

@@ -12,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
-from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_values
+from ..core.spread import spread
+from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
+from ..data.depth_fill import is_measured
 from ..data.description import TOOLS_FOUND
 from ..data.found_tools import FoundTools
+from ..data.frame_files import match_files, match_names
 from ..data.mask_files import tool_polarity
 from ..data.mask_folders import MaskFrame, open_mask_folder
 from ..footage.changes import COLOR_DISTANCE, color_share
@@ -22,7 +25,6 @@ from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit
 from .config import PrepareConfig
 from .first_pass import FirstPass
-from .frame_files import match_files, match_names
 from .frame_geometry import FrameGeometry
 from .frames import Depth, FrameMethods, Mask, MeasuredFrame
 from .relative_depth import Kind, fit_reference, relative_to_mm
@@ -36,8 +38,6 @@ FITTED_SAMPLES = 16
 MAX_ROW_OFFSET_PX = 1.5
 """If the rows of the two cameras are further apart, stereo matching is poor."""
 NETWORK = "depth-anything"
-FEWEST_STEPS = 256
-"""Depth with at most this many different values was stored in 8 bits."""
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
 A = TypeVar("A")
@@ -74,7 +74,10 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
     notes = _check_stereo(samples, geometry, clip) if clip.stereo else []
     kind = _depth_kind(cfg, clip)
     relative = kind in ("shading", "network") or cfg.depth_relative != "no"
-    measure, source = (None, kind) if kind in ("none", "shading") else _measured_depth(kind, cfg, clip, first_pass)
+    measure, source = None, kind
+    if kind not in ("none", "shading"):
+        measure, source, depth_notes = _measured_depth(kind, cfg, clip, first_pass)
+        notes += depth_notes
     tools, mask_source, mask_note = _tools(cfg, first_pass, samples)
     notes += mask_note
     shade: Shade | None = None
@@ -130,8 +133,10 @@ def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
     return kind
 
 
-def _measured_depth(kind: DepthKind, cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> tuple[Measure, str]:
-    """A function that measures depth without a mask (mm, or relative values of a network), and its name."""
+def _measured_depth(
+    kind: DepthKind, cfg: PrepareConfig, clip: Clip, first_pass: FirstPass
+) -> tuple[Measure, str, list[str]]:
+    """A function that measures depth without a mask (mm, or relative values of a network), its name, and notes."""
     geometry = first_pass.geometry
     if kind == "sgbm":
         if not clip.stereo or geometry.baseline_mm is None:
@@ -143,23 +148,29 @@ def _measured_depth(kind: DepthKind, cfg: PrepareConfig, clip: Clip, first_pass:
             assert frame.right_u8 is not None
             return stereo_depth(frame.rgb_u8, frame.right_u8, focal, baseline, cfg.stereo).depth
 
-        return match, "stereo: semi-global matching"
+        return match, "stereo: semi-global matching", []
     if kind == "network":
         from .depth_network import DEFAULT_MODEL, DepthNetwork
 
         network = DepthNetwork(cfg.depth.partition(":")[2] or DEFAULT_MODEL)
-        return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2"
-    files = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
+        return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2", []
+    files, notes = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
     if cfg.depth_relative == "no" and not cfg.depth_unit_mm:
         fix = "`--depth-unit-mm 1` for mm, `0.01` for 0.01 mm, `1000` for m; or `--depth-relative depth`."
         raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.depth}", "none", fix)
 
+    if cfg.depth_relative == "no":
+        some = spread(len(first_pass.indices), FITTED_SAMPLES)
+        notes += _check_stored([read_stored(files[first_pass.indices[i]]) for i in some])
+
     def read(path: Path, size: tuple[int, int]) -> NDArray:
         if cfg.depth_relative != "no":
+            if cfg.depth_relative == "depth":
+                return read_depth_file(path, 1.0, size, relative=True)
             return read_values(path, size)
         return read_depth_file(path, cfg.depth_unit_mm, size)
 
-    return lambda frame: geometry.values(_of_either_size(read, files[frame.index], geometry)), "user's files"
+    return lambda frame: geometry.values(_of_either_size(read, files[frame.index], geometry)), "user's files", notes
 
 
 def _scaled(measure: Measure, samples: list[MeasuredFrame], usable: list[Mask], cfg: PrepareConfig) -> Measure:
@@ -175,9 +186,19 @@ def _check_unit(samples: list[MeasuredFrame], depths: list[Depth], geometry: Fra
     if guess.unit in ("m", "0.01 mm"):
         fix = f"The values look like {guess.unit}: multiply --depth-unit-mm by {guess.mm_per_unit:g}."
         raise input_error("--depth-unit-mm", "tissue 20 to 250 mm away", f"{guess.median:g} mm in {folder}", fix)
-    notes = [] if guess.unit == "mm" else [f"the depth unit may be wrong: {guess.reason}. Check --depth-unit-mm."]
-    if max(len(np.unique(depth)) for depth in depths) <= FEWEST_STEPS:
+    return [] if guess.unit == "mm" else [f"the depth unit may be wrong: {guess.reason}. Check --depth-unit-mm."]
+
+
+def _check_stored(images: list[NDArray]) -> list[str]:
+    """Notes on the numbers (H, W) of some depth files: 8 bits, and what stands for missing depth."""
+    notes = []
+    if all(image.dtype == np.uint8 for image in images):
         notes.append("the depth has at most 256 steps: 8-bit files are too coarse for motion in mm. Use 16-bit files.")
+    filled = [np.isfinite(image) & (image > 0) & ~is_measured(image) for image in images]
+    if any(each.any() for each in filled):
+        least = min(float(image[each].min()) for image, each in zip(images, filled, strict=True) if each.any())
+        share = float(np.mean([each.mean() for each in filled]))
+        notes.append(f"depth: numbers from {least:g} on are far above the rest and count as missing, {share:.1%} of it")
     return notes
 
 
@@ -220,15 +241,15 @@ def _user_masks(
     path, geometry = Path(cfg.masks), first_pass.geometry
     given = open_mask_folder(path, cfg.mask_labels)
     names = [each.name for each in given.frames]
-    found = match_names(path, names, first_pass.indices, first_pass.image_names, in_order_only=given.in_order_only)
+    matched = match_names(path, names, first_pass.indices, first_pass.image_names, in_order_only=given.in_order_only)
 
     def read(each: MaskFrame, size: tuple[int, int]) -> Mask:
         return each.read(size)
 
     def high(frame: MeasuredFrame) -> Mask:
-        return geometry.values(_of_either_size(read, given.frames[found[frame.index]], geometry))
+        return geometry.values(_of_either_size(read, given.frames[matched.files[frame.index]], geometry))
 
-    notes = [f"masks: {given.note}"] if given.note else []
+    notes = [f"masks: {each}" for each in (given.note, matched.rule) if each]
     if given.tool_is_high is None or cfg.mask_tool_value != "auto":
         polarity = tool_polarity(cfg.mask_tool_value, [high(f) for f in samples], [f.rgb_u8 for f in samples])
         tool_is_high = polarity.tool_is_high

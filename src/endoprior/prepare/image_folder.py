@@ -11,10 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..data.files import entries, natural_order
+from ..data.files import entries, files_with
 from ..data.images import decode_image, describe_pixels
+from ..data.series import one_per_frame
 from ..data.video_files import STILL_SUFFIXES
 from .source_frame import SourceFrame
+
+OTHER_IMAGES = (".webp", ".jp2", ".gif", ".avif", ".exr")
+"""Suffixes of images that are counted, but not read."""
 
 
 class ImageFolder:
@@ -24,13 +28,12 @@ class ImageFolder:
     """Time of the first image on the clock of the files, s."""
 
     def __init__(self, path: Path, frames_per_second: float) -> None:
-        """List the folder; raises InputError if it has no images."""
+        """List the folder; raises InputError if it has no images, or several of each frame."""
         self.path, self.frames_per_second = path, frames_per_second
-        visible = [file for file in entries(path) if file.name[0] != "."]
-        self.files = sorted((file for file in visible if file.suffix.lower() in STILL_SUFFIXES), key=natural_order)
+        self.files, self._left_out = one_per_frame(path, files_with(path, STILL_SUFFIXES), "images")
         if not self.files:
             raise input_error(path, "images (PNG, JPEG, TIFF, BMP) or a video file", "none", "Check the path.")
-        self._others = [file for file in visible if file.suffix.lower() in (".webp", ".jp2", ".gif", ".avif", ".exr")]
+        self._others = [file for file in entries(path) if file.suffix.lower() in OTHER_IMAGES and file.name[0] != "."]
         self.times = [index / frames_per_second for index in range(len(self.files))]
         self.num_frames, self.seconds = len(self.files), len(self.files) / frames_per_second
         self.height, self.width = self._stored(self.files[0]).shape[:2]
@@ -38,7 +41,7 @@ class ImageFolder:
     @property
     def notes(self) -> list[str]:
         """What is particular about the images, one line each."""
-        found = []
+        found = [self._left_out] if self._left_out else []
         if self._others:
             kinds = ", ".join(sorted({file.suffix for file in self._others}))
             found.append(f"{self.path.name}: {len(self._others)} images of other kinds ({kinds}) are not used")

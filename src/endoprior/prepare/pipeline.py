@@ -142,7 +142,9 @@ def prepare(
             notes.append(f"masks: tools are likely missed: {what}. To look and correct: {command('view', out)}")
         if others := sorted({*unexplained} - {*damaged}):
             frames = number_ranges(others)
-            notes.append(f"no camera pose, or another scene, in frames {frames}; --start and --end can leave them out")
+            few = files.count - len(unexplained) < 2
+            fix = "look at the images: is this one video?" if few else "--start and --end can leave them out"
+            notes.append(f"no camera pose, or another scene, in frames {frames}; {fix}")
     return Prepared(out, files.count, first_pass.geometry.size, notes)
 
 

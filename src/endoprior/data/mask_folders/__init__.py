@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...core.checks import input_error
-from ..files import entries, files_with, natural_order
-from ..mask_files import MASK_SUFFIXES
+from ..files import entries, files_with, in_order
+from ..mask_files import MASK_SUFFIXES, demand_known, rule_of_files
+from ..mask_values import name
 from ..reading import kind_of
+from ..series import one_per_frame
 from .cvat import segmentation_masks
 from .cvat_xml import annotations
 from .frames import MaskFolder, MaskFrame, union_of_files
@@ -56,7 +58,7 @@ def _in_folder(folder: Path, labels: str) -> MaskFolder:
             raise input_error(folder, "one file with annotations", names, f"Pass one of them, such as {read[0][0]}.")
         if read:
             return read[0][1]
-        inner = sorted((each for each in entries(folder) if each.is_dir() and each.name[0] != "."), key=natural_order)
+        inner = in_order(each for each in entries(folder) if each.is_dir() and each.name[0] != ".")
         # SAM 2 writes a folder per video.
         with_masks = [each for each in inner if files_with(each, MASK_SUFFIXES) or object_folders(each, "")]
         if len(with_masks) == 1:
@@ -67,7 +69,19 @@ def _in_folder(folder: Path, labels: str) -> MaskFolder:
     if not files:
         fix = "Put one file per frame there."
         raise input_error(folder, f"masks ({', '.join(MASK_SUFFIXES)})", "none", fix)
-    return _without_labels(MaskFolder([MaskFrame(file.name, union_of_files([file])) for file in files]), labels)
+    return _plain(folder, files, labels)
+
+
+def _plain(folder: Path, files: list[Path], labels: str) -> MaskFolder:
+    """One file per frame; labels in them are tools where their values or the user tell."""
+    files, left_out = one_per_frame(folder, files, "masks")
+    rule = rule_of_files(files, labels)
+    example = name(rule.labels[-1]) if rule.labels else ""
+    demand_known(folder, rule, f"name those of tools, such as `{OPTION} {example}`.")
+    frames = [MaskFrame(file.name, union_of_files([file], rule)) for file in files]
+    hint = f"; others: `{OPTION} {example}`" if rule.labels and not labels else ""
+    note = "; ".join(each for each in (left_out, rule.note + hint) if each)
+    return MaskFolder(frames, note, True if rule.labels else None)
 
 
 def _in_file(file: Path, labels: str) -> MaskFolder | None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import input_error
-from ..files import files_with, natural_order
+from ..files import files_with, in_order
 from ..images import decode_image
 from ..reading import kind_of, read_text
 from .frames import Mask, MaskFolder, MaskFrame, Size, demand_size
@@ -34,7 +34,7 @@ def segmentation_masks(folder: Path, asked: str) -> MaskFolder | None:
     files = {file.stem: file for file in files_with(root / CLASSES, (".png",))}
     listed = _listed(root / LISTED)
     # Images without a shape are listed, but some versions write no mask for them.
-    names = sorted({*files, *listed}, key=lambda name: natural_order(Path(name)))
+    names = [file.name for file in in_order(map(Path, {*files, *listed}))]
     wanted = [colors[name] for name in tools]
     frames = [MaskFrame(f"{name}.png", _reader(files.get(name), colors, wanted)) for name in names]
     rest = [name for name in labels if name != "background"]

@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 
 from ...core.checks import input_error
-from ..files import natural_order
 from ..reading import read_text
-from .frames import Mask, MaskFolder, MaskFrame, Size, demand_size
+from .frames import Mask, MaskFolder, MaskFrame, Size, demand_size, sorted_frames
 from .labels import tool_labels, words_about
 from .run_lengths import mask_of_runs
 
@@ -54,8 +53,7 @@ def annotations(file: Path, asked: str) -> MaskFolder | None:
     labels = [*dict.fromkeys([*named, *used])]
     tools = tool_labels(file, labels, asked)
     skipped = Counter(shape.tag for image in images for shape in image if shape.get("label") in tools)
-    frames = [_frame(file, image, tools) for image in images]
-    frames.sort(key=lambda frame: natural_order(Path(frame.name)))
+    frames = sorted_frames([_frame(file, image, tools) for image in images])
     left_out = ", ".join(f"{count} of {tag}" for tag, count in sorted(skipped.items()) if tag not in SHAPES)
     note = f"CVAT for images; {words_about(labels, tools)}" + (f"; shapes left out: {left_out}" if left_out else "")
     return MaskFolder(frames, note, True)

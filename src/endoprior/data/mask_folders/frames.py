@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import input_error
+from ..file_names import sorting_keys
 from ..mask_files import read_user_mask
+from ..mask_values import HighValues
 
 Mask = NDArray[np.bool_]
 Size = tuple[int, int]
@@ -41,11 +43,17 @@ class MaskFolder:
     """The numbers in the names are not those of frames: masks belong to frames in order, if there are as many."""
 
 
-def union_of_files(files: Sequence[Path]) -> Callable[[Size], Mask]:
-    """Reads the union of some mask files; of none, an empty mask."""
+def sorted_frames(frames: Sequence[MaskFrame]) -> list[MaskFrame]:
+    """The frames in natural order of their names."""
+    keys = sorting_keys([Path(frame.name).stem for frame in frames])
+    return [frames[i] for i in sorted(range(len(frames)), key=keys.__getitem__)]
+
+
+def union_of_files(files: Sequence[Path], rule: HighValues | None = None) -> Callable[[Size], Mask]:
+    """Reads the union of some mask files; of none, an empty mask. Args: rule: as `read_user_mask`."""
 
     def read(size: Size) -> Mask:
-        return union((read_user_mask(file, size) for file in files), size)
+        return union((read_user_mask(file, size, rule) for file in files), size)
 
     return read
 

@@ -11,10 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ...core.checks import InputError
-from ..files import natural_order
 from ..mask_files import read_user_mask
 from ..reading import kind_of, read_text
-from .frames import Mask, MaskFolder, MaskFrame, Size
+from .frames import Mask, MaskFolder, MaskFrame, Size, sorted_frames
 
 TRANSFORMS = "transforms.json"
 SHRUNK = (2, 4, 8)
@@ -27,8 +26,7 @@ def ignore_masks(folder: Path) -> MaskFolder | None:
             if root != folder and not any(folder.name in _siblings(mask.parent.name) for _, mask in named):
                 continue
             # A frame is known by its image; the mask usually has the same name.
-            frames = [MaskFrame(image.name, _reader(root / mask)) for image, mask in named]
-            frames.sort(key=lambda frame: natural_order(Path(frame.name)))
+            frames = sorted_frames([MaskFrame(image.name, _reader(root / mask)) for image, mask in named])
             return MaskFolder(frames, "nerfstudio masks; tools: where a mask is 0", False)
     return None
 

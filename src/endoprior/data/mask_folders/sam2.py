@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...core.checks import input_error
-from ..files import entries, files_with, natural_order
+from ..files import entries, files_with, in_order
 from ..images import decode_image
 from ..mask_files import MASK_SUFFIXES
 from ..reading import read_bytes, read_text
@@ -50,7 +50,7 @@ def palette_folder(folder: Path, asked: str) -> MaskFolder | None:
 
 def object_folders(folder: Path, asked: str) -> MaskFolder | None:
     """A folder per object, named by its number, each with a mask per frame; None for other folders."""
-    parts = sorted((each for each in entries(folder) if each.is_dir() and each.name.isdigit()), key=natural_order)
+    parts = in_order(each for each in entries(folder) if each.is_dir() and each.name.isdigit())
     if not parts or files_with(folder, MASK_SUFFIXES):
         return None
     tools = chosen_objects(folder, [part.name for part in parts], asked)
@@ -60,7 +60,7 @@ def object_folders(folder: Path, asked: str) -> MaskFolder | None:
             by_name.setdefault(file.name, []).extend([file] if part.name in tools else [])
     if not by_name:
         return None
-    names = sorted(by_name, key=lambda name: natural_order(Path(name)))
+    names = [file.name for file in in_order(map(Path, by_name))]
     note = f"SAM 2, a folder per object; tools: objects {', '.join(tools)}"
     return MaskFolder([MaskFrame(name, union_of_files(by_name[name])) for name in names], note, True)
 

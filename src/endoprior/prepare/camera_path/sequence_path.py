@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...core.checks import number_ranges
 from ...core.geometry import length_unit
+from ...data.writer import FARTHEST_UNIT
 from ...footage.camera_motion import camera_motion
 from ...footage.changes import find_changes
 from .choose import How, find_path
@@ -99,8 +100,9 @@ def unexplained_frames(path: CameraPath | None, images: Iterable[NDArray[np.uint
 
 
 def rescaled(stored: NDArray, scale: float) -> NDArray[np.uint16]:
-    """Stored depth times a factor; 0, missing, stays."""
-    return np.clip(np.round(stored.astype(np.float64) * scale), 0, 65535).astype(np.uint16)
+    """Stored depth times a factor; 0, missing, stays, and what is too far for 16 bits becomes it."""
+    units = np.round(stored.astype(np.float64) * scale)
+    return np.where(units <= FARTHEST_UNIT, units, 0).astype(np.uint16)
 
 
 def _from_file(
