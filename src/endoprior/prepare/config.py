@@ -38,13 +38,19 @@ class PrepareConfig:
     right: Path | None = None
     """Video or image folder of the second camera, if each camera has its own file."""
     calibration: Path | None = None
-    """Calibration of one or two cameras: OpenCV (.yaml, .json, .npz) or da Vinci (.ini)."""
+    """Calibration of one or two cameras, in a file of OpenCV, ROS, Kalibr, ORB-SLAM, COLMAP or the da Vinci."""
+    calibration_size: str = ""
+    """Size of one camera's image when it was calibrated, such as `1280x1024`, if the file does not state it."""
     calibration_unit: Unit = "auto"
     """Unit of the translation T in the calibration."""
     layout: Layout = "auto"
     """How the images of two cameras are stored in a video frame."""
     swap_eyes: bool = False
     """The first camera of the video is the right one: swap them."""
+    squeezed_eyes: bool = False
+    """Each camera has half of its width (side by side) or height (top-bottom): stretch its images."""
+    row_offset: Literal["no", "auto"] = "no"
+    """`auto` measures how many rows apart both cameras see the same point, and moves the right images by that."""
     field_of_view_degrees: float = 70.0
     """Assumed angle across the image width, or across the round border. Used only without a calibration."""
 

@@ -16,9 +16,11 @@ from ..footage.optical_flow import MOTION_S
 from ..footage.overlays import find_static_overlays
 from ..footage.round_border import CERTAIN
 from .calibration import Calibration
+from .calibration_size import fitted
 from .config import PrepareConfig, Rectangle, parse_rectangle
 from .frame_geometry import FrameGeometry, demand_within, make_geometry
 from .source import ImageFolder
+from .stereo_layout import Layout
 from .video_clip import Clip, EvenSample, SampledFrame
 
 SAMPLES = 24
@@ -65,6 +67,11 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
     lefts = [sampled.frame.left for sampled in sample.kept]
     notes = [source.note for source in (clip.source, clip.second) if source and source.note]
     notes += _timing_notes(selection.gaps, selection.uneven_steps, len(indices))
+    stretch = _stretch(clip.layout) if cfg.squeezed_eyes else (1, 1)
+    if calibration is not None:
+        full = clip.camera_size[0] * stretch[0], clip.camera_size[1] * stretch[1]
+        calibration, words = fitted(calibration, full, name, squeezed=cfg.squeezed_eyes)
+        notes += [*calibration.notes, *words]
     strips = circle = outside = None
     labels: list[Rectangle] = []
     if cfg.border == "auto":
@@ -79,6 +86,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         calibration,
         stereo=clip.stereo,
         name=name,
+        stretch=stretch,
         field_of_view_degrees=cfg.field_of_view_degrees,
         max_width=cfg.max_width,
         crop=parse_rectangle(cfg.crop, "--crop") if cfg.crop else None,
@@ -95,6 +103,14 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         )
     names = [file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else []
     return FirstPass(indices, sample.kept, geometry, notes, names)
+
+
+def _stretch(layout: Layout) -> tuple[int, int]:
+    """Factors (across, down) that give images of a squeezed layout their shape back."""
+    if layout not in ("side-by-side", "top-bottom"):
+        fix = "Set --layout, or remove --squeezed-eyes."
+        raise input_error("--squeezed-eyes", "both cameras side by side or top-bottom in a frame", layout, fix)
+    return (2, 1) if layout == "side-by-side" else (1, 2)
 
 
 def _without(image: NDArray[np.uint8], strips: Strips | None) -> NDArray[np.uint8]:

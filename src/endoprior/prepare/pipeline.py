@@ -17,6 +17,7 @@ from ..data.images import decode_image, read_color, read_depth, read_tool_mask, 
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
 from .calibration_files import read_calibration
+from .calibration_size import parse_size
 from .camera_path.seen import CameraPath, Lens, PoseInput
 from .camera_path.sequence_path import (
     ASSUMED,
@@ -74,6 +75,8 @@ def prepare(
     plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
         calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
+        if calibration is not None and cfg.calibration_size:
+            calibration = replace(calibration, size=parse_size(cfg.calibration_size), size_is_sure=True)
         clip = Clip(video, cfg, calibration)
         progress("looking through", 0, clip.source.num_frames)
         first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
