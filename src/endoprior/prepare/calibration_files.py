@@ -82,6 +82,8 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     layout = table.get("layout") if isinstance(table.get("layout"), str) else None
     if not any(_has_lens(side, table, path) for side in (left_side, right_side) if side):
         notes.append(f"{path}: no lens distortion is stated; the images count as undistorted")
+    if left.fisheye:
+        notes.append(f"{path}: the lens is a fisheye (equidistant), and is undistorted as one")
     return Calibration(
         left, right, rotation, translation, size, layout, size_is_sure=path.name == "sequence.json", notes=tuple(notes)
     )

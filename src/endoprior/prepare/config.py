@@ -38,7 +38,7 @@ class PrepareConfig:
     right: Path | None = None
     """Video or image folder of the second camera, if each camera has its own file."""
     calibration: Path | None = None
-    """Calibration of one or two cameras, in a file of OpenCV, ROS, Kalibr, ORB-SLAM, COLMAP or the da Vinci."""
+    """Calibration of one or two cameras: a file of OpenCV, ROS, Kalibr, da Vinci, ..."""
     calibration_size: str = ""
     """Size of one camera's image when it was calibrated, such as `1280x1024`, if the file does not state it."""
     calibration_unit: Unit = "auto"

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from ..core.checks import input_error, number_ranges
 from ..core.shell import command
 from ..data import write_stir_tracks
+from ..data.description import SIZE_NOT_STATED
 from ..data.found_tools import FrameRow, RowLog, read_rows, uncertain_frames
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
+from .calibration import Calibration
 from .calibration_files import read_calibration
 from .calibration_size import parse_size
 from .camera_path.seen import CameraPath, Lens, PoseInput
@@ -35,6 +37,7 @@ from .first_pass import input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry
 from .frames import write_frames
 from .record import record_of
+from .row_offset import with_equal_rows
 from .sam2 import is_sam2, open_sam2
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
@@ -80,9 +83,13 @@ def prepare(
         clip = Clip(video, cfg, calibration)
         progress("looking through", 0, clip.source.num_frames)
         first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
+        if cfg.row_offset == "auto":
+            frames = [sampled.frame for sampled in first_pass.samples]
+            first_pass.geometry, row_note = with_equal_rows(first_pass.geometry, frames)
+            first_pass.notes.append(row_note)
         progress("looking at tools and light", 0, len(first_pass.indices))
         chosen = choose_methods(cfg, clip, first_pass)
-        meta = _meta(clip, first_pass.geometry, chosen, calibrated=calibration is not None)
+        meta = _meta(clip, first_pass.geometry, chosen, lens=_lens_source(calibration))
         parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
         found = RowLog(folder)
         done = frames_done(folder, parts)
@@ -138,7 +145,7 @@ def prepare(
     return Prepared(out, files.count, first_pass.geometry.size, notes)
 
 
-def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, calibrated: bool) -> SequenceMeta:
+def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, lens: str) -> SequenceMeta:
     return SequenceMeta(
         width=geometry.size[0],
         height=geometry.size[1],
@@ -151,8 +158,14 @@ def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, calibra
         depth_scale=DEPTH_SCALE,
         depth_source=chosen.sources["depth"],
         depth_relative=chosen.relative,
-        sources=chosen.sources | {"lens": CALIBRATED if calibrated else ASSUMED},
+        sources=chosen.sources | {"lens": lens},
     )
+
+
+def _lens_source(calibration: Calibration | None) -> str:
+    if calibration is None:
+        return ASSUMED
+    return CALIBRATED if calibration.size else SIZE_NOT_STATED
 
 
 def _camera_path(

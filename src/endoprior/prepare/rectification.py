@@ -17,6 +17,8 @@ from .calibration import Calibration, Intrinsics
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 LEAST_FOCAL_SHARE, MOST_FOCAL_SHARE = 0.2, 5.0
 """A rectified focal length outside of this range, as a share of the calibrated one, comes from wrong coefficients."""
+MOST_LOST = 0.2
+"""So much of an image may be lost: corners outside of a round image, where nothing was measured."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +44,20 @@ def rectify(calibration: Calibration, size: tuple[int, int], name: str, *, stere
     """
     found = _pair(calibration, size, name) if stereo else _single(calibration.left, size)
     share = found.matrix[0, 0] / calibration.left.matrix[0, 0]
-    if not LEAST_FOCAL_SHARE < share < MOST_FOCAL_SHARE:
-        want, got = "coefficients that undistort the whole image", f"{share:.3g} times the focal length after it"
-        raise input_error(name, want, got, "Check the distortion and its model.")
+    lost = max((_lost(maps, size) for maps in found.maps if maps is not None), default=0.0)
+    if lost > MOST_LOST or not LEAST_FOCAL_SHARE < share < MOST_FOCAL_SHARE:
+        got = f"{share:.3g} times the focal length and {lost:.0%} of the image lost after it"
+        raise input_error(
+            name, "a distortion that can be undone", got, "Check the distortion, its model and the size of its images."
+        )
     return found
+
+
+def _lost(maps: Maps, size: tuple[int, int]) -> float:
+    """Share of the rectified pixels that are outside of the source image, or whose neighbors change sides in it."""
+    (x_down, x_across), (y_down, y_across) = (np.gradient(of) for of in maps)
+    shown = (maps[0] > -1) & (maps[0] < size[0]) & (maps[1] > -1) & (maps[1] < size[1])
+    return float((~shown | (x_across * y_down - x_down * y_across <= 0)).mean())
 
 
 def stretched(maps: Maps | None, size: tuple[int, int], stretch: tuple[int, int]) -> Maps | None:
