@@ -20,8 +20,10 @@ from ..data.description import SIZE_NOT_STATED
 from ..footage.camera_motion import MOVING_FRACTION
 from .facts import Facts
 from .fixes import (
+    convert_poses,
     correct_masks,
     detect_tools,
+    estimate_poses,
     in_stored_px,
     longest_part,
     mask_tools,
@@ -244,6 +246,18 @@ def _motion(facts: Facts) -> Iterator[Finding]:
     yield Finding("camera-moves", "warning", what, ", or ".join(fixes) or "store the poses of the camera")
 
 
+def _poses(facts: Facts) -> Iterator[Finding]:
+    fit = facts.pose_fit
+    if fit is None:
+        return
+    if fit.another_fits:
+        what = f"the camera poses explain the images better in another convention: depth reprojects to {fit.reason}"
+        yield Finding("poses-convention", "error", what, convert_poses(facts, fit.best, fit.unit))
+    elif fit.none_fits:
+        what = f"the camera poses do not explain the images in any convention: depth reprojects to {fit.reason}"
+        yield Finding("poses-convention", "warning", what, estimate_poses(facts))
+
+
 def _windows(facts: Facts) -> Iterator[Finding]:
     if len(facts.windows) == 1:
         return
@@ -320,6 +334,7 @@ CHECKS: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
     _border,
     _stereo,
     _motion,
+    _poses,
     _windows,
     _changes,
     _size,

@@ -88,6 +88,25 @@ def rescale_camera(facts: Facts, factor: float) -> str:
     return f"{set_values(facts, **values)}, or what the calibration says for these images"
 
 
+def convert_poses(facts: Facts, convention: str, unit: float) -> str:
+    """The command that reads the stored poses in another convention, in the folder itself where that is possible."""
+    options = {"--poses-convention": (convention,)} if convention != "opencv" else {}
+    options |= {"--poses-unit-mm": (f"{unit:.4g}",)} if unit != 1 else {}
+    file, remake = facts.path / "poses_bounds.npy", facts.remakes.from_frames
+    if remake and file.is_file():
+        in_place = f"`{command_of('poses', (facts.path,), {'--poses': (str(file),)} | options)}`"
+        return f"{in_place}, which keeps the old ones in poses_bounds_before.npy"
+    return "store camera-to-world matrices in mm with OpenCV axes (x right, y down, z forward)"
+
+
+def estimate_poses(facts: Facts) -> str:
+    """What to do about poses that fit in no convention: match them to the frames, or estimate them."""
+    fix = "check that each pose stands in the row of its frame"
+    if facts.remakes.from_frames and (facts.path / "poses_bounds.npy").is_file():
+        fix += f", or `{command('poses', facts.path, '--poses', 'estimate')}` finds the camera path"
+    return fix
+
+
 def detect_tools(facts: Facts) -> str | None:
     """The command that finds tools; None if this was done, or cannot be."""
     remake, present = facts.remakes.best, facts.sources.get("masks", "")

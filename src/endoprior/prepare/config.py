@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..core.checks import check_range, input_error
+from ..core.pose_conventions import Convention
 from .calibration_files import Unit
 from .stereo import StereoConfig
 from .stereo_layout import Layout
@@ -99,6 +100,11 @@ class PrepareConfig:
     """`still` (static camera), `estimate` (from depth and static tissue; by COLMAP if it is installed and explains the
     frames better; `own` and `colmap` force one), or a file: .npy (T, 4, 4) camera-to-world in mm, or poses_bounds.npy.
     `auto` estimates poses if the camera moves; `auto-own` never by COLMAP, which takes longer."""
+    poses_convention: Convention = "opencv"
+    """Meaning of the matrices in the file of --poses: camera-to-world with OpenCV or OpenGL axes, or with LLFF's columns
+    (down, right, back); or world-to-camera. `check` tells which one fits."""
+    poses_unit_mm: float = 1.0
+    """mm per unit of the positions in the file of --poses: 1000 for m."""
     stir: Path | None = None
     """Folder of the STIR clip (`left/seqNN`) that VIDEO belongs to: its tattooed points become `truth/tracks.npz`."""
     keep_right: bool = False
@@ -116,4 +122,5 @@ class PrepareConfig:
         check_range("max_frames", self.max_frames, 2, 1_000_000)
         check_range("max_width", self.max_width, 0, 16384)
         check_range("depth_unit_mm", self.depth_unit_mm, 0, 1e6)
+        check_range("poses_unit_mm", self.poses_unit_mm, 1e-6, 1e6)
         check_range("working_distance_mm", self.working_distance_mm, 1, 1000)

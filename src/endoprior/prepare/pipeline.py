@@ -25,6 +25,7 @@ from .camera_path.sequence_path import (
     ASSUMED,
     CALIBRATED,
     PATH_RECORD,
+    Reading,
     record_of_path,
     rescaled,
     sequence_path,
@@ -118,7 +119,9 @@ def prepare(
             inside, shade = first_pass.geometry.inside, chosen.methods.shade
             carried_notes = replace_by_carried(files, segmenter, inside, shade, progress)
         progress("following the camera", 0, files.count)
-        path, motion_notes = _camera_path(cfg, files, lambda done: progress("following the camera", done, files.count))
+        path, motion_notes = _camera_path(
+            cfg, files, first_pass.geometry, lambda done: progress("following the camera", done, files.count)
+        )
         unexplained = unexplained_frames(path, (read_color(files.file("images", i)) for i in range(files.count)))
         if path is not None:
             if files.meta.depth_relative:
@@ -169,7 +172,7 @@ def _lens_source(calibration: Calibration | None) -> str:
 
 
 def _camera_path(
-    cfg: PrepareConfig, files: FrameFiles, progress: Callable[[int], None]
+    cfg: PrepareConfig, files: FrameFiles, geometry: FrameGeometry, progress: Callable[[int], None]
 ) -> tuple[CameraPath | None, list[str]]:
     """Poses of the written frames, None for a static camera; and notes for the user."""
     meta = files.meta
@@ -182,6 +185,8 @@ def _camera_path(
         return PoseInput(read_color(files.file("images", index)), tissue(index), depth)
 
     matrix = np.array([[meta.fx, 0, meta.cx], [0, meta.fy, meta.cy], [0, 0, 1]])
+    # Poses of a file are those of the source's left camera, which rectification turns.
+    turn = None if np.array_equal(geometry.turn, np.eye(3)) else geometry.turn
     return sequence_path(
         cfg.poses,
         frame,
@@ -191,6 +196,7 @@ def _camera_path(
         (meta.width, meta.height),
         has_depth=cfg.depth != "none",
         refine_focal=cfg.calibration is None,
+        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn),
         progress=progress,
     )
 
