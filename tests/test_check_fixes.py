@@ -300,7 +300,7 @@ def test_the_fix_of_a_stereo_sequence(stereo, capsys, code, damage):
 def test_every_problem_has_a_test_or_a_reason():
     text = (Path(__file__).parents[1] / "docs" / "check.md").read_text()
     listed = set(re.findall(r"`([a-z0-9-]+)`", " ".join(re.findall(r"^- (.*?) \(", text, re.MULTILINE))))
-    tested = {code for code, _, _ in [*QUICK, *SLOW]} | {"swapped-eyes", "vertical-offset"}
+    tested = {code for code, _, _ in [*QUICK, *SLOW]} | {"swapped-eyes", "vertical-offset", "poses-convention"}
     same_code = {"depth-centimetres", "depth-unit"}  # as depth-metres, with another factor
     assert listed == tested | set(DECISIONS) | same_code
     assert not tested & set(DECISIONS)

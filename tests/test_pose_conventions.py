@@ -128,17 +128,8 @@ def test_poses_of_another_convention_are_noticed_by_all_commands_and_corrected(
 ):
     np.save(tmp_path / "poses.npy", in_meters(FILES[name], unit))
     out = tmp_path / "OUT"
-    options = [
-        "--masks",
-        "none",
-        "--depth",
-        data / "depth",
-        "--depth-unit-mm",
-        "0.01",
-        "--poses",
-        tmp_path / "poses.npy",
-    ]
-    options += ["--calibration", data / "sequence.json", "--border", "keep"]
+    options = ["--layout", "mono", "--masks", "none", "--border", "keep", "--depth", data / "depth"]
+    options += ["--depth-unit-mm", "0.01", "--calibration", data / "sequence.json", "--poses", tmp_path / "poses.npy"]
     assert main(["prepare", *map(str, [data / "images", out, *options])]) == 0
     assert " ".join(words) in capsys.readouterr().out
     (finding,) = (found for found in find(measure(load_sequence(out))) if found.code == "poses-convention")

@@ -101,7 +101,7 @@ class PrepareConfig:
     frames better; `own` and `colmap` force one), or a file: .npy (T, 4, 4) camera-to-world in mm, or poses_bounds.npy.
     `auto` estimates poses if the camera moves; `auto-own` never by COLMAP, which takes longer."""
     poses_convention: Convention = "opencv"
-    """Meaning of the matrices in the file of --poses: camera-to-world with OpenCV or OpenGL axes, or with LLFF's columns
+    """Meaning of the matrices in the file of --poses: camera-to-world with OpenCV or OpenGL axes, or LLFF's columns
     (down, right, back); or world-to-camera. `check` tells which one fits."""
     poses_unit_mm: float = 1.0
     """mm per unit of the positions in the file of --poses: 1000 for m."""
