@@ -32,7 +32,7 @@ EDIT = re.compile(r"set (.*) in (\S+/sequence\.json)|write \{(.*)\} to (\S+/sequ
 DECISIONS = {
     "few-frames": "more frames must be recorded",
     "relative-depth": "nothing is wrong unless mm are needed",
-    "vertical-offset": "only the user has the calibration of the endoscope",
+    "calibration-size": "only the user knows for which images the endoscope was calibrated",
     "no-points": "masks or depth are wrong in a way that the figure shows",
     "reader": "the note itself says what is unusual",
     "windows": "nothing is wrong",
@@ -256,6 +256,10 @@ def swap(data):
     (data / "left").rename(data / "right")
 
 
+def low_right(data):
+    edit(data / "right", lambda image, _: np.roll(image, 4, 0))
+
+
 QUICK = [
     ("mask-polarity", inverted, 1),
     ("depth-metres", in_meters, 2),
@@ -294,7 +298,8 @@ def test_the_fix_of_a_sequence(data, capsys, code, damage, ways):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("code", "damage"), [("swapped-eyes", swap), ("depth-sparse", sparse), ("no-depth-frames", no_depth)]
+    ("code", "damage"),
+    [("swapped-eyes", swap), ("vertical-offset", low_right), ("depth-sparse", sparse), ("no-depth-frames", no_depth)],
 )
 def test_the_fix_of_a_stereo_sequence(stereo, capsys, code, damage):
     damage(stereo)
@@ -307,7 +312,7 @@ def test_the_fix_of_a_stereo_sequence(stereo, capsys, code, damage):
 def test_every_problem_has_a_test_or_a_reason():
     text = (Path(__file__).parents[1] / "docs" / "check.md").read_text()
     listed = set(re.findall(r"`([a-z0-9-]+)`", " ".join(re.findall(r"^- (.*?) \(", text, re.MULTILINE))))
-    tested = {code for code, _, _ in [*QUICK, *SLOW]} | {"swapped-eyes"}
+    tested = {code for code, _, _ in [*QUICK, *SLOW]} | {"swapped-eyes", "vertical-offset", "poses-convention"}
     same_code = {"depth-centimetres", "depth-unit"}  # as depth-metres, with another factor
     assert listed == tested | set(DECISIONS) | same_code
     assert not tested & set(DECISIONS)
@@ -402,11 +407,12 @@ def test_a_prepared_sequence_whose_video_is_gone_is_made_from_its_frames(whole, 
 
 
 @pytest.mark.slow
-def test_vertical_offset_names_the_video_and_leaves_the_calibration_open(stereo, capsys):
-    edit(stereo / "right", lambda image, _: np.roll(image, 4, 0))
+def test_vertical_offset_of_a_video_moves_the_rows_then_asks_for_the_calibration(stereo, capsys):
+    low_right(stereo)
     words = [stereo / "images", stereo.parent / "pair", "--right", stereo / "right"]
     options = ["--calibration", stereo / "calibration.json", "--keep-right"]
     assert main(["prepare", *map(str, words), *map(str, options)]) == 0
-    fix = check(stereo.parent / "pair")["vertical-offset"].fix
-    assert fix.startswith(f"`endoprior prepare '{stereo}/images' {stereo.parent}/pair_2 ")
+    assert_fixed(capsys, stereo.parent / "pair", "vertical-offset")
+    low_right(stereo.parent / "pair_2")
+    fix = check(stereo.parent / "pair_2")["vertical-offset"].fix
     assert "--calibration FILE" in fix and str(stereo / "calibration.json") not in fix

@@ -25,9 +25,11 @@ from ..footage.border import find_outline, masked_border
 from ..footage.camera_motion import CameraMotion, camera_motion
 from ..footage.changes import Changes, find_changes
 from ..footage.polarity import Polarity, mask_polarity
+from ..footage.pose_fit import PoseFit
 from ..initialization.sampling import initial_points
 from .border_facts import BorderFacts, measure_border
 from .depth_facts import DepthFacts, measure_depth
+from .pose_facts import measure_pose_fit
 from .remake import Remakes, find_remakes
 from .stereo_facts import StereoFacts, measure_stereo
 
@@ -103,6 +105,8 @@ class Facts:
     """Distance between the frames compared by `motion`."""
     windows: tuple[tuple[int, int], ...]
     """First frame, and the frame after the last one, of each window that `train` would cut the sequence into."""
+    pose_fit: PoseFit | None
+    """How well the stored poses explain the images; None for a static camera."""
     changes: Changes
     masks: MaskFacts
     border: BorderFacts
@@ -164,6 +168,7 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         motion=camera_motion([f.rgb_u8 for f in followed], [masks.tissue(f) for f in followed]),
         motion_step=step,
         windows=tuple(plan_windows(cameras, look_through(sequence), preset("default").windows)),
+        pose_fit=measure_pose_fit(sequence),
         changes=find_changes(frame.rgb_u8 for frame in frames),
         masks=masks,
         border=measure_border(outline, images, tissue, masked),

@@ -16,18 +16,24 @@ from ..core.config import DataConfig
 from ..core.geometry import length_unit
 from ..core.presets import preset
 from ..core.types import Camera
+from ..data.description import SIZE_NOT_STATED
 from ..footage.camera_motion import MOVING_FRACTION
 from ..footage.units import FAR_MM
 from .facts import Facts
 from .fixes import (
+    convert_poses,
     correct_masks,
     detect_tools,
+    estimate_poses,
     in_stored_px,
     longest_part,
     mask_tools,
     measure_depth_again,
+    move_rows,
+    rescale_camera,
     set_values,
     skip,
+    state_size,
     train,
 )
 from .remake import field_of_view, swapped
@@ -46,6 +52,8 @@ VERTICAL_PX = 1.5
 """Largest vertical offset of rectified cameras, px."""
 ODD_VIEW_DEG = (20.0, 120.0)
 """Range of the horizontal field of view of endoscopes."""
+OFF_SCALE, SAME_SCALE = 0.2, 0.1
+"""A principal point off by more than the first, and on both axes alike up to the second: another size."""
 USUAL_FOCAL = 0.9
 """Focal length of a usual endoscope, image widths: 58 degrees."""
 ITERATION_S, USUAL_PIXELS, FIXED_SHARE = 0.09, 640 * 512, 0.3
@@ -88,19 +96,39 @@ def _size(facts: Facts) -> Iterator[Finding]:
     if facts.frames < FEW_FRAMES:
         what = f"{facts.frames} frames, {facts.test_frames} of them to test"
         yield Finding("few-frames", "warning", what, f"give at least {FEW_FRAMES}; 50 to 200 are usual")
+    yield from _intrinsics(facts)
+
+
+def _intrinsics(facts: Facts) -> Iterator[Finding]:
     camera = facts.camera
-    view = field_of_view(camera)
-    off_center = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
-    if not ODD_VIEW_DEG[0] <= view <= ODD_VIEW_DEG[1] or off_center > 0.2 or not 0.8 < camera.fx / camera.fy < 1.25:
+    if facts.sources.get("lens") == SIZE_NOT_STATED:
         what = (
-            f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px give {view:.0f} degrees across "
-            f"{camera.width}x{camera.height} px; they may belong to images of another size"
+            "the calibration does not state the size of its images, and its principal point fits "
+            f"{camera.width}x{camera.height} px; if they had another size, every length is wrong"
         )
-        width, height = in_stored_px(facts, camera.width, camera.height)
-        usual = {"fx": USUAL_FOCAL * width, "fy": USUAL_FOCAL * width, "cx": width / 2, "cy": height / 2}
-        fix = set_values(facts, **{name: f"{value:g}" for name, value in usual.items()})
-        fix += f", which is usual for endoscopes, or what the calibration says for {width}x{height} px"
-        yield Finding("intrinsics", "warning", what, fix)
+        yield Finding("calibration-size", "note", what, state_size(facts))
+    view = field_of_view(camera)
+    center = np.array([camera.cx / camera.width, camera.cy / camera.height])
+    scale = 2 * float(center.mean())
+    # Both halves of the center off by one factor: numbers for images of another size. A crop moves them apart.
+    other_size = abs(scale - 1) > OFF_SCALE and abs(center[0] - center[1]) < SAME_SCALE * center.mean()
+    odd = not ODD_VIEW_DEG[0] <= view <= ODD_VIEW_DEG[1] or not 0.8 < camera.fx / camera.fy < 1.25
+    if not (odd or other_size or np.abs(center - 0.5).max() > 0.2):
+        return
+    what = (
+        f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px give {view:.0f} degrees across "
+        f"{camera.width}x{camera.height} px; they may belong to images of another size"
+    )
+    if other_size:
+        yield Finding("intrinsics", "warning", what, rescale_camera(facts, scale))
+        return
+    width, height = in_stored_px(facts, camera.width, camera.height)
+    usual = {"fx": USUAL_FOCAL * width, "fy": USUAL_FOCAL * width, "cx": width / 2, "cy": height / 2}
+    fix = set_values(facts, **{name: f"{value:g}" for name, value in usual.items()})
+    fix += f", which is usual for endoscopes, or what the calibration says for {width}x{height} px"
+    if facts.sources.get("depth", "").startswith("stereo"):
+        fix += ", and measure depth again: it comes from the same numbers"
+    yield Finding("intrinsics", "warning", what, fix)
 
 
 def _masks(facts: Facts) -> Iterator[Finding]:
@@ -229,6 +257,18 @@ def _motion(facts: Facts) -> Iterator[Finding]:
     yield Finding("camera-moves", "warning", what, ", or ".join(fixes) or "store the poses of the camera")
 
 
+def _poses(facts: Facts) -> Iterator[Finding]:
+    fit = facts.pose_fit
+    if fit is None:
+        return
+    if fit.another_fits:
+        what = f"the camera poses explain the images better in another convention: depth reprojects to {fit.reason}"
+        yield Finding("poses-convention", "error", what, convert_poses(facts, fit.best, fit.unit))
+    elif fit.none_fits:
+        what = f"the camera poses do not explain the images in any convention: depth reprojects to {fit.reason}"
+        yield Finding("poses-convention", "warning", what, estimate_poses(facts))
+
+
 def _windows(facts: Facts) -> Iterator[Finding]:
     if len(facts.windows) == 1:
         return
@@ -299,9 +339,7 @@ def _stereo(facts: Facts) -> Iterator[Finding]:
         yield Finding("swapped-eyes", "error", what, swapped(facts.remakes) or by_hand)
     if stereo.vertical_px > VERTICAL_PX:
         what = f"the rows of left and right images are {stereo.vertical_px:.1f} px apart"
-        video = facts.remakes.from_video
-        fix = video.command({"--calibration": ("FILE",)}) if video else "rectify both cameras by their calibration"
-        yield Finding("vertical-offset", "warning", what, f"{fix}; FILE must belong to this video" if video else fix)
+        yield Finding("vertical-offset", "warning", what, move_rows(facts))
 
 
 def _points(facts: Facts) -> Iterator[Finding]:
@@ -323,6 +361,7 @@ CHECKS: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
     _border,
     _stereo,
     _motion,
+    _poses,
     _windows,
     _changes,
     _video,

@@ -58,6 +58,59 @@ def measure_depth_again(facts: Facts) -> str | None:
     return remake.command(MEASURED_DEPTH | ({"--depth": ("shading",)} if present.startswith("stereo") else {}))
 
 
+def move_rows(facts: Facts) -> str:
+    """What brings the rows of both cameras together: the command that moves them, or another calibration."""
+    video, frames = facts.remakes.from_video, facts.remakes.from_frames
+    if video and "--row-offset" not in video.options:
+        return f"{video.command({'--row-offset': ('auto',)})}, or pass the calibration that belongs to this video"
+    if video:
+        return f"{video.command({'--calibration': ('FILE',)})}; FILE must belong to this video"
+    if frames and "--right" in frames.options:
+        return frames.command(MEASURED_DEPTH | {"--row-offset": ("auto",)})
+    return "rectify both cameras by their calibration"
+
+
+def state_size(facts: Facts) -> str:
+    """The command that states for images of which size the calibration was made."""
+    remake, fix = facts.remakes.from_video, "nothing if that is so"
+    return f"{fix}; else {remake.command({'--calibration-size': ('WIDTHxHEIGHT',)})}" if remake else fix
+
+
+def rescale_camera(facts: Facts, factor: float) -> str:
+    """What corrects a camera for images `factor` times as large, and stereo depth, which comes from the same numbers.
+
+    The command that states the size, if the video is known; else the edit of all numbers together.
+    """
+    camera, record, video = facts.camera, facts.remakes.record, facts.remakes.from_video
+    if video and record and "--calibration" in video.options:
+        size = "x".join(str(round(side * factor)) for side in record.source_size)
+        return f"{video.command({'--calibration-size': (size,)})}, if the calibration was made at this size"
+    numbers = dict(zip(("fx", "fy", "cx", "cy"), (camera.fx, camera.fy, camera.cx, camera.cy), strict=True))
+    values = {name: f"{value * facts.data.shrink / factor:g}" for name, value in numbers.items()}
+    if facts.sources.get("depth", "").startswith("stereo"):
+        values["depth_scale"] = f"{facts.depth.scale / factor:.6g}"
+    return f"{set_values(facts, **values)}, or what the calibration says for these images"
+
+
+def convert_poses(facts: Facts, convention: str, unit: float) -> str:
+    """The command that reads the stored poses in another convention, in the folder itself where that is possible."""
+    options = {"--poses-convention": (convention,)} if convention != "opencv" else {}
+    options |= {"--poses-unit-mm": (f"{unit:.4g}",)} if unit != 1 else {}
+    file, remake = facts.path / "poses_bounds.npy", facts.remakes.from_frames
+    if remake and file.is_file():
+        in_place = f"`{command_of('poses', (facts.path,), {'--poses': (str(file),)} | options)}`"
+        return f"{in_place}, which keeps the old ones in poses_bounds_before.npy"
+    return "store camera-to-world matrices in mm with OpenCV axes (x right, y down, z forward)"
+
+
+def estimate_poses(facts: Facts) -> str:
+    """What to do about poses that fit in no convention: match them to the frames, or estimate them."""
+    fix = "check that each pose stands in the row of its frame"
+    if facts.remakes.from_frames and (facts.path / "poses_bounds.npy").is_file():
+        fix += f", or `{command('poses', facts.path, '--poses', 'estimate')}` finds the camera path"
+    return fix
+
+
 def detect_tools(facts: Facts) -> str | None:
     """The command that finds tools; None if this was done, or cannot be."""
     remake, present = facts.remakes.best, facts.sources.get("masks", "")

@@ -29,6 +29,7 @@ def table(facts: Facts) -> list[tuple[str, str]]:
             f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px; {view:.0f} degrees",
         ),
         ("camera", _camera_words(facts)),
+        *([("poses fit", facts.pose_fit.reason)] if facts.pose_fit else []),
         ("image motion", facts.motion.reason),
         ("tools", f"{tool.mean():.1%} of the pixels inside the border ({tool.min():.1%} to {tool.max():.1%})"),
         ("mask polarity", f"read as tool = {value}; {facts.masks.reason}"),

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ..core.checks import number_ranges
+from ..core.checks import check_range, number_ranges
+from ..core.pose_conventions import Convention
 from ..core.shell import command
 from ..system.console import say
 from .help_page import Help
@@ -34,6 +35,13 @@ class Poses:
     poses: str = "auto"
     """`auto` (static, or estimated if the camera moves), `estimate` (by our own tracks, or by COLMAP if it is installed
     and explains the frames better), `own`, `colmap`, `auto-own`, `still`, or a file as for `prepare --poses`."""
+    poses_convention: Convention = "opencv"
+    """Meaning of the matrices in the file of --poses, as for `prepare`."""
+    poses_unit_mm: float = 1.0
+    """mm per unit of the positions in the file of --poses: 1000 for m."""
+
+    def __post_init__(self) -> None:
+        check_range("poses_unit_mm", self.poses_unit_mm, 1e-6, 1e6)
 
 
 HELP = Help(examples=(("DATA",), ("DATA", "--poses", "estimate")))
@@ -43,11 +51,15 @@ def run(argv: list[str]) -> None:
     """Find the camera path and write it."""
     args = parse(Poses, argv, "poses", HELP)
     from ..data.pose_writing import POSES
+    from ..prepare.camera_path.sequence_path import Reading
     from ..prepare.folder_path import write_folder_path
 
     with Counting() as progress:
         found = write_folder_path(
-            args.data, args.poses, lambda done, total: progress("following the camera", done, total)
+            args.data,
+            args.poses,
+            lambda done, total: progress("following the camera", done, total),
+            reading=Reading(args.poses_convention, args.poses_unit_mm),
         )
     for note in found.notes:
         say(f"note: {note}")

@@ -15,6 +15,8 @@ TOOLS_FOUND = "tools found"
 OWN_POSES, COLMAP_POSES = "our own tracks", "COLMAP"
 ESTIMATED_POSES = (OWN_POSES, COLMAP_POSES)
 """Sources of poses that a program found in the video."""
+SIZE_NOT_STATED = "calibration, the size of its images not stated"
+"""Source of a lens whose calibration file has no image size: the principal point decided."""
 FORMAT_VERSION = 1
 """Newest `format_version` this program can read; a file without one is of version 1."""
 POSITIVE = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")

@@ -58,13 +58,35 @@ def read_bytes(path: Path, expected: str = "a readable file", fix: str = ACCESS_
         raise input_error(path, expected, error.strerror or str(error), fix) from None
 
 
-def read_text(path: Path, expected: str, fix: str) -> str:
-    """The text of a UTF-8 file; as `read_bytes`, up to `MOST_TEXT_BYTES`."""
+def read_text(path: Path, expected: str, fix: str, *, or_latin_1: bool = False) -> str:
+    """The text of a file in UTF-8, or in what its first bytes tell: editors on Windows write UTF-16 and a BOM.
+
+    Args:
+        or_latin_1: read other bytes as Latin-1, where only comments can have them.
+    Raises:
+        InputError: as `read_bytes`, up to `MOST_TEXT_BYTES`, or the bytes are no text.
+    """
     demand_file(path, expected, fix, MOST_TEXT_BYTES)
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        with path.open("rb") as file:
+            encoding = _encoding(file.read(4))
+        try:
+            return path.read_text(encoding=encoding)
+        except UnicodeDecodeError:
+            if not or_latin_1 or encoding != "utf-8-sig":
+                raise
+            return path.read_text(encoding="latin-1")
+    except (OSError, UnicodeError) as error:
         raise input_error(path, expected, str(error).split("\n")[0], fix) from None
+
+
+def _encoding(start: bytes) -> str:
+    """The encoding of a text that starts with these 4 bytes. The first character of our files is always ASCII."""
+    if start.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
+    if len(start) > 1 and (start[0] == 0) != (start[1] == 0):
+        return "utf-16-le" if start[0] else "utf-16-be"
+    return "utf-8-sig"
 
 
 def demand_file(path: Path, expected: str, fix: str, most: int = MOST_BYTES) -> None:

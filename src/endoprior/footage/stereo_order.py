@@ -72,17 +72,21 @@ def vertical_offset_px(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) 
     Raises:
         ValueError: wrong shapes.
     """
+    offsets = np.abs(row_offsets_px(left_u8, right_u8))
+    return float(np.median(offsets)) if len(offsets) >= FEWEST_MATCHES else float("nan")
+
+
+def row_offsets_px(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(N,) y_right - y_left of each matching feature, px; arguments as for `vertical_offset_px`."""
     finder = cv2.SIFT_create(FEATURES)
     (left, left_marks), (right, right_marks) = (
         finder.detectAndCompute(camera, None) for camera in _gray(left_u8, right_u8)
     )
     if min(len(left), len(right)) < FEWEST_MATCHES:
-        return float("nan")
+        return np.zeros(0)
     pairs = cv2.BFMatcher().knnMatch(left_marks, right_marks, k=2)
     good = [best for best, second in pairs if best.distance < RATIO * second.distance]
-    if len(good) < FEWEST_MATCHES:
-        return float("nan")
-    return float(np.median([abs(left[m.queryIdx].pt[1] - right[m.trainIdx].pt[1]) for m in good]))
+    return np.array([right[m.trainIdx].pt[1] - left[m.queryIdx].pt[1] for m in good])
 
 
 def _gray(left_u8: NDArray[np.uint8], right_u8: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

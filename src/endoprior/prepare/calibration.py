@@ -1,4 +1,4 @@
-"""Calibration of one or two cameras, and its scaling to the image size.
+"""Calibration of one or two cameras.
 
 Matrices follow OpenCV (x right, y down, z forward) with one exception: the center of the top-left pixel is (0.5, 0.5)
 here and (0, 0) in OpenCV. Principal points from OpenCV files are therefore moved by half a pixel.
@@ -6,7 +6,7 @@ here and (0, 0) in OpenCV. Principal points from OpenCV files are therefore move
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,14 @@ class Intrinsics:
     matrix: NDArray[np.float64]
     """(3, 3) K, px."""
     distortion: NDArray[np.float64]
-    """(k,) OpenCV distortion coefficients, k in 0, 4, 5, 8, 12, 14."""
+    """(k,) OpenCV distortion coefficients, k in 0, 4, 5, 8, 12, 14; of a fisheye k1..k4."""
+    fisheye: bool = False
+    """OpenCV's fisheye model (equidistant, Kannala-Brandt): bent even where all coefficients are 0."""
+
+    @property
+    def bent(self) -> bool:
+        """Whether straight lines become curves."""
+        return self.fisheye or bool(np.any(self.distortion))
 
 
 @dataclass(frozen=True)
@@ -43,38 +50,20 @@ class Calibration:
     """(width, height) of one camera's image during calibration, px; None if the file does not state it."""
     layout: str | None = None
     """Text in the file that describes the stereo layout."""
+    size_is_sure: bool = False
+    """The user states the size, or this program wrote it: a principal point far from the center is a crop."""
+    notes: tuple[str, ...] = ()
+    """What the reader decided, one line each."""
 
     @property
     def rectified(self) -> bool:
         """Whether the images are rectified already, and by one camera matrix: disparity 0 is infinitely far."""
         if self.right is None or self.rotation is None or self.translation_mm is None:
             return False
-        distorted = any(np.any(camera.distortion) for camera in (self.left, self.right))
         rotated = np.abs(self.rotation - np.eye(3)).max() > NEGLIGIBLE
         shifted = np.abs(self.translation_mm[1:]).max() > NEGLIGIBLE
-        return bool(not (distorted or rotated or shifted) and np.allclose(self.left.matrix, self.right.matrix))
-
-    def for_size(self, width: int, height: int, name: str) -> Calibration:
-        """The calibration scaled to another image size.
-
-        Args:
-            name: of the calibration file, for the error message.
-        Raises:
-            InputError: the aspect ratios differ by more than 1 %.
-        """
-        if self.size is None or self.size == (width, height):
-            return self
-        across, down = width / self.size[0], height / self.size[1]
-        if abs(across / down - 1) > 0.01:
-            raise input_error(
-                name,
-                f"images of {self.size[0]}x{self.size[1]} px, or the same aspect ratio",
-                f"{width}x{height}",
-                "Pass the calibration of this video, or set --layout.",
-            )
-        grow = np.diag([across, down, 1.0])
-        scaled = [camera and replace(camera, matrix=grow @ camera.matrix) for camera in (self.left, self.right)]
-        return replace(self, left=scaled[0], right=scaled[1], size=(width, height))
+        bent = self.left.bent or self.right.bent
+        return bool(not (bent or rotated or shifted) and np.allclose(self.left.matrix, self.right.matrix))
 
 
 def check_pair(calibration: Calibration, name: str) -> float:

@@ -1,26 +1,24 @@
-"""Read calibration files: OpenCV YAML, plain YAML or JSON, NPZ, and da Vinci ini.
+"""Read the calibration of one or two cameras from the names and values of its file.
 
-A file becomes a flat table of names and values. Names are compared without case and punctuation, and every usual name
-of a quantity is accepted. Nothing in a file is ever executed.
+Names are compared without case and punctuation, and every usual name of a quantity is accepted.
 """
 
 from __future__ import annotations
 
-import configparser
-import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from ..core.checks import InputError, input_error
-from ..data.numpy_files import read_numpy
-from ..data.reading import read_text
-from ..data.yaml_text import BoundedLoader, load_yaml
+from ..core.checks import input_error
 from .calibration import Calibration, Intrinsics
+from .calibration_size import written_in_order
+from .calibration_tables import HINT, Table, read_table
+from .lens_models import lens_of
 
 Unit = Literal["auto", "mm", "cm", "m"]
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
@@ -28,225 +26,245 @@ MOST_PX = 1e6
 """Largest plausible image size, focal length or principal point, px."""
 METERS_BELOW = 0.05
 """A T shorter than this is in meters: no stereo endoscope has a baseline of 0.05 mm."""
+LEAST_SKEW = 1e-3
+"""Share of the focal length above which the skew of K would move pixels: OpenCV ignores it."""
 
-MATRIX = ("k", "m", "cameramatrix", "mtx", "intrinsics", "intrinsic", "intrinsicmatrix", "cammatrix")
-DISTORTION = ("d", "dist", "distortion", "distcoeffs", "distcoeff", "distortioncoefficients", "distortioncoeffs")
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""One camera's distortion as single numbers, in OpenCV's order."""
-SIDES = (("left", "right"), ("l", "r"), ("1", "2"), ("0", "1"))
-ROTATION = ("r", "rotation", "rot", "rotationmatrix", "rstereo")
+MATRIX = (
+    "k",
+    "m",
+    "cameramatrix",
+    "mtx",
+    "intrinsics",
+    "intrinsic",
+    "intrinsicmatrix",
+    "cammatrix",
+    "cameramat",
+    "matrix",
+)
+FOCAL_X, FOCAL_Y = ("fx", "fcx", "flx"), ("fy", "fcy", "fly")
+CENTER_X, CENTER_Y = ("cx", "ccx", "ppx", "u0"), ("cy", "ccy", "ppy", "v0")
+SIDES = (
+    ("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("camera1", "camera2"), ("cam1", "cam2"),
+    ("l", "r"), ("1", "2"), ("0", "1"),
+)  # fmt: skip
+"""How files name the left and the right camera."""
+PREFIXES = ("", "camera", "cam", "intrinsics", "calibration")
+"""What files put before the values of an only camera."""
+ROTATION = ("r", "rotation", "rot", "rotationmatrix", "rstereo", "om")
 TRANSLATION = ("t", "translation", "trans", "translationvector", "tvec", "tstereo")
-HINT = "Use the names K_left, distortion_left, K_right, distortion_right, R, T_mm, width, height (docs/prepare.md)."
-
-Table = dict[str, Any]
-"""Numbers, arrays and texts, by name in lower case without punctuation."""
+LEFT_TO_RIGHT, RIGHT_TO_LEFT = ("tcncnm1",), ("stereotc1c2",)
+"""4x4 poses of Kalibr and ORB-SLAM, in m."""
+SIZE_PAIRS = (("width", "height"), ("imagewidth", "imageheight"), ("resx", "resy"), ("w", "h"))
+SIZES = ("imagesize", "resolution", "size", "imgsize", "imageshape", "imgshape", "shape", "dimensions")
 
 
 def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     """Read the calibration of one or two cameras.
 
     Args:
-        path: .yaml, .yml, .json, .npz or .ini.
+        path: of any format of `calibration_tables`.
         unit: of T; "auto" uses the name in the file (`T_mm`), else mm, or m if T is shorter than 0.05.
     Raises:
-        InputError: the file is unreadable, or a quantity is missing or malformed.
+        InputError: the file is unreadable, or a quantity is missing, malformed or of a model that is not known.
     """
-    table = _read_table(path)
-    table = {_plain(name): value for name, value in table.items()}
-    size, layout = _size(table, path), table.get("layout") if isinstance(table.get("layout"), str) else None
-    if "k1" in table and np.ndim(table["k1"]) == 0:  # coefficients, not the matrices K1 and K2
-        table["d"] = [_number(table, name, path, 0.0) for name in COEFFICIENTS]
-        table = {name: value for name, value in table.items() if name not in COEFFICIENTS}
-    # Files of this package count pixel centers from 0.5; OpenCV and all others count them from 0.
-    offset = 0.5 - _number(table, "pixelcenter", path, 0.5 if path.name == "sequence.json" else 0.0)
-    if "fcxleft" in table:
-        left, right = _da_vinci_camera(table, "left", offset, path), _da_vinci_camera(table, "right", offset, path)
-    else:
-        left, right = _cameras(table, offset, path)
+    table = read_table(path)
+    left_side, right_side = _sides(table)
+    left = _camera(left_side, table, path)
+    right = _camera(right_side, table, path) if right_side else None
     if left is None:
         raise input_error(path, "the left camera matrix", f"only {', '.join(list(table)[:6])}", HINT)
-    if right is None and table.get("baselinemm") is not None:
-        shift = np.array([-_number(table, "baselinemm", path), 0.0, 0.0])
-        return Calibration(left, left, np.eye(3), shift, size, layout)
-    if right is None:
-        return Calibration(left, size=size, layout=layout)
-    rotation = _find(table, ROTATION, path, (3, 3))
-    in_mm = any(name + "mm" in table for name in TRANSLATION)
-    translation = _find(table, (*(name + "mm" for name in TRANSLATION), *TRANSLATION), path, (3,))
-    if rotation is None or translation is None:
-        missing = "R" if rotation is None else "T"
-        raise input_error(path, "the relative pose of the cameras (R, T)", f"no {missing}", HINT)
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+    rotation = translation = None
+    if right is not None:
+        rotation, translation = _relative_pose(table, left_side, right_side, unit, path)
+    elif (baseline := _baseline(table, left, unit, path)) is not None:
+        right, rotation, translation = left, np.eye(3), np.array([-baseline, 0.0, 0.0])
+    size, notes = _size([left_side, _part(table, "camera"), table], [left, right], path)
+    layout = table.get("layout") if isinstance(table.get("layout"), str) else None
+    if not any(_has_lens(side, table, path) for side in (left_side, right_side) if side):
+        notes.append(f"{path}: no lens distortion is stated; the images count as undistorted")
+    if left.fisheye:
+        notes.append(f"{path}: the lens is a fisheye (equidistant), and is undistorted as one")
+    return Calibration(
+        left, right, rotation, translation, size, layout, size_is_sure=path.name == "sequence.json", notes=tuple(notes)
+    )
+
+
+def _sides(table: Table) -> tuple[Table, Table]:
+    """The values of the left and of the right camera, without the names of the sides; those of one camera, and {}."""
+    for left, right in SIDES:
+        if _has_matrix(found := _part(table, left)):
+            other = _part(table, right)
+            return found, other if _has_matrix(other) else {}
+    for prefix in PREFIXES:
+        if _has_matrix(found := _part(table, prefix)):
+            return found, {}
+    return _part(table, "left"), {}
+
+
+def _part(table: Table, side: str) -> Table:
+    """The values whose name has a side before or behind it, by the rest of the name."""
+    if not side:
+        return dict(table)
+    behind = {name.removesuffix(side): value for name, value in table.items() if name.endswith(side) and name != side}
+    return behind | {name.removeprefix(side): value for name, value in table.items() if name.startswith(side)}
+
+
+def _has_matrix(local: Table) -> bool:
+    matrix = any(np.ndim(local[name]) > 0 for name in MATRIX if name in local)
+    return matrix or any(name in local for name in FOCAL_X)
+
+
+def _camera(local: Table, table: Table, path: Path) -> Intrinsics | None:
+    """One camera of its own values, and of those that hold for both, such as the model of the lens."""
+    matrix = None
+    for name in MATRIX:
+        if name in local and np.ndim(local[name]) > 0:
+            four = np.size(local[name]) == 4
+            matrix = _array(local[name], name, (4,) if four else (3, 3), path)
+            if four:
+                matrix = np.array([[matrix[0], 0, matrix[2]], [0, matrix[1], matrix[3]], [0, 0, 1.0]])
+            break
+    if matrix is None:
+        if not any(name in local for name in FOCAL_X):
+            return None
+        if missing := [names[0] for names in (FOCAL_Y, CENTER_X, CENTER_Y) if _first(local, names) is None]:
+            want = "fx, fy, cx, cy (fc_x, fc_y, cc_x, cc_y) of the camera"
+            raise input_error(path, want, f"no {missing[0]}", "Complete it.")
+        fx, fy, cx, cy = (_number(local, names, path) for names in (FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y))
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    distortion, fisheye, _ = lens_of(_shared(table) | local, path)
+    plausible = (
+        np.isfinite(matrix).all() and np.abs(matrix).max() < MOST_PX and np.abs(distortion).max(initial=0) < MOST_PX
+    )
+    if not (plausible and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], (0, 0, 1))):
+        raise input_error(path, "a camera matrix (fx 0 cx; 0 fy cy; 0 0 1)", str(matrix.tolist()), "Correct it.")
+    if max(abs(matrix[0, 1]), abs(matrix[1, 0])) > LEAST_SKEW * matrix[0, 0]:
+        raise input_error(path, "a camera matrix without skew", str(matrix.tolist()), "Calibrate without skew.")
+    moved = matrix.copy()
+    # Files of this package count pixel centers from 0.5; OpenCV and all others count them from 0.
+    ours = path.name == "sequence.json" or any(name in table for name in ("flx", "leftflx"))
+    moved[:2, 2] += 0.5 - _number(table, ("pixelcenter",), path, 0.5 if ours else 0.0)
+    return Intrinsics(moved, distortion, fisheye)
+
+
+def _shared(table: Table) -> Table:
+    """Values of the whole file that describe both lenses: words and flags, not numbers."""
+    of_camera = _part(table, "camera")
+    return {n: v for part in (of_camera, table) for n, v in part.items() if isinstance(v, str | bool) or "fisheye" in n}
+
+
+def _has_lens(local: Table, table: Table, path: Path) -> bool:
+    return lens_of(_shared(table) | local, path)[2]
+
+
+def _relative_pose(
+    table: Table, left: Table, right: Table, unit: Unit, path: Path
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """R and T of x_right = R x_left + T, T in mm."""
+    for names, inverse in ((LEFT_TO_RIGHT, False), (RIGHT_TO_LEFT, True)):
+        for name in names:
+            for part in (right, table):
+                if name in part:
+                    pose = _array(part[name], name, (4, 4), path)
+                    pose = np.linalg.inv(pose) if inverse and np.linalg.det(pose) else pose
+                    return _rotation(pose[:3, :3], path), _in_mm(pose[:3, 3], "m" if unit == "auto" else unit)
+    for part in (table, right):
+        rotation, in_mm, translation = _first(part, ROTATION), _first(part, [n + "mm" for n in TRANSLATION]), None
+        translation = in_mm or _first(part, TRANSLATION)
+        if rotation and translation:
+            r = _array(part[rotation], rotation, (3,) if np.size(part[rotation]) == 3 else (3, 3), path)
+            r = cv2.Rodrigues(r)[0] if r.size == 3 else r
+            return _rotation(r, path), _in_mm(
+                _array(part[translation], translation, (3,), path), "mm" if in_mm else unit
+            )
+    rectified = [
+        (_first(part, ("r", "rectificationmatrix", "rect")), _first(part, ("p", "projectionmatrix")))
+        for part in (left, right)
+    ]
+    if all(name for pair in rectified for name in pair):
+        r1, r2 = (
+            _rotation(_array(part[r], r, (3, 3), path), path)
+            for part, (r, _) in zip((left, right), rectified, strict=True)
+        )
+        p2 = _array(right[rectified[1][1]], rectified[1][1], (3, 4), path)
+        return r2.T @ r1, _in_mm(r2.T @ np.array([p2[0, 3] / p2[0, 0], p2[1, 3] / p2[1, 1], 0.0]), unit)
+    missing = "T" if _first(table, ROTATION) else "R"
+    raise input_error(path, "the relative pose of the cameras (R, T)", f"no {missing}", HINT)
+
+
+def _rotation(matrix: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+    if np.abs(matrix.T @ matrix - np.eye(3)).max() > 1e-3 or np.linalg.det(matrix) < 0:
         raise input_error(path, "R to be a rotation", "another matrix", "Write R as 3x3, row by row.")
+    return matrix
+
+
+def _in_mm(translation: NDArray[np.float64], unit: Unit) -> NDArray[np.float64]:
     if unit == "auto":
-        unit = "m" if not in_mm and 0 < np.linalg.norm(translation) < METERS_BELOW else "mm"
-    scale = 1.0 if in_mm else MM_PER_UNIT[unit]
-    return Calibration(left, right, rotation, translation * scale, size, layout)
+        unit = "m" if 0 < np.linalg.norm(translation) < METERS_BELOW else "mm"
+    return translation * MM_PER_UNIT[unit]
 
 
-def _read_table(path: Path) -> Table:
-    """The file as a flat table; nested names are joined, matrices with rows, cols and data become arrays."""
-    readers = {".yaml": _read_yaml, ".yml": _read_yaml, ".json": _read_yaml, ".npz": _read_npz, ".ini": _read_ini}
-    if path.suffix.lower() not in readers:
-        raise input_error(path, "a .yaml, .json, .npz or .ini file", path.suffix or "no suffix", "Convert it.")
-    try:
-        content = readers[path.suffix.lower()](path)
-        if isinstance(content, dict) and content:
-            return _flat(content)
-    except InputError:
-        raise
-    except (ValueError, TypeError, OverflowError, RecursionError, yaml.YAMLError, configparser.Error) as error:
-        raise input_error(path, "a readable calibration", " ".join(str(error).split())[:120], "Correct it.") from None
-    raise input_error(path, "named values", type(content).__name__, HINT)
-
-
-class _Loader(BoundedLoader):
-    """Safe YAML that also knows OpenCV's matrices."""
-
-
-for _name in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", lambda loader, node: loader.construct_mapping(node, True))
-
-
-def _read_yaml(path: Path) -> Any:
-    text = read_text(path, "a calibration file", "Check the path.")
-    if path.suffix.lower() == ".json":
-        return json.loads(text)
-    # OpenCV writes "%YAML:1.0", which is not YAML, and tabs or "---" after it.
-    lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
-    return load_yaml("\n".join(lines), _Loader)
-
-
-def _read_npz(path: Path) -> Table:
-    stored = read_numpy(path, "a readable calibration", "Save it again with numpy.savez.")
-    if isinstance(stored, np.ndarray):
-        raise ValueError("a single array")
-    return stored
-
-
-def _read_ini(path: Path) -> Table:
-    parser = configparser.ConfigParser(interpolation=None)
-    parser.read_string(read_text(path, "a calibration file", "Check the path."))
-    table: Table = {}
-    for section in parser.sections():
-        side = "left" if "left" in section.lower() else "right" if "right" in section.lower() else section
-        for name, value in parser.items(section):
-            table[f"{name}_{side}"] = float(value)
-    return table
-
-
-def _flat(content: dict[Any, Any], prefix: str = "") -> Table:
-    table: Table = {}
-    for name, value in content.items():
-        if isinstance(value, dict) and {"rows", "cols", "data"} <= {str(key) for key in value}:
-            table[f"{prefix}{name}"] = np.reshape(value["data"], (int(value["rows"]), int(value["cols"])))
-        elif isinstance(value, dict) and {"sizes", "data"} <= {str(key) for key in value}:
-            table[f"{prefix}{name}"] = np.reshape(value["data"], np.ravel(value["sizes"]))
-        elif isinstance(value, dict):
-            table |= _flat(value, f"{prefix}{name}.")
-        else:
-            table[f"{prefix}{name}"] = value
-    return table
-
-
-def _plain(name: str) -> str:
-    return "".join(c for c in name.lower() if c.isalnum())
-
-
-def _find(table: Table, names: tuple[str, ...], path: Path, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """The first of the named values as an array of this shape (-1: any length); None if there is none."""
-    for name in names:
-        if name not in table:
-            continue
-        try:
-            value = np.asarray(table[name], np.float64)
-            value = value.reshape(shape)
-        except (TypeError, ValueError, OverflowError):
-            want = "x".join(map(str, shape)).replace("-1", "k")
-            raise input_error(path, f"{name} to have {want} numbers", repr(table[name])[:60], HINT) from None
-        if not np.isfinite(value).all():
-            raise input_error(path, f"{name} to be finite", "NaN or infinity", "Calibrate again.")
-        return value
+def _baseline(table: Table, left: Intrinsics, unit: Unit, path: Path) -> float | None:
+    """Distance, mm, of the cameras of a rectified pair of which the file has one matrix; None without any."""
+    if table.get("baselinemm") is not None:
+        return _number(table, ("baselinemm",), path)
+    if (name := _first(table, ("stereob", "camerabf"))) is not None:  # ORB-SLAM: m, or m times fx
+        value = _number(table, (name,), path) / (left.matrix[0, 0] if name == "camerabf" else 1.0)
+        return value * MM_PER_UNIT["m" if unit == "auto" else unit]
     return None
 
 
-def _cameras(table: Table, offset: float, path: Path) -> tuple[Intrinsics | None, Intrinsics | None]:
-    """Left and right camera, under the first pair of side names in the table; or one camera without side names."""
-    for left_name, right_name in SIDES:
-        if left := _camera(table, left_name, offset, path):
-            return left, _camera(table, right_name, offset, path)
-    return _camera(table, "", offset, path) or _plain_pinhole(table, offset, path), None
+def _first(table: Table, names: Iterable[str]) -> str | None:
+    return next((name for name in names if name in table), None)
 
 
-def _camera(table: Table, side: str, offset: float, path: Path) -> Intrinsics | None:
-    def spelled(names: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(spelling for name in names for spelling in (name + side, side + name))
-
-    matrix = _find(table, spelled(MATRIX), path, (3, 3))
-    if matrix is None:
-        return None
-    return _checked(matrix, _find(table, spelled(DISTORTION), path, (-1,)), offset, path)
-
-
-def _checked(matrix: NDArray, distortion: NDArray | None, offset: float, path: Path) -> Intrinsics:
-    distortion = np.zeros(0) if distortion is None else distortion
-    plausible = np.isfinite(matrix).all() and np.isfinite(distortion).all() and np.abs(matrix).max() < MOST_PX
-    if not (plausible and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], (0, 0, 1))):
-        raise input_error(path, "a camera matrix (fx 0 cx; 0 fy cy; 0 0 1)", str(matrix.tolist()), "Correct it.")
-    if len(distortion) not in (0, 1, 2, 3, 4, 5, 8, 12, 14):
-        raise input_error(path, "4, 5, 8, 12 or 14 distortion coefficients", str(len(distortion)), "Correct them.")
-    if len(distortion) < 4:
-        distortion = np.pad(distortion, (0, 4 - len(distortion)))
-    moved = matrix.copy()
-    moved[:2, 2] += offset
-    return Intrinsics(moved, distortion)
+def _array(value: Any, name: str, shape: tuple[int, ...], path: Path) -> NDArray[np.float64]:
+    """A value as a finite array of this shape."""
+    try:
+        array = np.asarray(value, np.float64).reshape(shape)
+    except (TypeError, ValueError, OverflowError):
+        want = "x".join(map(str, shape))
+        raise input_error(path, f"{name} to have {want} numbers", repr(value)[:60], HINT) from None
+    if not np.isfinite(array).all():
+        raise input_error(path, f"{name} to be finite", "NaN or infinity", "Calibrate again.")
+    return array
 
 
-def _plain_pinhole(table: Table, offset: float, path: Path) -> Intrinsics | None:
-    """A camera from fx, fy, cx, cy, as in `sequence.json`, and its distortion."""
-    if not {"fx", "cx", "cy"} <= table.keys():
-        return None
-    fx, cx, cy = (_number(table, name, path) for name in ("fx", "cx", "cy"))
-    matrix = np.array([[fx, 0, cx], [0, _number(table, "fy", path, fx), cy], [0, 0, 1]])
-    return _checked(matrix, _find(table, DISTORTION, path, (-1,)), offset, path)
-
-
-def _da_vinci_camera(table: Table, side: str, offset: float, path: Path) -> Intrinsics:
-    names = [name + side for name in ("fcx", "fcy", "ccx", "ccy")]
-    if missing := [name for name in names if name not in table]:
-        raise input_error(path, "fc_x, fc_y, cc_x, cc_y of both cameras", f"no {missing[0]}", "Complete it.")
-    fx, fy, cx, cy = (_number(table, name, path) for name in names)
-    distortion = [_number(table, f"kc{i}{side}", path, 0.0) for i in range(8)]
-    if side == "right":
-        for name, count in (("r", 9), ("t", 3)):
-            values = [table.get(f"{name}{i}right") for i in range(count)]
-            if None not in values:
-                table[name] = values
-    return _checked(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(distortion), offset, path)
-
-
-def _number(table: Table, name: str, path: Path, otherwise: float | None = None) -> float:
-    """A finite number from the table."""
-    value = table.get(name, otherwise)
+def _number(table: Table, names: tuple[str, ...], path: Path, otherwise: float | None = None) -> float:
+    """A finite number from the table, under the first of these names that it has."""
+    name = _first(table, names)
+    value = otherwise if name is None else table[name]
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise input_error(path, f"{name} to be a number", repr(value)[:60], "Correct it.")
+        raise input_error(path, f"{name or names[0]} to be a number", repr(value)[:60], "Correct it.")
     return number
 
 
-def _size(table: Table, path: Path) -> tuple[int, int] | None:
-    pairs = [("width", "height"), ("imagewidth", "imageheight"), ("resxleft", "resyleft")]
-    found = [(table[a], table[b]) for a, b in pairs if a in table and b in table]
-    found += [tuple(np.ravel(table[n])) for n in ("imagesize", "resolution", "size") if np.size(table.get(n, 0)) == 2]
-    if not found:
-        return None
+def _size(
+    tables: list[Table], cameras: list[Intrinsics | None], path: Path
+) -> tuple[tuple[int, int] | None, list[str]]:
+    """(width, height) of the calibration's images and a note; None if the file does not state it."""
+    for table in tables:
+        for a, b in SIZE_PAIRS:
+            if a in table and b in table:
+                return _whole((table[a], table[b]), path), []
+        for name in SIZES:
+            if np.size(table.get(name, 0)) in (2, 3):
+                size = _whole(tuple(np.ravel(table[name])[:2]), path)
+                ordered = written_in_order(size, [camera for camera in cameras if camera])
+                words = f"{path}: {name} {list(size)} is read as height, width: the principal point says so"
+                return ordered, [words] if ordered != size else []
+    return None, []
+
+
+def _whole(found: tuple[Any, Any], path: Path) -> tuple[int, int]:
     try:
-        width, height = (int(v) for v in found[0])
+        width, height = (int(float(v)) for v in found)
     except (TypeError, ValueError, OverflowError):
-        raise input_error(path, "width and height in px", repr(found[0])[:60], "Correct them.") from None
+        raise input_error(path, "width and height in px", repr(found)[:60], "Correct them.") from None
     if not (1 <= width < MOST_PX and 1 <= height < MOST_PX):
         raise input_error(path, "width and height in px", f"{width}x{height}", "Correct them.")
     return width, height

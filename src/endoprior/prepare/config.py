@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..core.checks import check_range, input_error
+from ..core.pose_conventions import Convention
 from .calibration_files import Unit
 from .stereo import StereoConfig
 from .stereo_layout import Layout
@@ -38,13 +39,19 @@ class PrepareConfig:
     right: Path | None = None
     """Video or image folder of the second camera, if each camera has its own file."""
     calibration: Path | None = None
-    """Calibration of one or two cameras: OpenCV (.yaml, .json, .npz) or da Vinci (.ini)."""
+    """Calibration of one or two cameras: a file of OpenCV, ROS, Kalibr, da Vinci, ..."""
+    calibration_size: str = ""
+    """Size of one camera's image when it was calibrated, such as `1280x1024`, if the file does not state it."""
     calibration_unit: Unit = "auto"
     """Unit of the translation T in the calibration."""
     layout: Layout = "auto"
     """How the images of two cameras are stored in a video frame."""
     swap_eyes: bool = False
     """The first camera of the video is the right one: swap them."""
+    squeezed_eyes: bool = False
+    """Each camera has half of its width (side by side) or height (top-bottom): stretch its images."""
+    row_offset: Literal["no", "auto"] = "no"
+    """`auto` measures how many rows apart both cameras see the same point, and moves the right images by that."""
     field_of_view_degrees: float = 70.0
     """Assumed angle across the image width, or across the round border. Used only without a calibration."""
 
@@ -93,6 +100,11 @@ class PrepareConfig:
     """`still` (static camera), `estimate` (from depth and static tissue; by COLMAP if it is installed and explains the
     frames better; `own` and `colmap` force one), or a file: .npy (T, 4, 4) camera-to-world in mm, or poses_bounds.npy.
     `auto` estimates poses if the camera moves; `auto-own` never by COLMAP, which takes longer."""
+    poses_convention: Convention = "opencv"
+    """Meaning of the matrices in the file of --poses: camera-to-world with OpenCV or OpenGL axes, or LLFF's columns
+    (down, right, back); or world-to-camera. `check` tells which one fits."""
+    poses_unit_mm: float = 1.0
+    """mm per unit of the positions in the file of --poses: 1000 for m."""
     stir: Path | None = None
     """Folder of the STIR clip (`left/seqNN`) that VIDEO belongs to: its tattooed points become `truth/tracks.npz`."""
     keep_right: bool = False
@@ -110,4 +122,5 @@ class PrepareConfig:
         check_range("max_frames", self.max_frames, 2, 1_000_000)
         check_range("max_width", self.max_width, 0, 16384)
         check_range("depth_unit_mm", self.depth_unit_mm, 0, 1e6)
+        check_range("poses_unit_mm", self.poses_unit_mm, 1e-6, 1e6)
         check_range("working_distance_mm", self.working_distance_mm, 1, 1000)

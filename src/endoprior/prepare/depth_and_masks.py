@@ -112,7 +112,10 @@ def _check_stereo(samples: list[MeasuredFrame], geometry: FrameGeometry, clip: C
         raise input_error(clip.source.path, "the left camera first", f"the right one ({shares})", fix)
     offset = float(np.nanmedian([vertical_offset_px(frame.rgb_u8, frame.right_u8) for frame in middle]))
     if offset > MAX_ROW_OFFSET_PX:
-        return [f"the rows of the cameras are {offset:.1f} px apart; depth will be poor. Check the calibration file."]
+        return [
+            f"the rows of the cameras are {offset:.1f} px apart; depth will be poor. Pass the calibration of "
+            "this video, or --row-offset auto."
+        ]
     return []
 
 

@@ -15,10 +15,12 @@ from ..footage.border import Circle, Strips, find_outline
 from ..footage.overlays import find_static_overlays
 from ..footage.round_border import CERTAIN
 from .calibration import Calibration
+from .calibration_size import fitted
 from .config import PrepareConfig, Rectangle, parse_rectangle
 from .frame_geometry import FrameGeometry, demand_within, make_geometry
 from .frame_selection import FrameSelection
 from .source import ImageFolder
+from .stereo_layout import Layout
 from .video_clip import Clip, EvenSample, StereoFrame
 
 SAMPLES = 24
@@ -64,6 +66,11 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
     lefts = [frame.left for frame in sample.kept]
     video_notes = [*clip.notes, *_timing_notes(look.selection, cfg), *_brightness_notes(lefts)]
     notes: list[str] = []
+    stretch = _stretch(clip.layout) if cfg.squeezed_eyes else (1, 1)
+    if calibration is not None:
+        full = clip.camera_size[0] * stretch[0], clip.camera_size[1] * stretch[1]
+        calibration, words = fitted(calibration, full, name, squeezed=cfg.squeezed_eyes)
+        notes += [*calibration.notes, *words]
     strips = circle = outside = None
     labels: list[Rectangle] = []
     if cfg.border == "auto":
@@ -78,6 +85,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         calibration,
         stereo=clip.stereo,
         name=name,
+        stretch=stretch,
         field_of_view_degrees=cfg.field_of_view_degrees,
         max_width=cfg.max_width,
         crop=parse_rectangle(cfg.crop, "--crop") if cfg.crop else None,
@@ -122,6 +130,14 @@ def _look_through(clip: Clip, cfg: PrepareConfig) -> _Look:
             hint = "Choose a part with --start and --end, lower --frames-per-second, or raise --max-frames."
             raise input_error(str(clip.source.path), f"at most {cfg.max_frames} frames", got, hint)
     return _Look(indices, frozenset(damaged), sample, selection)
+
+
+def _stretch(layout: Layout) -> tuple[int, int]:
+    """Factors (across, down) that give images of a squeezed layout their shape back."""
+    if layout not in ("side-by-side", "top-bottom"):
+        fix = "Set --layout, or remove --squeezed-eyes."
+        raise input_error("--squeezed-eyes", "both cameras side by side or top-bottom in a frame", layout, fix)
+    return (2, 1) if layout == "side-by-side" else (1, 2)
 
 
 def _without(image: NDArray[np.uint8], strips: Strips | None) -> NDArray[np.uint8]:

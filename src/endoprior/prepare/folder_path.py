@@ -26,9 +26,11 @@ from ..data.pose_writing import (
 from ..system.atomic import write_json
 from .camera_path.seen import CameraPath, Lens, PoseInput
 from .camera_path.sequence_path import (
+    AS_OURS,
     ASSUMED,
     PATH_RECORD,
     REFINED,
+    Reading,
     record_of_path,
     rescaled,
     sequence_path,
@@ -56,13 +58,18 @@ class FolderPath:
 
 
 def write_folder_path(
-    folder: Path, how: str = "auto", progress: Callable[[int, int], None] = lambda done, total: None
+    folder: Path,
+    how: str = "auto",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    reading: Reading = AS_OURS,
 ) -> FolderPath:
     """Find the camera path of a sequence folder and write it there, with relative depth at the scale of the path.
 
     Args:
         folder: with `images/ masks/ depth/` and, for the focal length, `sequence.json` or old poses.
         how: as `--poses` of `prepare`.
+        reading: how the matrices of a file are to be read.
         progress: is told the number of frames followed, and of all.
     Raises:
         InputError: no sequence folder, read-only, or the poses named by `how` cannot be used; nothing is written.
@@ -99,6 +106,7 @@ def write_folder_path(
         size,
         has_depth=True,
         refine_focal=sources.get("lens") in (ASSUMED, REFINED),
+        reading=reading,
         progress=lambda done: progress(done, len(images)),
     )
     unexplained = unexplained_frames(path, colors())

@@ -1,4 +1,4 @@
-"""From a source image to a frame: rectify or undistort, crop, resize. All frames share one camera matrix.
+"""From a source image to a frame: stretch, rectify or undistort, crop, resize. All frames share one camera matrix.
 
 Rectangles and borders are in px of one camera's source image.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,9 +17,9 @@ from ..core.checks import input_error
 from ..footage.border import Circle, Strips
 from .calibration import Calibration, check_pair
 from .config import Rectangle
+from .rectification import Maps, Rectified, identity, rectify, stretched
 
 MIN_SIDE_PX = 32
-Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,15 @@ class FrameGeometry:
     source_size: tuple[int, int]
     """(width, height) of one camera's source image, px."""
     maps: tuple[Maps | None, Maps | None]
-    """Rectification maps of the left and right camera; None if the images are rectified already."""
+    """Where each pixel of the rectified left and right image lies in the source; None if the images are rectified."""
     cut: Rectangle
     """Part of the rectified image to keep."""
     size: tuple[int, int]
     """(width, height) of a frame, px."""
     matrix: NDArray[np.float64]
     """(3, 3) camera matrix K of the frames, px; the left-most pixel is centered at 0.5."""
+    turn: NDArray[np.float64]
+    """(3, 3) rotation from the axes of the source's left camera to those of the frames."""
     baseline_mm: float | None
     """None if monocular."""
     blank: NDArray[np.bool_]
@@ -82,6 +84,7 @@ def make_geometry(
     *,
     stereo: bool,
     name: str,
+    stretch: tuple[int, int] = (1, 1),
     field_of_view_degrees: float,
     max_width: int,
     crop: Rectangle | None = None,
@@ -94,8 +97,10 @@ def make_geometry(
 
     Args:
         size: (width, height) of one camera's source image.
-        calibration: None assumes a pinhole camera of `field_of_view_degrees` with a centered principal point.
+        calibration: in px of this image, stretched; None assumes a pinhole camera of `field_of_view_degrees` with a
+            centered principal point.
         name: of the calibration, for error messages.
+        stretch: factors (across, down) that undo the squeezing of an image.
         crop, blank, strips, circle: parts to keep and parts to paint over. The rim of the circle is left out.
         outside: (h, w) of the source, True on more that shows no tissue, such as black arcs inside of the circle.
     Raises:
@@ -115,20 +120,19 @@ def make_geometry(
         keep &= circle.mask(width, height, circle.margin_px)
     if outside is not None:
         keep &= ~outside
+    baseline = None
     painted = np.zeros_like(keep)
     for x, y, w, h in blank:
         painted[y : y + h, x : x + w] = True
-    maps: tuple[Maps | None, Maps | None] = (None, None)
-    baseline = None
+    full = width * stretch[0], height * stretch[1]
     if calibration is None:
-        matrix = _assumed(width, height, circle, field_of_view_degrees)
+        # A round border of a squeezed image is no circle.
+        assumed = _assumed(*full, circle if full == size else None, field_of_view_degrees)
+        rectified = Rectified(assumed, np.eye(3), (None, None))
     else:
-        calibration = calibration.for_size(width, height, name)
-        if stereo:
-            baseline = check_pair(calibration, name)
-            matrix, maps = _rectify_pair(calibration, size)
-        else:
-            matrix, maps = _undistort(calibration, size)
+        baseline = check_pair(calibration, name) if stereo else None
+        rectified = rectify(calibration, full, name, stereo=stereo)
+    maps = stretched(rectified.maps[0], full, stretch), stretched(rectified.maps[1], full, stretch)
     warped = keep if maps[0] is None else cv2.remap(keep.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
     cut = _bounding_box(warped)
     frame = _frame_size(cut, max_width)
@@ -137,7 +141,25 @@ def make_geometry(
     shown = keep & ~painted
     shown = shown if maps[0] is None else cv2.remap(shown.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
     inside = _shrink(_cut(shown.astype(np.float32), cut), frame) > 0.999
-    return FrameGeometry(size, maps, cut, frame, scale @ shift @ matrix, baseline, painted, inside)
+    matrix = scale @ shift @ rectified.matrix
+    return FrameGeometry(size, maps, cut, frame, matrix, rectified.turn, baseline, painted, inside)
+
+
+def with_rows_moved(geometry: FrameGeometry, offset_px: float) -> FrameGeometry:
+    """The geometry whose right frames are moved up by a row offset, px of a frame, so that the rows of a pair agree.
+
+    Args:
+        offset_px: y_right - y_left of the same points.
+    """
+    offset = np.float32(offset_px * geometry.cut[3] / geometry.size[1])
+    columns, rows = identity(geometry.source_size if geometry.maps[1] is None else geometry.maps[1][0].shape[::-1])
+    maps = columns, rows + offset
+    if geometry.maps[1] is not None:  # maps are smooth: those of the rows below, 0 beyond the image
+        maps = tuple(
+            cv2.remap(of, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-1e4)
+            for of in geometry.maps[1]
+        )
+    return replace(geometry, maps=(geometry.maps[0], maps))
 
 
 def demand_within(rectangle: Rectangle, size: tuple[int, int], option: str) -> None:
@@ -155,43 +177,6 @@ def _assumed(width: int, height: int, circle: Circle | None, degrees: float) -> 
     if circle is not None:
         extent, x, y = circle.radius, circle.center_x, circle.center_y
     return np.array([[extent / half, 0, x], [0, extent / half, y], [0, 0, 1.0]])
-
-
-def _moved(matrix: NDArray, by: float) -> NDArray[np.float64]:
-    """K with its principal point moved: OpenCV counts pixel centers from 0, this package from 0.5."""
-    moved = matrix.copy()
-    moved[:2, 2] += by
-    return moved
-
-
-def _rectify_pair(calibration: Calibration, size: tuple[int, int]) -> tuple[NDArray, tuple[Maps | None, Maps | None]]:
-    """K of both rectified cameras, and the rectification maps; None if the images are rectified already."""
-    left, right = calibration.left, calibration.right
-    assert right is not None and calibration.rotation is not None and calibration.translation_mm is not None
-    if calibration.rectified:
-        return left.matrix, (None, None)
-    k1, k2 = _moved(left.matrix, -0.5), _moved(right.matrix, -0.5)
-    r1, r2, p1, p2 = cv2.stereoRectify(
-        k1, left.distortion, k2, right.distortion, size, calibration.rotation,
-        calibration.translation_mm.reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
-    )[:4]  # fmt: skip
-    maps = (
-        cv2.initUndistortRectifyMap(k1, left.distortion, r1, p1, size, cv2.CV_32FC1),
-        cv2.initUndistortRectifyMap(k2, right.distortion, r2, p2, size, cv2.CV_32FC1),
-    )
-    return _moved(p1[:, :3], 0.5), maps
-
-
-def _undistort(calibration: Calibration, size: tuple[int, int]) -> tuple[NDArray, tuple[Maps | None, None]]:
-    camera = calibration.left
-    if not np.any(camera.distortion):
-        return camera.matrix, (None, None)
-    k = _moved(camera.matrix, -0.5)
-    better, _ = cv2.getOptimalNewCameraMatrix(k, camera.distortion, size, 0)
-    return _moved(better, 0.5), (
-        cv2.initUndistortRectifyMap(k, camera.distortion, None, better, size, cv2.CV_32FC1),
-        None,
-    )
 
 
 def _bounding_box(keep: NDArray[np.bool_]) -> Rectangle:

@@ -12,16 +12,20 @@ from numpy.typing import NDArray
 from ..core.checks import input_error, number_ranges
 from ..core.shell import command
 from ..data import write_stir_tracks
+from ..data.description import SIZE_NOT_STATED
 from ..data.found_tools import FrameRow, RowLog, mark_moving, read_rows, uncertain_frames
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
+from .calibration import Calibration
 from .calibration_files import read_calibration
+from .calibration_size import parse_size
 from .camera_path.seen import CameraPath, Lens, PoseInput
 from .camera_path.sequence_path import (
     ASSUMED,
     CALIBRATED,
     PATH_RECORD,
+    Reading,
     record_of_path,
     rescaled,
     sequence_path,
@@ -34,6 +38,7 @@ from .first_pass import input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry
 from .frames import write_frames
 from .record import record_of
+from .row_offset import with_equal_rows
 from .sam2 import is_sam2, open_sam2
 from .unmasked_motion import frames_with_unmasked_motion
 from .video_clip import Clip
@@ -75,13 +80,18 @@ def prepare(
     plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
         calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
+        if calibration is not None and cfg.calibration_size:
+            calibration = replace(calibration, size=parse_size(cfg.calibration_size), size_is_sure=True)
         clip = Clip(video, cfg, calibration)
         calibration = clip.calibration
         progress("looking through", 0, clip.source.num_frames)
         first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
+        if cfg.row_offset == "auto":
+            first_pass.geometry, row_note = with_equal_rows(first_pass.geometry, first_pass.samples)
+            first_pass.notes.append(row_note)
         progress("looking at tools and light", 0, len(first_pass.indices))
         chosen = choose_methods(cfg, clip, first_pass)
-        meta = _meta(clip, first_pass.geometry, chosen, calibrated=calibration is not None)
+        meta = _meta(clip, first_pass.geometry, chosen, lens=_lens_source(calibration))
         parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
         found = RowLog(folder)
         done = frames_done(folder, parts)
@@ -112,7 +122,9 @@ def prepare(
         moving = _unmasked(files, first_pass.geometry.inside) if chosen.finds_tools or segmenter is not None else []
         mark_moving(folder, moving)
         progress("following the camera", 0, files.count)
-        path, motion_notes = _camera_path(cfg, files, lambda done: progress("following the camera", done, files.count))
+        path, motion_notes = _camera_path(
+            cfg, files, first_pass.geometry, lambda done: progress("following the camera", done, files.count)
+        )
         damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
         unexplained = _unexplained(path, files, damaged)
         if path is not None:
@@ -180,7 +192,7 @@ def _damage_notes(damaged: list[int]) -> list[str]:
     ]
 
 
-def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, calibrated: bool) -> SequenceMeta:
+def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, lens: str) -> SequenceMeta:
     return SequenceMeta(
         width=geometry.size[0],
         height=geometry.size[1],
@@ -193,12 +205,18 @@ def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, calibra
         depth_scale=DEPTH_SCALE,
         depth_source=chosen.sources["depth"],
         depth_relative=chosen.relative,
-        sources=chosen.sources | {"lens": CALIBRATED if calibrated else ASSUMED},
+        sources=chosen.sources | {"lens": lens},
     )
 
 
+def _lens_source(calibration: Calibration | None) -> str:
+    if calibration is None:
+        return ASSUMED
+    return CALIBRATED if calibration.size else SIZE_NOT_STATED
+
+
 def _camera_path(
-    cfg: PrepareConfig, files: FrameFiles, progress: Callable[[int], None]
+    cfg: PrepareConfig, files: FrameFiles, geometry: FrameGeometry, progress: Callable[[int], None]
 ) -> tuple[CameraPath | None, list[str]]:
     """Poses of the written frames, None for a static camera; and notes for the user."""
     meta = files.meta
@@ -211,6 +229,8 @@ def _camera_path(
         return PoseInput(read_color(files.file("images", index)), tissue(index), depth)
 
     matrix = np.array([[meta.fx, 0, meta.cx], [0, meta.fy, meta.cy], [0, 0, 1]])
+    # Poses of a file are those of the source's left camera, which rectification turns.
+    turn = None if np.array_equal(geometry.turn, np.eye(3)) else geometry.turn
     return sequence_path(
         cfg.poses,
         frame,
@@ -220,6 +240,7 @@ def _camera_path(
         (meta.width, meta.height),
         has_depth=cfg.depth != "none",
         refine_focal=cfg.calibration is None,
+        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn),
         progress=progress,
     )
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.checks import number_ranges
+from ...core.checks import input_error, number_ranges
 from ...core.geometry import length_unit
+from ...core.pose_conventions import Convention, to_ours
 from ...data.writer import FARTHEST_UNIT
 from ...footage.camera_motion import camera_motion
 from ...footage.changes import find_changes
+from ...footage.pose_fit import View, measure_poses
 from .choose import How, find_path
 from .follow import follow_camera
 from .given import with_poses
@@ -33,6 +35,33 @@ WITHOUT_COLMAP = {"auto": "auto-own", "estimate": "own", "colmap": "own"}
 """The same by our own tracks alone, which is ten times faster."""
 
 
+@dataclass(frozen=True)
+class Reading:
+    """How the matrices of a file of poses are to be read."""
+
+    convention: Convention = "opencv"
+    unit_mm: float = 1.0
+    """mm per unit of the positions."""
+    turn: NDArray[np.float64] | None = None
+    """(3, 3) rotation from the camera that the poses belong to, to that of the frames; None if they are the same."""
+
+    def scaled(self, stored: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The stored poses with positions in mm."""
+        scaled = stored.copy()
+        scaled[:, :3, 3] *= self.unit_mm
+        return scaled
+
+    def ours(self, stored: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(T, 4, 4) camera-to-world of the frames, mm, OpenCV axes."""
+        poses = to_ours(stored, self.convention, self.unit_mm)
+        if self.turn is not None:
+            poses[:, :3, :3] = poses[:, :3, :3] @ self.turn.T
+        return poses
+
+
+AS_OURS = Reading()
+
+
 def sequence_path(
     how: str,
     frame: Callable[[int], PoseInput],
@@ -43,6 +72,7 @@ def sequence_path(
     *,
     has_depth: bool,
     refine_focal: bool,
+    reading: Reading = AS_OURS,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[CameraPath | None, list[str]]:
     """The path, None for a static camera; and notes for the user.
@@ -53,14 +83,21 @@ def sequence_path(
         views: opens all images and all tissue masks, one after the other.
         lens: its focal length may be an assumption: `refine_focal`.
         size: (width, height), px.
+        reading: how the matrices of a file are to be read.
     Raises:
         InputError: the file of poses cannot be used, or COLMAP is asked for and not there.
     """
+    if how not in (*METHODS, "still"):
+        stored = read_poses(Path(how), count)
+        poses = reading.ours(stored)
+        if not has_depth:
+            return _unscaled(poses), []
+        return _from_file(poses, frame, lens, progress), _fit_notes(how, stored, frame, lens, reading)
+    if (reading.convention, reading.unit_mm) != (AS_OURS.convention, AS_OURS.unit_mm):
+        got, fix = f"--poses {how}", "Remove --poses-convention and --poses-unit-mm."
+        raise input_error("--poses-convention", "a file with --poses", got, fix)
     if how == "still":
         return None, []
-    if how not in METHODS:
-        poses = read_poses(Path(how), count)
-        return _from_file(poses, frame, lens, progress) if has_depth else _unscaled(poses), []
     motion = camera_motion(*views())
     if how in ONLY_IF_MOVING and not motion.moving:
         return None, [f"the camera is static: {motion.reason}"]
@@ -114,6 +151,25 @@ def _from_file(
     follower = follow_camera(frame, len(poses), lens, progress)
     world = with_poses(follower, np.linalg.inv(poses), np.ones(len(poses), bool))
     return replace(_unscaled(poses), depth_scale=world.scales)
+
+
+def _fit_notes(how: str, stored: NDArray, frame: Callable[[int], PoseInput], lens: Lens, reading: Reading) -> list[str]:
+    """A note if the images say that the poses are to be read in another way."""
+
+    def view(index: int) -> View:
+        seen = frame(index)
+        return seen.rgb_u8, seen.tissue_mask, np.nan_to_num(seen.depth)
+
+    relative = lens.depth_is_relative
+    turn = np.eye(3) if reading.turn is None else reading.turn
+    fit = measure_poses(view, lens.matrix, reading.scaled(stored), reading.convention, turn=turn, relative=relative)
+    if fit is not None and fit.another_fits:
+        unit = f" --poses-unit-mm {fit.unit * reading.unit_mm:.4g}" if fit.unit * reading.unit_mm != 1 else ""
+        words = f"the poses in {how} explain the images better in another way: {fit.reason}"
+        return [f"{words}. If so: --poses-convention {fit.best}{unit}"]
+    if fit is not None and fit.none_fits:
+        return [f"the poses in {how} do not explain the images: {fit.reason}. Is each in the row of its frame?"]
+    return []
 
 
 def _unscaled(poses: NDArray) -> CameraPath:

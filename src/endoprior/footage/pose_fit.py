@@ -1,0 +1,254 @@
+"""Do camera poses explain the images? Corners on tissue are followed, and their depth is reprojected with the poses.
+
+A wrong convention moves the points of one frame to the wrong pixels of another one. The convention that brings them to
+the followed corners is the right one: deforming tissue adds the same error to all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.pose_conventions import CONVENTIONS, Convention, to_ours
+from ..core.spread import spread
+from .corner_flow import follow_both_ways
+
+View = tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]]
+"""Of a frame: (H, W, 3) image, (H, W) True on tissue, (H, W) depth in mm, 0 where missing."""
+WORK_WIDTH = 320
+"""Wider images are resized to this width, px."""
+STARTS = 10
+"""Number of frames from which corners are followed."""
+REACH = 24
+"""... over so many frames at most ..."""
+FAR = 0.05
+"""... or until they have moved by this share of the image width (median)."""
+MAX_CORNERS, FEWEST = 200, 40
+RETURN_PX = 1.0
+EDGE_STEP = 0.05
+"""No corners where depth changes by more than this share between neighbors."""
+LEAST_PX = 1.0
+"""Errors below this, px of an image 640 px wide, come from corners and tissue: nothing is wrong."""
+AS_GOOD = 1.15
+"""Conventions whose errors differ by less than this factor are not told apart."""
+NONE_PX, NONE_FIT = 3.0, ((1.05, 3.0), (0.6, 10.0))
+"""Poses do not fit at all if their error is above the first, px, and above both multiples of one pair: of the error
+without motion, and of that of the best rigid motion. Tissue that moves makes the latter small and the error large."""
+CLEARLY, STILL = 0.65, 0.95
+"""Another convention fits better if its error is less than the first share of the given one's, and less than the
+second share of that without motion."""
+SCALES, FINER = np.geomspace(1e-4, 1e5, 37), np.geomspace(0.6, 1 / 0.6, 9)
+"""Lengths of a unit that are tried, as multiples of the given one; then around the best."""
+INLIER_PX = 3.0
+PLAIN_UNITS, SAME_UNIT = (1.0, 1000.0, 10.0, 1e-3, 0.1), 2.5
+"""Up to this factor a unit is one of those: tissue that breathes with the camera shifts the best one."""
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """How well poses explain the images. Errors are medians over corners, px of an image 640 px wide."""
+
+    given_px: float
+    """Error of the poses as given."""
+    still_px: float
+    """Error without any camera motion."""
+    rigid_px: float
+    """Error of the rigid motion that fits each pair of frames best: tissue deforms."""
+    moved_px: float
+    """Motion that the poses as given predict."""
+    best: Convention
+    """The convention that fits best ..."""
+    unit: float
+    """... with this length of a unit, as a multiple of the given one ..."""
+    best_px: float
+    """... and its error."""
+    as_good: tuple[Convention, ...] = ()
+    """Others that fit as well with this unit: the camera moves too little to tell them apart."""
+
+    @property
+    def another_fits(self) -> bool:
+        """Whether another convention or unit fits clearly better than the given one."""
+        return self.given_px > LEAST_PX and self.best_px < min(CLEARLY * self.given_px, STILL * self.still_px)
+
+    @property
+    def none_fits(self) -> bool:
+        """Whether the poses move the camera, but not in the way in which the images move."""
+        least = min(max(still * self.still_px, rigid * self.rigid_px) for still, rigid in NONE_FIT)
+        wrong = self.given_px > max(NONE_PX, least)
+        return not self.another_fits and wrong and self.moved_px > self.given_px / 2
+
+    @property
+    def reason(self) -> str:
+        """The measurements in one line."""
+        words = f"{self.given_px:.1f} px as given, {self.still_px:.1f} without camera motion"
+        return f"{words}, {self.best_px:.1f} as {self.name}" if self.another_fits else words
+
+    @property
+    def name(self) -> str:
+        """The best convention and unit, in words."""
+        words = " or ".join((self.best, *self.as_good))
+        return words if self.unit == 1 else f"{words} with a unit of {self.unit:.4g} mm"
+
+
+@dataclass(frozen=True)
+class _Tracks:
+    """Corners of one frame, found again in a later one."""
+
+    first: int
+    last: int
+    points: NDArray[np.float64]
+    """(N, 3) place in the first camera, mm."""
+    before: NDArray[np.float64]
+    """(N, 2) px there."""
+    after: NDArray[np.float64]
+    """(N, 2) px in the last frame."""
+    half: tuple[float, float]
+    """Half of the image's width and height, px."""
+
+
+def measure_poses(
+    view: Callable[[int], View],
+    matrix: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    given: Convention = "opencv",
+    *,
+    turn: NDArray[np.float64] | None = None,
+    relative: bool = False,
+) -> PoseFit | None:
+    """Compare all conventions of poses.
+
+    Args:
+        view: reads frame i; few frames are read, in ascending order from each start.
+        matrix: (3, 3) K, px; pixel centers count from 0.
+        poses: (T, 4, 4) as the file has them; the unit is that of the depth if it is right.
+        given: the convention in which they are read at present.
+        turn: (3, 3) rotation from the camera that the poses belong to, to that of the frames.
+        relative: whether the unit of the depth is unknown, so that any unit of the poses is right.
+    Returns:
+        None if the poses do not move, or if too few corners can be followed.
+    """
+    steps = np.abs(poses - poses[0]).max()
+    if len(poses) < 2 or steps < 1e-6:
+        return None
+    starts = spread(len(poses) - 1, STARTS)
+    width = view(0)[0].shape[1]
+    factor = min(1.0, WORK_WIDTH / width)
+    px = 640 / (factor * width)
+    matrix = np.diag([factor, factor, 1]) @ matrix + [[0, 0, (factor - 1) / 2], [0, 0, (factor - 1) / 2], [0, 0, 0]]
+    tracks = [found for i in starts if (found := _follow(lambda j: _small(view(j), factor), matrix, i, len(poses)))]
+    if not tracks:
+        return None
+
+    def read(convention: Convention, unit: float) -> NDArray[np.float64]:
+        ours = to_ours(poses, convention, unit)
+        if turn is not None:
+            ours[:, :3, :3] = ours[:, :3, :3] @ turn.T
+        return ours
+
+    def error(convention: Convention, unit: float) -> float:
+        ours = read(convention, unit)
+        return px * float(np.median(np.concatenate([_errors(each, matrix, ours) for each in tracks])))
+
+    fits: list[tuple[float, Convention, float]] = []
+    for convention in (given, *(each for each in CONVENTIONS if each != given)):
+        fits.append(_best_unit(lambda unit, name=convention: error(name, unit), convention))
+    as_given = fits[0][0] if relative else error(given, 1.0)
+    least, best, unit = min(fits, key=lambda fit: fit[0])
+    others = tuple(name for at, name, of in fits if name != best and of == unit and at < AS_GOOD * least)
+    still = px * float(np.median(np.concatenate([np.linalg.norm(t.after - t.before, axis=1) for t in tracks])))
+    rigid = px * float(np.median(np.concatenate([_rigid_errors(each, matrix) for each in tracks])))
+    ours = read(given, 1.0)
+    moved = px * float(np.median(np.concatenate([_errors(each, matrix, ours, each.before) for each in tracks])))
+    return PoseFit(as_given, still, rigid, moved, best, 1.0 if relative else unit, least, others)
+
+
+def _best_unit(error: Callable[[float], float], convention: Convention) -> tuple[float, Convention, float]:
+    """Least error of a convention over lengths of its unit: (error, convention, unit)."""
+    unit = float(SCALES[int(np.argmin([error(each) for each in SCALES]))])
+    plain = next((each for each in PLAIN_UNITS if 1 / SAME_UNIT < unit / each < SAME_UNIT), None)
+    if plain is None:
+        finer = unit * FINER
+        unit = float(finer[int(np.argmin([error(each) for each in finer]))])
+    unit = plain or unit
+    return error(unit), convention, unit
+
+
+def _rigid_errors(tracks: _Tracks, matrix: NDArray) -> NDArray[np.float64]:
+    """(N,) distance from the followed corners after the rigid motion that explains most of them, px."""
+    found, turn, shift, _ = cv2.solvePnPRansac(tracks.points, tracks.after, matrix, None, reprojectionError=INLIER_PX)
+    if not found:
+        return np.full(len(tracks.after), np.inf)
+    pixels, _ = cv2.projectPoints(tracks.points, turn, shift, matrix, None)
+    return np.linalg.norm(pixels[:, 0] - tracks.after, axis=1)
+
+
+def _errors(
+    tracks: _Tracks, matrix: NDArray, camera_to_world: NDArray, pixels_there: NDArray | None = None
+) -> NDArray[np.float64]:
+    """(N,) distance of the reprojected points from the followed corners, px; the image's size behind the camera."""
+    goal = tracks.after if pixels_there is None else pixels_there
+    first, last = camera_to_world[tracks.first], camera_to_world[tracks.last]
+    world = tracks.points @ first[:3, :3].T + first[:3, 3]
+    there = (world - last[:3, 3]) @ last[:3, :3]
+    pixels = there @ matrix.T
+    ahead = there[:, 2] > 1e-6
+    far = 2 * max(tracks.half)
+    pixels = pixels[:, :2] / np.where(ahead, there[:, 2], 1)[:, None]
+    return np.where(ahead, np.minimum(np.linalg.norm(pixels - goal, axis=1), far), far)
+
+
+def _small(view: View, factor: float) -> View:
+    """Gray image, tissue and depth of a frame at the working size."""
+    rgb_u8, tissue, depth = view
+    gray = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY)
+    if factor == 1:
+        return gray, tissue, depth
+    size = round(gray.shape[1] * factor), max(round(gray.shape[0] * factor), 1)
+    tissue, depth = (cv2.resize(of, size, interpolation=cv2.INTER_NEAREST) for of in (tissue.astype(np.uint8), depth))
+    return cv2.resize(gray, size, interpolation=cv2.INTER_AREA), tissue, depth
+
+
+def _follow(view: Callable[[int], View], matrix: NDArray, start: int, count: int) -> _Tracks | None:
+    """Follow corners from a frame until they are far away; None if too few are left."""
+    gray, tissue, depth = view(start)
+    before = _corners(gray, tissue, depth)
+    kept, pixels, last = np.arange(len(before)), before, start
+    for index in range(start + 1, min(start + REACH + 1, count)):
+        following, tissue, _ = view(index)
+        if len(kept) < FEWEST:
+            return None
+        there, good = follow_both_ways(gray, following, pixels, RETURN_PX)
+        good &= _sampled(tissue, there) > 0
+        if good.sum() < FEWEST:
+            break
+        kept, pixels, gray, last = kept[good], there[good], following, index
+        if np.median(np.linalg.norm(pixels - before[kept], axis=1)) > FAR * gray.shape[1]:
+            break
+    if last == start:
+        return None
+    corners = before[kept].astype(np.float64)
+    rays = np.concatenate([corners, np.ones((len(kept), 1))], 1) @ np.linalg.inv(matrix).T
+    z = _sampled(depth, before[kept]).astype(np.float64)
+    half = gray.shape[1] / 2, gray.shape[0] / 2
+    return _Tracks(start, last, rays * z[:, None], corners, pixels.astype(np.float64), half)
+
+
+def _corners(gray: NDArray[np.uint8], tissue: NDArray[np.bool_], depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 2) corners on smooth tissue with depth."""
+    near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
+    inner = cv2.erode(tissue.astype(np.uint8), np.ones((9, 9)), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    allowed = inner * ((near > 0) & (far - near < EDGE_STEP * depth)).astype(np.uint8)
+    found = cv2.goodFeaturesToTrack(gray, MAX_CORNERS, 0.003, max(5, gray.shape[1] // 80), mask=allowed)
+    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+
+
+def _sampled(image: NDArray, pixels: NDArray[np.float32]) -> NDArray:
+    """(N,) values at the nearest pixels; 0 outside."""
+    at = np.round(np.nan_to_num(pixels, nan=-9, posinf=-9, neginf=-9)).astype(int)
+    inside = (at >= 0).all(1) & (at[:, 0] < image.shape[1]) & (at[:, 1] < image.shape[0])
+    at = np.where(inside[:, None], at, 0)
+    return np.where(inside, image[at[:, 1], at[:, 0]], 0)

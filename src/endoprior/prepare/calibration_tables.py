@@ -1,0 +1,212 @@
+"""Calibration files as flat tables of names and values, whatever program wrote them.
+
+The content tells the format, not the name of the file: OpenCV's YAML, JSON and XML, plain YAML and JSON, ini sections,
+COLMAP's `cameras.txt`, rows of numbers (`intrinsics.txt`), NumPy. Nothing in a file is ever executed.
+"""
+
+from __future__ import annotations
+
+import configparser
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import yaml
+
+from ..core.checks import InputError, input_error
+from ..data.numpy_files import read_numpy
+from ..data.reading import read_bytes, read_text
+from ..data.yaml_text import BoundedLoader, load_yaml
+
+Table = dict[str, Any]
+"""Numbers, arrays and texts, by name in lower case without punctuation."""
+FORMATS = "a calibration of OpenCV, ROS, Kalibr, ORB-SLAM, COLMAP or the da Vinci, or rows of numbers"
+HINT = "Use the names K_left, distortion_left, K_right, distortion_right, R, T_mm, width, height (docs/prepare.md)."
+FOREIGN = {
+    b"MATLAB": ("a .mat file of MATLAB", "Write K and the distortion to a .json file."),
+    b"\x89HDF": ("a .mat or .h5 file (HDF5)", "Write K and the distortion to a .json file."),
+    b"\x80": ("a pickle, which could run programs", "Save it with numpy.savez, or as .json."),
+    b"\xd0\xcf\x11\xe0": ("a document of an office program", "Export it as text."),
+}
+"""First bytes of formats that are not read: what they are, and what to do."""
+COLMAP_NAMES = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+}
+"""Parameters of COLMAP's camera models, in the order of its files."""
+COLMAP_LINE = re.compile(r"\d+\s+([A-Z_]{3,})\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)\s*")
+INI_SECTION = re.compile(r"^\s*\[[A-Za-z][^\]=:]*\]\s*$", re.MULTILINE)
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+ONLY_NUMBERS = re.compile(rf"[\s,;\[\]()]*(?:{NUMBER}[\s,;\[\]()]+)*")
+
+
+def read_table(path: Path) -> Table:
+    """The names and values of a calibration file; nested names are joined, matrices become arrays.
+
+    Raises:
+        InputError: unreadable, a format that is not read (it is named), or no named values.
+    """
+    try:
+        content = _content(path)
+        if isinstance(content, dict) and content:
+            return {plain(name): value for name, value in _flat(content).items()}
+    except InputError:
+        raise
+    except (ValueError, TypeError, OverflowError, RecursionError, yaml.YAMLError, configparser.Error) as error:
+        raise input_error(path, "a readable calibration", " ".join(str(error).split())[:120], "Correct it.") from None
+    got = "text without names" if isinstance(content, str) else type(content).__name__
+    raise input_error(path, FORMATS, got, HINT)
+
+
+def plain(name: str) -> str:
+    """A name in lower case without punctuation."""
+    return "".join(c for c in name.lower() if c.isalnum())
+
+
+def _content(path: Path) -> Any:
+    """What the file holds, in the nesting of its format."""
+    if path.suffix.lower() in (".npz", ".npy"):
+        stored = read_numpy(path, "a readable calibration", "Save it again with numpy.savez.")
+        return _of_rows(path, np.atleast_2d(stored)) if isinstance(stored, np.ndarray) else stored
+    start = read_bytes(path, "a calibration file", "Check the path.")[:16].tobytes()
+    for mark, (what, fix) in FOREIGN.items():
+        if start.startswith(mark):
+            raise input_error(path, FORMATS, what, fix)
+    if path.name in ("cameras.bin", "rigs.bin"):
+        fix = "`colmap model_converter --input_path DIR --output_path DIR --output_type TXT` writes cameras.txt."
+        raise input_error(path, FORMATS, "a binary file of COLMAP", fix)
+    text = read_text(path, "a calibration file", "Check the path.", or_latin_1=True)
+    if text.lstrip().startswith("<"):
+        return _of_xml(path, text)
+    if path.suffix.lower() == ".json":
+        return json.loads(text)
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    cameras = [COLMAP_LINE.fullmatch(line.strip()) for line in lines]
+    if lines and all(cameras):
+        return _of_colmap(path, [camera.groups() for camera in cameras if camera])
+    if lines and ONLY_NUMBERS.fullmatch("\n".join(lines) + "\n"):
+        numbers = [[float(word) for word in re.findall(NUMBER, line)] for line in lines]
+        numbers = [row for row in numbers if row]
+        return _of_rows(path, np.array(numbers)) if len({len(row) for row in numbers}) == 1 else numbers
+    if INI_SECTION.search(text):
+        return _of_ini(text)
+    # OpenCV writes "%YAML:1.0", which is not YAML.
+    return load_yaml("\n".join(line for line in text.splitlines() if not line.startswith("%YAML")), _Loader)
+
+
+class _Loader(BoundedLoader):
+    """Safe YAML that also knows OpenCV's matrices."""
+
+
+for _name in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", lambda loader, node: loader.construct_mapping(node, True))
+
+
+def _of_xml(path: Path, text: str) -> Any:
+    fix = "Write it with cv2.FileStorage, or as .json."
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # OpenCV writes neither; entities can expand without end
+        raise input_error(path, "OpenCV's XML", "a document type", fix)
+    try:
+        # The text is decoded already: another encoding in its first line must not count.
+        root = ElementTree.fromstring(re.sub(r"^\s*<\?xml[^>]*\?>", "", text))
+    except ElementTree.ParseError as error:
+        raise input_error(path, "OpenCV's XML", str(error), fix) from None
+    if root.tag != "opencv_storage":
+        raise input_error(path, "OpenCV's XML, <opencv_storage>", f"<{root.tag[:40]}>", fix)
+    return {each.tag: _xml_value(each) for each in root}
+
+
+def _xml_value(node: ElementTree.Element) -> Any:
+    if len(node):
+        return {child.tag: _xml_value(child) for child in node}
+    words = (node.text or "").replace('"', " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return " ".join(words)
+    return numbers[0] if len(numbers) == 1 and node.tag != "data" else numbers
+
+
+def _of_colmap(path: Path, cameras: list[tuple[str, ...]]) -> Table:
+    if len(cameras) > 1:
+        fix = "Keep the line of this video's camera."
+        raise input_error(path, "one camera of COLMAP, which writes no R and T", f"{len(cameras)} cameras", fix)
+    model, width, height, numbers = cameras[0]
+    values = [float(word) for word in numbers.split()]
+    names = COLMAP_NAMES.get(model, "").split()
+    if not names:
+        fix = "Choose OPENCV or OPENCV_FISHEYE in COLMAP."
+        raise input_error(path, f"a camera model of {', '.join(COLMAP_NAMES)}", model, fix)
+    if len(names) != len(values):
+        raise input_error(path, f"{len(names)} numbers of {model}", str(len(values)), "Write it again.")
+    found = dict(zip(names, values, strict=True))
+    focal = {"fx": found["f"]} if "f" in found else {}
+    return {"camera_model": model, "width": width, "height": height, "pixel_center": 0.5} | found | focal
+
+
+def _of_rows(path: Path, rows: np.ndarray) -> Table:
+    """3x3, 3x4 or 4x4 camera matrix; or `fx fy cx cy`, then distortion coefficients, if any."""
+    rows = rows.astype(np.float64)
+    if rows.shape == (1, 9) and not rows[0, [1, 3, 6, 7]].any() and rows[0, 8] == 1:
+        rows = rows.reshape(3, 3)
+    if rows.shape in ((3, 3), (3, 4), (4, 4)):
+        if rows.shape[1] == 4 and rows[:3, 3].any():
+            fix = "Write the 3x3 camera matrix K."
+            raise input_error(path, "a camera matrix without a translation", "a projection matrix", fix)
+        return {"K": rows[:3, :3]}
+    numbers = rows.ravel()
+    if 1 in rows.shape and len(numbers) in (4, 8, 9):
+        matrix = [[numbers[0], 0, numbers[2]], [0, numbers[1], numbers[3]], [0, 0, 1]]
+        return {"K": matrix} | ({"D": numbers[4:]} if len(numbers) > 4 else {})
+    want = "a 3x3 camera matrix, or fx fy cx cy and distortion coefficients"
+    raise input_error(path, want, f"{'x'.join(map(str, rows.shape))} numbers", HINT)
+
+
+def _of_ini(text: str) -> Table:
+    """Sections named after a side get its name in front; `R_0 R_1 ...` become arrays."""
+    parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"), strict=True)
+    parser.read_string(text[INI_SECTION.search(text).start() :])
+    table: Table = {}
+    for section in parser.sections():
+        side = "left" if "left" in section.lower() else "right" if "right" in section.lower() else section
+        values = {name: _ini_value(value) for name, value in parser.items(section)}
+        for name in ("kc", "r", "t", "om"):
+            parts = [values[f"{name}_{i}"] for i in range(14) if f"{name}_{i}" in values]
+            if parts and f"{name}_0" in values:
+                values[name] = parts
+        table[side] = table.get(side, {}) | values
+    return table
+
+
+def _ini_value(text: str) -> Any:
+    words = text.strip(" []\"'").replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return text.strip(" \"'")
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def _flat(content: Mapping[Any, Any], prefix: str = "") -> Table:
+    table: Table = {}
+    for name, value in content.items():
+        if isinstance(value, dict) and {"rows", "cols", "data"} <= {str(key) for key in value}:
+            table[f"{prefix}{name}"] = np.reshape(value["data"], (int(value["rows"]), int(value["cols"])))
+        elif isinstance(value, dict) and {"sizes", "data"} <= {str(key) for key in value}:
+            table[f"{prefix}{name}"] = np.reshape(value["data"], [int(n) for n in np.ravel(value["sizes"])])
+        elif isinstance(value, dict):
+            table |= _flat(value, f"{prefix}{name}.")
+        else:
+            table[f"{prefix}{name}"] = value
+    return table
