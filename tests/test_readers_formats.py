@@ -38,6 +38,8 @@ LOOKS = {
     "stereomis": ("images/0.png", "masks/0.png", "depth/0.png", "poses_bounds.npy", "split.json"),
     "stereomis raw": ("P2_7.mp4", "StereoCalibration.ini", "groundtruth.txt", "masks/000001l.png"),
     "hamlyn": ("images/0.png", "gt_masks/0.png", "gt_depth/0.png", "poses_bounds.npy"),
+    "hamlyn of Forplane": ("images/0.png", "gt_masks/0.png", "pred_disp/0.png", "intrinsics.txt"),
+    "hamlyn for tracking": ("color/0.png", "depth/0.png", "intrinsics.txt"),
     "hamlyn rectified": ("image01/0.jpg", "depth01/0.png", "intrinsics.txt"),
     "endonerf": ("images/0.png", "masks/0.png", "depth/0.png", "poses_bounds.npy"),
     "endonerf without images": ("poses_bounds.npy",),

@@ -15,6 +15,7 @@ from ..core.config import DataConfig
 from ..core.options import Options, command_of
 from ..core.types import Camera
 from ..data import FrameSequence
+from ..data.camera_matrix import MATRIX_FILE
 from ..data.files import entries
 from ..data.load import find_format
 from ..data.prepare_record import SURROGATES, PrepareRecord, read_record
@@ -103,6 +104,8 @@ def _options_of_frames(path: Path, sequence: FrameSequence, described: Mapping[s
         options["--folder-rate"] = (f"{sequence.frames_per_second * (cfg.stride or 1):g}",)
     if {"fx", "cx", "cy"} <= described.keys():
         options["--calibration"] = (str(path / "sequence.json"),)
+    elif (path / MATRIX_FILE).is_file() and "fx" not in described:
+        options["--calibration"] = (str(path / MATRIX_FILE),)
     else:
         options["--field-of-view-degrees"] = (f"{np.clip(field_of_view(sequence.camera(0)), *VIEWS):.6g}",)
     if (path / "right").is_dir() and "baseline_mm" in described and "--calibration" in options:

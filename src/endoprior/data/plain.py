@@ -9,6 +9,7 @@ import numpy as np
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
+from .camera_matrix import MATRIX_FILE, read_camera_matrix
 from .depth_files import DEPTH_SUFFIXES, read_depth_file
 from .description import check_frames, intrinsics_of, read_description
 from .files import IMAGE_SUFFIXES, demand_count, list_files, unequal_names
@@ -46,6 +47,7 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
             demand_count(files, path / folder, len(images))
             remarks += unequal_names(images, files)
     described = read_description(path / "sequence.json")
+    description = [path / "sequence.json"] if described else []
     remarks += check_frames(path / "sequence.json", described, len(images))
     if not masks:
         remarks.append(f"{path / 'masks'}: missing, every pixel counts as tissue")
@@ -55,6 +57,11 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
     if depths and not unit:
         remarks.append(f"{path / 'depth'}: no unit given, mm assumed; set data.depth_unit_mm")
     height, width = read_color(images[0]).shape[:2]
+    calibration = path / MATRIX_FILE
+    if "fx" not in described and calibration.is_file():
+        matrix = read_camera_matrix(calibration)
+        described |= {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+        description.append(calibration)
     if "fx" not in described:
         focal = ASSUMED_FOCAL * width
         remarks.append(f"{path}: no focal length given, {ASSUMED_FOCAL:g} image widths ({focal:g} px) are assumed")
@@ -79,7 +86,7 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
         [Camera(*shape, pose) for pose in identity_poses(len(kept))],
         decode,
         images=images,
-        files=[*masks, *depths, *([path / "sequence.json"] if described else [])],
+        files=[*masks, *depths, *description],
         frames_per_second=float(rate) / (cfg.stride or 1) if rate is not None else None,
         right_eye=right_eye,
         remarks=remarks,
