@@ -37,12 +37,12 @@ def seen(matrix: np.ndarray, camera_to_world: np.ndarray, size: tuple[int, int],
 
 
 def seen_through_lens(matrix: np.ndarray, distortion: np.ndarray, camera_to_world: np.ndarray, size: tuple[int, int]):
-    """As `seen`, through a lens with OpenCV's distortion, or the four numbers of a fisheye; OpenCV's pixel centers."""
+    """As `seen`, finely painted, through a lens with OpenCV's distortion; the left-most pixel is centered at 0."""
     columns, rows = np.meshgrid(np.arange(size[0], dtype=np.float64), np.arange(size[1], dtype=np.float64))
     at = np.stack([columns, rows], -1).reshape(-1, 1, 2)
-    flat = cv2.undistortPoints(at, matrix, distortion, None, None, None, (3, 100, 1e-12))
+    flat = cv2.undistortPoints(at, matrix, distortion, criteria=(3, 100, 1e-12))
     rays = np.concatenate([flat.reshape(-1, 2), np.ones((flat.shape[0], 1))], 1).reshape(size[1], size[0], 3)
-    return _of_rays(rays, camera_to_world)
+    return _of_rays(rays, camera_to_world, fine=30)
 
 
 def off_the_plane(sequence: FrameSequence, index: int) -> float:
@@ -65,12 +65,13 @@ def color_change(sequence: FrameSequence, first: int, second: int) -> float:
     return float(np.quantile(np.abs(there - colors[inside])[tissue].max(1), 0.95))
 
 
-def _of_rays(rays: np.ndarray, camera_to_world: np.ndarray):
+def _of_rays(rays: np.ndarray, camera_to_world: np.ndarray, fine: float = 0):
     turn, start = camera_to_world[:3, :3], camera_to_world[:3, 3]
     directions = rays @ turn.T
     depth = (OFFSET - NORMAL @ start) / (directions @ NORMAL)
     x, y, _ = np.moveaxis(start + directions * depth[..., None], -1, 0)
     color = np.stack([140 + 60 * np.sin(x / 5), 90 + 50 * np.sin(y / 4 + 1), 80 + 40 * np.sin((x + y) / 7)], -1)
+    color += fine * (np.sin(2.1 * x + 0.4 * y) * np.sin(1.7 * y - 0.6 * x))[..., None]
     return np.rint(color).astype(np.uint8), depth
 
 

@@ -29,7 +29,7 @@ MOST_PX = 1e6
 METERS_BELOW = 0.05
 """A T shorter than this is in meters: no stereo endoscope has a baseline of 0.05 mm."""
 
-MATRIX = ("k", "m", "cameramatrix", "mtx", "intrinsics", "intrinsic", "intrinsicmatrix", "cammatrix")
+MATRIX = ("k", "m", "cameramatrix", "cameramat", "mtx", "intrinsics", "intrinsic", "intrinsicmatrix", "cammatrix")
 DISTORTION = ("d", "dist", "distortion", "distcoeffs", "distcoeff", "distortioncoefficients", "distortioncoeffs")
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """One camera's distortion as single numbers, in OpenCV's order."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -70,6 +71,7 @@ def prepare(
     cfg = cfg or PrepareConfig()
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
+        _demand_all_frames(cfg)
     segmenter = open_sam2(cfg.masks, "--masks") if is_sam2(cfg.masks) else None
     plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
@@ -133,6 +135,13 @@ def prepare(
             frames = number_ranges(unexplained)
             notes.append(f"no camera pose, or another scene, in frames {frames}; --start and --end can leave them out")
     return Prepared(out, files.count, first_pass.geometry.size, notes)
+
+
+def _demand_all_frames(cfg: PrepareConfig) -> None:
+    """Raise InputError if options leave out frames: points of STIR belong to the first and the last frame of a clip."""
+    options = {"--start": cfg.start > 0, "--end": cfg.end < math.inf, "--drop-out-of-body": cfg.drop_out_of_body}
+    if left_out := [name for name, is_set in options.items() if is_set]:
+        raise input_error("--stir", "all frames of the clip", left_out[0], f"remove {left_out[0]}.")
 
 
 def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, calibrated: bool) -> SequenceMeta:
