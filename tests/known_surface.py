@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from endoprior.data import FrameSequence
 
@@ -59,10 +60,14 @@ def color_change(sequence: FrameSequence, first: int, second: int) -> float:
     at = moved[:, :2] / moved[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     inside = ((at > 1) & (at < (camera.width - 1, camera.height - 1))).all(1)
     assert inside.mean() > 0.3  # both frames show the same part
-    x, y = (at[inside] - 0.5).astype(np.float32).T
-    tissue = cv2.remap(frame.tissue_mask.astype(np.float32), x[None], y[None], cv2.INTER_LINEAR)[0] > 0.99
-    there = cv2.remap(frame.rgb_u8.astype(np.float32), x[None], y[None], cv2.INTER_LINEAR)[0]
-    return float(np.quantile(np.abs(there - colors[inside])[tissue].max(1), 0.95))
+    places = (at[inside] - 0.5).T[::-1]
+
+    def there(image: np.ndarray) -> np.ndarray:
+        return map_coordinates(image.astype(np.float64), places, order=1)
+
+    tissue = there(frame.tissue_mask) > 0.99
+    found = np.stack([there(frame.rgb_u8[..., channel]) for channel in range(3)], 1)
+    return float(np.quantile(np.abs(found - colors[inside])[tissue].max(1), 0.95))
 
 
 def _of_rays(rays: np.ndarray, camera_to_world: np.ndarray, fine: float = 0):

@@ -91,8 +91,8 @@ class PrepareConfig:
 
     poses: str = "auto"
     """`still` (static camera), `estimate` (from depth and static tissue; by COLMAP if it is installed and explains the
-    frames better; `own` and `colmap` force one), or a file: .npy (T, 4, 4) camera-to-world in mm, or poses_bounds.npy.
-    `auto` estimates poses if the camera moves; `auto-own` never by COLMAP, which takes longer."""
+    frames better; `own` and `colmap` force one), or a file of camera-to-world poses (docs/prepare.md). `auto` estimates
+    poses if the camera moves; `auto-own` never by COLMAP."""
     stir: Path | None = None
     """Folder of the STIR clip (`left/seqNN`) that VIDEO belongs to: its tattooed points become `truth/tracks.npz`."""
     keep_right: bool = False

@@ -36,6 +36,8 @@ class FrameGeometry:
     """(width, height) of a frame, px."""
     matrix: NDArray[np.float64]
     """(3, 3) camera matrix K of the frames, px; the left-most pixel is centered at 0.5."""
+    turn: NDArray[np.float64]
+    """(3, 3) rotation from the axes of the source's left camera to those of the frames."""
     baseline_mm: float | None
     """None if monocular."""
     blank: NDArray[np.bool_]
@@ -119,14 +121,14 @@ def make_geometry(
     for x, y, w, h in blank:
         painted[y : y + h, x : x + w] = True
     maps: tuple[Maps | None, Maps | None] = (None, None)
-    baseline = None
+    baseline, turn = None, np.eye(3)
     if calibration is None:
         matrix = _assumed(width, height, circle, field_of_view_degrees)
     else:
         calibration = calibration.for_size(width, height, name)
         if stereo:
             baseline = check_pair(calibration, name)
-            matrix, maps = _rectify_pair(calibration, size)
+            matrix, turn, maps = _rectify_pair(calibration, size)
         else:
             matrix, maps = _undistort(calibration, size)
     warped = keep if maps[0] is None else cv2.remap(keep.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
@@ -137,7 +139,7 @@ def make_geometry(
     shown = keep & ~painted
     shown = shown if maps[0] is None else cv2.remap(shown.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
     inside = _shrink(_cut(shown.astype(np.float32), cut), frame) > 0.999
-    return FrameGeometry(size, maps, cut, frame, scale @ shift @ matrix, baseline, painted, inside)
+    return FrameGeometry(size, maps, cut, frame, scale @ shift @ matrix, turn, baseline, painted, inside)
 
 
 def demand_within(rectangle: Rectangle, size: tuple[int, int], option: str) -> None:
@@ -164,12 +166,14 @@ def _moved(matrix: NDArray, by: float) -> NDArray[np.float64]:
     return moved
 
 
-def _rectify_pair(calibration: Calibration, size: tuple[int, int]) -> tuple[NDArray, tuple[Maps | None, Maps | None]]:
-    """K of both rectified cameras, and the rectification maps; None if the images are rectified already."""
+def _rectify_pair(
+    calibration: Calibration, size: tuple[int, int]
+) -> tuple[NDArray, NDArray, tuple[Maps | None, Maps | None]]:
+    """K of both rectified cameras, the left one's turn, and the maps; None if the images are rectified already."""
     left, right = calibration.left, calibration.right
     assert right is not None and calibration.rotation is not None and calibration.translation_mm is not None
     if calibration.rectified:
-        return left.matrix, (None, None)
+        return left.matrix, np.eye(3), (None, None)
     k1, k2 = _moved(left.matrix, -0.5), _moved(right.matrix, -0.5)
     r1, r2, p1, p2 = cv2.stereoRectify(
         k1, left.distortion, k2, right.distortion, size, calibration.rotation,
@@ -179,7 +183,7 @@ def _rectify_pair(calibration: Calibration, size: tuple[int, int]) -> tuple[NDAr
         cv2.initUndistortRectifyMap(k1, left.distortion, r1, p1, size, cv2.CV_32FC1),
         cv2.initUndistortRectifyMap(k2, right.distortion, r2, p2, size, cv2.CV_32FC1),
     )
-    return _moved(p1[:, :3], 0.5), maps
+    return _moved(p1[:, :3], 0.5), r1, maps
 
 
 def _undistort(calibration: Calibration, size: tuple[int, int]) -> tuple[NDArray, tuple[Maps | None, None]]:

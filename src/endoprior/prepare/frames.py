@@ -54,14 +54,19 @@ class FrameMethods:
 
 
 def measure_frames(
-    stereo_frames: Iterable[StereoFrame], geometry: FrameGeometry, methods: FrameMethods, first: int
+    stereo_frames: Iterable[StereoFrame], geometry: FrameGeometry, methods: FrameMethods, first: int, used: list[int]
 ) -> Iterator[MeasuredFrame]:
-    """Rectify the wanted frames and measure their depth, from position `first` on."""
+    """Rectify the wanted frames and measure their depth, from position `first` on.
+
+    Args:
+        used: gets the position in the source of every wanted frame.
+    """
     position = 0
     for stereo_frame in stereo_frames:
         rgb_u8 = geometry.image(stereo_frame.left)
         if not methods.wanted(rgb_u8):
             continue
+        used.append(stereo_frame.index)
         if position >= first:
             right = None if stereo_frame.right is None else geometry.image(stereo_frame.right, right=True)
             frame = MeasuredFrame(position, stereo_frame.index, rgb_u8, right, None)
@@ -98,16 +103,18 @@ def write_frames(
     keep_right: bool,
     on_tools: Callable[[int, FoundTools], None] = lambda position, found: None,
     on_frame: Callable[[int], None] = lambda count: None,
-) -> None:
+) -> list[int]:
     """Write every wanted frame that `files` does not have yet.
 
     Args:
         on_tools: called with the position of each frame and its tools before its files are written.
         on_frame: called after each frame with the number of frames written.
+    Returns:
+        Position in the source of each frame of the sequence.
     """
-    done = files.count
+    done, used = files.count, []
     # After a resume, measure a few finished frames again: the temporal filter needs their depth.
-    for window in with_neighbors(measure_frames(stereo_frames, geometry, methods, max(done - REACH, 0))):
+    for window in with_neighbors(measure_frames(stereo_frames, geometry, methods, max(done - REACH, 0), used)):
         frame = window[len(window) // 2]
         if frame.position < done:
             continue
@@ -124,3 +131,4 @@ def write_frames(
         rgb_u8 = np.where(geometry.inside[..., None], frame.rgb_u8, np.uint8(0))
         files.add(rgb_u8, tools, depth, frame.right_u8 if keep_right else None)
         on_frame(files.count)
+    return used

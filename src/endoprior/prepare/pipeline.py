@@ -18,6 +18,7 @@ from ..data.images import decode_image, read_color, read_depth, read_tool_mask, 
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
 from .calibration_files import read_calibration
+from .camera_path.pose_file import GivenPoses
 from .camera_path.seen import CameraPath, Lens, PoseInput
 from .camera_path.sequence_path import (
     ASSUMED,
@@ -34,6 +35,7 @@ from .depth_and_masks import ChosenMethods, choose_methods
 from .first_pass import input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry
 from .frames import write_frames
+from .masked_frames import masked_frames
 from .record import record_of
 from .sam2 import is_sam2, open_sam2
 from .video_clip import Clip
@@ -79,9 +81,16 @@ def prepare(
         clip = Clip(video, cfg, calibration)
         progress("looking through", 0, clip.source.num_frames)
         first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
+        masked = masked_frames(cfg, first_pass.indices, first_pass.image_names)
+        if masked is not None:
+            clip.only = masked.indices
+            first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
+            first_pass.notes.append(masked.note)
         progress("looking at tools and light", 0, len(first_pass.indices))
         chosen = choose_methods(cfg, clip, first_pass)
         meta = _meta(clip, first_pass.geometry, chosen, calibrated=calibration is not None)
+        if masked is not None:
+            meta = replace(meta, frames_per_second=meta.frames_per_second / masked.step)
         parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
         found = RowLog(folder)
         done = frames_done(folder, parts)
@@ -89,7 +98,7 @@ def prepare(
             done = min(done, len(found.rows))
             found.cut(done)
         files = FrameFiles(folder, meta, done)
-        write_frames(
+        used = write_frames(
             clip.stereo_frames(clip.selection()),
             first_pass.geometry,
             chosen.methods,
@@ -110,7 +119,10 @@ def prepare(
             inside, shade = first_pass.geometry.inside, chosen.methods.shade
             carried_notes = replace_by_carried(files, segmenter, inside, shade, progress)
         progress("following the camera", 0, files.count)
-        path, motion_notes = _camera_path(cfg, files, lambda done: progress("following the camera", done, files.count))
+        given = GivenPoses(used, first_pass.geometry.turn)
+        path, motion_notes = _camera_path(
+            cfg, files, given, lambda done: progress("following the camera", done, files.count)
+        )
         unexplained = unexplained_frames(path, (read_color(files.file("images", i)) for i in range(files.count)))
         if path is not None:
             if files.meta.depth_relative:
@@ -162,7 +174,7 @@ def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, calibra
 
 
 def _camera_path(
-    cfg: PrepareConfig, files: FrameFiles, progress: Callable[[int], None]
+    cfg: PrepareConfig, files: FrameFiles, given: GivenPoses, progress: Callable[[int], None]
 ) -> tuple[CameraPath | None, list[str]]:
     """Poses of the written frames, None for a static camera; and notes for the user."""
     meta = files.meta
@@ -184,6 +196,7 @@ def _camera_path(
         (meta.width, meta.height),
         has_depth=cfg.depth != "none",
         refine_focal=cfg.calibration is None,
+        given=given,
         progress=progress,
     )
 

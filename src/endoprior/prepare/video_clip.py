@@ -57,12 +57,14 @@ class Clip:
         self.stereo = self.layout != "mono"
         self.camera_size = camera_size(first.shape[1], first.shape[0], self.layout)
         self.frames_per_second = cfg.frames_per_second or self.source.frames_per_second
+        self.only: frozenset[int] | None = None
+        """Positions in the source of the frames to use, of those selected; None for all."""
         self._cfg = cfg
 
     def selection(self) -> FrameSelection:
         """The frames to use, with all counts at zero."""
         rate = self.source.frames_per_second
-        return FrameSelection(self.frames_per_second, self._cfg.start, self._cfg.end, rate)
+        return FrameSelection(self.frames_per_second, self._cfg.start, self._cfg.end, rate, self.only)
 
     def stereo_frames(self, selection: FrameSelection) -> Iterator[StereoFrame]:
         """The selected frames, in order.

@@ -17,7 +17,7 @@ from ...footage.changes import find_changes
 from .choose import How, find_path
 from .follow import follow_camera
 from .given import with_poses
-from .pose_file import read_poses
+from .pose_file import GivenPoses, read_poses
 from .seen import CameraPath, Lens, PoseInput
 
 PATH_RECORD = "camera_path.json"
@@ -42,6 +42,7 @@ def sequence_path(
     *,
     has_depth: bool,
     refine_focal: bool,
+    given: GivenPoses | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[CameraPath | None, list[str]]:
     """The path, None for a static camera; and notes for the user.
@@ -52,14 +53,16 @@ def sequence_path(
         views: opens all images and all tissue masks, one after the other.
         lens: its focal length may be an assumption: `refine_focal`.
         size: (width, height), px.
+        given: what the poses of a file belong to, if that is not the frames themselves.
     Raises:
         InputError: the file of poses cannot be used, or COLMAP is asked for and not there.
     """
     if how == "still":
         return None, []
     if how not in METHODS:
-        poses = read_poses(Path(how), count)
-        return _from_file(poses, frame, lens, progress) if has_depth else _unscaled(poses), []
+        poses = read_poses(Path(how), count, given)
+        path = _from_file(poses, frame, lens, progress) if has_depth else _unscaled(poses)
+        return path, [given.note] if given is not None and given.note else []
     motion = camera_motion(*views())
     if how in ONLY_IF_MOVING and not motion.moving:
         return None, [f"the camera is static: {motion.reason}"]
