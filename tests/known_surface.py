@@ -34,7 +34,7 @@ def seen(matrix: np.ndarray, camera_to_world: np.ndarray, size: tuple[int, int],
     """
     columns, rows = np.meshgrid(np.arange(size[0]) + center, np.arange(size[1]) + center)
     rays = np.stack([columns, rows, np.ones_like(columns)], -1) @ np.linalg.inv(matrix).T
-    return _of_rays(rays, camera_to_world)
+    return of_rays(rays, camera_to_world)
 
 
 def seen_through_lens(matrix: np.ndarray, distortion: np.ndarray, camera_to_world: np.ndarray, size: tuple[int, int]):
@@ -43,7 +43,7 @@ def seen_through_lens(matrix: np.ndarray, distortion: np.ndarray, camera_to_worl
     at = np.stack([columns, rows], -1).reshape(-1, 1, 2)
     flat = cv2.undistortPoints(at, matrix, distortion, criteria=(3, 100, 1e-12))
     rays = np.concatenate([flat.reshape(-1, 2), np.ones((flat.shape[0], 1))], 1).reshape(size[1], size[0], 3)
-    return _of_rays(rays, camera_to_world, fine=30)
+    return of_rays(rays, camera_to_world, fine=30)
 
 
 def off_the_plane(sequence: FrameSequence, index: int) -> float:
@@ -70,7 +70,8 @@ def color_change(sequence: FrameSequence, first: int, second: int) -> float:
     return float(np.quantile(np.abs(found - colors[inside])[tissue].max(1), 0.95))
 
 
-def _of_rays(rays: np.ndarray, camera_to_world: np.ndarray, fine: float = 0):
+def of_rays(rays: np.ndarray, camera_to_world: np.ndarray, fine: float = 0):
+    """Color and depth of the plane on rays (H, W, 3) of a camera, z = 1. Args: fine: levels of a fine pattern."""
     turn, start = camera_to_world[:3, :3], camera_to_world[:3, 3]
     directions = rays @ turn.T
     depth = (OFFSET - NORMAL @ start) / (directions @ NORMAL)

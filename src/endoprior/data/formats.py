@@ -23,6 +23,8 @@ FORMATS = (
     "stir",
     "stereomis",  # before EndoNeRF, whose layout it extends
     "hamlyn",  # likewise
+    "nerfstudio",
+    "colmap",
     "endonerf",
     "plain",  # last: it recognizes every folder with images
 )

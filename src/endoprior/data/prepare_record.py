@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
 
 from ..core.checks import InputError, input_error
 from ..core.config_io import from_dict
@@ -78,6 +77,8 @@ class PrepareRecord:
         Returns:
             (P, 2) x, y as shares of the frame's width and height; NaN for points that the frame does not show.
         """
+        from scipy.interpolate import RectBivariateSpline  # slow to import, and every reader imports this module
+
         grid = np.array(self.source_px)
         rows, columns = (np.linspace(0, 1, count) for count in grid.shape[:2])
         order = {"kx": min(3, len(rows) - 1), "ky": min(3, len(columns) - 1)}
@@ -95,6 +96,8 @@ class PrepareRecord:
 
     def _source(self, x: NDArray, y: NDArray) -> NDArray[np.float64]:
         """(K, 2) x, y in the source, px, of K points given as shares of the frame."""
+        from scipy.interpolate import RegularGridInterpolator
+
         grid = np.array(self.source_px)
         axes = [np.linspace(0, 1, count) for count in grid.shape[:2]]
         return RegularGridInterpolator(axes, grid)(np.stack([y, x], 1))
