@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 
 import cv2
@@ -13,7 +14,8 @@ from reader_checks import assert_rejected, edit_json, remark_with
 from scipy.spatial.transform import Rotation
 from sequence_edits import write
 
-from endoprior.cli import main
+from endoprior.check.facts import measure
+from endoprior.check.findings import find
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 
@@ -229,9 +231,14 @@ def test_a_prepared_folder_stays_what_it_is(tiny_sequence):
     assert load_sequence(tiny_sequence).camera(0).fx == 50
 
 
-def test_check_reports_what_the_file_does_not_tell(nerfstudio, capsys):
-    main(["check", str(nerfstudio), "--out", str(nerfstudio.parent / "check.png")])
-    assert "the scale of its poses is unknown" in capsys.readouterr().out
+def test_check_reports_what_the_file_does_not_tell(nerfstudio):
+    shutil.rmtree(nerfstudio / "depth")
+    sequence = load_sequence(nerfstudio)
+    found = {finding.code: finding for finding in find(measure(sequence))}
+    words = f"--calibration {nerfstudio / 'transforms.json'}`"
+    assert found["no-depth-frames"].fix.startswith(f"`endoprior prepare {nerfstudio / 'images'} {nerfstudio}_2 ")
+    assert found["no-depth-frames"].fix.endswith(words)
+    assert any("the scale of its poses is unknown" in remark for remark in sequence.remarks)
 
 
 def first(**changes):

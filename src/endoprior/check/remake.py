@@ -22,6 +22,8 @@ from ..data.prepare_record import SURROGATES, PrepareRecord, read_record
 
 FROM_FRAMES = ("endonerf", "plain")
 """Layouts whose files `prepare` reads with their meaning unchanged."""
+NERFSTUDIO, TRANSFORMS = "nerfstudio", "transforms.json"
+"""The layout from whose images and lens `prepare` makes depth, and a camera path of its own."""
 MOST_FRAMES = 10_000
 """Number of frames that `prepare` accepts without `--max-frames`."""
 VIEWS = (10.0, 170.0)
@@ -53,7 +55,8 @@ class Remakes:
     from_video: Remake | None
     """Repeats that `prepare`; None if the video is not known or not there any more, or its path is no text."""
     from_frames: Remake | None
-    """Keeps frames, depth, masks and poses as they are; None for layouts that `prepare` would misread."""
+    """Keeps frames, depth, masks and poses as they are, as far as the layout has them in our units; None for layouts
+    that `prepare` would misread."""
 
     @property
     def best(self) -> Remake | None:
@@ -89,8 +92,15 @@ def find_remakes(sequence: FrameSequence, described: Mapping[str, Any], cfg: Dat
     from_video = from_frames = None
     if record and SURROGATES not in record.categories and Path(record.video).exists():
         from_video = Remake(Path(record.video), out, record.options)
-    if find_format(path, cfg) in FROM_FRAMES:
+    layout = find_format(path, cfg)
+    if layout in FROM_FRAMES:
         options = _options_of_frames(path, sequence, described, cfg)
+        from_frames = Remake(path / "images", out, options)
+    elif layout == NERFSTUDIO and (path / "images").is_dir():
+        options = {"--border": ("keep",), "--max-width": ("0",), "--layout": ("mono",)}
+        options["--calibration"] = (str(path / TRANSFORMS),)
+        if (path / "masks").is_dir():
+            options["--masks"] = (str(path / "masks"),)
         from_frames = Remake(path / "images", out, options)
     return Remakes(record, from_video, from_frames)
 

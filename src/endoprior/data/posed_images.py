@@ -101,6 +101,7 @@ def load_posed(
         images=images,
         files=[*(file for file in others if file is not None), *files],
         remarks=remarks,
+        mask_folder="masks" if tool_value == 255 else ".",
         depth_is_relative=mm_per_unit is None,
         sources={"poses": f"given, {source.name}"},
     )
