@@ -7,9 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from known_surface import color_change, of_rays, off_the_plane, turned
+from known_surface import pose as plane_pose
 from reader_checks import assert_rejected, remark_with
 from sequence_edits import write
 
+from endoprior.check.facts import measure
+from endoprior.check.findings import find
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.c3vd import CF_HQ190L, camera_to_world, read_lens
@@ -70,6 +74,30 @@ def write_lens(folder, lens, **changes):
 @pytest.fixture
 def video(tmp_path):
     return write_video(tmp_path / "cecum_t1_a")
+
+
+def test_the_plane_lands_on_itself(tmp_path):
+    """A tilted, painted plane through the lens from moving poses; depth is z, 16 bit up to 100 mm."""
+    folder = write_video(tmp_path / "trans_t1_a")
+    direction = rays(LENS)
+    poses = [plane_pose(turned(0.5 * i, -0.8 * i, 2 * i), (1.2 * i, -i, 0.9 * i)) for i in range(FRAMES)]
+    for i, to_world in enumerate(poses):
+        color, depth = of_rays(direction / direction[..., 2:], to_world)
+        write(folder / f"{i}_color.png", color[..., ::-1])
+        stored = np.where((depth > 0) & (depth < 100), np.rint(depth * 655.35), 65535)
+        write(folder / f"{i:04d}_depth.tiff", stored.astype(np.uint16))
+    (folder / "pose.txt").write_text("\n".join(",".join(map(repr, p.T.ravel().tolist())) for p in poses))
+    seq = load_sequence(folder)
+    assert off_the_plane(seq, 0) < 0.5 and off_the_plane(seq, 8) < 0.5  # depth is that of the nearest pixel
+    assert color_change(seq, 0, 8) < 6 and color_change(seq, 8, 0) < 6
+
+
+def test_check_does_not_advise_masks_that_are_not_read(video):
+    for file in video.glob("*_depth.tiff"):
+        write(file, np.full((LENS.height, LENS.width), 16384, np.uint16))
+    assert not load_sequence(video).takes_masks
+    (finding,) = (each for each in find(measure(load_sequence(video))) if each.code == "tool-fraction")
+    assert finding.fix.endswith("this layout has no masks") and "paint" not in finding.fix
 
 
 def test_frames_and_depths_match_by_number(video):

@@ -38,6 +38,10 @@ LOOKS = {
     "stereomis": ("images/0.png", "masks/0.png", "depth/0.png", "poses_bounds.npy", "split.json"),
     "stereomis raw": ("P2_7.mp4", "StereoCalibration.ini", "groundtruth.txt", "masks/000001l.png"),
     "hamlyn": ("images/0.png", "gt_masks/0.png", "gt_depth/0.png", "poses_bounds.npy"),
+    "nerfstudio": ("images/0.png", "transforms.json"),
+    "colmap": ("images/0.png", "sparse/0/cameras.bin", "sparse/0/images.bin"),
+    "hamlyn of Forplane": ("images/0.png", "gt_masks/0.png", "pred_disp/0.png", "intrinsics.txt"),
+    "hamlyn for tracking": ("color/0.png", "depth/0.png", "intrinsics.txt"),
     "hamlyn rectified": ("image01/0.jpg", "depth01/0.png", "intrinsics.txt"),
     "endonerf": ("images/0.png", "masks/0.png", "depth/0.png", "poses_bounds.npy"),
     "endonerf without images": ("poses_bounds.npy",),
@@ -71,7 +75,7 @@ def test_option_wins_over_what_the_folder_looks_like(tmp_path, name):
 
 
 def test_unknown_folder_is_described(tmp_path):
-    known = "scared, c3vd, stir, stereomis, hamlyn, no_depth, endonerf, plain"
+    known = "scared, c3vd, stir, stereomis, hamlyn, no_depth, nerfstudio, colmap, endonerf, plain"
     assert_rejected(tmp_path, tmp_path.name, f"the layouts {known}, got an empty folder. Fix: See docs/datasets.md.")
     touch(tmp_path, *"abcdef", "g/x", ".hidden")
     assert_rejected(tmp_path, tmp_path.name, "got a, b, c, d, e and 2 more")

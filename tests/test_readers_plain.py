@@ -47,6 +47,18 @@ def test_images_alone(plain):
         seq.validate()
 
 
+def test_a_camera_matrix_beside_the_images_counts(plain):
+    (plain / "intrinsics.txt").write_text("31 0 14 0\n0 32 9 0\n0 0 1 0\n")
+    seq = load_sequence(plain)
+    camera, before = seq.camera(3), seq.fingerprint()
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (31, 32, 14.5, 9.5)
+    assert not any("no focal length" in remark for remark in seq.remarks)
+    (plain / "intrinsics.txt").write_text("30 0 14\n0 32 9\n0 0 1\n")
+    assert load_sequence(plain).fingerprint() != before
+    (plain / "sequence.json").write_text('{"fx": 40}')
+    assert load_sequence(plain).camera(3).fx == 40
+
+
 @pytest.mark.parametrize("suffix", [".npy", ".tiff"])
 def test_depth_of_another_kind(plain, suffix):
     add_depth(plain, suffix)

@@ -93,6 +93,8 @@ class Facts:
     """Content of `sequence.json`; empty without one."""
     sources: dict[str, str]
     """Where each part comes from, if the folder states it."""
+    takes_masks: bool
+    """Whether masks that a person paints are read; some layouts have none."""
     notes: tuple[str, ...]
     """Notes of the reader, one line each."""
     camera_path_mm: float
@@ -162,6 +164,7 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         camera=sequence.camera(0),
         described=described,
         sources=dict(sequence.sources),
+        takes_masks=sequence.takes_masks,
         notes=tuple(sequence.remarks),
         camera_path_mm=distance,
         camera_turn_deg=turn,

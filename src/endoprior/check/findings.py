@@ -27,6 +27,7 @@ from .fixes import (
     estimate_poses,
     in_stored_px,
     longest_part,
+    mark_in_masks,
     mask_tools,
     measure_depth_again,
     move_rows,
@@ -230,18 +231,19 @@ def _border(facts: Facts) -> Iterator[Finding]:
         x0, x1 = strips.left / width, 1 - strips.right / width
         y0, y1 = strips.top / height, 1 - strips.bottom / height
         command = remakes.crop(x0, y0, x1, y1, in_stored_px(facts, width, height))
-        fix = f"{command}, or mark it in the masks" if command else "mark it in the masks"
+        by_hand = mark_in_masks(facts, "it")
+        fix = f"{command}, or {by_hand}" if command else by_hand
         yield Finding("console-strip", "warning", what, fix)
     if border.circle and border.outside_as_tissue > SEEN_AS_TISSUE:
         what = f"the image is round (radius {border.circle.radius:.0f} px) and its outside counts as tissue"
         command = frames and frames.command({"--border": None})
-        yield Finding("round-border", "warning", what, command or "mark the outside in the masks")
+        yield Finding("round-border", "warning", what, command or mark_in_masks(facts, "the outside"))
     if border.overlays:
         boxes = ", ".join(f"{width}x{height} px at {x}, {y}" for x, y, width, height in border.overlays[:3])
         what = f"burned-in text counts as tissue: {boxes}{' and more' if len(border.overlays) > 3 else ''}"
         blank = tuple(",".join(map(str, in_stored_px(facts, *box))) for box in border.overlays)
         command = frames and frames.command({"--blank": blank})
-        yield Finding("burned-in-text", "warning", what, command or "mark it in the masks")
+        yield Finding("burned-in-text", "warning", what, command or mark_in_masks(facts, "it"))
 
 
 def _motion(facts: Facts) -> Iterator[Finding]:

@@ -123,11 +123,18 @@ def mask_tools(facts: Facts) -> str:
     """What adds tools to masks without any: the command that detects them, else painting, or masks of the user."""
     if command := detect_tools(facts):
         return command
+    if not facts.takes_masks:
+        return "leave out its frames with --data.skip-frames; this layout has no masks"
     painted = f"paint them white (255) in {facts.path / 'masks'}"
     if facts.remakes.best is None:
         return painted
     given = facts.remakes.best.command({"--masks": ("FOLDER",), "--mask-tool-value": None})
     return f"{painted}, or {given} with a mask for each frame in FOLDER"
+
+
+def mark_in_masks(facts: Facts, what: str) -> str:
+    """The edit that excludes a part of every frame."""
+    return f"mark {what} in the masks" if facts.takes_masks else "nothing can exclude it: this layout has no masks"
 
 
 def correct_masks(facts: Facts) -> str:

@@ -15,12 +15,15 @@ from ..core.config import DataConfig
 from ..core.options import Options, command_of
 from ..core.types import Camera
 from ..data import FrameSequence
+from ..data.camera_matrix import MATRIX_FILE
 from ..data.files import entries
 from ..data.load import find_format
 from ..data.prepare_record import SURROGATES, PrepareRecord, read_record
 
 FROM_FRAMES = ("endonerf", "no_depth", "plain")
 """Layouts whose files `prepare` reads with their meaning unchanged."""
+NERFSTUDIO, TRANSFORMS = "nerfstudio", "transforms.json"
+"""The layout from whose images and lens `prepare` makes depth, and a camera path of its own."""
 MOST_FRAMES = 10_000
 """Number of frames that `prepare` accepts without `--max-frames`."""
 VIEWS = (10.0, 170.0)
@@ -52,7 +55,8 @@ class Remakes:
     from_video: Remake | None
     """Repeats that `prepare`; None if the video is not known or not there any more, or its path is no text."""
     from_frames: Remake | None
-    """Keeps frames, depth, masks and poses as they are; None for layouts that `prepare` would misread."""
+    """Keeps frames, depth, masks and poses as they are, as far as the layout has them in our units; None for layouts
+    that `prepare` would misread."""
 
     @property
     def best(self) -> Remake | None:
@@ -88,8 +92,15 @@ def find_remakes(sequence: FrameSequence, described: Mapping[str, Any], cfg: Dat
     from_video = from_frames = None
     if record and SURROGATES not in record.categories and Path(record.video).exists():
         from_video = Remake(Path(record.video), out, record.options)
-    if find_format(path, cfg) in FROM_FRAMES:
+    layout = find_format(path, cfg)
+    if layout in FROM_FRAMES:
         options = _options_of_frames(path, sequence, described, cfg)
+        from_frames = Remake(path / "images", out, options)
+    elif layout == NERFSTUDIO and (path / "images").is_dir():
+        options = {"--border": ("keep",), "--max-width": ("0",), "--layout": ("mono",)}
+        options["--calibration"] = (str(path / TRANSFORMS),)
+        if (path / "masks").is_dir():
+            options["--masks"] = (str(path / "masks"),)
         from_frames = Remake(path / "images", out, options)
     return Remakes(record, from_video, from_frames)
 
@@ -103,6 +114,8 @@ def _options_of_frames(path: Path, sequence: FrameSequence, described: Mapping[s
         options["--folder-rate"] = (f"{sequence.frames_per_second * (cfg.stride or 1):g}",)
     if {"fx", "cx", "cy"} <= described.keys():
         options["--calibration"] = (str(path / "sequence.json"),)
+    elif (path / MATRIX_FILE).is_file() and "fx" not in described:
+        options["--calibration"] = (str(path / MATRIX_FILE),)
     else:
         options["--field-of-view-degrees"] = (f"{np.clip(field_of_view(sequence.camera(0)), *VIEWS):.6g}",)
     if (path / "right").is_dir() and "baseline_mm" in described and "--calibration" in options:

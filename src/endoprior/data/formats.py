@@ -24,6 +24,8 @@ FORMATS = (
     "stereomis",  # before EndoNeRF, whose layout it extends
     "hamlyn",  # likewise
     "no_depth",
+    "nerfstudio",
+    "colmap",
     "endonerf",
     "plain",  # last: it recognizes every folder with images
 )

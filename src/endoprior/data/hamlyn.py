@@ -1,37 +1,44 @@
-"""Reader of Hamlyn sequences in two layouts: Forplane's (`images/ gt_masks/ gt_depth/`) and `rectifiedNN`.
+"""Reader of Hamlyn sequences: Forplane's selection, and the rectified videos of Endo-Depth-and-Motion.
 
-Neither has camera poses: the camera is assumed to be static.
+None has camera poses: the camera is assumed to be static. Rectification leaves a black margin, which is no tissue.
 """
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core.checks import input_error
 from ..core.config import DataConfig
+from ..core.spread import spread
 from ..core.types import Camera
+from ..footage.black_margin import black_margin
 from .assemble import Pixels, assemble, kept_frames
+from .camera_matrix import MATRIX_FILE, matrix_of_images, read_camera_matrix
 from .depth_files import read_depth_file
 from .endonerf import focal_at, read_poses_bounds
-from .files import IMAGE_SUFFIXES, demand_count, list_files, read_table, unequal_names
+from .files import IMAGE_SUFFIXES, demand_count, list_files, unequal_names
 from .formats import Format
 from .images import read_color, read_tool_mask
 from .poses import identity_poses
 from .sequence import FrameSequence
 
-CROP_LEFT_PX = 40
-"""Empty columns at the left of Forplane's images; its own program crops them, too."""
+FULL_SIZE = (640, 480)
+"""(width, height) to which Forplane and EndoGaussian bring every image; that of their `intrinsics.txt`."""
+CROPPED_PX = 40
+"""Empty columns at the left of such an image; their programs crop them, too."""
+SAMPLES = 20
+"""Number of images in which a margin must be black."""
+RECTIFIED = (("image01", "depth01"), ("color", "depth"))
+"""Folders of images and depth in the rectified videos: for depth networks, and for tracking."""
 
 
 def is_hamlyn(path: Path) -> bool:
-    """Whether a folder is a Hamlyn sequence; Forplane's have `gt_depth/`, or `hamlyn` in their name."""
-    named = any("hamlyn" in name.lower() for name in (path.name, path.parent.name))
-    # A folder that this program prepared from a Hamlyn video has a sequence.json and no empty columns.
-    bare = (path / "poses_bounds.npy").exists() and not (path / "sequence.json").exists()
-    forplane = (path / "images").is_dir() and ((path / "gt_depth").is_dir() or (named and bare))
-    return forplane or _is_rectified(path)
+    """Whether a folder is a Hamlyn sequence; Forplane's have `gt_depth/`, `pred_disp/`, or `hamlyn` in their name."""
+    return _is_forplane(path) or _rectified_folders(path) is not None
 
 
 def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
@@ -40,83 +47,143 @@ def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
     Raises:
         InputError: files are missing, their numbers differ, or they cannot be used.
     """
-    return _load_rectified(path, cfg) if _is_rectified(path) else _load_forplane(path, cfg)
+    folders = _rectified_folders(path)
+    return _load_forplane(path, cfg) if folders is None else _load_rectified(path, cfg, *folders)
 
 
-def _is_rectified(path: Path) -> bool:
-    return (path / "image01").is_dir() and (path / "depth01").is_dir()
+def _is_named(path: Path) -> bool:
+    return any("hamlyn" in name.lower() for name in (path.name, path.parent.name))
+
+
+def _is_forplane(path: Path) -> bool:
+    if not (path / "images").is_dir():
+        return False
+    own_depth = any((path / name).is_dir() for name in ("gt_depth", "pred_disp"))
+    own_camera = (path / MATRIX_FILE).exists() and ((path / "gt_masks").is_dir() or _is_named(path))
+    # A folder that this program prepared from a Hamlyn video has a sequence.json and no empty columns.
+    bare = (path / "poses_bounds.npy").exists() and not (path / "sequence.json").exists()
+    return own_depth or own_camera or (bare and _is_named(path))
+
+
+def _rectified_folders(path: Path) -> tuple[str, str] | None:
+    """Names of the folders of images and depth of a rectified video; None if it is none."""
+    for images, depths in RECTIFIED:
+        if not ((path / images).is_dir() and (path / depths).is_dir()):
+            continue
+        # Other RGB-D datasets have such folders, with a pose for each frame.
+        if images == "image01" or (_matrix_file(path).exists() and not any(path.glob("pose*"))):
+            return images, depths
+    return None
 
 
 def _load_forplane(path: Path, cfg: DataConfig) -> FrameSequence:
-    """`images/`, `gt_masks/` or `masks/`, `gt_depth/` or `depth/`; size and focal length from `poses_bounds.npy`."""
+    """`images/`, `gt_masks/` or `masks/`, depth, and a camera: `intrinsics.txt`, else `poses_bounds.npy`."""
     mask_folder = "gt_masks" if (path / "gt_masks").is_dir() else "masks"
-    depth_folder = "gt_depth" if (path / "gt_depth").is_dir() else "depth"
+    depth_folder = next((name for name in ("gt_depth", "pred_disp") if (path / name).is_dir()), "depth")
     folders = ("images", mask_folder, depth_folder)
     images, masks, depths = (list_files(path / name, (".png",), "Forplane") for name in folders)
     demand_count(masks, path / mask_folder, len(images))
     demand_count(depths, path / depth_folder, len(images))
     height, width = read_color(images[0]).shape[:2]
-    if width <= CROP_LEFT_PX:
-        raise input_error(images[0], f"more than {CROP_LEFT_PX} columns", f"{width}", "pass images of full size.")
-    # All rows must be finite, but only size and focal length are used: Forplane's camera is static.
-    stored = read_poses_bounds(path / "poses_bounds.npy", len(images))[0, :, 4]
-    remarks: list[str] = []
-    # Some files hold the size after the crop, which leaves the focal length as it is.
-    across = width - CROP_LEFT_PX if stored[1] == width - CROP_LEFT_PX else width
-    focal = focal_at(path / "poses_bounds.npy", stored, across, height, remarks)
-    remarks += unequal_names(images, masks) + unequal_names(images, depths)
-    remarks.append(f"{path}: {CROP_LEFT_PX} empty columns at the left are cropped, as in Forplane")
+    remarks = unequal_names(images, masks) + unequal_names(images, depths)
+    is_hamlyn_video = _is_named(path) or (path / MATRIX_FILE).exists() or width * 3 == height * 4
+    crop = round(CROPPED_PX * width / FULL_SIZE[0]) if is_hamlyn_video else 0
+    matrix, camera_file = _forplane_matrix(path, (width, height), crop, len(images), remarks)
+    if crop:
+        remarks.append(f"{path}: {crop} empty columns at the left are cropped, as in Forplane")
+    else:
+        remarks.append(f"{path}: {width}x{height} px is no Hamlyn video; read as EndoNeRF's, without Forplane's crop")
+    if depth_folder == "pred_disp":
+        remarks.append(f"{path / depth_folder}: read as depth, as Forplane does, though its name says disparity")
     if not cfg.depth_unit_mm:
         remarks.append(f"{path / depth_folder}: its unit is not documented, mm assumed; set data.depth_unit_mm")
-    kept = kept_frames(len(images), cfg)
-    images, masks, depths = ([files[i] for i in kept] for files in (images, masks, depths))
-    size = (width, height)
+    source, relative = "stereo matching, by Forplane", not cfg.depth_unit_mm
+    files = _Files(path, images, masks, depths, crop, camera_file, mask_folder, source, relative)
+    return _assembled(files, cfg, (width, height), matrix, remarks)
+
+
+def _forplane_matrix(
+    path: Path, size: tuple[int, int], crop: int, count: int, remarks: list[str]
+) -> tuple[NDArray[np.float64], Path]:
+    """(3, 3) K, px with centers at halves, of the images before the crop, and the file that it comes from."""
+    width, height = size
+    stored, poses = path / MATRIX_FILE, path / "poses_bounds.npy"
+    if stored.exists():
+        if poses.exists():
+            remarks.append(f"{poses}: not used; {MATRIX_FILE} is the calibration")
+        return matrix_of_images(stored, read_camera_matrix(stored), size, FULL_SIZE, remarks), stored
+    # All rows must be finite, but only size and focal length are used: Forplane's camera is static.
+    known = read_poses_bounds(poses, count)[0, :, 4]
+    # Some files hold the size after the crop, which leaves the focal length as it is.
+    across = width - crop if known[1] == width - crop else width
+    focal = focal_at(poses, known, across, height, remarks)
+    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), poses
+
+
+def _load_rectified(path: Path, cfg: DataConfig, image_folder: str, depth_folder: str) -> FrameSequence:
+    """Images, depth in mm and a camera matrix; no masks."""
+    images = list_files(path / image_folder, IMAGE_SUFFIXES, "Hamlyn")
+    depths = list_files(path / depth_folder, (".png",), "Hamlyn")
+    demand_count(depths, path / depth_folder, len(images))
+    calibration = _matrix_file(path)
+    matrix = read_camera_matrix(calibration)
+    height, width = read_color(images[0]).shape[:2]
+    remarks = [*unequal_names(images, depths), f"{path}: no tool masks, tools count as tissue"]
+    files = _Files(path, images, [], depths, 0, calibration, image_folder, "stereo matching", relative=False)
+    return _assembled(files, cfg, (width, height), matrix, remarks)
+
+
+def _matrix_file(path: Path) -> Path:
+    """The camera matrix of a rectified video: beside its frames, or with those of the other videos."""
+    number = (re.findall(r"[0-9]+", path.name) or [""])[-1]
+    own = f"intrinsics_rectified{number}.txt"
+    calibration = path.parent / "calibration"
+    places = [path / MATRIX_FILE, path / own, path / "intrinsic" / "intrinsic_color.txt", path.parent / own]
+    places += [calibration / number / MATRIX_FILE, calibration / own]
+    return next((place for place in places if place.is_file()), places[0])
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Files of a folder, one of each kind per frame; no masks at all where a video has none."""
+
+    path: Path
+    images: list[Path]
+    masks: list[Path]
+    depths: list[Path]
+    crop: int
+    """Columns to leave out at the left, px."""
+    camera: Path
+    mask_folder: str
+    """Its name, for messages."""
+    depth_source: str
+    relative: bool
+    """Whether the unit of depth is unknown."""
+
+
+def _assembled(
+    files: _Files, cfg: DataConfig, size: tuple[int, int], matrix: NDArray[np.float64], remarks: list[str]
+) -> FrameSequence:
+    """The sequence of a static camera; `matrix` is in px of the whole image, with centers at halves."""
+    path, crop, (width, height) = files.path, files.crop, size
+    remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
+    kept = kept_frames(len(files.images), cfg)
+    images, depths = [files.images[i] for i in kept], [files.depths[i] for i in kept]
+    masks = [files.masks[i] for i in kept] if files.masks else []
+    margin = black_margin([read_color(images[i], size)[:, crop:] for i in spread(len(images), SAMPLES)])
+    if margin.any():
+        remarks.append(f"{path}: a black margin, {margin.mean():.0%} of a frame, is no tissue")
 
     def decode(index: int) -> Pixels:
-        depth = read_depth_file(depths[index], cfg.depth_unit_mm or 1.0, size)
-        pixels = read_color(images[index], size), ~read_tool_mask(masks[index], 255, size), depth
-        return tuple(np.ascontiguousarray(image[:, CROP_LEFT_PX:]) for image in pixels)
+        depth = read_depth_file(depths[index], cfg.depth_unit_mm or 1.0, size)[:, crop:]
+        tissue = ~margin
+        if masks:
+            tissue = tissue & ~read_tool_mask(masks[index], 255, size)[:, crop:]
+        color = read_color(images[index], size)[:, crop:]
+        return np.ascontiguousarray(color), tissue, np.ascontiguousarray(depth)
 
     # The principal point moves by the whole crop; Forplane moves it by half of that, which is a different camera.
-    shape = (width - CROP_LEFT_PX, height, focal, focal, width / 2 - CROP_LEFT_PX, height / 2)
-    return assemble(
-        path,
-        cfg,
-        [Camera(*shape, pose) for pose in identity_poses(len(kept))],
-        decode,
-        images=images,
-        files=[*masks, *depths, path / "poses_bounds.npy"],
-        remarks=remarks,
-        mask_folder=mask_folder,
-        depth_is_relative=not cfg.depth_unit_mm,
-        sources={"depth": "stereo matching, by Forplane"},
-    )
-
-
-def _load_rectified(path: Path, cfg: DataConfig) -> FrameSequence:
-    """`image01/`, `depth01/` in mm, `intrinsics.txt`; no masks."""
-    images = list_files(path / "image01", IMAGE_SUFFIXES, "Hamlyn")
-    depths = list_files(path / "depth01", (".png",), "Hamlyn")
-    demand_count(depths, path / "depth01", len(images))
-    number = path.name[-2:]
-    places = [path / "intrinsics.txt", path.parent / "calibration" / number / "intrinsics.txt"]
-    calibration = next((place for place in places if place.exists()), places[0])
-    hint = "put the dataset's intrinsics.txt, a 3x3 camera matrix, beside image01/."
-    matrix = read_table(calibration, hint)
-    if matrix.shape not in ((3, 3), (3, 4)) or min(matrix[0, 0], matrix[1, 1]) <= 0 or not np.isfinite(matrix).all():
-        raise input_error(calibration, "a 3x3 camera matrix", f"shape {matrix.shape} or other numbers", hint)
-    height, width = read_color(images[0]).shape[:2]
-    remarks = [*unequal_names(images, depths), f"{path}: no tool masks, every pixel counts as tissue"]
-    remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
-    kept = kept_frames(len(images), cfg)
-    images, depths = ([files[i] for i in kept] for files in (images, depths))
-    size = (width, height)
-
-    def decode(index: int) -> Pixels:
-        depth = read_depth_file(depths[index], cfg.depth_unit_mm or 1.0, size)
-        return read_color(images[index], size), np.ones((height, width), bool), depth
-
-    shape = (width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)
+    shape = (width - crop, height, matrix[0, 0], matrix[1, 1], matrix[0, 2] - crop, matrix[1, 2])
     return assemble(
         path,
         cfg,
@@ -124,10 +191,11 @@ def _load_rectified(path: Path, cfg: DataConfig) -> FrameSequence:
         decode,
         images=images,
         # A calibration outside the folder has no name below it, which the fingerprint needs.
-        files=[*depths, *([calibration] if calibration.parent == path else [])],
+        files=[*masks, *depths, *([files.camera] if files.camera.is_relative_to(path) else [])],
         remarks=remarks,
-        mask_folder="image01",
-        sources={"depth": "stereo matching"},
+        mask_folder=files.mask_folder,
+        depth_is_relative=files.relative,
+        sources={"depth": files.depth_source},
     )
 
 

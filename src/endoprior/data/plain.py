@@ -9,9 +9,10 @@ import numpy as np
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
+from .camera_matrix import MATRIX_FILE, read_camera_matrix
 from .depth_files import DEPTH_SUFFIXES, read_depth_file
 from .description import check_frames, intrinsics_of, read_description
-from .endonerf import read_poses_bounds
+from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, list_files
 from .formats import Format
 from .frame_files import match_names
@@ -21,7 +22,7 @@ from .right_eye import open_right_eye
 from .sequence import FrameSequence
 from .series import Kind, one_per_frame
 
-FACTS = ("sequence.json", "poses_bounds.npy")
+FACTS = ("sequence.json", "poses_bounds.npy", MATRIX_FILE)
 """Files beside those of the frames."""
 ASSUMED_FOCAL = 0.9
 """Focal length in image widths if none is given: a field of view of 58 degrees, typical of endoscopes."""
@@ -59,11 +60,17 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
     if depths and not unit:
         remarks.append(f"{path / 'depth'}: no unit given, mm assumed; set data.depth_unit_mm")
     height, width = read_color(images[0]).shape[:2]
+    calibration = path / MATRIX_FILE
+    if "fx" not in described and calibration.is_file():
+        matrix = read_camera_matrix(calibration)
+        described |= {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
     kept = kept_frames(len(images), cfg)
     focal, poses = ASSUMED_FOCAL * width, identity_poses(len(images))
     if (path / "poses_bounds.npy").exists():
         stored = read_poses_bounds(path / "poses_bounds.npy", len(images))
-        focal, poses = float(stored[0, 2, 4]), [world_to_camera(pose[:, :3], pose[:, 3]) for pose in stored]
+        poses = [world_to_camera(pose[:, :3], pose[:, 3]) for pose in stored]
+        if "fx" not in described:
+            focal = focal_at(path / "poses_bounds.npy", stored[0, :, 4], width, height, remarks)
     else:
         remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
         if "fx" not in described:

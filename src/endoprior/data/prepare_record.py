@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 
 from ..core.checks import InputError, input_error
 from ..core.config_io import from_dict
@@ -26,6 +25,8 @@ CONTROLS = {"Cc", "Zl", "Zp"}
 """Unicode categories of characters that no path or option has: control characters and line separators."""
 SURROGATES = "Cs"
 """That of bytes in a path that are no text: it can be opened, but not printed."""
+STEPS, NEAR_PX = 40, 0.5
+"""Steps to find a source point in the frame, and how near it they end, px, unless it lies outside of the frame."""
 EDGE_POINTS = 65
 """Points along each edge of a rectangle that are taken to the source."""
 
@@ -66,12 +67,39 @@ class PrepareRecord:
         x1 = min(self._source(np.full_like(down, right), down)[:, 0].min(), self.source_size[0])
         y0 = max(self._source(across, np.full_like(across, top))[:, 1].max(), 0)
         y1 = min(self._source(across, np.full_like(across, bottom))[:, 1].min(), self.source_size[1])
-        # The grid is rounded to 0.1 px: so much of a neighbor is not seen.
+        # The grid is exact to 0.1 px: so much of a neighbor is not seen.
         x, y = int(np.ceil(x0 - 0.1)), int(np.ceil(y0 - 0.1))
         return x, y, max(int(x1 + 0.1) - x, 1), max(int(y1 + 0.1) - y, 1)
 
+    def in_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where points of the source lie in the frame: through the rectification, or undistortion, and the crop.
+
+        Args:
+            points: (P, 2) x, y in the source, px.
+        Returns:
+            (P, 2) x, y as shares of the frame's width and height; NaN for points that the frame does not show.
+        """
+        from scipy.interpolate import RectBivariateSpline  # slow to import, and every reader imports this module
+
+        grid = np.array(self.source_px)
+        rows, columns = (np.linspace(0, 1, count) for count in grid.shape[:2])
+        order = {"kx": min(3, len(rows) - 1), "ky": min(3, len(columns) - 1)}
+        splines = [RectBivariateSpline(rows, columns, grid[..., axis], **order) for axis in (0, 1)]
+
+        def missed(at: NDArray[np.float64]) -> NDArray[np.float64]:
+            """(P, 2) from where shares of the frame lie in the source to the points, px."""
+            return points - np.stack([spline.ev(at[:, 1], at[:, 0]) for spline in splines], 1)
+
+        at, extent = np.full(points.shape, 0.5), grid[-1, -1] - grid[0, 0]
+        for _ in range(STEPS):  # the map is nearly a scaling and a shift
+            at = np.clip(at + missed(at) / extent, 0, 1)
+        off = np.linalg.norm(missed(at), axis=1)
+        return np.where(off[:, None] < NEAR_PX, at, np.nan)
+
     def _source(self, x: NDArray, y: NDArray) -> NDArray[np.float64]:
         """(K, 2) x, y in the source, px, of K points given as shares of the frame."""
+        from scipy.interpolate import RegularGridInterpolator
+
         grid = np.array(self.source_px)
         axes = [np.linspace(0, 1, count) for count in grid.shape[:2]]
         return RegularGridInterpolator(axes, grid)(np.stack([y, x], 1))

@@ -124,6 +124,11 @@ class FrameSequence:
         """Name of the folder of the masks that are read; empty where the layout has none, or it is missing."""
         return self._masks.name if self._masks.name in ("masks", "gt_masks") and self._masks.is_dir() else ""
 
+    @property
+    def takes_masks(self) -> bool:
+        """Whether the layout has a folder of masks, so that masks that are painted there are read."""
+        return self._masks.name in ("masks", "gt_masks")
+
     def __len__(self) -> int:
         return len(self._cameras)
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
+from ..core.shell import command
 from .depth_files import read_values
 from .endonerf import load_endonerf
 from .files import list_files, read_json
@@ -19,7 +20,7 @@ from .formats import Format
 from .images import decode_image
 from .sequence import FrameSequence, is_test_frame
 
-RAW_FILE = "StereoCalibration.ini"
+RAW_FILE, POSES_FILE = "StereoCalibration.ini", "groundtruth.txt"
 
 
 def is_stereomis(path: Path) -> bool:
@@ -36,8 +37,7 @@ def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
         InputError: a raw sequence, another split than every 8th frame, or files that cannot be used.
     """
     if not (path / "images").is_dir():
-        hint = "run endoprior prepare on its video with this calibration and masks/."
-        raise input_error(path / RAW_FILE, "a prepared sequence", "a raw one", hint)
+        raise input_error(path / RAW_FILE, "a prepared sequence", "a raw one", f"`{_preparing(path)}`.")
     count = len(list_files(path / "images", (".png",), "StereoMIS"))
     _check_split(path / "split.json", count)
     depth = decode_image(list_files(path / "depth", (".png",), "StereoMIS")[0], None)
@@ -49,6 +49,17 @@ def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
         facts |= _read_intrinsics(path / "intrinsics.npy")
         fact_files.append(path / "intrinsics.npy")
     return load_endonerf(path, cfg, facts=facts, fact_files=fact_files)
+
+
+def _preparing(path: Path) -> str:
+    """The command that prepares a raw sequence with the parts that are there."""
+    videos = sorted(path.glob("*.mp4"))
+    options: list[str | Path] = ["--calibration", path / RAW_FILE, "--layout", "top-bottom"]
+    if (path / "masks").is_dir():
+        options += ["--masks", path / "masks", "--mask-tool-value", "low"]
+    if (path / POSES_FILE).is_file():
+        options += ["--poses", path / POSES_FILE]
+    return command("prepare", videos[0] if videos else path / "VIDEO.mp4", "OUT", *options)
 
 
 def _read_intrinsics(path: Path) -> dict[str, float]:

@@ -7,6 +7,7 @@ true one. We do not pair them by distance either, because that would favor stati
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,7 @@ from ..system.atomic import whole_file
 from .endonerf import load_endonerf
 from .formats import Format
 from .images import decode_image, single_channel
+from .prepare_record import RECORD, read_record
 from .reading import kind_of
 from .sequence import FrameSequence
 from .truth import Tracks
@@ -28,6 +30,7 @@ from .truth import Tracks
 DEPTH_WINDOW_PX = 2
 """Depth of a point is the median of the measured depth up to so many pixels to each side."""
 SEGMENTATIONS = ("segmentation/icgstartseg.png", "segmentation/icgendseg.png")
+CALIBRATION = "calib.json"
 ASPECT_TOLERANCE = 0.01
 """Largest relative difference between the scales of width and height that rounding explains; a crop exceeds it."""
 
@@ -38,17 +41,30 @@ def is_stir(path: Path) -> bool:
 
 
 def load_stir(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Explain how to prepare a clip.
+    """Explain how to prepare a clip, by stereo if the right camera and the calibration are there.
 
     Raises:
         InputError: always.
     """
     clips = [path] if (path / SEGMENTATIONS[0]).exists() else sorted(path.glob("left*/seq*"))
-    videos = sorted((clips[0] / "frames").glob("*.mp4")) if clips else []
-    video = videos[0] if videos else clips[0] / "frames" / "VIDEO.mp4" if clips else path
     clip = clips[0] if clips else path
-    hint = f"`{command('prepare', video, 'OUT', '--border', 'keep', '--stir', clip)}` (docs/datasets.md)."
+    recording = Path(os.path.abspath(clip)).parents[1]
+    right = recording / clip.parent.name.replace("left", "right", 1) / clip.name
+    calibration = recording / CALIBRATION
+    options: list[str | Path] = ["--border", "keep", "--stir", clip]
+    note = ""
+    if right.is_dir() and calibration.is_file():
+        options = ["--right", _video(right), "--calibration", calibration, *options]
+    else:
+        note = f"; without {calibration if right.is_dir() else right} its depth has no unit"
+    hint = f"`{command('prepare', _video(clip), 'OUT', *options)}`{note} (docs/datasets.md)."
     raise input_error(path, "a prepared sequence", "a STIR clip, which has no depth", hint)
+
+
+def _video(clip: Path) -> Path:
+    """The video of one camera of a clip."""
+    videos = sorted((clip / "frames").glob("*.mp4"))
+    return videos[0] if videos else clip / "frames" / "VIDEO.mp4"
 
 
 def tattoo_centers(path: Path) -> NDArray[np.float64]:
@@ -111,23 +127,34 @@ def write_stir_tracks(clip: Path, prepared: Path) -> Path:
 
     The file also has `paired`, False: STIR does not pair starts with ends.
 
+    Spots are those of the raw image. They go to the frame as its pixels did: through the rectification and the crop
+    that `prepare.json` records.
+
     Args:
         clip: STIR's `left/seqNN` folder.
-        prepared: the folder that `endoprior prepare` wrote for its video, all frames, not cropped.
+        prepared: the folder that `endoprior prepare` wrote for its video, all frames.
     Raises:
-        InputError: no segmentations, no spot with depth, or cropped images.
+        InputError: no record, no segmentations, those of other images, or no spot with depth.
     """
     sequence = load_endonerf(Path(prepared), DataConfig(lift_missing_depth=False))
+    record = read_record(Path(prepared))
+    if record is None:
+        fix = "prepare the clip again, with --stir."
+        raise input_error(Path(prepared) / RECORD, "the record of `prepare`, to rectify spots", "no such file", fix)
     frames = sequence.frame(0), sequence.frame(len(sequence) - 1)
     spots = []
     for name, frame in zip(SEGMENTATIONS, frames, strict=True):
         path = Path(clip) / name
         height, width = decode_image(path, None).shape[:2]
-        scale = np.array([frame.camera.width / width, frame.camera.height / height])
+        scale = np.array(record.source_size) / (width, height)
         if abs(scale[0] / scale[1] - 1) > ASPECT_TOLERANCE:
-            got = f"{frame.camera.width}x{frame.camera.height} px for {width}x{height}"
-            raise input_error(prepared, f"the whole image of {path}", got, "prepare the clip with --border keep.")
-        spots.append(tattoo_centers(path) * scale)
+            want, got = (
+                f"the shape of the video, {record.source_size[0]}x{record.source_size[1]} px",
+                f"{width}x{height}",
+            )
+            raise input_error(path, want, got, "pass the clip whose video was prepared.")
+        shares = record.in_frame(tattoo_centers(path) * scale)
+        spots.append(shares[np.isfinite(shares).all(1)] * (frame.camera.width, frame.camera.height))
     tracks = stir_tracks(*spots, *frames, len(sequence))
     for time, name in ((0, SEGMENTATIONS[0]), (-1, SEGMENTATIONS[1])):
         if not tracks.visible[time].any():

@@ -17,7 +17,12 @@ EVEN = 0.25
 
 
 class Timed(Protocol):
-    """An image of a source, or only its time."""
+    """An image of a source, or only its place there and its time."""
+
+    @property
+    def index(self) -> int:
+        """Position in the source, from 0."""
+        ...
 
     @property
     def seconds(self) -> float:
@@ -40,6 +45,8 @@ class FrameSelection:
     """Seconds; images at or after it are not used."""
     source_rate: float = 0.0
     """Nominal rate of the source, 1/s; half of its time step is the tolerance. 0 if unknown."""
+    only: frozenset[int] | None = None
+    """Positions in the source of the images to use, of those on the grid; None for all."""
     taken: int = field(default=0, init=False)
     gaps: int = field(default=0, init=False)
     """Grid steps without an image."""
@@ -68,4 +75,5 @@ class FrameSelection:
             self.gaps += reached - slot if self.taken else 0
             slot = reached + 1
             self.taken += 1
-            yield image
+            if self.only is None or image.index in self.only:
+                yield image

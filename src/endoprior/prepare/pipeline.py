@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -37,6 +38,7 @@ from .depth_and_masks import ChosenMethods, choose_methods
 from .first_pass import input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry
 from .frames import write_frames
+from .masked_frames import masked_frames
 from .record import record_of
 from .row_offset import with_equal_rows
 from .sam2 import is_sam2, open_sam2
@@ -76,6 +78,7 @@ def prepare(
     cfg = cfg or PrepareConfig()
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
+        _demand_all_frames(cfg)
     segmenter = open_sam2(cfg.masks, "--masks") if is_sam2(cfg.masks) else None
     plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
@@ -86,12 +89,19 @@ def prepare(
         calibration = clip.calibration
         progress("looking through", 0, clip.source.num_frames)
         first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
+        masked = masked_frames(cfg, first_pass.indices, first_pass.image_names)
+        if masked is not None:
+            clip.only = masked.indices
+            first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
+            first_pass.notes.append(masked.note)
         if cfg.row_offset == "auto":
             first_pass.geometry, row_note = with_equal_rows(first_pass.geometry, first_pass.samples)
             first_pass.notes.append(row_note)
         progress("looking at tools and light", 0, len(first_pass.indices))
         chosen = choose_methods(cfg, clip, first_pass)
         meta = _meta(clip, first_pass.geometry, chosen, lens=_lens_source(calibration))
+        if masked is not None:
+            meta = replace(meta, frames_per_second=meta.frames_per_second / masked.step)
         parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
         found = RowLog(folder)
         done = frames_done(folder, parts)
@@ -123,7 +133,7 @@ def prepare(
         mark_moving(folder, moving)
         progress("following the camera", 0, files.count)
         path, motion_notes = _camera_path(
-            cfg, files, first_pass.geometry, lambda done: progress("following the camera", done, files.count)
+            cfg, files, first_pass.geometry, used, lambda done: progress("following the camera", done, files.count)
         )
         damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
         unexplained = _unexplained(path, files, damaged)
@@ -192,6 +202,13 @@ def _damage_notes(damaged: list[int]) -> list[str]:
     ]
 
 
+def _demand_all_frames(cfg: PrepareConfig) -> None:
+    """Raise InputError if options leave out frames: points of STIR belong to the first and the last frame of a clip."""
+    options = {"--start": cfg.start > 0, "--end": cfg.end < math.inf, "--drop-out-of-body": cfg.drop_out_of_body}
+    if left_out := [name for name, is_set in options.items() if is_set]:
+        raise input_error("--stir", "all frames of the clip", left_out[0], f"remove {left_out[0]}.")
+
+
 def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, lens: str) -> SequenceMeta:
     return SequenceMeta(
         width=geometry.size[0],
@@ -216,7 +233,11 @@ def _lens_source(calibration: Calibration | None) -> str:
 
 
 def _camera_path(
-    cfg: PrepareConfig, files: FrameFiles, geometry: FrameGeometry, progress: Callable[[int], None]
+    cfg: PrepareConfig,
+    files: FrameFiles,
+    geometry: FrameGeometry,
+    used: Sequence[int],
+    progress: Callable[[int], None],
 ) -> tuple[CameraPath | None, list[str]]:
     """Poses of the written frames, None for a static camera; and notes for the user."""
     meta = files.meta
@@ -240,7 +261,7 @@ def _camera_path(
         (meta.width, meta.height),
         has_depth=cfg.depth != "none",
         refine_focal=cfg.calibration is None,
-        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn),
+        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn, used),
         progress=progress,
     )
 

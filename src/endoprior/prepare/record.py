@@ -62,4 +62,4 @@ def _source_px(geometry: FrameGeometry) -> tuple[tuple[tuple[float, ...], ...], 
         at = (columns - 0.5).astype(np.float32), (rows - 0.5).astype(np.float32)
         maps = [cv2.remap(of, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for of in geometry.maps[0]]
         grid = np.stack(maps, -1) + 0.5
-    return tuple(tuple(tuple(round(float(v), 1) for v in point) for point in row) for row in grid)
+    return tuple(tuple(tuple(round(float(v), 2) for v in point) for point in row) for row in grid)

@@ -71,6 +71,8 @@ class Clip:
         self.frames_per_second = cfg.frames_per_second or self._rate
         self.unpaired = 0
         """Images of the first video, in the last iteration, without one of the second video at their time."""
+        self.only: frozenset[int] | None = None
+        """Positions in the source of the frames to use, of those selected; None for all."""
         self._cfg = cfg
 
     @property
@@ -93,7 +95,7 @@ class Clip:
 
     def selection(self) -> FrameSelection:
         """The frames to use, with all counts at zero."""
-        return FrameSelection(self.frames_per_second, self._cfg.start, self._cfg.end, self._rate)
+        return FrameSelection(self.frames_per_second, self._cfg.start, self._cfg.end, self._rate, self.only)
 
     def stereo_frames(self, selection: FrameSelection) -> Iterator[StereoFrame]:
         """The selected frames, in order. Of two files, only images that both have at one time.

@@ -1,36 +1,102 @@
-"""Camera poses from a file of the user."""
+"""Camera poses from a file of the user: of each frame, or of the images of the video that the frames were made from."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...core.checks import input_error
+from ...data.files import read_table
 from ...data.numpy_files import read_numpy
 from ...data.poses import demand_rotations
 
+HINT = "Write (T, 4, 4) camera-to-world matrices in mm, OpenCV axes."
+TEXT_SUFFIXES = (".txt", ".tum", ".freiburg", ".csv")
+TEXT_HINT = "Write `frame x y z qx qy qz qw` in each row: camera to world, m."
+MM_PER_M = 1000.0
+FARTHEST_M = 2.0
+"""An endoscope does not move further; larger numbers are mm."""
+UNIT_TOLERANCE = 0.01
+"""Largest difference of a quaternion's length from 1 that rounding explains."""
 
-def read_poses(path: Path, count: int) -> NDArray[np.float64]:
-    """(T, 4, 4) camera-to-world in mm from .npy of (T, 4, 4) or (T, 3, 4), or from `poses_bounds.npy` (T, 17).
 
+def read_poses(path: Path, count: int, sources: Sequence[int] | None = None) -> NDArray[np.float64]:
+    """(T, 4, 4) poses as the file has them; those of text in mm.
+
+    Args:
+        path: .npy of (T, 4, 4) or (T, 3, 4), or `poses_bounds.npy` (T, 17), one row per frame, mm; or text with
+            `frame x y z qx qy qz qw` in each row, m, as StereoMIS and TUM have it, of the images of a video.
+        count: T.
+        sources: position in the video of each frame, from 0; None if the frames are of no video.
     Raises:
         InputError: the file is unreadable, has another shape, or holds values that are not rotations.
     """
-    hint = "Write (T, 4, 4) camera-to-world matrices in mm, OpenCV axes."
-    stored = read_numpy(path, "camera poses", hint)
+    if path.suffix.lower() in TEXT_SUFFIXES:
+        if sources is None:
+            fix = "pass it to `endoprior prepare VIDEO OUT --poses`, which knows their frames and rectifies them."
+            raise input_error(path, "poses of these frames, .npy", "poses of the images of a video", fix)
+        return _of_images(path, sources)
+    return _of_frames(path, count)
+
+
+def _of_frames(path: Path, count: int) -> NDArray[np.float64]:
+    stored = read_numpy(path, "camera poses", HINT)
     shape = getattr(stored, "shape", None)
     if shape not in ((count, 4, 4), (count, 3, 4), (count, 17)):
-        raise input_error(path, f"shape ({count}, 4, 4), one pose per frame", str(shape or "an archive"), hint)
+        raise input_error(path, f"shape ({count}, 4, 4), one pose per frame", str(shape or "an archive"), HINT)
     if stored.dtype.kind not in "iuf":
-        raise input_error(path, "numbers", str(stored.dtype), hint)
+        raise input_error(path, "numbers", str(stored.dtype), HINT)
     values = stored.astype(np.float64)
     if shape == (count, 17):
         values = values[:, :15].reshape(count, 3, 5)
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3] = values[:, :3, :4]
     if not np.isfinite(poses).all():
-        raise input_error(path, "finite numbers", "NaN or infinity", hint)
-    demand_rotations(path, poses[:, :3, :3], "the upper left 3x3", hint)
+        raise input_error(path, "finite numbers", "NaN or infinity", HINT)
+    demand_rotations(path, poses[:, :3, :3], "the upper left 3x3", HINT)
     return poses
+
+
+def _of_images(path: Path, sources: Sequence[int]) -> NDArray[np.float64]:
+    """(T, 4, 4) of the images at these positions of the video."""
+    rows = read_table(path, TEXT_HINT)
+    if rows.shape[1] != 8:
+        raise input_error(path, "rows of 8 numbers", f"{rows.shape[1]}", TEXT_HINT)
+    rows = rows[_rows_of(path, rows[:, 0], sources)]
+    lengths = np.linalg.norm(rows[:, 4:], axis=1)
+    wrong = np.flatnonzero(~(np.isfinite(rows).all(1) & (np.abs(lengths - 1) <= UNIT_TOLERANCE)))
+    if wrong.size:
+        got = f"length {lengths[wrong[0]]:g} of that of frame {wrong[0]}"
+        raise input_error(path, "finite numbers and quaternions of length 1", got, TEXT_HINT)
+    reach = np.linalg.norm(rows[:, 1:4] - rows[0, 1:4], axis=1).max()
+    if reach > FARTHEST_M:
+        got = f"a path that reaches {reach:g} from its start"
+        raise input_error(path, f"positions in m, within {FARTHEST_M:g} m", got, "divide positions in mm by 1000.")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    poses[:, :3, 3] = MM_PER_M * rows[:, 1:4]
+    return poses
+
+
+def _rows_of(path: Path, numbers: NDArray[np.float64], sources: Sequence[int]) -> NDArray[np.int_]:
+    """(T,) the row of each image: by its number, from 0 or 1; in order where the first column holds times.
+
+    Raises:
+        InputError: an image has no row.
+    """
+    wanted = np.array(sources)
+    counted = bool(np.isfinite(numbers).all() and (numbers == np.round(numbers)).all() and (np.diff(numbers) > 0).all())
+    by_number = wanted + (0 if numbers[0] == 0 else 1)
+    if counted and (numbers[0] <= 1 or np.isin(by_number, numbers).all()):
+        rows, missing = np.searchsorted(numbers, by_number), by_number[~np.isin(by_number, numbers)]
+    else:
+        rows, missing = wanted, wanted[wanted >= len(numbers)]
+    if missing.size:
+        got = f"{len(numbers)} rows, none for image {missing[0]}"
+        fix = "choose other images by --start and --end."
+        raise input_error(path, "a row for each image of the video that is used", got, fix)
+    return rows

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...core.checks import input_error, number_ranges
 from ...core.geometry import length_unit
@@ -23,6 +24,7 @@ from .given import with_poses
 from .pose_file import read_poses
 from .seen import CameraPath, Lens, PoseInput
 
+NEGLIGIBLE_DEGREES = 1e-3
 PATH_RECORD = "camera_path.json"
 """In a sequence folder: how each pose was found, and how sure it is."""
 ASSUMED, CALIBRATED, REFINED = "assumed field of view", "calibration", "refined with the camera path"
@@ -44,6 +46,17 @@ class Reading:
     """mm per unit of the positions."""
     turn: NDArray[np.float64] | None = None
     """(3, 3) rotation from the camera that the poses belong to, to that of the frames; None if they are the same."""
+    sources: Sequence[int] | None = None
+    """Position in the video of each frame, from 0, where a file may have a row for each image of a video."""
+
+    @property
+    def notes(self) -> list[str]:
+        """A line for the user if the poses are turned."""
+        angle = 0.0 if self.turn is None else float(np.degrees(Rotation.from_matrix(self.turn).magnitude()))
+        if angle < NEGLIGIBLE_DEGREES:
+            return []
+        what = "given poses are those of the left camera before rectification"
+        return [f"{what}; they are turned as its images are, by {angle:.2f} degrees"]
 
     def scaled(self, stored: NDArray[np.float64]) -> NDArray[np.float64]:
         """The stored poses with positions in mm."""
@@ -83,16 +96,17 @@ def sequence_path(
         views: opens all images and all tissue masks, one after the other.
         lens: its focal length may be an assumption: `refine_focal`.
         size: (width, height), px.
-        reading: how the matrices of a file are to be read.
+        reading: how the matrices of a file are to be read, and what they belong to.
     Raises:
         InputError: the file of poses cannot be used, or COLMAP is asked for and not there.
     """
     if how not in (*METHODS, "still"):
-        stored = read_poses(Path(how), count)
-        poses = reading.ours(stored)
+        stored = read_poses(Path(how), count, reading.sources)
+        poses, notes = reading.ours(stored), reading.notes
         if not has_depth:
-            return _unscaled(poses), []
-        return _from_file(poses, frame, lens, progress), _fit_notes(how, stored, frame, lens, reading)
+            return _unscaled(poses), notes
+        notes += _fit_notes(how, stored, frame, lens, reading)
+        return _from_file(poses, frame, lens, progress), notes
     if (reading.convention, reading.unit_mm) != (AS_OURS.convention, AS_OURS.unit_mm):
         got, fix = f"--poses {how}", "Remove --poses-convention and --poses-unit-mm."
         raise input_error("--poses-convention", "a file with --poses", got, fix)

@@ -1,0 +1,176 @@
+"""Images with a lens and a pose each, as reconstruction programs leave them: the sequence that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import input_error
+from ..core.config import DataConfig
+from ..core.shell import command
+from ..core.types import Camera
+from .assemble import Pixels, assemble, kept_frames
+from .depth_files import DEPTH_SUFFIXES, read_depth_file
+from .files import demand_count, list_files, unequal_names
+from .images import read_color, read_tool_mask
+from .lens import Lens, Undistorter
+from .poses import demand_rotations
+from .sequence import FrameSequence
+
+ROUNDED_PX = 1.0
+"""Scaled images may differ from the exact shape by rounding."""
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """One image and what is known of it."""
+
+    file: Path
+    lens: Lens
+    world_to_camera: NDArray[np.float64]
+    """(4, 4), OpenCV axes."""
+    mask: Path | None = None
+    """0 = not to be used, as reconstruction programs have it."""
+    depth: Path | None = None
+
+
+def load_posed(
+    path: Path,
+    cfg: DataConfig,
+    source: Path,
+    posed: Sequence[PosedImage],
+    files: Sequence[Path],
+    remarks: list[str],
+    mm_per_unit: float | None = None,
+) -> FrameSequence:
+    """The sequence of some images, in this order; frames are undistorted.
+
+    Args:
+        source: the file of the poses, for messages.
+        posed: at least one.
+        files: that describe them; the first one holds the lens.
+        remarks: what is unusual, so far.
+        mm_per_unit: of positions; None if their scale is unknown, and depth is then in their units. Else it is in mm.
+    Raises:
+        InputError: images of several sizes, or other than those of the lens, or files that cannot be used.
+    """
+    demand_rotations(
+        source, np.stack([each.world_to_camera[:3, :3] for each in posed]), "the poses", "export them again."
+    )
+    height, width = read_color(posed[0].file).shape[:2]
+    size = (width, height)
+    lenses = _lenses(source, [each.lens for each in posed], size, remarks)
+    undistorters = {id(lens): Undistorter(lens) for lens in lenses}
+    if any(lens.is_bent for lens in lenses):
+        remarks.append(f"{source}: the lens is distorted; frames are undistorted, without part of the periphery")
+    masks, tool_value = _masks(path, posed, remarks)
+    depths = _depths(path, files[0], posed, remarks)
+    if mm_per_unit is None:
+        remarks.append(f"{source}: the scale of its poses is unknown; lengths are not millimeters")
+    kept = kept_frames(len(posed), cfg)
+    images = [posed[i].file for i in kept]
+    scale = mm_per_unit or 1.0
+    unit = cfg.depth_unit_mm or 1.0
+
+    def decode(index: int) -> Pixels:
+        at = kept[index]
+        undistorter = undistorters[id(lenses[at])]
+        tissue = undistorter.shown
+        if masks and masks[at] is not None:
+            tool = read_tool_mask(masks[at], tool_value, size)
+            tissue = tissue & (undistorter.nearest((~tool).astype(np.uint8)) > 0)
+        depth = read_depth_file(depths[at], unit, size) if depths else np.zeros((height, width), np.float32)
+        return undistorter.smooth(read_color(images[index], size)), tissue, undistorter.nearest(depth)
+
+    def camera(at: int) -> Camera:
+        matrix, pose = lenses[at].matrix, posed[at].world_to_camera.copy()
+        pose[:3, 3] *= scale
+        return Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], pose)
+
+    others = [column[at] for column in (masks, depths) if column for at in kept]
+    return assemble(
+        path,
+        cfg,
+        [camera(at) for at in kept],
+        decode,
+        images=images,
+        files=[*(file for file in others if file is not None), *files],
+        remarks=remarks,
+        mask_folder="masks" if tool_value == 255 else ".",
+        depth_is_relative=mm_per_unit is None,
+        sources={"poses": f"given, {source.name}"},
+    )
+
+
+def _lenses(source: Path, lenses: Sequence[Lens], size: tuple[int, int], remarks: list[str]) -> list[Lens]:
+    """The lens of each image, in px of the images."""
+
+    @cache
+    def fitted(index: int) -> Lens:
+        lens = by_id[index]
+        if (lens.width, lens.height) == size:
+            return lens
+        scale = size[0] / lens.width
+        if abs(scale * lens.height - size[1]) > ROUNDED_PX:
+            want, fix = (
+                f"images of {lens.width}x{lens.height} px, or of that shape",
+                "pass the images that it was made of.",
+            )
+            raise input_error(source, want, f"{size[0]}x{size[1]}", fix)
+        remarks.append(
+            f"{source}: its lens is that of {lens.width}x{lens.height} px; fx {lens.matrix[0, 0]:g} px is scaled to "
+            f"{lens.matrix[0, 0] * scale:g} px for {size[0]}x{size[1]}"
+        )
+        return lens.scaled(*size)
+
+    by_id = {id(lens): lens for lens in lenses}
+    return [fitted(id(lens)) for lens in lenses]
+
+
+def _masks(path: Path, posed: Sequence[PosedImage], remarks: list[str]) -> tuple[list[Path | None], int]:
+    """A mask for each image, None where an image has none, and the value of tools; no list without any masks."""
+    named = [each.mask for each in posed]
+    if any(named):
+        if not all(named):
+            remarks.append(
+                f"{path}: {named.count(None)} of {len(named)} images name no mask, all of them counts as tissue"
+            )
+        return named, 0
+    folder = path / "masks"
+    if not folder.is_dir():
+        remarks.append(f"{folder}: missing, every pixel counts as tissue")
+        return [], 255
+    # COLMAP's own masks are called like the image, with .png behind its suffix, and 0 is not used.
+    if all((folder / f"{each.file.name}.png").is_file() for each in posed):
+        return [folder / f"{each.file.name}.png" for each in posed], 0
+    return _beside(folder, posed, (".png",), remarks), 255
+
+
+def _depths(path: Path, calibration: Path, posed: Sequence[PosedImage], remarks: list[str]) -> list[Path]:
+    """The depth of each image; none without any."""
+    named = [each.depth for each in posed if each.depth is not None]
+    if named:
+        demand_count(named, path, len(posed))
+        return named
+    if (path / "depth").is_dir():
+        remarks.append(f"{path / 'depth'}: taken to be in the units of the poses")
+        return _beside(path / "depth", posed, DEPTH_SUFFIXES, remarks)
+    prepare = command("prepare", posed[0].file.parent, "OUT", "--calibration", calibration)
+    remarks.append(f"{path / 'depth'}: missing; `{prepare}` makes depth, and a camera path of its own")
+    return []
+
+
+def _beside(folder: Path, posed: Sequence[PosedImage], suffixes: tuple[str, ...], remarks: list[str]) -> list[Path]:
+    """A file for each image: of its name, else in order."""
+    files = list_files(folder, suffixes, "nerfstudio")
+    by_name = {file.stem: file for file in files}
+    if all(each.file.stem in by_name for each in posed):
+        return [by_name[each.file.stem] for each in posed]
+    demand_count(files, folder, len(posed))
+    remarks += unequal_names([each.file for each in posed], files)
+    return files
