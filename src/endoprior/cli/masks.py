@@ -106,7 +106,8 @@ def _add_clicked(args: Masks) -> None:
     """Add the tools at the points of `--tool` to the masks of all frames."""
     if args.refine or args.segmenter is not None:
         other = "--refine" if args.refine else "--with"
-        raise input_error("--tool", f"no {other}", other, f"Find the tools first: `endoprior masks DATA {other}`.")
+        fix = f"Find the tools first: `{command('masks', args.data, other)}`."
+        raise input_error("--tool", f"no {other}", other, fix)
     from ..core.config import DataConfig
     from ..data import load_sequence
     from ..data.found_tools import read_rows, write_rows

@@ -42,7 +42,6 @@ from .masked_frames import masked_frames
 from .record import record_of
 from .row_offset import with_equal_rows
 from .sam2 import is_sam2, open_sam2
-from .unmasked_motion import frames_with_unmasked_motion
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
@@ -172,6 +171,8 @@ def prepare(
 
 def _unmasked(files: FrameFiles, inside: NDArray[np.bool_]) -> list[int]:
     """Written frames in which something moves that no mask covers."""
+    from .unmasked_motion import frames_with_unmasked_motion  # imports torch
+
     return frames_with_unmasked_motion(
         files.count,
         files.meta.frames_per_second,

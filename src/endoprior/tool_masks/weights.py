@@ -14,7 +14,7 @@ from ..core.checks import input_error
 from .network import ToolNetwork
 
 FILE = Path(__file__).with_name("tool_network.safetensors")
-SHA256 = "9ee2f3b89d87eb4ce21c217893e6cc57927894720935a19e64d259c0f4e58d21"
+SHA256 = "c49c792f112e198d4a1d206bd207df48166d957f0cd12afebde312d891b96c9c"
 """Of the file; a test compares it with the file and with the model card."""
 
 

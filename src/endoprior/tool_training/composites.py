@@ -23,7 +23,7 @@ from .tissue import tissue
 SIZE = (160, 192)
 """(h, w) of an example."""
 IGNORED = 255
-REAL = 0.55
+REAL = 0.45
 """Share of the examples on real frames, where there are any."""
 NUMBER = (0.22, 0.4, 0.28, 0.1)
 """Probability of 0 to 3 instruments."""
@@ -77,12 +77,12 @@ def _scene(
     """(h, w, 3) tissue with bodies over it, its labels, and the view."""
     real = bool(frames) and rng.random() < REAL
     scene, label, view = _real_scene(rng, frames) if real else _procedural_scene(rng)
-    if real and rng.random() < 0.25:  # as it is: real tools, or tissue without any
+    if real and rng.random() < 0.15:  # as it is: real tools, or tissue without any
         return scene, label, view
     if rng.random() < 0.08:
         scene, tube = ribbed_tube(rng, scene)
         scene, label = _placed(rng, scene, label, tube)
-    if rng.random() < 0.14:
+    if rng.random() < 0.04:
         scene, label = _placed(rng, scene, label, gauze(rng, scene, view))
     if frames and rng.random() < 0.25:
         scene, label = _transferred(rng, scene, label, frames)
