@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from ..data.file_names import numbers_of
 from ..data.mask_folders import open_mask_folder
 from .config import PrepareConfig
 from .sam2 import is_sam2
@@ -42,9 +42,9 @@ def masked_frames(cfg: PrepareConfig, indices: Sequence[int], image_names: Seque
     given = open_mask_folder(Path(cfg.masks), cfg.mask_labels)
     if given.in_order_only or len(given.frames) in (len(indices), len(image_names)):
         return None
-    numbers = [_last_number(frame.name) for frame in given.frames]
-    names = [_last_number(name) for name in image_names]
-    if None in numbers or len({*numbers}) < len(numbers) or None in names or len({*names}) < len(names):
+    numbers = numbers_of([Path(frame.name).stem for frame in given.frames])
+    names = numbers_of(image_names)
+    if numbers is None or names is None:
         return None
     first = 0 if 0 in numbers else 1
     has_mask = {*numbers}
@@ -56,8 +56,3 @@ def masked_frames(cfg: PrepareConfig, indices: Sequence[int], image_names: Seque
     left_out = len(indices) - len(kept)
     note = f"masks: one for every {step} frames; {left_out} of {len(indices)} frames have none and are left out"
     return MaskedFrames(frozenset(kept), step, note)
-
-
-def _last_number(name: str) -> int | None:
-    digits = re.findall(r"[0-9]+", Path(name).stem)
-    return int(digits[-1]) if digits else None
