@@ -64,7 +64,7 @@ TAG = "K_left: !!python/object/apply:os.system ['touch executed']\n"
 
 CALIBRATIONS = [
     Case("no calibration", beside("--calibration", "c.yaml"), ("c.yaml", "o such file")),
-    Case("a calibration of another kind", calibrated("c.txt", "x"), ("c.txt", ".yaml")),
+    Case("a calibration of another kind", calibrated("c.txt", "x"), ("c.txt", "named values")),
     Case("an empty calibration", calibrated("c.yaml", ""), ("c.yaml", "named values")),
     Case("a calibration that is a list", calibrated("c.json", "[1, 2]"), ("c.json", "list")),
     Case("YAML aliases that explode", calibrated("c.yaml", BOMB), ("c.yaml", "aliases")),
@@ -75,7 +75,11 @@ CALIBRATIONS = [
     Case(
         "a matrix of 10^9 rows", calibrated("c.yaml", "K: {rows: 1000000000, cols: 1000000000, data: [1]}"), ("c.yaml",)
     ),
-    Case("a matrix of NaN", eyes(K_left=[[float("nan"), 0, 1], [0, 90, 1], [0, 0, 1]]), ("c.json", "kleft")),
+    Case(
+        "a matrix of NaN",
+        eyes(K_left=[[float("nan"), 0, 1], [0, 90, 1], [0, 0, 1]]),
+        ("c.json", "k of the left camera"),
+    ),
     Case("a matrix in words", eyes(K_left="wide"), ("c.json", "kleft")),
     Case(
         "a matrix of 10^400", calibrated("c.json", '{"K": [[1' + "0" * 400 + ",0,1],[0,1,1],[0,0,1]]}"), ("c.json", "k")
@@ -92,10 +96,12 @@ CALIBRATIONS = [
     Case("a size in words", eyes(width="wide"), ("c.json", "width")),
     Case(
         "a baseline in words",
-        calibrated("c.json", json.dumps({"fx": 9, "cx": 5, "cy": 5, "baseline_mm": "x"})),
+        calibrated("c.json", json.dumps({"fx": 9, "fy": 9, "cx": 5, "cy": 5, "baseline_mm": "x"})),
         ("c.json", "baselinemm"),
     ),
-    Case("a center in words", calibrated("c.json", json.dumps({"fx": 9, "cx": "x", "cy": 5})), ("c.json", "cx")),
+    Case(
+        "a center in words", calibrated("c.json", json.dumps({"fx": 9, "fy": 9, "cx": "x", "cy": 5})), ("c.json", "cx")
+    ),
     Case("pixel centers in words", eyes(pixel_center="half"), ("c.json", "pixelcenter")),
     Case("seven distortions", eyes(distortion_left=[0] * 7), ("c.json", "distortion")),
     Case("an archive of pickles", calibrated("c.npz", executing_pickle()), ("c.npz", "pickle")),

@@ -214,7 +214,7 @@ LAYOUTS = [
         made(hamlyn, put("intrinsics.txt", "nan 0 1\n0 nan 1\n0 0 1")),
         ("intrinsics.txt", "camera matrix"),
     ),
-    Case("Forplane, too narrow", damaged(narrow), ("images/000000.png", "40 columns")),
+    Case("Forplane, too narrow", damaged(narrow), ("poses_bounds.npy", "30x40 px", "48x40")),
     Case("a raw StereoMIS sequence", made(put("StereoCalibration.ini", "x")), ("StereoCalibration.ini", "prepare")),
     Case(
         "StereoMIS with a split of its own",

@@ -69,8 +69,8 @@ def read_calibration(path: Path, unit: Unit = "auto") -> Calibration:
     """
     table = read_table(path)
     left_side, right_side = _sides(table)
-    left = _camera(left_side, table, path)
-    right = _camera(right_side, table, path) if right_side else None
+    left = _camera(left_side, table, path, "left" if right_side else "only")
+    right = _camera(right_side, table, path, "right") if right_side else None
     if left is None:
         raise input_error(path, "the left camera matrix", f"only {', '.join(list(table)[:6])}", HINT)
     rotation = translation = None
@@ -114,13 +114,13 @@ def _has_matrix(local: Table) -> bool:
     return matrix or any(name in local for name in FOCAL_X)
 
 
-def _camera(local: Table, table: Table, path: Path) -> Intrinsics | None:
-    """One camera of its own values, and of those that hold for both, such as the model of the lens."""
+def _camera(local: Table, table: Table, path: Path, which: str) -> Intrinsics | None:
+    """One camera (`which`: a word for messages) of its own values, and of those for both, such as the lens model."""
     matrix = None
     for name in MATRIX:
         if name in local and np.ndim(local[name]) > 0:
             four = np.size(local[name]) == 4
-            matrix = _array(local[name], name, (4,) if four else (3, 3), path)
+            matrix = _array(local[name], f"{name} of the {which} camera", (4,) if four else (3, 3), path)
             if four:
                 matrix = np.array([[matrix[0], 0, matrix[2]], [0, matrix[1], matrix[3]], [0, 0, 1.0]])
             break
@@ -128,7 +128,7 @@ def _camera(local: Table, table: Table, path: Path) -> Intrinsics | None:
         if not any(name in local for name in FOCAL_X):
             return None
         if missing := [names[0] for names in (FOCAL_Y, CENTER_X, CENTER_Y) if _first(local, names) is None]:
-            want = "fx, fy, cx, cy (fc_x, fc_y, cc_x, cc_y) of the camera"
+            want = f"fx, fy, cx, cy (fc_x, fc_y, cc_x, cc_y) of the {which} camera"
             raise input_error(path, want, f"no {missing[0]}", "Complete it.")
         fx, fy, cx, cy = (_number(local, names, path) for names in (FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y))
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

@@ -65,7 +65,7 @@ def read_table(path: Path) -> Table:
         raise
     except (ValueError, TypeError, OverflowError, RecursionError, yaml.YAMLError, configparser.Error) as error:
         raise input_error(path, "a readable calibration", " ".join(str(error).split())[:120], "Correct it.") from None
-    got = "text without names" if isinstance(content, str) else type(content).__name__
+    got = "a list" if isinstance(content, list) else "text without named values" if content else "no named values"
     raise input_error(path, FORMATS, got, HINT)
 
 
@@ -98,7 +98,8 @@ def _content(path: Path) -> Any:
     if lines and ONLY_NUMBERS.fullmatch("\n".join(lines) + "\n"):
         numbers = [[float(word) for word in re.findall(NUMBER, line)] for line in lines]
         numbers = [row for row in numbers if row]
-        return _of_rows(path, np.array(numbers)) if len({len(row) for row in numbers}) == 1 else numbers
+        if len({len(row) for row in numbers}) == 1:
+            return _of_rows(path, np.array(numbers))
     if INI_SECTION.search(text):
         return _of_ini(text)
     # OpenCV writes "%YAML:1.0", which is not YAML.

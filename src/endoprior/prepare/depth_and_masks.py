@@ -110,7 +110,8 @@ def _check_stereo(samples: list[MeasuredFrame], geometry: FrameGeometry, clip: C
         fix = "Remove --swap-eyes." if clip.swap else "Add --swap-eyes."
         shares = f"{orders[0].exchanged:.0%} of the image matches swapped, {orders[0].as_given:.0%} as given"
         raise input_error(clip.source.path, "the left camera first", f"the right one ({shares})", fix)
-    offset = float(np.nanmedian([vertical_offset_px(frame.rgb_u8, frame.right_u8) for frame in middle]))
+    offsets = np.array([vertical_offset_px(frame.rgb_u8, frame.right_u8) for frame in middle])
+    offset = float(np.median(offsets[np.isfinite(offsets)])) if np.isfinite(offsets).any() else 0.0
     if offset > MAX_ROW_OFFSET_PX:
         return [
             f"the rows of the cameras are {offset:.1f} px apart; depth will be poor. Pass the calibration of "
