@@ -87,7 +87,7 @@ def test_canonical_is_what_the_scene_stores(run, tmp_path):
     assert np.array_equal(positions(tmp_path / "b.ply"), scene.at(0.35).means.numpy())
 
 
-@pytest.mark.parametrize("name", ["ply", "compressed_ply", "splat", "spz", "gltf", "points"])
+@pytest.mark.parametrize("name", ["ply", "compressed_ply", "sog", "splat", "spz", "gltf", "points"])
 def test_scenes_where_nothing_but_the_centers_moves(tmp_path, name):
     """What no deformation touches is the trained tensor itself."""
     scene = moving_scene()
@@ -190,7 +190,7 @@ def test_every_suffix_has_a_format_and_ambiguous_ones_the_first():
 def test_a_name_without_a_known_suffix_lists_the_formats(run, tmp_path, capsys, name):
     assert main(["export", str(run), str(tmp_path / name)]) == 2
     error = capsys.readouterr().err
-    assert ".ply .splat .spz .glb .obj .stl .mrb .json " in error
+    assert ".ply .sog .splat .spz .glb .obj .stl .mrb .json " in error
     assert ", ".join(FORMATS) in error and error.count("\n") == 1 and not list(tmp_path.iterdir())
 
 

@@ -26,6 +26,7 @@ Progress = Callable[[int, int], None]
 FORMATS = (
     "ply",
     "compressed_ply",
+    "sog",
     "splat",
     "spz",
     "gltf",
