@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import gzip
+import io
+import json
 import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from pygltflib import GLTF2
 
 
@@ -75,6 +79,37 @@ def read_compressed_ply(data: bytes) -> dict[str, np.ndarray]:
         "dc": (color - 0.5) / 0.28209479177387814,
         "opacities": (packed[:, 3] & 255) / 255,
         "rest": (rest * (8 / 255) - 4).reshape(num, 3, width // 3).transpose(0, 2, 1),
+    }
+
+
+def read_sog(data: bytes) -> dict[str, np.ndarray]:
+    """Decode SOG version 2 without higher harmonics, from its specification."""
+    archive = zipfile.ZipFile(io.BytesIO(data))
+    about = json.loads(archive.read("meta.json"))
+    num = about["count"]
+    assert about["version"] == 2 and "shN" not in about
+
+    def pixels(name: str) -> np.ndarray:
+        image = Image.open(io.BytesIO(archive.read(name)))
+        assert image.format == "WEBP"
+        return np.array(image).reshape(-1, len(image.mode))[:num].astype(np.int64)
+
+    low, high = (pixels(name) for name in about["means"]["files"])
+    shares = (low + (high << 8)) / 65535
+    least, most = np.array(about["means"]["mins"]), np.array(about["means"]["maxs"])
+    logs = least + (most - least) * shares
+    (scales,), (colors,), (quats,) = ([pixels(f) for f in about[name]["files"]] for name in ("scales", "sh0", "quats"))
+    unit = np.zeros((num, 4))
+    for row, (*others, alpha) in zip(unit, quats, strict=True):
+        parts = (np.array(others) / 255 - 0.5) * np.sqrt(2)
+        row[[i for i in range(4) if i != alpha - 252]] = parts
+        row[alpha - 252] = np.sqrt(max(0, 1 - (parts**2).sum()))
+    return {
+        "means": np.sign(logs) * (np.exp(np.abs(logs)) - 1),
+        "log_scales": np.array(about["scales"]["codebook"])[scales],
+        "quats": unit,
+        "dc": np.array(about["sh0"]["codebook"])[colors[:, :3]],
+        "opacities": colors[:, 3] / 255,
     }
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import json
 import posixpath
 import zipfile
 from dataclasses import dataclass
+from typing import Any
 from urllib.parse import unquote
 from xml.etree import ElementTree
 
@@ -64,6 +66,15 @@ class Bundle:
         mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
         mesh.vertices = mesh.vertices * [-1, -1, 1]
         return mesh
+
+    def markups(self, node: Node) -> tuple[np.ndarray, list[dict[str, Any]]]:
+        """(P, 3) positions of a point list in Slicer's world, RAS, and its control points."""
+        data = json.loads(self.stored(node, "MarkupsJsonStorage"))
+        assert "markups-schema-v1." in data["@schema"]
+        (found,) = data["markups"]
+        assert f"Markups{found['type']}" == node.tag
+        signs = {"LPS": [-1, -1, 1], "RAS": [1, 1, 1]}[found["coordinateSystem"]]
+        return np.array([p["position"] for p in found["controlPoints"]]) * signs, found["controlPoints"]
 
 
 def _node(element: ElementTree.Element) -> Node:

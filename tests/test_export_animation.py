@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -124,6 +125,19 @@ def test_every_frame_of_the_sequence(run, tmp_path):
     found = Reader(out)
     assert found.seconds == pytest.approx([i / 25 for i in range(10)])
     assert np.median(found.positions(0)[:, 1]) == pytest.approx(0.06, abs=0.005)  # y is depth in LPS
+
+
+@pytest.mark.parametrize(("times", "first", "last"), [((), 0, 9), (("--times", "0.2", "0.55"), 2, 6)])
+def test_the_command_says_what_to_type_in_blender(run, tmp_path, capsys, times, first, last):
+    """Blender's importer sets neither the frame rate nor the frames that are played."""
+    out = tmp_path / "it's.glb"
+    assert main(["export", str(run), str(out), "--format", "animation", "--mesh-step", "8", *times]) == 0
+    code = capsys.readouterr().out.split("type: ")[1].strip()
+    opened, bpy = [], SimpleNamespace(context=SimpleNamespace(scene=SimpleNamespace(render=SimpleNamespace())))
+    bpy.ops = SimpleNamespace(import_scene=SimpleNamespace(gltf=lambda filepath: opened.append(filepath)))
+    exec(code, {"bpy": bpy})
+    scene = bpy.context.scene
+    assert (scene.render.fps, scene.frame_start, scene.frame_end) == (25, first, last) and opened == [str(out)]
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,34 @@ def test_the_view_looks_along_the_endoscope_and_shows_the_whole_mesh(run, bundle
     assert np.sign(rays @ towards).min() == 1
 
 
+def test_points_play_with_the_mesh_where_tracks_has_them(run, tmp_path):
+    queries = tmp_path / "points.csv"
+    queries.write_text("x,y,frame\n30.5,20.5,0\n28,25,4\n34,22,4\n")
+    options = ("--points", str(queries))
+    assert main(["export", str(run), str(tmp_path / "a.mrb"), "--split", "test", "--mesh-step", "8", *options]) == 0
+    assert main(["export", str(run), str(tmp_path / "t"), "--format", "tracks", "--frame", "ras", *options]) == 0
+    found = np.load(tmp_path / "t" / "tracks.npz")
+    bundle = Bundle((tmp_path / "a.mrb").read_bytes())
+    browser = bundle.only("SequenceBrowser")
+    assert browser.attributes["virtualNodePostfixes"].split() == ["0", "1"]
+    assert "playback true" in browser.attributes["SynchronizationPropertiesMap1"]
+    assert bundle.referenced(browser, "dataNodeRef0", "Model") is bundle.only("Model")
+    shown = bundle.referenced(browser, "dataNodeRef1", "MarkupsFiducial")
+    bundle.referenced(shown, "display", "MarkupsDisplay")
+    assert bundle.markups(shown)[0] == pytest.approx(found["points"][1], abs=1e-4)
+    sequence = bundle.referenced(browser, "sequenceNodeRef1", "Sequence")
+    assert sequence.attributes["attributes"] == "DataNodeClassName:vtkMRMLMarkupsFiducialNode"
+    inside = Bundle(bundle.stored(sequence, "SequenceStorage"))
+    index = sequence_index(inside.only("Sequence"))
+    assert index == sequence_index(sequence) and list(index) == pytest.approx([1 / 25, 9 / 25])
+    for frame, identity in zip((1, 9), index.values(), strict=True):
+        positions, points = inside.markups(inside.nodes[identity])
+        assert positions == pytest.approx(found["points"][frame], abs=1e-4)
+        assert [p["label"] for p in points] == ["0", "1", "2"]
+        confidence = [float(p["description"].removeprefix("confidence ")) for p in points]
+        assert confidence == pytest.approx(found["confidence"][frame], abs=0.02)
+
+
 def test_vtk_reads_color_and_axes(bundle, meshes, tmp_path):
     vtk = pytest.importorskip("vtk", reason="THE MESHES ARE NOT READ BY VTK: `pip install vtk`")
     file = tmp_path / "model.ply"
@@ -143,6 +171,7 @@ def test_every_frame_at_the_rate_of_the_sequence_and_equal_bytes(run, tmp_path):
         ("a.mrb", ("--times", "0.5"), "two or more"),
         ("a.mrb", ("--times", "0.5", "0.2"), "in order"),
         ("a.mrb", ("--frame", "ras"), "--frame"),
+        ("a.mrb", ("--points", "missing.csv"), "missing.csv"),
         ("a.mrb", ("--max-slope", "0.01", "--mesh-step", "20", "--min-alpha", "1"), "--min-alpha"),
     ],
 )

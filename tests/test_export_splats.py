@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 import torch
-from export_readers import read_compressed_ply, read_glb, read_splat, read_spz
+from export_readers import read_compressed_ply, read_glb, read_sog, read_splat, read_spz
 from export_scenes import covariances, random_splats
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
@@ -17,6 +17,7 @@ from endoprior.core.types import Splats
 from endoprior.export.compressed_ply import encode_compressed_ply
 from endoprior.export.gltf import encode_glb
 from endoprior.export.ply import encode_ply
+from endoprior.export.sog import encode_sog
 from endoprior.export.splat import encode_splat
 from endoprior.export.spz import encode_spz
 
@@ -136,6 +137,25 @@ def test_compressed_ply_within_its_precision(degree):
     axes = np.array([[4.0, 2.0, 1.0]])
     wanted = covariances(splats.quats.double().numpy()[row], axes)
     assert covariances(found["quats"], axes) == pytest.approx(wanted, abs=0.06)
+
+
+def test_sog_within_its_precision():
+    splats = random_splats(1001, 1)
+    data = encode_sog(splats)
+    found = read_sog(data)
+    assert data == encode_sog(splats)
+    row = np.array([((splats.means.numpy() - mean) ** 2).sum(1).argmin() for mean in found["means"]])
+    assert len(set(row)) == 1001
+    assert found["means"] == pytest.approx(splats.means.numpy()[row], abs=0.01)  # 16 bits of the logarithm up to 90 mm
+    for name, want in (("log_scales", splats.scales.log()), ("dc", splats.sh[:, 0])):
+        assert found[name] == pytest.approx(want.numpy()[row], abs=0.501 * float(want.max() - want.min()) / 255)
+    assert found["opacities"] == pytest.approx(splats.opacities.numpy()[row], abs=0.5 / 255 + 1e-6)
+    axes = np.array([[4.0, 2.0, 1.0]])
+    wanted = covariances(splats.quats.double().numpy()[row], axes)
+    assert covariances(found["quats"], axes) == pytest.approx(wanted, abs=0.25)
+    with pytest.raises(InputError, match="sog: expected finite"):
+        encode_sog(one_splat(means=[[np.nan, 0.0, 0.0]]))
+    assert read_sog(encode_sog(one_splat()))["means"] == pytest.approx(np.array([[1.0, 2.0, 3.0]]))
 
 
 def test_compressed_ply_of_one_and_of_none():

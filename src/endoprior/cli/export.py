@@ -17,6 +17,7 @@ from .progress import Counting
 from .trained_scene import folder_of, open_gaussians, sequence_of
 
 if TYPE_CHECKING:
+    from ..export.formats import Format
     from ..model.scene import Scene
 
 
@@ -65,41 +66,45 @@ def run(argv: list[str]) -> None:
         say(f"{path}: {_words(scene, path, options)}")
     if scene.config.render.color_slopes and _holds(args.out, options) == "Gaussians":
         say("note: this format knows one color for each Gaussian, so its pictures are less sharp (docs/export.md).")
+    if note := _chosen(args.out, options)[1].note:
+        say(f"note: {note(scene, args.out, options)}")
     if scene.lengths_are_relative:
         say("note: the scale of this scene is assumed. Its lengths are not millimeters.")
 
 
 def _with_data(scene: Scene, run: Path, out: Path, options: ExportOptions) -> ExportOptions:
     """`options` with the sequence folder of the run, for a format that uses it; with a note if there is none."""
-    from ..export.exporting import format_name
-    from ..export.formats import load_format
-
-    if "data" not in load_format(format_name(out, options)).options:
+    if "data" not in _chosen(out, options)[1].options:
         return options
     sequence = sequence_of(scene, folder_of(run), options.data, "there are no tool masks, and tools hide no point")
     return replace(options, data=sequence and sequence.path)
 
 
-def _holds(out: Path, options: ExportOptions) -> str:
-    """What the format holds, in plain words."""
+def _chosen(out: Path, options: ExportOptions) -> tuple[str, Format]:
+    """The format's name, and the format."""
     from ..export.exporting import format_name
     from ..export.formats import load_format
 
     name = format_name(out, options)
-    return load_format(name).holds or name
+    return name, load_format(name)
+
+
+def _holds(out: Path, options: ExportOptions) -> str:
+    """What the format holds, in plain words."""
+    name, chosen = _chosen(out, options)
+    return chosen.holds or name
 
 
 def _words(scene: Scene, out: Path, options: ExportOptions) -> str:
     """What was written; without --format also what else a file of this suffix can hold, and how to get that."""
-    from ..export.exporting import format_name
     from ..export.formats import formats_of, load_format
 
-    name, holds = format_name(out, options), _holds(out, options)
+    (name, chosen), holds = _chosen(out, options), _holds(out, options)
     # Of several windows, a time shows one or two.
     count = f"{len(scene):,} " if holds == "Gaussians" and len(scene.windows) == 1 else ""
     words = f"{count}{holds}"
     if out.is_dir():
-        words += ", one file for each time step" if load_format(name).files else ""
+        words += ", one file for each time step" if chosen.files else ""
     elif options.format is None:
         others = [other for other in formats_of(out.suffix) if other != name]
         words += "".join(f"; for {load_format(other).holds or other}: --format {other}" for other in others)

@@ -6,6 +6,7 @@ displaces every vertex to where it is at time step i + 1; the animation fades fr
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,16 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     with whole_file(out) as temporary:
         temporary.write_bytes(encode_animation(positions, mesh.triangles, mesh.colors, seconds, names, extras))
     progress(1, 1)
+
+
+def blender_note(scene: Scene, out: Path, options: ExportOptions) -> str:
+    """How to open `out` in Blender: glTF cannot tell it the rate and the range of the frames to play."""
+    seconds = seconds_of_motion(scene, selected_time_steps(scene, options))
+    rate = max(round(scene.frames_per_second), 1)
+    first, last = math.floor(seconds[0] * rate + 1e-6), math.ceil(seconds[-1] * rate - 1e-6)
+    code = f"s = bpy.context.scene; s.render.fps = {rate}; s.frame_start = {first}; s.frame_end = {last}; "
+    code += f"bpy.ops.import_scene.gltf(filepath={str(out.absolute())!r})"
+    return f"a .glb file does not say which frames to play. In Blender's Python console, type: {code}"
 
 
 def encode_animation(
@@ -95,4 +106,5 @@ FORMAT = Format(
     write=write,
     default_axes="opengl",
     holds="a moving mesh",
+    note=blender_note,
 )

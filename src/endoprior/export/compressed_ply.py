@@ -16,6 +16,7 @@ from ..model.gaussians import SH_C0
 from ..model.scene import Scene
 from .formats import TIME_STEP_OPTIONS, Axes, Format
 from .options import ExportOptions
+from .ply import when
 from .time_steps import TimeStep
 
 CHUNK = 256
@@ -29,11 +30,11 @@ PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The compressed PLY file of one time step."""
-    unit = length_unit(scene.lengths_are_relative)
-    return {".ply": encode_compressed_ply(step.plain_splats(scene, options.frame), options.frame, unit)}
+    unit, splats = length_unit(scene.lengths_are_relative), step.plain_splats(scene, options.frame)
+    return {".ply": encode_compressed_ply(splats, options.frame, unit, when(scene, step))}
 
 
-def encode_compressed_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm") -> bytes:
+def encode_compressed_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", comment: str = "") -> bytes:
     """All Gaussians along a curve that keeps neighbors together, equal bytes for equal input.
 
     Position and log scale: 11, 10 and 11 bits within the range of their chunk. Color 0.5 + C0 dc: 8 bits a channel
@@ -43,22 +44,16 @@ def encode_compressed_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm
     Raises:
         InputError: a position is not finite.
     """
-    means = splats.means.numpy().astype(np.float64)
-    if not np.isfinite(means).all():
-        raise input_error("compressed_ply", "finite positions", "NaN or infinity", "train the scene again.")
-    order = np.argsort(_morton(means), kind="stable")
-    means, sh = means[order], splats.sh.numpy().astype(np.float64)[order]
-    log_scales = np.log(splats.scales.numpy().astype(np.float64)[order].clip(1e-30)).clip(*LOG_SCALES)
+    means, log_scales, quats, opacities, sh = ordered(splats, "compressed_ply")
     colors = 0.5 + SH_C0 * sh[:, 0]
-    opacities = splats.opacities.numpy().astype(np.float64)[order]
     of_mean, of_scale, of_color = (_ranges(values) for values in (means, log_scales, colors))
-    red, green, blue = _bits(_within(colors, of_color), 8).T
+    red, green, blue = in_bits(_within(colors, of_color), 8).T
     vertices = np.stack(
         [
             _packed(_within(means, of_mean)),
-            _packed_rotations(splats.quats.numpy().astype(np.float64)[order]),
+            _packed_rotations(quats),
             _packed(_within(log_scales, of_scale)),
-            red << 24 | green << 16 | blue << 8 | _bits(opacities, 8),
+            red << 24 | green << 16 | blue << 8 | in_bits(opacities, 8),
         ],
         1,
     )
@@ -66,12 +61,30 @@ def encode_compressed_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm
     harmonics = np.rint((rest + 4) * (255 / 8)).clip(0, 255).astype(np.uint8)
     ranges = np.concatenate([of_mean, of_scale, of_color], 1).astype("<f4")
     lines = ["ply", "format binary_little_endian 1.0", f"comment axes {axes}, unit {unit}"]
+    lines += [f"comment {comment}"] if comment else []
     lines += [f"element chunk {len(ranges)}", *(f"property float {name}" for name in RANGES)]
     lines += [f"element vertex {len(vertices)}", *(f"property uint {name}" for name in PACKED)]
     if rest.shape[1]:
         lines += [f"element sh {len(sh)}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
     header = "\n".join([*lines, "end_header"]) + "\n"
     return header.encode() + ranges.tobytes() + vertices.astype("<u4").tobytes() + harmonics.tobytes()
+
+
+def ordered(splats: Splats, name: str) -> tuple[NDArray[np.float64], ...]:
+    """Positions, log scales, quaternions, opacities and coefficients along a curve that keeps neighbors together.
+
+    Raises:
+        InputError: names the format `name`: a position is not finite.
+    """
+    means = splats.means.numpy().astype(np.float64)
+    if not np.isfinite(means).all():
+        raise input_error(name, "finite positions", "NaN or infinity", "train the scene again.")
+    order = np.argsort(_morton(means), kind="stable")
+    scales, *others = (
+        tensor.numpy().astype(np.float64)[order]
+        for tensor in (splats.scales, splats.quats, splats.opacities, splats.sh)
+    )
+    return means[order], np.log(scales.clip(1e-30)).clip(*LOG_SCALES), *others
 
 
 def _morton(means: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -103,27 +116,38 @@ def _within(values: NDArray[np.float64], ranges: NDArray[np.float32]) -> NDArray
     return (values - own[:, :3]) / (own[:, 3:] - own[:, :3])
 
 
-def _bits(shares: NDArray[np.float64], bits: int) -> NDArray[np.int64]:
+def in_bits(shares: NDArray[np.float64], bits: int) -> NDArray[np.int64]:
+    """The integers of so many bits for values in 0..1."""
     return np.rint(shares * (2**bits - 1)).clip(0, 2**bits - 1).astype(np.int64)
 
 
-def _packed(shares: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(N,) three shares in 11, 10 and 11 bits."""
-    x, y, z = (_bits(shares[:, i], bits) for i, bits in enumerate((11, 10, 11)))
-    return x << 21 | y << 11 | z
-
-
-def _packed_rotations(quats: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(N,) of quaternions (w, x, y, z) of any length."""
+def smallest_three(quats: NDArray[np.float64], bits: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(N,) the place of the largest of w, x, y, z, and (N, 3) the others, times 1 / sqrt(2), in so many bits."""
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     largest = np.abs(unit).argmax(1)
     rows = np.arange(len(unit))
     unit = unit * np.where(unit[rows, largest] < 0, -1, 1)[:, None]
     others = unit[np.arange(4) != largest[:, None]].reshape(-1, 3)
-    a, b, c = _bits(others / np.sqrt(2) + 0.5, 10).T
+    return largest, in_bits(others / np.sqrt(2) + 0.5, bits)
+
+
+def _packed(shares: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(N,) three shares in 11, 10 and 11 bits."""
+    x, y, z = (in_bits(shares[:, i], bits) for i, bits in enumerate((11, 10, 11)))
+    return x << 21 | y << 11 | z
+
+
+def _packed_rotations(quats: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(N,) of quaternions (w, x, y, z) of any length."""
+    largest, others = smallest_three(quats, 10)
+    a, b, c = others.T
     return largest << 30 | a << 20 | b << 10 | c
 
 
 FORMAT = Format(
-    suffixes=(".ply",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, holds="compressed Gaussians"
+    suffixes=(".ply",),
+    options=(*TIME_STEP_OPTIONS, "canonical"),
+    files=files,
+    holds="compressed Gaussians",
+    has_index=False,  # as in a folder of `ply`
 )

@@ -26,6 +26,7 @@ Progress = Callable[[int, int], None]
 FORMATS = (
     "ply",
     "compressed_ply",
+    "sog",
     "splat",
     "spz",
     "gltf",
@@ -33,6 +34,7 @@ FORMATS = (
     "mesh",
     "animation",
     "slicer",
+    "cameras",
     "depth",
     "tracks",
     "measures",
@@ -65,6 +67,8 @@ class Format:
     """What is in a file, in plain words: `a mesh`; `endoprior export` says it of what it wrote."""
     has_index: bool = True
     """Whether a folder of its files also holds `index.json`; False where each file says itself what it is."""
+    note: Callable[[Scene, Path, ExportOptions], str] | None = None
+    """What a user of the file must know, in one line; `endoprior export` says it."""
     index_facts: Mapping[str, Any] | None = None
     """What `index.json` says of the files' units, for a format without axes in mm."""
 

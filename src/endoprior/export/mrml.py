@@ -37,10 +37,17 @@ class SlicerScene:
         ElementTree.SubElement(self._root, tag, {"id": identity, "name": name, **attributes})
         return identity
 
-    def add_model(self, file: str, references: dict[str, str] | None = None) -> str:
-        """Append a surface model stored in `file`, relative to the scene's own, in LPS axes; return its id."""
-        storage = self.add("ModelStorage", "storage", fileName=file, coordinateSystem="LPS")
-        return self.add("Model", "tissue", {"storage": storage, **(references or {})})
+    def add_stored(
+        self, kind: tuple[str, str], name: str, file: str, references: dict[str, str] | None = None, **attributes: str
+    ) -> str:
+        """Append a node whose data is in `file`, relative to the scene's own, in LPS axes; return its id.
+
+        Args:
+            kind: tags of the node and of its storage node.
+        """
+        tag, storage_tag = kind
+        storage = self.add(storage_tag, "storage", fileName=file, coordinateSystem="LPS")
+        return self.add(tag, name, {"storage": storage, **(references or {})}, **attributes)
 
     def file(self) -> bytes:
         """The .mrml file."""

@@ -42,7 +42,8 @@ class ExportOptions:
     """Edge of a voxel of the fusion, mm."""
     points: Path | None = None
     """CSV with columns x, y, frame: pixels to track; default: a grid on the first frame (tracks).
-    For measures the rows are the corners of a polygon, and the first two the ends of a distance; default: none."""
+    For measures the rows are the corners of a polygon, and the first two the ends of a distance; default: none.
+    For slicer they become a list of points; default: none."""
     grid_px: int = 32
     """Pixels between the points of that grid."""
     data: Path | None = None

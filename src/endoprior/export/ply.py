@@ -22,15 +22,20 @@ _TYPES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
 
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
-    """The PLY file of one time step. It says which one it is, because no other file may lie beside it."""
-    unit, facts = length_unit(scene.lengths_are_relative), step.facts()
-    when = [f"{name} {value}" for name, value in facts.items() if value is not None] or ["canonical"]
-    when += [f"frames_per_second {scene.frames_per_second:g}"] if scene.frames_per_second else []
-    return {".ply": encode_ply(step.plain_splats(scene, options.frame), options.frame, unit, ", ".join(when))}
+    """The PLY file of one time step."""
+    unit = length_unit(scene.lengths_are_relative)
+    return {".ply": encode_ply(step.plain_splats(scene, options.frame), options.frame, unit, when(scene, step))}
 
 
-def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", when: str = "") -> bytes:
-    """Binary PLY with one vertex per Gaussian, all properties float32. Args: when: a comment on the time.
+def when(scene: Scene, step: TimeStep) -> str:
+    """The comment of a PLY file on its time; no other file may lie beside it (`has_index`)."""
+    words = [f"{name} {value}" for name, value in step.facts().items() if value is not None] or ["canonical"]
+    words += [f"frames_per_second {scene.frames_per_second:g}"] if scene.frames_per_second else []
+    return ", ".join(words)
+
+
+def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", comment: str = "") -> bytes:
+    """Binary PLY with one vertex per Gaussian, all properties float32. Args: comment: on the time.
 
     x y z (mm), nx ny nz (0), f_dc_0..2, f_rest_0.. (all of red, then green, then blue, each in the order of
     docs/format.md), opacity (logit), scale_0..2 (log of mm), rot_0..3 (w, x, y, z, of length 1).
@@ -47,7 +52,7 @@ def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", when: st
     columns |= {f"scale_{i}": np.log(splats.scales.numpy()[:, i].clip(1e-30)) for i in range(3)}
     rotations = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     columns |= {f"rot_{i}": rotations[:, i] for i in range(4)}
-    return ply_bytes(vertex_table(columns), axes, unit, comment=when)
+    return ply_bytes(vertex_table(columns), axes, unit, comment=comment)
 
 
 def vertex_table(columns: dict[str, NDArray]) -> NDArray:

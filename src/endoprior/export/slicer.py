@@ -1,24 +1,27 @@
-"""The moving tissue surface as a scene that 3D Slicer plays: one .mrb file.
+"""The moving tissue surface, and points that move with it, as a scene that 3D Slicer plays: one .mrb file.
 
-A .mrb file is a zip archive of a scene and its data. This scene holds a sequence, itself an archive of the same kind
-with one mesh per time step, a browser that plays it, and the model that the browser shows.
+A .mrb file is a zip archive of a scene and its data. This scene holds a sequence of meshes and one of point lists,
+each an archive of the same kind with one file per time step, a browser that plays them, and the nodes that it shows.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.geometry import length_unit
 from ..core.types import Camera
+from ..model.carry import CarriedPoints, carry
 from ..model.scene import Scene
 from ..system.atomic import whole_file
 from .axes import points_in_axes
@@ -27,100 +30,166 @@ from .mesh import SURFACE_OPTIONS, Mesh, surface_mesh
 from .mesh_files import encode_mesh
 from .mrml import SlicerScene
 from .options import ExportOptions
-from .time_steps import seconds_of_motion, selected_time_steps
+from .time_steps import TimeStep, seconds_of_motion, selected_time_steps
+from .tracks import back_projected, read_query_points
 
 FOLDER = "tissue"
 """Folder in each archive, and name of the scene in it."""
-MODEL_FILE, SEQUENCE_FILE = "Data/tissue.ply", "Data/tissue.seq.mrb"
+MARKUPS_SCHEMA = (
+    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
+    "markups-schema-v1.0.3.json#"
+)
+"""Name of the format of point lists; Slicer takes files with this name."""
 IN_MEMORY_BYTES = 2**28
 """A larger sequence waits in a temporary file."""
 VIEW_ANGLE = 30.0
 """Vertical angle of Slicer's 3D view, degrees."""
 
 
+@dataclass(frozen=True)
+class Played:
+    """What one sequence holds."""
+
+    name: str
+    tags: tuple[str, str]
+    """Of its nodes, and of their storage nodes."""
+    suffix: str
+
+    @property
+    def first_file(self) -> str:
+        """Name of the file of what is shown at the start."""
+        return f"Data/{self.name}{self.suffix}"
+
+    @property
+    def sequence_file(self) -> str:
+        """Name of the file of the sequence."""
+        return f"Data/{self.name}.seq.mrb"
+
+
+TISSUE = Played("tissue", ("Model", "ModelStorage"), ".ply")
+POINTS = Played("points", ("MarkupsFiducial", "MarkupsJsonStorage"), ".mrk.json")
+DISPLAYS = {
+    TISSUE: {
+        "tag": "ModelDisplay",
+        "scalarVisibility": "true",
+        "activeScalarName": "RGB",  # the name that VTK gives the colors of a PLY file
+        "activeAttributeLocation": "point",
+        "scalarRangeFlag": "UseDirectMapping",
+        "ambient": "1",  # colors are those of the video, the endoscope's light included: do not light them again
+        "diffuse": "0",
+        "backfaceCulling": "false",
+    },
+    POINTS: {"tag": "MarkupsDisplay", "pointLabelsVisibility": "true"},
+}
+"""Class and attributes of the display node of each."""
+
+
 def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
     """Write the .mrb file.
 
     Raises:
-        InputError: there are fewer than two time steps, they do not increase, one shows no surface, or Slicer would
-            mistake `out` for a bare sequence.
+        InputError: there are fewer than two time steps, they do not increase, one shows no surface, the points cannot
+            be read or show no surface, or Slicer would mistake `out` for a bare sequence.
     """
     if out.name.lower().endswith(".seq.mrb"):  # Slicer chooses the reader by the name
         want, fix = "a name that does not end in .seq.mrb", f"use {out.name[:-8]}.mrb."
         raise input_error(out, want, "one", fix)
     steps = selected_time_steps(scene, options)
     seconds = seconds_of_motion(scene, steps)
+    played: dict[Played, Iterable[bytes]] = {}
     meshes = (surface_mesh(scene, step, options) for step in steps)
-    unit = length_unit(scene.lengths_are_relative)
-    with whole_file(out) as temporary, tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES) as sequence:
-        first = next(meshes)
-        _write_sequence(sequence, chain([first], meshes), unit, seconds, progress)
-        with ZipFile(temporary, "w") as archive:
-            _put(archive, f"{FOLDER}.mrml", _scene_text(first, steps[0].camera(scene), seconds))
-            _put(archive, MODEL_FILE, _ply(first, unit))
-            entry = _entry(SEQUENCE_FILE)  # stored as it is: its files are compressed
-            entry.file_size = sequence.tell()
-            sequence.seek(0)
-            with archive.open(entry, "w") as stored:
-                shutil.copyfileobj(sequence, stored)
+    first, unit = next(meshes), length_unit(scene.lengths_are_relative)
+    played[TISSUE] = (_ply(mesh, unit) for mesh in chain([first], meshes))
+    if options.points:
+        found = _carried(scene, options, steps)
+        played[POINTS] = (markups(*there) for there in zip(found.positions, found.confidence, strict=True))
+    with whole_file(out) as temporary, ZipFile(temporary, "w") as archive:
+        _put(archive, f"{FOLDER}.mrml", _scene_text(first, steps[0].camera(scene), seconds, list(played)))
+        for each, contents in played.items():
+            _put_sequence(archive, each, _counted(contents, len(steps), progress), seconds)
 
 
-def _write_sequence(
-    file: BinaryIO, meshes: Iterable[Mesh], unit: str, seconds: list[float], progress: Progress
-) -> None:
-    """Write the archive of a sequence: one model for each time step, and an index of them."""
+def _carried(scene: Scene, options: ExportOptions, steps: list[TimeStep]) -> CarriedPoints:
+    """The query points of `options` at the time steps."""
+    queries = read_query_points(options.points, scene)
+    starts = back_projected(scene, queries, options.min_alpha)
+    frames, own = np.unique(queries.frames, return_inverse=True)
+    times = [*(frames / len(scene.cameras)), *(step.time for step in steps)]
+    found = carry(scene, starts, own, times)
+    return CarriedPoints(found.positions[len(frames) :], found.confidence[len(frames) :])
+
+
+def markups(positions: NDArray[np.float32], confidence: NDArray[np.float32]) -> bytes:
+    """A .mrk.json file of (P, 3) positions in world axes, mm, labeled by their number in `tracks`."""
+    points = [
+        {"id": f"{k + 1}", "label": f"{k}", "description": f"confidence {share:.2f}", "position": place}
+        for k, (place, share) in enumerate(zip(points_in_axes(positions, "lps").tolist(), confidence, strict=True))
+    ]
+    fiducials = {"type": "Fiducial", "coordinateSystem": "LPS", "locked": True, "controlPoints": points}
+    return json.dumps({"@schema": MARKUPS_SCHEMA, "markups": [fiducials]}, allow_nan=False).encode()
+
+
+def _counted(contents: Iterable[bytes], total: int, progress: Progress) -> Iterator[bytes]:
+    for k, content in enumerate(contents):
+        yield content
+        progress(k + 1, total)
+
+
+def _put_sequence(archive: ZipFile, played: Played, contents: Iterable[bytes], seconds: list[float]) -> None:
+    """Add what is shown at the start, and the archive of a sequence: a node for each time step, and an index."""
     scene = SlicerScene()
-    with ZipFile(file, "w") as archive:
-        for k, mesh in enumerate(meshes):
-            name = f"Data/tissue_{k}.ply"
-            _put(archive, name, _ply(mesh, unit))
-            scene.add_model(name)
-            progress(k + 1, len(seconds))
-        scene.add("Sequence", "tissue", singleton="SequenceIndex", **_index(seconds))
-        _put(archive, f"{FOLDER}.mrml", scene.file())
+    with tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES) as sequence:
+        with ZipFile(sequence, "w") as inner:
+            for k, content in enumerate(contents):
+                if not k:
+                    _put(archive, played.first_file, content)
+                name = f"Data/{played.name}_{k}{played.suffix}"
+                _put(inner, name, content)
+                scene.add_stored(played.tags, played.name, name)
+            scene.add("Sequence", played.name, singleton="SequenceIndex", **_index(played, seconds))
+            _put(inner, f"{FOLDER}.mrml", scene.file())
+        entry = _entry(played.sequence_file)  # stored as it is: its files are compressed
+        entry.file_size = sequence.tell()
+        sequence.seek(0)
+        with archive.open(entry, "w") as stored:
+            shutil.copyfileobj(sequence, stored)
 
 
-def _scene_text(first: Mesh, camera: Camera, seconds: list[float]) -> bytes:
-    """The scene that Slicer opens, with the first mesh shown."""
+def _scene_text(first: Mesh, camera: Camera, seconds: list[float], played: list[Played]) -> bytes:
+    """The scene that Slicer opens, with the first time step shown."""
     scene = SlicerScene()
     scene.add("Camera", "Camera", singleton="1", **_view(first, camera))
-    display = scene.add(
-        "ModelDisplay",
-        "display",
-        scalarVisibility="true",
-        activeScalarName="RGB",  # the name that VTK gives the colors of a PLY file
-        activeAttributeLocation="point",
-        scalarRangeFlag="UseDirectMapping",
-        ambient="1",  # colors are those of the video, the endoscope's light included: do not light them again
-        diffuse="0",
-        backfaceCulling="false",
-    )
-    model = scene.add_model(MODEL_FILE, {"display": display})
-    storage = scene.add("SequenceStorage", "storage", fileName=SEQUENCE_FILE)
-    attributes = {"attributes": "DataNodeClassName:vtkMRMLModelNode", **_index(seconds)}
-    sequence = scene.add("Sequence", "tissue", {"storage": storage}, **attributes)
+    roles: dict[str, str] = {}
+    for k, each in enumerate(played):
+        display = scene.add(name="display", **DISPLAYS[each])
+        shown = scene.add_stored(each.tags, each.name, each.first_file, {"display": display})
+        storage = scene.add("SequenceStorage", "storage", fileName=each.sequence_file)
+        attributes = {"attributes": f"DataNodeClassName:vtkMRML{each.tags[0]}Node", **_index(each, seconds)}
+        sequence = scene.add("Sequence", each.name, {"storage": storage}, **attributes)
+        roles |= {f"sequenceNodeRef{k}": sequence, f"dataNodeRef{k}": shown}
+    synchronization = "playback true recording false overwriteProxyName false saveChanges false"
     scene.add(
         "SequenceBrowser",
         "tissue",
-        {"sequenceNodeRef0": sequence, "dataNodeRef0": model},
-        virtualNodePostfixes="0",
-        SynchronizationPropertiesMap0="playback true recording false overwriteProxyName false saveChanges false",
+        roles,
+        virtualNodePostfixes=" ".join(str(k) for k in range(len(played))),
         playbackRateFps=f"{(len(seconds) - 1) / (seconds[-1] - seconds[0]):.6g}",
         playbackLooped="true",
         selectedItemNumber="0",
+        **{f"SynchronizationPropertiesMap{k}": synchronization for k in range(len(played))},
     )
     return scene.file()
 
 
-def _index(seconds: list[float]) -> dict[str, str]:
-    """What says at which second each model of the sequence is shown."""
-    models = (f"vtkMRMLModelNode{k + 1}:{second:.9g}" for k, second in enumerate(seconds))
+def _index(played: Played, seconds: list[float]) -> dict[str, str]:
+    """What says at which second each node of the sequence is shown."""
+    nodes = (f"vtkMRML{played.tags[0]}Node{k + 1}:{second:.9g}" for k, second in enumerate(seconds))
     return {
         "indexName": "time",
         "indexUnit": "s",
         "indexType": "numeric",
         "numericIndexValueTolerance": f"{np.diff(seconds).min() / 10:.3g}",
-        "indexValues": ";".join(models),
+        "indexValues": ";".join(nodes),
     }
 
 
@@ -148,5 +217,8 @@ def _entry(name: str) -> ZipInfo:
 
 
 FORMAT = Format(
-    suffixes=(".mrb",), options=("times", "split", *SURFACE_OPTIONS), write=write, holds="a sequence of meshes"
+    suffixes=(".mrb",),
+    options=("times", "split", "points", *SURFACE_OPTIONS),
+    write=write,
+    holds="a sequence of meshes",
 )
