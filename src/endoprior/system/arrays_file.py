@@ -176,8 +176,8 @@ def _match(stored: Mapping[str, tuple[str, tuple[int, ...]]], schema: Mapping[st
 
 
 def _digest(arrays: Mapping[str, Tensor], about: Mapping[str, Any]) -> str:
-    """BLAKE2b, 128 bits, of the metadata and of the name, type, shape and bytes of each array."""
-    digest = hashlib.blake2b(json.dumps(about, sort_keys=True).encode(), digest_size=16)
+    """SHA-256 of the metadata and of the name, type, shape and bytes of each array."""
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
     for name, value in sorted(arrays.items()):
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
         digest.update(value.numpy().reshape(-1).view("u1"))
