@@ -145,6 +145,7 @@ def encode_png(pixels: NDArray, compression: int = 1) -> bytes:
     Raises:
         MemoryError: the encoder stopped; libpng has no other reason with pixels of these types.
     """
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below replaces its messages
     stored = np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels
     done, encoded = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, compression])
     if not done or not (data := encoded.tobytes()).endswith(PNG_END):
