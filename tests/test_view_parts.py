@@ -11,12 +11,13 @@ import pytest
 from endoprior.core.checks import InputError
 from endoprior.core.geometry import project
 from endoprior.core.types import Camera
+from endoprior.data.images import encode_png
 from endoprior.view.access_control import check_address, is_trusted
 from endoprior.view.browsers import Browsers
 from endoprior.view.line_overlay import concatenated, draw_lines, no_lines, ruler, track_lines
 from endoprior.view.measure import POINTS_OF, Measurement, measurement_text, pick
 from endoprior.view.point_rendering import render_points
-from endoprior.view.saving import keep, mp4_bytes, png_bytes
+from endoprior.view.saving import keep, mp4_bytes
 from endoprior.view.video_path import PathPoint, follow_frames, interpolate
 from endoprior.view.view_settings import frame_due, shrink_factor
 from endoprior.view.viewport import bounded_aspect, endoscope_viewport, free_viewport
@@ -199,7 +200,7 @@ def test_an_occupied_address_is_an_error():
 
 def test_files_are_never_overwritten_and_stay_in_the_folder(tmp_path):
     picture = np.zeros((8, 8, 3), np.uint8)
-    first, second = (keep(tmp_path / "view", "a.png", png_bytes(picture)) for _ in range(2))
+    first, second = (keep(tmp_path / "view", "a.png", encode_png(picture)) for _ in range(2))
     assert first != second and first.read_bytes() == second.read_bytes()
     assert b"ftyp" in mp4_bytes([picture] * 3, 10.0)[:32]
     for name in ("../a.png", "/etc/a.png", "b/a.png", ".."):

@@ -20,6 +20,7 @@ from typing import Any
 import viser
 
 from ..core.checks import InputError
+from ..data.images import encode_png
 from . import panel, saving
 from .access_control import check_address
 from .browsers import Browsers, camera_pose, picture_with_lines
@@ -339,7 +340,7 @@ class Viewer:
         if viewport is None:
             return
         picture = picture_with_lines(self.viewable, self.settings, viewport.camera, self._lines(self.settings))
-        self._offer(client, f"{self.settings.layer}_{self.settings.frame:06d}.png", saving.png_bytes(picture))
+        self._offer(client, f"{self.settings.layer}_{self.settings.frame:06d}.png", encode_png(picture))
 
     def _save_video(self, client: viser.ClientHandle) -> None:
         viewport = self._browsers.viewport(client, self.viewable, self.settings)
