@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from endoprior.cli import main
 from endoprior.view.server import Viewer
 
@@ -28,3 +30,6 @@ def test_ctrl_c_is_the_usual_way_to_end_the_viewer(tiny_sequence, capsys, monkey
     assert main(["view", str(tiny_sequence), "--port", "0"]) == 0
     printed = capsys.readouterr()
     assert printed.out.endswith("viewer closed\n") and "interrupted" not in printed.err
+    assert re.search(r": http://127\.0\.0\.1:\d+/[\w-]{32}/  \(Ctrl-C", printed.out) and "encrypted" not in printed.out
+    assert main(["view", str(tiny_sequence), "--port", "0", "--host", "0.0.0.0"]) == 0
+    assert "nothing is encrypted" in capsys.readouterr().out.splitlines()[0]
