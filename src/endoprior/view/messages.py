@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from ..core.geometry import FARTHEST_MM
@@ -23,51 +24,32 @@ def are_numbers(values: Any, count: int, largest: float) -> bool:
     return all(type(v) in (int, float) and -largest <= v <= largest for v in values)
 
 
-def _is_place(value: Any) -> bool:
-    return are_numbers(value, 3, FARTHEST_MM)
-
-
-def _is_on_screen(value: Any) -> bool:
-    return are_numbers(value, 2, 1e3)
-
-
-def _is_side(value: Any) -> bool:
-    return are_numbers([value], 1, LARGEST_CANVAS) and value >= 0
-
-
-def _is_modifier(value: Any) -> bool:
-    return value is None or isinstance(value, str)
-
-
-FIELDS: dict[str, dict[str, Callable[[Any], bool]]] = {
-    "ViewerCameraMessage": {
-        "wxyz": lambda value: are_numbers(value, 4, 1e3) and math.hypot(*value) > 1e-6,
-        **dict.fromkeys(("position", "look_at", "up_direction"), _is_place),
-        "fov": lambda value: are_numbers([value], 1, 4),
-        **dict.fromkeys(("image_width", "image_height"), _is_side),
-    },
-    "ScenePointerMessage": {
-        "event_type": lambda value: value == "click",
-        "screen_pos": lambda value: isinstance(value, list | tuple) and len(value) == 1 and _is_on_screen(value[0]),
-        **dict.fromkeys(("ray_origin", "ray_direction"), _is_place),
-        "modifier": _is_modifier,
-    },
-    "SceneNodeDragMessage": {
-        "phase": lambda value: value in ("start", "update", "end"),
-        "button": lambda value: value == "left",
-        "name": lambda value: value == BRUSH_NODE,
-        "owner": lambda value: value == "",
-        "instance_index": lambda value: value is None,
-        **dict.fromkeys(("start_screen_pos", "end_screen_pos"), _is_on_screen),
-        **dict.fromkeys(("start_position", "end_position"), _is_place),
-        "modifier": _is_modifier,
-    },
+_is_place = partial(are_numbers, count=3, largest=FARTHEST_MM)
+_is_on_screen = partial(are_numbers, count=2, largest=1e3)
+KINDS = ("ViewerCameraMessage", "ScenePointerMessage", "SceneNodeDragMessage")
+FIELDS: dict[str, Callable[[Any], bool]] = {
+    "wxyz": lambda value: are_numbers(value, 4, 1e3) and math.hypot(*value) > 1e-6,
+    **dict.fromkeys(("position", "look_at", "up_direction"), _is_place),
+    "fov": lambda value: are_numbers([value], 1, 4),
+    **dict.fromkeys(
+        ("image_width", "image_height"), lambda value: are_numbers([value], 1, LARGEST_CANVAS) and value >= 0
+    ),
+    "event_type": lambda value: value == "click",
+    "screen_pos": lambda value: isinstance(value, list | tuple) and len(value) == 1 and _is_on_screen(value[0]),
+    **dict.fromkeys(("ray_origin", "ray_direction", "start_position", "end_position"), _is_place),
+    **dict.fromkeys(("start_screen_pos", "end_screen_pos"), _is_on_screen),
+    "phase": lambda value: value in ("start", "update", "end"),
+    "button": lambda value: value == "left",
+    "name": lambda value: value == BRUSH_NODE,
+    "owner": lambda value: value == "",
+    "instance_index": lambda value: value is None,
+    "modifier": lambda value: value is None or isinstance(value, str),
 }
-"""For each accepted type of message, whether a field can have a value; `GuiUpdateMessage` is the fourth type."""
+"""For the fields of messages of these kinds, whether they can have a value. viser rejects a message without one."""
 
 
 def is_valid_message(message: Any, accepts: Callable[[str, Any], bool]) -> bool:
-    """Whether the viewer's own page could have sent this decoded message.
+    """Whether the viewer's own page could have sent this decoded message: one of `KINDS`, or a value of a control.
 
     Args:
         accepts: whether the control with this id can have this value.
@@ -79,5 +61,5 @@ def is_valid_message(message: Any, accepts: Callable[[str, Any], bool]) -> bool:
         # viser would set any other attribute too, such as callbacks or visibility.
         named = isinstance(updates, dict) and updates.keys() == {"value"}
         return named and accepts(str(message.get("uuid")), updates["value"])
-    rules = FIELDS.get(str(message.get("type")), {})
-    return bool(rules) and all(name in message and rule(message[name]) for name, rule in rules.items())
+    rules = ((rule, message[name]) for name, rule in FIELDS.items() if name in message)
+    return message.get("type") in KINDS and all(rule(value) for rule, value in rules)
