@@ -37,13 +37,12 @@ LAYERS = ("color", "depth", "displacement")
 class Client:
     """The browser's side of one connection."""
 
-    port: int
+    url: str
 
     def __post_init__(self) -> None:
         version = server_module.viser.__version__
-        self.socket = connect(
-            f"ws://127.0.0.1:{self.port}", subprotocols=[f"viser-v{version}"], max_size=None, compression=None
-        )
+        address = self.url.replace("http:", "ws:").removesuffix("/")
+        self.socket = connect(address, subprotocols=[f"viser-v{version}"], max_size=None, compression=None)
         camera = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "look_at": (0, 0, 60), "up_direction": (0, -1, 0)}
         camera |= {"fov": 0.9, "near": 0.01, "far": 1000.0, "image_height": 800, "image_width": 960}
         self.send("ViewerCameraMessage", **camera)
@@ -80,7 +79,7 @@ def measure(sizes: tuple[common.Size, ...]) -> list[common.Row]:
         viewer = server_module.Viewer(make_viewable(size))
         worker = threading.Thread(target=work, args=(viewer, stop := threading.Event()), daemon=True)
         worker.start()
-        client = Client(viewer.port)
+        client = Client(viewer.url)
         client.wait_for("BackgroundImageMessage")
         moves = iter(range(1, 1 << 30))
 

@@ -29,6 +29,17 @@ def cut(name: str, by: int) -> Step:
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:-by])
 
 
+def flipped(name: str) -> Step:
+    """Changes one bit near the end of a file: the last digit of a number."""
+
+    def flip(folder: Path) -> None:
+        content = bytearray((folder / name).read_bytes())
+        content[-4] ^= 1
+        (folder / name).write_bytes(content)
+
+    return flip
+
+
 def header(text: bytes | str, length: int | None = None) -> bytes:
     """A safetensors file that is nothing but a header."""
     encoded = text if isinstance(text, bytes) else text.encode()
@@ -76,6 +87,7 @@ RUNS = [
     scene("a scene of nothing", put(SCENE, b"")),
     scene("a scene of noise", put(SCENE, BYTES * 20)),
     scene("a scene cut short", cut(SCENE, 100)),
+    scene("a scene with one bit flipped", flipped(SCENE), says=("the bits that were written",)),
     scene("a scene with an endless header", put(SCENE, header("{}", 1 << 63))),
     scene("a scene that promises terabytes", put(SCENE, header(TERABYTES))),
     scene("a scene without a description", put(SCENE, header("{}"))),
@@ -96,6 +108,7 @@ RUNS = [
     Case("other data", given(f"{EVAL} --data other", put("other/images/a.png", "x"), needs="run"), ("other",)),
     resumed("nothing to resume", without(CHECKPOINT), without(CONFIG)),
     resumed("a checkpoint cut short", cut(CHECKPOINT, 100)),
+    resumed("a checkpoint with one bit flipped", flipped(CHECKPOINT), says=("the bits that were written",)),
     resumed("a checkpoint of noise", put(CHECKPOINT, BYTES * 20)),
     resumed("a checkpoint that promises terabytes", put(CHECKPOINT, header(TERABYTES))),
     resumed("a checkpoint nested without end", put(CHECKPOINT, about(NESTED))),

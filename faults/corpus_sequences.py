@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from corpus_bombs import jpeg_bomb, jpeg_of_two_sizes, tiff_bomb
 from corpus_case import Case, given
 from corpus_damage import (
     CHECK,
@@ -162,6 +163,9 @@ PICTURES = [
         noise="libpng",
     ),
     Case("a TIFF that promises too much", damaged(put(IMAGE, LYING_TIFF)), (IMAGE, "16777216x40")),
+    Case("a JPEG of 4 Gpx in 2 KB", damaged(put(IMAGE, jpeg_bomb())), (IMAGE, "65500x65500")),
+    Case("a JPEG of two sizes", damaged(put(IMAGE, jpeg_of_two_sizes())), (IMAGE, "cannot be decoded")),
+    Case("a TIFF of two sizes", damaged(put(IMAGE, tiff_bomb((20000, 20000), (48, 40)))), (IMAGE, "20000x20000")),
     Case("another size", damaged(picture(IMAGE, NOISE[:30])), (IMAGE, "48x40", "48x30")),
     Case("16-bit color", damaged(picture(IMAGE, NOISE.astype(np.uint16))), (IMAGE, "16-bit")),
     Case("a gray picture", damaged(picture(IMAGE, NOISE[..., 0])), (IMAGE, "1 channel")),

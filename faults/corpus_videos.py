@@ -10,6 +10,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from corpus_bombs import mov_bomb
 from corpus_case import Build, Case, Step, given
 from corpus_damage import NOISE, SOUND, empty_folder, link, picture, pipe, png_bomb, put
 
@@ -114,6 +115,7 @@ CASES = [
     Case("a video of 2x2 px", encoded([(2, 2)] * 3), ("32",)),
     Case("a video of odd size", encoded([(65, 47)] * 3), leaves=("out",)),
     Case("a size that changes", given(f"prepare clip.mpg out {PLAIN}", growing), ("clip.mpg", "64x48", "96x80")),
+    Case("a video of bombs", video("clip.mov", mov_bomb(png_bomb(16000, 15000))), ("clip.mov", "64 Mpx")),
     Case("a playlist to a local file", video("clip.mp4", HLS.format("clip.mkv")), ("clip.mp4", "a video file")),
     Case("a playlist to an address", video("clip.mp4", HLS.format("http://127.0.0.1:9/a.ts")), ("clip.mp4",)),
     Case("a playlist to a secret", video("clip.m3u8", HLS.format("file:///etc/passwd")), ("clip.m3u8", "playlist")),

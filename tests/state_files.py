@@ -23,11 +23,12 @@ class StateFile:
 
     @staticmethod
     def read(path: Path) -> StateFile:
-        """Every array and the description."""
+        """Every array and the description, without the digest, which would reject every change."""
         raw = path.read_bytes()
         end = 8 + int.from_bytes(raw[:8], "little")
         header = json.loads(raw[8:end])
         about = json.loads(header.pop("__metadata__")["endoprior"])
+        about.pop("digest", None)
         arrays = {}
         for name, entry in header.items():
             first, last = entry["data_offsets"]

@@ -38,6 +38,17 @@ def resume(run) -> GaussianTrainer:
     return trainer
 
 
+def test_every_flipped_bit_is_noticed(run, tmp_path):
+    trainer, file, _ = run
+    data, rng = file.read_bytes(), np.random.default_rng(0)
+    damaged = tmp_path / "checkpoint.safetensors"
+    for at in rng.integers(8 + int.from_bytes(data[:8], "little"), len(data), 30):
+        damaged.write_bytes(data[:at] + bytes([data[at] ^ 1 << at % 8]) + data[at + 1 :])
+        with pytest.raises(InputError, match=r"Fix: Train again without --resume\."):
+            resume((trainer, damaged, None))
+    assert resume(run).finished
+
+
 def test_the_schema_is_what_a_checkpoint_holds(run):
     trainer, file, stored = run
     stored.write(file)

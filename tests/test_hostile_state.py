@@ -88,6 +88,20 @@ def test_the_good_file_is_good(scene, path):
     assert load_scene(path).render(0.3).color.isfinite().all()
 
 
+def test_every_flipped_bit_is_noticed_and_files_without_a_digest_are_read(scene, path):
+    moving_scene(moving_camera=True).save(path)
+    data, rng = path.read_bytes(), random.Random(0)
+    arrays = 8 + int.from_bytes(data[:8], "little")
+    for at in (*(rng.randrange(arrays, len(data)) for _ in range(50)), data.index(b"frames_per_second") + 22):
+        path.write_bytes(data[:at] + bytes([data[at] ^ 1 << rng.randrange(3)]) + data[at + 1 :])
+        assert "Fix: Train the scene again." in complaint(path, f"byte {at}")
+    path.write_bytes(data)
+    assert set(StateFile.read(path).about) == set(scene.about), "without the digest"
+    color = load_scene(path).render(0.3).color
+    scene.write(path)
+    assert torch.equal(load_scene(path).render(0.3).color, color)
+
+
 DEEP = "[" * 100_000 + "]" * 100_000
 BYTES = {
     "empty": lambda header, data: b"",

@@ -11,7 +11,7 @@ from PIL import Image, ImageOps
 
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.data.image_header import is_whole, orientation, stored_size
+from endoprior.data.image_header import read_header
 from endoprior.data.images import decode_image, read_color
 from endoprior.prepare.source import open_source
 
@@ -35,7 +35,7 @@ def test_images_are_read_as_they_are_shown(tmp_path, kind, turn):
     path = tmp_path / f"a.{kind.lower()}"
     path.write_bytes(data)
     shown = np.asarray(ImageOps.exif_transpose(Image.open(path)).convert("RGB")).astype(int)
-    assert stored_size(data) == shown.shape[1::-1] and orientation(data) == turn
+    assert read_header(data) == (*shown.shape[1::-1], turn)
     for found in (read_color(path, shown.shape[1::-1]), decode_image(path, None, cv2.IMREAD_COLOR)[..., ::-1]):
         assert found.shape == shown.shape and np.abs(found.astype(int) - shown).mean() < 3
 
@@ -62,23 +62,31 @@ def jpegs():
 @pytest.mark.parametrize("data", list(jpegs()), ids=["progressive", "restarts", "small picture"])
 def test_what_follows_the_end_of_a_jpeg_does_not_count(tmp_path, data, capfd):
     for tail in (b"", b"\0" * 5000, b"trailer" * 3000, encoded("JPEG", pixels=PIXELS[:8])[:-300]):
-        assert is_whole(data + tail) and stored_size(data + tail) == (80, 48)
+        assert read_header(data + tail) == (80, 48, 1)
         (tmp_path / "a.jpg").write_bytes(data + tail)
         np.testing.assert_array_equal(
             read_color(tmp_path / "a.jpg"), cv2.imdecode(np.frombuffer(data, np.uint8), 1)[..., ::-1]
         )
     for length in range(2, len(data), 41):
-        assert not is_whole(data[:length])
+        assert read_header(data[:length]) is None
     (tmp_path / "a.jpg").write_bytes(data[:-90])
     with pytest.raises(InputError, match="cannot be decoded"):
         read_color(tmp_path / "a.jpg")
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning:PIL")  # as everywhere but in tests
 def test_damaged_exif_says_nothing():
     data = bytearray(encoded("JPEG", 6))
     at = data.index(b"Exif\0\0") + 6
     for position in range(at, at + 20):
         broken = bytes(data[:position]) + bytes([data[position] ^ 255]) + bytes(data[position + 1 :])
-        assert 1 <= orientation(broken) <= 8
-    assert orientation(b"") == orientation(b"II") == orientation(bytes(data[: at + 9])) == 1
+        assert read_header(broken) in ((80, 48, 1), (48, 80, 6))
+
+
+def test_exif_behind_the_pixels_of_a_png(tmp_path):
+    data = encoded("PNG", 6)
+    start = data.index(b"eXIf") - 4
+    stop = start + 12 + int.from_bytes(data[start : start + 4], "big")
+    moved = data[:start] + data[stop:-12] + data[start:stop] + data[-12:]
+    assert read_header(moved) == read_header(data) == (48, 80, 6)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from endoprior.cli import main
 from endoprior.view.server import Viewer
 
@@ -25,6 +27,12 @@ def test_ctrl_c_is_the_usual_way_to_end_the_viewer(tiny_sequence, capsys, monkey
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Viewer, "work", stop)
-    assert main(["view", str(tiny_sequence), "--port", "0"]) == 0
-    printed = capsys.readouterr()
+    tokens = set()
+    for _ in range(2):
+        assert main(["view", str(tiny_sequence), "--port", "0"]) == 0
+        printed = capsys.readouterr()
+        tokens.add(re.search(r": http://127\.0\.0\.1:\d+/([\w-]{32})/  \(Ctrl-C", printed.out)[1])
+    assert len(tokens) == 2 and "encrypted" not in printed.out
     assert printed.out.endswith("viewer closed\n") and "interrupted" not in printed.err
+    assert main(["view", str(tiny_sequence), "--port", "0", "--host", "0.0.0.0"]) == 0
+    assert "nothing is encrypted" in capsys.readouterr().out.splitlines()[0]

@@ -196,7 +196,7 @@ def test_a_click_finds_a_tool_in_all_frames_over_the_protocol(tiny_sequence, cap
     found_in(monkeypatch, {0: np.s_[5:9, 5:9], 2: np.s_[5:9, 30:35]}, clicks)
     with at_work(Viewer(viewable)) as viewer:
         panel, edits = viewer.panel, viewable.mask_edits
-        client = Client(viewer.port)
+        client = Client(viewer.url)
         client.send_camera()
         client.set(panel.correct, True)
         client.set(panel.find, True)
@@ -269,7 +269,7 @@ def test_painting_carrying_undoing_and_saving_over_the_protocol(tiny_sequence, c
     viewable, _ = open_viewable(tiny_sequence, None)
     with at_work(Viewer(viewable)) as viewer:
         panel, edits = viewer.panel, viewable.mask_edits
-        client = Client(viewer.port)
+        client = Client(viewer.url)
         client.send_camera()
         plain = client.image()
         client.drag([(0.3, 0.3), (0.5, 0.3)])  # the pointer belongs to the camera

@@ -1,6 +1,5 @@
-"""Pure functions of the viewer: playback, canvas, lines, measuring, video paths, points, access control, files."""
+"""Pure functions of the viewer: playback, canvas, lines, measuring, video paths, points, files."""
 
-import socket
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,15 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from endoprior.core.checks import InputError
 from endoprior.core.geometry import project
 from endoprior.core.types import Camera
-from endoprior.view.access_control import check_address, is_trusted
+from endoprior.data.images import encode_png
 from endoprior.view.browsers import Browsers
 from endoprior.view.line_overlay import concatenated, draw_lines, no_lines, ruler, track_lines
 from endoprior.view.measure import POINTS_OF, Measurement, measurement_text, pick
 from endoprior.view.point_rendering import render_points
-from endoprior.view.saving import keep, mp4_bytes, png_bytes
+from endoprior.view.saving import keep, mp4_bytes
 from endoprior.view.video_path import PathPoint, follow_frames, interpolate
 from endoprior.view.view_settings import frame_due, shrink_factor
 from endoprior.view.viewport import bounded_aspect, endoscope_viewport, free_viewport
@@ -166,40 +164,9 @@ def test_the_nearest_point_is_on_top():
     assert not render_points(points[2:], colors[2:], 1.0, CAMERA)[0].any()
 
 
-@pytest.mark.parametrize(
-    "origin, asked, bound, admitted",
-    (
-        (None, "127.0.0.1:1", "127.0.0.1", True),
-        ("http://127.0.0.1:80", "127.0.0.1:80", "127.0.0.1", True),
-        ("http://localhost:80", "localhost:80", "127.0.0.1", True),
-        ("http://evil.example", "127.0.0.1:80", "127.0.0.1", False),
-        ("http://127.0.0.1:81", "127.0.0.1:80", "127.0.0.1", False),
-        ("http://evil.example:80", "evil.example:80", "127.0.0.1", False),
-        ("http://server.example:80", "server.example:80", "0.0.0.0", True),
-        ("null", "127.0.0.1:80", "127.0.0.1", False),
-    ),
-)
-def test_pages_of_other_sites_are_rejected(origin, asked, bound, admitted):
-    assert is_trusted(origin, asked, bound) is admitted
-
-
-def test_an_occupied_address_is_an_error():
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        with pytest.raises(InputError, match="--port 0"):
-            check_address("127.0.0.1", taken.getsockname()[1])
-    with pytest.raises(InputError, match="--port"):
-        check_address("127.0.0.1", 70000)
-    for host in ("192.0.2.7", "no such host", "x" * 300):
-        with pytest.raises(InputError, match="Correct --host"):
-            check_address(host, 0)
-    check_address("127.0.0.1", 0)
-
-
 def test_files_are_never_overwritten_and_stay_in_the_folder(tmp_path):
     picture = np.zeros((8, 8, 3), np.uint8)
-    first, second = (keep(tmp_path / "view", "a.png", png_bytes(picture)) for _ in range(2))
+    first, second = (keep(tmp_path / "view", "a.png", encode_png(picture)) for _ in range(2))
     assert first != second and first.read_bytes() == second.read_bytes()
     assert b"ftyp" in mp4_bytes([picture] * 3, 10.0)[:32]
     for name in ("../a.png", "/etc/a.png", "b/a.png", ".."):
@@ -227,7 +194,7 @@ def test_the_measured_quantity_is_told_with_its_unit_and_reference():
 
 
 def test_browsers_ride_along_with_the_endoscope():
-    """A browser 5 mm beside the endoscope stays 5 mm beside it, turned as it is; one without a place stays nowhere."""
+    """A browser 5 mm beside the endoscope stays 5 mm beside it, turned as it is."""
     turned = np.eye(4)
     turned[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # the camera looks along -x
     place = {
@@ -235,16 +202,13 @@ def test_browsers_ride_along_with_the_endoscope():
         "look_at": np.array([5.0, 0, 60]),
         "up_direction": np.array([0, -1.0, 0]),
     }
-    cameras = [SimpleNamespace(wxyz=np.array([1.0, 0, 0, 0]), fov=0.9, **place) for _ in range(2)]
-    cameras[1].fov = np.nan
-    clients = {i: SimpleNamespace(client_id=i, camera=c, atomic=nullcontext) for i, c in enumerate(cameras)}
-    browsers = Browsers(SimpleNamespace(get_clients=lambda: clients))
-    for client in clients.values():
-        browsers.join(client)
+    camera = SimpleNamespace(**place)
+    client = SimpleNamespace(client_id=0, camera=camera, atomic=nullcontext)
+    browsers = Browsers(SimpleNamespace(get_clients=lambda: {0: client}))
+    browsers.join(client)
     browsers.ride(CAMERA, CAMERA)
-    np.testing.assert_array_equal(cameras[0].position, [5, 0, 0])
+    np.testing.assert_array_equal(camera.position, [5, 0, 0])
     browsers.ride(CAMERA, replace(CAMERA, world_to_camera=turned))
-    np.testing.assert_allclose(cameras[0].position, [0, 0, -5], atol=1e-12)
-    np.testing.assert_allclose(cameras[0].look_at, [60, 0, -5], atol=1e-12)
-    np.testing.assert_allclose(cameras[0].up_direction, [0, -1, 0], atol=1e-12)
-    np.testing.assert_array_equal(cameras[1].position, [5, 0, 0])
+    np.testing.assert_allclose(camera.position, [0, 0, -5], atol=1e-12)
+    np.testing.assert_allclose(camera.look_at, [60, 0, -5], atol=1e-12)
+    np.testing.assert_allclose(camera.up_direction, [0, -1, 0], atol=1e-12)

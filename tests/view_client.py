@@ -15,19 +15,18 @@ from numpy.typing import NDArray
 from websockets.protocol import State
 from websockets.sync.client import connect
 
-from endoprior.view.access_control import BRUSH_NODE
+from endoprior.view.messages import BRUSH_NODE
 from endoprior.view.panel import control_id
 
 VISER = "viser-v1.1.1"
 
 
 class Client:
-    """The browser's side of one connection: a canvas of 600 x 480 px."""
+    """The browser's side of one connection to the page at `url`: a canvas of 600 x 480 px."""
 
-    def __init__(self, port: int, **options: Any) -> None:
-        self.socket = connect(
-            f"ws://127.0.0.1:{port}", subprotocols=[VISER], max_size=None, compression=None, **options
-        )
+    def __init__(self, url: str, **options: Any) -> None:
+        address = url.replace("http:", "ws:").removesuffix("/")
+        self.socket = connect(address, subprotocols=[VISER], max_size=None, compression=None, **options)
 
     def send_camera(self, **changes: Any) -> None:
         """Send the position of its camera."""

@@ -3,6 +3,7 @@
 Names are imported when first used, so that `import endoprior` and `endoprior --help` stay fast.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
     from .model.scene_file import load_scene
     from .priors import joint_texture_prior
     from .runs.train import train
+
+# OpenCV reads at its import how many pixels it decodes at most (`data.reading.MOST_PIXELS`): what a header says twice,
+# its decoders and the readers of headers may understand differently. A value set by the user stays.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "64000000")
 
 HOMES = {
     "Config": "core.config",

@@ -40,7 +40,7 @@ class View:
     highlights: bool = True
     """`--no-highlights` shows the tissue below the highlights of a run, as other frames show it."""
     host: str = "127.0.0.1"
-    """Address to listen on. Everyone who can reach it sees the scene; there is no password."""
+    """Address to listen on. Other machines reach any but 127.0.0.1, without encryption."""
     port: int = DEFAULT_PORT
     """Port to listen on; 0 uses any free port."""
     device: Wanted = "auto"
@@ -53,11 +53,14 @@ HELP = Help(examples=(("RUN",), ("DATA", "--port", "9000")))
 def run(argv: list[str]) -> None:
     """Serve until interrupted."""
     args = parse(View, argv, "view", HELP)
-    from ..view.access_control import check_address
+    viewer_class = import_viewer()
+    from ..view.access_control import check_address, is_open
 
     check_address(args.host, args.port)
     viewable, out = open_viewable(args.path, args.data, args.device, highlights=args.highlights)
-    viewer = import_viewer()(viewable, host=args.host, port=args.port, out=out)
+    viewer = viewer_class(viewable, host=args.host, port=args.port, out=out)
+    if is_open(args.host):
+        say("--host: whoever learns the address below can see and change everything here; nothing is encrypted.")
     say(f"{viewable.title}: {viewer.url}  (Ctrl-C stops)")
     try:
         viewer.run()

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.extras import install_command
 from .depth_fill import is_measured
-from .images import MOST_PIXELS, decode_image, single_channel
+from .images import decode_image, single_channel
 from .numpy_files import read_only_array
-from .reading import demand_file
+from .reading import MOST_PIXELS, demand_file
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
 """Suffixes of the files this module reads, in lower case."""

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from .depth_fill import is_measured
-from .image_header import TIFF_STARTS, TURNED, is_whole, orientation, stored_size
-from .reading import read_bytes
+from .image_header import TIFF_STARTS, TURNED, read_header
+from .reading import MOST_PIXELS, read_bytes
 
-MOST_PIXELS = 64_000_000
-"""Of one image; 7680x4320 has half as many."""
+PNG_END = b"IEND\xaeB`\x82"
+"""Last bytes of every PNG file."""
 
 
 def read_color(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
@@ -92,21 +92,20 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
     """
     encoded = read_bytes(path)
     data = encoded.tobytes()
-    header_size = stored_size(data)
-    if header_size and header_size[0] * header_size[1] > MOST_PIXELS:
-        got = f"{header_size[0]}x{header_size[1]} px in its header"
+    header = read_header(data)
+    if header and header.width * header.height > MOST_PIXELS:
+        got = f"{header.width}x{header.height} px in its header"
         raise input_error(path, f"an image of at most {MOST_PIXELS // 1_000_000} Mpx", got, "scale it down.")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below replaces its messages
     try:
-        whole = header_size and is_whole(data)
-        pixels = cv2.imdecode(encoded, flags | cv2.IMREAD_IGNORE_ORIENTATION) if whole else None
+        pixels = cv2.imdecode(encoded, flags | cv2.IMREAD_IGNORE_ORIENTATION) if header else None
     except cv2.error:
         pixels = None
     if pixels is None:
         got = f"{encoded.size} bytes that cannot be decoded"
         raise input_error(path, "an image (PNG, JPEG, TIFF, BMP, WebP)", got, "write the file again.")
     if not data.startswith(TIFF_STARTS):  # OpenCV turns TIFF whatever it is told
-        pixels = _upright(pixels, orientation(data))
+        pixels = _upright(pixels, header.orientation)
     got = (pixels.shape[1], pixels.shape[0])
     if size is not None and got != size:
         want, fix = f"{size[0]}x{size[1]} px like the first image", "bring all images, masks and depth to one size."
@@ -129,14 +128,29 @@ def save_png(path: Path, pixels: NDArray, compression: int = 1) -> None:
     """Write a PNG. It is encoded in memory first, because libpng prints to stderr when the disk is full.
 
     Args:
+        pixels, compression: as `encode_png`.
+    Raises:
+        OSError: the disk is full or not writable.
+        MemoryError: as `encode_png`.
+    """
+    path.write_bytes(encode_png(pixels, compression))
+
+
+def encode_png(pixels: NDArray, compression: int = 1) -> bytes:
+    """The bytes of a PNG file.
+
+    Args:
         pixels: (H, W) 8- or 16-bit, or (H, W, 3) 8-bit red, green, blue.
         compression: 0 to 9.
     Raises:
-        OSError: the disk is full or not writable.
+        MemoryError: the encoder stopped; libpng has no other reason with pixels of these types.
     """
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below replaces its messages
     stored = np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels
-    encoded = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, compression])[1]
-    path.write_bytes(encoded.tobytes())
+    done, encoded = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, compression])
+    if not done or not (data := encoded.tobytes()).endswith(PNG_END):
+        raise MemoryError("a PNG encoder that stopped")
+    return data
 
 
 def single_channel(path: Path, pixels: NDArray) -> NDArray:

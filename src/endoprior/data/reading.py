@@ -13,6 +13,8 @@ from ..core.checks import input_error
 
 MOST_BYTES = 1 << 30
 """Largest size of one file, also after decompression."""
+MOST_PIXELS = 64_000_000
+"""Most pixels of one image; 7680x4320 has half as many. `endoprior/__init__.py` tells OpenCV the same."""
 MOST_TEXT_BYTES = 64 << 20
 """Largest size of a JSON, YAML or text file."""
 ACCESS_HINT = "check the path and its permissions."

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .description import LEAST, MOST
 from .files import IMAGE_SUFFIXES, files_with, unequal_names
-from .image_header import stored_size
+from .image_header import read_header
 from .images import read_color
 from .reading import read_bytes
 from .shrink import shrunk_color
@@ -88,8 +88,8 @@ def open_right_eye(
         reason = f"baseline_mm in sequence.json is {repr(baseline)[:60]}, not a number in [{LEAST:g}, {MOST:g}]"
     elif relative:
         reason = "the scale of the depth is unknown, and the distance between the cameras is in mm"
-    elif (found := stored_size(read_bytes(files[0]).tobytes())) != size:
-        got = "no size that can be read" if found is None else f"{found[0]}x{found[1]} px"
+    elif not (found := read_header(read_bytes(files[0]).tobytes())) or found[:2] != size:
+        got = f"{found.width}x{found.height} px" if found else "no size that can be read"
         reason = f"its first image has {got}, and the left one {size[0]}x{size[1]} px"
     if reason:
         remarks.append(f"{folder}: ignored, because {reason}")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .reading import MOST_PIXELS
+
 if TYPE_CHECKING:
     from av.container import InputContainer
 
@@ -33,8 +35,9 @@ def open_container(path: Path) -> InputContainer:
     """
     import av
 
-    # The scheme keeps FFmpeg from reading a colon in the name as an address; the lists restrict it to this file.
-    limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
+    # The scheme keeps FFmpeg from reading a colon in the name as an address; the lists restrict it to this file. FFmpeg
+    # may decode an image to open a file, whatever size the container states.
+    limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file", "max_pixels": str(MOST_PIXELS)}
     return av.open(f"file:{path.absolute()}", options=limits)
 
 

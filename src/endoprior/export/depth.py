@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import io
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.images import encode_png
 from ..model.scene import Scene
 from ..model.surface import render_surface
 from .formats import Format
@@ -30,10 +30,7 @@ def depth_png(depth: NDArray[np.float32]) -> bytes:
     """A 16-bit gray PNG of (H, W) depth, mm; what is deeper than 655.35 mm does not fit and becomes 0, missing."""
     steps = np.rint(depth * np.float32(PNG_STEPS_PER_MM))
     fits = (steps > 0) & (steps <= 65535)
-    done, png = cv2.imencode(".png", np.where(fits, steps, 0).astype(np.uint16))
-    if not done:
-        raise OSError("could not encode a depth image")
-    return png.tobytes()
+    return encode_png(np.where(fits, steps, 0).astype(np.uint16))
 
 
 FORMAT = Format(

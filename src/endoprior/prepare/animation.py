@@ -12,7 +12,7 @@ from PIL.Image import DecompressionBombError, Image
 from PIL.Image import open as open_image
 
 from ..core.checks import input_error
-from ..data.images import MOST_PIXELS
+from ..data.reading import MOST_PIXELS
 from .source_frame import SourceFrame
 from .timeline import usual_rate
 
@@ -27,14 +27,15 @@ class Animation:
         self.path = path
         try:
             with open_image(path) as file:
-                shown, size = [_shown(file, index) for index in range(file.n_frames)], file.size
+                self.width, self.height = file.size
+                too_large = self.width * self.height > MOST_PIXELS
+                shown = [] if too_large else [_shown(file, index) for index in range(file.n_frames)]
         except (OSError, ValueError, SyntaxError, DecompressionBombError) as error:
             raise input_error(path, "a video", str(error).split("\n")[0], "Copy or export it again.") from None
-        self.num_frames, (self.width, self.height) = len(shown), size
-        if self.height * self.width > MOST_PIXELS:
+        if too_large:
             got, hint = f"{self.width}x{self.height}", "Export it at a smaller size."
             raise input_error(path, f"images of at most {MOST_PIXELS // 1_000_000} Mpx", got, hint)
-        self.times = [0.0, *accumulate(shown[:-1])]
+        self.num_frames, self.times = len(shown), [0.0, *accumulate(shown[:-1])]
         self.seconds = self.times[-1] + shown[-1]
         self.frames_per_second = usual_rate(self.times, [])
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..data.images import MOST_PIXELS
+from ..data.reading import MOST_PIXELS
 from ..data.video_files import num_joined_mp4, open_container, what_it_is
 from .decoding import AVI, DecodedImage, Undecodable, choose_track, decode, is_cover, packet_times
 from .source_frame import SourceFrame
@@ -67,7 +67,8 @@ class Video:
         self.start = 0.0
         first = next(iter(self), None)
         if first is None:
-            raise input_error(path, "a video with images", "none that can be decoded", "Copy or export it again.")
+            want = f"a video with images of at most {MOST_PIXELS // 1_000_000} Mpx"
+            raise input_error(path, want, "none that can be decoded", "Copy or export it again.")
         self.height, self.width = first.rgb_u8.shape[:2]
         lasts = max(self._announced_end - self.start, 0.0)
         self.seconds = max(lasts, self.times[-1] + self._step if self.times else 0.0)
@@ -111,7 +112,8 @@ class Video:
             except av.error.FFmpegError as error:
                 broken = error.strerror or str(error)
         self.was_damaged |= lost.count > 0
-        self._found = self._check_end(index, began or 0.0, last, shown_until, broken)
+        nothing_decodes = bool(self.times) and not index
+        self._found = [] if nothing_decodes else self._check_end(index, began or 0.0, last, shown_until, broken)
         self._found += self._oddities(timeline, lost.count, interlaced)
 
     def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
@@ -201,11 +203,15 @@ class Video:
             notes.append(f"{name}: {interlaced} images are interlaced; one field of each is used, with its rows filled")
         return notes
 
-    def _demand_size(self, width: int, height: int, index: int) -> None:
-        """Reject images that are too large, and a size that changes within the video."""
-        if max(width, self._shown_width(width)) * height > MOST_PIXELS:
+    def _demand_pixels(self, width: int, height: int) -> None:
+        """Reject images that are too large."""
+        if width * height > MOST_PIXELS:
             hint = "Export the video at a smaller size."
             raise input_error(self.path, f"images of at most {MOST_PIXELS // 1_000_000} Mpx", f"{width}x{height}", hint)
+
+    def _demand_size(self, width: int, height: int, index: int) -> None:
+        """Reject images that are too large, and a size that changes within the video."""
+        self._demand_pixels(max(width, self._shown_width(width)), height)
         self._size = self._size or (width, height)
         if (width, height) != self._size:
             want, got = "{}x{} px as in the first image".format(*self._size), f"{width}x{height} in image {index}"
@@ -227,6 +233,8 @@ class Video:
             if track is None:
                 got = "images in an unknown format" if container.streams.video else "a file without images"
                 raise input_error(self.path, "a video", got, "Check the path, or export it as H.264.")
+            self._demand_pixels(track.codec_context.width, track.codec_context.height)
+            # The size may change later, and that which the container states may be wrong.
             track.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
             yield container, track
 

@@ -1,11 +1,12 @@
 """Named arrays and metadata in one safetensors file: atomic, versioned, without pickle, deterministic bytes.
 
 A file may be untrusted. Its header is compared with its size and with a schema before any array is read, because
-kernels trust shapes and types. Then all values are checked to be finite.
+kernels trust shapes and types. Then all values are checked to be finite, and compared with the digest in the metadata.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import stat
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 KEY = "endoprior"
 """The single metadata entry. With several, safetensors writes them in random order, and equal files would differ."""
+DIGEST = "digest"
+"""The entry of the metadata with the digest of all others and of the arrays. Earlier versions wrote none."""
 LARGEST_HEADER = 2**20
 """Largest header (names, shapes, metadata), bytes; normal files have a few thousand."""
 LARGEST_FILE = 2**36
@@ -49,21 +52,23 @@ Schema = Callable[[dict[str, Any]], Mapping[str, ArraySpec]]
 
 
 def save_arrays(path: Path, arrays: Mapping[str, Tensor], about: Mapping[str, Any], file_format: str) -> None:
-    """Write tensors and JSON metadata.
+    """Write tensors and JSON metadata, with a digest of both.
 
     Args:
         file_format: name and version, such as `endoprior-scene-1`.
     """
     from safetensors.torch import save_file
 
-    text = json.dumps({"format": file_format, **about}, sort_keys=True)
+    stored = {name: value.detach().cpu().contiguous() for name, value in arrays.items()}
+    facts = {"format": file_format, **about}
+    text = json.dumps({**facts, DIGEST: _digest(stored, facts)}, sort_keys=True)
     with whole_file(path) as temporary:
         # The library writes to a temporary sibling of its own, which would remain after a kill.
         staging = temporary.with_name(f"{temporary.name}.staging")
         staging.mkdir()
         try:
             file = staging / "arrays"
-            save_file({name: value.detach().cpu().contiguous() for name, value in arrays.items()}, file, {KEY: text})
+            save_file(stored, file, {KEY: text})
             file.replace(temporary)
         finally:
             shutil.rmtree(staging, ignore_errors=True)
@@ -78,7 +83,8 @@ def load_arrays(path: Path, formats: Mapping[str, Schema], fix: str) -> tuple[di
     Returns:
         The arrays, which match the schema and are finite; and the metadata, with the `format` in it.
     Raises:
-        InputError: not a safetensors file, another format, or arrays that do not match the schema.
+        InputError: not a safetensors file, another format, arrays that do not match the schema, or bits that changed
+            since the file was written.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -87,6 +93,7 @@ def load_arrays(path: Path, formats: Mapping[str, Schema], fix: str) -> tuple[di
         _check_size(path)
         with safe_open(path, "pt") as opened:
             about = _strict_json((opened.metadata() or {})[KEY])
+            digest = about.pop(DIGEST, None)
             found = about["format"]
             if not isinstance(found, str) or found not in formats:
                 raise input_error(path, f"format {expected}", f"{found!r:.80}", fix)
@@ -97,6 +104,8 @@ def load_arrays(path: Path, formats: Mapping[str, Schema], fix: str) -> tuple[di
             arrays = {name: opened.get_tensor(name).clone() for name in stored}
         for name, value in arrays.items():
             _demand_finite(name, value)
+        if digest is not None and digest != _digest(arrays, about):
+            raise InputError("expected the bits that were written, got others: the file was damaged or changed")
         return arrays, about
 
 
@@ -164,6 +173,15 @@ def _match(stored: Mapping[str, tuple[str, tuple[int, ...]]], schema: Mapping[st
             bound = ", ".join(f"{letter} = {size}" for letter, size in sizes.items() if letter in spec.shape)
             known = f" with {bound}" if bound else ""
             raise InputError(f"expected the array {name} to be {spec}{known}, got {dtype} {shape}")
+
+
+def _digest(arrays: Mapping[str, Tensor], about: Mapping[str, Any]) -> str:
+    """SHA-256 of the metadata and of the name, type, shape and bytes of each array."""
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    for name, value in sorted(arrays.items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.numpy().reshape(-1).view("u1"))
+    return digest.hexdigest()
 
 
 def _demand_finite(name: str, value: Tensor) -> None:

@@ -1,32 +1,51 @@
-"""Access control of the viewer: which connections it accepts, and which messages are valid.
+"""Access control of the viewer: a secret token in its address, and limits of what a connection sends.
 
-Any program on this machine can connect, and viser trusts every message: a message could set any attribute of a control,
-or store parts of an upload that was not requested.
+viser has no option for either. `access_control` hands both to the web server (`websockets`) that viser starts.
 """
 
 from __future__ import annotations
 
 import errno
-import math
+import hmac
+import ipaddress
+import logging
 import socket
-from collections.abc import Callable, Mapping
+import time as clock
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from http import HTTPStatus
 from typing import Any
 from urllib.parse import urlsplit
 
-from ..core.checks import input_error
-from ..core.geometry import FARTHEST_MM
+import msgspec
+import websockets.asyncio.server as web_server
+from websockets.exceptions import ConnectionClosedError
+from websockets.http11 import Request, Response
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+from ..core.checks import input_error
+from .messages import is_valid_message
+
 MAX_MESSAGE_BYTES = 2**16
 """Largest message of a browser, bytes; normal messages have a few hundred."""
 MAX_BROWSERS = 32
 """Largest number of simultaneous connections."""
 MAX_PER_SECOND = 500
 """Largest message rate of one connection; dragging sends one per screen refresh."""
-BRUSH_NODE = "/brush"
-"""The only object of the scene that browsers can drag: see `mask_editor`."""
-LARGEST_CANVAS = 100_000
-"""Largest side of a canvas, px."""
+HEADERS = {
+    # viser's page is one file of inline scripts and styles. It unpacks them with WebAssembly, and its sorter of splats
+    # builds functions from text. Its workers, sorter and images are blob: or data: addresses.
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; "
+        "worker-src blob: data:; connect-src 'self' data:; img-src data: blob:; font-src data:; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+"""Headers of every response."""
 
 
 def check_address(host: str, port: int) -> None:
@@ -49,95 +68,109 @@ def check_address(host: str, port: int) -> None:
         raise input_error(f"{host}:{port}", "a free address", reason, fix) from None
 
 
-def is_trusted(origin: str | None, asked_host: str | None, bound_host: str) -> bool:
-    """Whether to accept a connection.
+def is_open(host: str) -> bool:
+    """Whether other machines can connect to a viewer that listens on this address of `check_address`."""
+    found = {answer[4][0] for answer in socket.getaddrinfo(host, None)}
+    return not all(ipaddress.ip_address(address).is_loopback for address in found)
 
-    A page of another site, open in the same browser, can connect to 127.0.0.1 too; it must not see the scene.
 
-    Args:
-        origin: the `Origin` header: the page that connects. Programs other than browsers send none.
-        asked_host: the `Host` header: the server name that the client uses.
-        bound_host: the address the viewer listens on.
+def is_known_host(asked: str, host: str) -> bool:
+    """Whether a `Host` header names this machine: by an IP address, as localhost, by its own name or by `host`.
+
+    Any other name was made to point here by somebody else (DNS rebinding).
     """
-    if origin is None:
-        return True
     try:
-        same, name = urlsplit(origin).netloc == asked_host, urlsplit(f"//{asked_host}").hostname
+        name = urlsplit(f"//{asked}").hostname or ""
+        if name in ("localhost", socket.gethostname().lower(), host.lower()):
+            return True
+        ipaddress.ip_address(name)
     except ValueError:
         return False
-    # Reject other names that resolve to this machine (DNS rebinding).
-    return same and (name in LOOPBACK if bound_host in LOOPBACK else True)
+    return True
 
 
 class RateLimit:
-    """Message rate of one connection."""
+    """Counts what happens in each second."""
 
-    def __init__(self) -> None:
-        self._since, self._count = 0.0, 0
+    def __init__(self, most: int) -> None:
+        self._most, self._since, self._count = most, float("-inf"), 0
 
     def exceeded(self, now: float) -> bool:
-        """Count a message received at `now`, s; whether there are more than `MAX_PER_SECOND` in this second."""
+        """Count an event at `now`, s; whether there are more than `most` in this second."""
         if now - self._since >= 1:
             self._since, self._count = now, 0
         self._count += 1
-        return self._count > MAX_PER_SECOND
+        return self._count > self._most
 
 
-def is_valid_message(kind: str, message: Mapping[str, Any], accepts: Callable[[str, Any], bool]) -> bool:
-    """Whether the viewer's own page could have sent this message.
+class _LimitedConnection(web_server.ServerConnection):
+    """A connection that passes on valid messages only, and ends if it floods or sends no MessagePack."""
+
+    def __init__(self, *args: Any, accepts: Callable[[str, Any], bool], **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._accepts, self._rate = accepts, RateLimit(MAX_PER_SECOND)
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        while True:
+            raw = await super().recv(decode)
+            try:
+                message = None if self._rate.exceeded(clock.monotonic()) else msgspec.msgpack.decode(raw)
+            except (msgspec.MsgspecError, RecursionError, TypeError, UnicodeDecodeError):
+                message = None
+            if message is None:
+                self.transport.abort()
+                raise ConnectionClosedError(None, None)
+            if is_valid_message(message, self._accepts):
+                return raw
+
+
+@contextmanager
+def access_control(token: str, host: str, accepts: Callable[[str, Any], bool]) -> Iterator[None]:
+    """Start the viser server within this context, to guard all of its pages and connections.
 
     Args:
-        kind: name of the message type.
-        message: its fields.
+        token: the path of the page, a secret.
+        host: address that the server listens on.
         accepts: whether the control with this id can have this value.
+    Raises:
+        RuntimeError: viser started no web server of `websockets`, so that nothing is guarded.
     """
-    if kind == "ViewerCameraMessage":
-        return is_camera(message) and _is_canvas(message)
-    if kind == "ScenePointerMessage":
-        return _is_click(message)
-    if kind == "SceneNodeDragMessage":
-        return _is_drag(message)
-    if kind == "GuiUpdateMessage":
-        updates, uuid = message["updates"], message["uuid"]
-        # viser would set any other attribute too, such as callbacks or visibility.
-        return isinstance(updates, dict) and updates.keys() == {"value"} and accepts(str(uuid), updates["value"])
-    return False
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # it logs a traceback for each malformed request
+    original, used = web_server.serve, False
 
+    def serve(*args: Any, process_request: Callable[..., Response], **options: Any) -> Any:
+        nonlocal used
+        used = True
 
-def is_camera(fields: Mapping[str, Any]) -> bool:
-    """Whether `wxyz`, `position`, `look_at`, `up_direction` and `fov` describe a camera near the tissue."""
-    places = (fields["position"], fields["look_at"], fields["up_direction"])
-    turned = are_numbers(fields["wxyz"], 4, 1e3) and math.hypot(*fields["wxyz"]) > 1e-6
-    return turned and all(are_numbers(place, 3, FARTHEST_MM) for place in places) and are_numbers([fields["fov"]], 1, 4)
+        def answer(connection: web_server.ServerConnection, request: Request) -> Response | None:
+            path, hosts = request.path, request.headers.get_all("Host")
+            given = path.partition("?")[0].strip("/").encode(errors="replace")
+            if len(hosts) != 1 or not is_known_host(hosts[0], host):
+                text = "Expected localhost, an IP address or the name of this machine in the address of the viewer.\n"
+                response = connection.respond(HTTPStatus.FORBIDDEN, text)
+            elif not hmac.compare_digest(given, token.encode()):
+                text = "Expected the address that endoprior printed when the viewer started: it has a token.\n"
+                response = connection.respond(HTTPStatus.FORBIDDEN, text)
+            elif "Upgrade" in request.headers:
+                if len(connection.server.connections) < MAX_BROWSERS:
+                    return None
+                response = connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "Too many browsers.\n")
+            elif path != f"/{token}/":  # viser's page obeys queries: one makes it connect to another server
+                response = connection.respond(HTTPStatus.FOUND, "")
+                response.headers["Location"] = f"/{token}/"
+            else:
+                response = process_request(connection, replace(request, path="/"))
+            response.headers.update(HEADERS)
+            return response
 
+        connection = partial(_LimitedConnection, accepts=accepts)
+        guarded = {"process_request": answer, "create_connection": connection, "max_size": MAX_MESSAGE_BYTES}
+        return original(*args, **options | guarded)
 
-def are_numbers(values: Any, count: int, largest: float) -> bool:
-    """Whether `values` are `count` finite numbers of absolute value at most `largest`."""
-    if not isinstance(values, list | tuple) or len(values) != count:
-        return False
-    return all(type(v) in (int, float) and -largest <= v <= largest for v in values)
-
-
-def _is_canvas(fields: Mapping[str, Any]) -> bool:
-    sides = [fields["image_width"], fields["image_height"]]
-    return are_numbers(sides, 2, LARGEST_CANVAS) and min(sides) >= 0
-
-
-def _is_click(fields: Mapping[str, Any]) -> bool:
-    places, ray = fields["screen_pos"], (fields["ray_origin"], fields["ray_direction"])
-    clicked = fields["event_type"] == "click" and isinstance(places, list | tuple) and len(places) == 1
-    known = _is_modifier(fields["modifier"])
-    return clicked and known and are_numbers(places[0], 2, 1e3) and all(are_numbers(v, 3, FARTHEST_MM) for v in ray)
-
-
-def _is_drag(fields: Mapping[str, Any]) -> bool:
-    places = fields["start_screen_pos"], fields["end_screen_pos"]
-    points = fields["start_position"], fields["end_position"]
-    known = fields["phase"] in ("start", "update", "end") and fields["button"] == "left"
-    known = known and fields["name"] == BRUSH_NODE and fields["owner"] == "" and fields["instance_index"] is None
-    finite = all(are_numbers(v, 2, 1e3) for v in places) and all(are_numbers(v, 3, FARTHEST_MM) for v in points)
-    return known and finite and _is_modifier(fields["modifier"])
-
-
-def _is_modifier(value: Any) -> bool:
-    return value is None or isinstance(value, str)
+    web_server.serve = serve
+    try:
+        yield
+    finally:
+        web_server.serve = original
+    if not used:
+        raise RuntimeError("viser starts its web server in another way than the viewer's access control expects")

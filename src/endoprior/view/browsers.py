@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Camera
-from .access_control import is_camera
 from .line_overlay import Lines, draw_lines
 from .view_settings import IDLE_SECONDS, ViewSettings, shrink_factor
 from .viewable import Viewable
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
 PREVIEW_QUALITY = 80
 """JPEG quality of images while something moves; static images are PNG (lossless)."""
-CAMERA_FIELDS = ("wxyz", "position", "look_at", "up_direction", "fov")
 SPLATS_NODE, POINTS_NODE, LINES_NODE = "/splats", "/points", "/lines"
 
 
@@ -75,8 +73,6 @@ class Browsers:
             return
         for browser in self._connected():
             camera = browser.client.camera
-            if not is_camera({name: np.asarray(getattr(camera, name)).tolist() for name in CAMERA_FIELDS}):
-                continue
             places = [move[:3, :3] @ place + move[:3, 3] for place in (camera.position, camera.look_at)]
             with browser.client.atomic():
                 camera.position, camera.look_at = places
@@ -90,8 +86,6 @@ class Browsers:
         aspect = bounded_aspect(camera.image_width, camera.image_height)
         if settings.endoscope:
             return endoscope_viewport(own, aspect, shrink)
-        if not is_camera({name: np.asarray(getattr(camera, name)).tolist() for name in CAMERA_FIELDS}):
-            return None
         return free_viewport(camera.wxyz, camera.position, camera.fov, aspect, own.height, shrink)
 
     def draw(self, viewable: Viewable, version: int, settings: ViewSettings, lines: Lines, idle_seconds: float) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.geometry import length_unit
-from .access_control import are_numbers
 from .measure import DISTANCE, POINTS_OF
+from .messages import are_numbers
 from .view_settings import Layer, ViewSettings
 from .viewable import Viewable
 

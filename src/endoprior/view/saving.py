@@ -6,21 +6,12 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..system.atomic import whole_file
 from ..visualization.video import write_video
-
-
-def png_bytes(rgb_u8: NDArray[np.uint8]) -> bytes:
-    """An (H, W, 3) image as a PNG file."""
-    done, encoded = cv2.imencode(".png", np.ascontiguousarray(rgb_u8[..., ::-1]))
-    if not done:
-        raise OSError("could not encode the image")
-    return encoded.tobytes()
 
 
 def mp4_bytes(pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> bytes:

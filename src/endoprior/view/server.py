@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import ipaddress
+import secrets
 import sys
 import time as clock
 import traceback
@@ -20,10 +22,10 @@ from typing import Any
 import viser
 
 from ..core.checks import InputError
+from ..data.images import encode_png
 from . import panel, saving
-from .access_control import check_address
+from .access_control import RateLimit, access_control, check_address
 from .browsers import Browsers, camera_pose, picture_with_lines
-from .connections import ConnectionFilter
 from .job_queue import JobQueue
 from .line_overlay import Lines, concatenated
 from .mask_editor import MaskEditor, Spot
@@ -55,7 +57,7 @@ class Viewer:
         """Start listening.
 
         Args:
-            host: address to listen on; with any but the loopback address, other machines can connect.
+            host: address to listen on; other machines can connect to any but the loopback address.
             port: 0 uses any free port.
             out: folder to store screenshots and videos, in addition to the download; None stores none.
         Raises:
@@ -70,9 +72,9 @@ class Viewer:
         self.tracks = DrawnTracks(viewable)
         self.kept_views: list[PathPoint] = []
         self._version, self._moved_at = 0, clock.monotonic() - IDLE_SECONDS
-        with contextlib.redirect_stdout(io.StringIO()):  # its banner
-            self.server = _LocalServer(host=host, port=port, label="EndoPrior-GS", verbose=False)
-        ConnectionFilter(self.server, host, self._accepts)
+        self._token = secrets.token_urlsafe(24)
+        with contextlib.redirect_stdout(io.StringIO()), access_control(self._token, host, self._accepts):
+            self.server = _LocalServer(host=host, port=port, label="EndoPrior-GS", verbose=False)  # prints a banner
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
         self.server.scene.set_up_direction("-y")
@@ -96,9 +98,13 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Address for a browser on this machine."""
-        host = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
+        """Address for a browser on this machine, with the token: who has it can use the viewer."""
+        host = self.host
+        with contextlib.suppress(ValueError):
+            address = ipaddress.ip_address(host)
+            if address.is_unspecified:
+                host = "127.0.0.1" if address.version == 4 else "::1"
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self._token}/"
 
     @property
     def measured(self) -> Measurement | None:
@@ -181,8 +187,15 @@ class Viewer:
             for handle in handles:  # values set by the viewer itself arrive without a client
                 handle.on_update(lambda event: ask(job, job) if event.client is not None else None)
 
-        def on_press(handle: viser.GuiButtonHandle, job: Callable[[viser.ClientHandle], None]) -> None:
-            handle.on_click(lambda event: ask(lambda: job(event.client)) if event.client is not None else None)
+        def on_press(
+            handle: viser.GuiButtonHandle, job: Callable[[viser.ClientHandle], object], key: object = None
+        ) -> None:
+            handle.on_click(lambda event: ask(lambda: job(event.client), key) if event.client is not None else None)
+
+        def on_save(handle: viser.GuiButtonHandle, job: Callable[[viser.ClientHandle], None]) -> None:
+            """Save at most once per second, and let one press wait: more would fill the disk."""
+            rate = RateLimit(1)
+            on_press(handle, lambda client: rate.exceeded(clock.monotonic()) or job(client), job)
 
         on_change(lambda: self._go_to(controls.frame.value), controls.frame)
         shown = controls.layer, controls.camera, controls.riding, controls.rendered_by, controls.rendered_as
@@ -194,15 +207,15 @@ class Viewer:
         on_press(controls.play, lambda _: self._toggle_play())
         on_press(controls.clear, lambda _: self._clear_measurement())
         on_press(controls.clear_tracks, lambda _: self.tracks.clear())
-        on_press(controls.table, self._save_table)
+        on_save(controls.table, self._save_table)
         on_press(controls.keep, self._keep_view)
         on_press(controls.forget, lambda _: self._forget_views())
-        on_press(controls.screenshot, self._screenshot)
-        on_press(controls.video, self._save_video)
+        on_save(controls.screenshot, self._screenshot)
+        on_save(controls.video, self._save_video)
         if editor := self._editor:
             on_press(controls.undo, lambda _: editor.undo())
             on_press(controls.carry, lambda _: editor.carry(self.settings.frame))
-            on_press(controls.save_masks, lambda _: editor.save())
+            on_save(controls.save_masks, lambda _: editor.save())
         self.server.on_client_connect(lambda client: ask(lambda: self._welcome(client), surely=True))
         self.server.on_client_disconnect(self._goodbye)
 
@@ -339,7 +352,7 @@ class Viewer:
         if viewport is None:
             return
         picture = picture_with_lines(self.viewable, self.settings, viewport.camera, self._lines(self.settings))
-        self._offer(client, f"{self.settings.layer}_{self.settings.frame:06d}.png", saving.png_bytes(picture))
+        self._offer(client, f"{self.settings.layer}_{self.settings.frame:06d}.png", encode_png(picture))
 
     def _save_video(self, client: viser.ClientHandle) -> None:
         viewport = self._browsers.viewport(client, self.viewable, self.settings)

@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from endoprior.data.images import decode_image, read_color, read_tool_mask
+from endoprior.data.video_files import open_container
 from endoprior.footage.border import find_outline
 
 from .benchmark import TestFrame
@@ -61,14 +61,14 @@ def wild(root: Path) -> Iterator[Labeled]:
     """Clips without tools of four kinds of scopes."""
     for name in WILD:
         path = root / "wild" / f"{name}.mp4"
-        with av.open(str(path)) as container:
+        with open_container(path) as container:
             total = container.streams.video[0].frames
         yield from _without_tools(path, range(0, total, max(total // WILD_FRAMES, 1)))
 
 
 def _without_tools(path: Path, wanted: range) -> Iterator[Labeled]:
     """Frames without a tool; black beyond the border is ignored."""
-    with av.open(str(path)) as container:
+    with open_container(path) as container:
         for i, picture in enumerate(container.decode(video=0)):
             if i in wanted:
                 image = picture.to_ndarray(format="rgb24")

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_PIXELS = 64_000_000
-"""Of one mask."""
+from ..reading import MOST_PIXELS
 
 
 def mask_of_runs(runs: Sequence[int], num_pixels: int) -> NDArray[np.bool_]:
