@@ -16,9 +16,9 @@ import torch
 from gpu_parity import Target
 
 from endoprior import render
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Splats
 from endoprior.model.deformation import HexPlaneField
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 
 SIZES = (common.Size(20_000, 640, 512), common.Size(40_000, 640, 512), common.Size(100_000, 640, 512))

@@ -14,9 +14,9 @@ import torch
 
 from endoprior import render
 from endoprior.core.config import Config
-from endoprior.core.presets import preset
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.evaluation.scoring import evaluate
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.system.devices import wait_for

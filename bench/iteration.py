@@ -17,10 +17,10 @@ import plain
 import torch
 
 from endoprior.core.config import Config
-from endoprior.core.presets import preset
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.model import motion
 from endoprior.model.deformation import HexPlaneField
+from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.render import numba as numba_backend
 from endoprior.training import gaussian_method, temporal, temporal_numba

@@ -15,16 +15,16 @@ import torch
 
 from endoprior.compute.relu_network import relu_network, relu_network_torch
 from endoprior.core.config_deformation import DeformationConfig
-from endoprior.core.presets import preset
-from endoprior.methods.time_network import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
 from endoprior.model.attributes import motion_shape
 from endoprior.model.basis import RankOneGradient, basis_offsets
 from endoprior.model.deformation import HexPlaneField
+from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
 from endoprior.training.optimizer import Optimizer
 from endoprior.training.plane_adam import PlaneAdam
 from endoprior.training.rates import motion_rates, rate_of
+from endoprior_baselines.time_network import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
 
 TIME, RATE, EPSILON = 0.4, 1e-3, 1e-15
 EARLIER_TIMES = (0.05, 0.2, 0.6, 0.85)

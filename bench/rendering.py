@@ -11,11 +11,11 @@ import scenes
 import torch
 
 from endoprior.core.config import Config
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera, RenderOutput, Splats
 from endoprior.model import motion
 from endoprior.model.deformation import HexPlaneField
 from endoprior.model.playback import Playback
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.render import numba as numba_backend

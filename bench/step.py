@@ -19,9 +19,9 @@ import common
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from endoprior.core.presets import preset
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
+from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps

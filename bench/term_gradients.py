@@ -22,8 +22,8 @@ import yaml
 
 from endoprior.core.config import Config
 from endoprior.core.config_io import from_dict, override, to_dict
-from endoprior.core.presets import preset
 from endoprior.data import load_sequence
+from endoprior.model.presets import preset
 from endoprior.training import losses_torch
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.stage import Stage, stage_length

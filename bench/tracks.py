@@ -19,9 +19,9 @@ import common  # noqa: F401, before torch
 import numpy as np
 from numpy.typing import NDArray
 
-from endoprior.core.presets import preset
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.evaluation.predicted_tracks import PredictedTracks, TrueTracks, by_chained_flow, by_scene, true_tracks
+from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.training.gaussian_trainer import GaussianTrainer
 

@@ -22,7 +22,7 @@ import zstandard
 from websockets.sync.client import connect
 
 import endoprior.view.server as server_module
-from endoprior.core.presets import preset
+from endoprior.model.presets import preset
 from endoprior.model.single_scene import SingleScene
 from endoprior.view import browsers
 from endoprior.view.panel import control_id

@@ -6,8 +6,8 @@ import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from endoprior.experiments.execute import Outcome
-from endoprior.experiments.worker import Job, work
+from endoprior_studies.execute import Outcome
+from endoprior_studies.worker import Job, work
 
 
 def in_this_process(jobs: list[Job]) -> Iterator[Outcome]:

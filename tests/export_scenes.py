@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from endoprior.cli import main
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Splats
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
 

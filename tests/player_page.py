@@ -15,11 +15,11 @@ from browser import Page
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera
 from endoprior.export.html_data import CHANNELS
 from endoprior.model import scene as scenes
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
 

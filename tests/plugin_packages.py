@@ -10,7 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from endoprior.evaluation.registry import all_scores
+from endoprior.model.method import method_named
 from endoprior.system.plugins import installed, report
+from endoprior_studies.method import method_named as bench_method
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "endoprior_example"
 Groups = dict[str, dict[str, str]]
@@ -30,9 +32,9 @@ def write_package(site: Path, name: str, groups: Groups, **modules: str) -> None
         (site / f"{module}.py").write_text(source)
 
 
-def example_groups() -> Groups:
-    """The entry points of the example package, as its pyproject.toml has them."""
-    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
+def entry_points(folder: Path) -> Groups:
+    """The entry points of the package in a folder, as its pyproject.toml has them."""
+    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     return {group.removeprefix("endoprior."): entries for group, entries in project["entry-points"].items()}
 
 
@@ -59,5 +61,5 @@ def on_path(*folders: Path) -> Iterator[None]:
 
 def _forget() -> None:
     """Look for plugins anew."""
-    for cached in (installed, report, all_scores):
+    for cached in (installed, report, all_scores, method_named, bench_method):
         cached.cache_clear()

@@ -1,19 +1,20 @@
 """docs/add_a_method.md: its method is complete. It trains, resumes, is scored, drawn, carried and exported."""
 
 import re
-import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 import torch
+from plugin_packages import on_path, write_package
 
-from endoprior.core import methods
 from endoprior.core.checks import InputError
-from endoprior.core.config import Config
-from endoprior.core.config_io import from_dict, to_dict
-from endoprior.core.presets import preset
+from endoprior.core.config import OWN, Config
+from endoprior.core.config_io import to_dict
 from endoprior.data import load_sequence
 from endoprior.evaluation.scoring import evaluate
+from endoprior.model.method import METHODS, config_from, method_named, method_of
+from endoprior.model.presets import preset, preset_names
 from endoprior.model.scene_file import load_scene
 from endoprior.runs.train import train
 
@@ -23,14 +24,14 @@ PAGE = Path(__file__).parents[1] / "docs" / "add_a_method.md"
 @pytest.fixture
 def linear(tmp_path, monkeypatch) -> Config:
     """The config of the page's method, registered as the page says."""
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    (code,), (entries,) = (re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)
+                           for language in ("python", "toml"))  # fmt: skip
     assert len(code.splitlines()) < 100
-    (tmp_path / "page").mkdir()
-    (tmp_path / "page" / "linear_of_the_page.py").write_text(code)
-    monkeypatch.syspath_prepend(tmp_path / "page")
-    monkeypatch.setitem(methods.METHODS, "linear", "linear_of_the_page")
-    yield preset("linear", iterations=12, gaussians=200)
-    sys.modules.pop("linear_of_the_page", None)
+    groups = tomllib.loads(entries)["project"]["entry-points"]
+    named = {group.removeprefix("endoprior."): targets for group, targets in groups.items()}
+    write_package(tmp_path / "site", "linear-of-the-page", named, linear=code)
+    with on_path(tmp_path / "site"):
+        yield preset("linear", iterations=12, gaussians=200)
 
 
 def test_the_method_of_the_page_is_complete(linear, tiny_sequence, tmp_path):
@@ -47,21 +48,11 @@ def test_the_method_of_the_page_is_complete(linear, tiny_sequence, tmp_path):
     assert torch.equal(resumed.gaussians["velocities"], scene.gaussians["velocities"])
 
 
-def test_the_line_of_the_page_is_that_of_the_table():
-    (line,) = re.findall(r"```text\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    table = (Path(methods.__file__)).read_text()
-    form = re.compile(r'^    "\w+": "endoprior\.methods\.\w+",$', re.MULTILINE)
-    assert form.fullmatch(line.rstrip("\n")) and form.search(table)
-
-
 def test_every_method_can_be_found_and_names_itself():
-    for name in methods.METHODS:
-        method = methods.method_named(name)
-        cfg = method.config()
-        assert cfg.method == name and from_dict(Config, to_dict(cfg)) == cfg
-        if name != methods.OWN:
-            assert preset(name) == cfg
+    for name in METHODS.names():
+        assert isinstance(method_named(name).config_type(), Config)
+    for name in preset_names():
+        cfg = preset(name)
+        assert cfg.method in (name.removesuffix("-published"), OWN) and config_from(to_dict(cfg)) == cfg
     with pytest.raises(InputError, match="method: expected one of"):
-        Config(method="nerf")
-    with pytest.raises(InputError, match=r"init\.motion: expected rest with method endogs"):
-        preset("default", method="endogs")
+        method_of(Config(method="nerf"))

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from endoprior.core.types import Camera, Frame
-from endoprior.experiments.image_grids import (
+from endoprior_studies.image_grids import (
     center_density,
     frames_grid,
     instability_map,

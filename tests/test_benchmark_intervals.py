@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from endoprior.experiments.matrix import Matrix, frames_of
-from endoprior.experiments.results import Results
-from endoprior.experiments.spec import Cell, MethodSpec, SequenceSpec, Spec
-from endoprior.experiments.statistics import Difference, Pair, difference
+from endoprior_studies.matrix import Matrix, frames_of
+from endoprior_studies.results import Results
+from endoprior_studies.spec import Cell, MethodSpec, SequenceSpec, Spec
+from endoprior_studies.statistics import Difference, Pair, difference
 
 
 def pair(ours, theirs=None, seed=0, fold=0, place="clip") -> Pair:

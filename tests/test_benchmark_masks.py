@@ -18,16 +18,16 @@ from endoprior.data import load_sequence
 from endoprior.evaluation.mask_scores import SCORES
 from endoprior.evaluation.scoring import evaluate, scored_data
 from endoprior.evaluation.true_masks import TrueMasks, score_masks
-from endoprior.experiments import found_masks
-from endoprior.experiments.changed_copy import write_copy
-from endoprior.experiments.matrix import Matrix, run_matrix, scores_of
-from endoprior.experiments.preset_method import PresetMethod
-from endoprior.experiments.report import write_report
-from endoprior.experiments.results import Results
-from endoprior.experiments.spec import Cell, SequenceSpec
-from endoprior.experiments.spec_file import load_spec
 from endoprior.model.scene_file import load_scene
 from endoprior.tool_masks import FoundTools
+from endoprior_studies import found_masks
+from endoprior_studies.changed_copy import write_copy
+from endoprior_studies.matrix import Matrix, run_matrix, scores_of
+from endoprior_studies.preset_method import PresetMethod
+from endoprior_studies.report import write_report
+from endoprior_studies.results import Results
+from endoprior_studies.spec import Cell, SequenceSpec
+from endoprior_studies.spec_file import load_spec
 
 OWN, FOUND = Cell("tiny", "m", None, 0), Cell("tiny_found", "m", None, 0)
 QUICK = {"schedule.fine_iterations": 6, "schedule.coarse_iterations": 0, "init.budget": 200, "init.motion": "rest"}

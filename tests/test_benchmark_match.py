@@ -9,12 +9,12 @@ import yaml
 from benchmark_runs import in_this_process
 
 from endoprior.core.checks import InputError
-from endoprior.experiments.matched_count import MOST_PROBES, Search, matched_table, next_threshold, search_thresholds
-from endoprior.experiments.matrix import run_matrix
-from endoprior.experiments.report import write_report
-from endoprior.experiments.spec import Cell, MatchSpec, MethodSpec, SequenceSpec, Spec
-from endoprior.experiments.spec_file import load_spec
 from endoprior.runs.growth import Growth
+from endoprior_studies.matched_count import MOST_PROBES, Search, matched_table, next_threshold, search_thresholds
+from endoprior_studies.matrix import run_matrix
+from endoprior_studies.report import write_report
+from endoprior_studies.spec import Cell, MatchSpec, MethodSpec, SequenceSpec, Spec
+from endoprior_studies.spec_file import load_spec
 
 
 def grown(last: float, first: int = 1000) -> Growth:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from plugin_packages import EXAMPLE, example_groups, on_path, write_package
+from plugin_packages import EXAMPLE, entry_points, on_path, write_package
 from tiny_training import tiny_config
 
 from endoprior import load_sequence
@@ -16,15 +16,16 @@ from endoprior.core.checks import InputError
 from endoprior.core.config_io import to_dict
 from endoprior.data.images import save_png
 from endoprior.evaluation.context import NO_SCENE
-from endoprior.experiments.execute import Outcome
-from endoprior.experiments.matrix import run_matrix
-from endoprior.experiments.method import REGISTRY
-from endoprior.experiments.report import write_report
-from endoprior.experiments.spec import cells
-from endoprior.experiments.spec_file import load_spec
-from endoprior.experiments.worker import work
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.training.gaussian_trainer import GaussianTrainer
+from endoprior_studies import method as methods
+from endoprior_studies import spec as specs
+from endoprior_studies.execute import Outcome
+from endoprior_studies.matrix import run_matrix
+from endoprior_studies.report import write_report
+from endoprior_studies.spec import cells
+from endoprior_studies.spec_file import load_spec
+from endoprior_studies.worker import work
 
 PHANTOM = {"frames": 10, "width": 48, "height": 40}
 METHODS = {
@@ -47,7 +48,7 @@ VALUES = {
 @pytest.fixture(autouse=True)
 def example(tmp_path):
     """The example package, installed."""
-    write_package(tmp_path / "site", "endoprior-example", example_groups())
+    write_package(tmp_path / "site", "endoprior-example", entry_points(EXAMPLE))
     with on_path(EXAMPLE, tmp_path / "site"):
         yield
 
@@ -140,7 +141,8 @@ def test_a_method_may_return_a_scene(tmp_path, make_tiny_sequence, monkeypatch):
             return trainer.scene()
 
     make_tiny_sequence("tiny")
-    monkeypatch.setattr(REGISTRY, "load", lambda name: Untrained())
+    for module in (specs, methods):
+        monkeypatch.setattr(module, "method_named", lambda name: Untrained())
     changes = {"methods": {"m": {"method": "nearest-frame", "set": {"init.budget": 200}}}}
     changes |= {"sequences": {"tiny": {"path": "tiny", "first_frames": 9}}, "seeds": [3], "budgets": [150]}
     spec, jobs = load_spec(write_spec(tmp_path, **changes)), []

@@ -17,14 +17,14 @@ from endoprior.core.geometry import camera_to_world
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.data.writer import SequenceMeta, SequenceWriter
 from endoprior.evaluation.metrics.trajectory import trajectory_errors
-from endoprior.experiments import found_masks
-from endoprior.experiments.matrix import run_matrix, scores_of
-from endoprior.experiments.preset_method import PresetMethod
-from endoprior.experiments.report import write_report
-from endoprior.experiments.spec import Cell
-from endoprior.experiments.spec_file import load_spec
 from endoprior.prepare.camera_path import choose
 from endoprior.tool_masks import FoundTools
+from endoprior_studies import found_masks
+from endoprior_studies.matrix import run_matrix, scores_of
+from endoprior_studies.preset_method import PresetMethod
+from endoprior_studies.report import write_report
+from endoprior_studies.spec import Cell
+from endoprior_studies.spec_file import load_spec
 
 COUNT = 14
 TRUE = path(COUNT, 1.3)

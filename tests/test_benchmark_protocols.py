@@ -15,11 +15,11 @@ import yaml
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.data.images import save_png
-from endoprior.experiments.execute import Outcome
-from endoprior.experiments.matrix import run_matrix
-from endoprior.experiments.report import write_report
-from endoprior.experiments.spec_file import load_spec
-from endoprior.experiments.worker import work
+from endoprior_studies.execute import Outcome
+from endoprior_studies.matrix import run_matrix
+from endoprior_studies.report import write_report
+from endoprior_studies.spec_file import load_spec
+from endoprior_studies.worker import work
 
 
 def write_pictures(folder, sequence, noise: int) -> None:

@@ -172,9 +172,9 @@ def test_killed_half_way_it_loses_no_finished_cell(tmp_path, how):
 @pytest.mark.slow
 def test_an_interrupted_cell_goes_on_to_the_same_scene(tmp_path):
     from endoprior.data import load_sequence
-    from endoprior.experiments.matrix import run_matrix
-    from endoprior.experiments.spec_file import load_spec
     from endoprior.runs.train import train
+    from endoprior_studies.matrix import run_matrix
+    from endoprior_studies.spec_file import load_spec
 
     write_tiny_sequence(tmp_path / "tiny")
     sequences = {"tiny": {"path": "tiny"}}
@@ -196,7 +196,7 @@ def test_an_interrupted_cell_goes_on_to_the_same_scene(tmp_path):
     (folder / "key").write_text(job.key)
     with pytest.raises(KeyboardInterrupt):
         train(sequence, cfg, folder / "run", on_step=stop)
-    from endoprior.experiments.worker import finished, work
+    from endoprior_studies.worker import finished, work
 
     work(job)
     assert finished(folder, job.key) and not finished(folder, "another")

@@ -11,11 +11,11 @@ import yaml
 
 from endoprior.cli import main
 from endoprior.core.checks import InputError
-from endoprior.core.presets import preset
 from endoprior.data.scared import dataset_number
-from endoprior.experiments.ready_specs import find_spec, spec_names, specs_of
-from endoprior.experiments.spec import Cell, MethodSpec, cells, sequence_folder
-from endoprior.experiments.spec_file import load_spec, load_specs
+from endoprior.model.presets import preset
+from endoprior_studies.ready_specs import find_spec, spec_names, specs_of
+from endoprior_studies.spec import Cell, MethodSpec, cells, sequence_folder
+from endoprior_studies.spec_file import load_spec, load_specs
 
 PLAIN = {
     "title": "two methods",

@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endoprior.experiments.report import change, claims_section
-from endoprior.experiments.results import Results
-from endoprior.experiments.spec import Cell, ClaimSpec, MethodSpec, SequenceSpec, Spec
-from endoprior.experiments.statistics import Difference, Pair, difference, gains, summary, verdict
-from endoprior.experiments.tables import csv_lines, latex, markdown, number, score_table
+from endoprior_studies.report import change, claims_section
+from endoprior_studies.results import Results
+from endoprior_studies.spec import Cell, ClaimSpec, MethodSpec, SequenceSpec, Spec
+from endoprior_studies.statistics import Difference, Pair, difference, gains, summary, verdict
+from endoprior_studies.tables import csv_lines, latex, markdown, number, score_table
 
 
 def test_summary_by_hand():

@@ -14,11 +14,11 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config, DensityConfig, RenderConfig
 from endoprior.core.config_deformation import BasisConfig, HexPlaneConfig
 from endoprior.core.config_io import from_dict, to_dict
-from endoprior.core.presets import preset
-from endoprior.experiments.spec import MethodSpec, SequenceSpec, Spec
 from endoprior.model.attributes import motion_shape
+from endoprior.model.presets import preset
 from endoprior.model.scene_file import SceneFacts
 from endoprior.runs.identity import reject_other_run
+from endoprior_studies.spec import MethodSpec, SequenceSpec, Spec
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
 PRESETS = ("default", "best", "paper", "released", "endogaussian")

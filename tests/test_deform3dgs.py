@@ -7,13 +7,10 @@ from method_runs import trained_and_resumed
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame, RenderOutput
 from endoprior.data import load_sequence
-from endoprior.methods.deform3dgs import METHOD
-from endoprior.methods.deform3dgs_points import first_points
-from endoprior.methods.learned_basis import COEFFICIENTS, value_at
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.presets import preset
 from endoprior.training.adam import AdamState
 from endoprior.training.adam_numba import adam_step, adam_unstored_step
 from endoprior.training.density import DensityStats
@@ -21,6 +18,9 @@ from endoprior.training.drawn import Drawn
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.stage import Stage
+from endoprior_baselines.deform3dgs import METHOD
+from endoprior_baselines.deform3dgs_points import first_points
+from endoprior_baselines.learned_basis import COEFFICIENTS, value_at
 
 
 def coefficients(num: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:

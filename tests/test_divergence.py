@@ -12,10 +12,9 @@ from tiny_training import KINDS, tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.core.config_deformation import HexPlaneConfig
-from endoprior.core.presets import preset
 from endoprior.data import load_sequence
-from endoprior.methods.own import OwnMethod
 from endoprior.model.hexplane import FRESH, TOUCHED, PlaneGrid
+from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.runs.train import train
 from endoprior.training import divergence
@@ -32,6 +31,7 @@ from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.losses_torch import color_l1
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.optimizer import Optimizer
+from endoprior.training.own_method import OwnMethod
 from endoprior.training.rates import rate_of
 
 BAD = [float("nan"), float("inf"), -float("inf"), 2 * LARGEST_GRADIENT, -1e30]

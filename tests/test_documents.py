@@ -12,10 +12,11 @@ from urllib.parse import unquote
 
 import pytest
 import yaml
+from command_modules import module_of
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
-from endoprior.cli import COMMANDS, MODULES
+from endoprior.cli import descriptions
 from endoprior.cli.parsing import parse
 
 ROOT = Path(__file__).parents[1]
@@ -86,10 +87,10 @@ def test_commands_parse(page, monkeypatch):
         raise Parsed
 
     for name, *rest in commands(page):
-        assert name in COMMANDS, f"{page.name}: endoprior {name}: there is no such command"
+        assert name in descriptions(), f"{page.name}: endoprior {name}: there is no such command"
         if [name, *rest[:1]] == ["bench", "masks"]:  # has options of its own
-            name, rest = "bench_masks", rest[1:]
-        module = import_module(f"endoprior.cli.{MODULES.get(name, name)}")
+            name, rest = "bench masks", rest[1:]
+        module = import_module(module_of(name))
         monkeypatch.setattr(module, "parse", parse_only)
         try:
             with pytest.raises((Parsed, SystemExit)):  # --help exits

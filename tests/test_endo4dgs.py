@@ -9,11 +9,19 @@ from method_runs import trained_and_resumed
 from scipy.spatial.transform import Rotation
 
 from endoprior.core.config_deformation import HexPlaneConfig
-from endoprior.core.presets import preset
 from endoprior.core.types import RenderOutput, Splats
 from endoprior.data import load_sequence
-from endoprior.methods.endo4dgs import METHOD
-from endoprior.methods.endo4dgs_terms import (
+from endoprior.model.deformation import HexPlaneField
+from endoprior.model.gaussians import SH_C0, create_gaussians
+from endoprior.model.presets import preset
+from endoprior.runs.train import train
+from endoprior.training.density import DensityStats
+from endoprior.training.drawn import Drawn
+from endoprior.training.frames import TrainingFrames
+from endoprior.training.ops import NUMBA
+from endoprior.training.stage import Stage
+from endoprior_baselines.endo4dgs import METHOD
+from endoprior_baselines.endo4dgs_terms import (
     confident_error,
     gradient_correlation,
     normal_picture,
@@ -21,14 +29,6 @@ from endoprior.methods.endo4dgs_terms import (
     smallest_axes,
     without_scale,
 )
-from endoprior.model.deformation import HexPlaneField
-from endoprior.model.gaussians import SH_C0, create_gaussians
-from endoprior.runs.train import train
-from endoprior.training.density import DensityStats
-from endoprior.training.drawn import Drawn
-from endoprior.training.frames import TrainingFrames
-from endoprior.training.ops import NUMBA
-from endoprior.training.stage import Stage
 
 CFG = preset("endo4dgs")
 SMALL = HexPlaneConfig(resolution=(6, 5, 4), time_resolution=7, channels=3, multires=(1, 2), width=8, learn_box=False)

@@ -8,14 +8,11 @@ import torch
 from method_runs import trained_and_resumed
 
 from endoprior.core.config_deformation import HexPlaneConfig
-from endoprior.core.presets import preset
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
-from endoprior.methods.endogs import METHOD, depth_huber
-from endoprior.methods.endogs_field import JointField
-from endoprior.methods.plane_terms import PlaneWeights, plane_term
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, PlaneGrid
+from endoprior.model.presets import preset
 from endoprior.runs.train import train
 from endoprior.training.density import DensityStats
 from endoprior.training.drawn import Drawn
@@ -24,6 +21,9 @@ from endoprior.training.gaussian_method import in_epochs
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.stage import Stage
+from endoprior_baselines.endogs import METHOD, depth_huber
+from endoprior_baselines.endogs_field import JointField
+from endoprior_baselines.plane_terms import PlaneWeights, plane_term
 
 CFG = preset("endogs")
 SMALL = HexPlaneConfig(resolution=(6, 5, 4), time_resolution=7, channels=3, multires=(1, 2), width=8)

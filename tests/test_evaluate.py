@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from endoprior.cli import main
-from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.data.truth import Tracks
 from endoprior.evaluation.context import Evaluation
@@ -16,6 +15,7 @@ from endoprior.evaluation.predicted_tracks import by_scene, true_tracks
 from endoprior.evaluation.scorers.tracks import parts_of, track_end_error_mm, track_scores
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.carry import carry_points
+from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.runs.train import train
 from endoprior.training.gaussian_trainer import GaussianTrainer

@@ -13,23 +13,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from plugin_packages import entry_points, write_package
 
 import endoprior
-from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
 
-PACKAGE, DOCS = Path(endoprior.__file__).parent, Path(__file__).parents[1] / "docs"
+SOURCES, DOCS = Path(endoprior.__file__).parents[1], Path(__file__).parents[1] / "docs"
 EVALUATE = """
 import sys
 from dataclasses import replace
 import torch
 from endoprior import evaluate, load_scene, load_sequence
-from endoprior.experiments.results import Results
-from endoprior.experiments.spec import Cell, MethodSpec, SequenceSpec, Spec
-from endoprior.experiments.tables import markdown, score_table
+from endoprior_studies.results import Results
+from endoprior_studies.spec import Cell, MethodSpec, SequenceSpec, Spec
+from endoprior_studies.tables import markdown, score_table
 from endoprior.model.deformation import Offsets
 
 
@@ -67,7 +68,8 @@ def extend(tmp_path):
     """Copies the package, and adds a file and a line to the copy."""
 
     def add(page: str, module: str, registry: str, variable: str) -> None:
-        shutil.copytree(PACKAGE, tmp_path / "src" / "endoprior", ignore=shutil.ignore_patterns("*.nb?", "*.ready"))
+        shutil.copytree(SOURCES, tmp_path / "src", ignore=shutil.ignore_patterns("*.nb?", "*.ready", "*.egg-info"))
+        write_package(tmp_path / "src", "endoprior", entry_points(SOURCES.parent))
         example = (DOCS / page).read_text(encoding="utf-8").split("\n## Add a ")[1]
         file = tmp_path / "src" / "endoprior" / module
         assert f"{file.parent.name}/NAME.py" in example and registry in example

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from endoprior.core.geometry import back_project, project
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.data import FrameSequence
 from endoprior.evaluation.context import Evaluation, EvaluationContext
@@ -19,6 +18,7 @@ from endoprior.model.attributes import motion_layout
 from endoprior.model.basis import basis_weights
 from endoprior.model.fixed_color import with_fixed_color
 from endoprior.model.gaussians import Gaussians, create_gaussians
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.visualization.carried_texture import SQUARES, PaintedTissue

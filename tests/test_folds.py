@@ -13,7 +13,7 @@ import pytest
 import yaml
 from benchmark_runs import in_this_process
 from conftest import write_tiny_sequence
-from plugin_packages import EXAMPLE, example_groups, on_path, write_package
+from plugin_packages import EXAMPLE, entry_points, on_path, write_package
 
 from endoprior.cli import main
 from endoprior.core.checks import InputError
@@ -23,14 +23,14 @@ from endoprior.data import load_sequence
 from endoprior.data.formats import REGISTRY
 from endoprior.data.images import save_png
 from endoprior.data.window_plan import look_through
-from endoprior.experiments.matched_count import search_thresholds
-from endoprior.experiments.matrix import KEY_DIGITS, SCORES_VERSION, frames_of, run_matrix
-from endoprior.experiments.report import write_report
-from endoprior.experiments.results import Results
-from endoprior.experiments.spec import Cell, MatchSpec, MethodSpec, SequenceSpec, Spec, cells
-from endoprior.experiments.spec_file import load_spec
 from endoprior.export.time_steps import frame_indices
 from endoprior.runs.growth import Growth
+from endoprior_studies.matched_count import search_thresholds
+from endoprior_studies.matrix import KEY_DIGITS, SCORES_VERSION, frames_of, run_matrix
+from endoprior_studies.report import write_report
+from endoprior_studies.results import Results
+from endoprior_studies.spec import Cell, MatchSpec, MethodSpec, SequenceSpec, Spec, cells
+from endoprior_studies.spec_file import load_spec
 
 QUICK = "--iterations 6 --gaussians 200 --schedule.coarse-iterations 2 --no-networks".split()
 
@@ -200,7 +200,7 @@ def test_a_benchmark_of_folds(tmp_path):
         "figures": ["curves", "frames"],
     }
     (tmp_path / "spec.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
-    write_package(tmp_path / "site", "endoprior-example", example_groups())
+    write_package(tmp_path / "site", "endoprior-example", entry_points(EXAMPLE))
     with on_path(EXAMPLE, tmp_path / "site"):
         spec = load_spec(tmp_path / "spec.yaml")
         done = run_matrix(spec, tmp_path / "out", in_this_process)

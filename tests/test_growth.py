@@ -5,11 +5,11 @@ import json
 import torch
 
 from endoprior.core.config import DensityConfig
-from endoprior.experiments.matrix import Matrix
-from endoprior.experiments.silent_rules import silent_rules
-from endoprior.experiments.spec import Cell, MethodSpec, SequenceSpec, Spec
 from endoprior.runs.growth import growth_of
 from endoprior.training.density import DensityStats, plan
+from endoprior_studies.matrix import Matrix
+from endoprior_studies.silent_rules import silent_rules
+from endoprior_studies.spec import Cell, MethodSpec, SequenceSpec, Spec
 
 
 def line(iteration: int, num: int, **more) -> str:

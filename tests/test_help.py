@@ -7,8 +7,9 @@ import shlex
 from importlib import import_module
 
 import pytest
+from command_modules import module_of
 
-from endoprior.cli import COMMANDS, MODULES, main
+from endoprior.cli import descriptions, main
 from endoprior.cli.options import options
 from endoprior.cli.parsing import parse
 from endoprior.core.checks import InputError
@@ -39,13 +40,13 @@ def parsed(monkeypatch):
         raise Parsed(parse(cls, argv, command, page, default), cls, page, default)
 
     def run(*words):
-        monkeypatch.setattr(f"endoprior.cli.{MODULES.get(words[0], words[0])}.parse", stop)
+        monkeypatch.setattr(f"{module_of(words[0])}.parse", stop)
         with pytest.raises(Parsed) as caught:
             main(list(words))
         return caught.value.args
 
-    for name in COMMANDS:
-        import_module(f"endoprior.cli.{MODULES.get(name, name)}")
+    for name in descriptions():
+        import_module(module_of(name))
     return run
 
 
@@ -68,7 +69,7 @@ def examples(page: str) -> list[list[str]]:
     return [shlex.split(line)[1:] for line in page.partition("examples:\n")[2].splitlines() if line.startswith("  ")]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", descriptions())
 def test_help_is_one_page_with_examples_that_parse(command, printed, parsed):
     page = printed(command, "--help")
     assert page == printed(command, "-h") and len(page.splitlines()) <= MOST_LINES
@@ -79,7 +80,7 @@ def test_help_is_one_page_with_examples_that_parse(command, printed, parsed):
         parsed(*words)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", descriptions())
 def test_every_option_of_help_all_can_be_typed(command, printed, parsed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "FILE").write_text("seed: 1")  # --config FILE is read before the options

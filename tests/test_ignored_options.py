@@ -8,16 +8,16 @@ import pytest
 
 from endoprior.core.checks import InputError
 from endoprior.core.config_windows import WindowConfig
-from endoprior.core.methods import METHODS, method_named
-from endoprior.core.presets import preset, preset_names
 from endoprior.data import load_sequence
+from endoprior.model.method import METHODS, method_named
+from endoprior.model.presets import preset, preset_names
 from endoprior.runs.train import start_run
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ignored_options import note_on_budget, reject_ignored_options
 from endoprior.training.memory_check import first_count
 
-WITHOUT_PRIOR = [name for name in METHODS if not getattr(method_named(name), "uses_prior", True)]
-FIELDS = [name for name in METHODS if not method_named(name).has_gaussians]
+WITHOUT_PRIOR = [name for name in METHODS.names() if not getattr(method_named(name), "uses_prior", True)]
+FIELDS = [name for name in METHODS.names() if not method_named(name).has_gaussians]
 OF_PIXELS = ["deform3dgs", "endo4dgs", "surgicalgaussian"]
 """Methods that start from the pixels of frames, not from `init.budget`."""
 

@@ -14,7 +14,6 @@ from scipy.stats import chisquare
 from endoprior.core.checks import InputError
 from endoprior.core.config import InitConfig, PriorConfig, SalienceConfig, SpecularConfig
 from endoprior.core.geometry import project
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
 from endoprior.initialization.cleanup import PointCloud, merge_voxels, remove_outliers
@@ -27,6 +26,7 @@ from endoprior.initialization.sampling import (
     sample_pixels,
     sampling_distribution,
 )
+from endoprior.model.presets import preset
 from endoprior.priors import joint_texture_prior
 
 HEIGHT, WIDTH = 26, 32

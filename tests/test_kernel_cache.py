@@ -9,9 +9,10 @@ from dataclasses import replace
 
 import pytest
 
+from endoprior.core.config import OWN
 from endoprior.core.config_io import to_dict
-from endoprior.core.methods import METHODS, OWN, method_named
-from endoprior.core.presets import preset
+from endoprior.model.method import METHODS, method_named
+from endoprior.model.presets import preset
 from endoprior.runs import kernel_cache
 from endoprior.runs.warm_up import shortened, tiny_sequence
 from endoprior.training.gaussian_trainer import GaussianTrainer
@@ -70,7 +71,7 @@ def test_a_warm_up_that_fails_is_tried_again_by_the_next_process(cold):
     assert len(asked) == 2
 
 
-OTHERS = [name for name in METHODS if name != OWN and method_named(name).has_gaussians]
+OTHERS = [name for name in METHODS.names() if name != OWN and method_named(name).has_gaussians]
 
 
 @pytest.mark.parametrize("name", ["default", "paper", "released", "endogaussian", *OTHERS])

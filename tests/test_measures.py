@@ -13,7 +13,6 @@ from export_scenes import plane_camera
 from plyfile import PlyData
 
 from endoprior.cli import main
-from endoprior.core.presets import preset
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.measures import (
     area,
@@ -25,6 +24,7 @@ from endoprior.model.measures import (
     principal_stretches,
     smoothed,
 )
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.model.surface_motion import SurfaceMotion

@@ -11,7 +11,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from endoprior.core.checks import InputError
-from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.data.truth import Tracks, Truth
 from endoprior.evaluation.context import Evaluation, EvaluationContext
@@ -22,6 +21,7 @@ from endoprior.evaluation.scorers.tracks import parts_of, track_end_error_mm, tr
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.attributes import motion_layout
 from endoprior.model.gaussians import Gaussians
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.training.gaussian_trainer import GaussianTrainer

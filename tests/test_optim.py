@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from endoprior.core.config import Config, OptimConfig
-from endoprior.core.presets import preset
 from endoprior.model.attributes import motion_layout
 from endoprior.model.basis import RankOneGradient
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.presets import preset
 from endoprior.training import adam_numba
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA

@@ -17,9 +17,9 @@ from endoprior.cli import main
 from endoprior.cli.run import resume_words
 from endoprior.cli.step_display import StepDisplay
 from endoprior.core.checks import InputError
-from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.export.html import DEFAULT_TITLE
+from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.pipeline import STEPS, make_job, notes_of, open_folder, problems, run_step

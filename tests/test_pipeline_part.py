@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from endoprior.cli.step_display import duration
-from endoprior.core.presets import preset
+from endoprior.model.presets import preset
 from endoprior.pipeline import Job, seconds_if_moving
 from endoprior.pipeline.estimate import FRAMES, Trial, scaled, seconds_of_colmap, shortened
 from endoprior.pipeline.part import Part, choose_part, every_kth_time, usable_frames

@@ -10,11 +10,11 @@ import torch
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera
 from endoprior.model.carry import carry_points
 from endoprior.model.gaussians import Gaussians, create_gaussians
 from endoprior.model.playback import Playback
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plugin_packages import EXAMPLE, example_groups, on_path, write_package
+from plugin_packages import EXAMPLE, entry_points, on_path, write_package
 
 from endoprior import evaluate, load_sequence
 from endoprior.cli import main
@@ -19,8 +19,10 @@ from endoprior.core.config import DataConfig
 from endoprior.data.formats import REGISTRY as DATASETS
 from endoprior.evaluation.registry import REGISTRY as SCORES
 from endoprior.evaluation.registry import all_scores
-from endoprior.experiments.method import REGISTRY as METHODS
 from endoprior.export.formats import REGISTRY as EXPORTERS
+from endoprior.model.method import METHODS
+from endoprior.model.presets import PRESETS
+from endoprior_studies.method import method_named as bench_method
 
 GOOD_SCORE = """
 from endoprior.evaluation.score import Score
@@ -111,11 +113,16 @@ def test_a_missing_object_is_named(install):
 
 @pytest.mark.parametrize(
     ("registry", "kind", "name"),
-    [(DATASETS, "datasets", "endonerf"), (DATASETS, "datasets", "auto"), (METHODS, "methods", "default")],
+    [
+        (DATASETS, "datasets", "endonerf"),
+        (DATASETS, "datasets", "auto"),
+        (METHODS, "methods", "endogs"),
+        (PRESETS, "presets", "default"),
+    ],
 )
 def test_built_in_names_stay_built_in(install, capsys, registry, kind, name):
     install({kind: {name: "bad_module"}}, bad_module="raise RuntimeError('imported')")
-    assert registry.names() == registry.builtin and list(registry.usable()) == []
+    assert registry.names() == registry.builtin and {used for used, _ in registry.usable()} <= {*registry.builtin}
     (line,) = problems(capsys)  # reported once, though asked twice
     assert f"plugin {name} of other-pkg 1.0" in line and "got that of a built-in one" in line
     if name != "auto":
@@ -201,7 +208,7 @@ def test_the_page_shows_the_example_as_it_is():
 
 @pytest.mark.slow
 def test_the_examples_own_tests_pass(tmp_path):
-    write_package(tmp_path, "endoprior-example", example_groups())
+    write_package(tmp_path, "endoprior-example", entry_points(EXAMPLE))
     with on_path(EXAMPLE, tmp_path):
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(EXAMPLE / "tests")]
         done = subprocess.run(command, capture_output=True, text=True, cwd=EXAMPLE)
@@ -218,4 +225,4 @@ def test_the_example_can_be_installed(tmp_path):
         assert all("endoprior-example 0.1.0" in registry.origin(name) for registry, name in (
             (DATASETS, "rendered"), (METHODS, "nearest-frame"), (SCORES, "mae"), (EXPORTERS, "transforms")
         ))  # fmt: skip
-        assert Path(METHODS.load("nearest-frame").__file__).is_relative_to(tmp_path / "site")
+        assert Path(bench_method("nearest-frame").__file__).is_relative_to(tmp_path / "site")

@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.data.sequence import FrameSequence
 from endoprior.evaluation import metrics
 from endoprior.evaluation.context import EXACT, Evaluation
 from endoprior.evaluation.scoring import evaluate
+from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
 
 IMAGE_SCORES = (metrics.psnr, metrics.psnr_tissue, metrics.ssim, metrics.ssim_tissue)

@@ -16,7 +16,6 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import InitConfig, PriorConfig
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import project
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.data.sequence import FrameSequence
 from endoprior.data.shrink import shrunk
@@ -29,6 +28,7 @@ from endoprior.initialization.sampling import (
     quotas,
     sample_pixels,
 )
+from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
 
 

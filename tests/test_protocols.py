@@ -23,7 +23,7 @@ from endoprior.evaluation.scoring import evaluate
 
 PAGE = Path(__file__).parents[1] / "docs" / "published.md"
 TEST = [1, 9]
-NAMES = tuple(PROTOCOLS)
+NAMES = PROTOCOLS.names()
 ZEROS = np.zeros((40, 48), bool)
 
 
@@ -44,19 +44,19 @@ def test_rows_follow_the_size_of_the_frame(protocol, height, shrink, rows):
 
 
 def test_names_of_protocols():
-    assert chosen_protocols("endogs, endonerf,endogs") == ("endonerf", "endogs")
+    assert chosen_protocols("endogs, endonerf,endogs") == ("endogs", "endonerf")
     assert chosen_protocols("all") == chosen_protocols("endonerf,all") == NAMES
     for text in ("endonurf", "endonerf,", "ENDONERF"):
-        with pytest.raises(InputError, match=r"--protocol: expected endonerf, .* or all, got "):
+        with pytest.raises(InputError, match=r"--protocol: expected deform3dgs, .* or all, got "):
             chosen_protocols(text)
 
 
 def test_what_the_paper_did_is_told_in_words_of_tags():
-    assert all(set(dict(about.paper)) <= set(KEYS) for about in PROTOCOLS.values())
-    assert all("split" in dict(about.paper) for about in PROTOCOLS.values())
+    assert all(set(dict(about.paper)) <= set(KEYS) for about in map(PROTOCOLS.load, NAMES))
+    assert all("split" in dict(about.paper) for about in map(PROTOCOLS.load, NAMES))
 
 
-@pytest.mark.parametrize("about", [*PROTOCOLS.values(), OURS], ids=lambda about: about.title)
+@pytest.mark.parametrize("about", [*map(PROTOCOLS.load, NAMES), OURS], ids=lambda about: about.title)
 def test_the_page_of_published_figures_has_the_tags_of_the_table(about):
     paper = {"split": "test", "saw_test_frames": "no", "background": "black"} | dict(about.paper)
     rows = f"0..{about.kept_rows - 1}" if about.kept_rows else "all"
@@ -317,7 +317,7 @@ def test_the_command_prints_a_column_for_each_protocol(tmp_path, sequence, capsy
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--pictures", "P", "DATA", "--protocol", "endonurf"], "--protocol: expected endonerf, endosurf, endogs,"),
+        (["--pictures", "P", "DATA", "--protocol", "endonurf"], "--protocol: expected deform3dgs, endo4dgs,"),
         (["nowhere", "--protocol", "nerf"], "got 'nerf'. Fix: See docs/scores.md."),
         (["--masks", "P", "DATA", "--protocol", "endonerf"], "--masks TRUTH DATA, with no option but --out"),
     ],

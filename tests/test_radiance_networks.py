@@ -7,15 +7,15 @@ import math
 import pytest
 import torch
 
-from endoprior.core import presets_radiance
-from endoprior.core.config_radiance import RadianceConfig
-from endoprior.radiance import endonerf_networks, endosurf_networks
-from endoprior.radiance.encoding import encoded, encoded_change, encoded_size
-from endoprior.radiance.endonerf import EndoNeRF
-from endoprior.radiance.endonerf_networks import CanonicalNetwork, TimeNetwork
-from endoprior.radiance.endosurf import EndoSurf, rounds_of
-from endoprior.radiance.endosurf_networks import ColorNetwork, DeformationNetwork, SurfaceNetwork
-from endoprior.radiance.layers import Linear, NormedLinear
+from endoprior_baselines.radiance import endonerf_networks, endosurf_networks
+from endoprior_baselines.radiance import presets as presets_radiance
+from endoprior_baselines.radiance.config import RadianceConfig
+from endoprior_baselines.radiance.encoding import encoded, encoded_change, encoded_size
+from endoprior_baselines.radiance.endonerf import EndoNeRF
+from endoprior_baselines.radiance.endonerf_networks import CanonicalNetwork, TimeNetwork
+from endoprior_baselines.radiance.endosurf import EndoSurf, rounds_of
+from endoprior_baselines.radiance.endosurf_networks import ColorNetwork, DeformationNetwork, SurfaceNetwork
+from endoprior_baselines.radiance.layers import Linear, NormedLinear
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -9,12 +9,12 @@ from render_scenes import camera as some_camera
 
 from endoprior.core.geometry import pixel_centers, project
 from endoprior.core.types import Camera
-from endoprior.radiance import endonerf_losses, endosurf_losses
-from endoprior.radiance.compositing import Composited, composited, density_alpha, surface_alpha
-from endoprior.radiance.marching import first_crossing
-from endoprior.radiance.rays import all_rays, from_perspective, rays_of, to_perspective
-from endoprior.radiance.refinement import due, refined
-from endoprior.radiance.sampling import by_weight, centers, even, jittered, sphere_ends, surface_places
+from endoprior_baselines.radiance import endonerf_losses, endosurf_losses
+from endoprior_baselines.radiance.compositing import Composited, composited, density_alpha, surface_alpha
+from endoprior_baselines.radiance.marching import first_crossing
+from endoprior_baselines.radiance.rays import all_rays, from_perspective, rays_of, to_perspective
+from endoprior_baselines.radiance.refinement import due, refined
+from endoprior_baselines.radiance.sampling import by_weight, centers, even, jittered, sphere_ends, surface_places
 
 
 def test_rays_pass_the_pixel_centers():

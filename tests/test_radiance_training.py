@@ -12,28 +12,28 @@ import torch
 from state_files import StateFile
 
 from endoprior.cli.trained_scene import open_gaussians
-from endoprior.core import presets_radiance
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
-from endoprior.core.presets import preset
 from endoprior.core.types import Frame
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.evaluation import context
 from endoprior.evaluation.scorers import speed
 from endoprior.evaluation.scoring import evaluate
+from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
-from endoprior.radiance.enclosing_sphere import enclosing_sphere, without_outliers
-from endoprior.radiance.endonerf import EndoNeRF, depth_spread
-from endoprior.radiance.endosurf import EndoSurf
-from endoprior.radiance.frames import RayFrames, measured
-from endoprior.radiance.scene import RadianceScene
 from endoprior.runs.remote import train_here, trainings
 from endoprior.runs.train import start_run, train
 from endoprior.system.arrays_file import load_arrays, save_arrays
 from endoprior.training import divergence
 from endoprior.training.divergence import Diverged
-from endoprior.training.radiance_trainer import RadianceTrainer
 from endoprior.training.stage import Stage
+from endoprior_baselines.radiance import presets as presets_radiance
+from endoprior_baselines.radiance.enclosing_sphere import enclosing_sphere, without_outliers
+from endoprior_baselines.radiance.endonerf import EndoNeRF, depth_spread
+from endoprior_baselines.radiance.endosurf import EndoSurf
+from endoprior_baselines.radiance.frames import RayFrames, measured
+from endoprior_baselines.radiance.scene import RadianceScene
+from endoprior_baselines.radiance.trainer import RadianceTrainer
 
 FIELDS = {"endonerf": EndoNeRF, "endosurf": EndoSurf}
 NAMES = tuple(FIELDS)
@@ -208,7 +208,7 @@ def test_scene_from_its_file_renders_alike(
     assert a.color.shape == (8, 10, 3) and a.depth.shape == a.alpha.shape == (8, 10)
     assert torch.equal(a.color, b.color) and torch.equal(a.depth, b.depth) and torch.equal(a.alpha, b.alpha)
     assert float(a.color.min()) >= 0 and float(a.color.max()) <= 1 and not a.color.requires_grad
-    monkeypatch.setattr("endoprior.radiance.scene.SAMPLES_AT_ONCE", {"cpu": 100})  # 8 rays at a time
+    monkeypatch.setattr("endoprior_baselines.radiance.scene.SAMPLES_AT_ONCE", {"cpu": 100})  # 8 rays at a time
     torch.testing.assert_close(loaded.render(0.4).color, a.color)
     assert loaded.to("cpu") is loaded and loaded.frames_per_second == 15
     with pytest.raises(ValueError, match="time must be"):

@@ -23,10 +23,10 @@ from endoprior.data.image_header import read_header
 from endoprior.data.numpy_files import read_numpy
 from endoprior.data.reading import kind_of, read_bytes, read_text
 from endoprior.data.yaml_text import MOST_NODES, load_yaml
-from endoprior.experiments.worker import finished
 from endoprior.phantom import PhantomConfig
 from endoprior.prepare import PrepareConfig
 from endoprior.prepare.stereo import StereoConfig
+from endoprior_studies.worker import finished
 
 HINT = "Write it again."
 

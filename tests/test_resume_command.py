@@ -13,7 +13,7 @@ import endoprior
 from endoprior.cli import main
 from endoprior.cli.start_config import resume_command, start_config, typed
 from endoprior.core.checks import InputError
-from endoprior.core.presets import preset
+from endoprior.model.presets import preset
 from endoprior.runs.stored_run import config_of_run, read_config
 
 QUICK = [

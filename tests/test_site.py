@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import endoprior
-from endoprior.cli import COMMANDS
+from endoprior.cli import descriptions
 from endoprior.core.config import Config
 from endoprior.core.config_io import to_dict
 
@@ -72,7 +72,7 @@ def test_the_site_builds_and_is_complete_without_the_network(tmp_path):
         if file.suffix in (".html", ".css"):
             assert not (found := FETCHED.search(file.read_text(encoding="utf-8"))), f"{file}: {found[0]}"
     commands, config = ((tmp_path / "docs" / f"{name}.html").read_text(encoding="utf-8") for name in ("cli", "config"))
-    for name in COMMANDS:
+    for name in descriptions():
         assert f"usage: endoprior {name}" in unescape(commands), name
     for name in field_names(to_dict(Config())):
         assert f">{name}<" in config, name

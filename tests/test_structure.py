@@ -10,17 +10,19 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 SRC = ROOT / "src" / "endoprior"
+ADDED = [ROOT / "src" / name for name in ("endoprior_baselines", "endoprior_studies")]
+"""Packages that add to the product through entry points alone."""
 FILES = sorted(SRC.rglob("*.py"))
+ALL_FILES = sorted({*FILES, *(path for package in ADDED for path in package.rglob("*.py"))})
 
 FLOORS = [
     {"core", "compute"},
     {"system", "render", "priors", "footage"},
     {"data", "model"},
-    {"initialization", "evaluation", "visualization", "phantom", "tool_masks", "radiance"},
-    {"training", "doctor", "prepare", "check", "export", "view", "tool_training"},
-    {"methods"},
+    {"initialization", "evaluation", "visualization", "phantom", "tool_masks"},
+    {"training", "doctor", "prepare", "check", "export", "view"},
     {"runs"},
-    {"experiments", "pipeline"},
+    {"pipeline"},
     {"cli"},
 ]
 """Packages, lowest first. A package imports from floors below its own, never from its own or from above."""
@@ -83,6 +85,13 @@ def test_imports_point_down():
             assert target[0] == here or FLOOR_OF[target[0]] < FLOOR_OF[here], f"{path} must not import {target[0]}"
 
 
+def test_the_product_knows_nothing_of_what_is_added_to_it():
+    baselines, studies = (package.name for package in ADDED)
+    assert not [path for path in FILES if baselines in path.read_text() or studies in path.read_text()]
+    assert not [path for path in ADDED[0].rglob("*.py") if studies in path.read_text()]
+    assert not [path for path in ADDED[1].rglob("*.py") if baselines in path.read_text()]
+
+
 def test_no_module_imports_itself_in_a_circle():
     names = {path.relative_to(SRC).with_suffix("").parts: path for path in FILES}
     edges = {name: {target for target in imports(path) if target in names} for name, path in names.items()}
@@ -100,14 +109,14 @@ def test_no_module_imports_itself_in_a_circle():
 
 
 def test_files_are_short_and_say_what_they_are():
-    for path in FILES:
+    for path in ALL_FILES:
         text = path.read_text()
         assert len(text.splitlines()) <= 400, path
         assert not text.strip() or ast.get_docstring(tree(path)), path
 
 
 def test_public_functions_and_classes_have_docstrings():
-    for path in FILES:
+    for path in ALL_FILES:
         for node in tree(path).body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                 if any("njit" in ast.unparse(decorator) for decorator in node.decorator_list):
@@ -131,7 +140,7 @@ def test_numpy_only_parts_do_not_import_torch():
 
 
 def test_no_pickle_and_no_eval_anywhere():
-    for path in FILES:
+    for path in ALL_FILES:
         for node in nodes(path):
             if isinstance(node, ast.Import | ast.ImportFrom):
                 names = {alias.name for alias in node.names}
@@ -187,7 +196,7 @@ def test_lines_of_pages_are_at_most_100_characters_long():
 def test_the_source_has_no_private_vocabulary():
     words = "|".join(PRIVATE_WORDS).replace(" ", "[ _]")
     pattern = re.compile(rf"(?<![a-z])(?:{words})(?:s|ed|ing)?(?![a-z])", re.IGNORECASE)
-    for path in sorted(SRC.rglob("*")):
+    for path in sorted((ROOT / "src").rglob("*")):
         if path.suffix in (".py", ".js", ".html", ".css"):
             for number, line in enumerate(path.read_text().splitlines(), 1):
                 assert not (word := pattern.search(line)), f"{path}:{number}: say {word[0]!r} in the field's words"

@@ -10,20 +10,20 @@ from scipy.spatial.transform import Rotation
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
-from endoprior.core.presets import preset
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
 from endoprior.evaluation import metrics
-from endoprior.methods.surface_points import grid_points
-from endoprior.methods.surgicalgaussian import METHOD, neighbor_terms
-from endoprior.methods.surgicalgaussian_terms import covariances, distance_change, ssim
-from endoprior.methods.time_network import TimeNetwork, encoded, state_shapes
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.presets import preset
 from endoprior.training.density import DensityStats
 from endoprior.training.drawn import Drawn
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA
 from endoprior.training.stage import Stage
+from endoprior_baselines.surface_points import grid_points
+from endoprior_baselines.surgicalgaussian import METHOD, neighbor_terms
+from endoprior_baselines.surgicalgaussian_terms import covariances, distance_change, ssim
+from endoprior_baselines.time_network import TimeNetwork, encoded, state_shapes
 
 CFG = preset("surgicalgaussian")
 

@@ -9,7 +9,7 @@ import torch
 from reference import temporal as reference
 
 from endoprior.core.config import TemporalConfig
-from endoprior.core.presets import preset
+from endoprior.model.presets import preset
 from endoprior.training import temporal, temporal_numba, temporal_torch
 
 CFG = TemporalConfig()

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from tiny_training import tiny_config
 
 from endoprior.cli import main
-from endoprior.core.presets import preset, preset_names
 from endoprior.data import load_sequence
 from endoprior.evaluation.scoring import evaluate
+from endoprior.model.presets import preset, preset_names
 from endoprior.runs.folder import CONFIG
 from endoprior.runs.mask_facts import MARGIN, mask_facts
 from endoprior.runs.train import start_run, train

@@ -14,15 +14,15 @@ from safetensors.torch import save
 from endoprior.core.checks import InputError
 from endoprior.tool_masks.network import ToolNetwork
 from endoprior.tool_masks.weights import network_from_file
-from endoprior.tool_training import benchmark, composites
-from endoprior.tool_training.benchmark import Counts, TestFrame, count, pictures, score_set
-from endoprior.tool_training.camera import photographed, random_view
-from endoprior.tool_training.composites import IGNORED, SIZE, LabeledFrame, examples
-from endoprior.tool_training.fit import RATE, Examples, fit, loss_of, rate_of
-from endoprior.tool_training.foreign_bodies import gauze, needle, ribbed_tube
-from endoprior.tool_training.instruments import instrument
-from endoprior.tool_training.noise import fractal_field, smooth_field
-from endoprior.tool_training.tissue import tissue
+from endoprior_studies.tool_training import benchmark, composites
+from endoprior_studies.tool_training.benchmark import Counts, TestFrame, count, pictures, score_set
+from endoprior_studies.tool_training.camera import photographed, random_view
+from endoprior_studies.tool_training.composites import IGNORED, SIZE, LabeledFrame, examples
+from endoprior_studies.tool_training.fit import RATE, Examples, fit, loss_of, rate_of
+from endoprior_studies.tool_training.foreign_bodies import gauze, needle, ribbed_tube
+from endoprior_studies.tool_training.instruments import instrument
+from endoprior_studies.tool_training.noise import fractal_field, smooth_field
+from endoprior_studies.tool_training.tissue import tissue
 
 TestFrame.__test__ = False
 
@@ -156,7 +156,7 @@ def test_examples_are_padded_and_ignored_there(monkeypatch):
 
 @pytest.mark.slow
 def test_training_learns_and_resumes_bit_identically(tmp_path, monkeypatch):
-    monkeypatch.setattr("endoprior.tool_training.fit.REPORTED", 6)
+    monkeypatch.setattr("endoprior_studies.tool_training.fit.REPORTED", 6)
     losses = []
 
     def train(checkpoint, stop=None):

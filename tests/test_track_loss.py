@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from endoprior.core.config_deformation import BasisConfig
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera
 from endoprior.data import load_sequence
 from endoprior.model.basis import basis_weights
+from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.track_loss import StartTracks, track_term

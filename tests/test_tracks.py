@@ -14,7 +14,6 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config, InitConfig
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, bilinear, project
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
 from endoprior.initialization import anchor_flow, track_kernels
@@ -22,6 +21,7 @@ from endoprior.initialization import flow_tracks as tracks
 from endoprior.initialization.cleanup import PointCloud
 from endoprior.initialization.neighbor_motion import fill_gaps, smooth_motion
 from endoprior.model.basis import basis_weights
+from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
 
 WIDTH, HEIGHT, NUM_FRAMES, DEPTH = 160, 128, 7, 50.0

@@ -16,10 +16,10 @@ from tiny_training import KINDS, losses_of, tiny_config
 from endoprior.compute.morton import morton_order
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config, DataConfig
-from endoprior.core.presets import preset
 from endoprior.data import load_sequence
 from endoprior.export import export
 from endoprior.export.options import ExportOptions
+from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.runs.train import train
 from endoprior.training.gaussian_trainer import GaussianTrainer

@@ -6,8 +6,8 @@ import pytest
 from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
-from endoprior.core.presets import preset
 from endoprior.data import load_sequence
+from endoprior.model.presets import preset
 from endoprior.runs.train import train
 from endoprior.training import memory_check as training_memory
 from endoprior.training.memory_check import LEAST_BYTES, PICTURE_BYTES, least_bytes

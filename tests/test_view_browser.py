@@ -14,8 +14,8 @@ from view_client import at_work
 
 from endoprior.cli.view import open_viewable
 from endoprior.core.geometry import back_project
-from endoprior.core.presets import preset
 from endoprior.data import load_sequence
+from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.runs.train import train
 from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT

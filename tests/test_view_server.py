@@ -16,10 +16,10 @@ from view_client import Client, at_work
 
 from endoprior.cli.view import live_view, open_viewable
 from endoprior.core.config import Config
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera
 from endoprior.data import load_sequence
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.runs.train import train

@@ -17,7 +17,6 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config, DataConfig
 from endoprior.core.config_poses import PoseConfig
 from endoprior.core.config_windows import WindowConfig
-from endoprior.core.presets import preset
 from endoprior.core.types import Camera, Splats
 from endoprior.data import load_sequence
 from endoprior.data.window_plan import Looks, look_through, plan_windows, windows_by_length
@@ -26,6 +25,7 @@ from endoprior.model.deformation import Offsets
 from endoprior.model.fixed_color import with_fixed_color
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.playback import Playback
+from endoprior.model.presets import preset
 from endoprior.model.scene import Scene, faded, faded_in, joined
 from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene

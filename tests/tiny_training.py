@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from endoprior.core.config import Config, DataConfig
-from endoprior.core.presets import preset
 from endoprior.data import load_sequence
+from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
 
 KINDS = ("basis", "hexplane")

@@ -13,9 +13,9 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from endoprior.cli import COMMANDS, main
+from endoprior.cli import descriptions, main
 from endoprior.core.config import Config
-from endoprior.core.presets import PresetName, preset
+from endoprior.model.presets import PresetName, preset
 
 COLUMNS = 88
 CONFIG_GROUP = re.compile(r"^\S+ options:$", re.MULTILINE)
@@ -36,7 +36,7 @@ def help_text(command: str) -> str:
 
 def commands_page() -> Iterator[str]:
     """Markdown: every command with all its options and their defaults."""
-    for name, about in COMMANDS.items():
+    for name, about in descriptions().items():
         yield f"## {name}\n\n`endoprior {name}`: {about}.\n\n```text\n{help_text(name)}\n```\n"
 
 

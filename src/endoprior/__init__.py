@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .core.checks import InputError
     from .core.config import Config
-    from .core.presets import preset
     from .data import load_sequence
     from .evaluation.scoring import evaluate
+    from .model.presets import preset
     from .model.scene import Scene
     from .model.scene_file import load_scene
     from .priors import joint_texture_prior
@@ -30,7 +30,7 @@ HOMES = {
     "joint_texture_prior": "priors",
     "load_scene": "model.scene_file",
     "load_sequence": "data",
-    "preset": "core.presets",
+    "preset": "model.presets",
     "train": "runs.train",
 }
 """Module of each public name. No module or package directly below this one has such a name: it would replace it."""

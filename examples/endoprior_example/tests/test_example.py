@@ -8,8 +8,8 @@ import pytest
 from endoprior import evaluate, load_sequence
 from endoprior.cli import main
 from endoprior.data.images import save_png
-from endoprior.experiments.method import REGISTRY as METHODS
 from endoprior.export.formats import load_format
+from endoprior_studies.method import method_named
 
 WIDTH, HEIGHT, FRAMES = 32, 24, 10
 
@@ -42,7 +42,7 @@ def test_the_layout_is_recognized(folder):
 @pytest.mark.parametrize(("num_frames", "errors"), [(1, (10, 10)), (2, (0, 15)), (100, (34, 46))])
 def test_the_method_and_the_score(folder, tmp_path, num_frames, errors):
     """Frames 1 and 9 are scored. The nearest are 0 and 8, then 2 and 7; the mean of all training frames is 44."""
-    sequence, method = load_sequence(folder), METHODS.load("nearest-frame")
+    sequence, method = load_sequence(folder), method_named("nearest-frame")
     options = type(method.options)(num_frames=num_frames)
     found = method.train(sequence.training_view(), options, seed=0, out=tmp_path / "out")
     result = evaluate(found, sequence, networks=False)

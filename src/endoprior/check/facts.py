@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError
 from ..core.config import DataConfig
-from ..core.presets import preset
 from ..core.spread import spread
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
@@ -27,6 +26,7 @@ from ..footage.changes import Changes, find_changes
 from ..footage.polarity import Polarity, mask_polarity
 from ..footage.pose_fit import PoseFit
 from ..initialization.sampling import initial_points
+from ..model.presets import preset
 from .border_facts import BorderFacts, measure_border
 from .depth_facts import DepthFacts, measure_depth
 from .pose_facts import measure_pose_fit

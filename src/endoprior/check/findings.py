@@ -14,11 +14,11 @@ import numpy as np
 from ..core.checks import number_ranges
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
-from ..core.presets import preset
 from ..core.types import Camera
 from ..data.description import SIZE_NOT_STATED
 from ..footage.camera_motion import MOVING_FRACTION
 from ..footage.units import FAR_MM
+from ..model.presets import preset
 from .facts import Facts
 from .fixes import (
     convert_poses,

@@ -13,6 +13,7 @@ from importlib import import_module
 from ..core.checks import InputError
 from ..system.installation import docs_folder
 from ..system.memory import reject_small_limits
+from ..system.plugins import Registry
 from .usage_errors import unknown_command
 
 COMMANDS = {
@@ -31,12 +32,19 @@ COMMANDS = {
     "view": "show a trained scene, or a sequence before training, in a web browser",
     "doctor": "report whether this computer can train and use a GPU, and what to install for it",
     "batch": "do `run` for many videos and sequence folders, here or on a Ray cluster",
-    "bench": "compare methods on sequences over seeds, under one protocol",
-    "plugins": "list datasets, methods, scores and exporters: built in, and of other packages",
+    "plugins": "list what other packages add, and what is built in: datasets, methods, scores, ...",
 }
 """Name and one-line description. Each command is a module of this package with the same name (`eval`: `evaluate`)."""
 
 MODULES = {"eval": "evaluate"}
+REGISTRY = Registry(
+    "commands",
+    "a module with ABOUT, its one-line description, and run(arguments)",
+    lambda found: "" if callable(getattr(found, "run", None)) and hasattr(found, "ABOUT") else "something else",
+    modules=tuple(COMMANDS),
+    load_module=lambda name: import_module(f".{MODULES.get(name, name)}", __package__),
+)
+"""The commands above, and those of other packages."""
 NO_MEMORY = ("can't allocate memory", "not enough memory", "Insufficient memory", "bad_alloc", "can't start new thread")
 """Messages of torch, OpenCV and the system when memory runs out; they do not raise MemoryError."""
 
@@ -65,10 +73,11 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     name, rest = argv[0], argv[1:]
     try:
-        if name not in COMMANDS:
-            raise unknown_command(name, {word: word for word in COMMANDS} | {MODULES[word]: word for word in MODULES})
+        if name not in REGISTRY.names():
+            words = REGISTRY.names()
+            raise unknown_command(name, {word: word for word in words} | {MODULES[word]: word for word in MODULES})
         reject_small_limits()
-        return import_module(f".{MODULES.get(name, name)}", __package__).run(rest) or 0
+        return REGISTRY.load(name).run(rest) or 0
     except InputError as error:
         print(f"endoprior: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -105,9 +114,14 @@ def system_failure(error: Exception) -> str | None:
     return None
 
 
+def descriptions() -> dict[str, str]:
+    """What each command does, by name; those of other packages last."""
+    return COMMANDS | {name: module.ABOUT for name, module in REGISTRY.usable()}
+
+
 def overview() -> str:
     """The text of `endoprior --help`."""
-    lines = [f"  {name:<9}{about}" for name, about in COMMANDS.items()]
+    lines = [f"  {name:<9}{about}" for name, about in descriptions().items()]
     return "\n".join(
         [
             "usage: endoprior COMMAND ...",

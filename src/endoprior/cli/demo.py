@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from ..core.presets import PresetName, preset
+from ..model.presets import PresetName, preset
 from ..system.console import say
 from .help_page import Help
 from .parsing import parse

@@ -23,7 +23,6 @@ from .trained_scene import folder_of, open_scene
 if TYPE_CHECKING:
     from ..data import FrameSequence
     from ..evaluation.context import Evaluation
-    from ..evaluation.protocols.table import ProtocolName
     from ..model.scene import RenderedScene
 
 
@@ -109,7 +108,7 @@ def evaluate_run(
     networks: bool,
     weights_dir: Path | None,
     extra: dict[str, float],
-    protocols: Sequence[ProtocolName] = (),
+    protocols: Sequence[str] = (),
 ) -> None:
     """Score the `scene` of a `run` on the sequence folder `data`, write the two files into `out`, print a table.
 
@@ -128,7 +127,7 @@ def evaluate_run(
     save_and_print(result, sequence, out, split, run)
 
 
-def evaluate_pictures(args: Eval, folder: Path, protocols: Sequence[ProtocolName]) -> None:
+def evaluate_pictures(args: Eval, folder: Path, protocols: Sequence[str]) -> None:
     """Score the rendered frames in `folder` on the sequence that takes the place of the run."""
     from ..data import load_sequence
     from ..evaluation.pictures import Pictures

@@ -12,11 +12,10 @@ import tyro
 
 from ..core.checks import input_error
 from ..core.config import Config
-from ..core.methods import method_named
 from ..core.options import command_of
-from ..core.presets import PresetName, preset
 from ..core.shell import command
 from ..doctor.choice import Wanted
+from ..model.presets import PresetName, preset
 from ..prepare.config import PrepareConfig
 from ..system.console import say
 from .devices import with_device
@@ -144,7 +143,9 @@ def require_gaussians(cfg: Config, fix: str) -> None:
     Raises:
         InputError: with this `fix`.
     """
-    if not method_named(cfg.method).has_gaussians:
+    from ..model.method import method_of
+
+    if not method_of(cfg).has_gaussians:
         raise input_error("--preset", "a method with Gaussians, which all steps need", cfg.method, fix)
 
 

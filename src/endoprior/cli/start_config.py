@@ -9,9 +9,9 @@ from typing import get_args
 
 from ..core.checks import input_error
 from ..core.config import Config
-from ..core.presets import PresetName, preset
 from ..core.shell import command
 from ..doctor.choice import Wanted
+from ..model.presets import PresetName, preset
 
 
 def start_config(argv: Sequence[str]) -> tuple[PresetName, Config]:

@@ -13,10 +13,9 @@ import tyro
 from ..core.checks import input_error
 from ..core.config import Config
 from ..core.config_io import SHORT_NAMES
-from ..core.methods import method_named
-from ..core.presets import PresetName
 from ..core.shell import command
 from ..doctor.choice import Wanted
+from ..model.presets import PresetName
 from ..runs.progress import training_progress
 from ..system.console import say
 from .devices import with_device
@@ -88,7 +87,9 @@ def run(argv: list[str]) -> None:
         raise input_error("--checkpoint-seconds", "at least 0", str(args.checkpoint_seconds), "Remove it for 60.")
     if args.ray and args.view:
         raise input_error("--view", "a training in this process", f"--ray {args.ray}", "remove one of them.")
-    if args.view and not method_named(cfg.method).has_gaussians:
+    from ..model.method import method_of
+
+    if args.view and not method_of(cfg).has_gaussians:
         raise input_error("--view", "a method with Gaussians", cfg.method, "remove --view.")
     kept = {"resume": args.resume, "checkpoint_seconds": args.checkpoint_seconds, "ray": args.ray}
     train_and_evaluate(args.data, cfg, args.out, args.networks, args.weights_dir, port, **kept)

@@ -19,11 +19,11 @@ from .checks import InputError, check_range, read_ranges
 from .config_deformation import DeformationConfig
 from .config_io import from_dict, override, to_dict
 from .config_poses import PoseConfig
-from .config_radiance import RadianceConfig
 from .config_windows import WindowConfig
-from .methods import METHODS, OWN
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
+OWN = "endoprior"
+"""Our own method."""
 Backend = Literal["reference", "numba", "triton", "gsplat"]
 """What renders: see `render`."""
 
@@ -332,7 +332,7 @@ class Config(Checked):
     """The whole config. Equal configs, data and machine give bit-identical results on a CPU."""
 
     method: str = OWN
-    """Whose rules start, draw, compare and grow: ours, or those of a compared method (docs/methods.md)."""
+    """Whose rules start, draw, compare and grow: ours, or those of another installed method (docs/methods.md)."""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of all random choices. Sampling, initial weights, frame order and splits."""
     data: DataConfig = field(default_factory=DataConfig)
@@ -347,19 +347,9 @@ class Config(Checked):
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     poses: PoseConfig = field(default_factory=PoseConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
-    radiance: RadianceConfig = field(default_factory=RadianceConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.method not in METHODS:
-            raise InputError(
-                f"method: expected one of {', '.join(METHODS)}; got {self.method!r:.80}. Start from its preset."
-            )
-        if self.init.motion == "flow" and self.method != OWN:
-            raise InputError(
-                f"init.motion: expected rest with method {self.method}; got flow, which only our own method can start "
-                f"from. Start from --preset {self.method}, or leave --method out."
-            )
         if self.init.motion == "flow" and self.deformation.kind != "basis":
             raise InputError(
                 f"init.motion: expected rest with deformation.kind {self.deformation.kind}; got flow, which only the "
@@ -377,7 +367,7 @@ class Config(Checked):
         """
         values = to_dict(self)
         override(values, changes, "config")
-        return from_dict(Config, values)
+        return from_dict(type(self), values)
 
     def fitted(self, num_frames: int) -> Config:
         """The config with the fields filled in that depend on the length of the sequence."""

@@ -48,10 +48,10 @@ def _problem(found: Any) -> str:
 
 REGISTRY: Registry[Format] = Registry(
     "datasets",
-    FORMATS,
-    lambda name: import_module(f".{name}", __package__).FORMAT,
     "a Format of endoprior.data.formats",
     _problem,
+    modules=FORMATS,
+    load_module=lambda name: import_module(f".{name}", __package__).FORMAT,
     reserved=("auto",),
 )
 """The layouts above, and those of plugins."""

@@ -65,10 +65,10 @@ def _builtin(name: str) -> Scorer:
 
 REGISTRY: Registry[Scorer] = Registry(
     "scores",
-    SCORERS,
-    _builtin,
     "SCORES, a tuple of endoprior.evaluation.score.Score, and compute(context)",
     _problem,
+    modules=SCORERS,
+    load_module=_builtin,
 )
 """The scorers above, and those of plugins."""
 

@@ -21,7 +21,7 @@ from ..system.devices import name_of
 from .context import Evaluation, EvaluationContext
 from .metrics import ScoreUnavailable
 from .protocols.compute import score_protocols
-from .protocols.table import OURS, ProtocolName
+from .protocols.table import OURS
 from .protocols.tags import tags_of
 from .registry import REGISTRY, SCORERS, Scorer, scorers
 from .rendered import Reconstruction, SceneFrames
@@ -37,7 +37,7 @@ def evaluate(
     weights_dir: Path | None = None,
     reading: DataConfig | None = None,
     given_path: NDArray[np.float64] | None = None,
-    protocols: Sequence[ProtocolName] = (),
+    protocols: Sequence[str] = (),
 ) -> Evaluation:
     """Score `scene` on a split of `sequence`: every score that docs/scores.md lists.
 

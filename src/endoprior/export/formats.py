@@ -82,10 +82,10 @@ def _problem(found: Any) -> str:
 
 REGISTRY: Registry[Format] = Registry(
     "exporters",
-    FORMATS,
-    lambda name: import_module(f".{name}", __package__).FORMAT,
     "a Format of endoprior.export.formats",
     _problem,
+    modules=FORMATS,
+    load_module=lambda name: import_module(f".{name}", __package__).FORMAT,
 )
 """The formats above, and those of plugins."""
 

@@ -1,20 +1,25 @@
-"""What a method is: which config it starts from, how it trains, and what its scenes are made of.
+"""What a method is: how it trains, what its scenes are made of, and which methods are installed.
 
 Reading frames, run folders, logs, checkpoints, scoring and rendering are the same for all. A method that consists of
-moving Gaussians is a `training.gaussian_method.GaussianMethod`.
+moving Gaussians is a `training.gaussian_method.GaussianMethod`. All methods, our own too, are entry points of the group
+`endoprior.methods` (docs/plugins.md), so that nothing here imports one.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from ..core.config import Config
-from ..core.methods import method_named
+from ..core.checks import input_error
+from ..core.config import OWN, Config
+from ..core.config_io import from_dict
 from ..system.arrays_file import ArraySpec
+from ..system.plugins import Registry
 
 if TYPE_CHECKING:
     from ..core.types import Camera
@@ -34,9 +39,11 @@ class Method(ABC):
     has_gaussians = True
     """Whether its scenes consist of Gaussians: a `Scene`; else they are only a `RenderedScene`."""
 
-    @abstractmethod
-    def config(self) -> Config:
-        """The config that the preset of its name starts from."""
+    config_type: type[Config] = Config
+    """Type of its configs: a subclass has options of its own."""
+
+    only: Mapping[str, Any] = {}
+    """Fields of the config that it does not use, by dotted name, and their one value: others are rejected."""
 
     @abstractmethod
     def trainer(self, sequence: FrameSequence, cfg: Config) -> Trainer:
@@ -67,9 +74,53 @@ class Method(ABC):
         raise TypeError(f"{cfg.method} has no Gaussians")
 
 
+def _problem(found: Any) -> str:
+    if isinstance(found, Method):
+        return ""
+    options = getattr(found, "options", None)
+    if not dataclasses.is_dataclass(options) or isinstance(options, type):
+        return f"options of type {type(options).__name__}"
+    return "" if callable(getattr(found, "train", None)) else "no function train"
+
+
+METHODS: Registry[Any] = Registry(
+    "methods",
+    "a Method, or options, a dataclass with its values, and train(sequence, options, seed, out)",
+    _problem,
+)
+"""What can be trained. One that is no `Method` is known to `endoprior bench` only."""
+
+
+@cache
+def method_named(name: str) -> Method:
+    """The method of that name.
+
+    Raises:
+        InputError: none has this name, or it is one that only `endoprior bench` can train.
+    """
+    known = METHODS.names()
+    if name not in known:
+        fix = "Install endoprior again." if OWN not in known else "Start from its preset, or install its package."
+        raise input_error("method", f"one of {', '.join(known) or 'none'}", f"{name!r:.80}", fix)
+    found = METHODS.load(name)
+    if not isinstance(found, Method):
+        raise input_error("method", "a Method", f"{name}, which only trains in a benchmark", "`endoprior bench`.")
+    return found
+
+
 def method_of(cfg: Config) -> Method:
     """The method of a config."""
     return method_named(cfg.method)
+
+
+def config_from(values: Any) -> Config:
+    """A config from the nested dict of a file; its type is that of its method.
+
+    Raises:
+        InputError: names the field, the expected and the actual value.
+    """
+    name = values.get("method", OWN) if isinstance(values, dict) else OWN
+    return from_dict(method_named(name).config_type if isinstance(name, str) else Config, values)
 
 
 def motion_of(cfg: Config) -> Motion:

@@ -12,14 +12,13 @@ import numpy as np
 from torch import Tensor
 
 from ..core.checks import input_error
-from ..core.config import Config
 from ..core.config_io import from_dict
 from ..core.geometry import FARTHEST_MM
 from ..core.shell import command
 from ..core.types import Camera
 from ..system.arrays_file import ArraySpec, load_arrays, rejecting
 from . import windowed_scene
-from .method import method_of
+from .method import config_from, method_of
 from .scene import RenderedScene
 from .scene_facts import LARGEST_IMAGE, LARGEST_SIDE, MOST_GAUSSIANS, SceneFacts, camera_arrays, demand
 from .single_scene import FORMAT, SingleScene
@@ -49,7 +48,8 @@ def load_scene(path: str | Path) -> RenderedScene:
         raise input_error(file, "a trained scene", "an unfinished run" if stopped else "none", f"`{finish}`.")
     arrays, about = load_arrays(file, {FORMAT: scene_schema, windowed_scene.FORMAT: index_schema}, NEXT_STEP)
     with rejecting(file, "a scene", NEXT_STEP):
-        facts = from_dict(SceneFacts, {name: value for name, value in about.items() if name != "format"}, "about")
+        known = {name: value for name, value in about.items() if name != "format"}
+        facts = from_dict(SceneFacts, known | {"config": config_from(about["config"])}, "about")
         _check_cameras(arrays)
         if about["format"] == windowed_scene.FORMAT:
             return _windowed(arrays, facts, file)
@@ -58,7 +58,7 @@ def load_scene(path: str | Path) -> RenderedScene:
 
 def scene_schema(about: dict[str, Any]) -> dict[str, ArraySpec]:
     """The arrays of a scene's file of this description; `T` frames."""
-    cfg = from_dict(Config, about["config"])
+    cfg = config_from(about["config"])
     return method_of(cfg).schema(cfg) | CAMERAS
 
 

@@ -9,10 +9,11 @@ import yaml
 
 from ..core.checks import InputError, input_error
 from ..core.config import Config
-from ..core.config_io import from_dict, to_dict
+from ..core.config_io import to_dict
 from ..data.files import read_json
 from ..data.reading import kind_of, read_text
 from ..data.yaml_text import load_yaml
+from ..model.method import config_from
 
 
 def config_of_run(run: Path) -> Config:
@@ -66,7 +67,7 @@ def config_of(values: Any, file: Path) -> Config:
         InputError: names file and field.
     """
     try:
-        return from_dict(Config, values)
+        return config_from(values)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 

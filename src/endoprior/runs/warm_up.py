@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from ..core.config import Config
-from ..core.config_io import from_dict
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..evaluation.scoring import evaluate
-from ..model.method import method_of
+from ..model.method import config_from, method_of
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
 
@@ -50,7 +49,7 @@ def shortened(cfg: Config) -> Config:
 
 def main() -> None:
     """Read the config, train, score."""
-    cfg, sequence = shortened(from_dict(Config, json.load(sys.stdin))), tiny_sequence()
+    cfg, sequence = shortened(config_from(json.load(sys.stdin))), tiny_sequence()
     trainer = method_of(cfg).trainer(sequence, cfg)
     trainer.start()
     while not trainer.finished:

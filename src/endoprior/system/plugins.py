@@ -1,4 +1,4 @@
-"""Plugins: datasets, methods, scores and exporters that other packages add through entry points; docs/plugins.md.
+"""Plugins: what packages add through entry points; docs/plugins.md. Our compared methods and studies are plugins too.
 
 Nothing is imported before it is used. A plugin that cannot be used is reported once and left out; only a command that
 asks for it by name ends with an error.
@@ -18,6 +18,8 @@ from typing import Any, Generic, TypeVar
 from ..core.checks import InputError, input_error
 
 T = TypeVar("T")
+OWN_PACKAGE = "endoprior"
+"""Its entry points are built in: no other package can have their names."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class Plugin:
     """An entry point of an installed package."""
 
     kind: str
-    """`datasets`, `methods`, `scores` or `exporters`; the group of its entry point is `endoprior.KIND`."""
+    """What it is, such as `methods`; the group of its entry point is `endoprior.KIND`."""
     name: str
     """What options and specs call it."""
     target: str
@@ -77,28 +79,34 @@ class Registry(Generic[T]):
     def __init__(
         self,
         kind: str,
-        builtin: tuple[str, ...],
-        load_builtin: Callable[[str], T],
         expected: str,
         problem: Callable[[Any], str],
         *,
+        modules: tuple[str, ...] = (),
+        load_module: Callable[[str], T] | None = None,
         reserved: tuple[str, ...] = (),
     ) -> None:
         """Describe a kind; nothing is imported yet.
 
         Args:
             kind: see `Plugin.kind`.
-            load_builtin: imports the built-in one of a name.
             expected: what an entry point must stand for, for messages.
             problem: what is wrong with the object that an entry point stands for; empty if nothing is.
+            modules: built-in names that need no entry point.
+            load_module: gives the one of such a name.
             reserved: names with a meaning of their own, which no plugin can have.
         """
-        self.kind, self.builtin, self.reserved = kind, builtin, reserved
-        self._load_builtin, self._expected, self._problem = load_builtin, expected, problem
+        self.kind, self.reserved = kind, reserved
+        self._modules, self._load_module, self._expected, self._problem = modules, load_module, expected, problem
+
+    @property
+    def builtin(self) -> tuple[str, ...]:
+        """The names that come with this package."""
+        return (*self._modules, *(plugin.name for plugin in installed(self.kind) if plugin.package == OWN_PACKAGE))
 
     def names(self) -> tuple[str, ...]:
         """The built-in names, then those of plugins. Plugins whose name is taken are reported and left out."""
-        return (*self.builtin, *self._plugins())
+        return (*self.builtin, *(name for name in self._plugins() if name not in self.builtin))
 
     def load(self, name: str) -> T:
         """The one of that name in `names()`.
@@ -107,10 +115,12 @@ class Registry(Generic[T]):
             InputError: it is a plugin that cannot be used; the message names package and object.
             KeyError: there is none.
         """
-        return self._load_builtin(name) if name in self.builtin else self.loaded(self._plugins()[name])
+        if name in self._modules and self._load_module:
+            return self._load_module(name)
+        return self.loaded(self._plugins()[name])
 
     def usable(self) -> Iterator[tuple[str, T]]:
-        """Name and object of each plugin that can be used; the others are reported."""
+        """Name and object of each entry point that can be used; the others are reported."""
         for name, plugin in self._plugins().items():
             try:
                 yield name, self.loaded(plugin)
@@ -155,6 +165,8 @@ class Registry(Generic[T]):
         return found
 
     def _demand_free_name(self, plugin: Plugin) -> None:
+        if plugin.package == OWN_PACKAGE:
+            return
         if plugin.name in (*self.builtin, *self.reserved):
             raise plugin.rejected("a name of its own", "that of a built-in one", f"uninstall {plugin.package}.")
         if Counter(other.name for other in installed(self.kind))[plugin.name] > 1:

@@ -37,12 +37,14 @@ EPOCHS = 2**31
 
 
 class GaussianMethod(Method):
-    """See `Method`. A subclass gives its `motion` and its `config`, and overrides what it does differently."""
+    """See `Method`. A subclass gives its `motion`, and overrides what it does differently."""
 
     uses_prior = True
     """The texture prior of the frames is computed, for density control and the temporal term."""
     keeps_optimizer = False
     """Adam's moments and steps go on from the coarse to the fine stage."""
+    starts_from_flow = False
+    """Its Gaussians can start with the motion that optical flow finds: `init.motion flow`."""
     color_is_error = False
     """Its term `color` is the mean absolute error over tissue; else the divergence check has that computed."""
     first_share = 0.0

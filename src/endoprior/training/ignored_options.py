@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from ..core.checks import input_error
 from ..core.config import Config
 from ..model.method import method_of
-from .radiance_method import RadianceMethod
+from ..model.presets import preset, preset_names
 
 
 def reject_ignored_options(cfg: Config) -> None:
@@ -17,11 +15,11 @@ def reject_ignored_options(cfg: Config) -> None:
         InputError: names the option, and the only value that its method takes.
     """
     method = method_of(cfg)
-    only: dict[str, Any] = {}
-    if isinstance(method, RadianceMethod):
-        only = {"data.eyes": "left", "poses.refine": "never"}
-    elif method.has_gaussians and not method.uses_prior:
-        only = {"temporal.weight": 0.0}  # the term weighs Gaussians by the prior
+    only = dict(method.only)
+    if method.has_gaussians and not method.uses_prior:
+        only["temporal.weight"] = 0.0  # the term weighs Gaussians by the prior
+    if method.has_gaussians and not method.starts_from_flow:
+        only["init.motion"] = "rest"
     for name, value in only.items():
         section, _, field = name.partition(".")
         got = getattr(getattr(cfg, section), field)
@@ -33,7 +31,8 @@ def reject_ignored_options(cfg: Config) -> None:
 def note_on_budget(cfg: Config) -> str | None:
     """A line for the user if `init.budget` was set and has no effect; not an error, as benchmark specs set it."""
     method = method_of(cfg)
-    if (method.has_gaussians and not method.first_share) or cfg.init.budget == method.config().init.budget:
+    usual = preset(cfg.method) if cfg.method in preset_names() else cfg
+    if (method.has_gaussians and not method.first_share) or cfg.init.budget == usual.init.budget:
         return None
     start = "starts from the pixels of frames" if method.has_gaussians else "has no Gaussians"
     return f"init.budget {cfg.init.budget} (--gaussians) has no effect: {cfg.method} {start}"

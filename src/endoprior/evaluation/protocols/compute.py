@@ -23,7 +23,7 @@ from .. import metrics
 from ..context import EXACT, NETWORKS_OFF, EvaluationContext
 from ..metrics import ScoreUnavailable
 from ..rendered import RenderedFrame
-from .table import PROTOCOLS, Protocol, ProtocolName
+from .table import PROTOCOLS, Protocol
 from .tags import rows_of, tags_of
 
 NO_TISSUE = "no tissue in the frames"
@@ -31,9 +31,7 @@ NO_DEPTH = "no tissue with measured depth"
 Load = Callable[[str, int], metrics.LpipsDistance]
 
 
-def score_protocols(
-    names: Sequence[ProtocolName], context: EvaluationContext, reading: DataConfig
-) -> dict[str, dict[str, Any]]:
+def score_protocols(names: Sequence[str], context: EvaluationContext, reading: DataConfig) -> dict[str, dict[str, Any]]:
     """Score the frames of the split by each protocol.
 
     Args:
@@ -44,7 +42,7 @@ def score_protocols(
         empty where the masks of the protocol are missing, and all scores are skipped.
     """
     load = _loader(context.networks, context.weights_dir)
-    return {name: _score(PROTOCOLS[name], context, reading, load) for name in names}
+    return {name: _score(PROTOCOLS.load(name), context, reading, load) for name in names}
 
 
 def _score(about: Protocol, context: EvaluationContext, reading: DataConfig, load: Load) -> dict[str, Any]:

@@ -1,0 +1,194 @@
+"""`learned_basis.value_at` and its step of Adam in Numba: sixteen coefficients at once. CPU.
+
+The coefficients of a Gaussian, and those of one Gaussian after the other, are one flat row: `LANES` of them are treated
+at once, whatever Gaussian, basis function and channel they belong to. At any one time most basis functions are zero in
+float32, so most groups of lanes need no exponential.
+"""
+
+from __future__ import annotations
+
+from math import log2
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from endoprior.compute.exponential import power_of_two
+from endoprior.compute.simd import (
+    LANES,
+    fma,
+    largest,
+    load_some,
+    magnitude,
+    splat,
+    square_root,
+    store,
+    store_some,
+    where_ge,
+)
+
+f4 = np.float32
+SMALLEST_SQUARE = f4(1e-4)
+"""Added to the squared width."""
+_REACH = f4(9.3)  # exp(-9.3^2) is below the smallest normal float32: 2^-126
+_LOG2_E = f4(log2(np.e))
+# Processors are slow with numbers below 1e-38, and the flank of a basis function leads there. As shares of epsilon:
+_FELT = f4(0.02)  # of a gradient: less moves a coefficient by less than 1 % of the learning rate
+_MOVES = f4(1e-10)  # of the first moment
+_BLOCK = 8  # Gaussians treated together: their gradients stay in the nearest cache, and few lanes are left over
+_CHUNK = 8  # blocks per task
+_ZERO, _ONE = f4(0), f4(1)
+
+
+def value_at(
+    weights: NDArray[np.float32], centers: NDArray[np.float32], widths: NDArray[np.float32], time: float
+) -> NDArray[np.float32]:
+    """See `learned_basis.value_at`."""
+    out = np.empty((weights.shape[0], weights.shape[2]), np.float32)
+    _value_at(*(array.reshape(-1) for array in (weights, centers, widths)), weights.shape[1], f4(time), out)
+    return out
+
+
+def adam_step(
+    tensors: list[NDArray[np.float32]],
+    firsts: list[NDArray[np.float32]],
+    seconds: list[NDArray[np.float32]],
+    times: NDArray[np.float32],
+    v_values: NDArray[np.float32],
+    rate: np.float32,
+    root_scale: np.float32,
+    constants: tuple[np.float32, np.float32, np.float32],
+) -> None:
+    """One step of Adam on the three coefficients with the gradient of `value_at` at several times, in place.
+
+    The gradient is computed where it is used: written to memory it would be as large as the coefficients.
+
+    Args:
+        tensors, firsts, seconds: weights, centers, widths, (N, B, C) each, and Adam's moments of each.
+        times: (K,) in [0, 1]. v_values: (K, N, C) gradient of the loss by the value at each.
+        rate: learning rate / (1 - beta1^steps). root_scale: 1 / sqrt(1 - beta2^steps).
+        constants: beta1, beta2, epsilon.
+    """
+    flat = [array.reshape(-1) for group in (tensors, firsts, seconds) for array in group]
+    _adam_step(*flat, tensors[0].shape[1], times, v_values, rate, root_scale, *constants)
+
+
+@njit(forceinline=True)
+def _reach(away, square):
+    # Whether some lane is above 0: its ratio (t - c)^2 / square is below _REACH.
+    return largest(fma(splat(_REACH), square, -(away * away))) > _ZERO
+
+
+@njit(forceinline=True)
+def _bell(ratio):
+    # exp(-ratio^2), 0 from _REACH on.
+    exponent = splat(-_LOG2_E) * ratio * ratio
+    return where_ge(ratio, splat(_REACH), splat(_ZERO), power_of_two(exponent))
+
+
+@njit(forceinline=True)
+def _value(weights, centers, widths, time, place, lanes, held, slot):
+    # Writes w exp(-ratio^2) of the coefficients from `place` on to `held` from `slot` on.
+    away = splat(time) - load_some(centers, place, lanes)
+    width = load_some(widths, place, lanes)
+    square = fma(width, width, splat(SMALLEST_SQUARE))
+    if _reach(away, square):
+        store(held, slot, load_some(weights, place, lanes) * _bell(away * away / square))
+    else:
+        store(held, slot, splat(_ZERO))
+
+
+@njit(parallel=True, cache=True)
+def _value_at(weights, centers, widths, bases, time, out):
+    # One task per chunk of blocks; writes out (N, C).
+    num, channels = out.shape
+    row = bases * channels
+    blocks = (num + _BLOCK - 1) // _BLOCK
+    for task in prange((blocks + _CHUNK - 1) // _CHUNK):
+        held = np.empty(_BLOCK * row + LANES, np.float32)
+        for block in range(task * _CHUNK, min(blocks, (task + 1) * _CHUNK)):
+            begin = block * _BLOCK
+            size = (min(num, begin + _BLOCK) - begin) * row
+            whole = size - size % LANES
+            for i in range(0, whole, LANES):
+                _value(weights, centers, widths, time, begin * row + i, None, held, i)
+            if whole < size:
+                _value(weights, centers, widths, time, begin * row + whole, size - whole, held, whole)
+            for n in range(size // row):
+                for c in range(channels):
+                    out[begin + n, c] = _ZERO
+                for b in range(bases):
+                    for c in range(channels):
+                        out[begin + n, c] += held[n * row + b * channels + c]
+
+
+@njit(forceinline=True)
+def _unless_below(least, value):
+    # 0 where the magnitude is below `least`.
+    return where_ge(magnitude(value), splat(least), value, splat(_ZERO))
+
+
+@njit(forceinline=True)
+def _adam(param, first, second, place, lanes, value, grad, rate, root_scale, beta1, beta2, epsilon):
+    # One step of `LANES` elements whose value and gradient are known.
+    grad = _unless_below(_FELT * epsilon, grad)
+    m = _unless_below(_MOVES * epsilon, fma(splat(beta1), load_some(first, place, lanes), splat(_ONE - beta1) * grad))
+    v = fma(splat(beta2), load_some(second, place, lanes), splat(_ONE - beta2) * grad * grad)
+    store_some(first, place, m, lanes)
+    store_some(second, place, v, lanes)
+    change = splat(rate) * m / fma(square_root(v), splat(root_scale), splat(epsilon))
+    store_some(param, place, value - change, lanes)
+
+
+@njit(forceinline=True)
+def _step(
+    w, c, s, w1, c1, s1, w2, c2, s2, times, held, place, slot, lanes, rate, root_scale, beta1, beta2, epsilon
+):  # fmt: skip
+    # One step of the `LANES` coefficients from `place` on; `held` (K, ...) has the gradient of the value of each.
+    weight, center, width = load_some(w, place, lanes), load_some(c, place, lanes), load_some(s, place, lanes)
+    square = fma(width, width, splat(SMALLEST_SQUARE))
+    v_weight = v_center = v_width = splat(_ZERO)
+    for k in range(len(times)):
+        away = splat(times[k]) - center
+        if _reach(away, square):
+            ratio = away * away / square
+            v_found = load_some(held[k], slot, None) * _bell(ratio)
+            slope = splat(f4(4)) * ratio * weight * v_found / square
+            v_weight = v_weight + v_found
+            v_center = fma(slope, away, v_center)
+            v_width = fma(slope, ratio * width, v_width)
+    _adam(w, w1, w2, place, lanes, weight, v_weight, rate, root_scale, beta1, beta2, epsilon)
+    _adam(c, c1, c2, place, lanes, center, v_center, rate, root_scale, beta1, beta2, epsilon)
+    _adam(s, s1, s2, place, lanes, width, v_width, rate, root_scale, beta1, beta2, epsilon)
+
+
+@njit(parallel=True, cache=True)
+def _adam_step(
+    w, c, s, w1, c1, s1, w2, c2, s2, bases, times, v_values, rate, root_scale, beta1, beta2, epsilon
+):  # fmt: skip
+    # One task per chunk of blocks; changes weights, centers, widths w, c, s and their moments, flat.
+    num_times, num, channels = v_values.shape
+    row = bases * channels
+    blocks = (num + _BLOCK - 1) // _BLOCK
+    for task in prange((blocks + _CHUNK - 1) // _CHUNK):
+        held = np.zeros((num_times, _BLOCK * row + LANES), np.float32)
+        for block in range(task * _CHUNK, min(blocks, (task + 1) * _CHUNK)):
+            begin = block * _BLOCK
+            end = min(num, begin + _BLOCK)
+            for k in range(num_times):
+                for n in range(begin, end):
+                    for b in range(bases):
+                        for i in range(channels):
+                            held[k, (n - begin) * row + b * channels + i] = v_values[k, n, i]
+            size, place = (end - begin) * row, begin * row
+            whole = size - size % LANES
+            for i in range(0, whole, LANES):
+                _step(
+                    w, c, s, w1, c1, s1, w2, c2, s2, times, held, place + i, i, None,
+                    rate, root_scale, beta1, beta2, epsilon,
+                )  # fmt: skip
+            if whole < size:
+                _step(
+                    w, c, s, w1, c1, s1, w2, c2, s2, times, held, place + whole, whole, size - whole,
+                    rate, root_scale, beta1, beta2, epsilon,
+                )  # fmt: skip

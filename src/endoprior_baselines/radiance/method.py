@@ -1,0 +1,53 @@
+"""A method that is a radiance field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from torch import Tensor
+
+from endoprior.core.checks import InputError
+from endoprior.core.config import Config
+from endoprior.core.types import Camera
+from endoprior.data import FrameSequence
+from endoprior.model.method import Method
+from endoprior.model.scene_facts import SceneFacts
+from endoprior.system.arrays_file import ArraySpec, part
+
+from .config import RadianceFieldConfig
+from .field import RadianceField
+from .scene import RadianceScene
+from .trainer import RadianceTrainer
+
+
+class RadianceMethod(Method):
+    """See `Method`."""
+
+    has_gaussians = False
+    config_type = RadianceFieldConfig
+    only: Mapping[str, Any] = {"data.eyes": "left", "poses.refine": "never", "init.motion": "rest"}
+
+    def __init__(self, kind: type[RadianceField], config: Callable[[], Config]) -> None:
+        """Args: kind: of the field. config: what its preset starts from."""
+        self.kind, self._config = kind, config
+
+    def config(self) -> Config:
+        """What its preset starts from."""
+        return self._config()
+
+    def trainer(self, sequence: FrameSequence, cfg: Config) -> RadianceTrainer:
+        """See `Method.trainer`."""
+        return RadianceTrainer(sequence, cfg, self.kind)
+
+    def schema(self, cfg: Config) -> dict[str, ArraySpec]:
+        """See `Method.schema`."""
+        return {f"field.{name}": spec for name, spec in self.kind.schema(cfg.radiance).items()}
+
+    def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> RadianceScene:
+        """See `Method.scene`."""
+        field = self.kind(facts.config.radiance)
+        field.load_state_dict(part(arrays, "field."))
+        if wrong := field.wrong_values():
+            raise InputError(f"expected {wrong}; got something else.")
+        return RadianceScene(field, facts.config, cameras, facts.frames_per_second, facts.lengths_are_relative)

@@ -1,0 +1,170 @@
+"""Training of a radiance field: one stage, rays of one frame in each iteration."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endoprior.core.checks import InputError
+from endoprior.core.config import Config
+from endoprior.data import FrameSequence
+from endoprior.model.scene_file import check_cameras
+from endoprior.system.arrays_file import ArraySpec
+from endoprior.training.divergence import LARGEST_GRADIENT, Diverged, Watch, unusable_numbers
+from endoprior.training.stage import Stage, StepReport, stage_length
+from endoprior.training.trainer import DEFAULT_FRAMES_PER_SECOND, Trainer, device_for
+
+from .field import RadianceField, RayBatch
+from .frames import RayFrames
+from .rays import rays_of
+from .refinement import due, refined
+from .scene import RadianceScene
+from .state import RadianceState, state_schema
+
+BETAS, EPSILON = (0.9, 0.999), 1e-8
+"""Adam's: torch's own, which both releases use."""
+ADVICE = (
+    "Lower --radiance.learning-rate, raise --radiance.rays, or look for wrong depth and poses with `endoprior check`"
+)
+
+
+class RadianceTrainer(Trainer):
+    """See `Trainer`.
+
+    Every random choice is a pure function of (seed, iteration), so a resumed run repeats an uninterrupted one.
+    """
+
+    def __init__(self, sequence: FrameSequence, cfg: Config, kind: type[RadianceField]) -> None:
+        """Prepare; nothing is computed yet.
+
+        Args:
+            kind: the field to train.
+        Raises:
+            InputError: the cameras cannot be used, or the backend has no device here.
+        """
+        self.sequence, self.cfg, self.kind = sequence, cfg.fitted(len(sequence)), kind
+        self.device = device_for(cfg.render.backend)
+        self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
+        try:
+            check_cameras(self.cameras)
+        except InputError as error:
+            raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
+        self.frames = RayFrames(sequence, only_measured=kind.only_measured)
+        self.state: RadianceState | None = None
+        self._watch = Watch(ADVICE)
+
+    def start(self) -> None:
+        """See `Trainer.start`: measure the sequence and give the networks their first values."""
+        self._enter()
+        self.state.field.cpu().start(self.frames, torch.Generator().manual_seed(self.cfg.seed))
+        self.state.field.to(self.device)
+        if self.cfg.radiance.refine_every:
+            depths = [self.frames.depth(k) for k in range(len(self.frames))]
+            self.state.depths = torch.from_numpy(np.stack(depths))
+
+    def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
+        """See `Trainer.restore`."""
+        self._enter()
+        self.state.load(iteration, arrays)
+
+    def _enter(self) -> None:
+        field = self.kind(self.cfg.radiance).to(self.device)
+        adam = torch.optim.Adam(field.parameters(), self.cfg.radiance.learning_rate, BETAS, EPSILON, foreach=False)
+        self.state = RadianceState(Stage.FINE, 0, field, adam, None)
+
+    def schema(self) -> dict[str, ArraySpec]:
+        """See `Trainer.schema`."""
+        camera = self.frames.camera
+        refines = self.cfg.radiance.refine_every > 0
+        with torch.device("meta"):
+            field = self.kind(self.cfg.radiance)
+        return state_schema(field, ("F", camera.height, camera.width) if refines else None)
+
+    def step(self) -> StepReport:
+        """One iteration: rays of one frame, their terms, their gradients, a check, then Adam.
+
+        Raises:
+            Diverged: the loss or a gradient is not finite, or rays have long been no better than black ones. The state
+                is the one before.
+        """
+        began, state, cfg = clock.perf_counter(), self.state, self.cfg
+        iteration, share = state.iteration + 1, (state.iteration + 1) / stage_length(self.cfg, Stage.FINE)
+        rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
+        field, buffers = state.field, {name: value.clone() for name, value in state.field.named_buffers()}
+        batch = self.batch(rng)
+        terms = field.losses(batch, share, rng)
+        state.optimizer.zero_grad(set_to_none=True)
+        sum(terms.values()).backward()
+        values = {name: float(value.detach()) for name, value in terms.items()}
+        reason = unusable_numbers(values, _unusable(field), ADVICE)
+        if reason is None:
+            black = field.color_term(torch.zeros_like(batch.color), batch.color)
+            reason = self._watch.see(values["color"], float(black))
+        if reason is not None:
+            state.optimizer.zero_grad(set_to_none=True)
+            for name, value in field.named_buffers():
+                value.copy_(buffers[name])
+            raise Diverged(reason)
+        for group in state.optimizer.param_groups:
+            group["lr"] = cfg.radiance.learning_rate * field.rate(share)
+        state.optimizer.step()
+        state.optimizer.zero_grad(set_to_none=True)
+        state.iteration = iteration
+        if due(iteration, cfg.radiance.refine_every):
+            self._refine()
+        losses = {name: value.detach() for name, value in terms.items()}
+        return StepReport(state.stage, iteration, losses, 0, clock.perf_counter() - began)
+
+    def batch(self, rng: np.random.Generator) -> RayBatch:
+        """Rays of a random training frame, and what it shows there."""
+        usable = self.frames.usable
+        position = usable[int(rng.integers(len(usable)))]
+        frame = self.frames.frame(position)
+        pixels = self.frames.draw(position, self.cfg.radiance.rays, rng)
+        known = self.frames.depth(position) if self.state.depths is None else self.state.depths[position].numpy()
+        return RayBatch(
+            rays_of(frame.camera, pixels, self.device),
+            frame.time,
+            torch.from_numpy(frame.rgb_u8.reshape(-1, 3)[pixels]).to(self.device).float() / 255,
+            torch.from_numpy(known.ravel()[pixels]).to(self.device),
+        )
+
+    def _refine(self) -> None:
+        """Correct the depth of every training frame by the rendered one."""
+        scene = self._scene()
+        for position in range(len(self.frames)):
+            frame = self.frames.frame(position)
+            view, measured = scene.render(frame.time, frame.camera), self.state.depths[position]
+            rendered = (view.depth / view.alpha.clamp(min=1e-6)).cpu()
+            measured.copy_(refined(measured, rendered, torch.from_numpy(frame.tissue_mask)))
+
+    def synchronize(self) -> None:
+        """Nothing to wait for: each iteration is checked before its update, on every device."""
+
+    def scene(self) -> RadianceScene:
+        """See `Trainer.scene`."""
+        return self._scene().to("cpu")
+
+    def _scene(self) -> RadianceScene:
+        return RadianceScene(
+            self.state.field,
+            self.cfg,
+            self.cameras,
+            self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
+            self.sequence.depth_is_relative,
+        )
+
+
+def _unusable(field: RadianceField) -> dict[str, int]:
+    """Entries of each gradient that are not finite or too large, by the name of the network."""
+    counts: dict[str, int] = {}
+    for name, parameter in field.named_parameters():
+        if parameter.grad is not None:
+            wrong = int((~(parameter.grad.abs() <= LARGEST_GRADIENT)).sum())  # NaN fails too
+            network = name.partition(".")[0]
+            counts[network] = counts.get(network, 0) + wrong
+    return counts

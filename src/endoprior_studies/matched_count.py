@@ -1,0 +1,148 @@
+"""A method whose growth threshold is searched until it ends with as many Gaussians as wanted.
+
+Methods that differ in how many Gaussians they end with differ in quality for that reason alone. The count falls as the
+threshold of growth rises, about as a power of it: the search is a bracketed secant in the logarithms of both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from endoprior.runs.growth import Growth
+
+from .spec import Cell, MatchSpec, Spec
+
+WITHIN = 0.03
+"""Share of the wanted count by which the found one may differ."""
+MOST_PROBES = 8
+FIRST_SLOPE = 0.7
+"""Power with which the count is taken to fall before two trainings say it."""
+SMALLEST_SLOPE = 0.1
+LARGEST_STEP = 8.0
+"""Factor between two thresholds while all tried ones lie on one side."""
+INSIDE = 0.1
+"""Share of the bracket, in logarithms, that the next threshold keeps away from its ends."""
+
+Place = tuple[str, str, int | None]
+"""Sequence, method and budget: what has a threshold of its own."""
+
+
+@dataclass
+class Search:
+    """What was tried for one method on one sequence."""
+
+    start: float
+    """The threshold of the method's own config."""
+    tried: list[tuple[float, Growth]] = field(default_factory=list)
+    target: float = math.nan
+    """Wanted number of Gaussians, known once it can be."""
+    failure: str = ""
+    """Why there is no result."""
+
+    @property
+    def best(self) -> tuple[float, Growth]:
+        """The threshold that comes nearest, and what it gave."""
+        return min(self.tried, key=lambda entry: abs(math.log(entry[1].last / self.target)))
+
+    @property
+    def matched(self) -> bool:
+        """Whether the count is as near as wanted."""
+        return abs(self.best[1].last / self.target - 1) <= WITHIN
+
+
+def next_threshold(search: Search) -> float | None:
+    """The threshold to train with next; None if the search is over, with or without success."""
+    if not search.tried:
+        return search.start
+    if search.matched or len(search.tried) >= MOST_PROBES:
+        return None
+    points = [(math.log(value), math.log(growth.last / search.target)) for value, growth in search.tried]
+    above, below = [p for p in points if p[1] > 0], [p for p in points if p[1] <= 0]
+    if above and below:
+        (low, excess), (high, lack) = max(above), min(below)
+        if low >= high:  # counts that do not fall with the threshold: noise decides, so stop
+            return None
+        share = excess / (excess - lack)
+        return math.exp(low + min(max(share, INSIDE), 1 - INSIDE) * (high - low))
+    value, excess = max(above) if above else min(below)
+    slope = FIRST_SLOPE
+    if len(points) > 1:
+        (one, first), (other, second) = points[-2:]
+        slope = max((first - second) / (other - one), SMALLEST_SLOPE)
+    step = min(max(excess / slope, -math.log(LARGEST_STEP)), math.log(LARGEST_STEP))
+    return math.exp(value + step)
+
+
+def search_thresholds(
+    spec: Spec,
+    counts: Callable[[Place], float],
+    train: Callable[[dict[Cell, float]], dict[Cell, Growth | str]],
+) -> dict[Place, Search]:
+    """Search for every method with a `MatchSpec`, in rounds: those of one round train side by side.
+
+    Args:
+        counts: mean number of Gaussians of a finished method without a search; NaN if there is none.
+        train: trains cells, of the first seed and fold, with the thresholds given; their growth, or why there is none.
+    Returns:
+        A search per place; those with `value_of` share that of another method.
+    """
+    found: dict[Place, Search] = {}
+    probes = {place: Cell(*place, spec.seeds[0], spec.sequences[place[0]].folds[0]) for place in _places(spec)}
+    for place in probes:
+        sequence, method, budget = place
+        match = spec.methods[method].match
+        if match.value_of:
+            continue
+        start = spec.config(method, sequence, budget, spec.seeds[0]).density.grow_threshold
+        found[place] = Search(start)
+        if match.count_of:
+            target = found[place].target = counts((sequence, match.count_of, budget))
+            found[place].failure = "" if target > 0 else f"{match.count_of} has no result to match"
+    while wanted := {place: value for place, search in found.items() if (value := _next(search)) is not None}:
+        results = train({probes[place]: value for place, value in wanted.items()})
+        for place, value in wanted.items():
+            result, search = results[probes[place]], found[place]
+            if isinstance(result, str):
+                search.failure = result
+                continue
+            search.tried.append((value, result))
+            if growth := spec.methods[place[1]].match.growth:
+                search.target = growth * result.first
+    for place in probes:
+        if other := spec.methods[place[1]].match.value_of:
+            found[place] = found[place[0], other, place[2]]
+    return found
+
+
+def _next(search: Search) -> float | None:
+    return None if search.failure else next_threshold(search)
+
+
+def _places(spec: Spec) -> list[Place]:
+    budgets: Sequence[int | None] = spec.budgets or (None,)
+    return [(s, m, b) for s in spec.sequences for m, about in spec.methods.items() if about.match for b in budgets]
+
+
+def matched_table(spec: Spec, searches: dict[Place, Search]) -> list[str]:
+    """Lines of a Markdown table: what was wanted, and what was found."""
+    titles = ("method", "sequence", "threshold of growth", "Gaussians", "wanted", "trainings")
+    lines = ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
+    for (sequence, method, budget), search in searches.items():
+        name = spec.label(method) + (f", {budget:,}" if budget else "")
+        value, counted, wanted = _words(spec.methods[method].match, search)
+        lines.append(f"| {name} | {sequence} | {value} | {counted} | {wanted} | {len(search.tried)} |")
+    return lines
+
+
+def _words(match: MatchSpec, search: Search) -> tuple[str, str, str]:
+    """The threshold, what it gave and what was wanted, in words."""
+    if search.failure:
+        return f"none: {search.failure}", "-", "-"
+    value = f"{search.best[0]:.3g}"
+    if match.value_of:
+        return value, "-", f"threshold of {match.value_of}"
+    why = f"as {match.count_of}" if match.count_of else f"{match.growth:g} times the start"
+    missed = "" if search.matched else " (not reached)"
+    return value, f"{search.best[1].last:,}{missed}", f"{search.target:,.0f}: {why}"

@@ -1,0 +1,286 @@
+"""Write what a benchmark measured: results.md, results.tex, results.csv, results.json and figures."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from endoprior.core.config_io import to_dict
+from endoprior.evaluation.registry import all_scores
+from endoprior.system.atomic import write_json, write_text
+
+from .image_grids import GRIDS, write_image_grids
+from .matched_count import matched_table
+from .matrix import Matrix, commits_of, scores_of
+from .plots import budget_figure, curve_figure
+from .protocol_report import protocol_blocks, protocol_tables, protocol_values
+from .results import Results
+from .silent_rules import silent_rules
+from .spec import ClaimSpec, Spec
+from .statistics import Difference
+from .tables import csv_lines, latex, markdown, score_table
+
+SHOWN_NAMES = 6
+
+
+def write_report(matrix: Matrix, out: Path) -> Path:
+    """Write tables, differences, claims and figures of the finished cells into `out`, and list the others.
+
+    Returns:
+        Path of `results.md`.
+    """
+    results = Results.of(matrix)
+    _figures(matrix, results, out / "figures")
+    tables = [score_table(results, name) for name in matrix.spec.sequences if name in matrix.data]
+    tables += protocol_tables(matrix)
+    write_text(out / "results.tex", "\n\n".join(latex(table) for table in tables) + "\n")
+    write_text(out / "results.csv", csv_lines(results, protocol_values(matrix)))
+    write_json(out / "results.json", _facts(matrix, results))
+    write_text(out / "results.md", "\n\n".join([*_body(matrix, results, out, out, 1), *_protocol([matrix], 2)]) + "\n")
+    return out / "results.md"
+
+
+def write_overview(reports: dict[Path, Matrix], out: Path) -> Path:
+    """Put the reports of several specs into one `results.md` in `out`.
+
+    Args:
+        reports: matrix by the folder that `write_report` wrote, below `out`.
+    """
+    blocks = ["# Results"]
+    for folder, matrix in reports.items():
+        blocks += _body(matrix, Results.of(matrix), folder, out, 2)
+    write_text(out / "results.md", "\n\n".join([*blocks, *_protocol(list(reports.values()), 2)]) + "\n")
+    return out / "results.md"
+
+
+def _body(matrix: Matrix, results: Results, folder: Path, base: Path, level: int) -> list[str]:
+    """All blocks of one spec, its title at heading `level`; links to figures in `folder` are relative to `base`."""
+    below = "#" * (level + 1)
+    return [
+        *_head(matrix, "#" * level),
+        *_tables(matrix, results, below),
+        *claims_section(results, below),
+        *_searches(matrix, below),
+        *_silent(matrix, below),
+        *protocol_blocks(matrix, below),
+        *_figure_links(matrix, folder, base, below),
+    ]
+
+
+def _head(matrix: Matrix, mark: str) -> list[str]:
+    spec = matrix.spec
+    size = f"{len(spec.methods)} methods x {len(spec.sequences)} sequences"
+    size += f" x {len(spec.budgets)} budgets" if spec.budgets else ""
+    seeds = ", ".join(map(str, spec.seeds))
+    lines = [f"{mark} {spec.title}"]
+    if spec.about:
+        lines.append(spec.about.strip())
+    commits = ", ".join(commits_of(matrix)) or "none yet"
+    over = "seeds"
+    if several := {name: about.folds for name, about in spec.sequences.items() if len(about.folds) > 1}:
+        size += "".join(f", folds {', '.join(map(str, folds))} of {name}" for name, folds in several.items())
+        over = "seeds of the mean over folds (which frame of every eight is held out)"
+    lines.append(f"{size}, seeds {seeds}; trained at commit {commits}. Mean ± standard deviation over {over}.")
+    if matrix.missing:
+        by_reason: dict[str, list[str]] = {}
+        for cell, reason in matrix.missing.items():
+            by_reason.setdefault(reason, []).append(f"`{cell.name}`")
+        missing = "\n".join(f"- {_some(names)}: {reason}" for reason, names in by_reason.items())
+        lines.append(f"No result for {len(matrix.missing)} cells:\n\n{missing}")
+    return lines
+
+
+def _some(names: list[str]) -> str:
+    """The first names, and how many more there are."""
+    rest = len(names) - SHOWN_NAMES
+    return ", ".join(names[:SHOWN_NAMES]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _protocol(matrices: list[Matrix], level: int) -> list[str]:
+    """The protocol of the scores, from the first finished cell that has all of it: images have no backend."""
+    folders = [folder for matrix in matrices for folder in matrix.done.values()]
+    if not folders:
+        return []
+    hidden = ("frames", "data_fingerprint", "shrink", "tags")
+    whole = max((scores_of(folder)["protocol"] for folder in folders), key=len)
+    shown = {name: text for name, text in whole.items() if name not in hidden}
+    shown["split_rule"] = "; ".join(sorted({scores_of(folder)["protocol"]["split_rule"] for folder in folders}))
+    return [f"{'#' * level} Protocol", "\n".join(f"- `{name}`: {text}" for name, text in shown.items())]
+
+
+def _tables(matrix: Matrix, results: Results, mark: str) -> list[str]:
+    spec, blocks = matrix.spec, []
+    for name in spec.sequences:
+        if name not in matrix.data:
+            continue
+        blocks += [f"{mark} {name}", "Best in bold, second best underlined.", markdown(score_table(results, name))]
+        scores, others = _of_scenes(spec), [method for method in spec.methods if method != spec.reference]
+        changes = {m: {s: results.difference(s, m, spec.reference, name) for s in scores} for m in others}
+        blocks += _differences(results, name, spec.label(spec.reference), changes)
+        if own := spec.with_own_parts(name):
+            changes = {m: {s: results.gain_of_found(s, m, name, own) for s in scores} for m in spec.methods}
+            parts = " and ".join(spec.sequences[name].found_parts)
+            blocks += _differences(results, name, f"{own}, which has its own {parts}", changes)
+    return blocks
+
+
+def _of_scenes(spec: Spec) -> list[str]:
+    """The scores without those of masks, which are equal for all methods."""
+    return [score for score in spec.scores if all_scores()[score].group != "masks"]
+
+
+def _differences(results: Results, sequence: str, than: str, changes: dict[str, dict[str, Difference]]) -> list[str]:
+    """The paired differences of methods, by score, as a table with a line above it; nothing without pairs."""
+    known = [score for score in _of_scenes(results.spec) if any(row[score].count for row in changes.values())]
+    if not known:
+        return []
+    headings = [all_scores()[score].heading(sequence in results.relative) for score in known]
+    rows = [[results.spec.label(method), *(change(s, row[s]) for s in known)] for method, row in changes.items()]
+    lines = [["method", *headings], ["---"] * (len(known) + 1), *rows]
+    over_frames = any(row[s].over_frames for row in changes.values() for s in known)
+    over = "seeds and, where scores have values of frames, these" if over_frames else "seeds"
+    about = f"Paired difference to {than}, positive where better, [95 % interval over {over}]:"
+    return [about, "\n".join("| " + " | ".join(line) + " |" for line in lines)]
+
+
+def change(score: str, difference: Difference) -> str:
+    """`+3.1 % [+1.0, +5.2]` or `+0.31 dB [+0.10, +0.52]`; a dash where there is nothing to compare."""
+    if not difference.count:
+        return "-"
+    about = all_scores()[score]
+    relative = about.compare == "relative"
+    factor, digits, unit = (100, 1, "%") if relative else (1, about.digits, about.unit)
+    numbers = (difference.mean, difference.low, difference.high)
+    mean, low, high = (f"{factor * value:+.{digits}f}" for value in numbers)
+    interval = f"[{low}, {high}]" if math.isfinite(difference.low) else ""
+    return " ".join(filter(None, (mean, unit, interval)))
+
+
+def _amount(score: str, by: float) -> str:
+    about = all_scores()[score]
+    return f"{100 * by:g} %" if about.compare == "relative" else f"{by:g} {about.unit}".rstrip()
+
+
+def claims_section(results: Results, mark: str) -> list[str]:
+    """Paragraphs with the verdict of each claim, and what no sequence has a result for; `mark`: the heading's `#`s."""
+    if not results.spec.claims:
+        return []
+    lines, missing = [], Counter()
+    for claim in results.spec.claims:
+        found = results.check(claim)
+        if not found:
+            missing[all_scores()[claim.score].heading(bool(results.relative))] += 1
+            continue
+        parts = [f"{name}: **{said}**, {change(claim.score, own)}" for name, (own, said) in found.items()]
+        if len(found) > 1:
+            parts.append(f"together {change(claim.score, results.together(claim))}")
+        source = f" [{claim.text}]" if claim.text else ""
+        lines.append(f"- {sentence(results, claim)}{source}: {'; '.join(parts)}.")
+    if missing:
+        lines.append(f"- Not measured: {'; '.join(f'{score} (claims: {n})' for score, n in missing.items())}.")
+    note = "A verdict needs the whole 95 % interval on one side. Intervals are over seeds (there is none for one) and, "
+    note += "where both methods have values of the same single frames, over these too."
+    return [f"{mark} Claims", "\n".join(lines), note]
+
+
+def _searches(matrix: Matrix, mark: str) -> list[str]:
+    if not matrix.searches:
+        return []
+    about = "Searched with the first seed and fold; the others train with the threshold found."
+    return [f"{mark} Thresholds found", about, "\n".join(matched_table(matrix.spec, matrix.searches))]
+
+
+def _silent(matrix: Matrix, mark: str) -> list[str]:
+    lines = silent_rules(matrix)
+    return [f"{mark} Rules that never fired", "\n".join(f"- {line}." for line in lines)] if lines else []
+
+
+def sentence(results: Results, claim: ClaimSpec) -> str:
+    """The claim in words."""
+    ours, theirs = results.spec.label(claim.method), results.spec.label(claim.than)
+    score, by = all_scores()[claim.score].heading(bool(results.relative)), _amount(claim.score, claim.by)
+    at = f" at {claim.budget:,} initial Gaussians" if claim.budget else ""
+    if claim.expect == "better":
+        return f"{ours} is better than {theirs} in {score}" + (f" by at least {by}" if claim.by else "") + at
+    if claim.expect == "no worse":
+        return f"{ours} is no worse than {theirs} in {score}" + (f" by more than {by}" if claim.by else "") + at
+    return f"{ours} and {theirs} differ in {score} by no more than {by}{at}"
+
+
+def _figures(matrix: Matrix, results: Results, folder: Path) -> None:
+    kinds = set(matrix.spec.figures)
+    if not matrix.done:
+        return
+    if "budgets" in kinds:
+        budget_figure(results, folder / "budgets.png")
+    if "curves" in kinds:
+        curve_figure(results, matrix, folder / "curves.png")
+    write_image_grids(matrix, folder, kinds)
+
+
+def _figure_links(matrix: Matrix, folder: Path, base: Path, mark: str) -> list[str]:
+    names = ["budgets", "curves", *(f"{kind}-{name}" for name in matrix.data for kind in GRIDS)]
+    wanted = [folder / "figures" / f"{name}.png" for name in names if name.split("-")[0] in matrix.spec.figures]
+    links = [f"![{path.stem}]({path.relative_to(base).as_posix()})" for path in wanted if path.exists()]
+    return [f"{mark} Figures", *links] if links else []
+
+
+def _facts(matrix: Matrix, results: Results) -> dict[str, Any]:
+    """Everything in the tables, for other programs."""
+    spec = matrix.spec
+    cells = [
+        {"sequence": c.sequence, "method": c.method, "budget": c.budget, "seed": c.seed, "fold": c.fold}
+        | {"folder": folder.name}
+        | scores_of(folder)
+        for c, folder in matrix.done.items()
+    ]
+    claims = []
+    for claim in spec.claims:
+        found = {name: {"verdict": said} | _json(own) for name, (own, said) in results.check(claim).items()}
+        about = {"sequences": found, "together": _json(results.together(claim)), "sentence": sentence(results, claim)}
+        claims.append(to_dict(claim) | about)
+    differences = [
+        {"sequence": name, "method": method, "than": spec.reference, "score": score}
+        | _json(results.difference(score, method, spec.reference, name))
+        for name in spec.sequences
+        for method in spec.methods
+        if method != spec.reference
+        for score in _of_scenes(spec)
+    ]
+    gains_of_found = [
+        {"sequence": name, "than": own, "method": method, "score": score}
+        | _json(results.gain_of_found(score, method, name, own))
+        for name in spec.sequences
+        if (own := spec.with_own_parts(name))
+        for method in spec.methods
+        for score in _of_scenes(spec)
+    ]
+    missing = {cell.name: reason for cell, reason in matrix.missing.items()}
+    return {
+        "spec": to_dict(spec) | {"folder": None},
+        "commits": commits_of(matrix),
+        "cells": cells,
+        "differences": differences,
+        "gains_of_found_parts": gains_of_found,
+        "claims": claims,
+        "silent_rules": silent_rules(matrix),
+        "thresholds": [
+            {"sequence": s, "method": m, "budget": b, "failure": search.failure, "target": _finite(search.target)}
+            | {"tried": [{"threshold": value, "gaussians": growth.last} for value, growth in search.tried]}
+            for (s, m, b), search in matrix.searches.items()
+        ],
+        "missing": missing,
+    }
+
+
+def _json(difference: Difference) -> dict[str, Any]:
+    numbers = {"mean": difference.mean, "low": difference.low, "high": difference.high}
+    pairs = {"pairs": difference.count, "over_frames": difference.over_frames}
+    return {name: _finite(value) for name, value in numbers.items()} | pairs
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no NaN."""
+    return value if math.isfinite(value) else None
