@@ -11,6 +11,7 @@ import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.video_files import open_container
 from ..system.atomic import whole_file
 
 HD_ROWS = 720
@@ -31,8 +32,8 @@ def write_video(path: Path, images: Iterable[NDArray[np.uint8]], frames_per_seco
         colors = ["-vf", f"scale=out_color_matrix={matrix}:out_range=tv,{tags}"]
         options = {"fps": frames_per_second, "codec": "libx264", "quality": 8, "macro_block_size": 1}
         options["output_params"] = [*colors, "-movflags", "+faststart"]
-        count = 0
-        with imageio.get_writer(str(temporary), format="FFMPEG", ffmpeg_log_level="quiet", **options) as writer:
+        name, count = str(temporary.absolute()), 0  # FFmpeg takes what is before a colon for a protocol, if no / is
+        with imageio.get_writer(name, format="FFMPEG", ffmpeg_log_level="quiet", **options) as writer:
             for image in chain(first, images):
                 height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
                 writer.append_data(np.ascontiguousarray(image[:height, :width]))
@@ -44,7 +45,7 @@ def write_video(path: Path, images: Iterable[NDArray[np.uint8]], frames_per_seco
 def num_frames(path: Path) -> int:
     """Number of frames of a video whose bytes are all there; 0 if the file is not a video."""
     try:
-        with av.open(str(path)) as video:
+        with open_container(path) as video:
             return sum(packet.size > 0 and not packet.is_corrupt for packet in video.demux(video=0))
     except (av.FFmpegError, OSError, IndexError):
         return 0
