@@ -151,7 +151,7 @@ def _logged_seconds(log: Path) -> float:
     """Iterations per second: the reciprocal of the mean time of the logged iterations."""
     from ..runs.folder import read_log
 
-    seconds = [line["seconds"] for line in read_log(log)]
+    seconds = [line["seconds"] for line in read_log(log, "seconds")]
     return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0
 
 

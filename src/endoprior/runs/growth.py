@@ -35,7 +35,7 @@ def growth_of(run: Path) -> Growth | None:
     first: dict[int, int] = {}
     last: dict[int, int] = {}
     num_events, changes = 0, Counter[str]()
-    for line in read_log(log):
+    for line in read_log(log, "num_gaussians"):
         window, count = line.get("window", 0), line["num_gaussians"]
         first.setdefault(window, count)
         last[window] = count

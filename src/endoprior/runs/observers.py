@@ -71,6 +71,6 @@ def cut_log(log: Path, stage: Stage, iteration: int) -> None:
     """Drop the lines of iterations after a checkpoint: they will be written again."""
     if not log.exists():
         return
-    lines = read_log(log)
+    lines = read_log(log, "stage", "iteration")
     kept = [line for line in lines if (Stage[line["stage"].upper()], line["iteration"]) <= (stage, iteration)]
     write_text(log, "".join(json.dumps(line) + "\n" for line in kept))
