@@ -32,8 +32,8 @@ def write_video(path: Path, images: Iterable[NDArray[np.uint8]], frames_per_seco
         colors = ["-vf", f"scale=out_color_matrix={matrix}:out_range=tv,{tags}"]
         options = {"fps": frames_per_second, "codec": "libx264", "quality": 8, "macro_block_size": 1}
         options["output_params"] = [*colors, "-movflags", "+faststart"]
-        name, count = str(temporary.absolute()), 0  # FFmpeg takes what is before a colon for a protocol, if no / is
-        with imageio.get_writer(name, format="FFMPEG", ffmpeg_log_level="quiet", **options) as writer:
+        count = 0
+        with imageio.get_writer(str(temporary), format="FFMPEG", ffmpeg_log_level="quiet", **options) as writer:
             for image in chain(first, images):
                 height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
                 writer.append_data(np.ascontiguousarray(image[:height, :width]))
