@@ -15,8 +15,9 @@ SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 def stopped(words: list[object], out: Path, number: signal.Signals) -> Row:
     """Send a signal once there is something of the output; what is hidden until it is complete counts."""
     name = f"{words[0]} {words[-1] if words[0] == 'export' else ''}".strip()
+    out.parent.mkdir(parents=True)
     program = Program(*words)
-    while program.running and not any(out.parent.glob(f"*{out.stem}*")):
+    while program.running and not any(out.parent.iterdir()):
         time.sleep(0.002)
     program.process.send_signal(number)
     done = program.wait()
@@ -32,14 +33,14 @@ def main(work: Path) -> list[Row]:
     demand(run(*arguments(data, trained, 60)))
     rows = []
     for number in SIGNALS:
-        out = work / number.name / "out"
-        out.parent.mkdir()
-        film = out.with_suffix(".mp4")
-        rows += [
-            stopped(["phantom", out, "--frames", 60, "--width", 320, "--height", 256], out, number),
-            stopped(["prepare", data / "images", out, "--layout", "mono"], out, number),
-            stopped(["prior", data, out], out, number),
-            stopped(["render", trained, out, "--split", "video"], out, number),
-            stopped(["export", trained, film, "--format", "video"], film, number),
-        ]
+        commands = {
+            "phantom": ["phantom", "OUT", "--frames", 60, "--width", 320, "--height", 256],
+            "prepare": ["prepare", data / "images", "OUT", "--layout", "mono"],
+            "prior": ["prior", data, "OUT"],
+            "render": ["render", trained, "OUT", "--split", "video"],
+            "film.mp4": ["export", trained, "OUT", "--format", "video"],
+        }
+        for name, words in commands.items():
+            out = work / number.name / name / name
+            rows.append(stopped([out if word == "OUT" else word for word in words], out, number))
     return rows
