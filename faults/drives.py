@@ -19,7 +19,7 @@ from harness import ENVIRONMENT, Row, demand, run, small_sequence
 from kills import arguments
 
 GONE = ("ESTALE", "ETIMEDOUT", "ENXIO", "EIO", "ENOTCONN")
-OPENS_BEFORE = (0, 1, 2, 5, 20, 60)
+OPENS_BEFORE = (0, 2, 10, 60)
 """Files that can still be opened before the drive is gone."""
 EVENTS = ("open", "os.listdir", "os.scandir")
 

@@ -34,6 +34,7 @@ def foreign_files(folder: Path) -> list[str]:
     temporary_sibling(folder / "scene.safetensors").touch()
     of_process(folder / "scene.safetensors", machine="0" * 12).touch()  # another machine, boot or container
     of_process(folder / "depth").symlink_to(folder / ".backup.2023.partial")
+    of_process(folder / "a.png").symlink_to(folder / ".thesis.2024.partial.tex")
     return sorted(path.name for path in folder.iterdir())
 
 
