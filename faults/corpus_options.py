@@ -107,6 +107,17 @@ OPTIONS = [
     Case("demo --frames 1", given("demo out --frames 1"), ("frames",)),
     Case("demo --frames 10^9", given(f"demo out --frames {HUGE}"), ("frames",)),
     Case("demo --seed -1", given("demo out --seed -1"), ("seed",)),
+    Case(
+        "training into a folder with files named like temporary ones",
+        given(
+            "train data out",
+            put("out/.thesis.2024.partial.tex", "x"),
+            put("out/.a.2023.partial/b", "x"),
+            needs="sequence",
+        ),
+        ("out", "files in it"),
+    ),
+    Case("a film with colons", given("export run 10:30:00.mp4 --format video", needs="run"), leaves=("10:30:00.mp4",)),
     with_run("render --times nan", "render run out --times nan", "--times"),
     with_run("render --times 2", "render run out --times 0.5 2", "--times"),
     with_run("eval of no split", "eval run --split some", "--split"),

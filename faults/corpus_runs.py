@@ -17,6 +17,7 @@ TRAINED = "--init-budget 200 --schedule.coarse-iterations 1 --schedule.fine-iter
 """Options of the sound run."""
 RESUME = f"train data run --resume {TRAINED}"
 SCENE, CHECKPOINT, CONFIG = "run/scene.safetensors", "run/checkpoint.safetensors", "run/config.json"
+LOG = "run/log.jsonl"
 
 
 def damaged(command: str, *steps: Step) -> Build:
@@ -38,6 +39,11 @@ def flipped(name: str) -> Step:
         (folder / name).write_bytes(content)
 
     return flip
+
+
+def added(name: str, text: str) -> Step:
+    """Adds text to the end of a file."""
+    return lambda folder: (folder / name).write_text((folder / name).read_text(encoding="utf-8") + text)
 
 
 def header(text: bytes | str, length: int | None = None) -> bytes:
@@ -117,6 +123,8 @@ RUNS = [
         lambda f: (f / CHECKPOINT).write_bytes((f / SCENE).read_bytes()),
         says=("endoprior-scene-1",),
     ),
+    Case("a log cut short", damaged(RESUME, added(LOG, '{"stage": "fi')), leaves=("run",)),
+    Case("a log broken inside", damaged(RESUME, added(LOG, "{\n{}\n")), ("log.jsonl, line", "'{'"), ("run",)),
     resumed("another config", options="--seed 7", says=("seed",)),
     resumed("other data to resume", without("data/sequence.json"), says=("other data",)),
     Case(

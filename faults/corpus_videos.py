@@ -114,6 +114,11 @@ CASES = [
     Case("a video of 1x1 px", encoded([(1, 1)] * 3), ("32",)),
     Case("a video of 2x2 px", encoded([(2, 2)] * 3), ("32",)),
     Case("a video of odd size", encoded([(65, 47)] * 3), leaves=("out",)),
+    Case(
+        "a video with colons in its name",
+        given(f"prepare 10:30.mkv 10:30 {PLAIN}", lambda f: (f / "clip.mkv").rename(f / "10:30.mkv"), needs="video"),
+        leaves=("10:30",),
+    ),
     Case("a size that changes", given(f"prepare clip.mpg out {PLAIN}", growing), ("clip.mpg", "64x48", "96x80")),
     Case("a video of bombs", video("clip.mov", mov_bomb(png_bomb(16000, 15000))), ("clip.mov", "64 Mpx")),
     Case("a playlist to a local file", video("clip.mp4", HLS.format("clip.mkv")), ("clip.mp4", "a video file")),

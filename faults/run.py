@@ -16,32 +16,50 @@ from collections.abc import Callable
 from pathlib import Path
 
 import disk
+import drives
 import kills
 import limits
 import memory
 import soak
+import stops
+from corpus import CASES
 from harness import ENVIRONMENT, Row
 
 ROOT = Path(__file__).parents[1]
 BEGIN, END = "<!-- figures: make test-faults -->", "<!-- end of figures -->"
 
 
-def properties(work: Path) -> list[Row]:
-    """The property-based tests with random seeds and ten times as many examples as in the test suite."""
-    files = sorted((ROOT / "tests").glob("test_properties_*.py"))
-    words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *map(str, files)]
-    environment = ENVIRONMENT | {"ENDOPRIOR_HYPOTHESIS": "thorough"}
+def _tests(files: list[Path], *options: str, **variables: str) -> tuple[str, bool]:
+    """Run tests; returns `n passed` and whether all did."""
+    words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *options, *map(str, files)]
+    environment = ENVIRONMENT | variables
     done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, encoding="utf-8", check=False)
     if done.returncode:
         print(done.stdout[-6000:], done.stderr[-3000:], sep="\n", file=sys.stderr)
     last = (done.stdout.strip() or "no output").splitlines()[-1]  # `n passed in ...`
-    return [Row("properties", "property-based tests, thorough", last.split(" in ")[0], done.returncode == 0)]
+    return last.split(" in ")[0], done.returncode == 0
+
+
+def properties(work: Path) -> list[Row]:
+    """The property-based tests with random seeds and ten times as many examples as in the test suite."""
+    files = sorted((ROOT / "tests").glob("test_properties_*.py"))
+    return [Row("properties", "property-based tests, thorough", *_tests(files, ENDOPRIOR_HYPOTHESIS="thorough"))]
+
+
+def inputs(work: Path) -> list[Row]:
+    """Every bad and hostile input of the corpora."""
+    told, passed = _tests([ROOT / "tests" / "test_bad_inputs.py"], "-m", "slow or not slow")
+    figure = "none" if passed else told
+    return [Row("inputs", f"{len(CASES)} bad and hostile inputs: tracebacks or wrong ends", figure, passed)]
 
 
 PARTS: dict[str, Callable[[Path], list[Row]]] = {
     "kills": kills.main,
     "disk": disk.main,
+    "stops": stops.main,
+    "drives": drives.main,
     "memory": memory.main,
+    "inputs": inputs,
     "properties": properties,
     "soak": soak.main,
     "limits": limits.main,

@@ -19,7 +19,7 @@ from endoprior.data import load_sequence
 from endoprior.runs.interrupt import deferred_interrupt
 from endoprior.runs.train import train
 from endoprior.system import atomic
-from endoprior.system.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder
+from endoprior.system.atomic import CannotWrite, whole_file, whole_folder
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.visualization import video
 from endoprior.visualization.video import write_video
@@ -84,17 +84,6 @@ def test_an_encoder_that_only_stops_is_asked_for_the_disk(tmp_path, monkeypatch)
 def test_an_unreadable_input_is_not_blamed_on_the_output(tmp_path):
     with pytest.raises(PermissionError), whole_folder(tmp_path / "a" / "out"):
         raise PermissionError(13, "Permission denied", str(tmp_path / "input.png"))
-
-
-def test_leftovers_of_the_dead_go_and_those_of_the_living_stay(tmp_path):
-    child = os.spawnlp(os.P_WAIT, "true", "true")
-    assert child == 0
-    dead = 2**22 - 3  # beyond what Linux gives to processes
-    for owner in (dead, os.getpid()):
-        (tmp_path / f".a.{owner}.partial.png").touch()
-        (tmp_path / f".b.{owner}.partial").mkdir()
-    remove_leftovers(tmp_path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == [f".a.{os.getpid()}.partial.png", f".b.{os.getpid()}.partial"]
 
 
 @pytest.mark.slow

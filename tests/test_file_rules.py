@@ -25,7 +25,8 @@ from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.work_folder import work_folder
 from endoprior.runs.train import train
 from endoprior.system.arrays_file import ArraySpec, load_arrays, save_arrays
-from endoprior.system.atomic import CannotWrite, remove_leftovers, whole_file, whole_folder, write_json, write_text
+from endoprior.system.atomic import CannotWrite, whole_file, whole_folder, write_json, write_text
+from endoprior.system.leftovers import remove_leftovers
 from endoprior.system.paths import lies_in
 
 
@@ -130,12 +131,16 @@ def test_a_scanner_that_holds_a_new_file_for_a_moment_is_waited_for(windows, tmp
 
 
 def test_leftovers_are_found_without_ending_their_owner(windows, tmp_path):
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as living:
-        for owner in (living.pid, 2**22 - 3):
-            (tmp_path / f".a.{owner}.partial.png").touch()
+    code = "import sys, pathlib; from endoprior.system.leftovers import temporary_sibling as name\n"
+    code += "name(pathlib.Path(sys.argv[1])).touch(); print(flush=True); input()"
+    words = [sys.executable, "-P", "-c", code, str(tmp_path / "a.png")]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as living:
+        living.stdout.readline()
         remove_leftovers(tmp_path)
-        assert names_in(tmp_path) == [f".a.{living.pid}.partial.png"] and living.poll() is None
+        assert len(names_in(tmp_path)) == 1 and living.poll() is None
         living.communicate(b"\n")
+    remove_leftovers(tmp_path)
+    assert names_in(tmp_path) == []
 
 
 def test_arrays_do_not_keep_their_file_in_use(windows, tmp_path):

@@ -357,9 +357,9 @@ def test_an_interruption_leaves_only_the_hidden_folder(tmp_path, phantom):
 
     with pytest.raises(KeyboardInterrupt):
         prepare(phantom / "images", tmp_path / "out", options(phantom, layout="mono"), stop)
-    assert [path.name for path in tmp_path.iterdir()] == [".out.preparing"]
-    assert (tmp_path / ".out.preparing" / work_folder.PLAN).exists()
-    shutil.rmtree(tmp_path / ".out.preparing")
+    assert [path.name for path in tmp_path.iterdir()] == [".out.endoprior.preparing"]
+    assert (tmp_path / ".out.endoprior.preparing" / work_folder.PLAN).exists()
+    shutil.rmtree(tmp_path / ".out.endoprior.preparing")
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """The command line: find the command, run it, and convert every failure to an exit status.
 
-Exit status: 0 done; 2 bad input or usage, one line on stderr; 1 a bug, with traceback; 130 interrupted.
+Exit status: 0 done; 2 bad input or usage, one line on stderr; 1 a bug, with traceback; 130 interrupted, by Ctrl-C,
+SIGTERM or SIGHUP.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ import sys
 from importlib import import_module
 
 from ..core.checks import InputError
+from ..system.atomic import DISK_ERRORS
 from ..system.installation import docs_folder
 from ..system.memory import reject_small_limits
 from ..system.plugins import Registry
+from ..system.signals import all_interrupt
 from .usage_errors import unknown_command
 
 COMMANDS = {
@@ -77,7 +80,8 @@ def main(argv: list[str] | None = None) -> int:
             words = REGISTRY.names()
             raise unknown_command(name, {word: word for word in words} | {MODULES[word]: word for word in MODULES})
         reject_small_limits()
-        return REGISTRY.load(name).run(rest) or 0
+        with all_interrupt():
+            return REGISTRY.load(name).run(rest) or 0
     except InputError as error:
         print(f"endoprior: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -108,8 +112,10 @@ def system_failure(error: Exception) -> str | None:
             f"expected enough memory, got {text or 'none'}. Fix: Free memory, or use smaller frames. The last "
             "checkpoint of a run is complete; resume with `endoprior train --resume RUN`."
         )
-    if isinstance(error, OSError) and error.filename is not None:
-        named = ascii(os.fsdecode(error.filename))[1:-1][-160:]
+    if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK_ERRORS):
+        is_named = isinstance(error.filename, str | bytes)
+        name = os.fsdecode(error.filename) if is_named else "the disk or network drive"
+        named = ascii(name)[1:-1][-160:]
         return f"{named}: expected a usable file, got {error.strerror}. Fix: Check the path, permissions and disk."
     return None
 

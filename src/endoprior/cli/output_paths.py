@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from ..core.checks import input_error
 from ..data.reading import kind_of
+from ..system.leftovers import temporary_sibling
 from ..system.paths import lies_in
 
 
@@ -48,7 +48,7 @@ def _require_writable(option: str, path: Path, folder: Path) -> None:
         folder = folder.parent
     try:
         # Not by `tempfile`: on Windows it tries two billion names if the folder is not writable.
-        probe = folder / f".writable.{os.getpid()}.partial"
+        probe = temporary_sibling(folder / "writable")
         probe.touch()
         probe.unlink()
     except OSError as error:

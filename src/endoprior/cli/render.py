@@ -101,6 +101,7 @@ def render(scene: RenderedScene, args: Render) -> None:
     from ..evaluation.scoring import scored_data
     from ..model.highlights import without_highlights
     from ..runs.stored_run import sequence_of_run
+    from ..system.atomic import removed_on_failure
     from ..visualization.camera_paths import read_path, sway_path, times_path
     from ..visualization.carried_texture import write_texture_film
     from ..visualization.rendered_views import depth_span, write_views
@@ -135,13 +136,14 @@ def render(scene: RenderedScene, args: Render) -> None:
         raise input_error(out, "a folder", "a link to one", "Remove the link, or pass OUT.")
     if beside:
         out, video = out / "no_highlights", video.with_stem(f"{video.stem}_no_highlights")
-    if args.layer == "color":
-        write_views(scene, views, out, video, frames)
-    else:
-        out = out / args.layer
-        if args.layer == "texture":
+    with removed_on_failure(args.out or out):
+        if args.layer == "color":
+            write_views(scene, views, out, video, frames)
+        elif args.layer == "texture":
+            out /= "texture"
             write_texture_film(scene, views, out, video, frames)
         else:
+            out /= "support"
             support = SupportMap(scene, sequence.training_part)
             write_support_film(support, views, out, video, scene.frames_per_second, frames)
     images = out / "rgb" if args.layer == "color" else out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time as clock
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -151,7 +150,9 @@ def train_and_evaluate(
 
 def _logged_seconds(log: Path) -> float:
     """Iterations per second: the reciprocal of the mean time of the logged iterations."""
-    seconds = [json.loads(line)["seconds"] for line in log.read_text(encoding="utf-8").splitlines()]
+    from ..runs.folder import read_log
+
+    seconds = [line["seconds"] for line in read_log(log, "seconds")]
     return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0
 
 

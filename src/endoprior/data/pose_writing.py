@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..system.atomic import remove_leftovers, whole_file, whole_folder, write_json
+from ..system.atomic import whole_file, whole_folder, write_json
+from ..system.leftovers import remove_leftovers, temporary_sibling
 from .images import save_png
 
 POSES, BACKUP = "poses_bounds.npy", "poses_bounds_before.npy"
@@ -73,9 +74,8 @@ def replace_depth(folder: Path, files: Iterable[tuple[str, NDArray[np.uint16]]])
     Args:
         files: name and (H, W) stored values of each.
     """
-    remove_leftovers(folder)
-    old, new = folder / "depth", folder / f".depth.{os.getpid()}.partial"
-    aside = folder / f".depth_old.{os.getpid()}.partial"
+    old, new = folder / "depth", temporary_sibling(folder / "depth")
+    aside = temporary_sibling(folder / "depth_old")
     shutil.rmtree(new, ignore_errors=True)
     with whole_folder(new) as temporary:
         for name, stored in files:
@@ -83,3 +83,4 @@ def replace_depth(folder: Path, files: Iterable[tuple[str, NDArray[np.uint16]]])
     old.rename(aside)
     new.rename(old)
     shutil.rmtree(aside, ignore_errors=True)
+    remove_leftovers(folder)  # not before the depth maps are in place: theirs may be the only ones of a killed process

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -46,6 +48,15 @@ def shortened(path: Path, most: int = 120) -> str:
     return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 2 :]}"
 
 
+@contextmanager
+def reading(path: Path, expected: str = "a readable file", fix: str = ACCESS_HINT) -> Iterator[None]:
+    """Convert errors of the system to an InputError about `path`: those of a file that is open do not name it."""
+    try:
+        yield
+    except OSError as error:
+        raise input_error(path, expected, error.strerror or str(error), fix) from None
+
+
 def read_bytes(path: Path, expected: str = "a readable file", fix: str = ACCESS_HINT) -> NDArray[np.uint8]:
     """(N,) bytes of a file.
 
@@ -54,10 +65,8 @@ def read_bytes(path: Path, expected: str = "a readable file", fix: str = ACCESS_
             `MOST_BYTES`.
     """
     demand_file(path, expected, fix, MOST_BYTES)
-    try:
+    with reading(path, expected, fix):
         return np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise input_error(path, expected, error.strerror or str(error), fix) from None
 
 
 def read_text(path: Path, expected: str, fix: str, *, or_latin_1: bool = False) -> str:

@@ -23,6 +23,7 @@ from ..core.types import Camera, Frame
 from ..footage.right_view import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
 from .description import ESTIMATED_POSES, TOOLS_FOUND
+from .reading import reading
 from .right_eye import RightEye
 from .truth import Truth
 
@@ -97,6 +98,7 @@ class FrameSequence:
         self._read_frame = read_frame
         self.files = list(files or [])
         """Every file that makes up the sequence."""
+        self._states = [_state(file) for file in self.files]
         self.reading: DataConfig | None = None
         """How `load_sequence` read it; None for a sequence that was made in another way."""
         self._remarks = remarks or []
@@ -257,8 +259,25 @@ class FrameSequence:
         digest = hashlib.sha256()
         for file in sorted(self.files):
             digest.update(os.fsencode(file.relative_to(self.path).as_posix()) + b"\0")
-            digest.update(hashlib.sha256(file.read_bytes()).digest())
+            with reading(file), file.open("rb") as content:
+                digest.update(hashlib.file_digest(content, "sha256").digest())
         return digest.hexdigest()
+
+    def demand_unchanged(self, fingerprint: str | None = None) -> None:
+        """Raise InputError if a file changed since the sequence was opened, so that frames of two states may be mixed.
+
+        Args:
+            fingerprint: that of the sequence; files with other times and the same contents are accepted. None: not.
+        """
+        states = [_state(file) for file in self.files]
+        if states == self._states:
+            return
+        if fingerprint is not None and self.fingerprint() == fingerprint:
+            self._states = states
+            return
+        changed = next(f for f, now, then in zip(self.files, states, self._states, strict=True) if now != then)
+        fix = "Put the data back and resume, or train on the new data in a new folder."
+        raise input_error(changed, "data that stays as it is during training", "a file that was changed", fix)
 
     def validate(self) -> list[str]:
         """Decode every frame and check that the sequence can be trained on.
@@ -292,6 +311,15 @@ class FrameSequence:
         if empty:
             remarks.append(f"{self.path}: {len(empty)} frames have no depth on tissue, the first is frame {empty[0]}")
         return remarks
+
+
+def _state(file: Path) -> tuple[int, int, int] | None:
+    """What changes with the contents of a file, without reading them; None if there is no such file."""
+    try:
+        facts = file.stat()
+    except OSError:
+        return None
+    return facts.st_mtime_ns, facts.st_ctime_ns, facts.st_size
 
 
 def _contents(frame: Frame) -> tuple[float, bool, bool]:

@@ -73,7 +73,7 @@ class Trial:
 
 def estimate(job: Job) -> dict[str, float]:
     """Seconds of each step of a job, by its name. Takes some 20 s itself, and leaves nothing behind."""
-    folder = job.out / ".trial"
+    folder = job.out / ".endoprior.trial"
     shutil.rmtree(folder, ignore_errors=True)
     try:
         source = open_source(job.source, job.prepare.folder_rate)

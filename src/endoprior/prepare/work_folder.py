@@ -31,7 +31,7 @@ def work_folder(out: Path, plan: dict[str, Any]) -> Iterator[Path]:
     """
     reject_occupied(out)
     reject_current_folder(out)
-    folder = out.absolute().with_name(f".{out.name}.preparing")
+    folder = out.absolute().with_name(f".{out.name}.endoprior.preparing")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

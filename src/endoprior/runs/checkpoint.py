@@ -26,7 +26,10 @@ def save_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
 
     Args:
         fingerprint: of the sequence; a run only resumes on the same data.
+    Raises:
+        InputError: the data changed meanwhile; the checkpoint before is kept, which no changed frame went into.
     """
+    trainer.sequence.demand_unchanged(fingerprint)
     about = {
         "stage": int(trainer.state.stage),
         "iteration": trainer.state.iteration,

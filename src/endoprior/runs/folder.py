@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..core.shell import command
-from ..data.reading import kind_of
-from ..system.atomic import reject_occupied, remove_leftovers
+from ..data.reading import kind_of, read_bytes
+from ..system.atomic import reject_occupied
+from ..system.leftovers import is_leftover
 
 LOCK = ".lock"
 """File that a process holds while it trains in a folder."""
@@ -22,12 +25,10 @@ def reject_unusable_folder(out: Path, *, resume: bool) -> None:
         InputError: it is a file, or it holds something and `resume` is False, or its name is not usable.
     """
     exists = kind_of(out) == "a folder"
-    if exists:
-        remove_leftovers(out)
     if not (resume and exists):
         is_run = exists and (out / CONFIG).is_file()
         resume_it = f", or resume the run in it: `{command('train', '--resume', out)}`" if is_run else ""
-        reject_occupied(out, resume_it, ignore=LOCK)
+        reject_occupied(out, resume_it, ignore=lambda file: file.name == LOCK or is_leftover(file))
 
 
 def prepare_run_folder(out: Path, *, resume: bool) -> bool:
@@ -45,3 +46,25 @@ def prepare_run_folder(out: Path, *, resume: bool) -> bool:
     except OSError as error:
         raise InputError(f"{out}: expected a place for a folder; got {error.strerror}. Choose another.") from error
     return not existed
+
+
+def read_log(log: Path, *names: str) -> list[dict[str, Any]]:
+    """The lines of `log.jsonl`, without a last one that a crash cut short.
+
+    Args:
+        names: what each line must have.
+    Raises:
+        InputError: it cannot be read, or another line is broken.
+    """
+    lines, rows = read_bytes(log, "the log of a training").tobytes().splitlines(), list[dict[str, Any]]()
+    for number, text in enumerate(lines, 1):
+        try:
+            row = json.loads(text)
+        except (ValueError, RecursionError):
+            row = None
+        if isinstance(row, dict) and row.keys() >= set(names):
+            rows.append(row)
+        elif number < len(lines):
+            found = ascii(text[:40].decode(errors="replace"))
+            raise input_error(f"{log}, line {number}", "an iteration as JSON", found, "Remove this line.")
+    return rows

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from .folder import LOG
+from .folder import LOG, read_log
 
 
 @dataclass(frozen=True)
@@ -36,12 +35,8 @@ def growth_of(run: Path) -> Growth | None:
     first: dict[int, int] = {}
     last: dict[int, int] = {}
     num_events, changes = 0, Counter[str]()
-    for text in log.read_text(encoding="utf-8").splitlines():
-        try:
-            line = json.loads(text)
-            window, count = line.get("window", 0), int(line["num_gaussians"])
-        except (ValueError, KeyError, TypeError, AttributeError):  # a line that a crash cut short
-            continue
+    for line in read_log(log, "num_gaussians"):
+        window, count = line.get("window", 0), line["num_gaussians"]
         first.setdefault(window, count)
         last[window] = count
         if "event" in line:

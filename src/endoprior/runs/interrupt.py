@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import signal
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from ..system.signals import stopping_signals
+from ..system.signals import handled_by
 
 
 @contextmanager
@@ -25,14 +24,5 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         pressed = True
 
-    if threading.current_thread() is not threading.main_thread():  # only the main one may handle signals
-        yield lambda: False
-        return
-    previous = stopping_signals()
-    try:
-        for number in previous:
-            signal.signal(number, note)
+    with handled_by(note):
         yield lambda: pressed
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

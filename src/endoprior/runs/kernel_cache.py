@@ -16,12 +16,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from filelock import FileLock
-
 from ..core.config import Config
 from ..core.config_io import to_dict
 from ..model.method import method_of
 from ..render import ON_GPU
+from ..system.file_lock import exclusive
 
 PACKAGE = Path(__file__).parents[1]
 LIMIT_S = 900.0
@@ -46,7 +45,7 @@ def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
         if marker.exists():
             return
         marker.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(marker.with_suffix(".lock")):
+        with exclusive(marker.with_suffix(".lock"), LIMIT_S):
             if marker.exists():
                 return
             say("compiling kernels, once after installation (about a minute)")

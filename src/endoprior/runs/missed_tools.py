@@ -8,7 +8,7 @@ from pathlib import Path
 from ..core.checks import InputError, number_ranges
 from ..core.shell import command
 from ..data.found_tools import read_rows
-from .folder import CONFIG, LOG
+from .folder import CONFIG, LOG, read_log
 
 KEY = "missed_tool_frames"
 """In the last line of the log, in the protocol of `metrics.json` and in `StepReport`."""
@@ -20,12 +20,11 @@ def missed_tools_of(run: Path) -> list[int] | None:
     if not log.is_file():
         return None
     starts, found = _window_starts(run), None
-    for text in log.read_text(encoding="utf-8").splitlines():
+    for line in read_log(log):
         try:
-            line = json.loads(text)
             frames, first = line[KEY], starts[line["window"]] if "window" in line else 0
             found = (found or set()) | {first + int(frame) for frame in frames}
-        except (ValueError, KeyError, TypeError, IndexError):  # most lines; or one that a crash cut short
+        except (ValueError, KeyError, TypeError, IndexError):  # most lines
             continue
     return None if found is None else sorted(found)
 

@@ -12,6 +12,7 @@ from ..system.atomic import write_text
 from ..training.stage import Stage, StepReport
 from ..training.trainer import Trainer
 from .checkpoint import save_checkpoint
+from .folder import read_log
 from .missed_tools import KEY
 
 LOG_EVERY = 10
@@ -70,13 +71,6 @@ def cut_log(log: Path, stage: Stage, iteration: int) -> None:
     """Drop the lines of iterations after a checkpoint: they will be written again."""
     if not log.exists():
         return
-    kept = []
-    for text in log.read_text(encoding="utf-8").splitlines():
-        try:
-            line = json.loads(text)
-            done = (Stage[line["stage"].upper()], line["iteration"]) <= (stage, iteration)
-        except (ValueError, KeyError):  # a line that a crash cut short
-            continue
-        if done:
-            kept.append(text + "\n")
-    write_text(log, "".join(kept))
+    lines = read_log(log, "stage", "iteration")
+    kept = [line for line in lines if (Stage[line["stage"].upper()], line["iteration"]) <= (stage, iteration)]
+    write_text(log, "".join(json.dumps(line) + "\n" for line in kept))

@@ -23,6 +23,7 @@ from ..visualization.carried_texture import PaintedTissue
 from ..visualization.image_tools import colorize, to_u8
 from ..visualization.rendered_views import depth_span
 from ..visualization.support_map import SupportMap
+from .folder import LOG, read_log
 from .observers import LOG_EVERY
 
 SHOWN_SCORES = (
@@ -61,7 +62,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     sequence = sequence.with_poses(scene.cameras)
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     per_frame = json.loads((run / "per_frame.json").read_text(encoding="utf-8"))
-    log = [json.loads(line) for line in (run / "log.jsonl").read_text(encoding="utf-8").splitlines()]
+    log = read_log(run / LOG, "stage", "terms")
     rows = [*_image_rows(scene, sequence), _side_row(scene, sequence), _texture_row(scene, sequence)]
     # An own canvas: `pyplot` would choose a backend for the whole process.
     figure = Figure(figsize=(2.6 * len(rows[0]), 2.1 * len(rows) + 3.4), layout="constrained", dpi=110)

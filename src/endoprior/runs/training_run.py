@@ -14,6 +14,7 @@ from ..model.scene import RenderedScene
 from ..system.atomic import write_json, writing
 from ..system.file_lock import locked
 from ..system.heap import freed_memory_kept
+from ..system.leftovers import remove_leftovers
 from ..tool_masks.margin import with_tool_margin
 from ..training.divergence import Diverged
 from ..training.memory_check import reject_too_large
@@ -77,6 +78,7 @@ class TrainingRun:
         try:
             with locked(self.out, self.out / LOCK):
                 fingerprint = self.trainer.sequence.fingerprint()
+                self.trainer.sequence.demand_unchanged()  # what was read before is of the same state
                 self._begin(self.out, fingerprint)
                 began = True
                 self._train_in(self.out, fingerprint, list(observers), checkpoint_seconds)
@@ -99,6 +101,7 @@ class TrainingRun:
             reject_other_start(about, trainer.cfg, fingerprint, trainer.sequence.path)
         elif self.resume:
             raise InputError(f"{checkpoint}: expected a checkpoint to resume from; found none. Start without --resume.")
+        remove_leftovers(out)  # not before the run was accepted and has the lock
         facts = run_facts(trainer.sequence, trainer.cfg, fingerprint)
         write_json(about, facts if self.tool_margin_px is None else facts | {MARGIN: self.tool_margin_px})
         if trainer.state is None:

@@ -17,8 +17,9 @@ from ..model.single_scene import SingleScene
 from ..model.windowed_scene import Span, WindowedScene, save_index, window_file
 from ..system.atomic import write_json, write_text
 from ..system.file_lock import locked
+from ..system.leftovers import remove_leftovers
 from ..training.trainer import DEFAULT_FRAMES_PER_SECOND, Observer
-from .folder import CONFIG, LOCK, LOG, SCENE, prepare_run_folder, reject_unusable_folder
+from .folder import CONFIG, LOCK, LOG, SCENE, prepare_run_folder, read_log, reject_unusable_folder
 from .identity import reject_other_start
 from .observers import CHECKPOINT_SECONDS
 from .provenance import run_facts
@@ -102,8 +103,7 @@ class WindowedRun:
         """Write log and list of the windows, all of which are trained."""
         files, lines = [window_file(out / SCENE, k) for k in range(len(self.plan))], []
         for k, file in enumerate(files):
-            logged = (file.parent / LOG).read_text(encoding="utf-8").splitlines()
-            lines += [json.dumps({"window": k} | json.loads(line)) + "\n" for line in logged]
+            lines += [json.dumps({"window": k} | line) + "\n" for line in read_log(file.parent / LOG)]
         write_text(out / LOG, "".join(lines))
         scene = self._scene(lambda k: load_scene(files[k]))
         save_index(out / SCENE, scene)
@@ -111,10 +111,12 @@ class WindowedRun:
 
     def _begin(self, out: Path) -> None:
         fingerprint, about = self.sequence.fingerprint(), out / CONFIG
+        self.sequence.demand_unchanged()
         if self.resume and about.is_file():
             reject_other_start(about, self.cfg, fingerprint, self.sequence.path)
         elif self.resume:
             raise InputError(f"{about}: expected a run to resume; found none. Start without --resume.")
+        remove_leftovers(out)
         write_json(about, run_facts(self.sequence, self.cfg, fingerprint) | {"windows": self.plan})
 
     def _train(

@@ -8,16 +8,24 @@ import os
 import re
 import shutil
 import time as clock
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from ..core.checks import InputError, input_error
+from .leftovers import temporary_sibling
 from .paths import lies_in
 
-DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO}
-"""Errors of a disk: full, over a quota or limit, read-only, no permission, broken."""
+DISK_ERRORS = {
+    getattr(errno, name)
+    for name in (
+        *("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM", "EIO", "ENODEV", "ENXIO"),
+        *("ESTALE", "ETIMEDOUT", "ENOTCONN", "EHOSTDOWN", "EHOSTUNREACH", "ENETDOWN", "ENETUNREACH", "EREMOTEIO"),
+    )
+    if hasattr(errno, name)
+}
+"""Errors of a disk: full, over a quota or limit, read-only, no permission, broken; and a network drive that is gone."""
 FULL_BYTES = 2**20
 """If less is free, a write error without a reason means that the disk is full."""
 NO_FOLDER_FLUSH = {errno.EACCES, errno.EBADF, errno.EINVAL, errno.ENOTSUP}
@@ -75,8 +83,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         CannotWrite: the disk rejects the file.
     """
-    # Keep the suffix last: many writers choose the format by it.
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    temporary = temporary_sibling(path)
     try:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -101,7 +108,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     """
     reject_current_folder(path)
     reject_occupied(path)
-    temporary = path.absolute().with_name(f".{path.name}.{os.getpid()}.partial")
+    temporary = temporary_sibling(path.absolute())
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
@@ -114,6 +121,18 @@ def whole_folder(path: Path) -> Iterator[Path]:
             complete_folder(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def removed_on_failure(folder: Path) -> Iterator[None]:
+    """Remove a folder that the block creates and does not complete. One that there was keeps what was written."""
+    existed = folder.exists()
+    try:
+        yield
+    except BaseException:
+        if not existed:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def complete_folder(temporary: Path, path: Path) -> None:
@@ -173,31 +192,21 @@ def _rename(source: Path, target: Path) -> None:
     os.replace(source, target)
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files that killed processes left in `folder`."""
-    import psutil  # os.kill(process, 0), the usual test of POSIX, ends the process on Windows
-
-    for file in folder.glob(".*.partial*"):
-        owner = re.search(r"\.(\d+)\.partial", file.name)
-        if owner and not psutil.pid_exists(int(owner[1])):
-            shutil.rmtree(file) if file.is_dir() else file.unlink(missing_ok=True)
-
-
 def reject_current_folder(path: Path) -> None:
     """Raise InputError if `path` is the current folder or one of its parents, which cannot be replaced."""
     if lies_in(Path.cwd(), path):
         raise input_error(path, "the name of a new folder", "one that is in use", "Choose a new name in this folder.")
 
 
-def reject_occupied(path: Path, alternative: str = "", *, ignore: str | None = None) -> None:
+def reject_occupied(path: Path, alternative: str = "", *, ignore: Callable[[Path], bool] = lambda file: False) -> None:
     """Raise InputError unless `path` does not exist yet or is an empty folder.
 
     Args:
         alternative: another possible fix, appended to the message.
-        ignore: name of a file that may exist.
+        ignore: says which files may exist.
     """
     try:
-        if path.is_dir() and any(file.name != ignore for file in path.iterdir()):
+        if path.is_dir() and not all(map(ignore, path.iterdir())):
             found = "one with files in it"
         elif not path.is_dir() and (path.exists() or path.is_symlink()):
             found = "a file"

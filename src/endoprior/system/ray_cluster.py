@@ -6,9 +6,7 @@ import importlib
 import logging
 import os
 import re
-import signal
 import socket
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,7 +14,7 @@ from typing import Any
 
 from ..core.checks import input_error
 from ..core.extras import install_command
-from .signals import stopping_signals
+from .signals import handled_by
 
 CONNECT_SECONDS = 5.0
 """Longest time that a machine may take to answer."""
@@ -190,19 +188,10 @@ def _interrupted_by_signals(cluster: Cluster) -> Iterator[None]:
 
     What a handler raises can be lost inside of Ray, so `Cluster.interrupted` remembers it.
     """
-    if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
-        yield
-        return
 
     def interrupt(signum: int, frame: Any) -> None:
         cluster.interrupted = True
         raise KeyboardInterrupt
 
-    previous = stopping_signals()
-    try:
-        for number in previous:
-            signal.signal(number, interrupt)
+    with handled_by(interrupt):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

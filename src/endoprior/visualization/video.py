@@ -11,6 +11,7 @@ import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.video_files import open_container
 from ..system.atomic import whole_file
 
 HD_ROWS = 720
@@ -44,7 +45,7 @@ def write_video(path: Path, images: Iterable[NDArray[np.uint8]], frames_per_seco
 def num_frames(path: Path) -> int:
     """Number of frames of a video whose bytes are all there; 0 if the file is not a video."""
     try:
-        with av.open(str(path)) as video:
+        with open_container(path) as video:
             return sum(packet.size > 0 and not packet.is_corrupt for packet in video.demux(video=0))
     except (av.FFmpegError, OSError, IndexError):
         return 0
