@@ -17,7 +17,7 @@ from endoprior.data import load_sequence
 from endoprior.data.images import read_color
 from endoprior.data.prepare_record import read_record
 from endoprior.prepare import PrepareConfig, prepare
-from endoprior.prepare.pairing import pair_by_number, pair_by_time
+from endoprior.prepare.pairing import pair_by_time
 from endoprior.prepare.source_frame import SourceFrame
 
 
@@ -125,14 +125,6 @@ def test_images_are_paired_by_time():
     assert paired([0, 1], []) == [None, None]
 
 
-def test_images_of_folders_are_paired_by_number():
-    assert pair_by_number(["a1", "a2", "a3"], ["b1", "b2", "b3"]) == ({0: 0, 1: 1, 2: 2}, "")
-    assert pair_by_number(["0", "1", "2"], ["1", "2", "3"]) == ({0: 0, 1: 1, 2: 2}, "")  # counted from 1
-    assert pair_by_number(["0", "1", "2", "3"], ["0", "2", "3"])[0] == {0: 0, 2: 1, 3: 2}
-    assert pair_by_number(["0", "1", "3"], ["0", "2", "3"])[0] == {0: 0, 2: 2}
-    assert pair_by_number(["a", "b"], ["a", "b"]) == ({0: 0, 1: 1}, "")
-
-
 @pytest.fixture
 def pair(tmp_path):
     """Options for two files, and (left, right) images of 30: the right camera sees all 6 px further left."""
@@ -192,7 +184,7 @@ def test_folders_of_two_cameras_are_paired_by_number(tmp_path, pair):
                 cv2.imwrite(str(tmp_path / name / f"{i:03d}.png"), image[..., ::-1])
     done, notes, _ = prepared(tmp_path / "l", tmp_path, right=tmp_path / "r", **options)
     demand_pairs(done.out, 18)
-    assert any("paired by the numbers in the names" in note for note in notes)
+    assert "r: 1 images have none of the first camera and are left out" in notes
     assert "l: 1 images have none of the second camera and are left out" in notes
 
 
