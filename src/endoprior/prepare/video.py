@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..data.images import MOST_PIXELS
-from ..data.video_files import num_joined_mp4, open_container, what_it_is
+from ..data.video_files import open_container, starts_of_parts, what_it_is
 from .decoding import AVI, DecodedImage, Undecodable, choose_track, decode, is_cover, packet_times
 from .source_frame import SourceFrame
 from .timeline import Timeline, usual_rate
@@ -50,7 +50,7 @@ class Video:
             raise input_error(path, "a video file", "an empty file", "Copy it again.")
         with self._open() as (container, track):
             stated = [float(rate) for rate in (track.average_rate, track.guessed_rate) if rate]
-            packets = packet_times(container, track)
+            packets, end = packet_times(container, track)
             self.frames_per_second = usual_rate([time for time in packets if time is not None], stated)
             self._step = 1 / self.frames_per_second
             along = Timeline(self._step).along((None, time) for time in packets)
@@ -61,8 +61,7 @@ class Video:
             self._announced_end = _announced_end(container, track)
             self._aspect = _pixel_aspect(track)
             self._unused = _other_tracks(container, track)
-            joined = num_joined_mp4(path) if "mp4" in container.format.name else 1
-            self._unused += [f"{path.name}: of {joined} joined files only the first is used"] if joined > 1 else []
+            self._unused += _unread_parts(path, container.format.name, end)
             self.clock_is_arbitrary = container.format.name in ARBITRARY_CLOCKS
         self.start = 0.0
         first = next(iter(self), None)
@@ -248,6 +247,16 @@ def _pixel_aspect(track: av.VideoStream) -> Fraction:
     """Width of a pixel divided by its height; 1 if unknown, 0 if not plausible."""
     aspect = track.sample_aspect_ratio or Fraction(1)
     return aspect if PIXEL_ASPECTS[0] <= aspect <= PIXEL_ASPECTS[1] else Fraction(0)
+
+
+def _unread_parts(path: Path, format_name: str, end: int) -> list[str]:
+    """A note if files that are joined in this one begin after its last image, at byte `end`."""
+    starts = starts_of_parts(path, format_name)
+    used = max(sum(start <= end for start in starts), 1)
+    if len(starts) <= used:
+        return []
+    first = "the first is" if used == 1 else f"the first {used} are"
+    return [f"{path.name}: of {len(starts)} joined files only {first} used; join them with `ffmpeg -f concat`"]
 
 
 def _other_tracks(container: av.container.InputContainer, used: av.VideoStream) -> list[str]:
