@@ -58,10 +58,12 @@ class Video:
             self.times: list[float] = sorted(time - times[0] for time in times) if times else []
             """Time of each image since the first one, s, before any is decoded."""
             self.num_frames = max(int(track.frames), 0)
-            self._announced_end = _announced_end(container, track)
             self._aspect = _pixel_aspect(track)
             self._unused = _other_tracks(container, track)
-            self._unused += _unread_parts(path, container.format.name, end)
+            unread = _unread_parts(path, container.format.name, end)
+            self._unused += unread
+            # The duration may be that of all parts.
+            self._announced_end = 0.0 if unread else _announced_end(container, track)
             self.clock_is_arbitrary = container.format.name in ARBITRARY_CLOCKS
         self.start = 0.0
         first = next(iter(self), None)
