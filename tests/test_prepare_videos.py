@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import shlex
 from fractions import Fraction
 
 import cv2
 import numpy as np
 import pytest
-from video_files import encode, psnr, smooth, write_video
+from video_files import encode, ffmpeg, psnr, smooth, write_video
 
 from endoprior.check.facts import measure
 from endoprior.check.findings import find
@@ -201,3 +202,18 @@ def test_nearly_black_images_are_said(tmp_path):
     done, notes, _ = prepared(video, tmp_path, depth="shading")
     assert any(note.startswith("the images are nearly black: their brightest parts have 1") for note in notes)
     assert "dark-images" in {finding.code for finding in find(measure(load_sequence(done.out)))}
+
+
+def test_combing_that_the_file_does_not_flag_is_said(tmp_path):
+    images = smooth(24, step=4)
+    combed = [image.copy() for image in images[::2]]
+    for image, later in zip(combed, images[1::2], strict=True):
+        image[1::2] = later[1::2]
+    _, notes, _ = prepared(write_video(tmp_path / "c.mkv", combed), tmp_path)
+    (note,) = [note for note in notes if "rows alternate" in note]
+    words = shlex.split(note.split("`")[1])
+    assert words[0] == "ffmpeg" and note.startswith("c.mkv: ")
+    ffmpeg(*words[1:])
+    (tmp_path / "even").mkdir()
+    _, notes, _ = prepared(tmp_path / "c_progressive.mp4", tmp_path / "even")
+    assert not any("rows alternate" in note for note in notes)

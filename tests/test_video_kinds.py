@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from fractions import Fraction
 
 import av
@@ -242,6 +243,13 @@ def test_the_track_of_the_video_is_used(tmp_path):
     assert (source.width, len(list(source))) == (160, 24)
     said = "only one is used (160x128 px, 24 images), not: 80x64 px, 24 images"
     assert source.notes == [f"a.mp4: of 2 video tracks, {said}"]
+    name = "two eyes.mp4"
+    first, hint = open_source(tracks(tmp_path / name, (96, 64, 9), (96, 64, 9))).notes
+    assert first == f"{name}: of 2 video tracks, only one is used (96x64 px, 9 images), not: 96x64 px, 9 images"
+    words = shlex.split(hint.split("`")[1])
+    assert words[:1] == ["ffmpeg"] and ffmpeg(*words[1:]).name == "two eyes_right.mp4"
+    assert len(list(open_source(tmp_path / "two eyes_right.mp4"))) == 9
+    assert hint.endswith(f"then add `--right '{tmp_path / 'two eyes_right.mp4'}'`")
     assert open_source(tracks(tmp_path / "b.mp4", (320, 256, 1), (160, 128, 24))).width == 160  # a cover
     assert open_source(tracks(tmp_path / "c.mp4", (320, 256, 4), (160, 128, 24))).width == 160  # a preview
 

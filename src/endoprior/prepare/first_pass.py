@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.shell import quoted
 from ..data.reading import kind_of
 from ..footage.border import Circle, Strips, find_outline
+from ..footage.combing import are_combed
 from ..footage.overlays import find_static_overlays
 from ..footage.round_border import CERTAIN
 from .calibration import Calibration
@@ -64,7 +66,8 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         hint = "Check --start, --end and --frames-per-second."
         raise input_error(str(clip.source.path), "at least 2 frames in the selection", str(len(indices)), hint)
     lefts = [frame.left for frame in sample.kept]
-    video_notes = [*clip.notes, *_timing_notes(look.selection, cfg), *_brightness_notes(lefts)]
+    video_notes = [*clip.notes, *_timing_notes(look.selection, cfg)]
+    video_notes += [*_brightness_notes(lefts), *_comb_notes(clip, lefts)]
     notes: list[str] = []
     stretch = _stretch(clip.layout) if cfg.squeezed_eyes else (1, 1)
     if calibration is not None:
@@ -171,6 +174,19 @@ def _brightness_notes(images: list[NDArray[np.uint8]]) -> list[str]:
     if brightest >= DARK:
         return []
     return [f"the images are nearly black: their brightest parts have {brightest:.0f} of 255. Export them brighter"]
+
+
+def _comb_notes(clip: Clip, images: list[NDArray[np.uint8]]) -> list[str]:
+    """A note, with the command that helps, if images of a progressive video have rows of two times."""
+    if clip.layout == "interlaced" or not are_combed(images):
+        return []
+    path = clip.source.path
+    fix = "deinterlace the video before its images are exported"
+    if not isinstance(clip.source, ImageFolder):
+        even = path.with_name(f"{path.stem}_progressive.mp4")
+        words = ["ffmpeg", "-i", path, "-vf", "bwdif=deint=all", "-crf", "10", even]
+        fix = f"`{' '.join(map(quoted, words))}`"
+    return [f"{path.name}: rows alternate where something moves, as in interlaced video. To mend it: {fix}"]
 
 
 def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:

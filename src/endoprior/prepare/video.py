@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.shell import quoted
 from ..data.images import MOST_PIXELS
 from ..data.video_files import open_container, starts_of_parts, what_it_is
 from .decoding import AVI, DecodedImage, Undecodable, choose_track, decode, is_cover, packet_times
@@ -261,6 +262,11 @@ def _unread_parts(path: Path, format_name: str, end: int) -> list[str]:
     return [f"{path.name}: of {len(starts)} joined files only {first} used; join them with `ffmpeg -f concat`"]
 
 
+def _size(track: av.VideoStream) -> tuple[int, int] | None:
+    """(width, height), px; None if its format is unknown."""
+    return (track.codec_context.width, track.codec_context.height) if track.codec_context else None
+
+
 def _other_tracks(container: av.container.InputContainer, used: av.VideoStream) -> list[str]:
     """A note if there are other tracks of images than the one that is used."""
     others = [track for track in container.streams.video if track.index != used.index and not is_cover(track)]
@@ -268,10 +274,15 @@ def _other_tracks(container: av.container.InputContainer, used: av.VideoStream) 
         return []
 
     def words(track: av.VideoStream) -> str:
-        context = track.codec_context
-        size = f"{context.width}x{context.height} px" if context else "of an unknown format"
+        size = "{}x{} px".format(*_size(track)) if track.codec_context else "of an unknown format"
         return f"{size}{f', {track.frames} images' if track.frames else ''}"
 
     left_out = "; ".join(map(words, others))
-    name = Path(container.name.removeprefix("file:")).name
-    return [f"{name}: of {len(others) + 1} video tracks, only one is used ({words(used)}), not: {left_out}"]
+    path = Path(container.name.removeprefix("file:"))
+    notes = [f"{path.name}: of {len(others) + 1} video tracks, only one is used ({words(used)}), not: {left_out}"]
+    if equal := [track for track in others if _size(track) == _size(used)]:
+        second = path.with_name(f"{path.stem}_right{path.suffix}")
+        words = ["ffmpeg", "-i", path, "-map", f"0:{equal[0].index}", "-c", "copy", second]
+        split = " ".join(map(quoted, words))
+        notes.append(f"{path.name}: if the tracks are two cameras: `{split}`, then add `--right {quoted(second)}`")
+    return notes
