@@ -52,6 +52,26 @@ def test_a_calibration_of_either_kind_of_pixels_fits(tmp_path, size, of_stored_p
     assert any("the calibration belongs to the stored pixels" in note for note in notes) == of_stored_pixels
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_masks_and_depth_of_stored_pixels_are_stretched_with_them(tmp_path, turned):
+    video = encode(tmp_path / "a.mp4", smooth(6), sample_aspect_ratio=Fraction(4, 3))
+    if turned:
+        video = ffmpeg("-display_rotation", "90", "-i", video, "-c", "copy", tmp_path / "t.mp4")
+    for folder in ("m", "d"):
+        (tmp_path / folder).mkdir()
+    for i in range(6):
+        values = np.zeros((96, 64) if turned else (64, 96), np.uint8)
+        values[6 : 6 + 30, 12 : 12 + 24] = 255
+        cv2.imwrite(str(tmp_path / f"m/{i}.png"), values)
+        np.save(tmp_path / f"d/{i}.npy", np.where(values > 0, np.float32(70), np.float32(90)))
+    done, _, _ = prepared(video, tmp_path, masks=str(tmp_path / "m"), depth=str(tmp_path / "d"), depth_unit_mm=1.0)
+    want = np.s_[8:48, 12:36] if turned else np.s_[6:36, 16:48]  # 3 px become 4
+    mask, depth = (cv2.imread(str(done.out / part / "000000.png"), -1) for part in ("masks", "depth"))
+    assert done.size == ((64, 128) if turned else (128, 64))
+    assert (mask[want] == 255).all() and (mask > 0).sum() == mask[want].size
+    assert (depth[want] == 7000).all() and (depth == 7000).sum() == mask[want].size
+
+
 def test_a_pause_leaves_no_frame_out(tmp_path):
     images = smooth(24)
     times = [*range(12), *range(250, 262)]

@@ -46,6 +46,8 @@ class FirstPass:
     """What is particular about the video and which of its images are not used, one line each."""
     damaged: frozenset[int] = frozenset()
     """Those of `indices` whose images are damaged."""
+    stored_size: tuple[int, int] | None = None
+    """(width, height) of one camera's image before its pixels became square, px; None if they were."""
     image_names: list[str] = field(default_factory=list)
     """Of all images of a source folder, without suffixes; empty for a video."""
 
@@ -104,7 +106,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
             f"(f = {geometry.matrix[0, 0]:.0f} px). To change it: --calibration or --field-of-view-degrees."
         )
     names = [file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else []
-    return FirstPass(indices, sample.kept, geometry, notes, video_notes, look.damaged, names)
+    return FirstPass(indices, sample.kept, geometry, notes, video_notes, look.damaged, clip.stored_size, names)
 
 
 @dataclass(frozen=True)
@@ -186,7 +188,7 @@ def _comb_notes(clip: Clip, images: list[NDArray[np.uint8]]) -> list[str]:
         even = path.with_name(f"{path.stem}_progressive.mp4")
         words = ["ffmpeg", "-i", path, "-vf", "bwdif=deint=all", "-crf", "10", even]
         fix = f"`{' '.join(map(quoted, words))}`"
-    return [f"{path.name}: rows alternate where something moves, as in interlaced video. To mend it: {fix}"]
+    return [f"{path.name}: rows alternate where something moves, as in interlaced video. Fix: {fix}"]
 
 
 def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:

@@ -80,6 +80,12 @@ class Video:
         return self._aspect if self._shown_width(self._size[0]) != self._size[0] else Fraction(1)
 
     @property
+    def stored_size(self) -> tuple[int, int]:
+        """(width, height) of an upright image before its pixels become square, px."""
+        width, height = self._size
+        return (width, height) if self.height == height else (height, width)
+
+    @property
     def notes(self) -> list[str]:
         """What is particular about the file, one line each; of its images after a complete iteration."""
         name, notes = self.path.name, list(self._unused)
