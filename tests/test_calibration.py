@@ -131,7 +131,7 @@ BROKEN = {
         "a calibration of OpenCV, ROS, Kalibr, ORB-SLAM, COLMAP or the da Vinci, or rows of numbers",
     ),
     "not json": ("c.json", "{", "a readable calibration"),
-    "a list": ("c.json", "[1]", "rows of numbers, got list"),
+    "a list": ("c.json", "[1]", "got a list"),
     "pickle in npz": ("c.npz", "x", "a readable calibration"),
     "python in yaml": ("c.yaml", "K_left: !!python/object/apply:os.system ['true']", "a readable calibration"),
     "no matrix": ("c.json", '{"R": 1}', "the left camera matrix"),
@@ -141,7 +141,7 @@ BROKEN = {
         json.dumps({"K1": K1.tolist(), "K2": K2.tolist(), "R": R.tolist(), "T": [1]}),
         "t to have 3 numbers",
     ),
-    "NaN": ("c.json", '{"K1": [[NaN,0,0],[0,1,0],[0,0,1]]}', "k to be finite"),
+    "NaN": ("c.json", '{"K1": [[NaN,0,0],[0,1,0],[0,0,1]]}', "k of the only camera to be finite"),
     "no rotation": (
         "c.json",
         json.dumps({"K1": K1.tolist(), "K2": K2.tolist(), "R": K1.tolist(), "T": [1, 2, 3]}),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +106,7 @@ def write_folder_path(
         size,
         has_depth=True,
         refine_focal=sources.get("lens") in (ASSUMED, REFINED),
-        reading=reading,
+        reading=replace(reading, image_names=[file.stem for file in images]),
         progress=lambda done: progress(done, len(images)),
     )
     unexplained = unexplained_frames(path, colors())

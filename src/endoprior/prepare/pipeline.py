@@ -132,7 +132,12 @@ def prepare(
         mark_moving(folder, moving)
         progress("following the camera", 0, files.count)
         path, motion_notes = _camera_path(
-            cfg, files, first_pass.geometry, used, lambda done: progress("following the camera", done, files.count)
+            cfg,
+            files,
+            first_pass.geometry,
+            used,
+            first_pass.image_names,
+            lambda done: progress("following the camera", done, files.count),
         )
         damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
         unexplained = _unexplained(path, files, damaged)
@@ -238,6 +243,7 @@ def _camera_path(
     files: FrameFiles,
     geometry: FrameGeometry,
     used: Sequence[int],
+    image_names: Sequence[str],
     progress: Callable[[int], None],
 ) -> tuple[CameraPath | None, list[str]]:
     """Poses of the written frames, None for a static camera; and notes for the user."""
@@ -262,7 +268,7 @@ def _camera_path(
         (meta.width, meta.height),
         has_depth=cfg.depth != "none",
         refine_focal=cfg.calibration is None,
-        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn, used),
+        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn, used, image_names),
         progress=progress,
     )
 
