@@ -173,6 +173,16 @@ def test_a_lost_image_of_the_second_video_costs_one_frame(tmp_path, pair):
     assert "l.mp4: 1 images have none of the second camera and are left out" in notes
 
 
+def test_a_second_video_that_ends_early_gives_the_pairs_there_are(tmp_path, pair):
+    options, lefts, rights = pair
+    left = encode(tmp_path / "l.mp4", lefts)
+    right = encode(tmp_path / "r.mp4", rights[:12])
+    done, notes, _ = prepared(left, tmp_path, right=right, **options)
+    demand_pairs(done.out, 12)
+    assert "l.mp4: 18 images have none of the second camera and are left out" in notes
+    assert "r.mp4: it ends 0.72 s before the first video" in notes
+
+
 def test_a_second_video_that_starts_later_is_paired_by_time(tmp_path, pair):
     options, lefts, rights = pair
     left = encode(tmp_path / "l.mp4", lefts)

@@ -350,8 +350,9 @@ def test_frames_without_a_pose_are_unexplained(tmp_path, capsys):
     del lines[5:7]  # the third image and its points
     (folder / "sparse/0/images.txt").write_text("\n".join(lines) + "\n")
     out = tmp_path / "out"
+    start = ["prepare", str(folder / "images")]
     words = ["--masks", "none", "--border", "keep", "--layout", "mono", "--depth", "none", "--poses"]
-    assert main(["prepare", str(folder / "images"), str(out), *words, str(folder)]) == 0
+    assert main([*start, str(out), *words, str(folder)]) == 0
     assert "no camera pose, or another scene, in frames 2;" in capsys.readouterr().out
     assert json.loads((out / "sequence.json").read_text())["unexplained_frames"] == [2]
     assert (
@@ -361,5 +362,5 @@ def test_frames_without_a_pose_are_unexplained(tmp_path, capsys):
         == 2
     )
     assert "whose axes are known" in capsys.readouterr().err
-    assert main(["prepare", str(folder / "images"), str(tmp_path / "x"), *words, str(folder / "images")]) == 2
+    assert main([*start, str(tmp_path / "x"), *words, str(folder / "images")]) == 2
     assert "got a folder without a model" in capsys.readouterr().err
