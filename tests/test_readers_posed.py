@@ -324,7 +324,7 @@ def test_prepare_reads_their_poses_by_the_names_of_images(tmp_path, kind):
     want = np.stack(POSES)[[1, 3, 4]]
     want[:, :3, 3] *= SCALE
     assert np.allclose(found, want)
-    by_number, known, rule = read_model_poses(folder if kind == "text" else given, range(FRAMES))
+    by_number, known, rule = read_model_poses(given if kind == "binary" else folder, range(FRAMES))
     assert np.allclose(by_number[[1, 3, 4]], want) and known.all() and "counted from 0" in rule
     out = tmp_path / "out"
     words = [

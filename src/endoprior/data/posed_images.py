@@ -71,7 +71,7 @@ def load_posed(
     if any(lens.is_bent for lens in lenses):
         remarks.append(f"{source}: the lens is distorted; frames are undistorted, without part of the periphery")
     masks, tool_value = _masks(path, posed, remarks)
-    depths = _depths(path, files[0], posed, remarks)
+    depths = _depths(path, files[0], source, posed, remarks)
     if mm_per_unit is None:
         remarks.append(f"{source}: the scale of its poses is unknown; lengths are not millimeters")
     kept = [i for i in kept_frames(len(posed), cfg) if all(i in files for files in (masks, depths) if files)]
@@ -151,7 +151,9 @@ def _masks(path: Path, posed: Sequence[PosedImage], remarks: list[str]) -> tuple
     return _beside(folder, posed, "masks", (".png",), remarks), 255
 
 
-def _depths(path: Path, calibration: Path, posed: Sequence[PosedImage], remarks: list[str]) -> dict[int, Path]:
+def _depths(
+    path: Path, calibration: Path, poses: Path, posed: Sequence[PosedImage], remarks: list[str]
+) -> dict[int, Path]:
     """The depth of each image that has one."""
     named = {i: each.depth for i, each in enumerate(posed) if each.depth is not None}
     if named:
@@ -161,8 +163,8 @@ def _depths(path: Path, calibration: Path, posed: Sequence[PosedImage], remarks:
     if (path / "depth").is_dir():
         remarks.append(f"{path / 'depth'}: taken to be in the units of the poses")
         return _beside(path / "depth", posed, "depth", DEPTH_SUFFIXES, remarks)
-    prepare = command("prepare", posed[0].file.parent, "OUT", "--calibration", calibration)
-    remarks.append(f"{path / 'depth'}: missing; `{prepare}` makes depth, and a camera path of its own")
+    prepare = command("prepare", posed[0].file.parent, "OUT", "--calibration", calibration, "--poses", poses)
+    remarks.append(f"{path / 'depth'}: missing; `{prepare}` makes depth")
     return {}
 
 

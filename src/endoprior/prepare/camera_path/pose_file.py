@@ -67,16 +67,17 @@ def read_model_poses(
     Raises:
         InputError: no such file, or it cannot be used, or its names do not tell the frames.
     """
-    if path.suffix.lower() == ".json":
-        stored = nerfstudio.read_poses(path)
-    else:
-        folder = path if path.is_dir() else path.parent
-        own = any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
-        model = folder if own else model_folder(folder)
-        if model is None:
-            fix = "Pass the folder with COLMAP's cameras and images, .bin or .txt, or transforms.json."
-            raise input_error(path, "camera poses", "a folder without a model", fix)
+    folder = path if path.is_dir() else path.parent
+    own = any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
+    model = folder if own else model_folder(folder)
+    file = path / nerfstudio.FILE if path.is_dir() else path
+    if file.suffix.lower() == ".json" and (file == path or (model is None and file.is_file())):
+        stored = nerfstudio.read_poses(file)
+    elif model is not None:
         stored = [(each.name, np.linalg.inv(each.world_to_camera)) for each in read_colmap(model)[0]]
+    else:
+        fix = "Pass the folder with COLMAP's cameras and images, .bin or .txt, or transforms.json."
+        raise input_error(path, "camera poses", "a folder without a model", fix)
     by_name = {Path(name).name: pose for name, pose in stored}
     files = [file.name for file in in_order(map(Path, by_name))]
     matched = match_names(path, files, sources, names, required=())
