@@ -3,6 +3,7 @@
 import codecs
 import io
 import json
+import struct
 
 import cv2
 import numpy as np
@@ -196,6 +197,14 @@ def test_single_cameras_of_other_programs(tmp_path, form):
     assert any("no lens distortion is stated" in note for note in found.notes) == (len(distortion) == 0)
 
 
+def test_colmap_binary(tmp_path):
+    values = (580, 582, 318.7, 255.6, *D1)
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<QiiQQ8d", 1, 1, 4, 640, 512, *values))
+    found = read_calibration(tmp_path / "cameras.bin")
+    assert np.allclose(found.left.matrix, K1 + HALF) and found.size == (640, 512)
+    assert np.allclose(found.left.distortion, [*D1, 0]) and found.right is None
+
+
 def test_npy(tmp_path):
     np.save(tmp_path / "intrinsics.npy", K1)
     assert np.allclose(read_calibration(tmp_path / "intrinsics.npy").left.matrix, K1 + HALF)
@@ -242,10 +251,10 @@ REJECTED = {
     "MATLAB": ("c.mat", b"MATLAB 5.0 MAT-file, Platform", "a .mat file of MATLAB"),
     "HDF5": ("c.mat", b"\x89HDF\r\n\x1a\n", "HDF5"),
     "pickle": ("c.pkl", b"\x80\x04\x95", "a pickle, which could run programs"),
-    "COLMAP binary": ("cameras.bin", b"\x01" + bytes(30), "a binary file of COLMAP"),
+    "COLMAP cut": ("cameras.bin", b"\x01" + bytes(30), "a .bin file that ends too early"),
     "Metashape": ("c.xml", "<?xml version='1.0'?><calibration><f>1</f></calibration>", "got <calibration>"),
     "entities": ("c.xml", "<!DOCTYPE x [<!ENTITY a 'b'>]><opencv_storage/>", "a document type"),
-    "two of COLMAP": ("cameras.txt", 2 * colmap("PINHOLE", "1 2 3 4"), "2 cameras"),
+    "two of COLMAP": ("cameras.txt", colmap("PINHOLE", "1 2 3 4") + "2 PINHOLE 640 512 1 2 3 4\n", "2 cameras"),
     "projection": ("P.txt", "580 0 318 -9\n0 582 255 0\n0 0 1 0\n", "a projection matrix"),
     "skew": ("c.json", json.dumps({"K": [[500, 9, 320], [0, 500, 256], [0, 0, 1]]}), "without skew"),
     "transposed": ("c.json", json.dumps({"K": K1.T.tolist()}), "a camera matrix"),

@@ -11,9 +11,11 @@ import pytest
 
 from endoprior.cli import main
 from endoprior.core.checks import InputError
+from endoprior.core.config import DataConfig
+from endoprior.data import load_sequence
 from endoprior.data.file_names import bare, numbers_of
 from endoprior.data.files import in_order
-from endoprior.data.frame_files import match_files, match_names
+from endoprior.data.frame_files import BY_NAME, BY_NUMBER, match_files, match_names
 from endoprior.data.mask_folders import open_mask_folder
 from endoprior.data.series import one_per_frame
 
@@ -114,6 +116,86 @@ def test_names_that_tell_nothing_are_an_error():
     for files in (["m1.png", "n1.png"], ["x.png", "y.png"]):
         with pytest.raises(InputError, match=rf"2 files for 3 frames, such as {files[0]} and {files[1]}"):
             match_names(FOLDER, files, range(3))
+
+
+OWN, FROM_ONE, TEST = [f"{i:06d}" for i in range(17)], [f"{i + 1:06d}" for i in range(17)], [1, 9]
+
+
+@pytest.mark.parametrize(
+    ("stems", "own", "rule", "frames"),
+    [
+        (["000001", "000009"], OWN, BY_NAME, [1, 9]),
+        (["frame-b", "frame-j"], [f"frame-{c}" for c in "abcdefghijklmnopq"], BY_NAME, [1, 9]),
+        (["00001", "00009"], OWN, BY_NUMBER, [1, 9]),
+        (["r_1", "r_9", "r_10"], [], "counted from 0", [1, 9, 10]),
+        (["000001", "000009"], FROM_ONE, "counted from 0", [1, 9]),  # by name, test frame 1 would be missing
+        (["000002", "000010"], FROM_ONE, BY_NAME, [1, 9]),
+        (["00000", "00001"], OWN, "in order", [1, 9]),
+        (["first", "second"], [], "in order", [1, 9]),
+        ([str(i + 1) for i in range(17)], OWN, "in order", list(range(17))),
+        (FROM_ONE, FROM_ONE, BY_NAME, list(range(17))),
+        (["1_2", "9_2", "3_2"], [], "counted from 0", [1, 3, 9]),
+    ],
+)
+def test_frames_that_are_required_tell_the_rule(stems, own, rule, frames):
+    matched = match_names(FOLDER, [f"{stem}.png" for stem in stems], range(17), own, required=TEST)
+    assert rule in matched.rule and sorted(matched.files) == frames
+
+
+@pytest.mark.parametrize(
+    ("stems", "own", "said"),
+    [
+        (["000001", "000008"], OWN, "2 files for 2 frames, none numbered 9"),  # never zipped
+        (["1", "9", "x"], OWN, "3 files for 2 frames, such as 1.png and x.png"),
+        (["1", "01", "9"], [], "3 files for 2 frames"),  # one frame twice
+        ([f"{i:06d}" for i in range(1, 11)], FROM_ONE, "10 names that are those of the images and also numbers of"),
+    ],
+)
+def test_required_frames_without_a_file_are_an_error(stems, own, said):
+    with pytest.raises(InputError, match=said):
+        match_names(FOLDER, [f"{stem}.png" for stem in stems], range(17), own, required=TEST)
+
+
+@pytest.mark.parametrize(
+    ("images", "files", "want"),
+    [
+        (["0", "1", "2", "3"], ["0", "2", "3"], {0: 0, 2: 1, 3: 2}),
+        (["0", "1", "3"], ["0", "2", "3"], {0: 0, 2: 2}),
+        (["l1", "l2", "l3"], ["r2", "r3"], {1: 0, 2: 1}),
+        (["a", "b", "c"], ["c_mask", "a_mask"], {0: 1, 2: 0}),
+        (["5", "6"], ["1", "2", "3"], None),
+        ([f"a{i}" for i in range(10)], [f"b{i}" for i in range(1, 11) if i != 5], None),  # one more, and one missing
+        (["a", "b"], ["c", "d", "e"], None),
+    ],
+)
+def test_frames_without_a_file_may_be_left_out(images, files, want):
+    def match():
+        return match_names(FOLDER, [f"{name}.png" for name in files], range(len(images)), images, required=())
+
+    if want is not None:
+        assert match().files == want
+        return
+    with pytest.raises(InputError):
+        match()
+
+
+@pytest.mark.parametrize("kind", ["endonerf", "plain", "hamlyn"])
+def test_readers_keep_the_frames_that_have_all_files(tiny_sequence, kind):
+    if kind == "hamlyn":
+        (tiny_sequence / "sequence.json").unlink()
+        (tiny_sequence / "depth").rename(tiny_sequence / "gt_depth")
+    depth = "gt_depth" if kind == "hamlyn" else "depth"
+    (tiny_sequence / "masks/000005.png").unlink()
+    (tiny_sequence / depth / "000009.png").rename(tiny_sequence / depth / "000099.png")
+    sequence = load_sequence(tiny_sequence, DataConfig(format=kind))
+    assert sequence.image_names == [f"{i:06d}" for i in range(17) if i not in (5, 9)]
+    remarks = [line.removeprefix(f"{tiny_sequence}/") for line in sequence.remarks]
+    for part in ("masks", depth):
+        assert f"{part}: 1 of 17 images have no file there and are left out" in remarks
+    assert f"{depth}: 1 files of other frames are not used" in remarks
+    assert sequence.frame(8).rgb_u8.shape == sequence.frame(0).rgb_u8.shape  # every file is read
+    want = cv2.imread(str(tiny_sequence / "images/000010.png"))[..., ::-1]
+    assert kind == "hamlyn" or (sequence.frame(8).rgb_u8 == want).all()
 
 
 def test_times_in_seconds_are_sorted_as_numbers():

@@ -17,8 +17,8 @@ from hypothesis_profiles import examples
 from endoprior import load_sequence
 from endoprior.cli import main
 from endoprior.core.checks import InputError
+from endoprior.data.frame_files import BY_NAME, BY_NUMBER
 from endoprior.evaluation.mask_scores import NO_VALUE, SCORES, TOLERANCE, MaskCounts, count, counted_pixels, tips
-from endoprior.evaluation.picture_names import IN_ORDER_ALL, NUMBERS, OWN_NAMES
 from endoprior.evaluation.true_masks import TrueMasks, score_masks
 from endoprior.footage.border import Circle
 
@@ -221,11 +221,11 @@ def true_masks(sequence, indices, folder, suffix=".png", name="{:06d}", inverted
 @pytest.mark.parametrize(
     ("indices", "options", "rule"),
     [
-        (range(17), {}, OWN_NAMES),
-        ([2, 9, 11], {}, OWN_NAMES),
-        ([2, 9, 11], {"name": "label_{}", "suffix": ".npy"}, NUMBERS),
-        (range(17), {"name": "a{}b3"}, IN_ORDER_ALL),
-        ([2, 9], {"inverted": True}, OWN_NAMES),
+        (range(17), {}, BY_NAME),
+        ([2, 9, 11], {}, BY_NAME),
+        ([2, 9, 11], {"name": "label_{}", "suffix": ".npy"}, BY_NUMBER),
+        (range(17), {"name": "a{}b3"}, BY_NUMBER),
+        ([2, 9], {"inverted": True}, BY_NAME),
     ],
 )
 def test_mask_files_are_matched_and_read(tmp_path, sequence, indices, options, rule):
@@ -274,7 +274,7 @@ def test_the_command_prints_and_writes_where_it_is_told(tmp_path, sequence, caps
     words = ["eval", "--masks", str(truth), str(sequence.path)]
     assert main(words) == 0
     out = capsys.readouterr().out
-    assert f"{truth}: true masks of 2 of 17 frames, matched by {OWN_NAMES}" in out
+    assert f"{truth}: true masks of 2 of 17 frames, {BY_NAME}" in out
     assert "masks   IoU " in out and "missed tips" in out and "to keep the scores: --out FOLDER" in out
     assert sorted(tmp_path.rglob("*")) == before
     assert main([*words, "--out", str(tmp_path / "out")]) == 0
@@ -293,7 +293,7 @@ def test_the_command_prints_and_writes_where_it_is_told(tmp_path, sequence, caps
     [
         (["--masks", "absent"], "absent: expected a folder of true masks, got nothing"),
         (["--masks", "empty"], "empty: expected mask files (.png, "),
-        (["--masks", "many"], "many: expected files of some of the 17 frames, or of all, got 2 files, '3' to '99'"),
+        (["--masks", "many"], "many: expected files of the 17 frames, got 1 of 2 files of no frame, such as 99.png"),
         (["--masks", "small/images"], "small/images/000000.png: expected 48x40 px like the images, got 24x20"),
         (["--masks", "few", "--no-networks"], "--no-networks: expected --masks TRUTH DATA, with no option but --out"),
         (["--masks", "few", "--pictures", "few"], "--pictures: expected --masks TRUTH DATA"),

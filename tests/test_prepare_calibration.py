@@ -1,11 +1,12 @@
 """Stereo videos with awkward calibrations, from the command line to depth: a flat wall 70 mm away."""
 
 import json
+from fractions import Fraction
 
 import cv2
 import numpy as np
 import pytest
-from video_files import write_video
+from video_files import encode, write_video
 
 from endoprior.check import find, measure
 from endoprior.cli import main
@@ -127,3 +128,63 @@ def test_the_fix_of_a_camera_for_another_size_corrects_depth_too(tmp_path, known
     assert depth_of(tmp_path / "DATA")[0] == pytest.approx(DEPTH, rel=0.01)
     assert load_sequence(tmp_path / "DATA").camera(0).fx == pytest.approx(FOCAL, rel=0.01)
     assert "intrinsics" not in codes(tmp_path / "DATA")
+
+
+# --- Options together
+
+
+@pytest.mark.parametrize("of_stored_pixels", [False, True])
+def test_squeezed_eyes_of_pixels_that_are_not_square(tmp_path, capsys, of_stored_pixels):
+    frames = [np.concatenate(each, 1) for each in PAIRS]
+    stored = [cv2.resize(frame, (WIDTH * 3 // 4, HEIGHT), interpolation=cv2.INTER_AREA) for frame in frames]
+    video = encode(tmp_path / "v.mp4", stored, sample_aspect_ratio=Fraction(4, 3))
+    calibrated = calibration(tmp_path / "c.json", width=WIDTH, height=HEIGHT)
+    if of_stored_pixels:
+        k = [[FOCAL * 3 / 4, 0, 120], [0, FOCAL, 128], [0, 0, 1]]
+        calibrated = calibration(tmp_path / "c.json", width=240, height=HEIGHT, K_left=k, K_right=k)
+    assert prepare(tmp_path, video, calibrated, "--squeezed-eyes", "--layout", "side-by-side") == 0
+    camera = load_sequence(tmp_path / "DATA").camera(0)
+    assert (camera.width, camera.height, camera.fx, camera.fy) == pytest.approx((WIDTH, HEIGHT, FOCAL, FOCAL))
+    depth, share = depth_of(tmp_path / "DATA")
+    assert depth == pytest.approx(DEPTH, rel=0.02) and share > 0.8
+
+
+def test_a_row_offset_of_squeezed_eyes(tmp_path, capsys):
+    video = side_by_side(tmp_path / "v.mkv", squeezed=True, low=5)
+    calibrated = calibration(tmp_path / "c.json", width=WIDTH, height=HEIGHT)
+    assert (
+        prepare(tmp_path, video, calibrated, "--squeezed-eyes", "--layout", "side-by-side", "--row-offset", "auto") == 0
+    )
+    assert "moved up by 5.0" in capsys.readouterr().out and depth_of(tmp_path / "DATA")[1] > 0.9
+
+
+def test_a_fisheye_of_another_size(tmp_path):
+    video = write_video(tmp_path / "v.mkv", [left for left, _ in PAIRS])
+    bent = {"model": "fisheye", "D": [-0.05, 0.01, 0.0, 0.0], "pixel_center": 0.5}
+    for scale, name in ((1, "same"), (2, "double")):
+        k = [[FOCAL * scale, 0, 158 * scale], [0, FOCAL * scale, 130 * scale], [0, 0, 1]]
+        file = tmp_path / f"{name}.json"
+        file.write_text(json.dumps(bent | {"K": k, "width": WIDTH * scale, "height": HEIGHT * scale}))
+        words = ["--calibration", str(file), "--depth", "none", "--layout", "mono", "--border", "keep", *QUICK]
+        assert main(["prepare", str(video), str(tmp_path / f"out_{name}"), *words]) == 0
+    same, double = (load_sequence(tmp_path / f"out_{name}") for name in ("same", "double"))
+    a, b = same.camera(0), double.camera(0)
+    assert (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == pytest.approx((b.width, b.height, b.fx, b.fy, b.cx, b.cy))
+    assert np.abs(same.frame(1).rgb_u8.astype(int) - double.frame(1).rgb_u8).max() <= 1
+    assert np.abs(same.frame(1).rgb_u8[:, :300].astype(int) - PAIRS[1][0][:, :300]).mean() > 5  # undistorted
+
+
+def test_masks_with_labels_of_every_second_frame(tmp_path, capsys):
+    video = write_video(tmp_path / "v.mkv", [left for left, _ in PAIRS * 2])
+    (tmp_path / "m").mkdir()
+    for i in (0, 2, 4):
+        labels = np.zeros((HEIGHT, WIDTH), np.uint8)
+        labels[:100, :120], labels[100:200, : 40 + 20 * i] = 1, 2  # tissue and a tool
+        cv2.imwrite(str(tmp_path / f"m/{i:04d}.png"), labels)
+    words = ["--masks", str(tmp_path / "m"), "--mask-labels", "2", "--depth", "none", "--poses", "still"]
+    assert main(["prepare", str(video), str(tmp_path / "DATA"), *words]) == 0
+    assert "one for every 2 frames; 3 of 6 frames have none and are left out" in capsys.readouterr().out
+    masks = [cv2.imread(str(file), 0) > 0 for file in sorted((tmp_path / "DATA/masks").iterdir())]
+    assert [int(mask[150].sum()) for mask in masks] == [40, 80, 120] and not any(mask[:100].any() for mask in masks)
+    images = [cv2.imread(str(file))[..., ::-1] for file in sorted((tmp_path / "DATA/images").iterdir())]
+    assert all((images[i] == PAIRS[j][0]).all() for i, j in ((0, 0), (1, 2), (2, 1)))

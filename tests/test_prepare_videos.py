@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import shlex
 from fractions import Fraction
 
 import cv2
 import numpy as np
 import pytest
-from video_files import encode, psnr, smooth, write_video
+from video_files import encode, ffmpeg, psnr, smooth, write_video
 
 from endoprior.check.facts import measure
 from endoprior.check.findings import find
@@ -17,7 +18,7 @@ from endoprior.data import load_sequence
 from endoprior.data.images import read_color
 from endoprior.data.prepare_record import read_record
 from endoprior.prepare import PrepareConfig, prepare
-from endoprior.prepare.pairing import pair_by_number, pair_by_time
+from endoprior.prepare.pairing import pair_by_time
 from endoprior.prepare.source_frame import SourceFrame
 
 
@@ -49,6 +50,26 @@ def test_a_calibration_of_either_kind_of_pixels_fits(tmp_path, size, of_stored_p
     _, notes, described = prepared(video, tmp_path, calibration=file)
     assert [described[key] for key in ("width", "height", "fx", "fy", "cx", "cy")] == [128, 64, 100, 100, 64, 32]
     assert any("the calibration belongs to the stored pixels" in note for note in notes) == of_stored_pixels
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_masks_and_depth_of_stored_pixels_are_stretched_with_them(tmp_path, turned):
+    video = encode(tmp_path / "a.mp4", smooth(6), sample_aspect_ratio=Fraction(4, 3))
+    if turned:
+        video = ffmpeg("-display_rotation", "90", "-i", video, "-c", "copy", tmp_path / "t.mp4")
+    for folder in ("m", "d"):
+        (tmp_path / folder).mkdir()
+    for i in range(6):
+        values = np.zeros((96, 64) if turned else (64, 96), np.uint8)
+        values[6 : 6 + 30, 12 : 12 + 24] = 255
+        cv2.imwrite(str(tmp_path / f"m/{i}.png"), values)
+        np.save(tmp_path / f"d/{i}.npy", np.where(values > 0, np.float32(70), np.float32(90)))
+    done, _, _ = prepared(video, tmp_path, masks=str(tmp_path / "m"), depth=str(tmp_path / "d"), depth_unit_mm=1.0)
+    want = np.s_[8:48, 12:36] if turned else np.s_[6:36, 16:48]  # 3 px become 4
+    mask, depth = (cv2.imread(str(done.out / part / "000000.png"), -1) for part in ("masks", "depth"))
+    assert done.size == ((64, 128) if turned else (128, 64))
+    assert (mask[want] == 255).all() and (mask > 0).sum() == mask[want].size
+    assert (depth[want] == 7000).all() and (depth == 7000).sum() == mask[want].size
 
 
 def test_a_pause_leaves_no_frame_out(tmp_path):
@@ -125,14 +146,6 @@ def test_images_are_paired_by_time():
     assert paired([0, 1], []) == [None, None]
 
 
-def test_images_of_folders_are_paired_by_number():
-    assert pair_by_number(["a1", "a2", "a3"], ["b1", "b2", "b3"]) == ({0: 0, 1: 1, 2: 2}, "")
-    assert pair_by_number(["0", "1", "2"], ["1", "2", "3"]) == ({0: 0, 1: 1, 2: 2}, "")  # counted from 1
-    assert pair_by_number(["0", "1", "2", "3"], ["0", "2", "3"])[0] == {0: 0, 2: 1, 3: 2}
-    assert pair_by_number(["0", "1", "3"], ["0", "2", "3"])[0] == {0: 0, 2: 2}
-    assert pair_by_number(["a", "b"], ["a", "b"]) == ({0: 0, 1: 1}, "")
-
-
 @pytest.fixture
 def pair(tmp_path):
     """Options for two files, and (left, right) images of 30: the right camera sees all 6 px further left."""
@@ -158,6 +171,16 @@ def test_a_lost_image_of_the_second_video_costs_one_frame(tmp_path, pair):
     done, notes, _ = prepared(left, tmp_path, right=right, **options)
     demand_pairs(done.out, 29)
     assert "l.mp4: 1 images have none of the second camera and are left out" in notes
+
+
+def test_a_second_video_that_ends_early_gives_the_pairs_there_are(tmp_path, pair):
+    options, lefts, rights = pair
+    left = encode(tmp_path / "l.mp4", lefts)
+    right = encode(tmp_path / "r.mp4", rights[:12])
+    done, notes, _ = prepared(left, tmp_path, right=right, **options)
+    demand_pairs(done.out, 12)
+    assert "l.mp4: 18 images have none of the second camera and are left out" in notes
+    assert "r.mp4: it ends 0.72 s before the first video" in notes
 
 
 def test_a_second_video_that_starts_later_is_paired_by_time(tmp_path, pair):
@@ -192,7 +215,7 @@ def test_folders_of_two_cameras_are_paired_by_number(tmp_path, pair):
                 cv2.imwrite(str(tmp_path / name / f"{i:03d}.png"), image[..., ::-1])
     done, notes, _ = prepared(tmp_path / "l", tmp_path, right=tmp_path / "r", **options)
     demand_pairs(done.out, 18)
-    assert any("paired by the numbers in the names" in note for note in notes)
+    assert "r: 1 images have none of the first camera and are left out" in notes
     assert "l: 1 images have none of the second camera and are left out" in notes
 
 
@@ -209,3 +232,18 @@ def test_nearly_black_images_are_said(tmp_path):
     done, notes, _ = prepared(video, tmp_path, depth="shading")
     assert any(note.startswith("the images are nearly black: their brightest parts have 1") for note in notes)
     assert "dark-images" in {finding.code for finding in find(measure(load_sequence(done.out)))}
+
+
+def test_combing_that_the_file_does_not_flag_is_said(tmp_path):
+    images = smooth(24, step=4)
+    combed = [image.copy() for image in images[::2]]
+    for image, later in zip(combed, images[1::2], strict=True):
+        image[1::2] = later[1::2]
+    _, notes, _ = prepared(write_video(tmp_path / "c.mkv", combed), tmp_path)
+    (note,) = [note for note in notes if "rows alternate" in note]
+    words = shlex.split(note.split("`")[1])
+    assert words[0] == "ffmpeg" and note.startswith("c.mkv: ")
+    ffmpeg(*words[1:])
+    (tmp_path / "even").mkdir()
+    _, notes, _ = prepared(tmp_path / "c_progressive.mp4", tmp_path / "even")
+    assert not any("rows alternate" in note for note in notes)

@@ -180,7 +180,6 @@ def test_vignetting_is_no_margin():
 
 
 FORPLANE_BAD = {
-    "fewer depths": (lambda f: (f / "gt_depth/000003.png").unlink(), "gt_depth", "10 files, one per image, got 9"),
     "no masks": (lambda f: shutil.rmtree(f / "gt_masks"), "masks", "no such folder"),
     "no poses": (lambda f: (f / "poses_bounds.npy").unlink(), "poses_bounds.npy", "no such file"),
     "pose NaN": (lambda f: change_poses(f, lambda p: p * np.nan), "poses_bounds.npy", "finite numbers"),
@@ -192,7 +191,6 @@ FORPLANE_BAD = {
     "depth cut": (lambda f: (f / "gt_depth/000003.png").write_bytes(b""), "gt_depth/000003.png", "0 bytes"),
 }
 RECTIFIED_BAD = {
-    "fewer depths": (lambda f: (f / "depth01/0000000003.png").unlink(), "depth01", "got 9"),
     "no calibration": (lambda f: (f / "intrinsics.txt").unlink(), "intrinsics.txt", "No such file"),
     "calibration words": (lambda f: (f / "intrinsics.txt").write_text("fx 70\n"), "intrinsics.txt", "rows of numbers"),
     "calibration shape": (lambda f: (f / "intrinsics.txt").write_text("1 2\n"), "intrinsics.txt", "3x3 camera matrix"),

@@ -119,7 +119,6 @@ def describe(**described):
 
 
 BAD = {
-    "fewer depths": (lambda f: (f / "depth/3.npy").unlink(), "depth", "11 files for 12 frames, none numbered 3"),
     "depth cut": (lambda f: (f / "depth/3.npy").write_bytes(b"x"), "depth/3.npy", "a NumPy file"),
     "depth of other size": (lambda f: np.save(f / "depth/3.npy", np.ones((2, 3))), "depth/3.npy", "got 3x2"),
     "empty masks": (lambda f: (f / "masks").mkdir(), "masks", "PNG files, got none"),

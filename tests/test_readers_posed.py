@@ -16,8 +16,10 @@ from sequence_edits import write
 
 from endoprior.check.facts import measure
 from endoprior.check.findings import find
+from endoprior.cli import main
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
+from endoprior.prepare.camera_path.pose_file import read_model_poses
 
 SIZE, FRAMES = (96, 80), 11
 MATRIX = np.array([[100.0, 0, 45.5], [0, 104, 42.25], [0, 0, 1]])
@@ -289,8 +291,8 @@ def rewrite(name, text):
 
 
 BAD_COLMAP = {
-    "cut cameras": ("binary", cut("cameras.bin", 20), "sparse/0", "ends too early"),
-    "cut images": ("binary", cut("images.bin", 500), "sparse/0", "ends too early"),
+    "cut cameras": ("binary", cut("cameras.bin", 20), "sparse/0/cameras.bin", "ends too early"),
+    "cut images": ("binary", cut("images.bin", 500), "sparse/0/images.bin", "ends too early"),
     "words": ("text", rewrite("images.txt", "1 0 0 0 x\n"), "images.txt", "rows `IMAGE_ID QW"),
     "no images": ("text", rewrite("images.txt", "# none\n"), "images.txt", "registered images, got none"),
     "other camera": ("text", rewrite("cameras.txt", "4 PINHOLE 96 80 1 1 1 1\n"), "images.txt", "got camera 3"),
@@ -305,3 +307,60 @@ def test_bad_models_of_colmap_are_rejected(tmp_path, case):
     folder = write_colmap(tmp_path / "scene", kind)
     damage(folder)
     assert_rejected(folder, named, words)
+
+
+# --- `--poses` of the files of these programs
+
+
+@pytest.mark.parametrize("kind", ["transforms.json", "text", "binary"])
+def test_prepare_reads_their_poses_by_the_names_of_images(tmp_path, kind):
+    folder = tmp_path / "scene"
+    if kind == "transforms.json":
+        given = write_nerfstudio(folder) / kind
+    else:
+        given = write_colmap(folder, kind) / "sparse/0"
+    found, known, rule = read_model_poses(given, [1, 3, 4], [f"frame_{i:05d}" for i in range(FRAMES)])
+    assert known.all() and rule == "matched by name"
+    want = np.stack(POSES)[[1, 3, 4]]
+    want[:, :3, 3] *= SCALE
+    assert np.allclose(found, want)
+    by_number, known, rule = read_model_poses(given if kind == "binary" else folder, range(FRAMES))
+    assert np.allclose(by_number[[1, 3, 4]], want) and known.all() and "counted from 0" in rule
+    out = tmp_path / "out"
+    words = [
+        "--poses",
+        str(given),
+        "--poses-unit-mm",
+        repr(1 / SCALE),
+        "--masks",
+        "none",
+        "--border",
+        "keep",
+        "--layout",
+        "mono",
+    ]
+    assert main(["prepare", str(folder / "images"), str(out), *words, "--depth", "none"]) == 0
+    stored = np.load(out / "poses_bounds.npy")[:, :15].reshape(-1, 3, 5)
+    assert np.allclose(stored[:, :, :4], np.stack(POSES)[:, :3], atol=1e-5)
+
+
+def test_frames_without_a_pose_are_unexplained(tmp_path, capsys):
+    folder = write_colmap(tmp_path / "scene", "text")
+    lines = (folder / "sparse/0/images.txt").read_text().splitlines()
+    del lines[5:7]  # the third image and its points
+    (folder / "sparse/0/images.txt").write_text("\n".join(lines) + "\n")
+    out = tmp_path / "out"
+    start = ["prepare", str(folder / "images")]
+    words = ["--masks", "none", "--border", "keep", "--layout", "mono", "--depth", "none", "--poses"]
+    assert main([*start, str(out), *words, str(folder)]) == 0
+    assert "no camera pose, or another scene, in frames 2;" in capsys.readouterr().out
+    assert json.loads((out / "sequence.json").read_text())["unexplained_frames"] == [2]
+    assert (
+        main(
+            ["prepare", str(folder / "images"), str(tmp_path / "y"), *words, str(folder), "--poses-convention", "llff"]
+        )
+        == 2
+    )
+    assert "whose axes are known" in capsys.readouterr().err
+    assert main([*start, str(tmp_path / "x"), *words, str(folder / "images")]) == 2
+    assert "got a folder without a model" in capsys.readouterr().err

@@ -95,10 +95,10 @@ def test_pictures_that_do_not_fit_are_a_remark(pair):
     assert "first image has 32x40 px, and the left one 48x40 px" in load_sequence(pair).remarks[0]
     (pair / "right/000000.png").unlink()
     sequence = load_sequence(pair)
-    assert sequence.right_eye is None and "it has 16 images, and images/ has 17" in sequence.remarks[0]
+    assert sequence.right_eye is None and "it has 16 images, not one of" in sequence.remarks[0]
     write_right(pair, "000017.png", 0)  # one too late
     sequence = load_sequence(pair)
-    assert sequence.right_eye is not None and "matched by order" in sequence.remarks[0]
+    assert sequence.right_eye is not None and "counted otherwise: 000001.png for image 000000" in sequence.remarks[0]
 
 
 def test_a_broken_picture_is_named_when_it_is_used(pair):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from fractions import Fraction
 
 import av
@@ -9,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from video_files import encode, psnr, smooth, write_video
+from video_files import encode, ffmpeg, psnr, smooth, write_video
 
 from endoprior.core.checks import InputError
 from endoprior.data.recognize import is_video
@@ -108,11 +110,39 @@ def test_joined_streams_follow_each_other(tmp_path):
             assert len(source.times) == 30 and source.seconds == pytest.approx(30 / 25)
 
 
-def test_what_is_behind_the_first_of_joined_mp4_files_is_named(tmp_path):
-    parts = [encode(tmp_path / f"{i}.mp4", smooth(5 + i)) for i in range(3)]
-    (tmp_path / "all.mp4").write_bytes(b"".join(part.read_bytes() for part in parts))
-    source = open_source(tmp_path / "all.mp4")
-    assert len(list(source)) == 5 and source.notes == ["all.mp4: of 3 joined files only the first is used"]
+@pytest.mark.parametrize(
+    ("ending", "codec", "used", "first"),
+    [
+        ("mp4", "libx264", 5, "the first is"),
+        ("flv", "libx264", 5, "the first is"),
+        ("wmv", "wmv2", 5, "the first is"),
+        ("mkv", "libx264", 11, "the first 2 are"),
+    ],
+)
+def test_joined_files_that_are_not_read_are_named(tmp_path, ending, codec, used, first):
+    parts = [encode(tmp_path / f"{i}.{ending}", smooth(5 + i), codec, options={"b": "9000000"}) for i in range(3)]
+    joined = tmp_path / f"all.{ending}"
+    joined.write_bytes(b"".join(part.read_bytes() for part in parts))
+    source = open_source(joined)
+    assert len(list(source)) == used
+    assert f"all.{ending}: of 3 joined files only {first} used; join them with `ffmpeg -f concat`" in source.notes
+    assert not any("joined files" in note for note in open_source(parts[0]).notes)
+
+
+@pytest.mark.parametrize("starts", [(0, 1, 0, 1), (0, 1, 0.5, 2), (0, 1, 40, 41)])
+def test_times_of_fragments_that_start_again_lose_no_image(tmp_path, starts):
+    images = smooth(24)
+    whole = encode(tmp_path / "w.mp4", images, options={"crf": "10", "g": "6"}, max_b_frames=0)
+    moved = ffmpeg("-i", whole, "-c", "copy", "-movflags", "frag_keyframe+empty_moov", tmp_path / "f.mp4")
+    content = bytearray(moved.read_bytes())
+    places = [found.end() + 4 for found in re.finditer(b"tfdt", content)]  # behind version and flags: 8 bytes
+    length = int.from_bytes(content[places[1] : places[1] + 8], "big")
+    for place, start in zip(places, starts, strict=True):
+        content[place : place + 8] = int(start * length).to_bytes(8, "big")
+    moved.write_bytes(content)
+    found = list(open_source(moved))
+    assert min(psnr(image.rgb_u8, want) for image, want in zip(found, images, strict=True)) > 25
+    assert min(np.diff([image.seconds for image in found])) > 0.039
 
 
 def test_images_that_a_folder_has_besides_are_counted(tmp_path):
@@ -213,6 +243,13 @@ def test_the_track_of_the_video_is_used(tmp_path):
     assert (source.width, len(list(source))) == (160, 24)
     said = "only one is used (160x128 px, 24 images), not: 80x64 px, 24 images"
     assert source.notes == [f"a.mp4: of 2 video tracks, {said}"]
+    name = "two eyes.mp4"
+    first, hint = open_source(tracks(tmp_path / name, (96, 64, 9), (96, 64, 9))).notes
+    assert first == f"{name}: of 2 video tracks, only one is used (96x64 px, 9 images), not: 96x64 px, 9 images"
+    words = shlex.split(hint.split("`")[1])
+    assert words[:1] == ["ffmpeg"] and ffmpeg(*words[1:]).name == "two eyes_right.mp4"
+    assert len(list(open_source(tmp_path / "two eyes_right.mp4"))) == 9
+    assert hint.endswith(f"then add `--right '{tmp_path / 'two eyes_right.mp4'}'`")
     assert open_source(tracks(tmp_path / "b.mp4", (320, 256, 1), (160, 128, 24))).width == 160  # a cover
     assert open_source(tracks(tmp_path / "c.mp4", (320, 256, 4), (160, 128, 24))).width == 160  # a preview
 

@@ -8,8 +8,9 @@ from endoprior.core.config import DataConfig
 from endoprior.core.types import Camera
 from endoprior.data import FrameSequence, read_depth_file
 from endoprior.data.assemble import Pixels, assemble, kept_frames
-from endoprior.data.files import demand_count, list_files
+from endoprior.data.files import list_files
 from endoprior.data.formats import Format
+from endoprior.data.frame_files import files_of_images
 from endoprior.data.images import read_color
 from endoprior.data.poses import identity_poses
 
@@ -25,11 +26,12 @@ def is_rendered(path: Path) -> bool:
 def load_rendered(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a folder."""
     images = list_files(path / "rgb", (".png",), "rendered")
-    depths = list_files(path / "depth", (".npy",), "rendered")
-    demand_count(depths, path / "depth", len(images))
     height, width = read_color(images[0]).shape[:2]
-    kept = kept_frames(len(images), cfg)
-    images, depths = ([files[i] for i in kept] for files in (images, depths))
+    remarks = [f"{path}: no focal length given, {ASSUMED_FOCAL:g} image widths are assumed"]
+    depths = list_files(path / "depth", (".npy",), "rendered")
+    depth_of = files_of_images(path / "depth", depths, "depth", images, remarks)
+    kept = [i for i in kept_frames(len(images), cfg) if i in depth_of]
+    images, depths = [images[i] for i in kept], [depth_of[i] for i in kept]
     focal = ASSUMED_FOCAL * width
     cameras = [Camera(width, height, focal, focal, width / 2, height / 2, pose) for pose in identity_poses(len(kept))]
 
@@ -38,7 +40,6 @@ def load_rendered(path: Path, cfg: DataConfig) -> FrameSequence:
         color = read_color(images[index], (width, height))
         return color, np.ones((height, width), bool), read_depth_file(depths[index], size=(width, height))
 
-    remarks = [f"{path}: no focal length given, {ASSUMED_FOCAL:g} image widths ({focal:g} px) are assumed"]
     return assemble(path, cfg, cameras, decode, images=images, files=depths, remarks=remarks, mask_folder="rgb")
 
 

@@ -168,7 +168,7 @@ def evaluate_masks(args: Eval, folder: Path) -> None:
     sequence = load_sequence(args.run)
     truth = TrueMasks(folder, sequence)
     total = len(sequence)
-    say(f"{truth.folder}: true masks of {len(truth.indices)} of {total} frames, matched by {truth.matched_by}")
+    say(f"{truth.folder}: true masks of {len(truth.indices)} of {total} frames, {truth.matched_by}")
     say(f"true masks: {truth.polarity}")
     result = score_masks(sequence, truth)
     say(f"\nscores of the tool masks in {len(truth.indices)} frames ({BETTER})")

@@ -18,7 +18,7 @@ PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 
 def is_colmap(path: Path) -> bool:
     """Whether a folder has images and a model, and no poses of its own."""
-    return (path / "images").is_dir() and not (path / "poses_bounds.npy").exists() and _model(path) is not None
+    return (path / "images").is_dir() and not (path / "poses_bounds.npy").exists() and model_folder(path) is not None
 
 
 def load_colmap(path: Path, cfg: DataConfig) -> FrameSequence:
@@ -27,7 +27,7 @@ def load_colmap(path: Path, cfg: DataConfig) -> FrameSequence:
     Raises:
         InputError: the model or an image cannot be used.
     """
-    model = _model(path)
+    model = model_folder(path)
     if model is None:
         fix = "pass the folder that holds images/ and sparse/0/."
         raise input_error(path / PLACES[0], "cameras and images, .bin or .txt", "no such files", fix)
@@ -61,8 +61,8 @@ def present(source: Path, posed: list[PosedImage], remarks: list[str]) -> list[P
     return there
 
 
-def _model(path: Path) -> Path | None:
-    """The folder of the model; None if there is none."""
+def model_folder(path: Path) -> Path | None:
+    """The folder of the model in a project folder; None if there is none."""
     for place in PLACES:
         for suffix in (".bin", ".txt"):
             if all((path / place / f"{name}{suffix}").is_file() for name in ("cameras", "images")):

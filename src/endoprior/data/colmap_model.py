@@ -13,12 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..core.checks import input_error
+from ..core.checks import InputError, input_error
 from .lens import MODELS, Lens
 from .reading import read_bytes, read_text
 
 FIX = "export the model again."
 MOST_IMAGES = 1_000_000
+
+
+@dataclass(frozen=True)
+class StoredCamera:
+    """One camera as the file has it."""
+
+    model: str
+    """One of `MODELS`, or another word."""
+    width: int
+    height: int
+    values: list[float]
 
 
 @dataclass(frozen=True)
@@ -40,11 +51,11 @@ def read_colmap(folder: Path) -> tuple[list[RegisteredImage], list[Path]]:
     """
     suffix = ".bin" if (folder / "images.bin").exists() else ".txt"
     cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
+    lenses = {number: _lens(cameras, each) for number, each in read_cameras(cameras).items()}
     try:
-        lenses = _cameras_of_bytes(cameras) if suffix == ".bin" else _cameras_of_text(cameras)
         rows = _images_of_bytes(images) if suffix == ".bin" else _images_of_text(images)
     except (struct.error, IndexError, UnicodeDecodeError):
-        raise input_error(folder, "a model of COLMAP", f"a {suffix} file that ends too early", FIX) from None
+        raise _cut(images) from None
     if not rows:
         raise input_error(images, "registered images", "none", FIX)
     found = []
@@ -60,12 +71,28 @@ def read_colmap(folder: Path) -> tuple[list[RegisteredImage], list[Path]]:
     return found, [cameras, images]
 
 
-def _lens(path: Path, model: str, width: int, height: int, values: list[float]) -> Lens:
-    names = MODELS.get(model, "").split()
-    if names and len(names) != len(values):
-        raise input_error(path, f"{len(names)} parameters of {model}", f"{len(values)}", FIX)
+def read_cameras(path: Path) -> dict[int, StoredCamera]:
+    """The cameras of `cameras.txt` or `cameras.bin` by their numbers.
+
+    Raises:
+        InputError: the file is damaged.
+    """
     try:
-        return Lens.of(model, width, height, dict(zip(names, values, strict=False)))
+        return _cameras_of_bytes(path) if path.suffix == ".bin" else _cameras_of_text(path)
+    except (struct.error, IndexError, UnicodeDecodeError):
+        raise _cut(path) from None
+
+
+def _cut(path: Path) -> InputError:
+    return input_error(path, "a model of COLMAP", f"a {path.suffix} file that ends too early", FIX)
+
+
+def _lens(path: Path, camera: StoredCamera) -> Lens:
+    names = MODELS.get(camera.model, "").split()
+    if names and len(names) != len(camera.values):
+        raise input_error(path, f"{len(names)} parameters of {camera.model}", f"{len(camera.values)}", FIX)
+    try:
+        return Lens.of(camera.model, camera.width, camera.height, dict(zip(names, camera.values, strict=False)))
     except ValueError as error:
         fix = "`colmap image_undistorter` writes images and a model of a pinhole camera."
         raise input_error(path, "a pinhole, radial, OpenCV or fisheye camera", str(error), fix) from None
@@ -76,8 +103,8 @@ def _lines(path: Path) -> list[str]:
     return [line.strip() for line in text.splitlines() if not line.lstrip().startswith("#")]
 
 
-def _cameras_of_text(path: Path) -> dict[int, Lens]:
-    lenses = {}
+def _cameras_of_text(path: Path) -> dict[int, StoredCamera]:
+    cameras = {}
     for line in filter(None, _lines(path)):
         words = line.split()
         try:
@@ -85,8 +112,8 @@ def _cameras_of_text(path: Path) -> dict[int, Lens]:
             values = [float(word) for word in words[4:]]
         except (ValueError, IndexError):
             raise input_error(path, "rows `CAMERA_ID MODEL WIDTH HEIGHT PARAMS`", line[:60], FIX) from None
-        lenses[number] = _lens(path, words[1], width, height, values)
-    return lenses
+        cameras[number] = StoredCamera(words[1], width, height, values)
+    return cameras
 
 
 def _images_of_text(path: Path) -> list[tuple[str, int, NDArray[np.float64]]]:
@@ -111,16 +138,16 @@ def _are_numbers(words: list[str]) -> bool:
         return False
 
 
-def _cameras_of_bytes(path: Path) -> dict[int, Lens]:
-    data, lenses = read_bytes(path, "a binary file of COLMAP", FIX).tobytes(), {}
+def _cameras_of_bytes(path: Path) -> dict[int, StoredCamera]:
+    data, cameras = read_bytes(path, "a binary file of COLMAP", FIX).tobytes(), {}
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(min(count, MOST_IMAGES)):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
         name = list(MODELS)[model] if 0 <= model < len(MODELS) else f"number {model}"
         size = len(MODELS.get(name, "").split())
-        lenses[number] = _lens(path, name, width, height, list(struct.unpack_from(f"<{size}d", data, at + 24)))
+        cameras[number] = StoredCamera(name, width, height, list(struct.unpack_from(f"<{size}d", data, at + 24)))
         at += 24 + 8 * size
-    return lenses
+    return cameras
 
 
 def _images_of_bytes(path: Path) -> list[tuple[str, int, NDArray[np.float64]]]:

@@ -1,4 +1,4 @@
-"""Reader of the EndoNeRF layout: `images/ masks/ depth/` matched by sorted order, `poses_bounds.npy`, `sequence.json`.
+"""Reader of the EndoNeRF layout: `images/ masks/ depth/`, `poses_bounds.npy`, `sequence.json`.
 
 `N` frames. Cheap facts (counts, poses, the description) are checked on loading, files when they are decoded.
 """
@@ -16,8 +16,9 @@ from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .description import check_frames, intrinsics_of, read_description
-from .files import demand_count, list_files, unequal_names
+from .files import list_files
 from .formats import Format
+from .frame_files import files_of_images
 from .images import read_color, read_depth, read_tool_mask
 from .numpy_files import read_numpy
 from .poses import demand_rotations, world_to_camera
@@ -59,18 +60,18 @@ def load_endonerf(
     """
     folders = ("images", "gt_masks" if cfg.use_gt_masks else "masks", "depth")
     images, masks, depths = (list_files(path / name, (".png",), "EndoNeRF") for name in folders)
-    for name, files in zip(folders[1:], (masks, depths), strict=True):
-        demand_count(files, path / name, len(images))
     if len(images) < 2:
         raise input_error(path / "images", "at least 2 frames, 1 to train and 1 to test", "1", "add frames.")
     own_description = read_description(path / "sequence.json")
     described = (facts or {}) | own_description
     height, width = read_color(images[0]).shape[:2]
-    remarks = unequal_names(images, masks) + unequal_names(images, depths)
+    remarks: list[str] = []
+    masks = files_of_images(path / folders[1], masks, "masks", images, remarks)
+    depths = files_of_images(path / folders[2], depths, "depth", images, remarks)
     poses = read_poses_bounds(path / "poses_bounds.npy", len(images))
     cameras = _cameras(poses, described, width, height, pose_axes, path, remarks)
     remarks += check_frames(path / "sequence.json", described, len(images))
-    kept = kept_frames(len(images), cfg)
+    kept = [i for i in kept_frames(len(images), cfg) if i in masks and i in depths]
     size, scale = (width, height), cfg.depth_unit_mm or described.get("depth_scale", 1.0)
     relative = described.get("depth_relative", False)
     right_eye = open_right_eye(path, images, kept, size, described, cfg.shrink, remarks, relative=relative)

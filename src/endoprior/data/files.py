@@ -1,4 +1,4 @@
-"""Files of a dataset folder: list them in order, compare their names, read JSON and tables of numbers."""
+"""Files of a dataset folder: list them in order, read JSON and tables of numbers."""
 
 from __future__ import annotations
 
@@ -71,21 +71,6 @@ def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str
         got = f"none (only {', '.join(other)})" if other else "none"
         raise input_error(folder, f"{kind} files", got, f"put one {kind} per frame there.")
     return in_order(files)
-
-
-def demand_count(files: list[Path], folder: Path, count: int) -> None:
-    """Raise InputError unless there is one file per image."""
-    if len(files) != count:
-        raise input_error(folder, f"{count} files, one per image", f"{len(files)}", "add or remove files to match.")
-
-
-def unequal_names(images: list[Path], others: list[Path]) -> list[str]:
-    """A remark when files matched by order share no number in their names, else nothing."""
-    for image, other in zip(images, others, strict=True):
-        numbers = [{int(digits) for digits in re.findall(r"[0-9]+", file.stem)} for file in (image, other)]
-        if all(numbers) and numbers[0].isdisjoint(numbers[1]):
-            return [f"{other}: matched by order with {image.name}, whose number differs; a frame may be missing"]
-    return []
 
 
 def read_json(path: Path, fix: str = "correct it or remove it.") -> dict[str, Any]:

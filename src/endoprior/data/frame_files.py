@@ -1,4 +1,4 @@
-"""Match the files of a mask or depth folder to frames: by their names, by the numbers in them, or in order.
+"""Match files to frames: by their names, by the numbers in them, or in order. Every pairing by names is done here.
 
 Numbers come first: as many files as frames may still be of other frames, if one is missing and one is too many. Order
 is used only where the numbers agree with it, or where there are none.
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from .files import files_with
 from .series import Kind, one_per_frame
 
 HINT = "Add the missing files, or name each file by its frame number."
+BY_NAME, BY_NUMBER = "matched by name", "matched by the numbers in the names"
+COUNTED = "matched in order, their numbers are counted otherwise"
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ def match_names(
     indices: Sequence[int],
     names: Sequence[str] = (),
     *,
+    required: Sequence[int] | None = None,
     in_order_only: bool = False,
 ) -> Matched:
     """The file of each selected frame of the source.
@@ -72,60 +76,164 @@ def match_names(
         files: file names in natural order.
         indices: positions of the selected frames in the source, ascending.
         names: of all images of a source folder, without suffixes; empty for a video.
+        required: those of `indices` that must have a file, while others may have none; None: all of them.
         in_order_only: the numbers in the names of the files say nothing about frames.
     Raises:
         InputError: frames without a file, or names that do not tell.
     """
-    counts = f"{len(files)} files for {len(indices)} frames"
     stems = [Path(file).stem for file in files]
     numbers = None if in_order_only else numbers_of(stems)
+    matched = _of_all(files, stems, numbers, indices, names, in_order_only=in_order_only)
+    if matched is None and required is not None and not in_order_only:
+        matched = _of_some(folder, files, stems, numbers, indices, names, required)
+        if matched is None and required:
+            matched = _of_all(files, stems, numbers, required, names)
+    if matched is not None:
+        return matched
+    wanted = required or indices
+    counts = f"{len(files)} files for {len(wanted)} frames"
+    if in_order_only:
+        hint = "Export one for each frame, or name each file by its frame number."
+        raise input_error(folder, "masks of as many tasks as frames", counts.replace("files", "tasks"), hint)
     if numbers is None:
-        if by_name := _by_name(stems, indices, names):
-            return Matched(by_name, "matched by name")
-        return _in_order(folder, files, indices, len(names), counts, in_order_only=in_order_only)
-    place = {number: position for position, number in enumerate(numbers)}
-    own = numbers_of(names) if names else None
-    if by_name := _by_name(stems, range(len(names)), names):
-        return Matched({index: by_name[index] for index in indices}, "matched by name")
-    if own is not None:
-        if all(number in place for number in own):
-            return Matched({index: place[own[index]] for index in indices}, "matched by the numbers in the names")
-        if len(files) == len(names) and _agree(numbers, own):
-            rule = f"matched in order, their numbers are counted otherwise: {files[0]} for image {names[0]}"
-            return Matched({index: index for index in indices}, rule)
-        if by_name := _by_name(stems, indices, names):
-            return Matched(by_name, "matched by name")
-        wanted = {index: own[index] for index in indices}
-        if all(number in place for number in wanted.values()):
-            return Matched({i: place[number] for i, number in wanted.items()}, "matched by the numbers in the names")
-    else:
-        fitting = [first for first in (0, 1) if all(index + first in place for index in indices)]
-        # Names that begin at 1 are counted from 1; what begins later may be either.
-        first = 1 if fitting == [1] or (fitting == [0, 1] and min(place) == 1) else 0
-        if fitting:
-            doubt = "" if fitting != [0, 1] or min(place) <= 1 else "; if they are counted from 1, number them anew"
-            rule = f"matched by the numbers in the names, counted from {first}"
-            files_of = {index: place[index + first] for index in indices}
-            return Matched(files_of, f"{rule}: {files[files_of[indices[0]]]} for frame {indices[0]}{doubt}")
-        wanted = {index: index + (0 if 0 in place else 1) for index in indices}
-    chosen = [own[index] for index in indices] if own is not None else list(map(float, indices))
-    if len(files) == len(indices) and _agree(numbers, chosen):
-        shown = f"image {names[indices[0]]}" if names else f"frame {indices[0]}"
-        rule = f"matched in order, their numbers are counted otherwise: {files[0]} for {shown}"
-        return Matched(dict(zip(indices, range(len(files)), strict=True)), rule)
-    missing = [f"{number:g}" for number in wanted.values() if number not in place]
+        want = "one file per frame, or a number of its own in each name"
+        raise input_error(folder, want, f"{counts}, such as {files[0]} and {files[-1]}", HINT)
+    missing = [f"{number:g}" for number in _wanted(numbers, wanted, names) if number not in numbers]
     some = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
     raise input_error(folder, "one file per frame", f"{counts}, none numbered {some}", HINT)
 
 
+def files_of_images(
+    folder: Path, files: Sequence[Path], kind: Kind, images: Sequence[Path], remarks: list[str]
+) -> dict[int, Path]:
+    """The file of each image, by position of the image.
+
+    Args:
+        folder: of the files, for messages.
+        files: in natural order; those of another kind are left out.
+        remarks: say where order decides, and count images without a file and files without an image.
+    Raises:
+        InputError: the names do not tell which file belongs to which image.
+    """
+    files, note = one_per_frame(folder, files, kind)
+    names = [file.name for file in files], [image.stem for image in images]
+    matched = match_names(folder, names[0], range(len(images)), names[1], required=())
+    remarks += [note] if note else []
+    remarks += [f"{folder}: {matched.rule}"] if "in order" in matched.rule else []
+    if without := len(images) - len(matched.files):
+        remarks.append(f"{folder}: {without} of {len(images)} images have no file there and are left out")
+    if unused := len(files) - len(matched.files):
+        remarks.append(f"{folder}: {unused} files of other frames are not used")
+    return {index: files[position] for index, position in matched.files.items()}
+
+
+def _of_all(
+    files: Sequence[str],
+    stems: Sequence[str],
+    numbers: Sequence[float] | None,
+    indices: Sequence[int],
+    names: Sequence[str],
+    *,
+    in_order_only: bool = False,
+) -> Matched | None:
+    """A file for every frame; None where the names do not give one to each."""
+    if numbers is None:
+        if by_name := _by_name(stems, indices, names):
+            return Matched(by_name, BY_NAME)
+        why = "their numbers are not those of frames" if in_order_only else "each has no number of its own"
+        if len(files) == len(indices):
+            return Matched(dict(zip(indices, range(len(files)), strict=True)), f"matched in order, {why}")
+        return Matched({i: i for i in indices}, f"matched in order, {why}") if len(files) == len(names) else None
+    own = numbers_of(names) if names else None
+    if by_name := _by_name(stems, range(len(names)), names):
+        return Matched({index: by_name[index] for index in indices}, BY_NAME)
+    if own is not None:
+        if {*own} <= {*numbers}:
+            return Matched(_places(numbers, indices, [own[index] for index in indices]), BY_NUMBER)
+        if len(files) == len(names) and _agree(numbers, own):
+            return Matched({index: index for index in indices}, f"{COUNTED}: {files[0]} for image {names[0]}")
+        if by_name := _by_name(stems, indices, names):
+            return Matched(by_name, BY_NAME)
+    wanted = _wanted(numbers, indices, names)
+    if {*wanted} <= {*numbers}:
+        found = _places(numbers, indices, wanted)
+        return Matched(found, BY_NUMBER if own is not None else _rule_of_positions(files, numbers, found))
+    chosen = wanted if own is not None else list(map(float, indices))
+    if len(files) == len(indices) and _agree(numbers, chosen):
+        shown = f"image {names[indices[0]]}" if names else f"frame {indices[0]}"
+        return Matched(dict(zip(indices, range(len(files)), strict=True)), f"{COUNTED}: {files[0]} for {shown}")
+    return None
+
+
+def _of_some(
+    folder: Path,
+    files: Sequence[str],
+    stems: Sequence[str],
+    numbers: Sequence[float] | None,
+    indices: Sequence[int],
+    names: Sequence[str],
+    required: Sequence[int],
+) -> Matched | None:
+    """The rule that finds a file for most frames and for all that are required; None if there is no such rule."""
+    found: list[Matched] = []
+    for form in (str, bare) if names else ():
+        wanted = [form(names[index]) for index in indices]
+        found.append(Matched(_places([form(stem) for stem in stems], indices, wanted), BY_NAME))
+    if numbers is not None:
+        own = numbers_of(names) if names else None
+        if own is not None:
+            here, before, after = (len({own[i] + by for i in indices} & {*numbers}) for by in (0, -1, 1))
+            if here >= max(before, after):  # else they are counted otherwise, and some are missing
+                found.append(Matched(_places(numbers, indices, [own[i] for i in indices]), BY_NUMBER))
+        for first in _starts(numbers, indices) if required or not names else ():
+            by_position = _places(numbers, indices, [index + first for index in indices])
+            found.append(Matched(by_position, _rule_of_positions(files, numbers, by_position)))
+    fitting = [each for each in found if each.files and {*required} <= each.files.keys()]
+    if required and names and any(each.files != fitting[0].files for each in fitting):
+        got = f"{len(files)} names that are those of the images and also numbers of other frames"
+        raise input_error(folder, "names that tell the frames", got, "Name each file by its frame, counted from 0.")
+    return max(fitting, key=lambda each: len(each.files), default=None)
+
+
 def _by_name(stems: Sequence[str], indices: Sequence[int], names: Sequence[str]) -> dict[int, int] | None:
     """The file called like each image, whatever its words for mask or depth; None if there is not one for each."""
-    for form in (str, bare):
-        place = {form(stem): position for position, stem in enumerate(stems)}
-        found = {index: place.get(form(names[index])) for index in indices} if names else {}
-        if found and None not in found.values() and len(set(found.values())) == len(found):
+    for form in (str, bare) if names else ():
+        found = _places([form(stem) for stem in stems], indices, [form(names[index]) for index in indices])
+        if found and len(found) == len(indices):
             return found
     return None
+
+
+def _places(of_files: Sequence[Any], indices: Sequence[int], wanted: Sequence[Any]) -> dict[int, int]:
+    """Position of the file of each frame that has one, by what is wanted for it; empty if frames share a file."""
+    place = {value: position for position, value in enumerate(of_files)}
+    found = {index: place[value] for index, value in zip(indices, wanted, strict=True) if value in place}
+    return found if len({*found.values()}) == len(found) else {}
+
+
+def _wanted(numbers: Sequence[float], indices: Sequence[int], names: Sequence[str]) -> list[float]:
+    """The number that the file of each frame should have."""
+    own = numbers_of(names) if names else None
+    first = _starts(numbers, indices)[0]
+    return [float(index + first) if own is None else own[index] for index in indices]
+
+
+def _starts(numbers: Sequence[float], indices: Sequence[int]) -> tuple[int, int]:
+    """Whether files of a video are counted from 0 or from 1: the likelier one first."""
+    from_zero, from_one = (len({index + first for index in indices} & {*numbers}) for first in (0, 1))
+    # Names that begin at 1 are counted from 1; what begins later may be either.
+    is_one = from_one > from_zero or (from_one == from_zero and min(numbers) == 1)
+    return (1, 0) if is_one else (0, 1)
+
+
+def _rule_of_positions(files: Sequence[str], numbers: Sequence[float], found: dict[int, int]) -> str:
+    if not found:
+        return ""
+    index = min(found)
+    first = int(numbers[found[index]]) - index
+    is_doubtful = first == 0 and min(numbers) > 1 and all(i + 1 in {*numbers} for i in found)
+    doubt = "; if they are counted from 1, number them anew" if is_doubtful else ""
+    return f"{BY_NUMBER}, counted from {first}: {files[found[index]]} for frame {index}{doubt}"
 
 
 def _agree(numbers: Sequence[float], others: Sequence[float]) -> bool:
@@ -137,19 +245,3 @@ def _agree(numbers: Sequence[float], others: Sequence[float]) -> bool:
         return True
     counted = a[0] in (0, 1) and (np.diff(a) == 1).all()
     return bool(counted and (np.ptp(np.diff(b)) == 0 or not set(numbers) & set(others)))
-
-
-def _in_order(
-    folder: Path, files: Sequence[str], indices: Sequence[int], total: int, counts: str, *, in_order_only: bool
-) -> Matched:
-    """Files without numbers, or with numbers of something else."""
-    why = "their numbers are not those of frames" if in_order_only else "each has no number of its own"
-    if len(files) == len(indices):
-        return Matched(dict(zip(indices, range(len(files)), strict=True)), f"matched in order, {why}")
-    if len(files) == total:
-        return Matched({index: index for index in indices}, f"matched in order, {why}")
-    if in_order_only:
-        hint = "Export one for each frame, or name each file by its frame number."
-        raise input_error(folder, "masks of as many tasks as frames", counts.replace("files", "tasks"), hint)
-    want = "one file per frame, or a number of its own in each name"
-    raise input_error(folder, want, f"{counts}, such as {files[0]} and {files[-1]}", HINT)

@@ -20,8 +20,9 @@ from .assemble import Pixels, assemble, kept_frames
 from .camera_matrix import MATRIX_FILE, matrix_of_images, read_camera_matrix
 from .depth_files import read_depth_file
 from .endonerf import focal_at, read_poses_bounds
-from .files import IMAGE_SUFFIXES, demand_count, list_files, unequal_names
+from .files import IMAGE_SUFFIXES, list_files
 from .formats import Format
+from .frame_files import files_of_images
 from .images import read_color, read_tool_mask
 from .poses import identity_poses
 from .sequence import FrameSequence
@@ -82,10 +83,10 @@ def _load_forplane(path: Path, cfg: DataConfig) -> FrameSequence:
     depth_folder = next((name for name in ("gt_depth", "pred_disp") if (path / name).is_dir()), "depth")
     folders = ("images", mask_folder, depth_folder)
     images, masks, depths = (list_files(path / name, (".png",), "Forplane") for name in folders)
-    demand_count(masks, path / mask_folder, len(images))
-    demand_count(depths, path / depth_folder, len(images))
     height, width = read_color(images[0]).shape[:2]
-    remarks = unequal_names(images, masks) + unequal_names(images, depths)
+    remarks: list[str] = []
+    masks_of = files_of_images(path / mask_folder, masks, "masks", images, remarks)
+    depths_of = files_of_images(path / depth_folder, depths, "depth", images, remarks)
     is_hamlyn_video = _is_named(path) or (path / MATRIX_FILE).exists() or width * 3 == height * 4
     crop = round(CROPPED_PX * width / FULL_SIZE[0]) if is_hamlyn_video else 0
     matrix, camera_file = _forplane_matrix(path, (width, height), crop, len(images), remarks)
@@ -98,7 +99,7 @@ def _load_forplane(path: Path, cfg: DataConfig) -> FrameSequence:
     if not cfg.depth_unit_mm:
         remarks.append(f"{path / depth_folder}: its unit is not documented, mm assumed; set data.depth_unit_mm")
     source, relative = "stereo matching, by Forplane", not cfg.depth_unit_mm
-    files = _Files(path, images, masks, depths, crop, camera_file, mask_folder, source, relative)
+    files = _Files(path, images, masks_of, depths_of, crop, camera_file, mask_folder, source, relative)
     return _assembled(files, cfg, (width, height), matrix, remarks)
 
 
@@ -124,12 +125,12 @@ def _load_rectified(path: Path, cfg: DataConfig, image_folder: str, depth_folder
     """Images, depth in mm and a camera matrix; no masks."""
     images = list_files(path / image_folder, IMAGE_SUFFIXES, "Hamlyn")
     depths = list_files(path / depth_folder, (".png",), "Hamlyn")
-    demand_count(depths, path / depth_folder, len(images))
     calibration = _matrix_file(path)
     matrix = read_camera_matrix(calibration)
     height, width = read_color(images[0]).shape[:2]
-    remarks = [*unequal_names(images, depths), f"{path}: no tool masks, tools count as tissue"]
-    files = _Files(path, images, [], depths, 0, calibration, image_folder, "stereo matching", relative=False)
+    remarks = [f"{path}: no tool masks, tools count as tissue"]
+    depths_of = files_of_images(path / depth_folder, depths, "depth", images, remarks)
+    files = _Files(path, images, {}, depths_of, 0, calibration, image_folder, "stereo matching", relative=False)
     return _assembled(files, cfg, (width, height), matrix, remarks)
 
 
@@ -145,12 +146,12 @@ def _matrix_file(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class _Files:
-    """Files of a folder, one of each kind per frame; no masks at all where a video has none."""
+    """Files of a folder; masks and depth by position of their image, no masks at all where a video has none."""
 
     path: Path
     images: list[Path]
-    masks: list[Path]
-    depths: list[Path]
+    masks: dict[int, Path]
+    depths: dict[int, Path]
     crop: int
     """Columns to leave out at the left, px."""
     camera: Path
@@ -167,7 +168,9 @@ def _assembled(
     """The sequence of a static camera; `matrix` is in px of the whole image, with centers at halves."""
     path, crop, (width, height) = files.path, files.crop, size
     remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
-    kept = kept_frames(len(files.images), cfg)
+    kept = [
+        i for i in kept_frames(len(files.images), cfg) if i in files.depths and (i in files.masks or not files.masks)
+    ]
     images, depths = [files.images[i] for i in kept], [files.depths[i] for i in kept]
     masks = [files.masks[i] for i in kept] if files.masks else []
     margin = black_margin([read_color(images[i], size)[:, crop:] for i in spread(len(images), SAMPLES)])

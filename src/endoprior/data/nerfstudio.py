@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
@@ -46,12 +47,7 @@ def load_nerfstudio(path: Path, cfg: DataConfig) -> FrameSequence:
         InputError: the file or an image cannot be used.
     """
     file = path / FILE
-    stored = read_json(file, FIX)
-    frames = stored.get("frames")
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise input_error(file, "a list frames", type(frames).__name__ if frames is not None else "no such key", FIX)
-    if stored.get("from_na"):
-        raise input_error(file, "OpenGL camera axes", "those of NeuS2 (from_na)", "export it for nerfstudio.")
+    stored, frames = _frames(file)
     lenses: dict[str, Lens] = {}
     posed = [(_posed(path, file, stored, frame, index, lenses), frame) for index, frame in enumerate(frames)]
     times = [frame.get("time") for frame in frames]
@@ -68,24 +64,52 @@ def load_nerfstudio(path: Path, cfg: DataConfig) -> FrameSequence:
     return load_posed(path, cfg, file, images, [file], remarks, MM_PER_M if has_depth else None)
 
 
-def _posed(
-    path: Path, file: Path, stored: dict[str, Any], frame: dict[str, Any], index: int, lenses: dict[str, Lens]
-) -> PosedImage:
+def read_poses(file: Path) -> list[tuple[str, NDArray[np.float64]]]:
+    """The name of the image of each frame, and its (4, 4) camera-to-world in OpenCV axes, in units of the file.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    return [(_name(file, frame, i), _to_world(file, frame)) for i, frame in enumerate(_frames(file)[1])]
+
+
+def _frames(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """All of the file, and its frames."""
+    stored = read_json(file, FIX)
+    frames = stored.get("frames")
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise input_error(file, "a list frames", type(frames).__name__ if frames is not None else "no such key", FIX)
+    if stored.get("from_na"):
+        raise input_error(file, "OpenGL camera axes", "those of NeuS2 (from_na)", "export it for nerfstudio.")
+    return stored, frames
+
+
+def _name(file: Path, frame: dict[str, Any], index: int) -> str:
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
         raise input_error(file, f"file_path in frame {index}", repr(name), FIX)
-    image = _below(path, file, name)
-    if not image.suffix:  # as in Blender's data
-        image = image.with_name(f"{image.name}.png")
+    return name
+
+
+def _to_world(file: Path, frame: dict[str, Any]) -> NDArray[np.float64]:
     rows = frame.get("transform_matrix")
     shape = (3, 4) if isinstance(rows, list) and len(rows) == 3 else (4, 4)
     to_world = np.eye(4)
     to_world[: shape[0]] = read_matrix(file, frame, "transform_matrix", shape)
+    return to_world @ TO_OPENCV
+
+
+def _posed(
+    path: Path, file: Path, stored: dict[str, Any], frame: dict[str, Any], index: int, lenses: dict[str, Lens]
+) -> PosedImage:
+    image = _below(path, file, _name(file, frame, index))
+    if not image.suffix:  # as in Blender's data
+        image = image.with_name(f"{image.name}.png")
     mask, depth = (frame.get(key) for key in ("mask_path", "depth_file_path"))
     return PosedImage(
         image,
         _lens(file, image, stored | frame, index, lenses),
-        np.linalg.inv(to_world @ TO_OPENCV),
+        np.linalg.inv(_to_world(file, frame)),
         _below(path, file, mask) if isinstance(mask, str) else None,
         _below(path, file, depth) if isinstance(depth, str) else None,
     )

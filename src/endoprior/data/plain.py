@@ -15,12 +15,12 @@ from .description import check_frames, intrinsics_of, read_description
 from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, list_files
 from .formats import Format
-from .frame_files import match_names
+from .frame_files import files_of_images
 from .images import read_color, read_tool_mask
 from .poses import identity_poses, world_to_camera
 from .right_eye import open_right_eye
 from .sequence import FrameSequence
-from .series import Kind, one_per_frame
+from .series import one_per_frame
 
 FACTS = ("sequence.json", "poses_bounds.npy", MATRIX_FILE)
 """Files beside those of the frames."""
@@ -48,8 +48,8 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
     masks = list_files(path / mask_folder, (".png",), "plain") if masked else []
     depths = list_files(path / "depth", DEPTH_SUFFIXES, "plain") if (path / "depth").is_dir() else []
     remarks = [note] if note else []
-    masks = _of_images(path / mask_folder, masks, "masks", images, remarks)
-    depths = _of_images(path / "depth", depths, "depth", images, remarks)
+    masks = files_of_images(path / mask_folder, masks, "masks", images, remarks) if masks else {}
+    depths = files_of_images(path / "depth", depths, "depth", images, remarks) if depths else {}
     described = read_description(path / "sequence.json")
     remarks += check_frames(path / "sequence.json", described, len(images))
     if not masks:
@@ -64,7 +64,7 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
     if "fx" not in described and calibration.is_file():
         matrix = read_camera_matrix(calibration)
         described |= {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
-    kept = kept_frames(len(images), cfg)
+    kept = [i for i in kept_frames(len(images), cfg) if all(i in files for files in (masks, depths) if files)]
     focal, poses = ASSUMED_FOCAL * width, identity_poses(len(images))
     if (path / "poses_bounds.npy").exists():
         stored = read_poses_bounds(path / "poses_bounds.npy", len(images))
@@ -106,19 +106,6 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
         depth_is_relative=relative,
         sources=described.get("sources"),
     )
-
-
-def _of_images(folder: Path, files: list[Path], kind: Kind, images: list[Path], remarks: list[str]) -> list[Path]:
-    """The file of each image, of all that a folder has; none of none."""
-    if not files:
-        return []
-    files, note = one_per_frame(folder, files, kind)
-    matched = match_names(folder, [file.name for file in files], range(len(images)), [image.stem for image in images])
-    unused = len(files) - len(images)
-    remarks += [note] if note else []
-    remarks += [f"{folder}: {matched.rule}"] if "in order" in matched.rule else []
-    remarks += [f"{folder}: {unused} files of other frames are not used"] if unused else []
-    return [files[position] for position in matched.files.values()]
 
 
 FORMAT = Format(is_plain, load_plain)

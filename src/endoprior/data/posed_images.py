@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,11 +16,13 @@ from ..core.shell import command
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import DEPTH_SUFFIXES, read_depth_file
-from .files import demand_count, list_files, unequal_names
+from .files import list_files
+from .frame_files import files_of_images
 from .images import read_color, read_tool_mask
 from .lens import Lens, Undistorter
 from .poses import demand_rotations
 from .sequence import FrameSequence
+from .series import Kind
 
 ROUNDED_PX = 1.0
 """Scaled images may differ from the exact shape by rounding."""
@@ -69,10 +71,10 @@ def load_posed(
     if any(lens.is_bent for lens in lenses):
         remarks.append(f"{source}: the lens is distorted; frames are undistorted, without part of the periphery")
     masks, tool_value = _masks(path, posed, remarks)
-    depths = _depths(path, files[0], posed, remarks)
+    depths = _depths(path, files[0], source, posed, remarks)
     if mm_per_unit is None:
         remarks.append(f"{source}: the scale of its poses is unknown; lengths are not millimeters")
-    kept = kept_frames(len(posed), cfg)
+    kept = [i for i in kept_frames(len(posed), cfg) if all(i in files for files in (masks, depths) if files)]
     images = [posed[i].file for i in kept]
     scale = mm_per_unit or 1.0
     unit = cfg.depth_unit_mm or 1.0
@@ -81,8 +83,8 @@ def load_posed(
         at = kept[index]
         undistorter = undistorters[id(lenses[at])]
         tissue = undistorter.shown
-        if masks and masks[at] is not None:
-            tool = read_tool_mask(masks[at], tool_value, size)
+        if mask := masks.get(at):
+            tool = read_tool_mask(mask, tool_value, size)
             tissue = tissue & (undistorter.nearest((~tool).astype(np.uint8)) > 0)
         depth = read_depth_file(depths[at], unit, size) if depths else np.zeros((height, width), np.float32)
         return undistorter.smooth(read_color(images[index], size)), tissue, undistorter.nearest(depth)
@@ -132,45 +134,43 @@ def _lenses(source: Path, lenses: Sequence[Lens], size: tuple[int, int], remarks
     return [fitted(id(lens)) for lens in lenses]
 
 
-def _masks(path: Path, posed: Sequence[PosedImage], remarks: list[str]) -> tuple[list[Path | None], int]:
-    """A mask for each image, None where an image has none, and the value of tools; no list without any masks."""
-    named = [each.mask for each in posed]
-    if any(named):
-        if not all(named):
-            remarks.append(
-                f"{path}: {named.count(None)} of {len(named)} images name no mask, all of them counts as tissue"
-            )
+def _masks(path: Path, posed: Sequence[PosedImage], remarks: list[str]) -> tuple[Mapping[int, Path | None], int]:
+    """The mask of each image, None where all of it is tissue, and the value of tools; nothing without any masks."""
+    named = {i: each.mask for i, each in enumerate(posed)}
+    if any(named.values()):
+        if without := list(named.values()).count(None):
+            remarks.append(f"{path}: {without} of {len(named)} images name no mask, all of them counts as tissue")
         return named, 0
     folder = path / "masks"
     if not folder.is_dir():
         remarks.append(f"{folder}: missing, every pixel counts as tissue")
-        return [], 255
+        return {}, 255
     # COLMAP's own masks are called like the image, with .png behind its suffix, and 0 is not used.
     if all((folder / f"{each.file.name}.png").is_file() for each in posed):
-        return [folder / f"{each.file.name}.png" for each in posed], 0
-    return _beside(folder, posed, (".png",), remarks), 255
+        return {i: folder / f"{each.file.name}.png" for i, each in enumerate(posed)}, 0
+    return _beside(folder, posed, "masks", (".png",), remarks), 255
 
 
-def _depths(path: Path, calibration: Path, posed: Sequence[PosedImage], remarks: list[str]) -> list[Path]:
-    """The depth of each image; none without any."""
-    named = [each.depth for each in posed if each.depth is not None]
+def _depths(
+    path: Path, calibration: Path, poses: Path, posed: Sequence[PosedImage], remarks: list[str]
+) -> dict[int, Path]:
+    """The depth of each image that has one."""
+    named = {i: each.depth for i, each in enumerate(posed) if each.depth is not None}
     if named:
-        demand_count(named, path, len(posed))
+        if without := len(posed) - len(named):
+            remarks.append(f"{path}: {without} of {len(posed)} images name no depth and are left out")
         return named
     if (path / "depth").is_dir():
         remarks.append(f"{path / 'depth'}: taken to be in the units of the poses")
-        return _beside(path / "depth", posed, DEPTH_SUFFIXES, remarks)
-    prepare = command("prepare", posed[0].file.parent, "OUT", "--calibration", calibration)
-    remarks.append(f"{path / 'depth'}: missing; `{prepare}` makes depth, and a camera path of its own")
-    return []
+        return _beside(path / "depth", posed, "depth", DEPTH_SUFFIXES, remarks)
+    prepare = command("prepare", posed[0].file.parent, "OUT", "--calibration", calibration, "--poses", poses)
+    remarks.append(f"{path / 'depth'}: missing; `{prepare}` makes depth")
+    return {}
 
 
-def _beside(folder: Path, posed: Sequence[PosedImage], suffixes: tuple[str, ...], remarks: list[str]) -> list[Path]:
-    """A file for each image: of its name, else in order."""
+def _beside(
+    folder: Path, posed: Sequence[PosedImage], kind: Kind, suffixes: tuple[str, ...], remarks: list[str]
+) -> dict[int, Path]:
+    """The file of each image in a folder."""
     files = list_files(folder, suffixes, "nerfstudio")
-    by_name = {file.stem: file for file in files}
-    if all(each.file.stem in by_name for each in posed):
-        return [by_name[each.file.stem] for each in posed]
-    demand_count(files, folder, len(posed))
-    remarks += unequal_names([each.file for each in posed], files)
-    return files
+    return files_of_images(folder, files, kind, [each.file for each in posed], remarks)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import InputError
 from .description import LEAST, MOST
-from .files import IMAGE_SUFFIXES, files_with, unequal_names
+from .files import IMAGE_SUFFIXES, files_with
+from .frame_files import match_names
 from .image_header import read_header
 from .images import read_color
 from .reading import read_bytes
@@ -70,7 +73,7 @@ def open_right_eye(
         size: (width, height) of the left pictures, px.
         described: contents of `sequence.json`, of which `baseline_mm` is used.
         shrink: see `RightEye`.
-        remarks: gets the reason, or that the names of the files look wrong.
+        remarks: gets the reason, or that the files are matched in order.
         relative: whether the scale of depth is unknown: then a baseline in mm does not fit the scene.
     Raises:
         InputError: the folder or its first picture cannot be read.
@@ -79,20 +82,23 @@ def open_right_eye(
     if not folder.is_dir():
         return None
     files, baseline = files_with(folder, IMAGE_SUFFIXES), described.get("baseline_mm")
-    reason = ""
-    if len(files) != len(images):
-        reason = f"it has {len(files)} images, and images/ has {len(images)}"
+    reason, matched = "", None
+    with suppress(InputError):
+        names = [file.stem for file in images]
+        matched = match_names(folder, [file.name for file in files], range(len(images)), names) if files else None
+    if matched is None:
+        reason = f"it has {len(files)} images, not one of the name or number of each of the {len(images)} in images/"
     elif baseline is None:
         reason = "sequence.json has no baseline_mm, the distance between the cameras"
     elif isinstance(baseline, bool) or not isinstance(baseline, int | float) or not LEAST <= baseline <= MOST:
         reason = f"baseline_mm in sequence.json is {repr(baseline)[:60]}, not a number in [{LEAST:g}, {MOST:g}]"
     elif relative:
         reason = "the scale of the depth is unknown, and the distance between the cameras is in mm"
-    elif not (found := read_header(read_bytes(files[0]).tobytes())) or found[:2] != size:
+    elif not (found := read_header(read_bytes(files[matched.files[0]]).tobytes())) or found[:2] != size:
         got = f"{found.width}x{found.height} px" if found else "no size that can be read"
         reason = f"its first image has {got}, and the left one {size[0]}x{size[1]} px"
-    if reason:
+    if reason or matched is None:
         remarks.append(f"{folder}: ignored, because {reason}")
         return None
-    remarks += unequal_names(images, files)
-    return RightEye([files[i] for i in kept], float(baseline), size, shrink)
+    remarks += [f"{folder}: {matched.rule}"] if "in order" in matched.rule else []
+    return RightEye([files[matched.files[i]] for i in kept], float(baseline), size, shrink)

@@ -40,7 +40,12 @@ def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
         raise input_error(path / RAW_FILE, "a prepared sequence", "a raw one", f"`{_preparing(path)}`.")
     count = len(list_files(path / "images", (".png",), "StereoMIS"))
     _check_split(path / "split.json", count)
-    depth = decode_image(list_files(path / "depth", (".png",), "StereoMIS")[0], None)
+    for folder in (path / "gt_masks" if cfg.use_gt_masks else path / "masks", path / "depth"):
+        files = list_files(folder, (".png",), "StereoMIS")
+        if len(files) != count:  # frames that are left out would move the published split
+            fix = "add the missing files, or remove split.json to read the frames that have all."
+            raise input_error(folder, f"{count} files, one per image", f"{len(files)}", fix)
+    depth = decode_image(files[0], None)
     facts: dict[str, Any] = {}
     if depth.dtype == np.uint8:
         facts = {"depth_relative": True, "sources": {"depth": "Omnidata, relative, 8 bits"}}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mmap
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +25,12 @@ STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 """Images that `prepare` reads from a folder."""
 PLAYLISTS = (b"#EXTM3U", b"ffconcat", b"<MPD", b"<smil", b"[playlist]")
 """What stands in the first bytes of playlists."""
+HEADS = {
+    "flv": rb"FLV\x01[\x01\x04\x05]\x00\x00\x00\x09",
+    "asf": rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11\xa6\xd9\x00\xaa\x00\x62\xce\x6c",
+    "matroska": rb"\x1a\x45\xdf\xa3(?=.{0,60}(?:matroska|webm))",
+}
+"""What a file begins with, by a word of FFmpeg's name of the format."""
 STILLS = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"RIFF")
 """First bytes of image files; RIFF is WebP here, because FFmpeg reads AVI."""
 
@@ -60,20 +68,34 @@ def is_animated_webp(path: Path) -> bool:
     return head[:4] == b"RIFF" and head[8:16] == b"WEBPVP8X" and bool(head[20] & 2)
 
 
-def num_joined_mp4(path: Path) -> int:
-    """How many MP4 or MOV files were written one after the other into this one; FFmpeg reads only the first."""
-    count, at, size = 0, 0, path.stat().st_size
+def starts_of_parts(path: Path, name: str) -> list[int]:
+    """Where files begin, in bytes, that were written one after the other into this one; FFmpeg may not read them all.
+
+    Args:
+        name: FFmpeg's name of the format.
+    """
+    if "mp4" in name:
+        return _starts_of_mp4(path)
+    mark = next((mark for word, mark in HEADS.items() if word in name), None)
+    if mark is None:
+        return [0]
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        return [found.start() for found in re.finditer(mark, content, re.DOTALL)]
+
+
+def _starts_of_mp4(path: Path) -> list[int]:
+    starts, at, size = [], 0, path.stat().st_size
     with path.open("rb") as file:
         while at + 8 <= size:
             file.seek(at)
             head = file.read(16).ljust(16, b"\0")
             length = int.from_bytes(head[:4], "big")
-            count += head[4:8] == b"ftyp"
+            starts += [at] if head[4:8] == b"ftyp" else []
             length = int.from_bytes(head[8:16], "big") if length == 1 else length
             if length < 8:  # up to the end of the file
                 break
             at += length
-    return count
+    return starts
 
 
 def what_it_is(path: Path) -> str:

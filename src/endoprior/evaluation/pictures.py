@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,13 @@ from ..core.checks import input_error
 from ..core.types import Camera
 from ..data import FrameSequence, Split, read_depth_file
 from ..data.files import entries, files_with
+from ..data.frame_files import HINT, match_names
 from ..data.images import decode_image, describe_pixels, single_channel
 from ..data.reading import kind_of
 from .metrics import ScoreUnavailable
-from .picture_names import IN_ORDER, NUMBERS, OWN_NAMES, match_names
 from .rendered import Rendering
 
 FULL_SCALE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}
-RULES = f"{OWN_NAMES}, or {NUMBERS}, or {IN_ORDER}"
 
 
 class Pictures:
@@ -67,10 +67,10 @@ class Pictures:
     def remarks(self) -> list[str]:
         """How files and frames were matched, one line for each folder."""
         facts, total = self.provenance["pictures"], len(self._sequence)
-        lines = [f"{facts['folder']}: {len(self._color)} of {total} frames, matched by {facts['matched_by']}"]
+        lines = [f"{facts['folder']}: {len(self._color)} of {total} frames, {facts['matched_by']}"]
         if self._depth:
             rule = facts["depth_matched_by"]
-            lines.append(f"{facts['depth_folder']}: {len(self._depth)} of {total} frames, matched by {rule}")
+            lines.append(f"{facts['depth_folder']}: {len(self._depth)} of {total} frames, {rule}")
         return lines
 
     def render(self, index: int) -> Rendering:
@@ -94,6 +94,23 @@ def fingerprint(folder: Path, suffixes: tuple[str, ...] = (".png", ".npy")) -> s
     return digest.hexdigest()
 
 
+def frames_of_files(
+    folder: Path, files: Sequence[Path], sequence: FrameSequence, required: Sequence[int]
+) -> tuple[dict[int, Path], str]:
+    """The file of each frame that has one, and the rule that says so.
+
+    Raises:
+        InputError: a required frame has no file, or a file belongs to no frame: it would then count frames otherwise.
+    """
+    names = [file.name for file in files]
+    match = match_names(folder, names, range(len(sequence)), sequence.image_names, required=required)
+    if unused := len(files) - len(match.files):
+        left = next(name for i, name in enumerate(names) if i not in match.files.values())
+        got = f"{unused} of {len(files)} files of no frame, such as {left}"
+        raise input_error(folder, f"files of the {len(sequence)} frames", got, HINT)
+    return {index: files[position] for index, position in match.files.items()}, match.rule
+
+
 def _matched(
     folder: Path, suffixes: tuple[str, ...], sequence: FrameSequence, split: Split
 ) -> tuple[dict[int, Path], str]:
@@ -108,12 +125,7 @@ def _matched(
         named = next((sub for sub in holders if sub.name == usual), holders[0] if holders else None)
         fix = f"pass {named}." if named else "pass the folder that holds the files themselves."
         raise input_error(folder, f"{kinds} files", "none", fix)
-    indices = sequence.indices(split)
-    match = match_names([file.stem for file in files], sequence.image_names, indices, len(sequence))
-    if isinstance(match, str):
-        want = f"{kinds} files of the {len(indices)} frames of the {split} split ({indices[0]}, ..., {indices[-1]})"
-        raise input_error(folder, want, match, f"rename them: {RULES}.")
-    return dict(zip(match.frames, files, strict=True)), match.rule
+    return frames_of_files(folder, files, sequence, sequence.indices(split))
 
 
 def _read_color(file: Path, camera: Camera) -> NDArray[np.float32]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,25 +12,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error
+from ..core.checks import InputError, input_error
 from ..core.spread import spread
 from ..data import FrameSequence
 from ..data.description import read_description
 from ..data.files import IMAGE_SUFFIXES, files_with
+from ..data.frame_files import match_names
 from ..data.images import read_color
 from ..data.mask_files import MASK_SUFFIXES, demand_known, read_user_mask, rule_of_files, tool_polarity
 from ..data.reading import kind_of
 from ..system.atomic import write_json
 from .mask_scores import NO_VALUE, TIP, TOLERANCE, MaskCounts, count, counted_pixels
-from .picture_names import IN_ORDER_ALL, NUMBERS, OWN_NAMES, match_names
-from .pictures import fingerprint
+from .pictures import fingerprint, frames_of_files
 
 SCORES_FILE = "mask_scores.json"
 SAMPLES = 20
 """Largest number of frames in which the border and the polarity of the true masks are looked for."""
 MORE_ALIKE = 0.8
 """An image is of another frame if it differs from that one by less than this share of its difference from its own."""
-RULES = f"{OWN_NAMES}, or {NUMBERS}, or {IN_ORDER_ALL}"
 
 
 class TrueMasks:
@@ -54,14 +53,9 @@ class TrueMasks:
         if not files:
             fix = "pass the folder that holds the files, or a sequence folder with masks/."
             raise input_error(self.folder, f"mask files ({', '.join(MASK_SUFFIXES)})", "none", fix)
-        match = match_names([file.stem for file in files], sequence.image_names, [], len(sequence))
-        if isinstance(match, str):
-            want = f"files of some of the {len(sequence)} frames, or of all"
-            raise input_error(self.folder, want, match, f"rename them: {RULES}.")
-        self.matched_by = match.rule
-        self._files = dict(zip(match.frames, files, strict=True))
+        self._files, self.matched_by = frames_of_files(self.folder, files, sequence, [])
         if self.folder != folder and kind_of(folder / "images") == "a folder":
-            _demand_same_frames(folder / "images", match.frames, sequence)
+            _demand_same_frames(folder / "images", self._files, sequence)
         self.indices = sorted(self._files)
         """Frames that have a true mask, ascending."""
         camera = sequence.camera(0)
@@ -88,26 +82,31 @@ class TrueMasks:
         return read_user_mask(self._files[index], self._size, self._rule) == self._tool_is_high
 
 
-def _demand_same_frames(folder: Path, frames: Sequence[int], sequence: FrameSequence) -> None:
+def _demand_same_frames(folder: Path, masks: Mapping[int, Path], sequence: FrameSequence) -> None:
     """Raise InputError if most images resemble other frames of the sequence more than those they are matched to.
 
     Equal names can be different frames: two folders of one video may start at different times, or skip frames.
 
     Args:
-        folder: images of the sequence folder with the true masks, in the order of its masks.
-        frames: index in `sequence` of each mask.
+        folder: images of the sequence folder with the true masks.
+        masks: the true mask of each frame of `sequence` that has one.
     """
-    images = files_with(folder, IMAGE_SUFFIXES)
-    if len(images) != len(frames):
+    images, (indices, files) = files_with(folder, IMAGE_SUFFIXES), zip(*sorted(masks.items()), strict=True)
+    names = [file.name for file in images], [file.stem for file in files]
+    try:
+        beside = match_names(folder, names[0], range(len(files)), names[1], required=())
+    except InputError:  # images of other names cannot tell
         return
+    pairs = [(images[image], indices[mask]) for mask, image in beside.files.items()]
     others = {index: _thumbnail(sequence.frame(index).rgb_u8) for index in spread(len(sequence), SAMPLES)}
-    checked, wrong = spread(len(images), SAMPLES), []
+    checked, wrong = spread(len(pairs), SAMPLES), []
     for place in checked:
-        image, index = _thumbnail(read_color(images[place])), frames[place]
+        file, index = pairs[place]
+        image = _thumbnail(read_color(file))
         here = np.abs(image - _thumbnail(sequence.frame(index).rgb_u8)).mean()
         distance, nearest = min((np.abs(image - other).mean(), i) for i, other in others.items())
         if distance < MORE_ALIKE * here:
-            wrong.append(f"{images[place].name}, which is more like frame {nearest} than frame {index}")
+            wrong.append(f"{file.name}, which is more like frame {nearest} than frame {index}")
     if len(wrong) > len(checked) / 2:
         fix = f"name the mask files by the frames of {sequence.path}, from 0, and pass a folder of them alone."
         raise input_error(folder, f"the frames of {sequence.path}", wrong[-1], fix)

@@ -1,7 +1,7 @@
 """Calibration files as flat tables of names and values, whatever program wrote them.
 
 The content tells the format, not the name of the file: OpenCV's YAML, JSON and XML, plain YAML and JSON, ini sections,
-COLMAP's `cameras.txt`, rows of numbers (`intrinsics.txt`), NumPy. Nothing in a file is ever executed.
+COLMAP's `cameras.txt` or `.bin`, rows of numbers (`intrinsics.txt`), NumPy. Nothing in a file is ever executed.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ import numpy as np
 import yaml
 
 from ..core.checks import InputError, input_error
+from ..data.colmap_model import StoredCamera, read_cameras
+from ..data.lens import MODELS, UNSUPPORTED
 from ..data.numpy_files import read_numpy
 from ..data.reading import read_bytes, read_text
 from ..data.yaml_text import BoundedLoader, load_yaml
@@ -33,18 +35,6 @@ FOREIGN = {
     b"\xd0\xcf\x11\xe0": ("a document of an office program", "Export it as text."),
 }
 """First bytes of formats that are not read: what they are, and what to do."""
-COLMAP_NAMES = {
-    "SIMPLE_PINHOLE": "f cx cy",
-    "PINHOLE": "fx fy cx cy",
-    "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
-    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
-    "RADIAL_FISHEYE": "f cx cy k1 k2",
-}
-"""Parameters of COLMAP's camera models, in the order of its files."""
 COLMAP_LINE = re.compile(r"\d+\s+([A-Z_]{3,})\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)\s*")
 INI_SECTION = re.compile(r"^\s*\[[A-Za-z][^\]=:]*\]\s*$", re.MULTILINE)
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -83,9 +73,8 @@ def _content(path: Path) -> Any:
     for mark, (what, fix) in FOREIGN.items():
         if start.startswith(mark):
             raise input_error(path, FORMATS, what, fix)
-    if path.name in ("cameras.bin", "rigs.bin"):
-        fix = "`colmap model_converter --input_path DIR --output_path DIR --output_type TXT` writes cameras.txt."
-        raise input_error(path, FORMATS, "a binary file of COLMAP", fix)
+    if path.name == "cameras.bin":
+        return _of_colmap(path, list(read_cameras(path).values()))
     text = read_text(path, "a calibration file", "Check the path.", or_latin_1=True)
     if text.lstrip().startswith("<"):
         return _of_xml(path, text)
@@ -94,7 +83,7 @@ def _content(path: Path) -> Any:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     cameras = [COLMAP_LINE.fullmatch(line.strip()) for line in lines]
     if lines and all(cameras):
-        return _of_colmap(path, [camera.groups() for camera in cameras if camera])
+        return _of_colmap(path, list(read_cameras(path).values()))
     if lines and ONLY_NUMBERS.fullmatch("\n".join(lines) + "\n"):
         numbers = [[float(word) for word in re.findall(NUMBER, line)] for line in lines]
         numbers = [row for row in numbers if row]
@@ -139,21 +128,22 @@ def _xml_value(node: ElementTree.Element) -> Any:
     return numbers[0] if len(numbers) == 1 and node.tag != "data" else numbers
 
 
-def _of_colmap(path: Path, cameras: list[tuple[str, ...]]) -> Table:
-    if len(cameras) > 1:
-        fix = "Keep the line of this video's camera."
+def _of_colmap(path: Path, cameras: list[StoredCamera]) -> Table:
+    if len(cameras) != 1:
+        fix = "Keep this video's camera alone, in cameras.txt."
         raise input_error(path, "one camera of COLMAP, which writes no R and T", f"{len(cameras)} cameras", fix)
-    model, width, height, numbers = cameras[0]
-    values = [float(word) for word in numbers.split()]
-    names = COLMAP_NAMES.get(model, "").split()
-    if not names:
+    (camera,) = cameras
+    if camera.model not in MODELS or camera.model in UNSUPPORTED:
+        known = ", ".join(name for name in MODELS if name not in UNSUPPORTED)
         fix = "Choose OPENCV or OPENCV_FISHEYE in COLMAP."
-        raise input_error(path, f"a camera model of {', '.join(COLMAP_NAMES)}", model, fix)
-    if len(names) != len(values):
-        raise input_error(path, f"{len(names)} numbers of {model}", str(len(values)), "Write it again.")
-    found = dict(zip(names, values, strict=True))
+        raise input_error(path, f"a camera model of {known}", camera.model, fix)
+    names = MODELS[camera.model].split()
+    if len(names) != len(camera.values):
+        raise input_error(path, f"{len(names)} numbers of {camera.model}", str(len(camera.values)), "Write it again.")
+    found = dict(zip(names, camera.values, strict=True))
     focal = {"fx": found["f"]} if "f" in found else {}
-    return {"camera_model": model, "width": width, "height": height, "pixel_center": 0.5} | found | focal
+    size = {"width": camera.width, "height": camera.height}
+    return {"camera_model": camera.model, "pixel_center": 0.5} | size | found | focal
 
 
 def _of_rows(path: Path, rows: np.ndarray) -> Table:

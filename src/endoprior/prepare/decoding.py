@@ -66,16 +66,21 @@ def is_cover(track: VideoStream) -> bool:
     return bool(int(track.disposition) & (ATTACHED_PICTURE | TIMED_THUMBNAILS))
 
 
-def packet_times(container: InputContainer, track: VideoStream) -> list[float | None]:
-    """The time of every image that is shown, in their order, s; None where there is none. Decodes nothing.
+def packet_times(container: InputContainer, track: VideoStream) -> tuple[list[float | None], int]:
+    """The time of every image that is shown, in their order, s, None where there is none. Decodes nothing.
 
     A file has its images in the order of decoding. Where the times of decoding start again, another part begins; within
     a part, the images are shown in the order of their times.
+
+    Returns:
+        The times, and where in the file, in bytes, the last image lies.
     """
     parts: list[list[int | None]] = [[]]
     last: int | None = None
+    end = 0
     try:
-        for packet in container.demux(track):
+        for packet in _packets(container, track):
+            end = max(end, packet.pos or 0)
             if not packet.size or packet.is_discard:
                 continue
             if packet.dts is not None:
@@ -90,7 +95,23 @@ def packet_times(container: InputContainer, track: VideoStream) -> list[float | 
         for part in parts
         for ticks in [*sorted(each for each in part if each is not None), *(each for each in part if each is None)]
     ]
-    return [None if ticks is None else float(ticks * track.time_base) for ticks in in_order]
+    return [None if ticks is None else float(ticks * track.time_base) for ticks in in_order], end
+
+
+def _packets(container: InputContainer, track: VideoStream) -> Iterator[av.Packet]:
+    """The packets of a track.
+
+    In a fragmented MP4 whose times start again, FFmpeg marks images as not to be shown, though no edit list says so.
+    """
+    is_fragmented, shown = "mp4" in container.format.name and not track.frames, False
+    for packet in container.demux(track):
+        if is_fragmented and shown and packet.is_discard:
+            whole = av.Packet(bytes(packet))
+            whole.pts, whole.dts, whole.time_base = packet.pts, packet.dts, packet.time_base
+            yield whole
+            continue
+        shown |= bool(packet.size) and not packet.is_discard
+        yield packet
 
 
 def decode(
@@ -123,13 +144,13 @@ def _with_damage(container: InputContainer, track: VideoStream, lost: Undecodabl
     is_avi, decode_times = container.format.name == AVI, deque()
     incomplete: set[int | None] = set()
     spoiled = False
-    for packet, following in _with_following(container.demux(track)):
+    for packet, following in _with_following(_packets(container, track)):
         if is_avi and packet.dts is not None:
             decode_times.append(packet.dts)
         if packet.is_corrupt and not _is_before_joint(packet, following):
             incomplete.add(packet.pts)
         try:
-            frames = packet.decode()
+            frames = track.decode(packet)
         except av.error.FFmpegError:
             lost.count += 1
             spoiled = True

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -174,7 +175,7 @@ def _measured_depth(
             return read_values(path, size)
         return read_depth_file(path, cfg.depth_unit_mm, size)
 
-    return lambda frame: geometry.values(_of_either_size(read, files[frame.index], geometry)), "user's files", notes
+    return lambda frame: _values(read, files[frame.index], first_pass), "user's files", notes
 
 
 def _scaled(measure: Measure, samples: list[MeasuredFrame], usable: list[Mask], cfg: PrepareConfig) -> Measure:
@@ -206,13 +207,20 @@ def _check_stored(images: list[NDArray]) -> list[str]:
     return notes
 
 
-def _of_either_size(read: Callable[[A, tuple[int, int]], NDArray], path: A, geometry: FrameGeometry) -> NDArray:
-    """Read a file that has the size of the source images or of the frames."""
+def _values(read: Callable[[A, tuple[int, int]], NDArray], path: A, first_pass: FirstPass) -> NDArray:
+    """The frame (H, W) of a file that has the size of the source images, of the frames, or of the stored pixels."""
+    geometry, stored = first_pass.geometry, first_pass.stored_size
     try:
-        return read(path, geometry.source_size)
+        return geometry.values(read(path, geometry.source_size))
     except InputError:
         with suppress(InputError):
-            return read(path, geometry.size)
+            return geometry.values(read(path, geometry.size))
+        if stored is not None:
+            with suppress(InputError):
+                values = read(path, stored)
+                kind = np.uint8 if values.dtype == bool else values.dtype
+                square = cv2.resize(values.astype(kind), geometry.source_size, interpolation=cv2.INTER_NEAREST_EXACT)
+                return geometry.values(square.astype(values.dtype))
         raise
 
 
@@ -242,7 +250,7 @@ def _user_masks(
     cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
 ) -> tuple[Tools, str, list[str]]:
     """As `_tools`, from the user's files."""
-    path, geometry = Path(cfg.masks), first_pass.geometry
+    path = Path(cfg.masks)
     given = open_mask_folder(path, cfg.mask_labels)
     names = [each.name for each in given.frames]
     matched = match_names(path, names, first_pass.indices, first_pass.image_names, in_order_only=given.in_order_only)
@@ -251,7 +259,7 @@ def _user_masks(
         return each.read(size)
 
     def high(frame: MeasuredFrame) -> Mask:
-        return geometry.values(_of_either_size(read, given.frames[matched.files[frame.index]], geometry))
+        return _values(read, given.frames[matched.files[frame.index]], first_pass)
 
     notes = [f"masks: {each}" for each in (given.note, matched.rule) if each]
     if given.tool_is_high is None or cfg.mask_tool_value != "auto":

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.shell import quoted
 from ..data.reading import kind_of
 from ..footage.border import Circle, Strips, find_outline
+from ..footage.combing import are_combed
 from ..footage.overlays import find_static_overlays
 from ..footage.round_border import CERTAIN
 from .calibration import Calibration
@@ -44,6 +46,8 @@ class FirstPass:
     """What is particular about the video and which of its images are not used, one line each."""
     damaged: frozenset[int] = frozenset()
     """Those of `indices` whose images are damaged."""
+    stored_size: tuple[int, int] | None = None
+    """(width, height) of one camera's image before its pixels became square, px; None if they were."""
     image_names: list[str] = field(default_factory=list)
     """Of all images of a source folder, without suffixes; empty for a video."""
 
@@ -64,7 +68,8 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
         hint = "Check --start, --end and --frames-per-second."
         raise input_error(str(clip.source.path), "at least 2 frames in the selection", str(len(indices)), hint)
     lefts = [frame.left for frame in sample.kept]
-    video_notes = [*clip.notes, *_timing_notes(look.selection, cfg), *_brightness_notes(lefts)]
+    video_notes = [*clip.notes, *_timing_notes(look.selection, cfg)]
+    video_notes += [*_brightness_notes(lefts), *_comb_notes(clip, lefts)]
     notes: list[str] = []
     stretch = _stretch(clip.layout) if cfg.squeezed_eyes else (1, 1)
     if calibration is not None:
@@ -101,7 +106,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
             f"(f = {geometry.matrix[0, 0]:.0f} px). To change it: --calibration or --field-of-view-degrees."
         )
     names = [file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else []
-    return FirstPass(indices, sample.kept, geometry, notes, video_notes, look.damaged, names)
+    return FirstPass(indices, sample.kept, geometry, notes, video_notes, look.damaged, clip.stored_size, names)
 
 
 @dataclass(frozen=True)
@@ -171,6 +176,19 @@ def _brightness_notes(images: list[NDArray[np.uint8]]) -> list[str]:
     if brightest >= DARK:
         return []
     return [f"the images are nearly black: their brightest parts have {brightest:.0f} of 255. Export them brighter"]
+
+
+def _comb_notes(clip: Clip, images: list[NDArray[np.uint8]]) -> list[str]:
+    """A note, with the command that helps, if images of a progressive video have rows of two times."""
+    if clip.layout == "interlaced" or not are_combed(images):
+        return []
+    path = clip.source.path
+    fix = "deinterlace the video before its images are exported"
+    if not isinstance(clip.source, ImageFolder):
+        even = path.with_name(f"{path.stem}_progressive.mp4")
+        words = ["ffmpeg", "-i", path, "-vf", "bwdif=deint=all", "-crf", "10", even]
+        fix = f"`{' '.join(map(quoted, words))}`"
+    return [f"{path.name}: rows alternate where something moves, as in interlaced video. Fix: {fix}"]
 
 
 def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..data.description import ESTIMATED_POSES, intrinsics_of, read_description
 from ..data.endonerf import read_poses_bounds
-from ..data.files import demand_count, list_files
+from ..data.files import list_files
+from ..data.frame_files import match_names
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask
 from ..data.pose_writing import (
     POSES,
@@ -75,9 +76,8 @@ def write_folder_path(
         InputError: no sequence folder, read-only, or the poses named by `how` cannot be used; nothing is written.
     """
     demand_writable(folder)
-    images, masks, depths = (list_files(folder / part, (".png",), "EndoNeRF") for part in ("images", "masks", "depth"))
-    for part, files in (("masks", masks), ("depth", depths)):
-        demand_count(files, folder / part, len(images))
+    images = list_files(folder / "images", (".png",), "EndoNeRF")
+    masks, depths = (_of_all_images(folder / part, images) for part in ("masks", "depth"))
     described = read_description(folder / "sequence.json")
     height, width = read_color(images[0]).shape[:2]
     size, scale = (width, height), float(described.get("depth_scale", 1.0))
@@ -106,7 +106,7 @@ def write_folder_path(
         size,
         has_depth=True,
         refine_focal=sources.get("lens") in (ASSUMED, REFINED),
-        reading=reading,
+        reading=replace(reading, image_names=[file.stem for file in images]),
         progress=lambda done: progress(done, len(images)),
     )
     unexplained = unexplained_frames(path, colors())
@@ -124,6 +124,14 @@ def write_folder_path(
     if path is not None:
         write_json(folder / PATH_RECORD, record_of_path(path))
     return FolderPath(new.camera_to_world, relative, unexplained, kept, notes)
+
+
+def _of_all_images(folder: Path, images: list[Path]) -> list[Path]:
+    """The file in a folder of each image."""
+    files = list_files(folder, (".png",), "EndoNeRF")
+    names = [file.stem for file in images]
+    matched = match_names(folder, [file.name for file in files], range(len(images)), names)
+    return [files[position] for position in matched.files.values()]
 
 
 def _focal(folder: Path, described: dict[str, Any], images: list[Path]) -> float:

@@ -1,4 +1,4 @@
-"""Masks of every n-th frame only, as in StereoMIS: frames with a mask are used, those between are left out."""
+"""Masks of some frames only, as in StereoMIS: frames with a mask are used, those between are left out."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data.file_names import numbers_of
+from ..data.frame_files import match_names
 from ..data.mask_folders import open_mask_folder
 from .config import PrepareConfig
 from .sam2 import is_sam2
+
+COVERED = 0.5
+"""Masks that extend over a smaller share of the frames are those of another clip, or not complete."""
 
 
 @dataclass(frozen=True)
@@ -27,32 +30,25 @@ class MaskedFrames:
 
 
 def masked_frames(cfg: PrepareConfig, indices: Sequence[int], image_names: Sequence[str]) -> MaskedFrames | None:
-    """The frames with a mask, if masks are numbered and regularly leave out frames; None if masks decide nothing.
-
-    A few missing masks are another matter: matching reports them.
+    """The frames with a mask, if there are fewer masks than frames; None if masks decide nothing.
 
     Args:
         indices: positions in the source of the selected frames, ascending.
         image_names: of all images of a source folder, without suffixes; empty for a video.
     Raises:
-        InputError: the folder of masks cannot be used.
+        InputError: the folder of masks cannot be used, or its names do not tell the frames.
     """
     if cfg.masks in ("auto", "none") or is_sam2(cfg.masks):
         return None
     given = open_mask_folder(Path(cfg.masks), cfg.mask_labels)
     if given.in_order_only or len(given.frames) in (len(indices), len(image_names)):
         return None
-    numbers = numbers_of([Path(frame.name).stem for frame in given.frames])
-    names = numbers_of(image_names)
-    if numbers is None or names is None:
+    names = [frame.name for frame in given.frames]
+    found = match_names(Path(cfg.masks), names, indices, image_names, required=()).files
+    places = np.searchsorted(indices, sorted(found))
+    if len(found) in (1, len(indices)) or np.ptp(places) < COVERED * (len(indices) - 1):
         return None
-    first = 0 if 0 in numbers else 1
-    has_mask = {*numbers}
-    kept = [i for i in indices if (names[i] if names else i + first) in has_mask]
-    places = np.searchsorted(indices, kept)
-    step = int(np.median(np.diff(places))) if len(kept) > 1 else 1
-    if step < 2:
-        return None
-    left_out = len(indices) - len(kept)
-    note = f"masks: one for every {step} frames; {left_out} of {len(indices)} frames have none and are left out"
-    return MaskedFrames(frozenset(kept), step, note)
+    step = int(np.median(np.diff(places)))
+    every = f"one for every {step} frames; " if step > 1 else ""
+    left_out = f"{len(indices) - len(found)} of {len(indices)} frames have none and are left out"
+    return MaskedFrames(frozenset(found), step, f"masks: {every}{left_out}")

@@ -1,11 +1,11 @@
-"""Which image of the second camera belongs to an image of the first: by time, or by the numbers in file names."""
+"""Which image of the second camera belongs to an image of the first: by time, or by the names of files."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from ..data.frame_files import match_names
 from .image_folder import ImageFolder
 from .source import Source
 from .source_frame import SourceFrame
@@ -22,20 +22,20 @@ class Pairing:
     """Time of the first image of the second source, s since that of the first source."""
     rate: float
     """Usual rate of the pairs, 1/s."""
-    by_number: dict[int, int] | None
+    by_name: dict[int, int] | None
     """Position in the second folder for a position in the first one; None: by time."""
     note: str
     """What is particular, one line; else empty."""
 
     def pairs(self, first: Source, second: Source) -> Iterator[tuple[SourceFrame, SourceFrame | None]]:
         """Each image of the first source, with that of the second source at the same time, if there is one."""
-        if self.by_number is None:
+        if self.by_name is None:
             tolerance = 0.5 * min(1 / first.frames_per_second, 1 / second.frames_per_second)
             yield from pair_by_time(first, second, self.offset, tolerance)
             return
         assert isinstance(second, ImageFolder)
         for image in first:
-            other = self.by_number.get(image.index)
+            other = self.by_name.get(image.index)
             yield image, None if other is None else second.image(other)
 
 
@@ -43,8 +43,12 @@ def find_pairing(first: Source, second: Source) -> Pairing:
     """How to pair the images of two opened sources."""
     rate, name = min(first.frames_per_second, second.frames_per_second), second.path.name
     if isinstance(first, ImageFolder) and isinstance(second, ImageFolder):
-        by_number, note = pair_by_number(*([file.stem for file in each.files] for each in (first, second)))
-        return Pairing(0.0, rate, by_number, note and f"{name}: {note}")
+        names = [file.name for file in second.files], [file.stem for file in first.files]
+        matched = match_names(second.path, names[0], range(len(names[1])), names[1], required=())
+        unused = len(names[0]) - len(matched.files)
+        notes = [matched.rule] if "in order" in matched.rule else []
+        notes += [f"{unused} images have none of the first camera and are left out"] if unused else []
+        return Pairing(0.0, rate, matched.files, f"{name}: {'; '.join(notes)}" if notes else "")
     offset, notes = second.start - first.start, []
     arbitrary = any(getattr(each, "clock_is_arbitrary", False) for each in (first, second))
     if arbitrary and abs(offset) > SAME_CLOCK_S:
@@ -93,28 +97,3 @@ def _in_order(images: Iterable[SourceFrame]) -> Iterator[SourceFrame]:
         if image.seconds > last:
             last = image.seconds
             yield image
-
-
-def pair_by_number(firsts: Sequence[str], seconds: Sequence[str]) -> tuple[dict[int, int], str]:
-    """Positions in a second folder by positions in a first one, and a note.
-
-    With as many files, and numbers in their names that are equal up to a constant, they are paired in order; else by
-    these numbers. Without a number of its own in each name, they are paired in order.
-
-    Args:
-        firsts, seconds: names without suffixes, in natural order.
-    """
-    numbers = [[int(digits[-1]) if (digits := re.findall(r"[0-9]+", name)) else None for name in each]
-               for each in (firsts, seconds)]  # fmt: skip
-    usable = all(None not in each and len(set(each)) == len(each) for each in numbers)
-    in_order = {position: position for position in range(min(len(firsts), len(seconds)))}
-    if not usable:
-        return in_order, "paired in order: its names have no numbers of their own" if len(firsts) != len(
-            seconds
-        ) else ""
-    if len(firsts) == len(seconds) and len({a - b for a, b in zip(*numbers, strict=True)}) == 1:
-        return in_order, ""
-    place = {number: position for position, number in enumerate(numbers[1])}
-    return {position: place[number] for position, number in enumerate(numbers[0]) if number in place}, (
-        "paired by the numbers in the names, which differ from those of the first folder"
-    )

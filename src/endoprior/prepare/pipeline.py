@@ -35,7 +35,7 @@ from .camera_path.sequence_path import (
 )
 from .config import PrepareConfig
 from .depth_and_masks import ChosenMethods, choose_methods
-from .first_pass import input_facts, run_first_pass, source_facts
+from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry
 from .frames import write_frames
 from .masked_frames import masked_frames
@@ -81,48 +81,15 @@ def prepare(
     segmenter = open_sam2(cfg.masks, "--masks") if is_sam2(cfg.masks) else None
     plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
-        calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
-        if calibration is not None and cfg.calibration_size:
-            calibration = replace(calibration, size=parse_size(cfg.calibration_size), size_is_sure=True)
-        clip = Clip(video, cfg, calibration)
-        calibration = clip.calibration
-        progress("looking through", 0, clip.source.num_frames)
-        first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
-        masked = masked_frames(cfg, first_pass.indices, first_pass.image_names)
-        if masked is not None:
-            clip.only = masked.indices
-            first_pass = run_first_pass(clip, cfg, calibration, str(cfg.calibration))
-            first_pass.notes.append(masked.note)
-        if cfg.row_offset == "auto":
-            first_pass.geometry, row_note = with_equal_rows(first_pass.geometry, first_pass.samples)
-            first_pass.notes.append(row_note)
+        clip, first_pass, step = _look(video, cfg, progress)
         progress("looking at tools and light", 0, len(first_pass.indices))
         chosen = choose_methods(cfg, clip, first_pass)
-        meta = _meta(clip, first_pass.geometry, chosen, lens=_lens_source(calibration))
-        if masked is not None:
-            meta = replace(meta, frames_per_second=meta.frames_per_second / masked.step)
-        parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
-        found = RowLog(folder)
-        done = frames_done(folder, parts)
-        if chosen.finds_tools:
-            done = min(done, len(found.rows))
-            found.cut(done)
-        files = FrameFiles(folder, meta, done)
-        used = write_frames(
-            clip.stereo_frames(clip.selection()),
-            first_pass.geometry,
-            chosen.methods,
-            files,
-            keep_right=cfg.keep_right,
-            on_tools=lambda i, tools: found.add(FrameRow.of(i, tools)) if chosen.finds_tools else None,
-            on_frame=lambda done: progress("writing frames", done, len(first_pass.indices)),
-        )
+        meta = _meta(clip, first_pass.geometry, chosen, step)
+        files, used = _write(folder, cfg, clip, first_pass, chosen, meta, progress)
         if files.count < 2:
             fix = "Change --start, --end or --drop-out-of-body."
             raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
         carried_notes: list[str] = []
-        if chosen.finds_tools:
-            found.finish()
         if segmenter is not None:
             from .carried_masks import replace_by_carried  # imports torch
 
@@ -130,23 +97,16 @@ def prepare(
             carried_notes = replace_by_carried(files, segmenter, inside, shade, progress)
         moving = _unmasked(files, first_pass.geometry.inside) if chosen.finds_tools or segmenter is not None else []
         mark_moving(folder, moving)
-        progress("following the camera", 0, files.count)
-        path, motion_notes = _camera_path(
-            cfg, files, first_pass.geometry, used, lambda done: progress("following the camera", done, files.count)
-        )
+        path, motion_notes = _camera_path(cfg, files, first_pass, used, progress)
         damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
         unexplained = _unexplained(path, files, damaged)
         if path is not None:
-            if files.meta.depth_relative:
-                _scale_depth(files, path)
-            focal = {"fx": meta.fx * path.focal_factor, "fy": meta.fy * path.focal_factor}
-            files.meta = replace(files.meta, **focal, sources=sources_with(files.meta.sources, path))
-            files.write_json(PATH_RECORD, record_of_path(path))
+            _use_path(files, path)
         if segmenter is not None:
             from .carried_masks import remove_carried
 
             remove_carried(files)
-        found.remove()
+        RowLog(folder).remove()
         files.finish(None if path is None else path.camera_to_world, unexplained)
         video_notes = [*first_pass.video_notes, *_damage_notes(damaged)]
         if outside := len(first_pass.indices) - len(used):
@@ -154,19 +114,83 @@ def prepare(
         record_of(video, cfg, first_pass.geometry, video_notes).save(folder)
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
+        others = sorted({*unexplained} - {*damaged})
         notes = [*video_notes, *first_pass.notes, *chosen.notes, *carried_notes, *motion_notes]
-        if uncertain := uncertain_frames(read_rows(folder)):
-            frames = number_ranges(uncertain)
-            notes.append(f"masks: unsure in frames {frames}. To look and correct: {command('view', out)}")
-        if moving:
-            what = f"in frames {number_ranges(moving)}, something moves that no mask covers"
-            notes.append(f"masks: tools are likely missed: {what}. To look and correct: {command('view', out)}")
-        if others := sorted({*unexplained} - {*damaged}):
-            frames = number_ranges(others)
-            few = files.count - len(unexplained) < 2
-            fix = "look at the images: is this one video?" if few else "--start and --end can leave them out"
-            notes.append(f"no camera pose, or another scene, in frames {frames}; {fix}")
+        notes += _advice(out, uncertain_frames(read_rows(folder)), moving, others, files.count - len(unexplained))
     return Prepared(out, files.count, first_pass.geometry.size, notes)
+
+
+def _look(video: Path, cfg: PrepareConfig, progress: Progress) -> tuple[Clip, FirstPass, int]:
+    """The clip, what a first pass over it found, and the usual distance between the frames that are used."""
+    calibration = read_calibration(cfg.calibration, cfg.calibration_unit) if cfg.calibration else None
+    if calibration is not None and cfg.calibration_size:
+        calibration = replace(calibration, size=parse_size(cfg.calibration_size), size_is_sure=True)
+    clip = Clip(video, cfg, calibration)
+    progress("looking through", 0, clip.source.num_frames)
+    first_pass = run_first_pass(clip, cfg, clip.calibration, str(cfg.calibration))
+    masked = masked_frames(cfg, first_pass.indices, first_pass.image_names)
+    if masked is not None:
+        clip.only = masked.indices
+        first_pass = run_first_pass(clip, cfg, clip.calibration, str(cfg.calibration))
+        first_pass.notes.append(masked.note)
+    if cfg.row_offset == "auto":
+        first_pass.geometry, row_note = with_equal_rows(first_pass.geometry, first_pass.samples)
+        first_pass.notes.append(row_note)
+    return clip, first_pass, masked.step if masked else 1
+
+
+def _write(
+    folder: Path,
+    cfg: PrepareConfig,
+    clip: Clip,
+    first_pass: FirstPass,
+    chosen: ChosenMethods,
+    meta: SequenceMeta,
+    progress: Progress,
+) -> tuple[FrameFiles, list[int]]:
+    """Write the frames that are not there yet; and the position in the source of every frame."""
+    parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
+    found, done = RowLog(folder), frames_done(folder, parts)
+    if chosen.finds_tools:
+        done = min(done, len(found.rows))
+        found.cut(done)
+    files = FrameFiles(folder, meta, done)
+    used = write_frames(
+        clip.stereo_frames(clip.selection()),
+        first_pass.geometry,
+        chosen.methods,
+        files,
+        keep_right=cfg.keep_right,
+        on_tools=lambda i, tools: found.add(FrameRow.of(i, tools)) if chosen.finds_tools else None,
+        on_frame=lambda done: progress("writing frames", done, len(first_pass.indices)),
+    )
+    if chosen.finds_tools and files.count >= 2:
+        found.finish()
+    return files, used
+
+
+def _use_path(files: FrameFiles, path: CameraPath) -> None:
+    """Bring relative depth and the focal length to those of the path, and record it."""
+    if files.meta.depth_relative:
+        _scale_depth(files, path)
+    focal = {"fx": files.meta.fx * path.focal_factor, "fy": files.meta.fy * path.focal_factor}
+    files.meta = replace(files.meta, **focal, sources=sources_with(files.meta.sources, path))
+    files.write_json(PATH_RECORD, record_of_path(path))
+
+
+def _advice(out: Path, uncertain: list[int], moving: list[int], others: list[int], usable: int) -> list[str]:
+    """Notes on frames to look at: of unsure masks, of likely missed tools, without a pose."""
+    notes = []
+    if uncertain:
+        frames = number_ranges(uncertain)
+        notes.append(f"masks: unsure in frames {frames}. To look and correct: {command('view', out)}")
+    if moving:
+        what = f"in frames {number_ranges(moving)}, something moves that no mask covers"
+        notes.append(f"masks: tools are likely missed: {what}. To look and correct: {command('view', out)}")
+    if others:
+        fix = "look at the images: is this one video?" if usable < 2 else "--start and --end can leave them out"
+        notes.append(f"no camera pose, or another scene, in frames {number_ranges(others)}; {fix}")
+    return notes
 
 
 def _unmasked(files: FrameFiles, inside: NDArray[np.bool_]) -> list[int]:
@@ -210,7 +234,7 @@ def _demand_all_frames(cfg: PrepareConfig) -> None:
         raise input_error("--stir", "all frames of the clip", left_out[0], f"remove {left_out[0]}.")
 
 
-def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, lens: str) -> SequenceMeta:
+def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, step: int) -> SequenceMeta:
     return SequenceMeta(
         width=geometry.size[0],
         height=geometry.size[1],
@@ -218,12 +242,12 @@ def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, *, lens: s
         fy=float(geometry.matrix[1, 1]),
         cx=float(geometry.matrix[0, 2]),
         cy=float(geometry.matrix[1, 2]),
-        frames_per_second=clip.frames_per_second,
+        frames_per_second=clip.frames_per_second / step,
         baseline_mm=geometry.baseline_mm,
         depth_scale=DEPTH_SCALE,
         depth_source=chosen.sources["depth"],
         depth_relative=chosen.relative,
-        sources=chosen.sources | {"lens": lens},
+        sources=chosen.sources | {"lens": _lens_source(clip.calibration)},
     )
 
 
@@ -234,14 +258,11 @@ def _lens_source(calibration: Calibration | None) -> str:
 
 
 def _camera_path(
-    cfg: PrepareConfig,
-    files: FrameFiles,
-    geometry: FrameGeometry,
-    used: Sequence[int],
-    progress: Callable[[int], None],
+    cfg: PrepareConfig, files: FrameFiles, first_pass: FirstPass, used: Sequence[int], progress: Progress
 ) -> tuple[CameraPath | None, list[str]]:
     """Poses of the written frames, None for a static camera; and notes for the user."""
-    meta = files.meta
+    meta, geometry = files.meta, first_pass.geometry
+    progress("following the camera", 0, files.count)
 
     def tissue(index: int) -> NDArray[np.bool_]:
         return ~read_tool_mask(files.file("masks", index))
@@ -262,8 +283,8 @@ def _camera_path(
         (meta.width, meta.height),
         has_depth=cfg.depth != "none",
         refine_focal=cfg.calibration is None,
-        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn, used),
-        progress=progress,
+        reading=Reading(cfg.poses_convention, cfg.poses_unit_mm, turn, used, first_pass.image_names),
+        progress=lambda done: progress("following the camera", done, files.count),
     )
 
 

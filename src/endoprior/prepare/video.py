@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.shell import quoted
 from ..data.reading import MOST_PIXELS
-from ..data.video_files import num_joined_mp4, open_container, what_it_is
+from ..data.video_files import open_container, starts_of_parts, what_it_is
 from .decoding import AVI, DecodedImage, Undecodable, choose_track, decode, is_cover, packet_times
 from .source_frame import SourceFrame
 from .timeline import Timeline, usual_rate
@@ -50,7 +51,7 @@ class Video:
             raise input_error(path, "a video file", "an empty file", "Copy it again.")
         with self._open() as (container, track):
             stated = [float(rate) for rate in (track.average_rate, track.guessed_rate) if rate]
-            packets = packet_times(container, track)
+            packets, end = packet_times(container, track)
             self.frames_per_second = usual_rate([time for time in packets if time is not None], stated)
             self._step = 1 / self.frames_per_second
             along = Timeline(self._step).along((None, time) for time in packets)
@@ -58,11 +59,12 @@ class Video:
             self.times: list[float] = sorted(time - times[0] for time in times) if times else []
             """Time of each image since the first one, s, before any is decoded."""
             self.num_frames = max(int(track.frames), 0)
-            self._announced_end = _announced_end(container, track)
             self._aspect = _pixel_aspect(track)
             self._unused = _other_tracks(container, track)
-            joined = num_joined_mp4(path) if "mp4" in container.format.name else 1
-            self._unused += [f"{path.name}: of {joined} joined files only the first is used"] if joined > 1 else []
+            unread = _unread_parts(path, container.format.name, end)
+            self._unused += unread
+            # The duration may be that of all parts.
+            self._announced_end = 0.0 if unread else _announced_end(container, track)
             self.clock_is_arbitrary = container.format.name in ARBITRARY_CLOCKS
         self.start = 0.0
         first = next(iter(self), None)
@@ -77,6 +79,12 @@ class Video:
     def pixel_aspect(self) -> Fraction:
         """Width of a stored pixel divided by its height. The images of the source have square pixels."""
         return self._aspect if self._shown_width(self._size[0]) != self._size[0] else Fraction(1)
+
+    @property
+    def stored_size(self) -> tuple[int, int]:
+        """(width, height) of an upright image before its pixels become square, px."""
+        width, height = self._size
+        return (width, height) if self.height == height else (height, width)
 
     @property
     def notes(self) -> list[str]:
@@ -258,6 +266,21 @@ def _pixel_aspect(track: av.VideoStream) -> Fraction:
     return aspect if PIXEL_ASPECTS[0] <= aspect <= PIXEL_ASPECTS[1] else Fraction(0)
 
 
+def _unread_parts(path: Path, format_name: str, end: int) -> list[str]:
+    """A note if files that are joined in this one begin after its last image, at byte `end`."""
+    starts = starts_of_parts(path, format_name)
+    used = max(sum(start <= end for start in starts), 1)
+    if len(starts) <= used:
+        return []
+    first = "the first is" if used == 1 else f"the first {used} are"
+    return [f"{path.name}: of {len(starts)} joined files only {first} used; join them with `ffmpeg -f concat`"]
+
+
+def _size(track: av.VideoStream) -> tuple[int, int] | None:
+    """(width, height), px; None if its format is unknown."""
+    return (track.codec_context.width, track.codec_context.height) if track.codec_context else None
+
+
 def _other_tracks(container: av.container.InputContainer, used: av.VideoStream) -> list[str]:
     """A note if there are other tracks of images than the one that is used."""
     others = [track for track in container.streams.video if track.index != used.index and not is_cover(track)]
@@ -265,10 +288,15 @@ def _other_tracks(container: av.container.InputContainer, used: av.VideoStream) 
         return []
 
     def words(track: av.VideoStream) -> str:
-        context = track.codec_context
-        size = f"{context.width}x{context.height} px" if context else "of an unknown format"
+        size = "{}x{} px".format(*_size(track)) if track.codec_context else "of an unknown format"
         return f"{size}{f', {track.frames} images' if track.frames else ''}"
 
     left_out = "; ".join(map(words, others))
-    name = Path(container.name.removeprefix("file:")).name
-    return [f"{name}: of {len(others) + 1} video tracks, only one is used ({words(used)}), not: {left_out}"]
+    path = Path(container.name.removeprefix("file:"))
+    notes = [f"{path.name}: of {len(others) + 1} video tracks, only one is used ({words(used)}), not: {left_out}"]
+    if equal := [track for track in others if _size(track) == _size(used)]:
+        second = path.with_name(f"{path.stem}_right{path.suffix}")
+        words = ["ffmpeg", "-i", path, "-map", f"0:{equal[0].index}", "-c", "copy", second]
+        split = " ".join(map(quoted, words))
+        notes.append(f"{path.name}: if the tracks are two cameras: `{split}`, then add `--right {quoted(second)}`")
+    return notes

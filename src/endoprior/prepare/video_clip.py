@@ -93,6 +93,13 @@ class Clip:
             notes.append(f"{name}: {self.unpaired} images have none of the second camera and are left out")
         return notes
 
+    @property
+    def stored_size(self) -> tuple[int, int] | None:
+        """(width, height) of one camera's image before its pixels became square, px; None if they were."""
+        if not isinstance(self.source, Video) or self.source.pixel_aspect == 1:
+            return None
+        return camera_size(*self.source.stored_size, self.layout)
+
     def selection(self) -> FrameSelection:
         """The frames to use, with all counts at zero."""
         return FrameSelection(self.frames_per_second, self._cfg.start, self._cfg.end, self._rate, self.only)

@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...core.checks import input_error
-from ...data.files import read_table
+from ...data import nerfstudio
+from ...data.colmap import model_folder
+from ...data.colmap_model import read_colmap
+from ...data.files import in_order, read_table
+from ...data.frame_files import match_names
 from ...data.numpy_files import read_numpy
 from ...data.poses import demand_rotations
 
@@ -41,6 +45,48 @@ def read_poses(path: Path, count: int, sources: Sequence[int] | None = None) -> 
             raise input_error(path, "poses of these frames, .npy", "poses of the images of a video", fix)
         return _of_images(path, sources)
     return _of_frames(path, count)
+
+
+def is_model(path: Path) -> bool:
+    """Whether a path is `transforms.json`, a model of COLMAP, or a folder with one."""
+    return path.is_dir() or path.suffix.lower() == ".json" or path.name in ("images.txt", "images.bin")
+
+
+def read_model_poses(
+    path: Path, sources: Sequence[int], names: Sequence[str] = ()
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], str]:
+    """Poses that a reconstruction program wrote, of the frames that it has a pose for.
+
+    Args:
+        path: `transforms.json`, or a model of COLMAP: its folder, that above it, or its `images.txt` or `images.bin`.
+        sources: position of each frame in the video or the folder of images, ascending.
+        names: of all images of the folder, without suffixes; empty for a video.
+    Returns:
+        (T, 4, 4) camera-to-world in OpenCV axes, in units of the file, with the pose before it where a frame has none;
+        (T,) whether a frame has one; and how they were matched.
+    Raises:
+        InputError: no such file, or it cannot be used, or its names do not tell the frames.
+    """
+    folder = path if path.is_dir() else path.parent
+    own = any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
+    model = folder if own else model_folder(folder)
+    file = path / nerfstudio.FILE if path.is_dir() else path
+    if file.suffix.lower() == ".json" and (file == path or (model is None and file.is_file())):
+        stored = nerfstudio.read_poses(file)
+    elif model is not None:
+        stored = [(each.name, np.linalg.inv(each.world_to_camera)) for each in read_colmap(model)[0]]
+    else:
+        fix = "Pass the folder with COLMAP's cameras and images, .bin or .txt, or transforms.json."
+        raise input_error(path, "camera poses", "a folder without a model", fix)
+    by_name = {Path(name).name: pose for name, pose in stored}
+    files = [file.name for file in in_order(map(Path, by_name))]
+    matched = match_names(path, files, sources, names, required=())
+    places = [matched.files.get(source) for source in sources]
+    known = np.array([place is not None for place in places])
+    before = np.maximum.accumulate(np.where(known, np.arange(len(places)), np.flatnonzero(known)[0]))
+    poses = np.stack([by_name[files[places[i]]] for i in before])
+    demand_rotations(path, poses[:, :3, :3], "the poses", "Export them again.")
+    return poses, known, matched.rule
 
 
 def _of_frames(path: Path, count: int) -> NDArray[np.float64]:

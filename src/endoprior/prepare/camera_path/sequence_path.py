@@ -21,7 +21,7 @@ from ...footage.pose_fit import View, measure_poses
 from .choose import How, find_path
 from .follow import follow_camera
 from .given import with_poses
-from .pose_file import read_poses
+from .pose_file import is_model, read_model_poses, read_poses
 from .seen import CameraPath, Lens, PoseInput
 
 NEGLIGIBLE_DEGREES = 1e-3
@@ -48,6 +48,8 @@ class Reading:
     """(3, 3) rotation from the camera that the poses belong to, to that of the frames; None if they are the same."""
     sources: Sequence[int] | None = None
     """Position in the video of each frame, from 0, where a file may have a row for each image of a video."""
+    image_names: Sequence[str] = ()
+    """Of all images of the folder that the frames come from, without suffixes, where a file names images."""
 
     @property
     def notes(self) -> list[str]:
@@ -101,12 +103,17 @@ def sequence_path(
         InputError: the file of poses cannot be used, or COLMAP is asked for and not there.
     """
     if how not in (*METHODS, "still"):
-        stored = read_poses(Path(how), count, reading.sources)
-        poses, notes = reading.ours(stored), reading.notes
+        known, notes = np.ones(count, bool), list(reading.notes)
+        if is_model(Path(how)):
+            stored, known, rule = _of_model(Path(how), count, reading)
+            notes.append(f"{how}: poses {rule}; their unit is that of --poses-unit-mm")
+        else:
+            stored = read_poses(Path(how), count, reading.sources)
+        path = replace(_unscaled(reading.ours(stored)), explained=known)
         if not has_depth:
-            return _unscaled(poses), notes
+            return path, notes
         notes += _fit_notes(how, stored, frame, lens, reading)
-        return _from_file(poses, frame, lens, progress), notes
+        return _scaled_to(path, frame, lens, progress), notes
     if (reading.convention, reading.unit_mm) != (AS_OURS.convention, AS_OURS.unit_mm):
         got, fix = f"--poses {how}", "Remove --poses-convention and --poses-unit-mm."
         raise input_error("--poses-convention", "a file with --poses", got, fix)
@@ -156,15 +163,24 @@ def rescaled(stored: NDArray, scale: float) -> NDArray[np.uint16]:
     return np.where(units <= FARTHEST_UNIT, units, 0).astype(np.uint16)
 
 
-def _from_file(
-    poses: NDArray, frame: Callable[[int], PoseInput], lens: Lens, progress: Callable[[int], None]
+def _of_model(path: Path, count: int, reading: Reading) -> tuple[NDArray, NDArray[np.bool_], str]:
+    """See `read_model_poses`; such files say themselves what their axes are."""
+    if reading.convention != AS_OURS.convention:
+        fix = "Remove --poses-convention."
+        raise input_error("--poses-convention", f"no convention for {path}, whose axes are known", "one", fix)
+    sources = range(count) if reading.sources is None else reading.sources
+    return read_model_poses(path, sources, reading.image_names)
+
+
+def _scaled_to(
+    path: CameraPath, frame: Callable[[int], PoseInput], lens: Lens, progress: Callable[[int], None]
 ) -> CameraPath:
-    """The given poses; relative depth gets the scale at which its points agree with them."""
+    """The given path; relative depth gets the scale at which its points agree with the poses."""
     if not lens.depth_is_relative:
-        return _unscaled(poses)
+        return path
+    poses = path.camera_to_world
     follower = follow_camera(frame, len(poses), lens, progress)
-    world = with_poses(follower, np.linalg.inv(poses), np.ones(len(poses), bool))
-    return replace(_unscaled(poses), depth_scale=world.scales)
+    return replace(path, depth_scale=with_poses(follower, np.linalg.inv(poses), path.explained).scales)
 
 
 def _fit_notes(how: str, stored: NDArray, frame: Callable[[int], PoseInput], lens: Lens, reading: Reading) -> list[str]:
