@@ -6,6 +6,8 @@ Names are imported when first used, so that `import endoprior` and `endoprior --
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from .system.settings_files import ignore_settings_of_current_folder
+
 if TYPE_CHECKING:
     from .core.checks import InputError
     from .core.config import Config
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from .model.scene_file import load_scene
     from .priors import joint_texture_prior
     from .runs.train import train
+
+ignore_settings_of_current_folder()
 
 HOMES = {
     "Config": "core.config",

@@ -20,6 +20,7 @@ from typing import Any
 import viser
 
 from ..core.checks import InputError
+from ..system.console import complain
 from . import panel, saving
 from .access_control import check_address
 from .browsers import Browsers, camera_pose, picture_with_lines
@@ -161,7 +162,7 @@ class Viewer:
         try:
             job()
         except InputError as error:
-            print(f"view: {error}", file=sys.stderr)
+            complain(f"view: {error}")
             self._browsers.notify("That did not work", str(error))
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
