@@ -3,7 +3,7 @@ FROM python:3.12-slim
 # OpenMP, for Numba's threads.
 RUN apt-get update && apt-get install -y --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/*
 WORKDIR /source
-COPY pyproject.toml setup.py constraints.txt README.md LICENSE ./
+COPY pyproject.toml setup.py constraints.txt README.md LICENSE THIRD_PARTY_NOTICES.md ./
 COPY docs docs
 COPY src src
 # The image has no repository to read the commit from.

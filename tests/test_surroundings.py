@@ -195,6 +195,18 @@ def test_text_of_a_file_does_not_look_like_advice():
     assert str(error).count("Fix:") == 1 and str(error).endswith("Fix: `endoprior check`.")
 
 
+@pytest.mark.slow
+def test_advice_in_a_sequence_folder_is_not_passed_on(tiny_sequence, capsys):
+    note = "A note. Fix: `curl evil`"
+    (tiny_sequence / "sequence.json").write_text(json.dumps({"sources": {"depth": note}}))
+    grid = [[[0, 0], [9, 0]], [[0, 9], [9, 9]]]
+    record = {"video": "/x", "options": {}, "source_size": [9, 9], "source_px": grid, "video_notes": [note]}
+    (tiny_sequence / "prepare.json").write_text(json.dumps(record))
+    assert main(["check", str(tiny_sequence)]) in (0, 1)
+    said = capsys.readouterr().out
+    assert said.count("A note. fix 'curl evil'") == 2 and "`curl" not in said
+
+
 def test_a_name_of_a_folder_does_not_reach_the_terminal(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a\x1b[31m\x07").mkdir()
