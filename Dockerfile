@@ -12,8 +12,8 @@ RUN if [ -n "$COMMIT" ]; then echo "$COMMIT" > src/endoprior/commit.txt; fi \
  && pip install --no-cache-dir -c constraints.txt . --extra-index-url https://download.pytorch.org/whl/cpu \
  && rm -rf build \
  && mkdir -m 1777 /cache /data
-# Any user may run it. Compiled kernels and downloaded weights go to /cache: keep it in a volume.
-ENV HOME=/cache NUMBA_CACHE_DIR=/cache/kernels
+# Any user may run it; no Python imports files of the data. Compiled kernels and downloaded weights go to /cache: keep it in a volume.
+ENV HOME=/cache NUMBA_CACHE_DIR=/cache/kernels PYTHONSAFEPATH=1
 USER 1000
 VOLUME /cache /data
 WORKDIR /data

@@ -20,28 +20,40 @@ import kills
 import limits
 import memory
 import soak
+from corpus import CASES
 from harness import ENVIRONMENT, Row
 
 ROOT = Path(__file__).parents[1]
+BAD_INPUTS = str(ROOT / "tests" / "test_bad_inputs.py")
 BEGIN, END = "<!-- figures: make test-faults -->", "<!-- end of figures -->"
+
+
+def inputs(work: Path) -> list[Row]:
+    """Every broken and hostile input of the corpus."""
+    return _tests("inputs", f"{len(CASES)} broken and hostile inputs: one line, no traceback", "-m", "", BAD_INPUTS)
 
 
 def properties(work: Path) -> list[Row]:
     """The property-based tests with random seeds and ten times as many examples as in the test suite."""
     files = sorted((ROOT / "tests").glob("test_properties_*.py"))
-    words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *map(str, files)]
+    return _tests("properties", "property-based tests, thorough", *map(str, files))
+
+
+def _tests(part: str, what: str, *arguments: str) -> list[Row]:
+    words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
     environment = ENVIRONMENT | {"ENDOPRIOR_HYPOTHESIS": "thorough"}
     done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, encoding="utf-8", check=False)
     if done.returncode:
         print(done.stdout[-6000:], done.stderr[-3000:], sep="\n", file=sys.stderr)
     last = (done.stdout.strip() or "no output").splitlines()[-1]  # `n passed in ...`
-    return [Row("properties", "property-based tests, thorough", last.split(" in ")[0], done.returncode == 0)]
+    return [Row(part, what, last.split(" in ")[0], done.returncode == 0)]
 
 
 PARTS: dict[str, Callable[[Path], list[Row]]] = {
     "kills": kills.main,
     "disk": disk.main,
     "memory": memory.main,
+    "inputs": inputs,
     "properties": properties,
     "soak": soak.main,
     "limits": limits.main,

@@ -1,4 +1,4 @@
-"""Write THIRD_PARTY_NOTICES.md from what the installed packages say of themselves: `python tools/third_party_notices.py`.
+"""Write THIRD_PARTY_NOTICES.md from what the installed packages say: `python tools/third_party_notices.py`.
 
 It lists what `pip install -c constraints.txt .` brings, and what optional parts add, in the pinned versions.
 """
