@@ -62,10 +62,9 @@ def test_worker_processes_of_libraries_do_not_search_the_current_folder(tmp_path
 
 
 @pytest.mark.slow
-def test_training_and_benchmark_run_no_code_of_the_current_folder(tiny_sequence, tmp_path):
+def test_a_benchmark_and_its_processes_run_no_code_of_the_current_folder(tiny_sequence, tmp_path):
     (tmp_path / "json.py").write_text(LEAVES_A_MARK)
     fresh = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}  # kernels are compiled by another process
-    assert start(endoprior("train", tiny_sequence, "run", *SHORT), tmp_path, **fresh).returncode == 0
     steps = "schedule.coarse_iterations: 1, schedule.fine_iterations: 1, init.budget: 100"
     spec = f"title: t\nsequences: {{clip: {{path: {tiny_sequence}}}}}\nmethods: {{ours: {{set: {{{steps}}}}}}}\n"
     (tmp_path / "spec.yaml").write_text(spec + "seeds: [0]\n")

@@ -116,7 +116,8 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     try:
         return cls(**built)
     except ValueError as error:
-        raise InputError(f"{where}: {error}. Fix: Correct the value.") from error
+        fix = "" if isinstance(error, InputError) else ". Fix: Correct the value."
+        raise InputError(f"{where}: {error}{fix}") from error
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:

@@ -114,7 +114,7 @@ class WindowedRun:
         if self.resume and about.is_file():
             reject_other_start(about, self.cfg, fingerprint, self.sequence.path)
         elif self.resume:
-            raise InputError(f"{about}: expected a run to resume; found none. Start without --resume.")
+            raise InputError(f"{about}: expected a run to resume, got none. Fix: Start without --resume.")
         write_json(about, run_facts(self.sequence, self.cfg, fingerprint) | {"windows": self.plan})
 
     def _train(
