@@ -19,15 +19,14 @@ from endoprior.system.atomic import write_json, write_text
 from endoprior.system.own_python import python_command, without_current_folder
 
 SHORT = "--init.budget 100 --schedule.coarse-iterations 1 --schedule.fine-iterations 1 --no-networks".split()
-LEAVES_A_MARK = """import os, sys
-open(os.path.join(os.path.dirname(os.path.abspath(__file__)), "EXECUTED"), "a").write(" ".join(sys.orig_argv))
+LEAVES_A_MARK = """import importlib, os, sys
 here = os.path.dirname(os.path.abspath(__file__))
+open(os.path.join(here, "EXECUTED"), "a").write(" ".join(sys.orig_argv))
 sys.path[:] = [p for p in sys.path if p not in ("", here)]
-del sys.modules["json"]
-import json as real
-sys.modules["json"] = real
+del sys.modules[__name__]
+sys.modules[__name__] = importlib.import_module(__name__)
 """
-"""A `json.py` that says who imported it, then gets out of the way."""
+"""A module that says who imported it, then gets out of the way."""
 
 
 def start(words: list[str], cwd: Path, shell: str = "", **variables: str) -> subprocess.CompletedProcess:
@@ -45,7 +44,9 @@ def endoprior(*words: object) -> list[str]:
 # Code in the current folder.
 
 
-@pytest.mark.parametrize("words", [python_command("endoprior", "plugins"), endoprior("plugins")])
+@pytest.mark.parametrize(
+    "words", [python_command("endoprior.doctor.gsplat_probe", "load", "a", "b"), endoprior("plugins")]
+)
 def test_a_module_in_the_current_folder_is_not_imported(words, tmp_path):
     (tmp_path / "json.py").write_text(LEAVES_A_MARK)
     assert start(words, tmp_path).returncode == 0
@@ -54,7 +55,7 @@ def test_a_module_in_the_current_folder_is_not_imported(words, tmp_path):
 
 def test_worker_processes_of_libraries_do_not_search_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "json.py").write_text(LEAVES_A_MARK)
+    (tmp_path / "pickle.py").write_text(LEAVES_A_MARK)
     context = multiprocessing.get_context("spawn")
     with without_current_folder(), context.Pool(1) as pool:
         assert pool.apply(json.dumps, ([1],)) == "[1]"
@@ -99,9 +100,12 @@ def test_settings_in_the_current_folder_are_not_read(first, tmp_path):
 # Streams.
 
 
-def test_a_command_does_its_work_without_streams(tiny_sequence, tmp_path):
-    words = python_command("endoprior", "prior", str(tiny_sequence), "out")
-    assert start(words, tmp_path, "<&- >&- 2>&-").returncode == 0 and any((tmp_path / "out").iterdir())
+@pytest.mark.parametrize("name", ["stdin", "stdout", "stderr"])
+def test_a_closed_stream_is_replaced(name, monkeypatch):
+    monkeypatch.setattr(sys, name, None)
+    assert main(["plugins"]) == 0
+    with getattr(sys, name) as stream:
+        assert not stream.isatty()
 
 
 def test_lines_that_have_no_reader_any_more_are_lost(monkeypatch):
