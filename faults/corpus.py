@@ -11,6 +11,7 @@ import corpus_options
 import corpus_prepare
 import corpus_runs
 import corpus_sequences
+import corpus_surroundings
 import corpus_videos
 from corpus_case import Case
 
@@ -21,5 +22,6 @@ KINDS = {
     "beside a video": corpus_prepare.CASES,
     "options and outputs": corpus_options.CASES,
     "runs and specs": corpus_runs.CASES,
+    "around the data": corpus_surroundings.CASES,
 }
 CASES: list[Case] = [case for cases in KINDS.values() for case in cases]

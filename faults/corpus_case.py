@@ -138,6 +138,10 @@ def complaints(case: Case, status: int, errors: str, before: dict[str, str], aft
         wrong.append("a traceback")
     if case.says and (len(lines) != 1 or not lines[0].startswith("endoprior: ")):
         wrong.append(f"{len(lines)} lines on stderr")
+    if not errors.replace("\n", "").isprintable():
+        wrong.append("control characters on stderr")
+    if case.says and errors.count("Fix: ") != 1:
+        wrong.append(f"{errors.count('Fix: ')} fixes")
     if missing := [word for word in case.says if word not in errors]:
         wrong.append(f"no word of {missing}")
     changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))

@@ -56,7 +56,7 @@ class Done:
 
 def command(*words: object) -> list[str]:
     """The program as a command line."""
-    return [sys.executable, "-m", "endoprior", *map(str, words)]
+    return [sys.executable, "-P", "-m", "endoprior", *map(str, words)]
 
 
 class Program:

@@ -26,6 +26,7 @@ from corpus import CASES
 from harness import ENVIRONMENT, Row
 
 ROOT = Path(__file__).parents[1]
+BAD_INPUTS = str(ROOT / "tests" / "test_bad_inputs.py")
 BEGIN, END = "<!-- figures: make test-faults -->", "<!-- end of figures -->"
 
 

@@ -25,9 +25,13 @@ SAMPLE = (
     *("poses of another clip", "no such option", "check --data.shrink 0", "prior into a file", "phantom --width 0"),
     *("a scene of noise", "a config that is not JSON", "a checkpoint cut short", "a camera path of words"),
     *("an empty spec", "a preset nobody knows", "a pipe for a picture", "a video of odd size"),
+    *("settings of Numba beside the data", "a name with a fix of its own"),
 )
 """One case of each way to go wrong, and two in which the command must work or must not wait."""
-AS_PROCESSES = ("a pipe for a picture", "a shape of terabytes", "a decompression bomb", "YAML aliases that explode")
+AS_PROCESSES = (
+    *("a pipe for a picture", "a shape of terabytes", "a decompression bomb", "YAML aliases that explode"),
+    *("json.py beside the data", "tomllib.py beside the data", "settings of Matplotlib beside the data"),
+)
 STATM = Path("/proc/self/statm")
 SECONDS, MORE_BYTES = 60, 3 << 30
 """What a case may take in this process, before it counts as one that hangs or takes all memory."""

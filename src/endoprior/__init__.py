@@ -7,6 +7,8 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from .system.settings_files import ignore_settings_of_current_folder
+
 if TYPE_CHECKING:
     from .core.checks import InputError
     from .core.config import Config
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 # OpenCV reads at its import how many pixels it decodes at most (`data.reading.MOST_PIXELS`): what a header says twice,
 # its decoders and the readers of headers may understand differently. A value set by the user stays.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "64000000")
+ignore_settings_of_current_folder()
 
 HOMES = {
     "Config": "core.config",

@@ -1,1 +1,1 @@
-"""The methods that can be trained, a file each; `core.methods` names them."""
+"""The compared methods, a file each, found as plugins (docs/plugins.md)."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import time as clock
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Protocol
 
 from endoprior.system.console import say
+from endoprior.system.own_python import python_command
 from endoprior.system.ray_cluster import connected
 
 from .worker import Job
@@ -55,7 +55,7 @@ def run_job(job: Job, started: list[subprocess.Popen] | None = None) -> Outcome:
     environment.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     began = clock.perf_counter()
     with open(log, "wb") as output:
-        command = [sys.executable, "-m", "endoprior_studies.worker", str(job_file)]
+        command = python_command("endoprior_studies.worker", str(job_file))
         process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment)
         if started is not None:
             started.append(process)

@@ -19,6 +19,7 @@ from typing import Any
 from endoprior.core.checks import InputError
 from endoprior.data.files import read_json
 from endoprior.system.atomic import write_json, write_text
+from endoprior.system.console import complain
 
 DONE = "cell.json"
 """Written last: a folder that has it, with the same key, is finished."""
@@ -138,7 +139,7 @@ def main(argv: list[str]) -> int:
     try:
         work(job)
     except InputError as error:
-        print(f"endoprior: {' '.join(str(error).split())}", file=sys.stderr)
+        complain(f"endoprior: {' '.join(str(error).split())}")
         return 2
     except KeyboardInterrupt:
         return 130

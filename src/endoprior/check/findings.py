@@ -14,6 +14,7 @@ import numpy as np
 from ..core.checks import number_ranges
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
+from ..core.text import quotation
 from ..core.types import Camera
 from ..data.description import SIZE_NOT_STATED
 from ..footage.camera_motion import MOVING_FRACTION
@@ -328,7 +329,7 @@ def _video(facts: Facts) -> Iterator[Finding]:
     record = facts.remakes.record
     for note in record.video_notes if record else ():
         fix = "nothing if you expect this; else copy or export the video again"
-        yield Finding("video", "note", note, fix)
+        yield Finding("video", "note", quotation(note), fix)
 
 
 def _stereo(facts: Facts) -> Iterator[Finding]:

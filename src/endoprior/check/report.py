@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..core.geometry import length_unit
+from ..core.text import quotation
 from .facts import Facts
 from .findings import Finding
 
@@ -57,7 +58,7 @@ def table(facts: Facts) -> list[tuple[str, str]]:
     ]
     if facts.stereo:
         rows.insert(4, ("stereo", facts.stereo.reason))
-    rows += [(f"source of {name}", text) for name, text in facts.sources.items()]
+    rows += [(quotation(f"source of {name}"), quotation(text)) for name, text in facts.sources.items()]
     return rows
 
 

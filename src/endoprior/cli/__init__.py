@@ -13,10 +13,12 @@ from importlib import import_module
 
 from ..core.checks import InputError
 from ..system.atomic import DISK_ERRORS
+from ..system.console import complain, complete_streams, say
 from ..system.installation import docs_folder
 from ..system.memory import reject_small_limits
 from ..system.plugins import Registry
 from ..system.signals import all_interrupt
+from ..system.surroundings import reject_surroundings, set_library_variables
 from .usage_errors import unknown_command
 
 COMMANDS = {
@@ -60,19 +62,18 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
         The exit status.
     """
-    # Idle torch threads spin on the cores that Numba needs, which makes rendering three times slower (docs/log.md).
-    # Torch reads this variable at its first import. A value set by the user stays.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    set_library_variables()
+    complete_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # write characters that its encoding lacks as \xNN
         sys.stdout.reconfigure(errors="backslashreplace")
     argv = sys.argv[1:] if argv is None else argv
     if not argv or argv[0] in ("-h", "--help"):
-        print(overview())
+        say(overview())
         return 0
     if argv[0] == "--version":
         from importlib.metadata import version
 
-        print(version("endoprior"))
+        say(version("endoprior"))
         return 0
     name, rest = argv[0], argv[1:]
     try:
@@ -80,22 +81,20 @@ def main(argv: list[str] | None = None) -> int:
             words = REGISTRY.names()
             raise unknown_command(name, {word: word for word in words} | {MODULES[word]: word for word in MODULES})
         reject_small_limits()
+        reject_surroundings()
         with all_interrupt():
             return REGISTRY.load(name).run(rest) or 0
     except InputError as error:
-        print(f"endoprior: {' '.join(str(error).split())}", file=sys.stderr)
+        complain(f"endoprior: {' '.join(str(error).split())}")
         return 2
     except KeyboardInterrupt:
-        print("endoprior: interrupted", file=sys.stderr)
+        complain("endoprior: interrupted")
         return 130
-    except BrokenPipeError:  # the reader of the pipe, such as `head`, has exited
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except Exception as error:
         if (words := system_failure(error)) is None:
             raise
-        print(f"endoprior: {words}", file=sys.stderr)
+        complain(f"endoprior: {words}")
         return 2
-    return 0
 
 
 def system_failure(error: Exception) -> str | None:

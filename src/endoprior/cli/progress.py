@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time as clock
 
+from ..core.text import printable
 from ..runs.progress import PLAIN_EVERY_SECONDS
 from ..system.console import say
 
@@ -40,5 +41,6 @@ class Counting:
 
     def _replace_line(self, line: str) -> None:
         """Overwrite the line of a terminal, without escape codes: older consoles of Windows print them."""
+        line = printable(line)
         print(f"\r{line:<{self._width}}", end="\r", file=sys.stderr, flush=True)
         self._width = len(line)

@@ -112,7 +112,7 @@ def run(argv: list[str]) -> None:
         ("scene", job.run),
     ):
         say(f"  {what:<8}{path}")
-    for line in problems(job):
+    if line := problems(job):
         say(line)
     if line := missed_tools_line(job.run, job.data):
         say(line)

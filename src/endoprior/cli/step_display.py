@@ -7,6 +7,7 @@ import time as clock
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from ..core.text import printable
 from ..runs.progress import PLAIN_EVERY_SECONDS
 from ..system.console import say
 
@@ -35,7 +36,7 @@ class StepDisplay:
             shown_at = now
             line = f"{head}: {what}{f' {done}/{total}' if total else ''}{self._left(name, now - began)}"
             if self._terminal:
-                print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+                print(f"\r\x1b[K{printable(line)}", end="", file=sys.stderr, flush=True)
             else:
                 say(line)
 

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from .text import quotation
+
 
 class InputError(ValueError):
     """The user's data or options cannot be used. The command line prints it as one line and exits with status 2."""
@@ -18,9 +20,11 @@ def input_error(subject: Path | str, expected: str, got: str, fix: str) -> Input
 
     Args:
         subject: name of the file, folder or option.
+        got: what was found. It may come from a file, so that nothing in it looks like a second `Fix`.
         fix: the command to run, in backticks, or one sentence; with its final period. It starts with a capital letter.
     """
-    return InputError(f"{subject}: expected {expected}, got {got}. Fix: {fix[:1].upper()}{fix[1:]}")
+    found = f"{quotation(str(subject))}: expected {expected}, got {quotation(got)}"
+    return InputError(f"{found}. Fix: {fix[:1].upper()}{fix[1:]}")
 
 
 SIMILAR = 0.75

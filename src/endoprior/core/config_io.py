@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from .checks import InputError, input_error, similar_name
+from .text import printable
 
 C = TypeVar("C")
 _hints = functools.cache(typing.get_type_hints)
@@ -47,7 +48,7 @@ def current_value(field: str, value: Any, *, hint: bool = False) -> Any:
 @functools.cache
 def print_renamed(field: str, former: str, current: str) -> None:
     """Print on stderr what a value is called now; once per process for the same arguments."""
-    print(f"endoprior: {field}: `{former}` is now called `{current}`", file=sys.stderr)
+    print(printable(f"endoprior: {field}: `{former}` is now called `{current}`"), file=sys.stderr)
 
 
 def to_dict(cfg: Any) -> Any:
@@ -115,7 +116,8 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     try:
         return cls(**built)
     except ValueError as error:
-        raise InputError(f"{where}: {error}. Fix: Correct the value.") from error
+        fix = "" if isinstance(error, InputError) else ". Fix: Correct the value."
+        raise InputError(f"{where}: {error}{fix}") from error
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:

@@ -8,7 +8,6 @@ import os
 import platform
 import re
 import shutil
-import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..system.memory import available_bytes
+from ..system.own_python import python_command
 from .driver import driver_answers, driver_files
 from .probe_process import MARK, Answer, clean, run_program
 from .records import Builders, Driver, Facts, Gpu, Gsplat, System, Toolkit, Torch, Triton
@@ -258,8 +258,7 @@ def _variables() -> dict[str, str]:
 
 
 def _run(module: str, arguments: list[str], limit_s: float) -> Answer:
-    # -P: a file in the current folder must not be imported in place of a package.
-    return run_program([sys.executable, "-P", "-m", f"{__package__}.{module}", *arguments], limit_s)
+    return run_program(python_command(f"{__package__}.{module}", *arguments), limit_s)
 
 
 def _after(answer: Answer) -> dict[str, Any] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,9 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..check import Finding, draw_check, find, measure
+from ..check import draw_check, find, measure
 from ..check.report import as_json
 from ..core.config import Config
+from ..core.shell import command
+from ..core.text import quotation
 from ..data import FrameSequence, load_sequence
 from ..data.description import read_description
 from ..data.files import read_json
@@ -40,6 +43,8 @@ PLAYER_BYTES = 40_000_000
 LEAST_BYTES = 7
 """Size of one Gaussian at one time step in the player; at least this (docs/export.md)."""
 PREVIEW_TITLE = "Preview: small frames, short training. Not for scores."
+CODE = re.compile("[a-z]+(-[a-z]+)*")
+"""Names of findings."""
 SHOWN_SCORES = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis")
 
 
@@ -68,9 +73,9 @@ def run_step(step: Step, job: SequenceJob, progress: Progress) -> list[str] | No
 
 
 def notes_of(step: Step, job: SequenceJob) -> list[str]:
-    """What a step that was done before returned."""
+    """What a step that was done before returned, as a quotation: the file may come from somebody else."""
     lines = _stored_notes(job).get(step.name)
-    return [str(line) for line in lines] if isinstance(lines, list) else []
+    return [quotation(str(line)) for line in lines] if isinstance(lines, list) else []
 
 
 def _stored_notes(job: SequenceJob) -> dict[str, Any]:
@@ -91,13 +96,17 @@ def _check(job: SequenceJob, progress: Progress) -> list[str]:
     draw_check(sequence, facts, findings, job.figure)
     write_json(job.findings, as_json(facts, findings))
     shown = [finding for finding in findings if finding.severity != "note" or finding.code == "windows"]
-    return [f"{finding.severity}: {finding.what}" for finding in shown]
+    return [str(finding) for finding in shown]
 
 
-def problems(job: SequenceJob) -> list[str]:
-    """Errors and warnings of `check`, each with its fix, one line each."""
-    found = (Finding(**finding) for finding in read_json(job.findings)["findings"])
-    return [str(finding) for finding in found if finding.severity != "note"]
+def problems(job: SequenceJob) -> str:
+    """Which errors and warnings `check` found, and the command that prints their fixes; empty without any.
+
+    What the file says is not repeated: it may come from somebody else.
+    """
+    found = [finding for finding in read_json(job.findings)["findings"] if finding["severity"] != "note"]
+    codes = dict.fromkeys(code for finding in found if CODE.fullmatch(code := finding["code"]))
+    return f"Found by check: {', '.join(codes)}. How to fix it: `{command('check', job.data)}`" if codes else ""
 
 
 def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[str]]:

@@ -46,7 +46,7 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
         InputError: the file is missing or damaged, or belongs to another config or other data.
     """
     if not os.path.isfile(path):
-        raise InputError(f"{path}: expected a checkpoint to resume from; found none. Start without --resume.")
+        raise InputError(f"{path}: expected a checkpoint to resume from, got none. Fix: Start without --resume.")
     cfg, next_step = trainer.cfg, "Train again without --resume."
 
     def schema(about: dict[str, Any]) -> dict[str, ArraySpec]:

@@ -44,7 +44,7 @@ def prepare_run_folder(out: Path, *, resume: bool) -> bool:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{out}: expected a place for a folder; got {error.strerror}. Choose another.") from error
+        raise InputError(f"{out}: expected a place for a folder, got {error.strerror}. Fix: Choose another.") from error
     return not existed
 
 

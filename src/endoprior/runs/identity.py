@@ -29,7 +29,7 @@ def reject_other_run(
     """
     reject_other_config(file, config_of(stored_config, file), cfg)
     if stored_fingerprint != fingerprint:
-        raise InputError(f"{file}: was trained on other data than {data}. Pass the same sequence.")
+        raise InputError(f"{file}: was trained on other data than {data}. Fix: Pass the same sequence.")
 
 
 def reject_other_start(about: Path, cfg: Config, fingerprint: str, data: Path) -> None:

@@ -21,6 +21,7 @@ from ..core.config_io import to_dict
 from ..model.method import method_of
 from ..render import ON_GPU
 from ..system.file_lock import exclusive
+from ..system.own_python import python_command
 
 PACKAGE = Path(__file__).parents[1]
 LIMIT_S = 900.0
@@ -49,8 +50,8 @@ def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
             if marker.exists():
                 return
             say("compiling kernels, once after installation (about a minute)")
-            words = [sys.executable, "-m", "endoprior.runs.warm_up"]
             config = json.dumps(to_dict(cfg))
+            words = python_command("endoprior.runs.warm_up")
             done = subprocess.run(words, input=config.encode(), capture_output=True, timeout=LIMIT_S, check=False)
             if done.returncode == 0:
                 marker.touch()

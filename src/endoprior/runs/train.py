@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import fields
@@ -15,6 +14,7 @@ from ..data import FrameSequence, load_sequence
 from ..data.window_plan import look_through, plan_windows
 from ..model.method import method_of
 from ..model.scene import RenderedScene
+from ..system.console import complain
 from ..training.ignored_options import note_on_budget, reject_ignored_options
 from ..training.trainer import Observer
 from .observers import CHECKPOINT_SECONDS
@@ -60,14 +60,10 @@ def train(
         raise ValueError("train needs a sequence and a config; only with resume=True and out it takes those of the run")
     if progress is None:
         progress = is_watched()
-    run = start_run(sequence, cfg, out, resume=resume, say=_print_note if progress else log.info)
+    run = start_run(sequence, cfg, out, resume=resume, say=complain if progress else log.info)
     with training_progress() if progress else nullcontext() as show_progress:
         observers = [observer for observer in (show_progress, on_step) if observer is not None]
         return run.complete(*observers, checkpoint_seconds=checkpoint_seconds)
-
-
-def _print_note(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _check_reading(sequence: FrameSequence, cfg: Config) -> None:

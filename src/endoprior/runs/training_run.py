@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..data import FrameSequence
 from ..model.method import method_of
@@ -100,7 +100,7 @@ class TrainingRun:
         elif self.resume and about.is_file():  # stopped before its first checkpoint
             reject_other_start(about, trainer.cfg, fingerprint, trainer.sequence.path)
         elif self.resume:
-            raise InputError(f"{checkpoint}: expected a checkpoint to resume from; found none. Start without --resume.")
+            raise input_error(checkpoint, "a checkpoint to resume from", "none", "start without --resume.")
         remove_leftovers(out)  # not before the run was accepted and has the lock
         facts = run_facts(trainer.sequence, trainer.cfg, fingerprint)
         write_json(about, facts if self.tool_margin_px is None else facts | {MARGIN: self.tool_margin_px})

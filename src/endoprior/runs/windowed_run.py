@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from ..core.checks import InputError, read_ranges
+from ..core.checks import InputError, input_error, read_ranges
 from ..core.config import Config
 from ..data import FrameSequence
 from ..model.scene_file import load_scene
@@ -115,7 +115,7 @@ class WindowedRun:
         if self.resume and about.is_file():
             reject_other_start(about, self.cfg, fingerprint, self.sequence.path)
         elif self.resume:
-            raise InputError(f"{about}: expected a run to resume; found none. Start without --resume.")
+            raise input_error(about, "a run to resume", "none", "start without --resume.")
         remove_leftovers(out)
         write_json(about, run_facts(self.sequence, self.cfg, fingerprint) | {"windows": self.plan})
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.checks import InputError, input_error
+from ..core.text import printable
 from .leftovers import temporary_sibling
 from .paths import lies_in
 
@@ -220,9 +221,9 @@ def reject_occupied(path: Path, alternative: str = "", *, ignore: Callable[[Path
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` in UTF-8, atomically; the same bytes on every system."""
+    """Write `text` in UTF-8, atomically; the same bytes on every system, and none that a terminal obeys."""
     with whole_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.write_text(printable(text), encoding="utf-8", newline="\n")
 
 
 def write_json(path: Path, value: Any) -> None:

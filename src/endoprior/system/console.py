@@ -1,8 +1,42 @@
-"""Printing lines for the user."""
+"""Printing lines for the user. All text that the program prints goes through here, and is made printable."""
 
 from __future__ import annotations
 
+import os
+import sys
+from contextlib import suppress
+
+from ..core.checks import input_error
+from ..core.text import printable
+
 
 def say(text: str) -> None:
-    """Print one line and flush it."""
-    print(text, flush=True)
+    """Print one line on stdout and flush it. If its reader has gone, `head` for instance, the work still goes on.
+
+    Raises:
+        InputError: stdout is a file on a disk that is full or broken.
+    """
+    try:
+        print(printable(text), flush=True)
+    except BrokenPipeError:  # what was not read, and all later lines, go nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        got = error.strerror or str(error)
+        raise input_error("standard output", "a file that takes text", got, "free space, then repeat.") from error
+
+
+def complain(text: str, end: str = "\n") -> None:
+    """Print text on stderr; where there is no reader, it is lost."""
+    with suppress(OSError):
+        print(printable(text), end=end, file=sys.stderr, flush=True)
+
+
+def complete_streams() -> None:
+    """Give a process that was started without stdin, stdout or stderr (`2>&-`, a service) ones that lead nowhere.
+
+    Without them the next file that is opened would get their number, and the messages of libraries in C.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # in this order: the lowest number is free
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))

@@ -6,7 +6,6 @@ asks for it by name ends with an error.
 
 from __future__ import annotations
 
-import sys
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -16,6 +15,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
 from ..core.checks import InputError, input_error
+from .console import complain
 
 T = TypeVar("T")
 OWN_PACKAGE = "endoprior"
@@ -70,7 +70,7 @@ def installed(kind: str) -> tuple[Plugin, ...]:
 @cache
 def report(error: str) -> None:
     """Print why a plugin cannot be used on stderr, once per process."""
-    print(f"endoprior: {error}", file=sys.stderr)
+    complain(f"endoprior: {error}")
 
 
 class Registry(Generic[T]):

@@ -6,7 +6,9 @@ import importlib
 import logging
 import os
 import re
+import secrets
 import socket
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -144,6 +146,9 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
     Raises:
         InputError: Ray is not installed, or the cluster cannot be reached.
     """
+    if address == "local" and "ray" not in sys.modules and "RAY_AUTH_MODE" not in os.environ:
+        # It listens on all addresses of this machine, and runs what it is sent by whoever has the token.
+        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     try:
         ray: Any = importlib.import_module("ray")
     except ImportError:
@@ -151,6 +156,9 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
     fix = "start it, correct --ray, or use `--ray local`; if it asks for a token, set RAY_AUTH_MODE=token."
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to others
     wait_policy = {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
+    # Ray puts the current folder first where its processes look for modules, except for jobs of its own client.
+    job = ray.job_config.JobConfig()
+    job._client_job = True
     try:
         _reject_silent(address)
         ray.init(
@@ -158,6 +166,7 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
             log_to_driver=False,
             include_dashboard=False,
             logging_level=logging.ERROR,
+            job_config=job,
             runtime_env={"env_vars": wait_policy},
         )
     except (ConnectionError, OSError, ValueError, RuntimeError, SystemExit) as error:

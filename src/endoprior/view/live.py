@@ -9,6 +9,7 @@ from __future__ import annotations
 import time as clock
 from typing import TYPE_CHECKING
 
+from ..system.console import say
 from .server import Viewer
 from .viewable_scene import ViewableScene
 
@@ -39,7 +40,7 @@ class LiveView:
         """After an iteration: handle user input, and from time to time show the new state."""
         if self.viewer is None:
             self.viewer = Viewer(self._subject(report, trainer), host=self.host, port=self.port)
-            print(f"view: {self.viewer.url}", flush=True)
+            say(f"view: {self.viewer.url}")
         began = clock.monotonic()
         if began >= self._due and self.viewer.watched:
             self.viewer.show(self._subject(report, trainer))

@@ -23,6 +23,7 @@ import viser
 
 from ..core.checks import InputError
 from ..data.images import encode_png
+from ..system.console import complain
 from . import panel, saving
 from .access_control import RateLimit, access_control, check_address
 from .browsers import Browsers, camera_pose, picture_with_lines
@@ -167,7 +168,7 @@ class Viewer:
         try:
             job()
         except InputError as error:
-            print(f"view: {error}", file=sys.stderr)
+            complain(f"view: {error}")
             self._browsers.notify("That did not work", str(error))
         except Exception as error:
             traceback.print_exc(file=sys.stderr)

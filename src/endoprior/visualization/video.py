@@ -1,14 +1,15 @@
-"""Write videos with imageio's bundled ffmpeg."""
+"""Write videos."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from fractions import Fraction
 from itertools import chain, islice
 from pathlib import Path
 
 import av
-import imageio.v2 as imageio
 import numpy as np
+from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
 from ..data.video_files import open_container
@@ -16,6 +17,10 @@ from ..system.atomic import whole_file
 
 HD_ROWS = 720
 """From so many rows on, players take a video for BT.709 where it does not say its colors, below for BT.601."""
+BT709, SMPTE170M = 1, 6
+"""Numbers of ISO 23091-2 for colors; the second has the matrix of BT.601."""
+CONSTANT_RATE_FACTOR = "10"
+"""Quality of x264: 0 is lossless, 51 the worst; from about 18 down no difference is seen."""
 
 
 def write_video(path: Path, images: Iterable[NDArray[np.uint8]], frames_per_second: float) -> None:
@@ -23,22 +28,39 @@ def write_video(path: Path, images: Iterable[NDArray[np.uint8]], frames_per_seco
 
     Args:
         images: (H, W, 3) 8-bit RGB, one size; an odd last row or column is cropped, because the codec needs even sizes.
+    Raises:
+        CannotWrite: the disk rejects the file.
+        ValueError: there are no images.
     """
+    images = iter(images)
+    if not (first := list(islice(images, 1))):
+        raise ValueError("a video needs at least one image")
+    height, width = first[0].shape[0] // 2 * 2, first[0].shape[1] // 2 * 2
+    is_hd = len(first[0]) >= HD_ROWS
+    matrix, tag = (Colorspace.ITU709, BT709) if is_hd else (Colorspace.ITU601, SMPTE170M)
+    count = 0
     with whole_file(path) as temporary:
-        images = iter(images)
-        first = list(islice(images, 1))
-        matrix, tag = ("bt709", "bt709") if first and len(first[0]) >= HD_ROWS else ("bt601", "smpte170m")
-        tags = f"setparams=range=tv:colorspace={tag}:color_primaries={tag}:color_trc={tag}"
-        colors = ["-vf", f"scale=out_color_matrix={matrix}:out_range=tv,{tags}"]
-        options = {"fps": frames_per_second, "codec": "libx264", "quality": 8, "macro_block_size": 1}
-        options["output_params"] = [*colors, "-movflags", "+faststart"]
-        count = 0
-        with imageio.get_writer(str(temporary), format="FFMPEG", ffmpeg_log_level="quiet", **options) as writer:
+        # Without `file:`, what stands before a colon in a name would be taken for a protocol.
+        with av.open(f"file:{temporary}", "w", options={"movflags": "+faststart"}) as container:
+            rate = Fraction(frames_per_second).limit_denominator(1001)
+            stream = container.add_stream("libx264", rate=rate, options={"crf": CONSTANT_RATE_FACTOR})
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            context = stream.codec_context
+            context.colorspace = context.color_primaries = context.color_trc = tag
+            context.color_range = ColorRange.MPEG
             for image in chain(first, images):
-                height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-                writer.append_data(np.ascontiguousarray(image[:height, :width]))
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), format="rgb24")
+                stored = frame.reformat(
+                    format="yuv420p",
+                    src_color_range=ColorRange.JPEG,
+                    dst_color_range=ColorRange.MPEG,
+                    dst_colorspace=matrix,
+                )
+                stored.pts, stored.time_base = count, 1 / rate
+                container.mux(stream.encode(stored))
                 count += 1
-        if num_frames(temporary) != count:  # imageio does not check the exit status of the encoder
+            container.mux(stream.encode())
+        if num_frames(temporary) != count:  # an error while the file is closed is not reported
             raise BrokenPipeError(f"{path}: the encoder stopped before the end")
 
 

@@ -17,6 +17,7 @@ from torch.nn import functional
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from endoprior.system.atomic import whole_file
+from endoprior.system.own_python import without_current_folder
 from endoprior.tool_masks.network import MULTIPLE, ToolNetwork, network_input
 
 from .composites import IGNORED, LabeledFrame, examples
@@ -99,7 +100,9 @@ def fit(
         multiprocessing_context="spawn" if workers else None,  # a fork would hang on threads of OpenCV
     )
     losses: list[float] = []
-    for batch in loader:
+    with without_current_folder():
+        batches = iter(loader)  # starts the workers
+    for batch in batches:
         image, label = (part.flatten(0, 1) for part in batch)
         losses.append(_step(state, image, label, rate_of(state.step, steps)))
         if state.step % REPORTED == 0 or state.step == steps:
