@@ -17,7 +17,7 @@ FLOORS = [
     {"system", "render", "priors", "footage"},
     {"data", "model"},
     {"initialization", "evaluation", "visualization", "phantom", "tool_masks", "radiance"},
-    {"training", "doctor", "prepare", "check", "export", "view", "tool_training"},
+    {"training", "prepare", "check", "export", "view", "tool_training"},
     {"methods"},
     {"runs"},
     {"experiments", "pipeline"},

@@ -16,10 +16,9 @@ from ..core.methods import method_named
 from ..core.options import command_of
 from ..core.presets import PresetName, preset
 from ..core.shell import command
-from ..doctor.choice import Wanted
 from ..prepare.config import PrepareConfig
 from ..system.console import say
-from .devices import with_device
+from .devices import Wanted, with_device
 from .help_page import Help
 from .parsing import parse
 from .step_display import StepDisplay, duration

@@ -11,7 +11,7 @@ from ..core.checks import input_error
 from ..core.config import Config
 from ..core.presets import PresetName, preset
 from ..core.shell import command
-from ..doctor.choice import Wanted
+from .devices import Wanted
 
 
 def start_config(argv: Sequence[str]) -> tuple[PresetName, Config]:

@@ -16,10 +16,9 @@ from ..core.config_io import SHORT_NAMES
 from ..core.methods import method_named
 from ..core.presets import PresetName
 from ..core.shell import command
-from ..doctor.choice import Wanted
 from ..runs.progress import training_progress
 from ..system.console import say
-from .devices import with_device
+from .devices import Wanted, with_device
 from .help_page import Help
 from .parsing import parse
 from .start_config import device_to_resume, resume_command, run_to_resume, start_config
