@@ -83,7 +83,7 @@ def try_backend(backend: Backend, *, compiles: bool = False) -> Trial:
         printed = output.read().decode("utf-8", "replace").strip()
     found = (printed.splitlines() or ["no answer"])[-1]
     if status is None or status < 0:
-        found = f"no answer in {limit_s:g} s" if status is None else f"ended by {signal.Signals(-status).name}"
+        found = f"no answer in {limit_s:g} s" if status is None else f"ended by signal {-status}"
     return Trial(status == 0, found, printed)
 
 
