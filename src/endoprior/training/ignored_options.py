@@ -19,7 +19,7 @@ def reject_ignored_options(cfg: Config) -> None:
     method = method_of(cfg)
     only: dict[str, Any] = {}
     if isinstance(method, RadianceMethod):
-        only = {"data.eyes": "left", "poses.refine": "never"}
+        only = {"data.eyes": "left"}
     elif method.has_gaussians and not method.uses_prior:
         only = {"temporal.weight": 0.0}  # the term weighs Gaussians by the prior
     for name, value in only.items():
