@@ -20,7 +20,9 @@ from pathlib import Path
 
 from safetensors.numpy import load_file
 
-PRESETS = ("default", "paper", "released", "endogaussian")
+PRESETS = (
+    "default", "best", "paper", "released", "endogaussian", "deform3dgs", "endogs", "endo4dgs", "surgicalgaussian",
+)  # fmt: skip
 PHANTOM = ("--frames", "18", "--width", "160", "--height", "128", "--seed", "3")
 SHORT = (
     "--schedule.coarse-iterations", "40", "--schedule.fine-iterations", "260", "--init.budget", "2500",

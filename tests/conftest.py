@@ -21,8 +21,8 @@ TINY_FRAMES, TINY_WIDTH, TINY_HEIGHT = 17, 48, 40
 TINY_FOCAL = 50.0
 TINY_DEPTH_SCALE = 0.01
 LINUX_ONLY = (
-    "test_bad_drives.py", "test_bad_inputs.py", "test_doctor_probes.py", "test_doctor_toolchain.py",
-    "test_doctor_triton.py", "test_faults.py", "test_hostile_viewer.py", "test_leftovers.py", "test_memory.py",
+    "test_bad_drives.py", "test_bad_inputs.py", "test_devices.py", "test_faults.py", "test_hostile_viewer.py",
+    "test_leftovers.py", "test_memory.py",
 )  # fmt: skip
 """Files that need limits of processes, /proc, signals or shell scripts."""
 collect_ignore = [] if sys.platform == "linux" else [*LINUX_ONLY]

@@ -7,7 +7,6 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from doctor_machines import NO_GPU
 
 from endoprior.cli import descriptions, main
 from endoprior.cli.view import open_viewable
@@ -67,7 +66,7 @@ def test_every_command_explains_itself(command, capsys):
             "--density.min-densify-weight: min_densify_weight must be in",
         ),
         (["train", "nowhere", "out", "--device", "cuda"], "--device"),
-        (["train", "nowhere", "out", "--render.backend", "triton"], "--device cuda"),
+        (["train", "nowhere", "out", "--render.backend", "triton"], "a GPU that torch can use, got none here"),
         (["train", "nowhere", "out", "--render.backend", "gsplat", "--device", "cpu"], "--render.backend gsplat"),
         (["eval", "nowhere", "--device", "gpu"], "gpu"),
         (["train", "nowhere", "out", "--weights-dir", "no-weights"], "no-weights"),
@@ -80,7 +79,7 @@ def test_every_command_explains_itself(command, capsys):
 )
 def test_bad_usage_is_one_line_and_status_2(arguments, says, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("endoprior.doctor.choice.read_facts", lambda: NO_GPU)
+    monkeypatch.setattr("endoprior.cli.devices.why_no_gpu", lambda: "none here")
     assert main(arguments) == 2
     assert says in complaint(capsys)
     assert list(tmp_path.iterdir()) == [], "something was left behind"

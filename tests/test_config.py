@@ -11,14 +11,13 @@ from endoprior.cli.parsing import parse
 from endoprior.cli.train import HELP, Train
 from endoprior.core import config_io
 from endoprior.core.checks import InputError
-from endoprior.core.config import Config, DensityConfig, RenderConfig
+from endoprior.core.config import Config, DensityConfig
 from endoprior.core.config_deformation import BasisConfig, HexPlaneConfig
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.model.attributes import motion_shape
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import SceneFacts
 from endoprior.runs.identity import reject_other_run
-from endoprior_studies.spec import MethodSpec, SequenceSpec, Spec
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
 PRESETS = ("default", "best", "paper", "released", "endogaussian")
@@ -139,28 +138,26 @@ def test_wrong_replacements_are_named(changes, says):
         preset("default").replace(changes)
 
 
-@pytest.mark.parametrize(("former", "current"), [("cpu", "numba"), ("cuda", "gsplat"), ("triton", "triton")])
-def test_files_with_former_names_of_backends_are_read(former, current, capsys):
-    stored, now = {"render": {"backend": former}}, Config(render=RenderConfig(current))
+def test_fields_that_earlier_versions_wrote_are_ignored_and_named_once(capsys):
+    config_io.print_ignored.cache_clear()
+    now = Config(seed=3)
+    stored = to_dict(now)
+    stored["poses"], stored["loss"]["fit_relative_depth"] = {"refine": "always"}, True
     assert from_dict(Config, stored) == now
     about = {"config": stored, "width": 9, "height": 9, "frames_per_second": 25.0}
     assert from_dict(SceneFacts, about, "about").config == now
-    config = to_dict(now)
-    reject_other_run(Path("f"), config | {"render": config["render"] | stored["render"]}, "data", now, "data", Path())
-    assert not capsys.readouterr().err
+    reject_other_run(Path("f"), stored, "data", now, "data", Path())
+    told = "endoprior: stored config: ignored poses, loss.fit_relative_depth, which this version does not have\n"
+    assert capsys.readouterr().err == told
 
 
-@pytest.mark.parametrize("words", [["--render.backend", "cpu"], ["--render.backend=cpu"]])
-def test_a_former_name_that_is_typed_gets_a_hint(words, capsys):
-    config_io.print_renamed.cache_clear()
-    assert parse(Train, [*words, "data", "out"], "train").config.render.backend == "numba"
-    assert capsys.readouterr().err == "endoprior: render.backend: `cpu` is now called `numba`\n"
-    assert parse(Train, ["--device", "cpu", "cpu", "cpu"], "train").data == Path("cpu")
-    assert not capsys.readouterr().err
+@pytest.mark.parametrize("name", ["poses.refine", "loss.fit_relative_depth"])
+def test_a_former_field_cannot_be_set(name):
+    with pytest.raises(InputError, match=f"got {name}"):
+        Config().replace({name: True})
 
 
-def test_a_former_name_in_a_benchmark_gets_a_hint(capsys):
-    config_io.print_renamed.cache_clear()
-    spec = Spec("t", {"s": SequenceSpec("f")}, {"m": MethodSpec(set={"render.backend": "cuda"})})
-    assert [spec.config("m", "s", None, seed).render.backend for seed in (0, 1)] == ["gsplat", "gsplat"]
-    assert capsys.readouterr().err == "endoprior: render.backend: `cuda` is now called `gsplat`\n"
+@pytest.mark.parametrize("stored", [{"pose": {}}, {"loss": {"fit_depth": True}}, {"FORMER_FIELDS": []}])
+def test_other_unknown_fields_of_a_stored_config_are_errors(stored):
+    with pytest.raises(InputError, match="no such field"):
+        from_dict(Config, stored)

@@ -5,9 +5,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from doctor_machines import NO_GPU
 
-from endoprior.cli import main
 from endoprior.core.extras import install_command, missing_package
 from endoprior.system import installation
 
@@ -56,12 +54,6 @@ def test_pages_that_the_program_names_exist():
     for path in sorted((ROOT / "src").rglob("*.py")):
         for page in re.findall(r"docs/(\w+\.md)", path.read_text()):
             assert (folder / page).is_file(), f"{path}: docs/{page}"
-
-
-def test_help_and_doctor_say_where_the_pages_are(capsys, monkeypatch):
-    monkeypatch.setattr("endoprior.doctor.read_facts", lambda: NO_GPU)
-    assert main(["--help"]) == 0 and main(["doctor"]) == 0
-    assert capsys.readouterr().out.count(str(ROOT / "docs")) == 2
 
 
 def test_the_stamp_of_a_built_package_comes_before_git(tmp_path, monkeypatch):

@@ -1,16 +1,15 @@
-"""Exact nearest neighbors: by hand, against all distances, invariances, threads, poison. The lanes."""
+"""Exact nearest neighbors: by hand, against all distances, invariances, threads, poison."""
 
 import numba
 import numpy as np
 import pytest
-from numba import njit
 
-from endoprior.compute import float64_lanes as f8
-from endoprior.compute.neighbors import MAX_COORDINATE, curve_order
+from endoprior.compute.morton import curve_order
+from endoprior.compute.neighbors import MAX_COORDINATE
 from endoprior.training.temporal_numba import neighbors
 
 NUM = 700
-"""Points of a cloud: more than 64 blocks of eight, so there are three levels of groups, and the last block is short."""
+"""Points of a cloud."""
 
 
 def surface(rng, num=NUM):
@@ -152,30 +151,3 @@ def test_too_few_points_are_an_error(num, k):
 def test_points_in_the_plane_are_an_error():
     with pytest.raises(ValueError, match="points must have shape"):
         neighbors(np.zeros((20, 2)), 3)
-
-
-@njit
-def _run(a, b, out):
-    x, y = f8.load(a, 3), f8.load(b, 0)
-    results = (x + y, x - y, x * y, f8.larger(x, y), f8.pick(f8.less(x, y), x, y), f8.splat(2.5))
-    for i in range(len(results)):
-        f8.store(out, i * f8.LANES, results[i])
-    return f8.less(x, y), f8.equal(x, y), f8.largest(y)
-
-
-def test_lanes_are_numpys():
-    rng = np.random.default_rng(6)
-    padded, b = rng.normal(size=f8.LANES + 3), rng.normal(size=f8.LANES)  # loads from offset 3: not aligned
-    a = padded[3:]
-    a[2] = b[2]
-    out = np.empty(6 * f8.LANES)
-    less, equal, largest = _run(padded, b, out)
-    want = [a + b, a - b, a * b, np.maximum(a, b), np.where(a < b, a, b), np.full(f8.LANES, 2.5)]
-    assert np.array_equal(out.reshape(6, -1), want)
-    assert less == (a < b) @ 2 ** np.arange(f8.LANES) and equal == 4 and largest == b.max()
-
-
-def test_nothing_is_less_than_or_equal_to_nan():
-    number, nan = np.zeros(f8.LANES + 3), np.full(f8.LANES + 3, np.nan)
-    for a, b in ((number, nan), (nan, number), (nan, nan)):
-        assert _run(a, b[3:], np.empty(6 * f8.LANES))[:2] == (0, 0)

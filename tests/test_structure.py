@@ -20,7 +20,7 @@ FLOORS = [
     {"system", "render", "priors", "footage"},
     {"data", "model"},
     {"initialization", "evaluation", "visualization", "phantom", "tool_masks"},
-    {"training", "doctor", "prepare", "check", "export", "view"},
+    {"training", "prepare", "check", "export", "view"},
     {"runs"},
     {"pipeline"},
     {"cli"},

@@ -15,7 +15,6 @@ from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config, DataConfig
-from endoprior.core.config_poses import PoseConfig
 from endoprior.core.config_windows import WindowConfig
 from endoprior.core.types import Camera, Splats
 from endoprior.data import load_sequence
@@ -31,7 +30,6 @@ from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.model.support import Support
 from endoprior.model.windowed_scene import Span, WindowedScene, save_index, window_file
-from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.runs.train import start_run, train
 from endoprior.view.view_settings import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
@@ -377,15 +375,3 @@ def test_the_viewer_shows_every_layer_of_windows(three, layer):
     settings = ViewSettings(frame=37, layer="displacement", since=2)
     assert "14.8 mm" in viewable.legend(settings), "37 frames of 0.4 mm, to the last one"
     assert len(viewable.follow(np.array([[0.0, 0, 80]]), [16]).positions) == 40
-
-
-def test_refined_cameras_of_the_windows_are_those_of_the_scene(tmp_path):
-    """Each frame has the camera of the window that shows it most."""
-    write_phantom(tmp_path / "data", PhantomConfig(frames=20, width=96, height=80, camera="inspect", side_views=False))
-    cfg = in_windows(tiny_config("basis"))
-    cfg = replace(cfg, poses=PoseConfig(refine="always", start_iteration=1, check_every=14, worse=1.0))
-    scene = train(load_sequence(tmp_path / "data"), cfg)
-    for frame, camera in enumerate(scene.cameras):
-        main = max(scene.shown_at(frame / 20), key=lambda shown: shown.weight)
-        own = main.window.scene.cameras[frame - main.window.start]
-        assert np.array_equal(camera.world_to_camera, own.world_to_camera), frame

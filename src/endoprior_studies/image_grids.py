@@ -50,7 +50,7 @@ def scenes_of(matrix: Matrix, sequence: str) -> dict[str, Scene]:
 
 
 def _camera(scene: Scene, frame: Frame) -> Camera:
-    """The camera of a frame, where the scene has it: its poses may have been estimated or refined."""
+    """The camera of a frame, where the scene has it: its poses may have been estimated."""
     return replace(frame.camera, world_to_camera=scene.cameras[frame.index].world_to_camera)
 
 

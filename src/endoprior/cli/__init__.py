@@ -35,7 +35,7 @@ COMMANDS = {
     "render": "render a trained scene: color, depth, side-by-side, video",
     "export": "write open formats: PLY, splat, SPZ, glTF, mesh, points, tracks, depth, video",
     "view": "show a trained scene, or a sequence before training, in a web browser",
-    "doctor": "report whether this computer can train and use a GPU, and what to install for it",
+    "doctor": "report versions, and try the backends that could render on this computer",
     "batch": "do `run` for many videos and sequence folders, here or on a Ray cluster",
     "plugins": "list what other packages add, and what is built in: datasets, methods, scores, ...",
 }

@@ -1,18 +1,131 @@
-"""Choose the device that trains or renders."""
+"""Choose the device that trains or renders, by trying what is there."""
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Literal
 
 from ..core.checks import input_error
-from ..core.config import Config
-from ..doctor.choice import Wanted, choose_here
+from ..core.config import Backend, Config
 from ..system.console import say
+from ..system.own_python import python_command
 
 if TYPE_CHECKING:
     from ..model.scene import RenderedScene
+
+Wanted = Literal["auto", "cpu", "cuda"]
+"""What `--device` takes."""
+DEVICE_FILES = ("/dev/nvidia0", "/dev/nvidiactl", "/dev/nvhost-gpu", "/dev/dxg")
+"""How programs on Linux reach a GPU: also in containers that have some of the GPUs, on a Jetson, in WSL."""
+TRIAL_LIMIT_S = 120.0
+"""Longest wait for a backend: importing torch, starting the GPU and compiling Triton's or Numba's kernels, once."""
+COMPILE_LIMIT_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of rendering with a backend."""
+
+    works: bool
+    found: str
+    """One line: the device and how well it agrees with `reference`, or what failed in its own words."""
+    printed: str = ""
+    """All that it printed."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A device, the backend that renders on it, and why it was chosen."""
+
+    device: Literal["cpu", "cuda"]
+    backend: Backend
+    why: str
+    """One line for the user: "CPU: torch 2.13.0+cpu, built without CUDA"."""
+
+
+def why_no_gpu() -> str:
+    """Why no backend can run on a GPU here; "" if one may. In milliseconds where there is no GPU."""
+    if sys.platform == "darwin" or (sys.platform == "linux" and not any(map(os.path.exists, DEVICE_FILES))):
+        return "no NVIDIA GPU found"
+    import torch
+
+    return "" if torch.version.cuda else f"torch {torch.__version__}, built without CUDA"
+
+
+@cache
+def try_backend(backend: Backend, *, compiles: bool = False) -> Trial:
+    """Render with a backend in a process of its own: it may crash, hang or print anything.
+
+    Args:
+        compiles: let gsplat compile itself first, which takes minutes.
+    """
+    limit_s = COMPILE_LIMIT_S if compiles else TRIAL_LIMIT_S
+    words = python_command("endoprior.render.trial", backend, *["compile"] * compiles)
+    with tempfile.TemporaryFile() as output:  # no pipe: what the process starts could keep one open
+        process = subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+        )
+        try:
+            status = process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            status = None
+        finally:  # also after Ctrl-C
+            _end(process)
+        output.seek(0)
+        printed = output.read().decode("utf-8", "replace").strip()
+    found = (printed.splitlines() or ["no answer"])[-1]
+    if status is None or status < 0:
+        found = f"no answer in {limit_s:g} s" if status is None else f"ended by signal {-status}"
+    return Trial(status == 0, found, printed)
+
+
+def _end(process: subprocess.Popen) -> None:
+    """End the process and, where that is possible, all that it started; a driver that hangs may keep it."""
+    try:
+        if os.name == "posix":
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+    except OSError:  # all gone
+        pass
+    try:
+        process.wait(1.0)
+    except subprocess.TimeoutExpired:
+        pass
+
+
+@cache
+def choose(wanted: Wanted) -> Choice:
+    """The device and the backend: gsplat where it works and is compiled, else Triton where that works, else the CPU.
+
+    Raises:
+        InputError: "cuda" is wanted and no backend works on it.
+    """
+    if wanted == "cpu":
+        return Choice("cpu", "numba", "CPU: as requested")
+    if not (problem := why_no_gpu()):
+        from ..render import ON_GPU
+
+        failed = []
+        for backend in ON_GPU:
+            trial = try_backend(backend) if find_spec(backend) else Trial(False, "not installed")
+            if trial.works:
+                return Choice("cuda", backend, f"CUDA: {trial.found.partition(';')[0]}")
+            failed.append(f"{backend}: {trial.found}")
+        problem = "; ".join(failed)
+    if wanted == "cuda":
+        raise input_error(
+            "--device cuda", "a GPU that renders", problem, "`endoprior doctor` and docs/gpu.md tell more."
+        )
+    return Choice("cpu", "numba", f"CPU: {problem}")
 
 
 def on_device(scene: RenderedScene, wanted: Wanted, *, fp16_planes: bool = False) -> RenderedScene:
@@ -23,7 +136,7 @@ def on_device(scene: RenderedScene, wanted: Wanted, *, fp16_planes: bool = False
     Raises:
         InputError: CUDA was requested and is not usable.
     """
-    choice = choose_here(wanted)
+    choice = choose(wanted)
     if wanted != "cpu":
         say(choice.why)
     on_gpu = choice.device != "cpu"
@@ -41,11 +154,14 @@ def with_device(cfg: Config, wanted: Wanted, tell: Callable[[str], None] = say) 
     from ..render import ON_GPU
 
     named = cfg.render.backend if cfg.render.backend in ON_GPU else None
-    if named and wanted == "cpu":
-        fix = f"Remove --device cpu or --render.backend {named}."
-        raise input_error(f"--render.backend {named}", "--device cuda or auto", "cpu", fix)
-    choice = choose_here("cuda" if named else wanted)
-    tell(choice.why)
-    if choice.device == "cpu" or named:
+    if named:
+        option = f"--render.backend {named}"
+        if wanted == "cpu":
+            raise input_error(option, "--device cuda or auto", "cpu", f"Remove --device cpu or {option}.")
+        if problem := why_no_gpu():
+            raise input_error(option, "a GPU that torch can use", problem, "leave it out for the CPU.")
+        tell(f"CUDA: {named}, as requested")  # which may compile itself first
         return cfg
-    return replace(cfg, render=replace(cfg.render, backend=choice.backend))
+    choice = choose(wanted)
+    tell(choice.why)
+    return cfg if choice.device == "cpu" else replace(cfg, render=replace(cfg.render, backend=choice.backend))

@@ -2,73 +2,102 @@
 
 from __future__ import annotations
 
-import json as json_text
+import os
+import platform
 from dataclasses import dataclass
-from importlib.metadata import version
-from typing import TYPE_CHECKING
+from importlib.metadata import PackageNotFoundError, version
 
+from ..core.extras import install_command, packages_of
 from ..system.console import say
-from ..system.installation import docs_folder, source_commit
+from ..system.installation import docs_folder, page, source_commit
+from ..system.memory import available_bytes
+from .devices import choose, try_backend, why_no_gpu
 from .help_page import Help
 from .parsing import parse
 
-if TYPE_CHECKING:
-    from ..doctor import Facts
+NEEDED = ("torch", "numba", "numpy")
+OPTIONAL = {
+    "exr": "depth in OpenEXR files",
+    "mono": "depth by a network",
+    "networks": "network scores",
+    "poses": "camera path by COLMAP",
+    "ray": "trainings on a cluster",
+    "tools": "tool masks by SAM 2",
+}
+"""Optional part of the installation -> what it is for."""
 
 
 @dataclass
 class Doctor:
-    """Report whether this computer can train, whether its GPU can be used, and what to install for it."""
+    """Report versions and optional parts, and render a small scene with each backend that could work here."""
 
     compile: bool = False
     """Compile gsplat now, which takes minutes, and render with it. Without a GPU, as in a container build, it compiles
     for the architectures in TORCH_CUDA_ARCH_LIST. Exit status 1 if that fails."""
-    json: bool = False
-    """Print JSON instead of a table."""
 
 
-HELP = Help(examples=((), ("--json",)))
+HELP = Help(examples=((), ("--compile",)))
 
 
 def run(argv: list[str]) -> int:
-    """Print the report. Exit status 0 even if something is missing; 1 if --compile fails."""
+    """Print the report. Exit status 1 if the CPU cannot render or --compile fails, whatever else is missing."""
     args = parse(Doctor, argv, "doctor", HELP)
-    from ..doctor import examine, read_facts
-    from ..doctor.choice import choose
-    from ..doctor.report import as_json, table
-
-    facts, compiling = read_facts(), ""
-    if args.compile:
-        facts, compiling = _compile(facts, quiet=args.json)
-    report = examine(facts)
-    choice = choose("auto", facts)
-    status = 1 if args.compile and not facts.gsplat.loads else 0
-    if args.json:
-        found = as_json(facts, report, choice.device, choice.backend, choice.why, compiling)
-        say(json_text.dumps(found, indent=1))
-        return status
     say(f"endoprior {version('endoprior')}, commit {source_commit() or 'unknown'}; documentation: {docs_folder()}\n")
-    for row in table(report):
-        say(row)
+    for name, found in (*machine().items(), *optional_parts().items()):
+        say(f"{name:<10}{found}")
     say("")
-    if compiling:
-        say(compiling)
-    say(f"--device auto: {choice.why}")
-    say(f"next: {report.next_step}")
-    return status
-
-
-def _compile(facts: Facts, quiet: bool) -> tuple[Facts, str]:
-    """Compile gsplat if its requirements are met; return the new facts and a line about the result."""
-    from ..doctor import examine
-    from ..doctor.facts import compile_gsplat
-
-    if problem := examine(facts).compile_problem:
-        return facts, f"gsplat was not compiled: {problem}"
-    if not quiet:
+    works = {"numba": _tell("numba")}
+    if args.compile:
         say("compiling gsplat; this takes minutes")
-    facts = compile_gsplat(facts)
-    if not facts.gsplat.loads:
-        return facts, f"gsplat did not compile: {facts.gsplat.error}"
-    where = "" if facts.torch.available else "; no GPU to render with"
-    return facts, f"gsplat is compiled, ready in {facts.gsplat.compile_seconds or 0:.0f} s{where}"
+        works["gsplat"] = _tell("gsplat", compiles=True)
+    if problem := why_no_gpu():
+        say(f"GPU       {problem}; everything runs on the CPU")
+    else:
+        for backend in ("triton", "gsplat"):
+            if backend not in works:
+                _tell(backend)
+    say(f"\n--device auto: {choose('auto').why}")
+    if not works["numba"]:
+        say(f"This computer cannot train yet: {page('install.md')}")
+    elif not works.get("gsplat", True) or choose("auto").device == "cpu":
+        say(f"What a GPU needs: {page('gpu.md')}")
+    return 0 if all(works.values()) else 1
+
+
+def machine() -> dict[str, str]:
+    """The computer and what every installation needs."""
+    free = available_bytes()
+    memory = "unknown memory" if free is None else f"{free / 1e9:.1f} GB free"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "computer": f"{platform.platform(terse=True)}, {platform.machine()}, {cores} cores, {memory}",
+        "Python": platform.python_version(),
+        **{name: _version(name) or "not installed" for name in NEEDED},
+    }
+
+
+def optional_parts() -> dict[str, str]:
+    """What each optional part is for, and its versions or how to install it."""
+    parts = {}
+    for part, purpose in OPTIONAL.items():
+        versions = {name: _version(name) for name in packages_of(part)}
+        there = ", ".join(f"{name} {found}" for name, found in versions.items())
+        parts[part] = f"{purpose}: {there if all(versions.values()) else install_command(part)}"
+    return parts
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def _tell(backend: str, *, compiles: bool = False) -> bool:
+    """Try a backend and print what came of it; whether it works."""
+    trial = try_backend(backend, compiles=compiles)
+    say(f"{backend:<10}{'works' if trial.works else 'fails'}: {trial.found}")
+    if not trial.works:
+        for line in trial.printed.splitlines()[-12:-1]:
+            say(f"{'':<10}| {line}")
+    return trial.works

@@ -11,10 +11,9 @@ import tyro
 
 from ..core.checks import input_error
 from ..core.shell import command
-from ..doctor.choice import Wanted
 from ..system.console import say
 from ..system.installation import page
-from .devices import on_device
+from .devices import Wanted, on_device
 from .help_page import Help
 from .parsing import parse
 from .score_table import score_table

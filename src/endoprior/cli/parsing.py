@@ -11,7 +11,6 @@ from typing import TypeVar
 import tyro
 
 from ..core.checks import InputError, input_error
-from ..core.config_io import current_value
 from ..system.console import say
 from .help_page import PLAIN, Help, help_page
 from .options import option_name, options
@@ -37,7 +36,7 @@ def parse(cls: type[A], argv: list[str], command: str, page: Help = PLAIN, defau
         fix = "Set the shell variable, or remove the empty argument."
         raise input_error(f"endoprior {command}", "no empty argument", "one", fix)
     reject_unknown(argv, command, [*page.short, *(name for option in arguments for name in option.names)])
-    words, errors = _current(argv, page.short), io.StringIO()
+    words, errors = _written_out(argv, page.short), io.StringIO()
     extra = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(errors):
@@ -50,16 +49,11 @@ def parse(cls: type[A], argv: list[str], command: str, page: Help = PLAIN, defau
         raise InputError(f"{str(error).removesuffix('.')}. Fix: `endoprior {command} --help`.") from None
 
 
-def _current(argv: list[str], short: Mapping[str, str]) -> list[str]:
-    """The words with short names written out, and values of earlier versions replaced by what they are called now."""
+def _written_out(argv: list[str], short: Mapping[str, str]) -> list[str]:
+    """The words with short names of options written out."""
     words: list[str] = []
     for word in argv:
         _, equals, value = word.partition("=")
         option = short.get(option_name(word), option_name(word)).removeprefix("--")
-        if word.startswith("--") and equals:
-            words.append(f"--{option}={current_value(option, value, hint=True)}")
-        elif word.startswith("--"):
-            words.append(f"--{option}")
-        else:
-            words.append(current_value(words[-1].removeprefix("--") if words else "", word, hint=True))
+        words.append(f"--{option}{equals}{value}" if word.startswith("--") else word)
     return words

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ..core.checks import input_error
-from ..doctor.choice import Wanted
 from ..system.console import say
-from .devices import on_device
+from .devices import Wanted, on_device
 from .help_page import Help
 from .parsing import parse
 from .trained_scene import folder_of, open_scene, reject_without_gaussians

@@ -14,11 +14,10 @@ from ..core.checks import input_error
 from ..core.config import Config
 from ..core.options import command_of
 from ..core.shell import command
-from ..doctor.choice import Wanted
 from ..model.presets import PresetName, preset
 from ..prepare.config import PrepareConfig
 from ..system.console import say
-from .devices import with_device
+from .devices import Wanted, with_device
 from .help_page import Help
 from .parsing import parse
 from .step_display import StepDisplay, duration

@@ -10,8 +10,8 @@ from typing import get_args
 from ..core.checks import input_error
 from ..core.config import Config
 from ..core.shell import command
-from ..doctor.choice import Wanted
 from ..model.presets import PresetName, preset
+from .devices import Wanted
 
 
 def start_config(argv: Sequence[str]) -> tuple[PresetName, Config]:

@@ -13,11 +13,10 @@ from ..core.checks import input_error
 from ..core.config import Config
 from ..core.config_io import SHORT_NAMES
 from ..core.shell import command
-from ..doctor.choice import Wanted
 from ..model.presets import PresetName
 from ..runs.progress import training_progress
 from ..system.console import say
-from .devices import with_device
+from .devices import Wanted, with_device
 from .help_page import Help
 from .parsing import parse
 from .start_config import device_to_resume, resume_command, run_to_resume, start_config

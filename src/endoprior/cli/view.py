@@ -13,9 +13,8 @@ import tyro
 
 from ..core.checks import input_error
 from ..core.shell import command
-from ..doctor.choice import Wanted
 from ..system.console import say
-from .devices import on_device
+from .devices import Wanted, on_device
 from .help_page import Help
 from .parsing import parse
 from .trained_scene import open_gaussians, sequence_of

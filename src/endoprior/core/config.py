@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal
 from .checks import InputError, check_range, read_ranges
 from .config_deformation import DeformationConfig
 from .config_io import from_dict, override, to_dict
-from .config_poses import PoseConfig
 from .config_windows import WindowConfig
 from .ranges import Checked, Count, DecayedRate, Percent, Positive, Range, Rate, Share, Threshold, Weight
 
@@ -172,8 +171,6 @@ class LossConfig(Checked):
     """Depth that is compared: sum of weight * z, or that divided by alpha."""
     min_depth_pixels: Count = 10
     """A frame with fewer measured tissue depths gets no depth loss."""
-    fit_relative_depth: bool = False
-    """Relative depth of a frame is compared up to a scale and a shift of inverse depth, fitted anew at each use."""
     track_weight: Weight = 0.0
     """Weight of the distance to the tracks of `init.motion flow`, where the flow found them; 0 switches it off."""
     trust_masks: bool = True
@@ -345,8 +342,9 @@ class Config(Checked):
     density: DensityConfig = field(default_factory=DensityConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    poses: PoseConfig = field(default_factory=PoseConfig)
     windows: WindowConfig = field(default_factory=WindowConfig)
+
+    FORMER_FIELDS = ("poses", "loss.fit_relative_depth", "radiance")  # that earlier versions wrote: see `from_dict`
 
     def __post_init__(self) -> None:
         super().__post_init__()

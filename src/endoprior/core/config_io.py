@@ -13,12 +13,9 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from .checks import InputError, input_error, similar_name
-from .text import printable
 
 C = TypeVar("C")
 _hints = functools.cache(typing.get_type_hints)
-FORMER_VALUES = {"render.backend": {"cpu": "numba", "cuda": "gsplat"}}
-"""Config field -> value of earlier versions -> what it is called now."""
 SHORT_NAMES = {
     "iterations": "schedule.fine_iterations",
     "gaussians": "init.budget",
@@ -28,27 +25,6 @@ SHORT_NAMES = {
 }
 """Short name of a config field -> its dotted name; in Python, in specs and, with dashes, on the command line."""
 FACTOR = re.compile(r"x([0-9]+(?:\.[0-9]+)?)")
-
-
-def current_value(field: str, value: Any, *, hint: bool = False) -> Any:
-    """What a value of a config field is called now; any other value is returned as it is.
-
-    Args:
-        field: dotted name; only its last two parts count.
-        hint: print the new name on stderr, once: for values that a user typed.
-    """
-    renamed = FORMER_VALUES.get(".".join(field.split(".")[-2:]), {})
-    if not isinstance(value, str) or value not in renamed:
-        return value
-    if hint:
-        print_renamed(field, value, renamed[value])
-    return renamed[value]
-
-
-@functools.cache
-def print_renamed(field: str, former: str, current: str) -> None:
-    """Print on stderr what a value is called now; once per process for the same arguments."""
-    print(printable(f"endoprior: {field}: `{former}` is now called `{current}`"), file=sys.stderr)
 
 
 def to_dict(cfg: Any) -> Any:
@@ -83,7 +59,7 @@ def override(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> 
             raise input_error(where, "the name of a config field", str(name), fix)
         if isinstance(value, str) and (factor := FACTOR.fullmatch(value)) and type(group[last]) in (int, float):
             value = type(group[last])(group[last] * float(factor[1]))
-        group[last] = current_value(str(full), value, hint=True)
+        group[last] = value
 
 
 def _dotted_names(values: dict[str, Any], prefix: str = "") -> list[str]:
@@ -96,7 +72,8 @@ def _dotted_names(values: dict[str, Any], prefix: str = "") -> list[str]:
 def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     """Build a config dataclass from a nested dict. Unknown fields and wrong types are errors; missing ones default.
 
-    Numbers must be finite; Python's JSON reader also accepts NaN and infinity.
+    Fields that the class lists as FORMER_FIELDS (dotted names) are ignored; one line on stderr names them. Numbers must
+    be finite; Python's JSON reader also accepts NaN and infinity.
 
     Raises:
         InputError: names the field, the expected and the actual value.
@@ -104,6 +81,11 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
     if not isinstance(values, dict):
         fix = "Use a file written by endoprior."
         raise input_error(where, "an object with fields", type(values).__name__, fix)
+    former = [name for name in getattr(cls, "FORMER_FIELDS", ()) if _without(values, name.split(".")) != values]
+    for name in former:
+        values = _without(values, name.split("."))
+    if former:
+        print_ignored(", ".join(former))
     hints = _hints(cls)
     unknown = sorted(map(str, set(values) - set(hints)))
     if unknown:
@@ -120,13 +102,28 @@ def from_dict(cls: type[C], values: Any, where: str = "config") -> C:
         raise InputError(f"{where}: {error}{fix}") from error
 
 
+def _without(values: Any, path: list[str]) -> Any:
+    """A nested dict without the entry of this path."""
+    name, *inner = path
+    if not isinstance(values, dict) or name not in values:
+        return values
+    if inner:
+        return values | {name: _without(values[name], inner)}
+    return {key: value for key, value in values.items() if key != name}
+
+
+@functools.cache
+def print_ignored(names: str) -> None:
+    """Tell on stderr which fields are ignored; once per process for the same ones."""
+    print(printable(f"endoprior: stored config: ignored {names}, which this version does not have"), file=sys.stderr)
+
+
 def _value(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return value if isinstance(value, hint) else from_dict(hint, value, where)
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return value
-    value = current_value(where, value)
     if origin is typing.Literal:
         ok, want = value in args, f"one of {', '.join(map(repr, args))}"
     elif origin is tuple:

@@ -19,11 +19,16 @@ def install_command(extra: str) -> str:
     Args:
         extra: a name of `[project.optional-dependencies]`, `networks` for instance.
     """
-    listed = [Requirement(line) for line in requires("endoprior") or ()]
-    names = [each.name for each in listed if each.marker and _wants(each.marker, extra)]
+    names = packages_of(extra)
     if not names:  # the installation is older than the program: a checkout that was updated since
         return f"pip install -c constraints.txt '.[{extra}]'"
     return " ".join(["pip install", *([] if extra == "cuda" else ["-c constraints.txt"]), *names])
+
+
+def packages_of(extra: str) -> list[str]:
+    """The packages of an optional part, as the installation lists them."""
+    listed = [Requirement(line) for line in requires("endoprior") or ()]
+    return [each.name for each in listed if each.marker and _wants(each.marker, extra)]
 
 
 def missing_package(package: str, extra: str, error: ImportError) -> str:

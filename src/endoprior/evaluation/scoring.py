@@ -115,7 +115,7 @@ def _protocol(sequence: FrameSequence, split: Split, data: DataConfig) -> dict[s
         "track_*": "all frames of the video; *_dis: optical flow chained over them, held-out frames included",
         "ate_mm": "all frames of the video; aligned by a rigid motion, or a similarity where depth is relative",
         "right_*": "tissue that both eyes see by measured depth; right pictures as they are, left mask",
-        "poses": "of the scene; where training refined them, held-out frames lie between their neighbors",
+        "poses": "of the scene",
         "depth_instability_mm": "all adjacent frames of the video",
         "data_fingerprint": sequence.fingerprint(),
     }

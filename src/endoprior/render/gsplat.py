@@ -115,7 +115,7 @@ def rasterize_many(
         check_device(each, background, DEVICE)
     if not len(splats[0]):
         return [_nothing(*each, background) for each in zip(splats, cameras, strict=True)]
-    _build_kernels()
+    build_kernels()
     return _render(splats, cameras, background, degrees.pop(), depth_grad_to_means)
 
 
@@ -231,7 +231,7 @@ def _together(lenses: list[Lens]) -> Lens:
 
 
 @cache
-def _build_kernels() -> None:
+def build_kernels() -> None:
     """Have gsplat build its kernels, which takes minutes the first time, or say in one line why it cannot."""
     try:
         from gsplat.cuda._backend import _C as kernels

@@ -131,17 +131,10 @@ class WindowedRun:
 
     def _scene(self, read: Callable[[int], SingleScene]) -> WindowedScene:
         """Args: read: the scene of window k; one at a time is in memory."""
-        spans, cameras, reached = [], [], 0
-        for k, (start, stop) in enumerate(self.plan):
-            part, shared = read(k), reached - start
-            spans.append(Span(start, stop, len(part)))
-            # Training may have refined them; in the overlap those count whose window shows more.
-            own = (max(shared, 0) + 1) // 2
-            cameras[start + own :] = part.cameras[own:]
-            reached = stop
+        spans = [Span(start, stop, len(read(k))) for k, (start, stop) in enumerate(self.plan)]
         return WindowedScene(
             config=self.cfg,
-            cameras=tuple(cameras),
+            cameras=tuple(self.sequence.camera(i) for i in range(len(self.sequence))),
             frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
             spans=tuple(spans),
             read=read,

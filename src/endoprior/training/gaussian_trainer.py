@@ -5,7 +5,7 @@ Two stages. Coarse: the first training frame alone, nothing deforms. Fine: a ran
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,6 @@ from .. import render
 from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.shell import command
-from ..core.types import Camera
 from ..data import FrameSequence
 from ..model.attributes import motion_layout
 from ..model.field import Field
@@ -26,16 +25,15 @@ from ..model.method import method_of
 from ..model.scene_file import check_cameras
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import ArraySpec, part
-from . import depth_fit, left_out
+from . import left_out
 from .density import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
-from .gaussians_schema import frame_schema, state_schema
+from .gaussians_schema import state_schema
 from .gaussians_state import GaussiansState
 from .mask_doubt import MaskDoubt
 from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
-from .pose_refinement import PoseRefinement, PoseState, refined_cameras
 from .stage import Stage, StepReport, stage_length
 from .step import TrainingStep
 from .track_loss import StartTracks
@@ -80,7 +78,6 @@ class GaussianTrainer(Trainer):
             render.load(cfg.render.backend),
             self.ops,
             DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
-            PoseRefinement(self.cameras, frames, self.cfg) if refines_poses(sequence, self.cameras, cfg) else None,
             MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
             torch.tensor(self.method.background, device=self.device),
         )
@@ -99,26 +96,16 @@ class GaussianTrainer(Trainer):
                 tracks = StartTracks.of_first(coefficients, torch.from_numpy(motion.followed).float()).to(self.device)
         field = self.method.motion(cfg).field(gaussians["means"].detach(), cfg)
         stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
-        num = len(self.sequence.indices("train"))
-        poses = PoseState.at_start(num) if self.step_once.poses else None
-        fit = depth_fit.at_start(num) if self.fits_depth else None
-        shares = left_out.at_start(num) if self.step_once.doubt else None
-        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, poses, fit, shares)
-
-    @property
-    def fits_depth(self) -> bool:
-        """Whether the depth of each frame is compared up to a scale and a shift."""
-        return self.cfg.loss.fit_relative_depth and self.sequence.depth_is_relative
+        shares = left_out.at_start(len(self.sequence.indices("train"))) if self.step_once.doubt else None
+        self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, shares)
 
     def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
         """See `Trainer.restore`."""
         gaussians = Gaussians(part(arrays, "gaussians.")).to(self.device)
         field = self.method.motion(self.cfg).field_of(part(arrays, "field."), self.cfg)
         held = part(arrays, "tracks.")
-        poses = PoseState(**part(arrays, "poses.")) if self.step_once.poses else None
         tracks = StartTracks(**held).to(self.device) if held else None
-        of_frames = arrays.get("depth_fit"), arrays.get("left_out")
-        self._enter(stage, gaussians, field and field.to(self.device), tracks, poses, *of_frames)
+        self._enter(stage, gaussians, field and field.to(self.device), tracks, arrays.get("left_out"))
         self.state.iteration = iteration
         self.state.optimizer.load_state_arrays(part(arrays, "optimizer."))
         self.state.stats = DensityStats(
@@ -131,20 +118,16 @@ class GaussianTrainer(Trainer):
         gaussians: Gaussians,
         field: Field | None,
         tracks: StartTracks | None,
-        poses: PoseState | None,
-        fit: Tensor | None,
         shares: Tensor | None,
     ) -> None:
         rate_of = partial(self.method.rate, cfg=self.cfg, spatial_scale=self.spatial_scale)
         optimizer = Optimizer(gaussians, field, self.cfg, rate_of, self.ops)
         stats = DensityStats.zeros(len(gaussians), self.device)
-        self.state = GaussiansState(stage, 0, gaussians, field, optimizer, stats, tracks, poses, fit, shares)
+        self.state = GaussiansState(stage, 0, gaussians, field, optimizer, stats, tracks, shares)
 
     def schema(self) -> dict[str, ArraySpec]:
         """See `Trainer.schema`."""
-        return state_schema(self.method.motion(self.cfg), self.cfg) | frame_schema(
-            refined=self.step_once.poses is not None, fitted=self.fits_depth, doubted=self.step_once.doubt is not None
-        )
+        return state_schema(self.method.motion(self.cfg), self.cfg, doubts=self.step_once.doubt is not None)
 
     def step(self) -> StepReport:
         """See `Trainer.step`, and `TrainingStep` for what happens in it.
@@ -154,8 +137,7 @@ class GaussianTrainer(Trainer):
         """
         state = self.state
         if state.stage is Stage.COARSE and state.iteration >= stage_length(self.cfg, Stage.COARSE):
-            of_frames = state.poses, state.depth_fit, state.left_out
-            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, *of_frames)
+            self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, state.left_out)
             if self.method.keeps_optimizer:
                 self.state.optimizer = state.optimizer
         report = self.step_once(self.state)
@@ -170,11 +152,6 @@ class GaussianTrainer(Trainer):
             self.state.iteration = divergence.last_good
             raise Diverged(divergence.reason)
 
-    def _refined_cameras(self) -> tuple[Camera, ...]:
-        if self.state.poses is None:
-            return self.cameras
-        return refined_cameras(self.cameras, self.step_once.frames.indices, self.state.poses.twists.numpy())
-
     def scene(self) -> SingleScene:
         """See `Trainer.scene`."""
         state, trained, num = self.state, self.step_once.frames.indices, len(self.sequence)
@@ -183,7 +160,7 @@ class GaussianTrainer(Trainer):
             gaussians=state.gaussians.to("cpu"),
             field=state.field and state.field.to("cpu"),
             config=self.cfg,
-            cameras=self._refined_cameras(),
+            cameras=self.cameras,
             frames_per_second=self.sequence.frames_per_second or DEFAULT_FRAMES_PER_SECOND,
             prior_score=state.stats.score(self.cfg.density.unobserved_score).cpu(),
             num_valid=state.stats.num_valid.cpu().clone(),
@@ -191,12 +168,6 @@ class GaussianTrainer(Trainer):
             trained_from=trained[0] / num if holds else 0.0,
             trained_until=trained[-1] / num if holds else 1.0,
         )
-
-
-def refines_poses(sequence: FrameSequence, cameras: Sequence[Camera], cfg: Config) -> bool:
-    """Whether training changes camera poses: as `PoseConfig.refine` says, and never those of a static camera."""
-    wanted = cfg.poses.refine == "always" or (cfg.poses.refine == "estimated" and sequence.poses_are_estimated)
-    return wanted and any((camera.world_to_camera != cameras[0].world_to_camera).any() for camera in cameras)
 
 
 def spatial_scale(camera_centers: Tensor, cfg: Config) -> float:

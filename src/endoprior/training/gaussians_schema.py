@@ -16,8 +16,12 @@ from .density import DensityStats
 from .left_out import VISITS
 
 
-def state_schema(motion: Motion, cfg: Config) -> dict[str, ArraySpec]:
-    """The model, Adam's moments, the statistics of density control, and the tracks that hold motion, if any."""
+def state_schema(motion: Motion, cfg: Config, *, doubts: bool) -> dict[str, ArraySpec]:
+    """The model, Adam's moments, the statistics of density control, and the tracks that hold motion, if any.
+
+    Args:
+        doubts: also how much of each frame was left out as a missed tool.
+    """
     model = gaussians_schema(motion, cfg)
     trained = {name.removeprefix("gaussians."): spec for name, spec in model.items() if name.startswith("gaussians.")}
     trained |= {name: ArraySpec("float32", shape) for name, shape in motion.parameter_shapes(cfg).items()}
@@ -33,24 +37,8 @@ def state_schema(motion: Motion, cfg: Config) -> dict[str, ArraySpec]:
         optimizer |= {f"plane_adam.{name}": spec for name, spec in of_planes.items()}
     found = {f"optimizer.{name}": spec for name, spec in optimizer.items()}
     found |= {f"stats.{field.name}": ArraySpec("float32", ("N",)) for field in fields(DensityStats)}
+    found |= {"left_out": ArraySpec("float32", ("F", VISITS))} if doubts else {}
     return model | found | _track_schema(cfg)
-
-
-def frame_schema(*, refined: bool, fitted: bool, doubted: bool) -> dict[str, ArraySpec]:
-    """What is found of each training frame.
-
-    Args:
-        refined: its pose. fitted: how its depth fits. doubted: how much of it was left out as a missed tool.
-    """
-    specs = {}
-    if refined:
-        specs = {f"poses.{name}": ArraySpec("float64", ("F", 6)) for name in ("twists", "first", "second", "accepted")}
-        specs["poses.steps"] = ArraySpec("int64", ("F",))
-    if fitted:
-        specs["depth_fit"] = ArraySpec("float64", ("F", 2))
-    if doubted:
-        specs["left_out"] = ArraySpec("float32", ("F", VISITS))
-    return specs
 
 
 def _track_schema(cfg: Config) -> dict[str, ArraySpec]:

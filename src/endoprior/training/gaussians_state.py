@@ -10,7 +10,6 @@ from ..model.field import Field
 from ..model.gaussians import Gaussians
 from .density import DensityStats
 from .optimizer import Optimizer
-from .pose_refinement import PoseState
 from .stage import Stage
 from .track_loss import StartTracks
 
@@ -28,11 +27,6 @@ class GaussiansState:
     stats: DensityStats
     tracks: StartTracks | None = None
     """Where motion started from optical flow and is held to it."""
-    poses: PoseState | None = None
-    """Corrections of the camera poses; None: they stay as given."""
-    depth_fit: Tensor | None = None
-    """(F, 2) scale and shift of each training frame's inverse depth, where depth is relative."""
-
     left_out: Tensor | None = None
     """(F, VISITS) share of the view that was left out as a missed tool in the last visits of each training frame."""
 
@@ -43,10 +37,6 @@ class GaussiansState:
         arrays |= {f"optimizer.{name}": value for name, value in self.optimizer.state_arrays().items()}
         if self.tracks is not None:
             arrays |= {f"tracks.{name}": value for name, value in self.tracks.tensors().items()}
-        if self.poses is not None:
-            arrays |= {f"poses.{name}": value for name, value in self.poses.tensors().items()}
-        if self.depth_fit is not None:
-            arrays["depth_fit"] = self.depth_fit
         if self.left_out is not None:
             arrays["left_out"] = self.left_out
         if self.field is not None:

@@ -15,7 +15,7 @@ from ..core.config import Config
 from ..core.types import RenderOutput, Splats
 from ..model.deformation import HexPlaneField, Offsets
 from ..render import Rasterizer
-from . import density, depth_fit, left_out
+from . import density, left_out
 from .densify import apply_plan, reset_opacities
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .drawn import Drawn
@@ -25,7 +25,6 @@ from .losses_torch import color_l1
 from .mask_doubt import MaskDoubt
 from .missed_tools import START
 from .ops import TrainingOps
-from .pose_refinement import PoseRefinement, moved, smoothness
 from .scale_limit import limit_scales
 from .stage import Stage, StepReport, stage_length
 from .temporal import temporal_terms
@@ -63,10 +62,8 @@ class Compared:
     """Of this iteration."""
     batch: Batch
     splats: Splats
-    """The Gaussians at the frame, before a refined camera moves them."""
+    """The Gaussians at the frame."""
     out: RenderOutput
-    twist: Tensor | None
-    """(6,) of the refined camera."""
     terms: dict[str, Tensor]
     """Weighted terms of the loss, () each."""
     color_error: Tensor
@@ -90,8 +87,6 @@ class TrainingStep:
     rasterize: Rasterizer
     ops: TrainingOps
     check: DivergenceCheck
-    poses: PoseRefinement | None = None
-    """Trains the camera poses; None leaves them as given."""
     doubt: MaskDoubt | None = None
     """Takes missed tools out of the frames; None trusts the masks."""
     background: Tensor = field(default_factory=lambda: torch.zeros(3))
@@ -150,21 +145,18 @@ class TrainingStep:
         batch = self._right_batch(iteration, position) if right else self._batch(iteration, position, fine)
 
         splats, offsets, means_before = self._deform(state, batch, iteration)
-        posed, twist = self._posed(state, splats, batch)
         draw = partial(
             self.rasterize,
             camera=batch.frame.camera,
             background=self.background,
             depth_grad_to_means=cfg.render.depth_grad_to_means,
         )
-        out = draw(posed)
+        out = draw(splats)
         out.means2d.retain_grad()
         counted, share = batch.frame, None
         if self.doubt and fine and not right and iteration > START * stage_length(cfg, Stage.FINE):
             counted = self.doubt.counted(counted, out.color)
             share = self.doubt.share(batch.frame, counted)
-        if state.depth_fit is not None and fine:
-            counted = depth_fit.fitted(counted, state.depth_fit[batch.position])
         drawn = Drawn(
             stage=state.stage,
             iteration=iteration,
@@ -173,7 +165,7 @@ class TrainingStep:
             gaussians=state.gaussians,
             field=state.field,
             offsets=offsets,
-            splats=posed,
+            splats=splats,
             out=out,
             draw=draw,
             context=self.context,
@@ -188,21 +180,15 @@ class TrainingStep:
             terms |= self._track_terms(state, batch, offsets)
         if batch.before is not None:
             terms |= temporal_terms(state, batch.frame, batch.before, splats.means, means_before, out, cfg, self.ops)
-        if twist is not None:
-            terms["poses"] = smoothness(state.poses.twists, batch.position, twist, cfg.poses)
-        return Compared(iteration, rng, batch, splats, out, twist, terms, color_error, share)
+        return Compared(iteration, rng, batch, splats, out, terms, color_error, share)
 
     def _update(self, state: GaussiansState, done: Compared, densify: bool, reset: bool) -> dict[str, int] | None:
         """Apply the gradients of an iteration, then grow or prune; what density control did, if it did anything."""
         cfg, batch, event = self.cfg, done.batch, None
         self._observe(state, batch, done.out)
-        if state.depth_fit is not None and state.stage is Stage.FINE:
-            depth_fit.update(state.depth_fit, batch.position, batch.frame, done.out)
         if state.left_out is not None and done.left_out is not None:
             left_out.record(state.left_out, batch.position, done.left_out)
         state.optimizer.step(done.iteration, self.check.skip)
-        if done.twist is not None:
-            self.poses.step(state.poses, batch.position, done.twist.grad, done.iteration)
         if cfg.density.max_scale_share:
             log_scales = state.gaussians["log_scales"].detach()
             limit_scales(log_scales, done.splats.means, batch.frame.camera, cfg.density.max_scale_share)
@@ -250,13 +236,6 @@ class TrainingStep:
                 )
                 means_before = gaussians["means"] + displacement
         return gaussians.splats(offsets, sh_degree(self.cfg, state.stage, iteration)), offsets, means_before
-
-    def _posed(self, state: GaussiansState, splats: Splats, batch: Batch) -> tuple[Splats, Tensor | None]:
-        """The Gaussians as the refined camera sees them, and its twist (6,), which gets a gradient; None: as given."""
-        if self.poses is None or state.stage is not Stage.FINE:
-            return splats, None
-        twist = state.poses.twists[batch.position].clone().requires_grad_()
-        return moved(splats, batch.frame.camera, twist), twist
 
     def _track_terms(self, state: GaussiansState, batch: Batch, offsets: Offsets) -> dict[str, Tensor]:
         means, basis = state.gaussians["means"], self.cfg.deformation.basis

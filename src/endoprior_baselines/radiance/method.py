@@ -26,7 +26,7 @@ class RadianceMethod(Method):
 
     has_gaussians = False
     config_type = RadianceFieldConfig
-    only: Mapping[str, Any] = {"data.eyes": "left", "poses.refine": "never", "init.motion": "rest"}
+    only: Mapping[str, Any] = {"data.eyes": "left", "init.motion": "rest"}
 
     def __init__(self, kind: type[RadianceField], config: Callable[[], Config]) -> None:
         """Args: kind: of the field. config: what its preset starts from."""
