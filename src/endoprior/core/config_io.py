@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from .checks import InputError, input_error, similar_name
+from .text import printable
 
 C = TypeVar("C")
 _hints = functools.cache(typing.get_type_hints)
