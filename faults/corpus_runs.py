@@ -43,7 +43,9 @@ def flipped(name: str) -> Step:
 
 def added(name: str, text: str) -> Step:
     """Adds text to the end of a file."""
-    return lambda folder: (folder / name).write_text((folder / name).read_text(encoding="utf-8") + text)
+    return lambda folder: (folder / name).write_text(
+        (folder / name).read_text(encoding="utf-8") + text, encoding="utf-8"
+    )
 
 
 def header(text: bytes | str, length: int | None = None) -> bytes:

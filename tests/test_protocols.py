@@ -220,7 +220,7 @@ def test_masks_that_cannot_be_read_cost_the_scores_not_the_evaluation(tmp_path, 
     next((sequence.path / "gt_masks").glob("*.png")).unlink()
     pictures = Pictures(folder / "rgb", sequence, "test")
     result = evaluate(pictures, sequence, networks=False, protocols=("endonerf", "endo4dgs"))
-    assert "other masks cannot be read" in result.protocols["endonerf"]["skipped"]["psnr"]
+    assert "needs other masks of 17 frames" in result.protocols["endonerf"]["skipped"]["psnr"]
     assert "psnr" in result.protocols["endo4dgs"]["scores"]
 
 

@@ -39,9 +39,9 @@ PRIVATE_NAMES_ALLOWED = {"_C", "_hub_dir", "_asdict", "_fields", "_replace"}
 """What tests may use of gsplat, of torch.hub and of named tuples."""
 PRINTS = {
     "system/console.py", "core/config_io.py", "cli/step_display.py", "cli/progress.py", "runs/progress.py",
-    "doctor/gsplat_probe.py", "doctor/torch_probe.py",
+    "render/trial.py",
 }  # fmt: skip
-"""The console; a module below it; lines that are replaced on a terminal; probes, which print JSON."""
+"""The console; a module below it; lines that are replaced on a terminal; a trial, which prints its answer."""
 NO_TORCH = ("priors", "data", "evaluation/metrics/stability.py", "phantom", "core", "footage", "check")
 
 
@@ -77,7 +77,7 @@ def imports(path: Path) -> Iterator[tuple[str, ...]]:
 
 def test_the_root_holds_packages_only():
     assert {path.name for path in SRC.iterdir() if path.is_file()} <= ROOT_FILES
-    packages = {path.name for path in SRC.iterdir() if path.is_dir() and path.name != "__pycache__"}
+    packages = {path.name for path in SRC.iterdir() if any(path.glob("*.py"))}
     assert packages == FLOOR_OF.keys()
 
 
@@ -158,9 +158,9 @@ def test_no_pickle_and_no_eval_anywhere():
 
 def test_one_module_starts_python_and_one_prints():
     """`sys.executable` elsewhere would be a Python without `-P`; `print` would show control characters."""
-    for path in FILES:
-        text, name = path.read_text(), path.relative_to(SRC).as_posix()
-        if name not in ("system/own_python.py", "doctor/toolchain.py"):  # the second names the folder of programs
+    for path in ALL_FILES:
+        text, name = path.read_text(), path.relative_to(ROOT / "src").as_posix().removeprefix("endoprior/")
+        if name != "system/own_python.py":
             assert "sys.executable" not in text and "executable_path" not in text, path
         assert not re.search(r"os\.(system|popen|exec\w+|spawn\w+|posix_spawn)\(|shell=True|ProcessPool", text), path
         if name not in PRINTS:

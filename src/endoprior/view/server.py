@@ -68,8 +68,7 @@ class Viewer:
         warnings.filterwarnings("ignore", "Queued a", UserWarning)  # from viser, when a browser disconnects
         self.viewable, self.settings, self.out, self.host = viewable, ViewSettings(layer=viewable.layers[0]), out, host
         self.jobs = JobQueue()
-        self._playing: tuple[int, float] | None = None
-        """Frame and time at the start of playback."""
+        self._playing: tuple[int, float] | None = None  # frame and time at the start of playback
         self.tracks = DrawnTracks(viewable)
         self.kept_views: list[PathPoint] = []
         self._version, self._moved_at = 0, clock.monotonic() - IDLE_SECONDS
