@@ -21,7 +21,7 @@ from endoprior.evaluation.protocols.table import OURS, PROTOCOLS, SCORES, Protoc
 from endoprior.evaluation.protocols.tags import KEYS, NETWORKS, rows_of
 from endoprior.evaluation.scoring import evaluate
 
-PAGE = Path(__file__).parents[1] / "docs" / "published.md"
+PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 TEST = [1, 9]
 NAMES = PROTOCOLS.names()
 ZEROS = np.zeros((40, 48), bool)
