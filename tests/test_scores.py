@@ -12,7 +12,7 @@ OF_MASKS = {name: score for name, score in all_scores().items() if score.group =
 OF_SCENES = {name: score for name, score in all_scores().items() if score.group != "masks"}
 LISTED = {n: s for n, s in OF_SCENES.items() if not (n.startswith("track_") and n.endswith(("_dis", "_still")))}
 """Scores of a scene with a row of their own; the page says of all others together what they are."""
-BETTER = {True: "higher", False: "lower", None: "-"}
+BETTER = {True: " \u2191", False: " \u2193", None: ""}
 
 
 def test_every_score_has_one_scorer():
@@ -23,8 +23,7 @@ def test_every_score_has_one_scorer():
 @pytest.mark.parametrize("scores", [LISTED, OF_MASKS], ids=["of a scene", "of masks"])
 def test_the_page_lists_every_score(scores):
     rows = [
-        f"| `{s.name}` | {s.label} | {s.unit or '-'} | {BETTER[s.higher_is_better]} | {s.description} "
-        f"| {s.hint or '-' if s.in_summary else 'not printed'} |"
+        f"| `{s.name}` | {s.label} | {(s.unit + BETTER[s.higher_is_better]).strip() or '-'} | {s.description} |"
         for s in scores.values()
     ]
     assert "\n".join(rows) + "\n\n" in PAGE.read_text(encoding="utf-8"), "expected this table:\n" + "\n".join(rows)
