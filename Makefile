@@ -1,5 +1,5 @@
 # Two commands on a fresh machine: `make demo` and `make test`. Both create .venv and install the pinned requirements.
-# `make test-all` runs `make test`, then the tests that take long. docs/development.md says what is where.
+# `make test-all` runs `make test`, then the tests that take long. docs/developers.md says what is where.
 # `make bench` times every stage beside plain torch and fails if one fell behind bench/baseline.json; options go in
 # BENCH, for example `make bench BENCH=--quick`.
 # `make demo PYTHON=python3.12` names the Python. `make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu` takes torch

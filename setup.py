@@ -28,7 +28,7 @@ def stamp(package: Path) -> None:
 
 
 class BuildPackage(build_py):
-    """Adds docs/ and the commit, except to an editable installation, which runs from the checkout."""
+    """Adds docs/ without the log, and the commit, except to an editable installation, which runs from the checkout."""
 
     def run(self) -> None:
         """Copy the package, then add what it has not."""
@@ -36,7 +36,8 @@ class BuildPackage(build_py):
         super().run()
         if not self.editable_mode:
             package = Path(self.build_lib, "endoprior")
-            shutil.copytree(ROOT / "docs", package / "docs", dirs_exist_ok=True)
+            ignored = shutil.ignore_patterns("log.md", "__pycache__")
+            shutil.copytree(ROOT / "docs", package / "docs", ignore=ignored, dirs_exist_ok=True)
             stamp(package)
 
 

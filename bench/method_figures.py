@@ -1,4 +1,4 @@
-"""Make the figures of docs/method.md, trust.md and tutorial.md again: `python bench/method_figures.py WORK`.
+"""Make the figures of docs/method.md, results.md and tutorial.md again: `python bench/method_figures.py WORK`.
 
 Trains `default` on a phantom of 24 frames (320x256) and renders everything from that. WORK keeps sequence and run; what
 is there is not made again.

@@ -8,7 +8,7 @@ sys.path[:0] = [str(ROOT / "docs" / "site"), str(ROOT / "src")]
 
 project = "EndoPrior-GS"
 root_doc = "docs/index"
-include_patterns = ["*.md", "docs/*.md", "docs/results/*.md", "docs/notebooks/*.ipynb"]
+include_patterns = ["*.md", "docs/*.md", "docs/notebooks/*.ipynb"]
 exclude_patterns = [path.name for path in ROOT.iterdir() if path.is_dir() and path.name != "docs"]
 
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb", "folders", "generated", "mathml"]

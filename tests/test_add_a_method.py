@@ -24,12 +24,12 @@ PAGE = Path(__file__).parents[1] / "docs" / "add_a_method.md"
 @pytest.fixture
 def linear(tmp_path, monkeypatch) -> Config:
     """The config of the page's method, registered as the page says."""
-    (code,), (entries,) = (re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)
-                           for language in ("python", "toml"))  # fmt: skip
+    (entries,) = re.findall(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    code = (PAGE.parents[1] / "examples" / "linear_method.py").read_text(encoding="utf-8")
     assert len(code.splitlines()) < 100
     groups = tomllib.loads(entries)["project"]["entry-points"]
     named = {group.removeprefix("endoprior."): targets for group, targets in groups.items()}
-    write_package(tmp_path / "site", "linear-of-the-page", named, linear=code)
+    write_package(tmp_path / "site", "linear-of-the-page", named, linear_method=code)
     with on_path(tmp_path / "site"):
         yield preset("linear", iterations=12, gaussians=200)
 

@@ -20,7 +20,7 @@ from endoprior.cli import descriptions
 from endoprior.cli.parsing import parse
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/results/*.md")})
+PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")})
 COMMANDS_OF_THE_LOG = ROOT / "docs" / "log.md"
 """What it tells of belongs to earlier versions."""
 CURRENT = [page for page in PAGES if page not in (COMMANDS_OF_THE_LOG, ROOT / "CHANGELOG.md")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,12 +25,9 @@ TIMES = (0.0, 0.13, 0.5, 0.99, 1.0)
 
 
 @pytest.fixture(scope="module")
-def reader(tmp_path_factory):
-    """The document's code as a module."""
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "format.md").read_text(encoding="utf-8"), re.DOTALL)
-    file = tmp_path_factory.mktemp("document") / "reader.py"
-    file.write_text("\n\n".join(blocks))
-    spec = importlib.util.spec_from_file_location("reader", file)
+def reader():
+    """The document's reader as a module."""
+    spec = importlib.util.spec_from_file_location("reader", DOCS / "read_scene.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -23,6 +23,7 @@ from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
 
 SOURCES, DOCS = Path(endoprior.__file__).parents[1], Path(__file__).parents[1] / "docs"
+EXAMPLE = DOCS.parent / "examples" / "endoprior_example" / "endoprior_example"
 EVALUATE = """
 import sys
 from dataclasses import replace
@@ -41,8 +42,8 @@ class Static:
 
 scene = replace(load_scene(sys.argv[1]), field=Static())  # so that no kernel has to be compiled
 scores = evaluate(scene, load_sequence(sys.argv[2]), networks=False).scores
-spec = Spec("t", {"s": SequenceSpec(path="s")}, {"m": MethodSpec()}, scores=("brightness",))
-print(scores["brightness"])
+spec = Spec("t", {"s": SequenceSpec(path="s")}, {"m": MethodSpec()}, scores=("mae",))
+print(scores["mae"])
 print(markdown(score_table(Results(spec, {Cell("s", "m", None, 0): scores}), "s")))
 """
 LOAD = """
@@ -50,7 +51,7 @@ import sys
 from endoprior import load_sequence
 from endoprior.core.config import DataConfig
 
-for name in ("auto", "frames"):
+for name in ("auto", "rendered"):
     sequence = load_sequence(sys.argv[1], DataConfig(format=name))
     print(name, len(sequence), *sequence.frame(3).rgb_u8.shape)
 """
@@ -73,7 +74,9 @@ def extend(tmp_path):
         example = (DOCS / page).read_text(encoding="utf-8").split("\n## Add a ")[1]
         file = tmp_path / "src" / "endoprior" / module
         assert f"{file.parent.name}/NAME.py" in example and registry in example
-        file.write_text(re.search(r"```python\n(.*?)```", example, re.DOTALL)[1])
+        linked, shown = EXAMPLE / file.name, re.search(r"```python\n(.*?)```", example, re.DOTALL)
+        assert shown or f"[{file.name}](" in example
+        file.write_text(shown[1] if shown else linked.read_text(encoding="utf-8"))
         lines = (tmp_path / "src" / "endoprior" / registry).read_text()
         start = f"{variable} = (\n"
         assert start in lines
@@ -104,18 +107,21 @@ def tiny_scene(folder: Path) -> Scene:
 
 
 def test_a_new_score_is_computed_and_stands_in_tables(extend, tmp_path, make_tiny_sequence):
-    extend("scores.md", "evaluation/scorers/brightness.py", "evaluation/registry.py", "SCORERS")
+    extend("scores.md", "evaluation/scorers/mae.py", "evaluation/registry.py", "SCORERS")
     data = make_tiny_sequence(num_frames=3)
     tiny_scene(data).save(tmp_path / "scene.safetensors")
     value, *table = run(tmp_path, "-c", EVALUATE, tmp_path / "scene.safetensors", data).splitlines()
     assert 0 < float(value) < 100
-    assert table[0] == "| method | brightness, % |" and table[2] != "| m | - |"
+    assert table[0] == "| method | mean absolute error, % |" and table[2] != "| m | - |"
 
 
 def test_a_new_layout_is_recognized_and_opened(extend, tmp_path, tiny_sequence):
-    extend("datasets.md", "data/frames.py", "data/formats.py", "FORMATS")
-    shutil.copytree(tiny_sequence / "images", tmp_path / "new" / "frames")
-    assert run(tmp_path, "-c", LOAD, tmp_path / "new").splitlines() == ["auto 17 40 48 3", "frames 17 40 48 3"]
+    extend("datasets.md", "data/rendered.py", "data/formats.py", "FORMATS")
+    shutil.copytree(tiny_sequence / "images", tmp_path / "new" / "rgb")
+    (tmp_path / "new" / "depth").mkdir()
+    for image in sorted((tmp_path / "new" / "rgb").iterdir()):
+        np.save(tmp_path / "new" / "depth" / f"{image.stem}.npy", np.full((40, 48), 60, np.float32))
+    assert run(tmp_path, "-c", LOAD, tmp_path / "new").splitlines() == ["auto 17 40 48 3", "rendered 17 40 48 3"]
 
 
 def test_a_new_export_format_is_offered_and_written(extend, tmp_path, tiny_sequence):

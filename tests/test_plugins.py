@@ -196,12 +196,10 @@ def test_nothing_is_imported_before_it_is_used(install, tiny_sequence):
     assert "bad_module" not in sys.modules and "mine" in SCORES.names()
 
 
-def test_the_page_shows_the_example_as_it_is():
+def test_the_page_names_every_file_of_the_example():
     """Whole files, which the tests of the example import and use; of pyproject.toml a part."""
     page = (EXAMPLE.parents[1] / "docs" / "plugins.md").read_text(encoding="utf-8")
-    shown = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    files = [file.read_text(encoding="utf-8") for file in EXAMPLE.glob("endoprior_example/[!_]*.py")]
-    assert sorted(shown) == sorted(files)
+    assert all(f"[{file.name}](" in page for file in EXAMPLE.glob("endoprior_example/[!_]*.py"))
     (entry,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     assert re.sub(r" +#.*", "", entry).strip() in (EXAMPLE / "pyproject.toml").read_text(encoding="utf-8")
 

@@ -92,7 +92,7 @@ def test_the_wheel_holds_the_whole_package_and_its_documentation(checkout, built
     found = {name for name in names(next(built.glob("*.whl"))) if ".dist-info/" not in name}
     package = {path.relative_to(ROOT / "src") for path in (ROOT / "src" / "endoprior").rglob("*") if path.is_file()}
     pages = {Path("endoprior") / path.relative_to(ROOT) for path in (ROOT / "docs").rglob("*") if path.is_file()}
-    wanted = {path.as_posix() for path in package | pages if "__pycache__" not in path.parts}
+    wanted = {path.as_posix() for path in package | pages if not {"__pycache__", "log.md"} & {*path.parts}}
     assert found == wanted | {"endoprior/commit.txt"}
     assert {"endoprior/py.typed", "endoprior/export/player/player.html", "endoprior/docs/prepare.md"} <= found
     output(sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", "direct", cwd=checkout)

@@ -10,9 +10,11 @@ from endoprior.evaluation.registry import all_scores, scorers
 PAGE = Path(__file__).parents[1] / "docs" / "scores.md"
 OF_MASKS = {name: score for name, score in all_scores().items() if score.group == "masks"}
 OF_SCENES = {name: score for name, score in all_scores().items() if score.group != "masks"}
-LISTED = {n: s for n, s in OF_SCENES.items() if not (n.startswith("track_") and n.endswith(("_dis", "_still")))}
-"""Scores of a scene with a row of their own; the page says of all others together what they are."""
-BETTER = {True: "higher", False: "lower", None: "-"}
+NAMED = {n: s for n, s in OF_SCENES.items() if not (n.startswith("track_") and n.endswith(("_dis", "_still")))}
+"""Scores of a scene that the page names; it says of all others together what they are."""
+LISTED = {name: score for name, score in NAMED.items() if score.in_summary}
+"""Those with a row of their own; the site shows rows of the others."""
+BETTER = {True: " \u2191", False: " \u2193", None: ""}
 
 
 def test_every_score_has_one_scorer():
@@ -23,11 +25,15 @@ def test_every_score_has_one_scorer():
 @pytest.mark.parametrize("scores", [LISTED, OF_MASKS], ids=["of a scene", "of masks"])
 def test_the_page_lists_every_score(scores):
     rows = [
-        f"| `{s.name}` | {s.label} | {s.unit or '-'} | {BETTER[s.higher_is_better]} | {s.description} "
-        f"| {s.hint or '-' if s.in_summary else 'not printed'} |"
+        f"| `{s.name}` | {s.label} | {(s.unit + BETTER[s.higher_is_better]).strip() or '-'} | {s.description} |"
         for s in scores.values()
     ]
     assert "\n".join(rows) + "\n\n" in PAGE.read_text(encoding="utf-8"), "expected this table:\n" + "\n".join(rows)
+
+
+def test_the_page_names_every_other_score():
+    page = PAGE.read_text(encoding="utf-8")
+    assert all(f"`{name}`" in page for name in NAMED)
 
 
 def test_every_score_has_a_group_and_a_meaning():

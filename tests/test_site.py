@@ -12,6 +12,7 @@ import endoprior
 from endoprior.cli import descriptions
 from endoprior.core.config import Config
 from endoprior.core.config_io import to_dict
+from endoprior.evaluation.registry import all_scores
 
 ROOT = Path(__file__).parents[1]
 PAGES_LISTED = re.compile(r"^(?:\.\./)?[\w/]+$", re.MULTILINE)
@@ -76,6 +77,10 @@ def test_the_site_builds_and_is_complete_without_the_network(tmp_path):
         assert f"usage: endoprior {name}" in unescape(commands), name
     for name in field_names(to_dict(Config())):
         assert f">{name}<" in config, name
+    scores = (tmp_path / "docs" / "scores.html").read_text(encoding="utf-8")
+    for name, score in all_scores().items():
+        if not score.in_summary and not name.endswith(("_dis", "_still")):
+            assert score.description.partition("'")[0] in unescape(scores), name  # the site has curved quotation marks
     method = (tmp_path / "docs" / "method.html").read_text(encoding="utf-8")
     assert method.count("<math") > 20 and "$" not in re.sub(r"<(script|math).*?</\1>", "", method, flags=re.DOTALL)
     compared = (tmp_path / "docs" / "notebooks" / "compare_methods.html").read_text(encoding="utf-8")

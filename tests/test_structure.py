@@ -29,7 +29,6 @@ FLOORS = [
 FLOOR_OF = {name: level for level, names in enumerate(FLOORS) for name in names}
 ROOT_FILES = {"__init__.py", "__main__.py", "py.typed"}
 CHECKED_PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")})
-"""Every page but the generated ones in docs/results/."""
 PRIVATE_WORDS = (
     "house", "storey", "desk", "mend", "crowd", "nobody", "dear", "bump", "refuse", "refusal", "judge", "half planes",
     "row form", "lacking",

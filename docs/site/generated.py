@@ -1,4 +1,4 @@
-"""Sphinx extension: directives that write the reference of commands and config fields from the code."""
+"""Sphinx extension: a directive that writes the reference of commands, config fields and scores from the code."""
 
 import contextlib
 import io
@@ -15,6 +15,7 @@ from sphinx.util.docutils import SphinxDirective
 
 from endoprior.cli import descriptions, main
 from endoprior.core.config import Config
+from endoprior.evaluation.registry import all_scores
 from endoprior.model.presets import PresetName, preset
 
 COLUMNS = 88
@@ -71,6 +72,16 @@ def config_page() -> Iterator[str]:
         yield f"| `{name}` | {_text(own)} | {others} | {meaning} |"
 
 
+def scores_page() -> Iterator[str]:
+    """Markdown: a table of the scores that are not printed, but those of references for tracks."""
+    yield "| name | in tables | unit | meaning |\n|---|---|---|---|"
+    arrows = {True: " \u2191", False: " \u2193", None: ""}
+    for name, score in all_scores().items():
+        if not score.in_summary and not (name.startswith("track_") and name.endswith(("_dis", "_still"))):
+            unit = (score.unit + arrows[score.higher_is_better]).strip() or "-"
+            yield f"| `{name}` | {score.label} | {unit} | {score.description} |"
+
+
 def _text(value: Any) -> str:
     if isinstance(value, tuple):
         return " ".join(map(str, value))
@@ -78,14 +89,14 @@ def _text(value: Any) -> str:
 
 
 class Generated(SphinxDirective):
-    """Puts generated Markdown in place of itself: `{generated} commands` or `{generated} config`."""
+    """Puts generated Markdown in place of itself: `{generated} commands`, `config` or `scores`."""
 
     required_arguments = 1
     has_content = True  # for readers of the file: where the generated text is
 
     def run(self) -> list[nodes.Node]:
         """The nodes of the page."""
-        lines = {"commands": commands_page, "config": config_page}[self.arguments[0]]()
+        lines = {"commands": commands_page, "config": config_page, "scores": scores_page}[self.arguments[0]]()
         return self.parse_text_to_nodes("\n".join(lines), allow_section_headings=True)
 
 

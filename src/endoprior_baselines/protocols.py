@@ -1,5 +1,5 @@
 """What the evaluation script of each compared method does, as data. Explained in docs/scores.md; figures:
-docs/published.md.
+docs/results.md.
 
 Facts were read in the released programs at these commits: EndoNeRF 5201b1e, EndoSurf 2b33413, EndoGS 72ca45a, Endo-4DGS
 39c6ce2, Deform3DGS b06f0a5, SurgicalGaussian c0ac51a; EndoGaussian at the version that scores with AlexNet.

@@ -289,7 +289,7 @@ def _windows(facts: Facts) -> Iterator[Finding]:
 
 
 def iteration_seconds(camera: Camera) -> float:
-    """Time of a training iteration with `default` on two cores, start included (docs/measurements.md)."""
+    """Time of a training iteration with `default` on two cores, start included (docs/results.md)."""
     return ITERATION_S * (FIXED_SHARE + (1 - FIXED_SHARE) * camera.width * camera.height / USUAL_PIXELS)
 
 

@@ -24,7 +24,7 @@ class Render:
     """Render a trained scene: rgb/*.png, depth/*.npy (mm), side_by_side/*.png and an mp4.
 
     With `--layer texture` it writes texture/*.png and texture.mp4: a grid painted on the first frame, carried by the
-    model's motion, beside the input. Where the grid slides on the tissue, the motion is wrong (docs/trust.md).
+    model's motion, beside the input. Where the grid slides on the tissue, the motion is wrong (docs/results.md).
 
     With `--layer support` it writes support/*.png and support.mp4: tissue that no frame saw is hatched, tissue from
     another time is blue; support/*.npy says how many frames saw it and how many seconds away the nearest is.

@@ -1,0 +1,65 @@
+"""Gaussians that move along straight lines."""
+
+from torch import Tensor
+
+from endoprior.core.config import Config, DensityConfig, ScheduleConfig, TemporalConfig
+from endoprior.model.deformation import Offsets
+from endoprior.model.field import Field
+from endoprior.model.gaussians import Gaussians
+from endoprior.model.motion import Motion
+from endoprior.model.ops import ModelOps
+from endoprior.training.drawn import Drawn
+from endoprior.training.gaussian_method import GaussianMethod
+from endoprior.training.ops import TrainingOps
+from endoprior.training.rates import Rate
+
+
+class LinearMotion(Motion):
+    """A velocity of each Gaussian, mm per sequence."""
+
+    def tensors(self, cfg: Config) -> dict[str, tuple[int, ...]]:
+        return {"velocities": (3,)}
+
+    def offsets(
+        self,
+        gaussians: Gaussians,
+        field: Field | None,
+        time: float,
+        cfg: Config,
+        ops: ModelOps,
+        chosen: Tensor | None = None,
+    ) -> Offsets:
+        velocities = gaussians["velocities"]
+        return Offsets(means=(time - 0.5) * (velocities if chosen is None else velocities[chosen]))
+
+
+class LinearMethod(GaussianMethod):
+    """The paper's start and growth without its prior, and a pull towards no motion."""
+
+    uses_prior = False
+    _motion = LinearMotion()
+
+    def motion(self, cfg: Config) -> Motion:
+        return self._motion
+
+    def rate(self, name: str, cfg: Config, spatial_scale: float) -> Rate:
+        if name == "velocities":
+            return lambda iteration: 1e-2
+        return super().rate(name, cfg, spatial_scale)
+
+    def terms(self, drawn: Drawn, cfg: Config, ops: TrainingOps) -> dict[str, Tensor]:
+        pull = 1e-4 * drawn.gaussians["velocities"].square().mean()
+        return super().terms(drawn, cfg, ops) | {"pull": pull}
+
+
+METHOD = LinearMethod()
+
+
+def config() -> Config:
+    """What `--preset linear` starts from."""
+    return Config(
+        method="linear",
+        temporal=TemporalConfig(weight=0.0),
+        density=DensityConfig(min_densify_weight=1.0, prior_prune=False),
+        schedule=ScheduleConfig(coarse_iterations=0, fine_iterations=1500),
+    )
