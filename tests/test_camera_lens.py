@@ -4,7 +4,7 @@ import numpy as np
 from relief import HEIGHT, MATRIX, WIDTH, path, view
 
 from endoprior.prepare.camera_path.own import own_path
-from endoprior.prepare.camera_path.seen import Lens, PoseInput
+from endoprior.prepare.camera_path.tracks import Lens, PoseInput
 
 
 def test_the_principal_point_may_lie_at_the_edge_of_the_image():

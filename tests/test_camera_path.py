@@ -9,19 +9,25 @@ from relief import HEIGHT, MATRIX, WIDTH, lens, path, pose, smooth, view
 
 from endoprior.core.checks import InputError
 from endoprior.prepare.camera_path import choose, colmap
-from endoprior.prepare.camera_path.adjust import Observations, adjust, weights
+from endoprior.prepare.camera_path.adjust import (
+    Observations,
+    adjust,
+    back_projected,
+    derivatives,
+    moved,
+    refined_pose,
+    residuals,
+    weights,
+)
 from endoprior.prepare.camera_path.breathing import breathing_period
-from endoprior.prepare.camera_path.choose import find_path
-from endoprior.prepare.camera_path.corners import gray_of, new_corners, sampled, usable_tissue
-from endoprior.prepare.camera_path.explained import explained_share
+from endoprior.prepare.camera_path.choose import explained_share, find_path
+from endoprior.prepare.camera_path.colmap import ray_points, with_poses
+from endoprior.prepare.camera_path.features import gray_of, new_corners, sampled, usable_tissue
 from endoprior.prepare.camera_path.follow import follow_camera
-from endoprior.prepare.camera_path.given import ray_points, with_poses
 from endoprior.prepare.camera_path.own import own_path
 from endoprior.prepare.camera_path.pose_file import read_poses
-from endoprior.prepare.camera_path.resection import refined_pose
-from endoprior.prepare.camera_path.residuals import back_projected, derivatives, moved, residuals
-from endoprior.prepare.camera_path.seen import PoseInput
 from endoprior.prepare.camera_path.sequence_path import sequence_path
+from endoprior.prepare.camera_path.tracks import PoseInput
 
 SIZE = (WIDTH, HEIGHT)
 OPENCV = lens().matrix

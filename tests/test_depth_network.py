@@ -9,9 +9,9 @@ import pytest
 
 from endoprior.core.checks import InputError
 from endoprior.evaluation.metrics.torchvision_compat import import_torchvision
-from endoprior.prepare import depth_network
-from endoprior.prepare.depth_network import DepthNetwork
+from endoprior.prepare import hub_model, relative_depth
 from endoprior.prepare.hub_model import FILES
+from endoprior.prepare.relative_depth import DepthNetwork
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 # The library's own warnings are not ours to fix.
@@ -56,7 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @needs_transformers
 def test_a_model_folder_runs_on_any_image_size(folder, monkeypatch):
-    monkeypatch.setattr(depth_network, "SHORT_SIDE_PX", 56)
+    monkeypatch.setattr(relative_depth, "SHORT_SIDE_PX", 56)
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
     network = DepthNetwork(folder)
     image = np.random.default_rng(0).integers(0, 256, (45, 71, 3), np.uint8)
@@ -65,10 +65,6 @@ def test_a_model_folder_runs_on_any_image_size(folder, monkeypatch):
     assert np.isfinite(inverse).all() and inverse.min() >= 0 and inverse.std() > 0
     assert (network.inverse_depth(image) == inverse).all()
     assert not np.array_equal(network.inverse_depth(image[..., ::-1].copy()), inverse)
-    with pytest.raises(ValueError, match="rgb_u8"):
-        network.inverse_depth(image[..., 0])
-    with pytest.raises(ValueError, match="8-bit"):
-        network.inverse_depth(image / 255)
 
 
 @needs_transformers
@@ -130,7 +126,7 @@ def test_a_hub_name_is_searched_in_the_cache_first(folder, monkeypatch):
 
 
 def test_without_the_package_its_name_is_said(monkeypatch):
-    monkeypatch.setattr(depth_network, "find_spec", lambda name: None)
+    monkeypatch.setattr(hub_model, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"Fix: `pip install -c constraints\.txt transformers`"):
         DepthNetwork()
 
@@ -159,7 +155,7 @@ def test_importing_the_module_loads_neither_torch_nor_transformers():
     import subprocess
 
     code = (
-        "import sys, endoprior.prepare.depth_network; "
+        "import sys, endoprior.prepare.relative_depth; "
         "assert not {'torch', 'transformers', 'huggingface_hub'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -17,8 +17,9 @@ from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.data.images import read_tool_mask
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.prepare import PrepareConfig, carried_masks, pipeline, prepare, sam2
+from endoprior.prepare import PrepareConfig, hub_model, pipeline, prepare
 from endoprior.prepare.hub_model import FILES
+from endoprior.prepare.masks import WORK
 from endoprior.prepare.record import names_path
 from endoprior.prepare.sam2 import DEFAULT_MODEL, is_sam2, open_sam2
 from endoprior.tool_masks.carry import carry
@@ -160,7 +161,7 @@ def test_prepare_writes_the_segmenters_masks_and_depth_made_with_them(phantom, t
     assert load_sequence(done.out).masks_are_found
     assert any("followed by a stand-in" in note for note in done.notes)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "v.mkv"]
-    assert not (done.out / carried_masks.WORK).exists()
+    assert not (done.out / WORK).exists()
     # The same masks, given by a user, give the same depth.
     given = prepare(tmp_path / "v.mkv", tmp_path / "given", OPTIONS.__class__(**given_options(done.out)))
     own = prepare(tmp_path / "v.mkv", tmp_path / "own", OPTIONS.__class__(**given_options("auto")))
@@ -258,7 +259,7 @@ def test_other_files_are_an_error(model, tmp_path):
 
 @pytest.mark.parametrize("option", ["--masks", "--with"])
 def test_without_the_package_its_name_is_said(monkeypatch, option):
-    monkeypatch.setattr(sam2, "find_spec", lambda name: None)
+    monkeypatch.setattr(hub_model, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=rf"{option} sam2: expected the transformers package, got none. Fix: `pip"):
         open_sam2("sam2", option)
 

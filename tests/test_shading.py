@@ -95,20 +95,9 @@ def test_pixels_missing_in_all_samples_use_the_image_alone():
     assert np.isfinite(depth).all() and 0.8 < np.median(depth) / 70 < 1.25
 
 
-def test_samples_are_checked():
-    with pytest.raises(ValueError, match="one mask each"):
-        fit_shading([], [])
-    with pytest.raises(ValueError, match="rgb_u8"):
-        fit_shading([lit(BUMP), lit(BUMP)[:-1]], [EVERYWHERE, EVERYWHERE[:-1]])
+def test_samples_without_tissue_are_an_error():
     with pytest.raises(InputError, match="got none"):
         fit_shading([lit(BUMP)], [~EVERYWHERE])
-    with pytest.raises(ValueError, match="working_distance_mm"):
-        fit_shading([lit(BUMP)], [EVERYWHERE], float("nan"))
-    model = fit_shading([lit(BUMP)], [EVERYWHERE])
-    with pytest.raises(ValueError, match="rgb_u8"):
-        model.depth(lit(BUMP)[:-1], EVERYWHERE[:-1])
-    with pytest.raises(ValueError, match="8-bit"):
-        model.depth(lit(BUMP).astype(np.float32), EVERYWHERE)
 
 
 def test_relative_disparity_is_linear_in_inverse_depth():
@@ -149,9 +138,5 @@ def test_relative_samples_are_checked():
     ones = np.ones((4, 4))
     with pytest.raises(InputError, match="none"):
         fit_reference([ones], [ones < 0], "depth")
-    with pytest.raises(InputError, match="none"):
-        fit_reference([], [], "depth")
     with pytest.raises(InputError, match="vary"):
         fit_reference([ones], [ones > 0], "disparity")
-    with pytest.raises(ValueError, match="usable"):
-        fit_reference([ones], [ones[1:] > 0], "depth")

@@ -7,7 +7,8 @@ from video_files import write_video
 
 from endoprior.core.checks import InputError
 from endoprior.prepare.frame_selection import FrameSelection
-from endoprior.prepare.source import SourceFrame, open_source
+from endoprior.prepare.source import open_source
+from endoprior.prepare.video import SourceFrame
 
 
 def pictures_of(count, height=24, width=32):

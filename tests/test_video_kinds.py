@@ -15,8 +15,8 @@ from video_files import encode, ffmpeg, psnr, smooth, write_video
 
 from endoprior.core.checks import InputError
 from endoprior.data.recognize import is_video
+from endoprior.prepare.decoding import Timeline, usual_rate
 from endoprior.prepare.source import open_source
-from endoprior.prepare.timeline import Timeline, usual_rate
 
 # --- Pixels
 

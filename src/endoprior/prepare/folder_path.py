@@ -25,7 +25,6 @@ from ..data.pose_writing import (
     replace_poses,
 )
 from ..system.atomic import write_json
-from .camera_path.seen import CameraPath, Lens, PoseInput
 from .camera_path.sequence_path import (
     AS_OURS,
     ASSUMED,
@@ -38,6 +37,7 @@ from .camera_path.sequence_path import (
     sources_with,
     unexplained_frames,
 )
+from .camera_path.tracks import CameraPath, Lens, PoseInput
 
 STATIC = "static camera"
 
@@ -81,9 +81,8 @@ def write_folder_path(
     described = read_description(folder / "sequence.json")
     height, width = read_color(images[0]).shape[:2]
     size, scale = (width, height), float(described.get("depth_scale", 1.0))
-    fx, fy, cx, cy = intrinsics_of(
-        folder / "sequence.json", described, width, height, _focal(folder, described, images)
-    )
+    focal = _focal(folder, described, images)
+    fx, fy, cx, cy = intrinsics_of(folder / "sequence.json", described, width, height, focal)
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     tool_value, relative = described.get("mask_tool_value", 255), described.get("depth_relative", False)
 
@@ -110,7 +109,8 @@ def write_folder_path(
         progress=lambda done: progress(done, len(images)),
     )
     unexplained = unexplained_frames(path, colors())
-    new = path or CameraPath(np.tile(np.eye(4), (len(images), 1, 1)), np.ones(len(images), bool), np.ones(len(images)))
+    count = len(images)
+    new = path or CameraPath(np.tile(np.eye(4), (count, 1, 1)), np.ones(count, bool), np.ones(count))
     if relative and path is not None:
         scaled = zip(depths, path.depth_scale, strict=True)
         replace_depth(folder, ((file.name, rescaled(decode_image(file, size), float(s))) for file, s in scaled))

@@ -4,53 +4,20 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..data.found_tools import FoundTools
 from ..data.writer import FrameFiles
+from .first_pass import MeasuredFrame
 from .frame_geometry import FrameGeometry
+from .methods import FrameMethods
 from .stereo import temporal_median
 from .video_clip import StereoFrame
 
 REACH = 2
 """Number of frames on each side in the temporal depth filter."""
-Mask = NDArray[np.bool_]
-Depth = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class MeasuredFrame:
-    """A rectified frame and its depth."""
-
-    position: int
-    """Position in the sequence, from 0."""
-    index: int
-    """Position in the source."""
-    rgb_u8: NDArray[np.uint8]
-    """(H, W, 3)."""
-    right_u8: NDArray[np.uint8] | None
-    """(H, W, 3) image of the right camera, rectified; None if monocular."""
-    depth: Depth | None
-    """(H, W) mm, 0 where missing; None before it is measured."""
-
-
-@dataclass(frozen=True)
-class FrameMethods:
-    """Functions that make depth and masks of one clip."""
-
-    measure: Callable[[MeasuredFrame], Depth] | None
-    """Depth that needs no mask: stereo, files, a network."""
-    shade: Callable[[NDArray[np.uint8], Mask], Depth] | None
-    """Depth from the shading of an image inside a mask."""
-    tools: Callable[[MeasuredFrame], FoundTools]
-    """The tools of a frame; those that the user gives have confidence 1."""
-    filter_in_time: bool
-    """Whether to filter depth over neighboring frames."""
-    wanted: Callable[[NDArray[np.uint8]], bool]
-    """Whether an image (H, W, 3) belongs in the sequence."""
 
 
 def measure_frames(
@@ -61,17 +28,13 @@ def measure_frames(
     Args:
         used: gets the position in the source of every wanted frame.
     """
-    position = 0
     for stereo_frame in stereo_frames:
-        rgb_u8 = geometry.image(stereo_frame.left)
-        if not methods.wanted(rgb_u8):
+        frame = MeasuredFrame.of(stereo_frame, geometry, len(used))
+        if not methods.wanted(frame.rgb_u8):
             continue
         used.append(stereo_frame.index)
-        if position >= first:
-            right = None if stereo_frame.right is None else geometry.image(stereo_frame.right, right=True)
-            frame = MeasuredFrame(position, stereo_frame.index, rgb_u8, right, None)
+        if frame.position >= first:
             yield replace(frame, depth=methods.measure(frame)) if methods.measure else frame
-        position += 1
 
 
 def with_neighbors(frames: Iterable[MeasuredFrame]) -> Iterator[list[MeasuredFrame]]:
@@ -101,8 +64,8 @@ def write_frames(
     files: FrameFiles,
     *,
     keep_right: bool,
-    on_tools: Callable[[int, FoundTools], None] = lambda position, found: None,
-    on_frame: Callable[[int], None] = lambda count: None,
+    on_tools: Callable[[int, FoundTools], None],
+    on_frame: Callable[[int], None],
 ) -> list[int]:
     """Write every wanted frame that `files` does not have yet.
 

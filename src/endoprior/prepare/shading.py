@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import check_range, check_shape, input_error
+from ..core.checks import input_error
 from ..priors.specular import specular_likelihood
 
 SMALL_WIDTH = 160
@@ -65,10 +65,7 @@ class ShadingModel:
         Returns:
             (H, W) depth, mm, within a factor of `MAX_RATIO` of the working distance; the working distance everywhere
             if no pixel is usable.
-        Raises:
-            ValueError: another size or type.
         """
-        check_shape(f"rgb_u8:{self.size[1]},{self.size[0]},3", rgb_u8=rgb_u8)
         brightness, weight = _log_brightness(rgb_u8, usable)
         compared = (weight > 0.5) & np.isfinite(self.reference)
         if not (weight > 0.5).any():
@@ -96,19 +93,11 @@ def fit_shading(
         usable: (H, W) each, True on tissue.
         working_distance_mm: median depth to scale to, mm.
     Raises:
-        ValueError: no images, or different sizes or types.
         InputError: no image has a usable pixel.
     """
-    check_range("working_distance_mm", working_distance_mm, 1, 1000)
-    if not images or len(images) != len(usable):
-        raise ValueError(f"images must have one mask each, got {len(images)} and {len(usable)}")
     height, width = images[0].shape[:2]
-    stack = []
-    for rgb_u8, mask in zip(images, usable, strict=True):
-        check_shape(f"rgb_u8:{height},{width},3", rgb_u8=rgb_u8)
-        brightness, weight = _log_brightness(rgb_u8, mask)
-        stack.append(np.where(weight > 0.5, brightness, np.nan))
-    values = np.stack(stack)
+    small = [_log_brightness(rgb_u8, mask) for rgb_u8, mask in zip(images, usable, strict=True)]
+    values = np.stack([np.where(weight > 0.5, brightness, np.nan) for brightness, weight in small])
     seen = np.isfinite(values).any(0)
     if not seen.any():
         raise input_error("sample images", "usable tissue", "none", "Check the masks, or choose other frames.")
@@ -130,9 +119,6 @@ def _log_brightness(
 
     Red, because blood absorbs it least: vessels change it less than they change green, blue or luminance.
     """
-    check_shape("rgb_u8:H,W,3 usable:H,W", rgb_u8=rgb_u8, usable=usable)
-    if rgb_u8.dtype != np.uint8:
-        raise ValueError(f"rgb_u8 must be 8-bit, got {rgb_u8.dtype}")
     height, width = usable.shape
     size = (min(SMALL_WIDTH, width), max(round(height * min(SMALL_WIDTH, width) / width), 1))
     rgb = rgb_u8 * np.float32(1 / 255)

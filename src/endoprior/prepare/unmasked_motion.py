@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import check_shape
 from ..core.spread import spread
 from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
 from ..tool_masks.regions import disk, entering_regions
@@ -67,10 +66,7 @@ def moves_unmasked(first: NDArray[np.uint8], later: NDArray[np.uint8], view: Mas
         first, later: (H, W, 3) about 0.1 s apart.
         view: (H, W) True inside the endoscope's image.
         tool: (H, W) True on the masked tools of either frame.
-    Raises:
-        ValueError: shapes that do not match.
     """
-    check_shape("first:H,W,3 later:H,W,3 view:H,W tool:H,W", first=first, later=later, view=view, tool=tool)
     shrink = max(1, min(view.shape) // SIDE_PX)
     before, after = gray_for_flow(first, shrink), gray_for_flow(later, shrink)
     if min(before.shape) < MIN_SIZE_PX:

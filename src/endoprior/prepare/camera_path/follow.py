@@ -13,13 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.spread import spread
-from .adjust import adjust
-from .corners import MAX_CORNERS, REFRESH, Gray, followed, gray_of, new_corners, sampled, usable_tissue
-from .keyframes import Keyframe, Link, keyframe, link
-from .resection import INLIER_PX, coarse_pose, refined_pose
-from .residuals import back_projected
-from .seen import Lens, PoseInput
-from .tracks import Tracks
+from .adjust import INLIER_PX, adjust, back_projected, coarse_pose, refined_pose
+from .features import (
+    MAX_CORNERS,
+    REFRESH,
+    Gray,
+    Keyframe,
+    Link,
+    followed,
+    gray_of,
+    keyframe,
+    link,
+    new_corners,
+    sampled,
+    usable_tissue,
+)
+from .tracks import Lens, PoseInput, Tracks
 
 MIN_TRACKS = 30
 """With fewer tracks a frame gets no pose from the frame before."""
@@ -116,6 +125,13 @@ class Follower:
         self.scales[index] = self._scale(pose, ids[inlier], depths[inlier], self.scales[index - 1])
         return True
 
+    def set_scale(self, frame: int, usable: NDArray[np.bool_]) -> None:
+        """Set the factor of a frame's depth by its rigid points, of those that are usable (P,)."""
+        ids = self.tracks.ids[frame]
+        good = usable[ids] & (self.tracks.weight[ids] > 0.3)
+        found = self._scale(self.poses[frame], ids[good], self.tracks.depths[frame][good], self.scales[frame])
+        self.scales[frame] = found
+
     def _scale(self, pose: NDArray, ids: NDArray, depths: NDArray, otherwise: float) -> float:
         """Median ratio of the points' z to the measured depth; 1 where depth has a unit."""
         if not self.lens.depth_is_relative:
@@ -188,15 +204,10 @@ class Follower:
         done = adjust(self.lens.matrix, self.poses[frames], self.tracks.points[ids], seen, fixed, rounds=2, steps=1)
         if not np.isfinite(done.poses).all():
             return
-        self.poses[frames], self.tracks.points[ids], self.tracks.weight[ids] = (
-            done.poses,
-            done.points,
-            done.track_weight,
-        )
+        tracks = self.tracks
+        self.poses[frames], tracks.points[ids], tracks.weight[ids] = done.poses, done.points, done.track_weight
         for frame in frames:
-            trusted = self.tracks.weight[self.tracks.ids[frame]] > 0.3
-            here = self.tracks.ids[frame][trusted], self.tracks.depths[frame][trusted]
-            self.scales[frame] = self._scale(self.poses[frame], *here, self.scales[frame])
+            self.set_scale(frame, np.ones(len(tracks.weight), bool))
 
     def _refill(self, index: int, view: _View) -> None:
         """Detect new corners where tracks died; their points come from depth."""

@@ -1,14 +1,14 @@
-"""All tracks of a clip: where each point was seen, and where it is. No image is kept. `P` points."""
+"""What camera tracking reads, keeps and returns: frames, lens, tracks of points, path. `T` frames, `P` points."""
 
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .adjust import Observations
-from .seen import Lens
 
 HELD_OUT = 8
 """One in this many tracks takes no part in any estimate: it measures how well a path explains the frames."""
@@ -22,18 +22,93 @@ DEPTH_STD = {False: 0.02, True: 0.15}
 """Error of other depth as a share of it, by whether it is relative."""
 
 
+@dataclass(frozen=True)
+class PoseInput:
+    """One frame for camera tracking."""
+
+    rgb_u8: NDArray[np.uint8]
+    """(H, W, 3)."""
+    tissue_mask: NDArray[np.bool_]
+    """(H, W) True outside tools."""
+    depth: NDArray[np.float32]
+    """(H, W) mm, 0 where missing."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A pinhole camera whose depth was measured; pixel centers are counted from 0, as in OpenCV."""
+
+    matrix: NDArray[np.float64]
+    """(3, 3) K, px."""
+    width: int
+    """Of the image, px."""
+    depth_is_relative: bool
+    """Each frame's depth has a scale of its own."""
+    baseline_mm: float | None = None
+    """Distance between the cameras that measured the depth, mm."""
+
+    @classmethod
+    def centered_at_half(
+        cls, matrix: NDArray[np.float64], width: int, depth_is_relative: bool, baseline_mm: float | None = None
+    ) -> Lens:
+        """From K with the left-most pixel centered at 0.5."""
+        opencv = np.array(matrix, np.float64)
+        opencv[:2, 2] -= 0.5
+        return cls(opencv, width, depth_is_relative, baseline_mm)
+
+    def with_focal(self, factor: float) -> Lens:
+        """The lens with both focal lengths multiplied."""
+        matrix = self.matrix.copy()
+        matrix[[0, 1], [0, 1]] *= factor
+        return replace(self, matrix=matrix)
+
+    @property
+    def px(self) -> float:
+        """Length of a pixel of an image 640 px wide, in px of this one: thresholds are multiples of it."""
+        return self.width / 640
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Poses of all frames."""
+
+    camera_to_world: NDArray[np.float64]
+    """(T, 4, 4), translation in mm; an unexplained frame has the pose of the frame before it."""
+    explained: NDArray[np.bool_]
+    """(T,) whether the pose is linked to those of the other frames."""
+    depth_scale: NDArray[np.float64]
+    """(T,) factor that makes the depth of the frame agree with the path; 1 for depth in mm."""
+    method: str = "file"
+    """Where the poses come from."""
+    focal_factor: float = 1.0
+    """Refined focal length, as a multiple of the given one."""
+    translation_std: NDArray[np.float64] | None = None
+    """(T,) standard deviation of the camera center, mm; NaN where unexplained."""
+    rotation_std: NDArray[np.float64] | None = None
+    """(T,) standard deviation of the rotation, degrees."""
+    still: NDArray[np.bool_] | None = None
+    """(T,) whether the pose is a copy, because the camera rests."""
+    breathes: bool = False
+    """Whether periodic motion of the tissue was told apart from the camera's."""
+    notes: list[str] = field(default_factory=list)
+    """Notes for the user, one line each."""
+
+
 class Tracks:
     """Observations by frame, and the points they belong to."""
 
     def __init__(self, lens: Lens) -> None:
         self.lens = lens
-        self.count = 0
         self.ids: list[NDArray[np.int32]] = []
         self.pixels: list[NDArray[np.float32]] = []
         self.depths: list[NDArray[np.float32]] = []
         self.points, self.weight = np.zeros((0, 3)), np.zeros(0)
-        self.keypoint = np.zeros(0, bool)
-        self.adjusted = np.zeros(0, bool)
+        self.keypoint, self.adjusted = np.zeros(0, bool), np.zeros(0, bool)
+
+    @property
+    def count(self) -> int:
+        """P."""
+        return len(self.points)
 
     def copy(self) -> Tracks:
         """The same observations; points and weights of its own."""
@@ -44,14 +119,11 @@ class Tracks:
 
     def add_points(self, points: NDArray, *, keypoint: bool) -> NDArray[np.int32]:
         """Ids of new points (N, 3)."""
-        first, self.count = self.count, self.count + len(points)
-        while self.count > len(self.points):
-            more = max(1024, len(self.points))
-            self.points = np.concatenate([self.points, np.zeros((more, 3))])
-            self.weight = np.concatenate([self.weight, np.ones(more)])
-            self.keypoint = np.concatenate([self.keypoint, np.zeros(more, bool)])
-            self.adjusted = np.concatenate([self.adjusted, np.zeros(more, bool)])
-        self.points[first : self.count], self.keypoint[first : self.count] = points, keypoint
+        first, more = self.count, len(points)
+        self.points = np.concatenate([self.points, points])
+        self.weight = np.append(self.weight, np.ones(more))
+        self.keypoint = np.append(self.keypoint, np.full(more, keypoint))
+        self.adjusted = np.append(self.adjusted, np.zeros(more, bool))
         return np.arange(first, self.count, dtype=np.int32)
 
     def see(self, frame: int, ids: NDArray, pixels: NDArray, depths: NDArray) -> None:

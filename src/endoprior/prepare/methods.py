@@ -1,35 +1,28 @@
-"""Choose how depth and tool masks of a clip are made, from the options and the available inputs."""
+"""Choose how the depth and the masks of a clip are made, from the options and the available inputs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError, input_error
+from ..core.checks import input_error
 from ..core.spread import spread
 from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
 from ..data.depth_fill import is_measured
-from ..data.description import TOOLS_FOUND
-from ..data.found_tools import FoundTools
-from ..data.frame_files import match_files, match_names
-from ..data.mask_files import tool_polarity
-from ..data.mask_folders import MaskFrame, open_mask_folder
+from ..data.frame_files import match_files
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit
 from .config import PrepareConfig
-from .first_pass import FirstPass
+from .first_pass import Depth, FirstPass, Mask, MeasuredFrame
 from .frame_geometry import FrameGeometry
-from .frames import Depth, FrameMethods, Mask, MeasuredFrame
+from .masks import Tools, choose_tools
 from .relative_depth import Kind, fit_reference, relative_to_mm
-from .sam2 import is_sam2
 from .shading import fit_shading
 from .stereo import stereo_depth
 from .video_clip import Clip
@@ -41,52 +34,49 @@ MAX_ROW_OFFSET_PX = 1.5
 NETWORK = "depth-anything"
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
-A = TypeVar("A")
-Tools = Callable[[MeasuredFrame], FoundTools]
-Shade = Callable[[NDArray[np.uint8], Mask], Depth]
 
 
-@dataclass
-class ChosenMethods:
-    """How depth and masks of a clip are made."""
+@dataclass(frozen=True)
+class FrameMethods:
+    """How depth and masks of one clip are made."""
 
-    methods: FrameMethods
+    measure: Measure | None
+    """Depth that needs no mask: stereo, files, a network."""
+    shade: Callable[[NDArray[np.uint8], Mask], Depth] | None
+    """Depth from the shading of an image inside a mask."""
+    tools: Tools
+    filter_in_time: bool
+    """Whether to filter depth over neighboring frames."""
+    wanted: Callable[[NDArray[np.uint8]], bool]
+    """Whether an image (H, W, 3) belongs in the sequence."""
     sources: dict[str, str]
     """Where images, depth and masks come from."""
     relative: bool
     """Whether the scale of the depth is assumed."""
     notes: list[str]
     """Notes for the user, one line each."""
-    finds_tools: bool = False
-    """Whether our own finder makes the masks, so that each frame has a confidence."""
 
 
-def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> ChosenMethods:
+def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> FrameMethods:
     """Choose the methods and fit their models to samples of the clip.
 
     Raises:
         InputError: a folder named by an option cannot be used, or an option needs a second camera.
     """
     geometry, step = first_pass.geometry, max(len(first_pass.samples) // FITTED_SAMPLES, 1)
-    samples = []
-    for frame in first_pass.samples[::step]:
-        right = None if frame.right is None else geometry.image(frame.right, right=True)
-        samples.append(MeasuredFrame(0, frame.index, geometry.image(frame.left), right, None))
-    notes = _check_stereo(samples, geometry, clip) if clip.stereo else []
+    samples = [MeasuredFrame.of(frame, geometry) for frame in first_pass.samples[::step]]
+    notes = _check_stereo(samples, clip) if clip.stereo else []
     kind = _depth_kind(cfg, clip)
     relative = kind in ("shading", "network") or cfg.depth_relative != "no"
     measure, source = None, kind
     if kind not in ("none", "shading"):
         measure, source, depth_notes = _measured_depth(kind, cfg, clip, first_pass)
         notes += depth_notes
-    tools, mask_source, mask_note = _tools(cfg, first_pass, samples)
-    notes += mask_note
-    shade: Shade | None = None
+    tools, mask_source, mask_notes = choose_tools(cfg, first_pass, samples)
+    notes += mask_notes
+    shade = None
     if relative:
-        images, usable = (
-            [frame.rgb_u8 for frame in samples],
-            [geometry.inside & ~tools(frame).mask for frame in samples],
-        )
+        images, usable = [f.rgb_u8 for f in samples], [geometry.inside & ~tools(f).mask for f in samples]
         if measure is None:
             shade = fit_shading(images, usable, cfg.working_distance_mm).depth
         else:
@@ -98,27 +88,24 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Cho
     elif kind == "folder":
         notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.depth)
     wanted = _inside_body([frame.rgb_u8 for frame in samples]) if cfg.drop_out_of_body else lambda rgb_u8: True
-    methods = FrameMethods(measure, shade, tools, kind == "sgbm", wanted)
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
-    return ChosenMethods(methods, sources, relative, notes, finds_tools=cfg.masks == "auto")
+    return FrameMethods(measure, shade, tools, kind == "sgbm", wanted, sources, relative, notes)
 
 
-def _check_stereo(samples: list[MeasuredFrame], geometry: FrameGeometry, clip: Clip) -> list[str]:
+def _check_stereo(samples: list[MeasuredFrame], clip: Clip) -> list[str]:
     """Reject swapped cameras; return a note if the rows do not match."""
-    middle = [frame for frame in samples if frame.right_u8 is not None][:: max(len(samples) // 3, 1)]
-    orders = [stereo_order(frame.rgb_u8, frame.right_u8) for frame in middle]
+    pairs = [(frame.rgb_u8, frame.right_u8) for frame in samples][:: max(len(samples) // 3, 1)]
+    orders = [stereo_order(*pair) for pair in pairs]
     if sum(order.swapped for order in orders) > len(orders) / 2:
         fix = "Remove --swap-eyes." if clip.swap else "Add --swap-eyes."
         shares = f"{orders[0].exchanged:.0%} of the image matches swapped, {orders[0].as_given:.0%} as given"
         raise input_error(clip.source.path, "the left camera first", f"the right one ({shares})", fix)
-    offsets = np.array([vertical_offset_px(frame.rgb_u8, frame.right_u8) for frame in middle])
+    offsets = np.array([vertical_offset_px(*pair) for pair in pairs])
     offset = float(np.median(offsets[np.isfinite(offsets)])) if np.isfinite(offsets).any() else 0.0
-    if offset > MAX_ROW_OFFSET_PX:
-        return [
-            f"the rows of the cameras are {offset:.1f} px apart; depth will be poor. Pass the calibration of "
-            "this video, or --row-offset auto."
-        ]
-    return []
+    if offset <= MAX_ROW_OFFSET_PX:
+        return []
+    fix = "Pass the calibration of this video, or --row-offset auto."
+    return [f"the rows of the cameras are {offset:.1f} px apart; depth will be poor. {fix}"]
 
 
 def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
@@ -155,27 +142,25 @@ def _measured_depth(
 
         return match, "stereo: semi-global matching", []
     if kind == "network":
-        from .depth_network import DEFAULT_MODEL, DepthNetwork
+        from .relative_depth import DEFAULT_MODEL, DepthNetwork
 
         network = DepthNetwork(cfg.depth.partition(":")[2] or DEFAULT_MODEL)
         return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2", []
     files, notes = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
-    if cfg.depth_relative == "no" and not cfg.depth_unit_mm:
-        fix = "`--depth-unit-mm 1` for mm, `0.01` for 0.01 mm, `1000` for m; or `--depth-relative depth`."
-        raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.depth}", "none", fix)
-
     if cfg.depth_relative == "no":
+        if not cfg.depth_unit_mm:
+            fix = "`--depth-unit-mm 1` for mm, `0.01` for 0.01 mm, `1000` for m; or `--depth-relative depth`."
+            raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.depth}", "none", fix)
         some = spread(len(first_pass.indices), FITTED_SAMPLES)
         notes += _check_stored([read_stored(files[first_pass.indices[i]]) for i in some])
 
     def read(path: Path, size: tuple[int, int]) -> NDArray:
-        if cfg.depth_relative != "no":
-            if cfg.depth_relative == "depth":
-                return read_depth_file(path, 1.0, size, relative=True)
+        if cfg.depth_relative == "disparity":
             return read_values(path, size)
-        return read_depth_file(path, cfg.depth_unit_mm, size)
+        relative = cfg.depth_relative == "depth"
+        return read_depth_file(path, 1.0 if relative else cfg.depth_unit_mm, size, relative=relative)
 
-    return lambda frame: _values(read, files[frame.index], first_pass), "user's files", notes
+    return lambda frame: first_pass.frame_of(lambda size: read(files[frame.index], size)), "user's files", notes
 
 
 def _scaled(measure: Measure, samples: list[MeasuredFrame], usable: list[Mask], cfg: PrepareConfig) -> Measure:
@@ -205,70 +190,6 @@ def _check_stored(images: list[NDArray]) -> list[str]:
         share = float(np.mean([each.mean() for each in filled]))
         notes.append(f"depth: numbers from {least:g} on are far above the rest and count as missing, {share:.1%} of it")
     return notes
-
-
-def _values(read: Callable[[A, tuple[int, int]], NDArray], path: A, first_pass: FirstPass) -> NDArray:
-    """The frame (H, W) of a file that has the size of the source images, of the frames, or of the stored pixels."""
-    geometry, stored = first_pass.geometry, first_pass.stored_size
-    try:
-        return geometry.values(read(path, geometry.source_size))
-    except InputError:
-        with suppress(InputError):
-            return geometry.values(read(path, geometry.size))
-        if stored is not None:
-            with suppress(InputError):
-                values = read(path, stored)
-                kind = np.uint8 if values.dtype == bool else values.dtype
-                square = cv2.resize(values.astype(kind), geometry.source_size, interpolation=cv2.INTER_NEAREST_EXACT)
-                return geometry.values(square.astype(values.dtype))
-        raise
-
-
-def _tools(cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]) -> tuple[Tools, str, list[str]]:
-    """A function that returns the tools of a frame, the name of its source, and a note."""
-    geometry = first_pass.geometry
-    if cfg.mask_labels and (cfg.masks in ("auto", "none") or is_sam2(cfg.masks)):
-        raise input_error("--mask-labels", "a folder with --masks", cfg.masks, "Remove --mask-labels.")
-    if cfg.masks == "none":
-        return lambda frame: FoundTools(np.zeros_like(geometry.inside), 1.0), "none", []
-    if cfg.masks == "auto" or is_sam2(cfg.masks):
-        from ..tool_masks import ToolFinder  # imports torch
-
-        finder = ToolFinder()
-        found = [finder.find(sample.rgb_u8, geometry.inside) for sample in samples]
-        share = sum(bool(tools.mask.any()) for tools in found) / max(len(found), 1)
-        source = f"{TOOLS_FOUND} in {share:.0%} of the samples" if share else f"no {TOOLS_FOUND}"
-        hint = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
-        if not share:
-            hint = "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
-        notes = [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"]  # its own masks replace these
-        return lambda frame: finder.find(frame.rgb_u8, geometry.inside), source, notes
-    return _user_masks(cfg, first_pass, samples)
-
-
-def _user_masks(
-    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
-) -> tuple[Tools, str, list[str]]:
-    """As `_tools`, from the user's files."""
-    path = Path(cfg.masks)
-    given = open_mask_folder(path, cfg.mask_labels)
-    names = [each.name for each in given.frames]
-    matched = match_names(path, names, first_pass.indices, first_pass.image_names, in_order_only=given.in_order_only)
-
-    def read(each: MaskFrame, size: tuple[int, int]) -> Mask:
-        return each.read(size)
-
-    def high(frame: MeasuredFrame) -> Mask:
-        return _values(read, given.frames[matched.files[frame.index]], first_pass)
-
-    notes = [f"masks: {each}" for each in (given.note, matched.rule) if each]
-    if given.tool_is_high is None or cfg.mask_tool_value != "auto":
-        polarity = tool_polarity(cfg.mask_tool_value, [high(f) for f in samples], [f.rgb_u8 for f in samples])
-        tool_is_high = polarity.tool_is_high
-        notes.append(f"masks: {polarity.reason}")
-    else:
-        tool_is_high = given.tool_is_high
-    return lambda frame: FoundTools(high(frame) == tool_is_high, 1.0), "user's files", notes
 
 
 def _inside_body(images: list[NDArray[np.uint8]]) -> Callable[[NDArray[np.uint8]], bool]:
