@@ -9,7 +9,7 @@ import pytest
 
 from endoprior.core.checks import InputError
 from endoprior.evaluation.metrics.torchvision_compat import import_torchvision
-from endoprior.prepare import hub_model, relative_depth
+from endoprior.prepare import relative_depth
 from endoprior.prepare.hub_model import FILES
 from endoprior.prepare.relative_depth import DepthNetwork
 
@@ -77,26 +77,6 @@ def test_a_folder_without_a_file_is_an_error(missing, tmp_path):
 
 
 @needs_transformers
-def test_other_files_are_an_error(folder, tmp_path):
-    for config, weights in ((b"{}", b"broken"), ((folder / "config.json").read_bytes(), b"broken")):
-        (tmp_path / "config.json").write_bytes(config)
-        (tmp_path / "model.safetensors").write_bytes(weights)
-        with pytest.raises(InputError, match="Depth Anything") as caught:
-            DepthNetwork(tmp_path)
-        assert "\n" not in str(caught.value)
-
-
-@needs_transformers
-def test_weights_of_another_network_are_an_error(folder, tmp_path):
-    from safetensors.numpy import save_file
-
-    (tmp_path / "config.json").write_bytes((folder / "config.json").read_bytes())
-    save_file({"other": np.zeros(3, np.float32)}, tmp_path / "model.safetensors", metadata={"format": "pt"})
-    with pytest.raises(InputError, match="no weights for"):
-        DepthNetwork(tmp_path)
-
-
-@needs_transformers
 @pytest.mark.parametrize("name", ["/nowhere/at-all", "some_folder", "./a/b"])
 def test_a_wrong_name_makes_no_network_request(name, monkeypatch):
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
@@ -125,12 +105,6 @@ def test_a_hub_name_is_searched_in_the_cache_first(folder, monkeypatch):
     assert asked == [True, True, False] and "\n" not in str(caught.value)
 
 
-def test_without_the_package_its_name_is_said(monkeypatch):
-    monkeypatch.setattr(hub_model, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"Fix: `pip install -c constraints\.txt transformers`"):
-        DepthNetwork()
-
-
 @needs_transformers
 def test_a_package_that_transformers_lacks_is_one_line(folder, monkeypatch):
     import transformers
@@ -155,7 +129,7 @@ def test_importing_the_module_loads_neither_torch_nor_transformers():
     import subprocess
 
     code = (
-        "import sys, endoprior.prepare.relative_depth; "
+        "import sys, endoprior.prepare.relative_depth, endoprior.prepare.sam2, endoprior.prepare.pipeline; "
         "assert not {'torch', 'transformers', 'huggingface_hub'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

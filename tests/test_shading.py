@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from endoprior.core.checks import InputError
-from endoprior.prepare import shading
-from endoprior.prepare.relative_depth import MAX_RATIO, NEAR_RATIO, fit_reference, relative_to_mm
-from endoprior.prepare.shading import RELIEF, fit_shading
+from endoprior.prepare import relative_depth
+from endoprior.prepare.relative_depth import MAX_RATIO, NEAR_RATIO, RELIEF, fit_reference, fit_shading, relative_to_mm
 
 WIDTH, HEIGHT = 201, 151
 COLUMN, ROW = np.meshgrid(np.linspace(-1, 1, WIDTH), np.linspace(-1, 1, HEIGHT))
@@ -79,7 +78,7 @@ def test_tools_highlights_and_the_outside_are_filled_in():
 
 
 def test_depth_is_finite_and_bounded_for_any_image(monkeypatch):
-    monkeypatch.setattr(shading, "RELIEF", 4.0)
+    monkeypatch.setattr(relative_depth, "RELIEF", 4.0)
     model = fit_shading([lit(BUMP)], [EVERYWHERE], 50)
     harsh = np.where(COLUMN[..., None] < 0, 1, 200).astype(np.uint8) * np.ones(3, np.uint8)
     depth = model.depth(harsh, EVERYWHERE)

@@ -65,15 +65,6 @@ def test_broken_sources_give_one_error_line(tmp_path, kind):
     assert str(path) in str(error.value) and says in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_truncated_video_suggests_end(tmp_path):
-    path = cut(write_video(tmp_path / "cut.mp4", pictures_of(40)), 0.6)
-    seen = []
-    with pytest.raises(InputError, match=r"cut\.mp4: expected 40 images, got .*--end"):
-        for image in open_source(path):
-            seen.append(image)
-    assert 0 < len(seen) < 40
-
-
 def test_an_image_of_another_size_is_named(tmp_path):
     for number, size in enumerate((32, 32, 30)):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((24, size, 3), np.uint8))

@@ -48,13 +48,6 @@ class DecodedImage:
 
 
 @dataclass
-class Undecodable:
-    """Counts images that are in the file and cannot be decoded."""
-
-    count: int = 0
-
-
-@dataclass
 class Timeline:
     """Times that only increase, and counts of where those of the file do not."""
 
@@ -170,12 +163,17 @@ def _packets(container: InputContainer, track: VideoStream) -> Iterator[av.Packe
 
 
 def decode(
-    container: InputContainer, track: VideoStream, lost: Undecodable, *, one_thread: bool = False, weave: bool = False
+    container: InputContainer,
+    track: VideoStream,
+    lost: list[int | None],
+    *,
+    one_thread: bool = False,
+    weave: bool = False,
 ) -> Iterator[DecodedImage]:
     """The images in the order in which they are shown.
 
     Args:
-        lost: its count grows with each image that cannot be decoded.
+        lost: gets the place, in ticks, of each image that is in the file and cannot be decoded.
         one_thread: slower; with threads, FFmpeg does not report all damage, and not always the same.
         weave: keep the rows of interlaced images as they are.
     Raises:
@@ -187,7 +185,7 @@ def decode(
     return images if weave else _deinterlaced(images)
 
 
-def _with_damage(container: InputContainer, track: VideoStream, lost: Undecodable) -> Iterator[DecodedImage]:
+def _with_damage(container: InputContainer, track: VideoStream, lost: list[int | None]) -> Iterator[DecodedImage]:
     """The images as stored.
 
     AVI holds the times at which images are decoded, not those at which they are shown. The decoder puts the images in
@@ -209,7 +207,7 @@ def _with_damage(container: InputContainer, track: VideoStream, lost: Undecodabl
         try:
             frames = track.decode(packet)
         except av.error.FFmpegError:
-            lost.count += 1
+            lost.append(packet.dts)
             spoiled = True
             if is_avi and packet.dts is not None:
                 decode_times.pop()

@@ -18,26 +18,16 @@ from ..data.found_tools import FrameRow, RowLog, mark_moving, read_rows, uncerta
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
+from ..footage.changes import find_changes
 from .calibration import parse_size
 from .calibration_files import read_calibration
-from .camera_path.sequence_path import (
-    ASSUMED,
-    CALIBRATED,
-    PATH_RECORD,
-    Reading,
-    record_of_path,
-    rescaled,
-    sequence_path,
-    sources_with,
-    unexplained_frames,
-)
+from .camera_path.sequence_path import ASSUMED, CALIBRATED, PATH_RECORD, Reading, rescaled, sequence_path
 from .camera_path.tracks import CameraPath, Lens, PoseInput
 from .config import PrepareConfig
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import with_equal_rows
-from .frames import write_frames
+from .frames import FrameMethods, choose_methods, write_frames
 from .masks import masked_frames, remove_carried, replace_by_carried
-from .methods import FrameMethods, choose_methods
 from .record import record_of
 from .sam2 import is_sam2, open_sam2
 from .video_clip import Clip
@@ -167,12 +157,8 @@ def _meta(clip: Clip, first_pass: FirstPass, methods: FrameMethods, step: int) -
     if clip.calibration is not None:
         lens = CALIBRATED if clip.calibration.size else SIZE_NOT_STATED
     return SequenceMeta(
-        width=geometry.size[0],
-        height=geometry.size[1],
-        fx=float(geometry.matrix[0, 0]),
-        fy=float(geometry.matrix[1, 1]),
-        cx=float(geometry.matrix[0, 2]),
-        cy=float(geometry.matrix[1, 2]),
+        *geometry.size,
+        *geometry.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(),
         frames_per_second=clip.frames_per_second / step,
         baseline_mm=geometry.baseline_mm,
         depth_scale=DEPTH_SCALE,
@@ -219,8 +205,8 @@ def _use_path(files: FrameFiles, path: CameraPath) -> None:
             file = files.file("depth", index)
             save_png(file, rescaled(decode_image(file, None), float(scale)))
     focal = {"fx": files.meta.fx * path.focal_factor, "fy": files.meta.fy * path.focal_factor}
-    files.meta = replace(files.meta, **focal, sources=sources_with(files.meta.sources, path))
-    files.write_json(PATH_RECORD, record_of_path(path))
+    files.meta = replace(files.meta, **focal, sources=path.sources(files.meta.sources))
+    files.write_json(PATH_RECORD, path.record())
 
 
 def _unmasked(files: FrameFiles, inside: NDArray[np.bool_]) -> list[int]:
@@ -238,9 +224,8 @@ def _unexplained(path: CameraPath | None, files: FrameFiles, damaged: list[int])
     whole = sorted({*range(files.count)} - {*damaged})
     if len(whole) < files.count / 2:  # too few to tell which scene is the usual one
         return damaged
-    lost = unexplained_frames(None, (_color(files, i) for i in whole))
-    without_pose = [] if path is None else np.flatnonzero(~path.explained).tolist()
-    return sorted({*damaged, *without_pose, *(whole[i] for i in lost)})
+    other_scene = [whole[i] for i in find_changes(_color(files, i) for i in whole).off_color]
+    return sorted({*damaged, *(path.lost if path else []), *other_scene})
 
 
 def _color(files: FrameFiles, index: int) -> NDArray[np.uint8]:

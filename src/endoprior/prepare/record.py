@@ -14,7 +14,7 @@ from ..core.options import changed_options
 from ..data.prepare_record import PrepareRecord
 from .config import PrepareConfig
 from .frame_geometry import FrameGeometry
-from .methods import NETWORK
+from .frames import NETWORK
 from .sam2 import SAM2
 
 GRID_POINTS = 9

@@ -71,21 +71,17 @@ class Sam2:
         """(1, 3, S, S) a frame (H, W, 3) as the network wants it."""
         import torch
 
-        image = torch.from_numpy(np.ascontiguousarray(rgb_u8)).permute(2, 0, 1)[None].to(self._device)
+        image = torch.from_numpy(np.ascontiguousarray(rgb_u8)).permute(2, 0, 1)[None].to(self.network.device)
         image = _resized(image.float() / 255, self.side_px)
-        mean, std = (torch.tensor(each, device=self._device).view(1, 3, 1, 1) for each in (MEAN, STD))
+        mean, std = (torch.tensor(each, device=self.network.device).view(1, 3, 1, 1) for each in (MEAN, STD))
         return (image - mean) / std
 
     def prompt(self, mask: NDArray[np.bool_]) -> Tensor:
         """(1, 1, S, S) 0 or 1: a mask (H, W) as the network wants it."""
         import torch
 
-        given = torch.from_numpy(mask.astype(np.float32))[None, None].to(self._device)
+        given = torch.from_numpy(mask.astype(np.float32))[None, None].to(self.network.device)
         return (_resized(given, self.side_px) >= 0.5).float()
-
-    @property
-    def _device(self):
-        return next(self.network.parameters()).device
 
 
 class Sam2Chunk:

@@ -19,7 +19,7 @@ from ..core.checks import InputError, input_error
 from ..core.shell import quoted
 from ..data.reading import MOST_PIXELS
 from ..data.video_files import open_container, starts_of_parts, what_it_is
-from .decoding import AVI, DecodedImage, Timeline, Undecodable, choose_track, decode, is_cover, packet_times, usual_rate
+from .decoding import AVI, DecodedImage, Timeline, choose_track, decode, is_cover, packet_times, usual_rate
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Video:
         return notes + self._found
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        timeline, lost = Timeline(self._step), Undecodable()
+        timeline, lost = Timeline(self._step), []
         began, last, shown_until = None, 0.0, 0.0
         index = interlaced = 0
         broken = ""
@@ -133,10 +133,10 @@ class Video:
                     index += 1
             except av.error.FFmpegError as error:
                 broken = error.strerror or str(error)
-        self.was_damaged |= lost.count > 0
+        self.was_damaged |= bool(lost)
         nothing_decodes = bool(self.times) and not index
         self._found = [] if nothing_decodes else self._check_end(index, began or 0.0, last, shown_until, broken)
-        self._found += self._oddities(timeline, lost.count, interlaced)
+        self._found += self._oddities(timeline, len(lost), interlaced)
 
     def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
         """A few images (H, W, 3) from the whole time range, with all their rows; at least one."""
@@ -148,7 +148,7 @@ class Video:
             if any(image is not None for image in found):
                 return [image for image in found if image is not None]
         with self._open() as (container, track):
-            images = decode(container, track, Undecodable(), weave=True)
+            images = decode(container, track, [], weave=True)
             positions = {bisect_left(self.times, time) for time in wanted} if self.times else {0}
             positions = {min(position, LOOKED_AT - 1) for position in positions} | {0}
             return [
@@ -160,7 +160,7 @@ class Video:
         at, image = time + self.start, None
         try:
             container.seek(int(at / track.time_base), stream=track)
-            for image in islice(decode(container, track, Undecodable(), weave=True), LOOKED_AT):
+            for image in islice(decode(container, track, [], weave=True), LOOKED_AT):
                 if image.seconds is None or image.seconds >= at - self._step / 2:
                     break
         except av.error.FFmpegError:

@@ -217,20 +217,17 @@ class Clip:
             for image in selection.pick(self.source):
                 yield self._stereo_frame(image, *split_cameras(image.rgb_u8, self.layout))
             return
-        others: dict[int, SourceFrame] = {}
-        self.unpaired = 0
+        self.unpaired, other = 0, None
 
         def paired() -> Iterator[SourceFrame]:
+            nonlocal other
             for image, other in self._pairing.pairs(self.source, self.second):
                 if other is None:
                     self.unpaired += self._cfg.start <= image.seconds < self._cfg.end
-                    continue
-                others.clear()
-                others[image.index] = other
-                yield image
+                else:
+                    yield image
 
         for image in selection.pick(paired()):
-            other = others[image.index]
             yield self._stereo_frame(image, image.rgb_u8, other.rgb_u8, damaged=other.damaged)
         if not selection.taken:
             hint = "Pass the two videos of one recording."

@@ -62,9 +62,8 @@ def derivatives(
     z = np.maximum(seen[:, 2], NEAREST_MM)
     zero = np.zeros_like(z)
     a, b = matrix[0, 0] / z / sigma[:, 0], matrix[1, 1] / z / sigma[:, 0]
-    by_seen = np.stack([a, zero, -a * x / z, zero, b, -b * y / z, zero, zero, -1 / (z * z * sigma[:, 1])], 1).reshape(
-        -1, 3, 3
-    )
+    entries = a, zero, -a * x / z, zero, b, -b * y / z, zero, zero, -1 / (z * z * sigma[:, 1])
+    by_seen = np.stack(entries, 1).reshape(-1, 3, 3)
     turned = np.stack([zero, seen[:, 2], -y, -seen[:, 2], zero, x, y, -x, zero], 1).reshape(-1, 3, 3)  # -[X]_x
     by_pose = np.concatenate([by_seen @ turned, by_seen], 2)
     by_focal = np.stack([a * x, b * y, zero], 1)
@@ -86,11 +85,6 @@ def back_projected(matrix: NDArray, pose: NDArray, pixels: NDArray, z: NDArray) 
     x = (pixels[:, 0] - matrix[0, 2]) / matrix[0, 0] * z
     y = (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1] * z
     return (np.stack([x, y, z], 1) - pose[:3, 3]) @ pose[:3, :3]
-
-
-def geman_mcclure(squared: NDArray, width: float) -> NDArray[np.float64]:
-    """Weight in (0, 1] of residuals with these squares: (c^2 / (c^2 + r^2))^2."""
-    return (width * width / (width * width + squared)) ** 2
 
 
 def _in_camera(poses: NDArray, points: NDArray) -> NDArray[np.float64]:
@@ -166,6 +160,11 @@ def adjust(
     return Adjusted(poses, points, track, float(np.exp(log_f)), focal_std)
 
 
+def geman_mcclure(squared: NDArray, width: float) -> NDArray[np.float64]:
+    """Weight in (0, 1] of residuals with these squares: (c^2 / (c^2 + r^2))^2."""
+    return (width * width / (width * width + squared)) ** 2
+
+
 def weights(
     error: NDArray, point: NDArray, count: int, wider: float = 1.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -181,14 +180,18 @@ def weights(
     usual = float(np.sqrt(np.median(history[number > 1]))) if (number > 1).any() else TRACK_WIDTH[1]
     width = wider * float(np.clip(2 * usual, *TRACK_WIDTH))
     track = geman_mcclure(history, width)
-    pixel = track[point] * geman_mcclure(squared, max(wider * SINGLE_WIDTH, 1.5 * width))
-    depth = track[point] * geman_mcclure(error[:, 2] ** 2, wider * DEPTH_WIDTH)
-    return np.stack([pixel, pixel, depth], 1), track
+    return _weights(error, track[point], max(wider * SINGLE_WIDTH, 1.5 * width), wider * DEPTH_WIDTH), track
+
+
+def _weights(error: NDArray, track: NDArray, width: float, depth_width: float = DEPTH_WIDTH) -> NDArray[np.float64]:
+    """(N, 3) weights of residuals whose tracks have these weights (N,)."""
+    pixel = track * geman_mcclure((error[:, :2] ** 2).sum(1), width)
+    return np.stack([pixel, pixel, track * geman_mcclure(error[:, 2] ** 2, depth_width)], 1)
 
 
 def _error(matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, log_f: float) -> NDArray[np.float64]:
-    scaled = _scaled(matrix, log_f)
-    return residuals(scaled, poses[seen.camera], points[seen.point], seen.pixels, seen.inverse_depth, seen.sigma)
+    here = poses[seen.camera], points[seen.point]
+    return residuals(_scaled(matrix, log_f), *here, seen.pixels, seen.inverse_depth, seen.sigma)
 
 
 def _cost(error: NDArray, weight: NDArray, log_f: float, focal_prior: float) -> float:
@@ -349,12 +352,6 @@ def refined_pose(
     covariance = np.linalg.inv(normal + 1e-9 * np.eye(6)) * variance
     spread = np.sqrt(np.maximum([np.trace(covariance[3:, 3:]), np.trace(covariance[:3, :3])], 0))
     return Resected(pose, squared < SINGLE_WIDTH**2, float(spread[0]), float(spread[1]))
-
-
-def _weights(error: NDArray, track_weight: NDArray, width: float) -> NDArray[np.float64]:
-    pixel = track_weight * geman_mcclure((error[:, :2] ** 2).sum(1), width)
-    depth = track_weight * geman_mcclure(error[:, 2] ** 2, DEPTH_WIDTH)
-    return np.stack([pixel, pixel, depth], 1)
 
 
 def _normal(

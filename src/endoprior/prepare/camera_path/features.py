@@ -42,21 +42,27 @@ INLIER_PX = 4.0
 
 
 @dataclass(frozen=True)
-class Gray:
-    """A frame as corners are followed in it."""
+class View:
+    """A frame as points are recognized in it."""
 
     plain: NDArray[np.uint8]
     """(H, W) brightness: finds large motion."""
     flat: NDArray[np.uint8]
     """(H, W) without shading: the light moves with the camera, and what it paints must not count as tissue."""
+    usable: NDArray[np.bool_]
+    """(H, W) see `usable_tissue`."""
+    depth: NDArray[np.float32]
+    """(H, W) 0 where missing."""
 
 
-def gray_of(rgb_u8: NDArray[np.uint8]) -> Gray:
-    """The gray images of (H, W, 3)."""
-    plain = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY)
+def view_of(seen: PoseInput) -> View:
+    """Prepare a frame."""
+    plain = cv2.cvtColor(seen.rgb_u8, cv2.COLOR_RGB2GRAY)
     bright = np.log(plain.astype(np.float32) + 8)
     bright -= cv2.GaussianBlur(bright, (0, 0), max(plain.shape[1] / FLAT_WIDTHS, 2.0))
-    return Gray(plain, np.clip(bright * FLAT_CONTRAST + 128, 0, 255).astype(np.uint8))
+    flat = np.clip(bright * FLAT_CONTRAST + 128, 0, 255).astype(np.uint8)
+    measured = np.isfinite(seen.depth) & (seen.depth > 0)
+    return View(plain, flat, usable_tissue(seen), np.where(measured, seen.depth, np.float32(0)))
 
 
 def usable_tissue(seen: PoseInput) -> NDArray[np.bool_]:
@@ -65,23 +71,22 @@ def usable_tissue(seen: PoseInput) -> NDArray[np.bool_]:
     small = cv2.resize(seen.rgb_u8, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
     glint = (specular_likelihood(small * np.float32(1 / 255)) > 0.5).astype(np.uint8)
     glint = cv2.resize(cv2.dilate(glint, np.ones((3, 3))), (width, height), interpolation=cv2.INTER_NEAREST)
-    tissue = cv2.erode(
-        seen.tissue_mask.astype(np.uint8), np.ones((7, 7)), borderType=cv2.BORDER_CONSTANT, borderValue=0
-    )
-    return (tissue & (1 - glint)).astype(bool)
+    tissue, border = seen.tissue_mask.astype(np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
+    return (cv2.erode(tissue, np.ones((7, 7)), **border) & (1 - glint)).astype(bool)
 
 
-def new_corners(
-    gray: Gray, usable: NDArray[np.bool_], depth: NDArray[np.float32], taken: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """(N, 2) corners on smooth tissue with depth, away from those `taken` (M, 2)."""
+def new_corners(view: View, taken: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 2) corners on smooth tissue with depth, away from those `taken` (M, 2); none if these are enough."""
+    if len(taken) >= REFRESH * MAX_CORNERS:
+        return np.zeros((0, 2), np.float32)
+    depth = view.depth
     near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
-    allowed = (usable & (near > 0) & (far - near < EDGE_STEP * depth)).astype(np.uint8)
+    allowed = (view.usable & (near > 0) & (far - near < EDGE_STEP * depth)).astype(np.uint8)
     height, width = depth.shape
     apart = max(5, width // 80)
     for x, y in taken:
         cv2.circle(allowed, (round(float(x)), round(float(y))), apart, 0, -1)
-    found = cv2.goodFeaturesToTrack(gray.flat, 3 * MAX_CORNERS, 0.002, apart, mask=allowed)
+    found = cv2.goodFeaturesToTrack(view.flat, 3 * MAX_CORNERS, 0.002, apart, mask=allowed)
     if found is None:
         return np.zeros((0, 2), np.float32)
     found = found.reshape(-1, 2)  # strongest first
@@ -99,9 +104,7 @@ def _cells(pixels: NDArray, width: int, height: int) -> NDArray[np.intp]:
     return np.clip((pixels[:, 1] * CELLS[1] / height).astype(int), 0, CELLS[1] - 1) * CELLS[0] + column
 
 
-def followed(
-    before: Gray, now: Gray, pixels: NDArray[np.float32], usable: NDArray[np.bool_]
-) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+def followed(before: View, now: View, pixels: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
     """Follow corners (N, 2) by Lucas-Kanade flow, forward and backward: indices of those kept, and their pixels."""
     if not len(pixels):
         return np.zeros(0, np.intp), pixels
@@ -109,7 +112,7 @@ def followed(
     there, still_good = follow_both_ways(
         before.flat, now.flat, pixels, RETURN_PX, halvings=FINE_HALVINGS, guess=near, criteria=FINE_CRITERIA
     )
-    good &= still_good & (np.abs(there - near).max(1) < FINE_PX) & (sampled(usable, there) > 0)
+    good &= still_good & (np.abs(there - near).max(1) < FINE_PX) & (sampled(now.usable, there) > 0)
     kept = np.flatnonzero(good)
     return kept, there[kept]
 
@@ -152,18 +155,17 @@ class Link:
     """Depth in the world of the old one, as a multiple of the new one's own depth."""
 
 
-def keyframe(index: int, gray: NDArray[np.uint8], usable: NDArray[np.bool_], depth: NDArray[np.float32]) -> Keyframe:
+def keyframe(index: int, view: View) -> Keyframe:
     """Describe a frame by its SIFT keypoints on tissue with depth."""
-    mask = (usable & (depth > 0)).astype(np.uint8)
-    found, descriptors = cv2.SIFT_create(KEYPOINTS, contrastThreshold=0.01).detectAndCompute(gray, mask)
+    mask = (view.usable & (view.depth > 0)).astype(np.uint8)
+    found, descriptors = cv2.SIFT_create(KEYPOINTS, contrastThreshold=0.01).detectAndCompute(view.plain, mask)
     if descriptors is None:
         found, descriptors = (), np.zeros((0, 128), np.float32)
     pixels = np.array([point.pt for point in found], np.float32).reshape(-1, 2)
-    depths = sampled(depth, pixels).astype(np.float32)
+    depths = sampled(view.depth, pixels).astype(np.float32)
     kept = depths > 0
-    return Keyframe(
-        index, pixels[kept], depths[kept], descriptors[kept].astype(np.uint8), np.full(kept.sum(), -1, np.int32)
-    )
+    no_track = np.full(kept.sum(), -1, np.int32)
+    return Keyframe(index, pixels[kept], depths[kept], descriptors[kept].astype(np.uint8), no_track)
 
 
 def link(lens: Lens, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe) -> Link | None:

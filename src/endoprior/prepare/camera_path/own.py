@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...data.description import OWN_POSES
-from .adjust import adjust, back_projected, refined_pose
+from .adjust import adjust, back_projected
 from .breathing import Breathing, separate_breathing
 from .features import Keyframe, link
 from .follow import Follower, follow_camera
@@ -51,15 +51,7 @@ def own_path(
     refine_focal: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[CameraPath, Follower]:
-    """Estimate the camera pose of every frame.
-
-    Args:
-        frame: reads frame i; each is read once, in order.
-        size: (width, height) of the images, px.
-        refine_focal: the focal length is an assumption.
-    Returns:
-        The path, and the tracks it comes from.
-    """
+    """The path, and the tracks it comes from. Each frame is read once, in order. Args: as `choose.find_path`."""
     follower = follow_camera(frame, count, lens, progress)
     labels, frames = np.unique(follower.segment, return_counts=True)
     explained = follower.segment == labels[np.argmax(frames)]
@@ -123,7 +115,7 @@ def place_frames(
         starts: frames whose pose stays.
         followed: (T, 4, 4) poses before the adjustment: they say how a frame lies to its keyframe.
     """
-    tracks, lens = follower.tracks, follower.lens
+    tracks = follower.tracks
     stds = np.full((2, len(explained)), np.nan)
     for f in np.flatnonzero(explained) if len(starts) else ():
         at = starts[max(np.searchsorted(starts, f, "right") - 1, 0)]
@@ -134,13 +126,8 @@ def place_frames(
         if used.sum() < MIN_POINTS:
             continue
         ids, pixels, depths = ids[used], pixels[used].astype(np.float64), depths[used]
-        inverse, sigma = tracks.measured(ids, depths, 1.0)
-        if lens.depth_is_relative:
-            sigma[:, 1] = np.inf
-        start, points = follower.poses[f], tracks.points[ids]
-        if breathing is not None:
-            points = points + breathing.at(int(f), ids)
-        found = refined_pose(lens.matrix, start, points, pixels, inverse, sigma, tracks.weight[ids])
+        points = tracks.points[ids] if breathing is None else tracks.points[ids] + breathing.at(int(f), ids)
+        found = tracks.refined(follower.poses[f], ids, points, pixels, depths)
         if not np.isfinite(found.pose).all():
             continue
         stds[:, f] = found.translation_std, found.rotation_std

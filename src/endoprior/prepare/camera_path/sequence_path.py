@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from ...core.geometry import length_unit
 from ...core.pose_conventions import Convention, to_ours
 from ...data.writer import FARTHEST_UNIT
 from ...footage.camera_motion import camera_motion
-from ...footage.changes import find_changes
 from ...footage.pose_fit import View, measure_poses
 from .choose import How, find_path
 from .colmap import with_poses
@@ -27,7 +25,7 @@ from .tracks import CameraPath, Lens, PoseInput
 NEGLIGIBLE_DEGREES = 1e-3
 PATH_RECORD = "camera_path.json"
 """In a sequence folder: how each pose was found, and how sure it is."""
-ASSUMED, CALIBRATED, REFINED = "assumed field of view", "calibration", "refined with the camera path"
+ASSUMED, CALIBRATED = "assumed field of view", "calibration"
 """Where the focal length comes from: `sources.lens` of `sequence.json`."""
 METHODS: dict[str, How] = {"auto": "best", "auto-own": "own", "estimate": "best", "own": "own", "colmap": "colmap"}
 """Values of --poses that estimate a path; `still` and files do not."""
@@ -59,12 +57,6 @@ class Reading:
             return []
         what = "given poses are those of the left camera before rectification"
         return [f"{what}; they are turned as its images are, by {angle:.2f} degrees"]
-
-    def scaled(self, stored: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The stored poses with positions in mm."""
-        scaled = stored.copy()
-        scaled[:, :3, 3] *= self.unit_mm
-        return scaled
 
     def ours(self, stored: NDArray[np.float64]) -> NDArray[np.float64]:
         """(T, 4, 4) camera-to-world of the frames, mm, OpenCV axes."""
@@ -135,35 +127,6 @@ def sequence_path(
     return path, [*_estimate_notes(motion.reason, path, lens), *path.notes]
 
 
-def record_of_path(path: CameraPath) -> dict[str, Any]:
-    """What `camera_path.json` holds."""
-
-    def numbers(values: NDArray | None) -> list[float | None]:
-        found = np.full(len(path.explained), np.nan) if values is None else values
-        return [round(float(v), 5) if np.isfinite(v) else None for v in found]
-
-    return {
-        "method": path.method,
-        "focal_factor": round(path.focal_factor, 5),
-        "explained": path.explained.tolist(),
-        "still": [] if path.still is None else path.still.tolist(),
-        "translation_std_mm": numbers(path.translation_std),
-        "rotation_std_degrees": numbers(path.rotation_std),
-        "depth_scale": [round(float(v), 6) for v in path.depth_scale],
-    }
-
-
-def sources_with(sources: dict[str, str], path: CameraPath) -> dict[str, str]:
-    """`sources` of `sequence.json` with those of a path."""
-    return sources | {"poses": path.method} | ({"lens": REFINED} if path.focal_factor != 1 else {})
-
-
-def unexplained_frames(path: CameraPath | None, images: Iterable[NDArray[np.uint8]]) -> list[int]:
-    """Frames without an estimated pose, and frames whose color differs from the rest."""
-    lost = set() if path is None else set(np.flatnonzero(~path.explained).tolist())
-    return sorted(lost | set(find_changes(images).off_color))
-
-
 def rescaled(stored: NDArray, scale: float) -> NDArray[np.uint16]:
     """Stored depth times a factor; 0, missing, stays, and what is too far for 16 bits becomes it."""
     units = np.round(stored.astype(np.float64) * scale)
@@ -177,9 +140,10 @@ def _fit_notes(how: str, stored: NDArray, frame: Callable[[int], PoseInput], len
         seen = frame(index)
         return seen.rgb_u8, seen.tissue_mask, np.nan_to_num(seen.depth)
 
+    scaled, turn = stored.copy(), np.eye(3) if reading.turn is None else reading.turn
+    scaled[:, :3, 3] *= reading.unit_mm
     relative = lens.depth_is_relative
-    turn = np.eye(3) if reading.turn is None else reading.turn
-    fit = measure_poses(view, lens.matrix, reading.scaled(stored), reading.convention, turn=turn, relative=relative)
+    fit = measure_poses(view, lens.matrix, scaled, reading.convention, turn=turn, relative=relative)
     if fit is not None and fit.another_fits:
         unit = f" --poses-unit-mm {fit.unit * reading.unit_mm:.4g}" if fit.unit * reading.unit_mm != 1 else ""
         words = f"the poses in {how} explain the images better in another way: {fit.reason}"

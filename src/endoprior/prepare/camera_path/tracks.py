@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .adjust import Observations
+from .adjust import Observations, Resected, refined_pose
 
+REFINED = "refined with the camera path"
+"""Where the focal length may come from: `sources.lens` of `sequence.json`."""
 HELD_OUT = 8
 """One in this many tracks takes no part in any estimate: it measures how well a path explains the frames."""
 PIXEL_STD = 0.5
@@ -93,6 +96,32 @@ class CameraPath:
     notes: list[str] = field(default_factory=list)
     """Notes for the user, one line each."""
 
+    @property
+    def lost(self) -> list[int]:
+        """Frames without a pose of their own."""
+        return np.flatnonzero(~self.explained).tolist()
+
+    def sources(self, old: dict[str, str]) -> dict[str, str]:
+        """`sources` of `sequence.json` with those of this path."""
+        return old | {"poses": self.method} | ({"lens": REFINED} if self.focal_factor != 1 else {})
+
+    def record(self) -> dict[str, Any]:
+        """What `camera_path.json` holds."""
+
+        def numbers(values: NDArray | None) -> list[float | None]:
+            found = np.full(len(self.explained), np.nan) if values is None else values
+            return [round(float(v), 5) if np.isfinite(v) else None for v in found]
+
+        return {
+            "method": self.method,
+            "focal_factor": round(self.focal_factor, 5),
+            "explained": self.explained.tolist(),
+            "still": [] if self.still is None else self.still.tolist(),
+            "translation_std_mm": numbers(self.translation_std),
+            "rotation_std_degrees": numbers(self.rotation_std),
+            "depth_scale": [round(float(v), 6) for v in self.depth_scale],
+        }
+
 
 class Tracks:
     """Observations by frame, and the points they belong to."""
@@ -140,16 +169,23 @@ class Tracks:
         """(N,) which tracks take no part in estimates."""
         return ids % HELD_OUT == HELD_OUT - 1
 
-    def measured(self, ids: NDArray, depths: NDArray, scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def measured(self, ids: NDArray, depths: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(N,) inverse depth, 1/mm, and (N, 2) standard deviations of pixel and inverse depth."""
         lens, there = self.lens, depths > 0
-        inverse = 1 / np.where(there, depths.astype(np.float64) * scale, 1.0)
+        inverse = 1 / np.where(there, depths.astype(np.float64), 1.0)
         if lens.baseline_mm and not lens.depth_is_relative:
             std = np.full(len(ids), DISPARITY_STD / (lens.matrix[0, 0] * lens.baseline_mm))
         else:
             std = DEPTH_STD[lens.depth_is_relative] * inverse
         pixel = np.where(self.keypoint[ids], KEYPOINT_STD, PIXEL_STD) * lens.px
         return inverse, np.stack([pixel, np.where(there, std, np.inf)], 1)
+
+    def refined(self, start: NDArray, ids: NDArray, points: NDArray, pixels: NDArray, depths: NDArray) -> Resected:
+        """The pose of a frame that sees these points (N, 3); relative depth has an unknown scale and does not count."""
+        inverse, sigma = self.measured(ids, depths)
+        if self.lens.depth_is_relative:
+            sigma[:, 1] = np.inf
+        return refined_pose(self.lens.matrix, start, points, pixels, inverse, sigma, self.weight[ids])
 
     def of_frames(self, frames: list[int], scales: NDArray, least: int = 2) -> tuple[NDArray[np.int32], Observations]:
         """Points seen in at least `least` of the frames, and their observations, for an adjustment.
@@ -165,7 +201,7 @@ class Tracks:
         number = np.bincount(ids, minlength=self.count)
         keep = (number[ids] >= least) & ~self.held_out(ids)
         ids, camera, pixels, depths, scale = ids[keep], camera[keep], pixels[keep], depths[keep], scale[keep]
-        inverse, sigma = self.measured(ids, depths * scale.astype(np.float32), 1.0)
+        inverse, sigma = self.measured(ids, depths * scale.astype(np.float32))
         if self.lens.depth_is_relative:
             # The depth of one place is wrong in the same way in every frame: all of them count as one measurement.
             sigma[:, 1] *= np.sqrt(number[ids])
