@@ -25,7 +25,7 @@ from .config import PrepareConfig
 from .first_pass import Depth, FirstPass, Mask, MeasuredFrame
 from .frame_geometry import FrameGeometry
 from .masks import Tools, choose_tools
-from .relative_depth import Kind, fit_reference, fit_shading, relative_to_mm
+from .relative_depth import DEFAULT_MODEL, DepthNetwork, Kind, fit_reference, fit_shading, relative_to_mm
 from .stereo import stereo_depth, temporal_median
 from .video_clip import Clip, StereoFrame
 
@@ -146,8 +146,6 @@ def _measured_depth(
 
         return match, "stereo: semi-global matching", []
     if kind == "network":
-        from .relative_depth import DEFAULT_MODEL, DepthNetwork
-
         network = DepthNetwork(cfg.depth.partition(":")[2] or DEFAULT_MODEL)
         return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2", []
     files, notes = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
