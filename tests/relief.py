@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from endoprior.prepare.camera_path.seen import Lens, PoseInput
+from endoprior.prepare.camera_path.tracks import Lens, PoseInput
 
 WIDTH, HEIGHT = 160, 120
 MATRIX = np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]])

@@ -31,20 +31,6 @@ def as_json(path, **items):
     return path
 
 
-def da_vinci(path):
-    lines = []
-    for side, matrix, bent in (("Left", K1, D1), ("Right", K2, D2)):
-        lines += [f"[Stereo{side}]", "res_x=640", "res_y=512"]
-        values = {"fc_x": matrix[0, 0], "fc_y": matrix[1, 1], "cc_x": matrix[0, 2], "cc_y": matrix[1, 2]}
-        lines += [f"{name}={value!r}" for name, value in values.items() for value in [float(value)]]
-        lines += [f"kc_{i}={float(k)!r}" for i, k in enumerate(bent)]
-        if side == "Right":
-            lines += [f"R_{i}={float(r)!r}" for i, r in enumerate(R.ravel())]
-            lines += [f"T_{i}={float(t)!r}" for i, t in enumerate(T)]
-    path.write_text("\n".join(lines))
-    return path
-
-
 FORMS = {
     "opencv yaml": lambda d: opencv_yaml(
         d / "c.yaml", M1=K1, D1=D1, M2=K2, D2=D2, R=R, T=T, image_width=640, image_height=512
@@ -76,7 +62,6 @@ FORMS = {
         or d / "c.npz"
     ),
     "meters": lambda d: as_json(d / "c.json", K1=K1, dist1=D1, K2=K2, dist2=D2, R=R, T=T / 1000, width=640, height=512),
-    "ini": lambda d: da_vinci(d / "StereoCalibration.ini"),
 }
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from endoprior.core.checks import InputError
-from endoprior.prepare.calibration import Calibration, Intrinsics
+from endoprior.prepare.calibration import Calibration, Intrinsics, fitted, parse_size
 from endoprior.prepare.calibration_files import read_calibration
-from endoprior.prepare.calibration_size import fitted, parse_size
 
 K1 = np.array([[580.0, 0, 318.2], [0, 582.0, 255.1], [0, 0, 1]])
 K2 = np.array([[575.0, 0, 322.4], [0, 577.0, 251.9], [0, 0, 1]])

@@ -9,19 +9,25 @@ from relief import HEIGHT, MATRIX, WIDTH, lens, path, pose, smooth, view
 
 from endoprior.core.checks import InputError
 from endoprior.prepare.camera_path import choose, colmap
-from endoprior.prepare.camera_path.adjust import Observations, adjust, weights
+from endoprior.prepare.camera_path.adjust import (
+    Observations,
+    adjust,
+    back_projected,
+    derivatives,
+    moved,
+    refined_pose,
+    residuals,
+    weights,
+)
 from endoprior.prepare.camera_path.breathing import breathing_period
-from endoprior.prepare.camera_path.choose import find_path
-from endoprior.prepare.camera_path.corners import gray_of, new_corners, sampled, usable_tissue
-from endoprior.prepare.camera_path.explained import explained_share
+from endoprior.prepare.camera_path.choose import explained_share, find_path
+from endoprior.prepare.camera_path.colmap import ray_points, with_poses
+from endoprior.prepare.camera_path.features import new_corners, sampled, view_of
 from endoprior.prepare.camera_path.follow import follow_camera
-from endoprior.prepare.camera_path.given import ray_points, with_poses
 from endoprior.prepare.camera_path.own import own_path
 from endoprior.prepare.camera_path.pose_file import read_poses
-from endoprior.prepare.camera_path.resection import refined_pose
-from endoprior.prepare.camera_path.residuals import back_projected, derivatives, moved, residuals
-from endoprior.prepare.camera_path.seen import PoseInput
 from endoprior.prepare.camera_path.sequence_path import sequence_path
+from endoprior.prepare.camera_path.tracks import Lens, PoseInput
 
 SIZE = (WIDTH, HEIGHT)
 OPENCV = lens().matrix
@@ -280,9 +286,8 @@ def test_corners_keep_off_edges_tools_and_each_other(relief):
     depth = seen.depth.copy()
     depth[:, 100:] += 30
     seen = PoseInput(seen.rgb_u8, mask, depth)
-    gray, usable = gray_of(seen.rgb_u8), usable_tissue(seen)
     taken = np.array([[70.0, 60.0]], np.float32)
-    corners = new_corners(gray, usable, depth, taken)
+    corners = new_corners(view_of(seen), taken)
     assert len(corners) > 20 and corners[:, 0].min() > 42
     assert (np.abs(corners[:, 0] - 99.5) > 1).all()
     assert np.hypot(*(corners - taken).T).min() >= 4
@@ -393,3 +398,55 @@ def test_poses_from_a_file(tmp_path):
     np.save(tmp_path / "p.npy", poses)
     with pytest.raises(InputError, match="expected finite numbers"):
         read_poses(tmp_path / "p.npy", 3)
+
+
+def test_the_principal_point_may_lie_at_the_edge_of_the_image():
+    """As after `--crop`: thresholds follow from the width of the image."""
+    true = path(24)
+    part = np.s_[:, 80:]
+    cropped = [PoseInput(seen.rgb_u8[part], seen.tissue_mask[part], seen.depth[part]) for seen in map(view, true)]
+    matrix = MATRIX - [[0, 0, 80], [0, 0, 0], [0, 0, 0]]
+    right = Lens.centered_at_half(matrix, WIDTH - 80, False, 4.0)
+    assert right.px == (WIDTH - 80) / 640 and right.with_focal(2.0).px == right.px
+    found, _ = own_path(cropped.__getitem__, 24, right, (WIDTH - 80, HEIGHT))
+    off = found.camera_to_world[:, :3, 3] - (np.linalg.inv(true[0]) @ true)[:, :3, 3]
+    assert found.explained.all() and np.linalg.norm(off, axis=1).max() < 2.0  # mm, by half of the view
+
+
+def test_colmap_takes_time_where_it_takes_part(monkeypatch):
+    monkeypatch.setattr(choose, "SECONDS_AN_IMAGE", 1.0)
+    monkeypatch.setattr(choose, "is_installed", lambda: True)
+    seconds = {(how, n): choose.colmap_seconds(how, n) for how in ("best", "own", "colmap") for n in (60, 300, 2000)}
+    assert seconds == {
+        ("best", 60): 60, ("best", 300): 150, ("best", 2000): 0, ("own", 60): 0, ("own", 300): 0, ("own", 2000): 0,
+        ("colmap", 60): 60, ("colmap", 300): 150, ("colmap", 2000): 500,
+    }  # fmt: skip
+    monkeypatch.setattr(choose, "is_installed", lambda: False)
+    assert choose.colmap_seconds("best", 60) == 0
+
+
+def test_a_mapping_that_was_stopped_is_told_whichever_path_is_taken(monkeypatch):
+    assert not colmap.time_note(59.9, 60.0) and "stopped after 60 s" in colmap.time_note(60.2, 60.0)[0]
+    frames = [view(pose) for pose in path(10, 2.0)]
+    args = frames.__getitem__, len(frames), lens(), (WIDTH, HEIGHT)
+    monkeypatch.setattr(choose, "is_installed", lambda: True)
+    own, _ = own_path(*args)
+    at_rest = np.tile(np.eye(4), (len(frames), 1, 1))
+    for poses, how, taken in ((at_rest, "best", own.method), (own.camera_to_world, "colmap", "COLMAP")):
+        stopped = replace(own, method="COLMAP", camera_to_world=poses, notes=colmap.time_note(60.0, 60.0))
+        monkeypatch.setattr(choose, "colmap_path", lambda *args, found=stopped, **options: found)
+        found = choose.find_path(*args, how)
+        assert found.method == taken and sum("stopped after 60 s" in note for note in found.notes) == 1
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_auto_own_decides_as_auto_and_leaves_colmap_out(moves, monkeypatch):
+    monkeypatch.setattr(choose, "is_installed", lambda: True)
+    monkeypatch.setattr(choose, "colmap_path", lambda *args, **options: pytest.fail("COLMAP was asked"))
+    frames = [view(pose) for pose in path(10, 2.0)] if moves else [view(path(1)[0])] * 10
+    found, notes = sequence_path(
+        "auto-own", frames.__getitem__, lambda: ([f.rgb_u8 for f in frames], [f.tissue_mask for f in frames]),
+        len(frames), lens(), (WIDTH, HEIGHT), has_depth=True, refine_focal=False,
+    )  # fmt: skip
+    assert (found is not None) == moves and ("the camera moves" in notes[0]) == moves
+    assert not moves or found.method == "our own tracks"

@@ -9,9 +9,9 @@ import pytest
 
 from endoprior.core.checks import InputError
 from endoprior.evaluation.metrics.torchvision_compat import import_torchvision
-from endoprior.prepare import depth_network
-from endoprior.prepare.depth_network import DepthNetwork
+from endoprior.prepare import relative_depth
 from endoprior.prepare.hub_model import FILES
+from endoprior.prepare.relative_depth import DepthNetwork
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 # The library's own warnings are not ours to fix.
@@ -56,7 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @needs_transformers
 def test_a_model_folder_runs_on_any_image_size(folder, monkeypatch):
-    monkeypatch.setattr(depth_network, "SHORT_SIDE_PX", 56)
+    monkeypatch.setattr(relative_depth, "SHORT_SIDE_PX", 56)
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
     network = DepthNetwork(folder)
     image = np.random.default_rng(0).integers(0, 256, (45, 71, 3), np.uint8)
@@ -65,10 +65,6 @@ def test_a_model_folder_runs_on_any_image_size(folder, monkeypatch):
     assert np.isfinite(inverse).all() and inverse.min() >= 0 and inverse.std() > 0
     assert (network.inverse_depth(image) == inverse).all()
     assert not np.array_equal(network.inverse_depth(image[..., ::-1].copy()), inverse)
-    with pytest.raises(ValueError, match="rgb_u8"):
-        network.inverse_depth(image[..., 0])
-    with pytest.raises(ValueError, match="8-bit"):
-        network.inverse_depth(image / 255)
 
 
 @needs_transformers
@@ -77,26 +73,6 @@ def test_a_folder_without_a_file_is_an_error(missing, tmp_path):
     for file in set(FILES) - {missing}:
         (tmp_path / file).write_bytes(b"{}")
     with pytest.raises(InputError, match=f"{tmp_path}: expected .*no {missing}"):
-        DepthNetwork(tmp_path)
-
-
-@needs_transformers
-def test_other_files_are_an_error(folder, tmp_path):
-    for config, weights in ((b"{}", b"broken"), ((folder / "config.json").read_bytes(), b"broken")):
-        (tmp_path / "config.json").write_bytes(config)
-        (tmp_path / "model.safetensors").write_bytes(weights)
-        with pytest.raises(InputError, match="Depth Anything") as caught:
-            DepthNetwork(tmp_path)
-        assert "\n" not in str(caught.value)
-
-
-@needs_transformers
-def test_weights_of_another_network_are_an_error(folder, tmp_path):
-    from safetensors.numpy import save_file
-
-    (tmp_path / "config.json").write_bytes((folder / "config.json").read_bytes())
-    save_file({"other": np.zeros(3, np.float32)}, tmp_path / "model.safetensors", metadata={"format": "pt"})
-    with pytest.raises(InputError, match="no weights for"):
         DepthNetwork(tmp_path)
 
 
@@ -129,12 +105,6 @@ def test_a_hub_name_is_searched_in_the_cache_first(folder, monkeypatch):
     assert asked == [True, True, False] and "\n" not in str(caught.value)
 
 
-def test_without_the_package_its_name_is_said(monkeypatch):
-    monkeypatch.setattr(depth_network, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"Fix: `pip install -c constraints\.txt transformers`"):
-        DepthNetwork()
-
-
 @needs_transformers
 def test_a_package_that_transformers_lacks_is_one_line(folder, monkeypatch):
     import transformers
@@ -159,7 +129,7 @@ def test_importing_the_module_loads_neither_torch_nor_transformers():
     import subprocess
 
     code = (
-        "import sys, endoprior.prepare.depth_network; "
+        "import sys, endoprior.prepare.relative_depth, endoprior.prepare.sam2, endoprior.prepare.pipeline; "
         "assert not {'torch', 'transformers', 'huggingface_hub'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -15,7 +15,7 @@ from endoprior.pipeline.part import Part, choose_part, every_kth_time, usable_fr
 from endoprior.prepare.camera_path import choose
 from endoprior.prepare.config import PrepareConfig
 from endoprior.prepare.frame_selection import FrameSelection
-from endoprior.prepare.source import SourceFrame
+from endoprior.prepare.video import SourceFrame
 
 WHOLE = (0.0, math.inf)
 

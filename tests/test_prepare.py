@@ -94,49 +94,6 @@ def test_two_image_folders_and_a_time_range(tmp_path, phantom):
         assert np.array_equal(mine.rgb_u8, true.rgb_u8) and np.array_equal(mine.tissue_mask, true.tissue_mask)
 
 
-@pytest.mark.slow
-def test_a_distorted_pair_is_rectified(tmp_path, phantom):
-    """Both cameras seen through lenses with distortion, the right one turned: depth is the same as before."""
-    focal, center = 0.9 * WIDTH, (120.0 - 0.5, HEIGHT / 2 - 0.5)
-    matrix = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]])
-    bent, turn = np.array([-0.12, 0.03, 0, 0, 0]), cv2.Rodrigues(np.array([0.0, 0.01, 0.02]))[0]
-    shift = turn @ np.array([-4.2, 0, 0])
-    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
-
-    def through(image, rotation):  # where each pixel of the lens's image lies in the pinhole's
-        straight = cv2.undistortPoints(np.stack([x, y], -1).reshape(-1, 1, 2), matrix, bent, R=rotation.T, P=matrix)
-        at = straight.reshape(HEIGHT, WIDTH, 2).astype(np.float32)
-        return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC)
-
-    pairs = zip(*cameras(phantom), strict=True)
-    frames = [np.hstack([through(left, np.eye(3)), through(right, turn)]) for left, right in pairs]
-    storage = cv2.FileStorage(str(tmp_path / "c.yaml"), cv2.FILE_STORAGE_WRITE)
-    for name, value in {"M1": matrix, "D1": bent, "M2": matrix, "D2": bent, "R": turn, "T": shift}.items():
-        storage.write(name, value)
-    storage.release()
-    cfg = PrepareConfig(calibration=tmp_path / "c.yaml", masks="none", border="keep")
-    done = prepare(write_video(tmp_path / "v.mkv", frames), tmp_path / "out", cfg)
-    # The rectified camera is turned against the phantom's: compare clouds of points, in the phantom's axes.
-    sequence = load_sequence(done.out)
-    frame, camera = sequence.frame(2), sequence.camera(2)
-    rows, columns = np.nonzero(frame.depth_valid)
-    rays = np.stack(
-        [(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(rows))], 1
-    )
-    left_turn = cv2.stereoRectify(
-        matrix, bent, matrix, bent, (WIDTH, HEIGHT), turn, shift.reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
-    )[0]
-    points = rays * frame.depth[rows, columns, None] @ left_turn
-    at_x = np.round(points[:, 0] / points[:, 2] * focal + center[0]).astype(int)
-    at_y = np.round(points[:, 1] / points[:, 2] * focal + center[1]).astype(int)
-    inside = (at_x >= 0) & (at_x < WIDTH) & (at_y >= 0) & (at_y < HEIGHT)
-    true = np.load(phantom / "truth/depth/000002.npy")
-    tissue = load_sequence(phantom).frame(2).tissue_mask
-    inside[inside] = tissue[at_y[inside], at_x[inside]]
-    assert inside.sum() > 20000
-    assert np.median(np.abs(points[inside, 2] - true[at_y[inside], at_x[inside]])) < 1.2
-
-
 def test_monocular_video_without_options(tmp_path, phantom):
     done = prepare(write_video(tmp_path / "v.mp4", cameras(phantom)[0]), tmp_path / "out")
     sequence = load_sequence(done.out)

@@ -10,7 +10,7 @@ from endoprior.prepare.calibration import Calibration, Intrinsics
 from endoprior.prepare.config import PrepareConfig, parse_rectangle
 from endoprior.prepare.frame_geometry import make_geometry
 from endoprior.prepare.frames import REACH, MeasuredFrame, with_neighbors
-from endoprior.prepare.stereo_layout import find_layout, split_cameras
+from endoprior.prepare.video_clip import find_layout, split_cameras
 from endoprior.prepare.work_folder import frames_done, work_folder
 
 
@@ -123,44 +123,6 @@ def test_masks_use_nearest_neighbor_at_either_size():
     assert geometry.size == (50, 25) and geometry.values(mask).shape == (25, 50) and geometry.values(mask).dtype == bool
     small = np.zeros(geometry.size[::-1], np.float32)  # made on frames
     assert geometry.values(small) is small
-
-
-def project(points, matrix, distortion, rotation, translation):
-    pixels, _ = cv2.projectPoints(points, cv2.Rodrigues(rotation)[0], translation, matrix, distortion)
-    return pixels[:, 0]
-
-
-def test_rectified_pair_has_equal_rows_and_the_true_disparity():
-    left = Intrinsics(np.array([[300.0, 0, 160.5], [0, 301, 120.5], [0, 0, 1]]), np.array([-0.2, 0.05, 0.001, 0, 0]))
-    right = Intrinsics(np.array([[295.0, 0, 165.5], [0, 296, 118.5], [0, 0, 1]]), np.array([-0.15, 0.02, 0, 0.001, 0]))
-    rotation = cv2.Rodrigues(np.array([0.01, -0.02, 0.015]))[0]
-    translation = np.array([-4.5, 0.1, 0.05])
-    geometry = geometry_of((320, 240), Calibration(left, right, rotation, translation), stereo=True)
-    assert geometry.baseline_mm == pytest.approx(np.linalg.norm(translation))
-    rng = np.random.default_rng(0)
-    points = np.stack([rng.uniform(-15, 15, 40), rng.uniform(-10, 10, 40), rng.uniform(50, 90, 40)], 1)
-    images = []
-    for camera, turn, shift in ((left, np.eye(3), np.zeros(3)), (right, rotation, translation)):
-        opencv = camera.matrix - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-        image = np.zeros((240, 320, 3), np.uint8)
-        images.append((image, project(points, opencv, camera.distortion, turn, shift)))
-    rectified = []
-    for (image, pixels), is_right in zip(images, (False, True), strict=True):
-        found = []
-        for pixel in pixels:  # a blob per point, found again by its center of mass
-            spot = image.copy()
-            y, x = np.mgrid[:240, :320]
-            spot[...] = (250 * np.exp(-((x - pixel[0]) ** 2 + (y - pixel[1]) ** 2) / 8))[..., None]
-            seen = geometry.image(spot, is_right)[..., 0].astype(float)
-            yy, xx = np.mgrid[: seen.shape[0], : seen.shape[1]]
-            found.append(((xx * seen).sum() / seen.sum() + 0.5, (yy * seen).sum() / seen.sum() + 0.5))
-        rectified.append(np.array(found))
-    inside = [(v > 8).all(1) & (v[:, 0] < geometry.size[0] - 8) & (v[:, 1] < geometry.size[1] - 8) for v in rectified]
-    both = inside[0] & inside[1]
-    disparity = (rectified[0] - rectified[1])[both]
-    assert both.sum() > 20 and np.abs(disparity[:, 1]).max() < 0.15
-    depth = geometry.matrix[0, 0] * geometry.baseline_mm / disparity[:, 0]
-    assert np.abs(depth / points[both, 2] - 1).max() < 0.03  # the rectified camera is turned by half a degree
 
 
 def test_a_pair_whose_images_have_their_centers_apart_is_shifted_together():

@@ -18,8 +18,8 @@ from endoprior.data import load_sequence
 from endoprior.data.images import read_color
 from endoprior.data.prepare_record import read_record
 from endoprior.prepare import PrepareConfig, prepare
-from endoprior.prepare.pairing import pair_by_time
-from endoprior.prepare.source_frame import SourceFrame
+from endoprior.prepare.frame_selection import pair_by_time
+from endoprior.prepare.video import SourceFrame
 
 
 def prepared(video, tmp_path, **options):

@@ -6,8 +6,7 @@ import pytest
 
 from endoprior.core.checks import InputError
 from endoprior.prepare.calibration import Calibration, Intrinsics
-from endoprior.prepare.frame_geometry import make_geometry, with_rows_moved
-from endoprior.prepare.rectification import rectify
+from endoprior.prepare.frame_geometry import make_geometry, rectify, with_rows_moved
 
 SIZE = 320, 240
 ROTATION = cv2.Rodrigues(np.array([0.01, -0.02, 0.015]))[0]

@@ -1,8 +1,6 @@
 """SAM 2: a tiny one with random weights stands for the real one; nothing is downloaded."""
 
 import json
-import subprocess
-import sys
 from importlib.util import find_spec
 from types import SimpleNamespace
 
@@ -17,8 +15,9 @@ from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.data.images import read_tool_mask
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.prepare import PrepareConfig, carried_masks, pipeline, prepare, sam2
+from endoprior.prepare import PrepareConfig, hub_model, pipeline, prepare
 from endoprior.prepare.hub_model import FILES
+from endoprior.prepare.masks import WORK
 from endoprior.prepare.record import names_path
 from endoprior.prepare.sam2 import DEFAULT_MODEL, is_sam2, open_sam2
 from endoprior.tool_masks.carry import carry
@@ -160,7 +159,7 @@ def test_prepare_writes_the_segmenters_masks_and_depth_made_with_them(phantom, t
     assert load_sequence(done.out).masks_are_found
     assert any("followed by a stand-in" in note for note in done.notes)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "v.mkv"]
-    assert not (done.out / carried_masks.WORK).exists()
+    assert not (done.out / WORK).exists()
     # The same masks, given by a user, give the same depth.
     given = prepare(tmp_path / "v.mkv", tmp_path / "given", OPTIONS.__class__(**given_options(done.out)))
     own = prepare(tmp_path / "v.mkv", tmp_path / "own", OPTIONS.__class__(**given_options("auto")))
@@ -258,7 +257,7 @@ def test_other_files_are_an_error(model, tmp_path):
 
 @pytest.mark.parametrize("option", ["--masks", "--with"])
 def test_without_the_package_its_name_is_said(monkeypatch, option):
-    monkeypatch.setattr(sam2, "find_spec", lambda name: None)
+    monkeypatch.setattr(hub_model, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=rf"{option} sam2: expected the transformers package, got none. Fix: `pip"):
         open_sam2("sam2", option)
 
@@ -266,10 +265,3 @@ def test_without_the_package_its_name_is_said(monkeypatch, option):
 def test_a_value_is_a_method_or_a_folder():
     assert is_sam2("sam2") and is_sam2("sam2:a/b") and not is_sam2("./sam2") and not is_sam2("auto")
     assert not names_path("sam2") and not names_path("sam2:a/b") and names_path("./sam2")
-
-
-def test_importing_the_module_loads_neither_torch_nor_transformers():
-    code = (
-        "import sys, endoprior.prepare.sam2; assert not {'torch', 'transformers', 'huggingface_hub'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from endoprior.core.checks import InputError
-from endoprior.prepare import shading
-from endoprior.prepare.relative_depth import MAX_RATIO, NEAR_RATIO, fit_reference, relative_to_mm
-from endoprior.prepare.shading import RELIEF, fit_shading
+from endoprior.prepare import relative_depth
+from endoprior.prepare.relative_depth import MAX_RATIO, NEAR_RATIO, RELIEF, fit_reference, fit_shading, relative_to_mm
 
 WIDTH, HEIGHT = 201, 151
 COLUMN, ROW = np.meshgrid(np.linspace(-1, 1, WIDTH), np.linspace(-1, 1, HEIGHT))
@@ -79,7 +78,7 @@ def test_tools_highlights_and_the_outside_are_filled_in():
 
 
 def test_depth_is_finite_and_bounded_for_any_image(monkeypatch):
-    monkeypatch.setattr(shading, "RELIEF", 4.0)
+    monkeypatch.setattr(relative_depth, "RELIEF", 4.0)
     model = fit_shading([lit(BUMP)], [EVERYWHERE], 50)
     harsh = np.where(COLUMN[..., None] < 0, 1, 200).astype(np.uint8) * np.ones(3, np.uint8)
     depth = model.depth(harsh, EVERYWHERE)
@@ -95,20 +94,9 @@ def test_pixels_missing_in_all_samples_use_the_image_alone():
     assert np.isfinite(depth).all() and 0.8 < np.median(depth) / 70 < 1.25
 
 
-def test_samples_are_checked():
-    with pytest.raises(ValueError, match="one mask each"):
-        fit_shading([], [])
-    with pytest.raises(ValueError, match="rgb_u8"):
-        fit_shading([lit(BUMP), lit(BUMP)[:-1]], [EVERYWHERE, EVERYWHERE[:-1]])
+def test_samples_without_tissue_are_an_error():
     with pytest.raises(InputError, match="got none"):
         fit_shading([lit(BUMP)], [~EVERYWHERE])
-    with pytest.raises(ValueError, match="working_distance_mm"):
-        fit_shading([lit(BUMP)], [EVERYWHERE], float("nan"))
-    model = fit_shading([lit(BUMP)], [EVERYWHERE])
-    with pytest.raises(ValueError, match="rgb_u8"):
-        model.depth(lit(BUMP)[:-1], EVERYWHERE[:-1])
-    with pytest.raises(ValueError, match="8-bit"):
-        model.depth(lit(BUMP).astype(np.float32), EVERYWHERE)
 
 
 def test_relative_disparity_is_linear_in_inverse_depth():
@@ -149,9 +137,5 @@ def test_relative_samples_are_checked():
     ones = np.ones((4, 4))
     with pytest.raises(InputError, match="none"):
         fit_reference([ones], [ones < 0], "depth")
-    with pytest.raises(InputError, match="none"):
-        fit_reference([], [], "depth")
     with pytest.raises(InputError, match="vary"):
         fit_reference([ones], [ones > 0], "disparity")
-    with pytest.raises(ValueError, match="usable"):
-        fit_reference([ones], [ones[1:] > 0], "depth")

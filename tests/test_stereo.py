@@ -4,8 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from endoprior.prepare.disparity import fill_small_holes, refine_disparity, smooth_disparity
-from endoprior.prepare.stereo import StereoConfig, stereo_depth, temporal_median
+from endoprior.prepare.stereo import (
+    StereoConfig,
+    fill_small_holes,
+    refine_disparity,
+    smooth_disparity,
+    stereo_depth,
+    temporal_median,
+)
 
 WIDTH, HEIGHT = 161, 119  # odd on purpose
 FOCAL, BASELINE = 150.0, 4.0
@@ -161,21 +167,6 @@ def test_small_holes_are_filled_on_planes_only():
 
 
 @pytest.mark.parametrize(
-    "change, message",
-    [
-        (lambda camera: camera[..., :1], "left_u8"),
-        (lambda camera: camera[..., 0], "left_u8"),
-        (lambda camera: camera[:, :-1], "left_u8|right_u8"),
-        (lambda camera: camera.astype(np.float32), "8-bit"),
-    ],
-)
-def test_wrong_images_are_errors(change, message):
-    left, right = cameras(flat(9.0), tissue())
-    with pytest.raises(ValueError, match=message):
-        measure((change(left), right))
-
-
-@pytest.mark.parametrize(
     "options", [{"near_mm": 400}, {"block_px": 4}, {"near_mm": float("nan")}, {"min_confidence": 2}, {"speckle_px": -1}]
 )
 def test_config_is_checked(options):
@@ -187,9 +178,6 @@ def test_impossible_geometry_is_an_error():
     pair = cameras(flat(9.0), tissue())
     with pytest.raises(ValueError, match="far_mm"):
         stereo_depth(*pair, 1e5, BASELINE)
-    for focal, baseline in ((np.nan, 4), (150, np.nan), (150, 0)):
-        with pytest.raises(ValueError):
-            stereo_depth(*pair, focal, baseline)
 
 
 def test_temporal_median_reduces_noise_and_keeps_motion():
@@ -214,7 +202,3 @@ def test_temporal_median_fills_only_what_agrees():
     assert (temporal_median([other, hole, other])[10:13, 10:13] == 0).all()
     assert (temporal_median([before * 0, hole, after])[10:13, 10:13] == 0).all()
     assert not temporal_median([np.zeros((9, 9), np.float32)] * 3).any()
-    with pytest.raises(ValueError, match="odd"):
-        temporal_median(maps[:2])
-    with pytest.raises(ValueError, match="middle"):
-        temporal_median([before, hole, after[:-1]])

@@ -81,11 +81,6 @@ def test_other_motion_is_not_reported(why):
     assert not moves_unmasked(first, later, view, tool)
 
 
-def test_shapes_must_match():
-    with pytest.raises(ValueError, match="view"):
-        moves_unmasked(*pair(), VIEW[:10], NOWHERE)
-
-
 def test_a_quadratic_motion_is_background_however_the_rest_moves():
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 100.0
     flow = np.stack([1 + x - 2 * y + x * y, 3 * x * x - y * y], -1).astype(np.float32)

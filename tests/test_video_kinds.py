@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from video_files import encode, ffmpeg, psnr, smooth, write_video
+from video_files import encode, ffmpeg, psnr, smooth
 
 from endoprior.core.checks import InputError
 from endoprior.data.recognize import is_video
+from endoprior.prepare.decoding import Timeline, usual_rate
 from endoprior.prepare.source import open_source
-from endoprior.prepare.timeline import Timeline, usual_rate
 
 # --- Pixels
 
@@ -57,12 +57,6 @@ def test_interlaced_images_are_not_combed(tmp_path, first):
     assert source.notes == ["i.mp4: 12 images are interlaced; one field of each is used, with its rows filled"]
     source.weave = True  # rows of two cameras
     assert psnr(next(iter(source)).rgb_u8, woven[0]) > 35
-
-
-def test_progressive_images_pass_unchanged(tmp_path):
-    images = smooth(4)
-    found = list(open_source(write_video(tmp_path / "a.mkv", images)))
-    assert all(np.array_equal(image.rgb_u8, want) for image, want in zip(found, images, strict=True))
 
 
 def test_the_bits_in_use_fill_the_range(tmp_path):

@@ -158,8 +158,7 @@ def _of_rows(path: Path, rows: np.ndarray) -> Table:
         return {"K": rows[:3, :3]}
     numbers = rows.ravel()
     if 1 in rows.shape and len(numbers) in (4, 8, 9):
-        matrix = [[numbers[0], 0, numbers[2]], [0, numbers[1], numbers[3]], [0, 0, 1]]
-        return {"K": matrix} | ({"D": numbers[4:]} if len(numbers) > 4 else {})
+        return {"K": numbers[:4]} | ({"D": numbers[4:]} if len(numbers) > 4 else {})
     want = "a 3x3 camera matrix, or fx fy cx cy and distortion coefficients"
     raise input_error(path, want, f"{'x'.join(map(str, rows.shape))} numbers", HINT)
 

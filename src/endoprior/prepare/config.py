@@ -11,8 +11,8 @@ from ..core.checks import check_range, input_error
 from ..core.pose_conventions import Convention
 from .calibration_files import Unit
 from .stereo import StereoConfig
-from .stereo_layout import Layout
 
+Layout = Literal["auto", "mono", "side-by-side", "top-bottom", "interlaced", "two-files"]
 Rectangle = tuple[int, int, int, int]
 """x, y, width, height in px, in one camera's image of the source video."""
 
@@ -113,14 +113,11 @@ class PrepareConfig:
     def __post_init__(self) -> None:
         if self.stir is not None and self.depth == "none":
             raise ValueError("stir needs depth, got --depth none")
-        check_range("field_of_view_degrees", self.field_of_view_degrees, 10, 170)
-        check_range("start", self.start, 0, 1e9)
+        for name, low, high in (
+            ("field_of_view_degrees", 10, 170), ("start", 0, 1e9), ("frames_per_second", 0, 1000),
+            ("folder_rate", 0.01, 1000), ("max_frames", 2, 1_000_000), ("max_width", 0, 16384),
+            ("depth_unit_mm", 0, 1e6), ("poses_unit_mm", 1e-6, 1e6), ("working_distance_mm", 1, 1000),
+        ):  # fmt: skip
+            check_range(name, getattr(self, name), low, high)
         if not self.end > self.start:
             raise ValueError(f"end must be after start, got {self.end:g} and {self.start:g}")
-        check_range("frames_per_second", self.frames_per_second, 0, 1000)
-        check_range("folder_rate", self.folder_rate, 0.01, 1000)
-        check_range("max_frames", self.max_frames, 2, 1_000_000)
-        check_range("max_width", self.max_width, 0, 16384)
-        check_range("depth_unit_mm", self.depth_unit_mm, 0, 1e6)
-        check_range("poses_unit_mm", self.poses_unit_mm, 1e-6, 1e6)
-        check_range("working_distance_mm", self.working_distance_mm, 1, 1000)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from itertools import chain, pairwise
+from typing import TypeVar
 
 import av
 import av.filter
-
-if TYPE_CHECKING:
-    from av.container import InputContainer
-    from av.video.stream import VideoStream
+import numpy as np
+from av.container import InputContainer
+from av.video.stream import VideoStream
 
 AVI = "avi"
 """FFmpeg's name of the format that counts time in images and does not hold when they are shown."""
@@ -21,6 +21,15 @@ DEFAULT, ATTACHED_PICTURE, TIMED_THUMBNAILS = 0x1, 0x400, 0x800
 """FFmpeg's bits of what a track is for."""
 SHORT = 0.5
 """A track that lasts a smaller share of the longest one is a preview."""
+RATES = (0.01, 100_000.0)
+"""Plausible frame rates, 1/s."""
+USUAL_RATE = 25.0
+"""Frame rate of a file without times, 1/s."""
+NEAR = 0.25
+"""Time steps that differ from the median by less than this share are the usual step, up to rounding of the file."""
+SAME_RATE = 0.01
+"""A stated rate that differs from the measured one by less than this share is its exact value."""
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -39,10 +48,53 @@ class DecodedImage:
 
 
 @dataclass
-class Undecodable:
-    """Counts images that are in the file and cannot be decoded."""
+class Timeline:
+    """Times that only increase, and counts of where those of the file do not."""
 
-    count: int = 0
+    step: float
+    """Usual time between two images, s."""
+    restarts: int = 0
+    """How often time starts again, as where two recordings were joined."""
+    misplaced: int = 0
+    """Images whose time is not after that of the image before, while the next one is in order again."""
+
+    def along(self, images: Iterable[tuple[Item, float | None]]) -> Iterator[tuple[Item, float]]:
+        """The images and their times, s. A misplaced image keeps its time; all others are later than those before.
+
+        Args:
+            images: in the order in which they are shown, with the times of the file; None where it has none.
+        """
+        shift, last = 0.0, None
+        for (image, time), (_, following) in pairwise(chain(images, [(None, None)])):
+            now = (0.0 if last is None else last + self.step) if time is None else time + shift
+            if time is not None and last is not None and now <= last:
+                if following is not None and following + shift > last:
+                    self.misplaced += 1
+                    yield image, now
+                    continue
+                self.restarts += 1
+                now = last + self.step
+                shift = now - time
+            yield image, now
+            last = now
+
+
+def usual_rate(times: Sequence[float], stated: Sequence[float]) -> float:
+    """Frame rate of a video, 1/s: that of most of its time steps. Pauses do not change it.
+
+    Args:
+        times: of the images in the order of the file, s; they may start again.
+        stated: rates that the file states, the best one first; they may be averages over pauses, or a clock.
+    """
+    usable = [rate for rate in stated if RATES[0] <= rate <= RATES[1]]
+    steps = np.diff(np.asarray(times, np.float64))
+    steps = steps[steps > 1 / RATES[1]]
+    if not len(steps):
+        return usable[0] if usable else USUAL_RATE
+    middle = float(np.median(steps))
+    rate = 1 / float(steps[np.abs(steps - middle) < NEAR * middle].mean())
+    exact = [each for each in usable if abs(each / rate - 1) < SAME_RATE]
+    return exact[0] if exact else max(rate, RATES[0])
 
 
 def choose_track(container: InputContainer) -> VideoStream | None:
@@ -90,12 +142,8 @@ def packet_times(container: InputContainer, track: VideoStream) -> tuple[list[fl
             parts[-1].append(packet.pts if packet.pts is not None else packet.dts)
     except av.error.FFmpegError:  # the decoder meets it, too, and says what is missing
         pass
-    in_order = [
-        ticks
-        for part in parts
-        for ticks in [*sorted(each for each in part if each is not None), *(each for each in part if each is None)]
-    ]
-    return [None if ticks is None else float(ticks * track.time_base) for ticks in in_order], end
+    ordered = [ticks for part in parts for ticks in sorted(part, key=lambda each: (each is None, each or 0))]
+    return [None if ticks is None else float(ticks * track.time_base) for ticks in ordered], end
 
 
 def _packets(container: InputContainer, track: VideoStream) -> Iterator[av.Packet]:
@@ -115,12 +163,17 @@ def _packets(container: InputContainer, track: VideoStream) -> Iterator[av.Packe
 
 
 def decode(
-    container: InputContainer, track: VideoStream, lost: Undecodable, *, one_thread: bool = False, weave: bool = False
+    container: InputContainer,
+    track: VideoStream,
+    lost: list[int | None],
+    *,
+    one_thread: bool = False,
+    weave: bool = False,
 ) -> Iterator[DecodedImage]:
     """The images in the order in which they are shown.
 
     Args:
-        lost: its count grows with each image that cannot be decoded.
+        lost: gets the place, in ticks, of each image that is in the file and cannot be decoded.
         one_thread: slower; with threads, FFmpeg does not report all damage, and not always the same.
         weave: keep the rows of interlaced images as they are.
     Raises:
@@ -132,7 +185,7 @@ def decode(
     return images if weave else _deinterlaced(images)
 
 
-def _with_damage(container: InputContainer, track: VideoStream, lost: Undecodable) -> Iterator[DecodedImage]:
+def _with_damage(container: InputContainer, track: VideoStream, lost: list[int | None]) -> Iterator[DecodedImage]:
     """The images as stored.
 
     AVI holds the times at which images are decoded, not those at which they are shown. The decoder puts the images in
@@ -147,12 +200,14 @@ def _with_damage(container: InputContainer, track: VideoStream, lost: Undecodabl
     for packet, following in _with_following(_packets(container, track)):
         if is_avi and packet.dts is not None:
             decode_times.append(packet.dts)
-        if packet.is_corrupt and not _is_before_joint(packet, following):
+        # Where the next part of a joined file begins, FFmpeg takes the end of the last part for a loss.
+        is_joint = packet.dts is not None and any(n.dts is not None and n.dts < packet.dts for n in following)
+        if packet.is_corrupt and not is_joint:
             incomplete.add(packet.pts)
         try:
             frames = track.decode(packet)
         except av.error.FFmpegError:
-            lost.count += 1
+            lost.append(packet.dts)
             spoiled = True
             if is_avi and packet.dts is not None:
                 decode_times.pop()
@@ -180,11 +235,6 @@ def _with_following(packets: Iterator[av.Packet]) -> Iterator[tuple[av.Packet, l
         yield window.popleft(), list(window)
 
 
-def _is_before_joint(packet: av.Packet, following: list[av.Packet]) -> bool:
-    """Whether the next part of a joined file begins. FFmpeg then takes the end of the last part for a loss."""
-    return packet.dts is not None and any(each.dts is not None and each.dts < packet.dts for each in following)
-
-
 def _deinterlaced(images: Iterator[DecodedImage]) -> Iterator[DecodedImage]:
     """From the first interlaced image on, each such image gets the rows of one field, and those between made anew."""
     rows: _MissingRows | None = None
@@ -192,19 +242,22 @@ def _deinterlaced(images: Iterator[DecodedImage]) -> Iterator[DecodedImage]:
         if rows is None and not image.interlaced:
             yield image
             continue
-        if rows is None or not rows.takes(image):
-            yield from rows.rest() if rows else ()
-            rows = _MissingRows(image)
-        yield from rows.add(image)
-    yield from rows.rest() if rows else ()
+        if rows is None or rows.kind != _kind(image.frame):
+            yield from rows.after(None) if rows else ()
+            rows = _MissingRows(image.frame)
+        yield from rows.after(image)
+    yield from rows.after(None) if rows else ()
+
+
+def _kind(frame: av.VideoFrame) -> tuple[int, int, str]:
+    return frame.width, frame.height, frame.format.name
 
 
 class _MissingRows:
     """FFmpeg's bwdif: one image out for each one in, a little later. Images that are not interlaced stay."""
 
-    def __init__(self, image: DecodedImage) -> None:
-        frame = image.frame
-        self._kind = frame.width, frame.height, frame.format.name
+    def __init__(self, frame: av.VideoFrame) -> None:
+        self.kind = _kind(frame)
         self._waiting: deque[DecodedImage] = deque()
         self._graph = av.filter.Graph()
         source = self._graph.add_buffer(
@@ -215,26 +268,14 @@ class _MissingRows:
         rows.link_to(sink)
         self._graph.configure()
 
-    def takes(self, image: DecodedImage) -> bool:
-        """Whether an image is of the same kind as the first one."""
-        return (image.frame.width, image.frame.height, image.frame.format.name) == self._kind
-
-    def add(self, image: DecodedImage) -> Iterator[DecodedImage]:
-        """The images that are complete after one more."""
-        self._waiting.append(image)
-        self._graph.push(image.frame)
-        yield from self._pull()
-
-    def rest(self) -> Iterator[DecodedImage]:
-        """The images that were still waiting for their successors."""
-        self._graph.push(None)
-        yield from self._pull()
-
-    def _pull(self) -> Iterator[DecodedImage]:
+    def after(self, image: DecodedImage | None) -> Iterator[DecodedImage]:
+        """The images that are complete after one more; the rest after None."""
+        if image is not None:
+            self._waiting.append(image)
+        self._graph.push(None if image is None else image.frame)
         while self._waiting:
             try:
                 frame = self._graph.pull()
             except (av.error.BlockingIOError, av.error.EOFError):
                 return
-            before = self._waiting.popleft()
-            yield DecodedImage(frame, before.seconds, before.damaged, before.interlaced, before.turns)
+            yield replace(self._waiting.popleft(), frame=frame)

@@ -3,32 +3,57 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error
+from ..core.checks import InputError, input_error
 from ..core.shell import quoted
 from ..data.reading import kind_of
 from ..footage.border import Circle, Strips, find_outline
 from ..footage.combing import are_combed
 from ..footage.overlays import find_static_overlays
 from ..footage.round_border import CERTAIN
-from .calibration import Calibration
-from .calibration_size import fitted
-from .config import PrepareConfig, Rectangle, parse_rectangle
+from .calibration import fitted
+from .config import Layout, PrepareConfig, Rectangle, parse_rectangle
 from .frame_geometry import FrameGeometry, demand_within, make_geometry
 from .frame_selection import FrameSelection
 from .source import ImageFolder
-from .stereo_layout import Layout
 from .video_clip import Clip, EvenSample, StereoFrame
 
 SAMPLES = 24
 """Number of frames used to detect borders, labels, tools and lighting."""
 DARK = 40.0
 """Images whose brightest percent of values is below this are nearly black."""
+Mask = NDArray[np.bool_]
+Depth = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class MeasuredFrame:
+    """A rectified frame and its depth."""
+
+    position: int
+    """Position in the sequence, from 0."""
+    index: int
+    """Position in the source."""
+    rgb_u8: NDArray[np.uint8]
+    """(H, W, 3)."""
+    right_u8: NDArray[np.uint8] | None
+    """(H, W, 3) image of the right camera, rectified; None if monocular."""
+    depth: Depth | None = None
+    """(H, W) mm, 0 where missing; None before it is measured."""
+
+    @classmethod
+    def of(cls, seen: StereoFrame, geometry: FrameGeometry, position: int = 0) -> MeasuredFrame:
+        """The frame of source images, not yet measured."""
+        right = None if seen.right is None else geometry.image(seen.right, right=True)
+        return cls(position, seen.index, geometry.image(seen.left), right)
 
 
 @dataclass
@@ -51,26 +76,44 @@ class FirstPass:
     image_names: list[str] = field(default_factory=list)
     """Of all images of a source folder, without suffixes; empty for a video."""
 
+    def frame_of(self, read: Callable[[tuple[int, int]], NDArray]) -> NDArray:
+        """The frame (H, W) of a file that has the size of the source images, of the frames, or of the stored pixels.
 
-def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | None, name: str) -> FirstPass:
+        Args:
+            read: gives the file's values; it raises InputError unless they have this (width, height).
+        """
+        geometry = self.geometry
+        try:
+            return geometry.values(read(geometry.source_size))
+        except InputError:
+            with suppress(InputError):
+                return geometry.values(read(geometry.size))
+            with suppress(InputError):
+                if self.stored_size is not None:
+                    values = read(self.stored_size)
+                    kind = np.uint8 if values.dtype == bool else values.dtype
+                    how = cv2.INTER_NEAREST_EXACT
+                    square = cv2.resize(values.astype(kind), geometry.source_size, interpolation=how)
+                    return geometry.values(square.astype(values.dtype))
+            raise
+
+
+def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
     """Decode the selected frames once.
 
-    Args:
-        name: of the calibration file, for error messages.
     Raises:
         InputError: too few or too many frames, or a file is damaged.
     """
-    look = _look_through(clip, cfg)
-    if clip.was_damaged:
-        look = _look_through(clip, cfg)  # now by one thread, which finds all damage
-    indices, sample = look.indices, look.sample
+    indices, damaged, samples, selection = _look_through(clip, cfg)
+    if clip.was_damaged:  # again, now by one thread, which finds all damage
+        indices, damaged, samples, selection = _look_through(clip, cfg)
     if len(indices) < 2:
         hint = "Check --start, --end and --frames-per-second."
         raise input_error(str(clip.source.path), "at least 2 frames in the selection", str(len(indices)), hint)
-    lefts = [frame.left for frame in sample.kept]
-    video_notes = [*clip.notes, *_timing_notes(look.selection, cfg)]
-    video_notes += [*_brightness_notes(lefts), *_comb_notes(clip, lefts)]
+    lefts = [frame.left for frame in samples]
+    video_notes = [*clip.notes, *_timing_notes(selection, cfg), *_brightness_notes(lefts), *_comb_notes(clip, lefts)]
     notes: list[str] = []
+    calibration, name = clip.calibration, str(cfg.calibration)
     stretch = _stretch(clip.layout) if cfg.squeezed_eyes else (1, 1)
     if calibration is not None:
         full = clip.camera_size[0] * stretch[0], clip.camera_size[1] * stretch[1]
@@ -106,23 +149,14 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig, calibration: Calibration | No
             f"(f = {geometry.matrix[0, 0]:.0f} px). To change it: --calibration or --field-of-view-degrees."
         )
     names = [file.stem for file in clip.source.files] if isinstance(clip.source, ImageFolder) else []
-    return FirstPass(indices, sample.kept, geometry, notes, video_notes, look.damaged, clip.stored_size, names)
+    return FirstPass(indices, samples, geometry, notes, video_notes, damaged, clip.stored_size, names)
 
 
-@dataclass(frozen=True)
-class _Look:
-    """What one iteration over the clip has seen."""
-
-    indices: list[int]
-    damaged: frozenset[int]
-    sample: EvenSample
-    selection: FrameSelection
-
-
-def _look_through(clip: Clip, cfg: PrepareConfig) -> _Look:
-    """Decode the selected frames once; raises InputError if they are too many."""
-    selection = clip.selection()
-    sample = EvenSample(SAMPLES)
+def _look_through(
+    clip: Clip, cfg: PrepareConfig
+) -> tuple[list[int], frozenset[int], list[StereoFrame], FrameSelection]:
+    """Positions of the selected frames, the damaged ones, samples, and the selection; InputError if too many."""
+    selection, sample = clip.selection(), EvenSample(SAMPLES)
     indices: list[int] = []
     damaged: set[int] = set()
     for stereo_frame in clip.stereo_frames(selection):
@@ -134,7 +168,7 @@ def _look_through(clip: Clip, cfg: PrepareConfig) -> _Look:
             got = f"{clip.source.num_frames or 'more'} in the file"
             hint = "Choose a part with --start and --end, lower --frames-per-second, or raise --max-frames."
             raise input_error(str(clip.source.path), f"at most {cfg.max_frames} frames", got, hint)
-    return _Look(indices, frozenset(damaged), sample, selection)
+    return indices, frozenset(damaged), sample.kept, selection
 
 
 def _stretch(layout: Layout) -> tuple[int, int]:
@@ -198,10 +232,10 @@ def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rect
         sides = ", ".join(f"{n} px {side}" for side, n in vars(strips).items() if n)
         notes.append(f"black bars or console strips were cropped: {sides}. To keep them: --border keep.")
     if circle:
-        center = f"({circle.center_x:.0f}, {circle.center_y:.0f})"
-        where = f"center {center}, radius {circle.radius:.0f} px"
-        rim = f"its rim of {circle.margin_px:.0f} px"
-        notes.append(f"round border: {where}. Its outside and {rim} are masked, {outside:.1%} of a frame.")
+        notes.append(
+            f"round border: center ({circle.center_x:.0f}, {circle.center_y:.0f}), radius {circle.radius:.0f} px. Its "
+            f"outside and its rim of {circle.margin_px:.0f} px are masked, {outside:.1%} of a frame."
+        )
         if circle.agreement < CERTAIN:
             notes.append(
                 f"the round border is uncertain: {circle.agreement:.0%} of it agree with the images. If it is wrong, "
@@ -227,15 +261,8 @@ def source_facts(path: Path) -> dict[str, object]:
     """
     files = [path]
     if kind_of(path) == "a folder":
-        inner = sorted(path.iterdir())
-        files = [
-            *inner,
-            *(
-                file
-                for each in inner
-                if each.is_dir() and os.access(each, os.R_OK | os.X_OK)
-                for file in sorted(each.iterdir())
-            ),
-        ]
+        files = sorted(path.iterdir())
+        folders = [each for each in files if each.is_dir() and os.access(each, os.R_OK | os.X_OK)]
+        files += [file for folder in folders for file in sorted(folder.iterdir())]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.exists()]
     return {"name": path.name, "files": [list(entry) for entry in stats]}

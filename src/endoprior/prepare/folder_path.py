@@ -16,28 +16,11 @@ from ..data.endonerf import read_poses_bounds
 from ..data.files import list_files
 from ..data.frame_files import match_names
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask
-from ..data.pose_writing import (
-    POSES,
-    demand_writable,
-    depth_bounds,
-    pose_table,
-    replace_depth,
-    replace_poses,
-)
+from ..data.pose_writing import POSES, demand_writable, depth_bounds, pose_table, replace_depth, replace_poses
+from ..footage.changes import find_changes
 from ..system.atomic import write_json
-from .camera_path.seen import CameraPath, Lens, PoseInput
-from .camera_path.sequence_path import (
-    AS_OURS,
-    ASSUMED,
-    PATH_RECORD,
-    REFINED,
-    Reading,
-    record_of_path,
-    rescaled,
-    sequence_path,
-    sources_with,
-    unexplained_frames,
-)
+from .camera_path.sequence_path import AS_OURS, ASSUMED, PATH_RECORD, Reading, rescaled, sequence_path
+from .camera_path.tracks import REFINED, CameraPath, Lens, PoseInput
 
 STATIC = "static camera"
 
@@ -77,13 +60,13 @@ def write_folder_path(
     """
     demand_writable(folder)
     images = list_files(folder / "images", (".png",), "EndoNeRF")
-    masks, depths = (_of_all_images(folder / part, images) for part in ("masks", "depth"))
+    names = [file.stem for file in images]
+    masks, depths = (_of_all_images(folder / part, names) for part in ("masks", "depth"))
     described = read_description(folder / "sequence.json")
     height, width = read_color(images[0]).shape[:2]
     size, scale = (width, height), float(described.get("depth_scale", 1.0))
-    fx, fy, cx, cy = intrinsics_of(
-        folder / "sequence.json", described, width, height, _focal(folder, described, images)
-    )
+    focal = _focal(folder, described, images)
+    fx, fy, cx, cy = intrinsics_of(folder / "sequence.json", described, width, height, focal)
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     tool_value, relative = described.get("mask_tool_value", 255), described.get("depth_relative", False)
 
@@ -106,31 +89,31 @@ def write_folder_path(
         size,
         has_depth=True,
         refine_focal=sources.get("lens") in (ASSUMED, REFINED),
-        reading=replace(reading, image_names=[file.stem for file in images]),
+        reading=replace(reading, image_names=names),
         progress=lambda done: progress(done, len(images)),
     )
-    unexplained = unexplained_frames(path, colors())
-    new = path or CameraPath(np.tile(np.eye(4), (len(images), 1, 1)), np.ones(len(images), bool), np.ones(len(images)))
+    unexplained = sorted({*(path.lost if path else []), *find_changes(colors()).off_color})
+    count = len(images)
+    new = path or CameraPath(np.tile(np.eye(4), (count, 1, 1)), np.ones(count, bool), np.ones(count))
     if relative and path is not None:
         scaled = zip(depths, path.depth_scale, strict=True)
         replace_depth(folder, ((file.name, rescaled(decode_image(file, size), float(s))) for file, s in scaled))
     focal = fx * new.focal_factor
     bounds = np.array([depth_bounds(decode_image(file, size), scale) for file in depths])
     facts = {"width": width, "height": height, "fx": focal, "fy": fy * new.focal_factor, "cx": cx, "cy": cy}
-    origin = sources | {"poses": STATIC} if path is None else sources_with(sources, path)
+    origin = sources | {"poses": STATIC} if path is None else path.sources(sources)
     more = facts | {"sources": origin, "unexplained_frames": unexplained}
     table = pose_table(new.camera_to_world, height, width, focal, bounds)
     kept = replace_poses(folder, table, described | more, ours=sources.get("poses") in ESTIMATED_POSES)
     if path is not None:
-        write_json(folder / PATH_RECORD, record_of_path(path))
+        write_json(folder / PATH_RECORD, path.record())
     return FolderPath(new.camera_to_world, relative, unexplained, kept, notes)
 
 
-def _of_all_images(folder: Path, images: list[Path]) -> list[Path]:
-    """The file in a folder of each image."""
+def _of_all_images(folder: Path, names: list[str]) -> list[Path]:
+    """The file in a folder of each image, of these names without suffixes."""
     files = list_files(folder, (".png",), "EndoNeRF")
-    names = [file.stem for file in images]
-    matched = match_names(folder, [file.name for file in files], range(len(images)), names)
+    matched = match_names(folder, [file.name for file in files], range(len(names)), names)
     return [files[position] for position in matched.files.values()]
 
 

@@ -1,6 +1,7 @@
 """From a source image to a frame: stretch, rectify or undistort, crop, resize. All frames share one camera matrix.
 
-Rectangles and borders are in px of one camera's source image.
+Rectangles and borders are in px of one camera's source image. A map has, for each pixel of the rectified image, the
+column and the row of the source image, px counted from 0.
 """
 
 from __future__ import annotations
@@ -14,12 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.spread import spread
 from ..footage.border import Circle, Strips
-from .calibration import Calibration, check_pair
+from ..footage.stereo_order import row_offsets_px
+from .calibration import Calibration, Intrinsics, check_pair
 from .config import Rectangle
-from .rectification import Maps, Rectified, identity, rectify, stretched
 
 MIN_SIDE_PX = 32
+LEAST_FOCAL_SHARE, MOST_FOCAL_SHARE = 0.2, 5.0
+"""A rectified focal length outside of this range, as a share of the calibrated one, comes from wrong coefficients."""
+MOST_LOST = 0.2
+"""So much of an image may be lost: corners outside of a round image, where nothing was measured."""
+COMPARED = 8
+"""Number of frames in which the offset between the rows of both cameras is measured ..."""
+FEWEST = 40
+"""... and of matching features, over all of them, that it needs."""
+Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -61,21 +72,11 @@ class FrameGeometry:
         """
         if image.shape[:2] != self.source_size[::-1]:
             return image
-        maps = self.maps[0]
         stored = image.astype(np.uint8) if image.dtype == bool else image
-        if maps is not None:
-            stored = cv2.remap(stored, *maps, cv2.INTER_NEAREST)
+        if self.maps[0] is not None:
+            stored = cv2.remap(stored, *self.maps[0], cv2.INTER_NEAREST)
         stored = cv2.resize(_cut(stored, self.cut), self.size, interpolation=cv2.INTER_NEAREST)
         return stored.astype(image.dtype)
-
-
-def _cut(image: NDArray, cut: Rectangle) -> NDArray:
-    x, y, width, height = cut
-    return np.ascontiguousarray(image[y : y + height, x : x + width])
-
-
-def _shrink(image: NDArray, size: tuple[int, int]) -> NDArray:
-    return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def make_geometry(
@@ -120,46 +121,30 @@ def make_geometry(
         keep &= circle.mask(width, height, circle.margin_px)
     if outside is not None:
         keep &= ~outside
-    baseline = None
     painted = np.zeros_like(keep)
     for x, y, w, h in blank:
         painted[y : y + h, x : x + w] = True
-    full = width * stretch[0], height * stretch[1]
+    full, baseline = (width * stretch[0], height * stretch[1]), None
     if calibration is None:
         # A round border of a squeezed image is no circle.
-        assumed = _assumed(*full, circle if full == size else None, field_of_view_degrees)
-        rectified = Rectified(assumed, np.eye(3), (None, None))
+        matrix = _assumed(*full, circle if full == size else None, field_of_view_degrees)
+        turn, maps = np.eye(3), (None, None)
     else:
         baseline = check_pair(calibration, name) if stereo else None
-        rectified = rectify(calibration, full, name, stereo=stereo)
-    maps = stretched(rectified.maps[0], full, stretch), stretched(rectified.maps[1], full, stretch)
-    warped = keep if maps[0] is None else cv2.remap(keep.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
-    cut = _bounding_box(warped)
-    frame = _frame_size(cut, max_width)
+        matrix, turn, maps = rectify(calibration, full, name, stereo=stereo)
+    maps = _stretched(maps[0], full, stretch), _stretched(maps[1], full, stretch)
+
+    def warped(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return mask if maps[0] is None else cv2.remap(mask.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
+
+    cut = _bounding_box(warped(keep))
+    frame = cut[2:]
+    if max_width and frame[0] > max_width:
+        frame = max_width, max(round(cut[3] * max_width / cut[2]), 1)
+    inside = _shrink(_cut(warped(keep & ~painted).astype(np.float32), cut), frame) > 0.999
     scale = np.diag([frame[0] / cut[2], frame[1] / cut[3], 1.0])
     shift = np.array([[1, 0, -cut[0]], [0, 1, -cut[1]], [0, 0, 1.0]])
-    shown = keep & ~painted
-    shown = shown if maps[0] is None else cv2.remap(shown.astype(np.uint8), *maps[0], cv2.INTER_NEAREST) > 0
-    inside = _shrink(_cut(shown.astype(np.float32), cut), frame) > 0.999
-    matrix = scale @ shift @ rectified.matrix
-    return FrameGeometry(size, maps, cut, frame, matrix, rectified.turn, baseline, painted, inside)
-
-
-def with_rows_moved(geometry: FrameGeometry, offset_px: float) -> FrameGeometry:
-    """The geometry whose right frames are moved up by a row offset, px of a frame, so that the rows of a pair agree.
-
-    Args:
-        offset_px: y_right - y_left of the same points.
-    """
-    offset = np.float32(offset_px * geometry.cut[3] / geometry.size[1])
-    columns, rows = identity(geometry.source_size if geometry.maps[1] is None else geometry.maps[1][0].shape[::-1])
-    maps = columns, rows + offset
-    if geometry.maps[1] is not None:  # maps are smooth: those of the rows below, 0 beyond the image
-        maps = tuple(
-            cv2.remap(of, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-1e4)
-            for of in geometry.maps[1]
-        )
-    return replace(geometry, maps=(geometry.maps[0], maps))
+    return FrameGeometry(size, maps, cut, frame, scale @ shift @ matrix, turn, baseline, painted, inside)
 
 
 def demand_within(rectangle: Rectangle, size: tuple[int, int], option: str) -> None:
@@ -170,13 +155,22 @@ def demand_within(rectangle: Rectangle, size: tuple[int, int], option: str) -> N
         raise input_error(option, want, ",".join(map(str, rectangle)), hint)
 
 
+def _cut(image: NDArray, cut: Rectangle) -> NDArray:
+    x, y, width, height = cut
+    return np.ascontiguousarray(image[y : y + height, x : x + width])
+
+
+def _shrink(image: NDArray, size: tuple[int, int]) -> NDArray:
+    return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
 def _assumed(width: int, height: int, circle: Circle | None, degrees: float) -> NDArray[np.float64]:
     """K of a camera with an assumed field of view."""
-    half = math.tan(math.radians(degrees / 2))
-    extent, x, y = (width / 2, width / 2, height / 2)
+    extent, x, y = width / 2, width / 2, height / 2
     if circle is not None:
         extent, x, y = circle.radius, circle.center_x, circle.center_y
-    return np.array([[extent / half, 0, x], [0, extent / half, y], [0, 0, 1.0]])
+    focal = extent / math.tan(math.radians(degrees / 2))
+    return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1.0]])
 
 
 def _bounding_box(keep: NDArray[np.bool_]) -> Rectangle:
@@ -187,8 +181,137 @@ def _bounding_box(keep: NDArray[np.bool_]) -> Rectangle:
     return int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)
 
 
-def _frame_size(cut: Rectangle, max_width: int) -> tuple[int, int]:
-    width, height = cut[2], cut[3]
-    if max_width and width > max_width:
-        return max_width, max(round(height * max_width / width), 1)
-    return width, height
+def rectify(
+    calibration: Calibration, size: tuple[int, int], name: str, *, stereo: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[Maps | None, Maps | None]]:
+    """Rectify images of this (width, height), px. Every pixel of the result shows something.
+
+    Args:
+        calibration: in px of these images; with both cameras if `stereo`.
+        name: of its file, for error messages.
+    Returns:
+        (3, 3) K of both rectified cameras, with the left-most pixel centered at 0.5; (3, 3) rotation from the axes of
+        the left camera to those of the rectified one; and the maps of the left and the right image.
+    Raises:
+        InputError: the distortion cannot be undone, or only one lens is a fisheye.
+    """
+    matrix, turn, maps = _pair(calibration, size, name) if stereo else _single(calibration.left, size)
+    share = matrix[0, 0] / calibration.left.matrix[0, 0]
+    lost = max((_lost(each, size) for each in maps if each is not None), default=0.0)
+    if lost > MOST_LOST or not LEAST_FOCAL_SHARE < share < MOST_FOCAL_SHARE:
+        got = f"{share:.3g} times the focal length and {lost:.0%} of the image lost after it"
+        fix = "Check the distortion, its model and the size of its images."
+        raise input_error(name, "a distortion that can be undone", got, fix)
+    return matrix, turn, maps
+
+
+def _single(camera: Intrinsics, size: tuple[int, int]):
+    if not camera.bent:
+        return camera.matrix, np.eye(3), (None, None)
+    k, bent = _moved(camera.matrix, -0.5), camera.distortion
+    if camera.fisheye:
+        better = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(k, bent, size, np.eye(3), balance=0)
+    else:
+        better = cv2.getOptimalNewCameraMatrix(k, bent, size, 0)[0]
+    return _moved(better, 0.5), np.eye(3), (_maps(camera, np.eye(3), better, size), None)
+
+
+def _pair(calibration: Calibration, size: tuple[int, int], name: str):
+    left, right = calibration.left, calibration.right
+    assert right is not None and calibration.rotation is not None and calibration.translation_mm is not None
+    if calibration.rectified:
+        return left.matrix, np.eye(3), (None, None)
+    if left.fisheye != right.fisheye:
+        fix = "Name the model of both lenses."
+        raise input_error(name, "two lenses of one model", "one fisheye and one that is not", fix)
+    both = (
+        _moved(left.matrix, -0.5), left.distortion, _moved(right.matrix, -0.5), right.distortion, size,
+        calibration.rotation, calibration.translation_mm.reshape(3, 1),
+    )  # fmt: skip
+    if left.fisheye:
+        r1, r2, p1, p2 = cv2.fisheye.stereoRectify(*both, flags=cv2.CALIB_ZERO_DISPARITY, balance=0)[:4]
+    else:
+        r1, r2, p1, p2 = cv2.stereoRectify(*both, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)[:4]
+    maps = _maps(left, r1, p1[:, :3], size), _maps(right, r2, p2[:, :3], size)
+    return _moved(p1[:, :3], 0.5), r1, maps
+
+
+def _moved(matrix: NDArray, by: float) -> NDArray[np.float64]:
+    """K with its principal point moved: OpenCV counts pixel centers from 0, this package from 0.5."""
+    moved = matrix.copy()
+    moved[:2, 2] += by
+    return moved
+
+
+def _maps(camera: Intrinsics, turn: NDArray, matrix: NDArray, size: tuple[int, int]) -> Maps:
+    """Args: matrix: K of the rectified camera, px counted from 0."""
+    make = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
+    return make(_moved(camera.matrix, -0.5), camera.distortion, turn, matrix, size, cv2.CV_32FC1)
+
+
+def _lost(maps: Maps, size: tuple[int, int]) -> float:
+    """Share of the rectified pixels that are outside of the source image, or whose neighbors change sides in it."""
+    (x_down, x_across), (y_down, y_across) = (np.gradient(of) for of in maps)
+    shown = (maps[0] > -1) & (maps[0] < size[0]) & (maps[1] > -1) & (maps[1] < size[1])
+    return float((~shown | (x_across * y_down - x_down * y_across <= 0)).mean())
+
+
+def _identity(size: tuple[int, int]) -> Maps:
+    columns, rows = np.meshgrid(np.arange(size[0], dtype=np.float32), np.arange(size[1], dtype=np.float32))
+    return columns, rows
+
+
+def _stretched(maps: Maps | None, size: tuple[int, int], stretch: tuple[int, int]) -> Maps | None:
+    """Maps into an image squeezed to 1 / stretch (across, down), from those into the image of this size."""
+    if stretch == (1, 1):
+        return maps
+    half = np.float32(0.5)
+    columns, rows = _identity(size) if maps is None else maps
+    return (columns + half) / stretch[0] - half, (rows + half) / stretch[1] - half
+
+
+def with_rows_moved(geometry: FrameGeometry, offset_px: float) -> FrameGeometry:
+    """The geometry whose right frames are moved up by a row offset, px of a frame, so that the rows of a pair agree.
+
+    Args:
+        offset_px: y_right - y_left of the same points.
+    """
+    old = geometry.maps[1]
+    offset = np.float32(offset_px * geometry.cut[3] / geometry.size[1])
+    columns, rows = _identity(geometry.source_size if old is None else old[0].shape[::-1])
+    maps = columns, rows + offset
+    if old is not None:  # maps are smooth: those of the rows below, 0 beyond the image
+        beyond = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": -1e4}
+        maps = tuple(cv2.remap(each, *maps, cv2.INTER_LINEAR, **beyond) for each in old)
+    return replace(geometry, maps=(geometry.maps[0], maps))
+
+
+def with_equal_rows(
+    geometry: FrameGeometry, pairs: Sequence[tuple[NDArray[np.uint8], NDArray[np.uint8] | None]]
+) -> tuple[FrameGeometry, str]:
+    """The geometry that moves the right images so that the rows of both cameras agree, and a note.
+
+    The offset is the median over features of all frames: one number, because it comes from the mounting of the cameras.
+
+    Args:
+        pairs: left and right source images (h, w, 3).
+    Raises:
+        InputError: one camera, or too few features match.
+    """
+    fix = "Remove `--row-offset auto`."
+    if any(right is None for _, right in pairs):
+        raise input_error("--row-offset", "two cameras", "one camera", fix)
+    pairs = [pairs[i] for i in spread(len(pairs), COMPARED)]
+
+    def offsets(of: FrameGeometry) -> NDArray[np.float64]:
+        images = ((of.image(left), of.image(right, right=True)) for left, right in pairs)
+        return np.concatenate([row_offsets_px(*both) for both in images])
+
+    before = offsets(geometry)
+    if len(before) < FEWEST:
+        raise input_error("--row-offset", f"{FEWEST} features that both cameras see", str(len(before)), fix)
+    offset = float(np.median(before))
+    moved = with_rows_moved(geometry, offset)
+    left = float(np.median(np.abs(offsets(moved))))
+    words = f"the right images are moved {'up' if offset > 0 else 'down'} by {abs(offset):.2f} px"
+    return moved, f"{words}: the rows of both cameras were {np.median(np.abs(before)):.2f} px apart, now {left:.2f}"

@@ -1,56 +1,203 @@
-"""Second pass over a clip: rectify each frame, measure depth and tool mask, filter depth in time, write the files."""
+"""Second pass over a clip: choose how depth and masks are made, rectify and measure each frame, write the files."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
+from ..core.spread import spread
+from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
+from ..data.depth_fill import is_measured
 from ..data.found_tools import FoundTools
+from ..data.frame_files import match_files
 from ..data.writer import FrameFiles
+from ..footage.changes import COLOR_DISTANCE, color_share
+from ..footage.stereo_order import stereo_order, vertical_offset_px
+from ..footage.units import guess_unit
+from .config import PrepareConfig
+from .first_pass import Depth, FirstPass, Mask, MeasuredFrame
 from .frame_geometry import FrameGeometry
-from .stereo import temporal_median
-from .video_clip import StereoFrame
+from .masks import Tools, choose_tools
+from .relative_depth import DEFAULT_MODEL, DepthNetwork, Kind, fit_reference, fit_shading, relative_to_mm
+from .stereo import stereo_depth, temporal_median
+from .video_clip import Clip, StereoFrame
 
 REACH = 2
 """Number of frames on each side in the temporal depth filter."""
-Mask = NDArray[np.bool_]
-Depth = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class MeasuredFrame:
-    """A rectified frame and its depth."""
-
-    position: int
-    """Position in the sequence, from 0."""
-    index: int
-    """Position in the source."""
-    rgb_u8: NDArray[np.uint8]
-    """(H, W, 3)."""
-    right_u8: NDArray[np.uint8] | None
-    """(H, W, 3) image of the right camera, rectified; None if monocular."""
-    depth: Depth | None
-    """(H, W) mm, 0 where missing; None before it is measured."""
+FITTED_SAMPLES = 16
+"""Number of frames to which the tool and shading models are fitted."""
+MAX_ROW_OFFSET_PX = 1.5
+"""If the rows of the two cameras are further apart, stereo matching is poor."""
+NETWORK = "depth-anything"
+DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
+Measure = Callable[[MeasuredFrame], Depth]
 
 
 @dataclass(frozen=True)
 class FrameMethods:
-    """Functions that make depth and masks of one clip."""
+    """How depth and masks of one clip are made."""
 
-    measure: Callable[[MeasuredFrame], Depth] | None
+    measure: Measure | None
     """Depth that needs no mask: stereo, files, a network."""
     shade: Callable[[NDArray[np.uint8], Mask], Depth] | None
     """Depth from the shading of an image inside a mask."""
-    tools: Callable[[MeasuredFrame], FoundTools]
-    """The tools of a frame; those that the user gives have confidence 1."""
+    tools: Tools
     filter_in_time: bool
     """Whether to filter depth over neighboring frames."""
     wanted: Callable[[NDArray[np.uint8]], bool]
     """Whether an image (H, W, 3) belongs in the sequence."""
+    sources: dict[str, str]
+    """Where images, depth and masks come from."""
+    relative: bool
+    """Whether the scale of the depth is assumed."""
+    notes: list[str]
+    """Notes for the user, one line each."""
+
+
+def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> FrameMethods:
+    """Choose the methods and fit their models to samples of the clip.
+
+    Raises:
+        InputError: a folder named by an option cannot be used, or an option needs a second camera.
+    """
+    geometry, step = first_pass.geometry, max(len(first_pass.samples) // FITTED_SAMPLES, 1)
+    samples = [MeasuredFrame.of(frame, geometry) for frame in first_pass.samples[::step]]
+    notes = _check_stereo(samples, clip) if clip.stereo else []
+    kind = _depth_kind(cfg, clip)
+    relative = kind in ("shading", "network") or cfg.depth_relative != "no"
+    measure, source = None, kind
+    if kind not in ("none", "shading"):
+        measure, source, depth_notes = _measured_depth(kind, cfg, clip, first_pass)
+        notes += depth_notes
+    tools, mask_source, mask_notes = choose_tools(cfg, first_pass, samples)
+    notes += mask_notes
+    shade = None
+    if relative:
+        images, usable = [f.rgb_u8 for f in samples], [geometry.inside & ~tools(f).mask for f in samples]
+        if measure is None:
+            shade = fit_shading(images, usable, cfg.working_distance_mm).depth
+        else:
+            measure = _scaled(measure, samples, usable, cfg)
+        notes.append(
+            f"depth is relative ({source}), with its median set to {cfg.working_distance_mm:g}: lengths have no unit "
+            "(rel.). For mm use a stereo video or measured depth."
+        )
+    elif kind == "folder":
+        notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.depth)
+    wanted = _inside_body([frame.rgb_u8 for frame in samples]) if cfg.drop_out_of_body else lambda rgb_u8: True
+    sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
+    return FrameMethods(measure, shade, tools, kind == "sgbm", wanted, sources, relative, notes)
+
+
+def _check_stereo(samples: list[MeasuredFrame], clip: Clip) -> list[str]:
+    """Reject swapped cameras; return a note if the rows do not match."""
+    pairs = [(frame.rgb_u8, frame.right_u8) for frame in samples][:: max(len(samples) // 3, 1)]
+    orders = [stereo_order(*pair) for pair in pairs]
+    if sum(order.swapped for order in orders) > len(orders) / 2:
+        fix = "Remove --swap-eyes." if clip.swap else "Add --swap-eyes."
+        shares = f"{orders[0].exchanged:.0%} of the image matches swapped, {orders[0].as_given:.0%} as given"
+        raise input_error(clip.source.path, "the left camera first", f"the right one ({shares})", fix)
+    offsets = np.array([vertical_offset_px(*pair) for pair in pairs])
+    offset = float(np.median(offsets[np.isfinite(offsets)])) if np.isfinite(offsets).any() else 0.0
+    if offset <= MAX_ROW_OFFSET_PX:
+        return []
+    fix = "Pass the calibration of this video, or --row-offset auto."
+    return [f"the rows of the cameras are {offset:.1f} px apart; depth will be poor. {fix}"]
+
+
+def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
+    """The depth method that --depth selects.
+
+    Raises:
+        InputError: --depth-relative without a depth folder.
+    """
+    if cfg.depth == "auto":
+        kind: DepthKind = "sgbm" if clip.stereo else "shading"
+    elif cfg.depth in ("none", "sgbm", "shading"):
+        kind = cfg.depth
+    else:
+        kind = "network" if cfg.depth.partition(":")[0] == NETWORK else "folder"
+    if cfg.depth_relative != "no" and kind != "folder":
+        raise input_error("--depth-relative", "a folder with --depth", cfg.depth, "Remove --depth-relative.")
+    return kind
+
+
+def _measured_depth(
+    kind: DepthKind, cfg: PrepareConfig, clip: Clip, first_pass: FirstPass
+) -> tuple[Measure, str, list[str]]:
+    """A function that measures depth without a mask (mm, or relative values of a network), its name, and notes."""
+    geometry = first_pass.geometry
+    if kind == "sgbm":
+        if not clip.stereo or geometry.baseline_mm is None:
+            fix = "`--calibration FILE` with both cameras, or `--depth shading`."
+            raise input_error("--depth sgbm", "two cameras and their calibration", "one camera", fix)
+        focal, baseline = float(geometry.matrix[0, 0]), geometry.baseline_mm
+
+        def match(frame: MeasuredFrame) -> Depth:
+            assert frame.right_u8 is not None
+            return stereo_depth(frame.rgb_u8, frame.right_u8, focal, baseline, cfg.stereo).depth
+
+        return match, "stereo: semi-global matching", []
+    if kind == "network":
+        network = DepthNetwork(cfg.depth.partition(":")[2] or DEFAULT_MODEL)
+        return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2", []
+    files, notes = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
+    if cfg.depth_relative == "no":
+        if not cfg.depth_unit_mm:
+            fix = "`--depth-unit-mm 1` for mm, `0.01` for 0.01 mm, `1000` for m; or `--depth-relative depth`."
+            raise input_error("--depth-unit-mm", f"mm per unit of the files in {cfg.depth}", "none", fix)
+        some = spread(len(first_pass.indices), FITTED_SAMPLES)
+        notes += _check_stored([read_stored(files[first_pass.indices[i]]) for i in some])
+
+    def read(path: Path, size: tuple[int, int]) -> NDArray:
+        if cfg.depth_relative == "disparity":
+            return read_values(path, size)
+        relative = cfg.depth_relative == "depth"
+        return read_depth_file(path, 1.0 if relative else cfg.depth_unit_mm, size, relative=relative)
+
+    return lambda frame: first_pass.frame_of(lambda size: read(files[frame.index], size)), "user's files", notes
+
+
+def _scaled(measure: Measure, samples: list[MeasuredFrame], usable: list[Mask], cfg: PrepareConfig) -> Measure:
+    """Relative values scaled to the working distance by constants of the clip."""
+    kind: Kind = "depth" if cfg.depth_relative == "depth" else "disparity"
+    reference = fit_reference([measure(frame) for frame in samples], usable, kind, cfg.working_distance_mm)
+    return lambda frame: relative_to_mm(measure(frame), kind, reference)
+
+
+def _check_unit(samples: list[MeasuredFrame], depths: list[Depth], geometry: FrameGeometry, folder: str) -> list[str]:
+    """Reject depth outside the range of an endoscope; return notes on implausible depth."""
+    guess = guess_unit((d, d > 0, f.rgb_u8, geometry.inside) for f, d in zip(samples, depths, strict=True))
+    if guess.unit in ("m", "0.01 mm"):
+        fix = f"The values look like {guess.unit}: multiply --depth-unit-mm by {guess.mm_per_unit:g}."
+        raise input_error("--depth-unit-mm", "tissue 20 to 250 mm away", f"{guess.median:g} mm in {folder}", fix)
+    return [] if guess.unit == "mm" else [f"the depth unit may be wrong: {guess.reason}. Check --depth-unit-mm."]
+
+
+def _check_stored(images: list[NDArray]) -> list[str]:
+    """Notes on the numbers (H, W) of some depth files: 8 bits, and what stands for missing depth."""
+    notes = []
+    if all(image.dtype == np.uint8 for image in images):
+        notes.append("the depth has at most 256 steps: 8-bit files are too coarse for motion in mm. Use 16-bit files.")
+    filled = [np.isfinite(image) & (image > 0) & ~is_measured(image) for image in images]
+    if any(each.any() for each in filled):
+        least = min(float(image[each].min()) for image, each in zip(images, filled, strict=True) if each.any())
+        share = float(np.mean([each.mean() for each in filled]))
+        notes.append(f"depth: numbers from {least:g} on are far above the rest and count as missing, {share:.1%} of it")
+    return notes
+
+
+def _inside_body(images: list[NDArray[np.uint8]]) -> Callable[[NDArray[np.uint8]], bool]:
+    """A function that tells whether an image has the usual color of the samples."""
+    usual = np.median([color_share(image) for image in images], 0)
+    return lambda rgb_u8: bool(np.abs(color_share(rgb_u8) - usual).max() < COLOR_DISTANCE)
 
 
 def measure_frames(
@@ -61,17 +208,13 @@ def measure_frames(
     Args:
         used: gets the position in the source of every wanted frame.
     """
-    position = 0
     for stereo_frame in stereo_frames:
-        rgb_u8 = geometry.image(stereo_frame.left)
-        if not methods.wanted(rgb_u8):
+        frame = MeasuredFrame.of(stereo_frame, geometry, len(used))
+        if not methods.wanted(frame.rgb_u8):
             continue
         used.append(stereo_frame.index)
-        if position >= first:
-            right = None if stereo_frame.right is None else geometry.image(stereo_frame.right, right=True)
-            frame = MeasuredFrame(position, stereo_frame.index, rgb_u8, right, None)
+        if frame.position >= first:
             yield replace(frame, depth=methods.measure(frame)) if methods.measure else frame
-        position += 1
 
 
 def with_neighbors(frames: Iterable[MeasuredFrame]) -> Iterator[list[MeasuredFrame]]:
@@ -101,8 +244,8 @@ def write_frames(
     files: FrameFiles,
     *,
     keep_right: bool,
-    on_tools: Callable[[int, FoundTools], None] = lambda position, found: None,
-    on_frame: Callable[[int], None] = lambda count: None,
+    on_tools: Callable[[int, FoundTools], None],
+    on_frame: Callable[[int], None],
 ) -> list[int]:
     """Write every wanted frame that `files` does not have yet.
 

@@ -18,29 +18,17 @@ from ..data.found_tools import FrameRow, RowLog, mark_moving, read_rows, uncerta
 from ..data.images import decode_image, read_color, read_depth, read_tool_mask, save_png
 from ..data.stir import demand_stir_clip
 from ..data.writer import FrameFiles, SequenceMeta
-from .calibration import Calibration
+from ..footage.changes import find_changes
+from .calibration import parse_size
 from .calibration_files import read_calibration
-from .calibration_size import parse_size
-from .camera_path.seen import CameraPath, Lens, PoseInput
-from .camera_path.sequence_path import (
-    ASSUMED,
-    CALIBRATED,
-    PATH_RECORD,
-    Reading,
-    record_of_path,
-    rescaled,
-    sequence_path,
-    sources_with,
-    unexplained_frames,
-)
+from .camera_path.sequence_path import ASSUMED, CALIBRATED, PATH_RECORD, Reading, rescaled, sequence_path
+from .camera_path.tracks import CameraPath, Lens, PoseInput
 from .config import PrepareConfig
-from .depth_and_masks import ChosenMethods, choose_methods
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
-from .frame_geometry import FrameGeometry
-from .frames import write_frames
-from .masked_frames import masked_frames
+from .frame_geometry import with_equal_rows
+from .frames import FrameMethods, choose_methods, write_frames
+from .masks import masked_frames, remove_carried, replace_by_carried
 from .record import record_of
-from .row_offset import with_equal_rows
 from .sam2 import is_sam2, open_sam2
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
@@ -82,30 +70,24 @@ def prepare(
     plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
         clip, first_pass, step = _look(video, cfg, progress)
+        inside = first_pass.geometry.inside
         progress("looking at tools and light", 0, len(first_pass.indices))
-        chosen = choose_methods(cfg, clip, first_pass)
-        meta = _meta(clip, first_pass.geometry, chosen, step)
-        files, used = _write(folder, cfg, clip, first_pass, chosen, meta, progress)
+        methods = choose_methods(cfg, clip, first_pass)
+        files, used = _write(folder, cfg, clip, first_pass, methods, step, progress)
         if files.count < 2:
             fix = "Change --start, --end or --drop-out-of-body."
             raise input_error(video, "at least 2 frames that show the inside of a body", str(files.count), fix)
-        carried_notes: list[str] = []
+        carried_notes = []
         if segmenter is not None:
-            from .carried_masks import replace_by_carried  # imports torch
-
-            inside, shade = first_pass.geometry.inside, chosen.methods.shade
-            carried_notes = replace_by_carried(files, segmenter, inside, shade, progress)
-        moving = _unmasked(files, first_pass.geometry.inside) if chosen.finds_tools or segmenter is not None else []
+            carried_notes = replace_by_carried(files, segmenter, inside, methods.shade, progress)
+        moving = _unmasked(files, inside) if cfg.masks == "auto" or segmenter is not None else []
         mark_moving(folder, moving)
         path, motion_notes = _camera_path(cfg, files, first_pass, used, progress)
         damaged = [i for i, index in enumerate(used) if index in first_pass.damaged]
         unexplained = _unexplained(path, files, damaged)
         if path is not None:
             _use_path(files, path)
-        if segmenter is not None:
-            from .carried_masks import remove_carried
-
-            remove_carried(files)
+        remove_carried(files)
         RowLog(folder).remove()
         files.finish(None if path is None else path.camera_to_world, unexplained)
         video_notes = [*first_pass.video_notes, *_damage_notes(damaged)]
@@ -115,7 +97,7 @@ def prepare(
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
         others = sorted({*unexplained} - {*damaged})
-        notes = [*video_notes, *first_pass.notes, *chosen.notes, *carried_notes, *motion_notes]
+        notes = [*video_notes, *first_pass.notes, *methods.notes, *carried_notes, *motion_notes]
         notes += _advice(out, uncertain_frames(read_rows(folder)), moving, others, files.count - len(unexplained))
     return Prepared(out, files.count, first_pass.geometry.size, notes)
 
@@ -127,16 +109,17 @@ def _look(video: Path, cfg: PrepareConfig, progress: Progress) -> tuple[Clip, Fi
         calibration = replace(calibration, size=parse_size(cfg.calibration_size), size_is_sure=True)
     clip = Clip(video, cfg, calibration)
     progress("looking through", 0, clip.source.num_frames)
-    first_pass = run_first_pass(clip, cfg, clip.calibration, str(cfg.calibration))
-    masked = masked_frames(cfg, first_pass.indices, first_pass.image_names)
-    if masked is not None:
-        clip.only = masked.indices
-        first_pass = run_first_pass(clip, cfg, clip.calibration, str(cfg.calibration))
-        first_pass.notes.append(masked.note)
+    first_pass = run_first_pass(clip, cfg)
+    step = 1
+    if masked := masked_frames(cfg, first_pass):
+        clip.only, step, note = masked
+        first_pass = run_first_pass(clip, cfg)
+        first_pass.notes.append(note)
     if cfg.row_offset == "auto":
-        first_pass.geometry, row_note = with_equal_rows(first_pass.geometry, first_pass.samples)
+        pairs = [(frame.left, frame.right) for frame in first_pass.samples]
+        first_pass.geometry, row_note = with_equal_rows(first_pass.geometry, pairs)
         first_pass.notes.append(row_note)
-    return clip, first_pass, masked.step if masked else 1
+    return clip, first_pass, step
 
 
 def _write(
@@ -144,140 +127,66 @@ def _write(
     cfg: PrepareConfig,
     clip: Clip,
     first_pass: FirstPass,
-    chosen: ChosenMethods,
-    meta: SequenceMeta,
+    methods: FrameMethods,
+    step: int,
     progress: Progress,
 ) -> tuple[FrameFiles, list[int]]:
     """Write the frames that are not there yet; and the position in the source of every frame."""
     parts = ["images", "masks", *(["depth"] if cfg.depth != "none" else []), *(["right"] if cfg.keep_right else [])]
-    found, done = RowLog(folder), frames_done(folder, parts)
-    if chosen.finds_tools:
+    found, done, finds_tools = RowLog(folder), frames_done(folder, parts), cfg.masks == "auto"
+    if finds_tools:
         done = min(done, len(found.rows))
         found.cut(done)
-    files = FrameFiles(folder, meta, done)
+    files = FrameFiles(folder, _meta(clip, first_pass, methods, step), done)
     used = write_frames(
         clip.stereo_frames(clip.selection()),
         first_pass.geometry,
-        chosen.methods,
+        methods,
         files,
         keep_right=cfg.keep_right,
-        on_tools=lambda i, tools: found.add(FrameRow.of(i, tools)) if chosen.finds_tools else None,
+        on_tools=lambda i, tools: found.add(FrameRow.of(i, tools)) if finds_tools else None,
         on_frame=lambda done: progress("writing frames", done, len(first_pass.indices)),
     )
-    if chosen.finds_tools and files.count >= 2:
+    if finds_tools and files.count >= 2:
         found.finish()
     return files, used
 
 
-def _use_path(files: FrameFiles, path: CameraPath) -> None:
-    """Bring relative depth and the focal length to those of the path, and record it."""
-    if files.meta.depth_relative:
-        _scale_depth(files, path)
-    focal = {"fx": files.meta.fx * path.focal_factor, "fy": files.meta.fy * path.focal_factor}
-    files.meta = replace(files.meta, **focal, sources=sources_with(files.meta.sources, path))
-    files.write_json(PATH_RECORD, record_of_path(path))
-
-
-def _advice(out: Path, uncertain: list[int], moving: list[int], others: list[int], usable: int) -> list[str]:
-    """Notes on frames to look at: of unsure masks, of likely missed tools, without a pose."""
-    notes = []
-    if uncertain:
-        frames = number_ranges(uncertain)
-        notes.append(f"masks: unsure in frames {frames}. To look and correct: {command('view', out)}")
-    if moving:
-        what = f"in frames {number_ranges(moving)}, something moves that no mask covers"
-        notes.append(f"masks: tools are likely missed: {what}. To look and correct: {command('view', out)}")
-    if others:
-        fix = "look at the images: is this one video?" if usable < 2 else "--start and --end can leave them out"
-        notes.append(f"no camera pose, or another scene, in frames {number_ranges(others)}; {fix}")
-    return notes
-
-
-def _unmasked(files: FrameFiles, inside: NDArray[np.bool_]) -> list[int]:
-    """Written frames in which something moves that no mask covers."""
-    from .unmasked_motion import frames_with_unmasked_motion  # imports torch
-
-    return frames_with_unmasked_motion(
-        files.count,
-        files.meta.frames_per_second,
-        lambda i: read_color(files.file("images", i)),
-        lambda i: read_tool_mask(files.file("masks", i)),
-        inside,
-    )
-
-
-def _unexplained(path: CameraPath | None, files: FrameFiles, damaged: list[int]) -> list[int]:
-    """Damaged frames, and those without a pose or of another scene than the frames that are not damaged."""
-    whole = sorted({*range(files.count)} - {*damaged})
-    if len(whole) < files.count / 2:  # too few to tell which scene is the usual one
-        return damaged
-    lost = unexplained_frames(None, (read_color(files.file("images", i)) for i in whole))
-    without_pose = [] if path is None else np.flatnonzero(~path.explained).tolist()
-    return sorted({*damaged, *without_pose, *(whole[i] for i in lost)})
-
-
-def _damage_notes(damaged: list[int]) -> list[str]:
-    """A note about frames whose bytes are damaged."""
-    if not damaged:
-        return []
-    frames = number_ranges(damaged)
-    return [
-        f"damaged in the video, or predicted from damaged images before the next key frame: frames {frames}. They are "
-        "unexplained_frames of sequence.json; leave them out with --start and --end, or copy the video again"
-    ]
-
-
-def _demand_all_frames(cfg: PrepareConfig) -> None:
-    """Raise InputError if options leave out frames: points of STIR belong to the first and the last frame of a clip."""
-    options = {"--start": cfg.start > 0, "--end": cfg.end < math.inf, "--drop-out-of-body": cfg.drop_out_of_body}
-    if left_out := [name for name, is_set in options.items() if is_set]:
-        raise input_error("--stir", "all frames of the clip", left_out[0], f"remove {left_out[0]}.")
-
-
-def _meta(clip: Clip, geometry: FrameGeometry, chosen: ChosenMethods, step: int) -> SequenceMeta:
+def _meta(clip: Clip, first_pass: FirstPass, methods: FrameMethods, step: int) -> SequenceMeta:
+    geometry, lens = first_pass.geometry, ASSUMED
+    if clip.calibration is not None:
+        lens = CALIBRATED if clip.calibration.size else SIZE_NOT_STATED
     return SequenceMeta(
-        width=geometry.size[0],
-        height=geometry.size[1],
-        fx=float(geometry.matrix[0, 0]),
-        fy=float(geometry.matrix[1, 1]),
-        cx=float(geometry.matrix[0, 2]),
-        cy=float(geometry.matrix[1, 2]),
+        *geometry.size,
+        *geometry.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(),
         frames_per_second=clip.frames_per_second / step,
         baseline_mm=geometry.baseline_mm,
         depth_scale=DEPTH_SCALE,
-        depth_source=chosen.sources["depth"],
-        depth_relative=chosen.relative,
-        sources=chosen.sources | {"lens": _lens_source(clip.calibration)},
+        depth_source=methods.sources["depth"],
+        depth_relative=methods.relative,
+        sources=methods.sources | {"lens": lens},
     )
-
-
-def _lens_source(calibration: Calibration | None) -> str:
-    if calibration is None:
-        return ASSUMED
-    return CALIBRATED if calibration.size else SIZE_NOT_STATED
 
 
 def _camera_path(
     cfg: PrepareConfig, files: FrameFiles, first_pass: FirstPass, used: Sequence[int], progress: Progress
 ) -> tuple[CameraPath | None, list[str]]:
     """Poses of the written frames, None for a static camera; and notes for the user."""
-    meta, geometry = files.meta, first_pass.geometry
+    meta, turn = files.meta, first_pass.geometry.turn
     progress("following the camera", 0, files.count)
-
-    def tissue(index: int) -> NDArray[np.bool_]:
-        return ~read_tool_mask(files.file("masks", index))
 
     def frame(index: int) -> PoseInput:
         depth = read_depth(files.file("depth", index), meta.depth_scale)
-        return PoseInput(read_color(files.file("images", index)), tissue(index), depth)
+        return PoseInput(_color(files, index), ~_tools(files, index), depth)
 
     matrix = np.array([[meta.fx, 0, meta.cx], [0, meta.fy, meta.cy], [0, 0, 1]])
     # Poses of a file are those of the source's left camera, which rectification turns.
-    turn = None if np.array_equal(geometry.turn, np.eye(3)) else geometry.turn
+    turn = None if np.array_equal(turn, np.eye(3)) else turn
+    everything = range(files.count)
     return sequence_path(
         cfg.poses,
         frame,
-        lambda: ((read_color(files.file("images", i)) for i in range(files.count)), map(tissue, range(files.count))),
+        lambda: ((_color(files, i) for i in everything), (~_tools(files, i) for i in everything)),
         files.count,
         Lens.centered_at_half(matrix, meta.width, meta.depth_relative, meta.baseline_mm),
         (meta.width, meta.height),
@@ -288,9 +197,71 @@ def _camera_path(
     )
 
 
-def _scale_depth(files: FrameFiles, path: CameraPath) -> None:
-    """Rescale the relative depth of each frame to agree with the tracked points of the pose estimation."""
-    delete_plan(files.folder)
-    for index, scale in enumerate(path.depth_scale):
-        file = files.file("depth", index)
-        save_png(file, rescaled(decode_image(file, None), float(scale)))
+def _use_path(files: FrameFiles, path: CameraPath) -> None:
+    """Bring relative depth and the focal length to those of the path, and record it."""
+    if files.meta.depth_relative:
+        delete_plan(files.folder)  # to scale depth twice would be wrong
+        for index, scale in enumerate(path.depth_scale):
+            file = files.file("depth", index)
+            save_png(file, rescaled(decode_image(file, None), float(scale)))
+    focal = {"fx": files.meta.fx * path.focal_factor, "fy": files.meta.fy * path.focal_factor}
+    files.meta = replace(files.meta, **focal, sources=path.sources(files.meta.sources))
+    files.write_json(PATH_RECORD, path.record())
+
+
+def _unmasked(files: FrameFiles, inside: NDArray[np.bool_]) -> list[int]:
+    """Written frames in which something moves that no mask covers."""
+    from .unmasked_motion import frames_with_unmasked_motion  # imports torch
+
+    rate = files.meta.frames_per_second
+    return frames_with_unmasked_motion(
+        files.count, rate, lambda i: _color(files, i), lambda i: _tools(files, i), inside
+    )
+
+
+def _unexplained(path: CameraPath | None, files: FrameFiles, damaged: list[int]) -> list[int]:
+    """Damaged frames, and those without a pose or of another scene than the frames that are not damaged."""
+    whole = sorted({*range(files.count)} - {*damaged})
+    if len(whole) < files.count / 2:  # too few to tell which scene is the usual one
+        return damaged
+    other_scene = [whole[i] for i in find_changes(_color(files, i) for i in whole).off_color]
+    return sorted({*damaged, *(path.lost if path else []), *other_scene})
+
+
+def _color(files: FrameFiles, index: int) -> NDArray[np.uint8]:
+    return read_color(files.file("images", index))
+
+
+def _tools(files: FrameFiles, index: int) -> NDArray[np.bool_]:
+    return read_tool_mask(files.file("masks", index))
+
+
+def _damage_notes(damaged: list[int]) -> list[str]:
+    """A note about frames whose bytes are damaged."""
+    if not damaged:
+        return []
+    what = "damaged in the video, or predicted from damaged images before the next key frame"
+    fix = "leave them out with --start and --end, or copy the video again"
+    frames = number_ranges(damaged)
+    return [f"{what}: frames {frames}. They are unexplained_frames of sequence.json; {fix}"]
+
+
+def _advice(out: Path, uncertain: list[int], moving: list[int], others: list[int], usable: int) -> list[str]:
+    """Notes on frames to look at: of unsure masks, of likely missed tools, without a pose."""
+    notes, correct = [], f"To look and correct: {command('view', out)}"
+    if uncertain:
+        notes.append(f"masks: unsure in frames {number_ranges(uncertain)}. {correct}")
+    if moving:
+        what = f"in frames {number_ranges(moving)}, something moves that no mask covers"
+        notes.append(f"masks: tools are likely missed: {what}. {correct}")
+    if others:
+        fix = "look at the images: is this one video?" if usable < 2 else "--start and --end can leave them out"
+        notes.append(f"no camera pose, or another scene, in frames {number_ranges(others)}; {fix}")
+    return notes
+
+
+def _demand_all_frames(cfg: PrepareConfig) -> None:
+    """Raise InputError if options leave out frames: points of STIR belong to the first and the last frame of a clip."""
+    options = {"--start": cfg.start > 0, "--end": cfg.end < math.inf, "--drop-out-of-body": cfg.drop_out_of_body}
+    if left_out := [name for name, is_set in options.items() if is_set]:
+        raise input_error("--stir", "all frames of the clip", left_out[0], f"remove {left_out[0]}.")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ..core.options import changed_options
 from ..data.prepare_record import PrepareRecord
 from .config import PrepareConfig
-from .depth_and_masks import NETWORK
 from .frame_geometry import FrameGeometry
+from .frames import NETWORK
 from .sam2 import SAM2
 
 GRID_POINTS = 9

@@ -1,14 +1,12 @@
 """SAM 2 (N. Ravi et al., 2024, Apache-2.0) as a segmenter that follows tools through a video. `H, W` image size.
 
 The network runs on this machine through the transformers library, on the GPU if torch has one. Frames are given to it
-one by one, so that it never holds the clip. The library's own preparation of images needs torchvision; these few lines
-do not.
+one by one, so that it never holds the clip. The library's own preparation of images needs torchvision; ours does not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.extras import install_command
-from .hub_model import FILES, find_model, first_line, import_transformers
+from .hub_model import load_network
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -47,13 +44,13 @@ def open_sam2(value: str, option: str) -> Sam2:
     method, _, name = value.partition(":")
     if method != SAM2:
         raise input_error(option, f"{SAM2}, or {SAM2}:FOLDER", value, f"`{option} {SAM2}`.")
-    if find_spec("transformers") is None:
-        raise input_error(f"{option} {SAM2}", "the transformers package", "none", f"`{install_command('tools')}`.")
-    name = name or DEFAULT_MODEL
-    hint = f"Download {' and '.join(FILES)} of {DEFAULT_MODEL} on another machine, then `{option} {SAM2}:FOLDER`."
+    name, usage = name or DEFAULT_MODEL, f"{option} {SAM2}"
+    network = load_network(name, DEFAULT_MODEL, "Sam2VideoModel", "a SAM 2 video model", option=usage, extra="tools")
+    import torch
+
     # What `sequence.json` says of its masks holds no path, which may name a person.
     shown = "SAM 2" if Path(name).expanduser().is_dir() else f"SAM 2 ({name})"
-    return Sam2(shown, _load(name, option, hint))
+    return Sam2(shown, network.to("cuda" if torch.cuda.is_available() else "cpu"))
 
 
 class Sam2:
@@ -74,21 +71,17 @@ class Sam2:
         """(1, 3, S, S) a frame (H, W, 3) as the network wants it."""
         import torch
 
-        image = torch.from_numpy(np.ascontiguousarray(rgb_u8)).permute(2, 0, 1)[None].to(self._device)
+        image = torch.from_numpy(np.ascontiguousarray(rgb_u8)).permute(2, 0, 1)[None].to(self.network.device)
         image = _resized(image.float() / 255, self.side_px)
-        mean, std = (torch.tensor(each, device=self._device).view(1, 3, 1, 1) for each in (MEAN, STD))
+        mean, std = (torch.tensor(each, device=self.network.device).view(1, 3, 1, 1) for each in (MEAN, STD))
         return (image - mean) / std
 
     def prompt(self, mask: NDArray[np.bool_]) -> Tensor:
         """(1, 1, S, S) 0 or 1: a mask (H, W) as the network wants it."""
         import torch
 
-        given = torch.from_numpy(mask.astype(np.float32))[None, None].to(self._device)
+        given = torch.from_numpy(mask.astype(np.float32))[None, None].to(self.network.device)
         return (_resized(given, self.side_px) >= 0.5).float()
-
-    @property
-    def _device(self):
-        return next(self.network.parameters()).device
 
 
 class Sam2Chunk:
@@ -112,10 +105,9 @@ class Sam2Chunk:
 
     def show(self, rgb_u8: NDArray[np.uint8], masks: Sequence[NDArray[np.bool_]]) -> None:
         """Give a frame (H, W, 3) whose objects are known: (H, W) each, empty for one that is out of view."""
-        objects = list(range(len(masks)))
-        for each, mask in zip(objects, masks, strict=True):
+        for each, mask in enumerate(masks):
             self._session.add_mask_inputs(self._session.obj_id_to_idx(each), self._count, self._sam2.prompt(mask))
-        self._session.obj_with_new_inputs = objects
+        self._session.obj_with_new_inputs = list(range(len(masks)))
         self._run(rgb_u8)
 
     def follow(self, rgb_u8: NDArray[np.uint8]) -> list[NDArray[np.bool_]]:
@@ -140,21 +132,3 @@ def _resized(image: Tensor, side: int) -> Tensor:
     import torch.nn.functional as F
 
     return F.interpolate(image, (side, side), mode="bilinear", align_corners=False, antialias=True)
-
-
-def _load(name: str, option: str, hint: str) -> Module:
-    """The network, on the GPU if there is one, in evaluation mode."""
-    import torch
-
-    transformers = import_transformers(f"{option} {SAM2}", "tools", "Sam2VideoModel")
-    folder = find_model(name, hint)
-    try:
-        network, report = transformers.Sam2VideoModel.from_pretrained(
-            folder, local_files_only=True, use_safetensors=True, output_loading_info=True
-        )
-    except Exception as error:  # the library raises many types for a wrong file
-        raise input_error(name, "a SAM 2 video model", first_line(error), "Choose another model.") from None
-    if report["missing_keys"]:
-        got = f"no weights for {sorted(report['missing_keys'])[0]} and {len(report['missing_keys']) - 1} more"
-        raise input_error(name, "a SAM 2 video model", got, "Choose another model.")
-    return network.eval().to("cuda" if torch.cuda.is_available() else "cpu")

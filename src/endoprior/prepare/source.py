@@ -1,23 +1,141 @@
-"""Video files, animations and image folders: a stream of images, each with its time.
+"""Folders of images, animations and video files: a stream of images, each with its time.
 
 Only a few images are in memory at a time. A source can be iterated any number of times.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import cached_property
+from itertools import accumulate, islice
 from pathlib import Path
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL.Image import DecompressionBombError, Image
+from PIL.Image import open as open_image
+
 from ..core.checks import input_error
-from ..data.reading import kind_of
-from ..data.video_files import is_animated_webp
-from .animation import Animation
-from .image_folder import ImageFolder
-from .source_frame import SourceFrame
-from .video import Video
+from ..data.files import entries, files_with
+from ..data.images import decode_image, describe_pixels
+from ..data.reading import MOST_PIXELS, kind_of
+from ..data.series import one_per_frame
+from ..data.video_files import STILL_SUFFIXES, is_animated_webp
+from .decoding import usual_rate
+from .video import SourceFrame, Video, too_many_pixels
+
+OTHER_IMAGES = (".webp", ".jp2", ".gif", ".avif", ".exr")
+"""Suffixes of images that are counted, but not read."""
+
+
+class ImageFolder:
+    """Images of one size, in the order of the numbers in their names: of 8 bits, or as many as are in use of 16."""
+
+    start, was_damaged = 0.0, False
+
+    def __init__(self, path: Path, frames_per_second: float) -> None:
+        """List the folder; raises InputError if it has no images, or several of each frame."""
+        self.path, self.frames_per_second = path, frames_per_second
+        self.files, self._left_out = one_per_frame(path, files_with(path, STILL_SUFFIXES), "images")
+        if not self.files:
+            raise input_error(path, "images (PNG, JPEG, TIFF, BMP) or a video file", "none", "Check the path.")
+        self.times = [index / frames_per_second for index in range(len(self.files))]
+        self.num_frames, self.seconds = len(self.files), len(self.files) / frames_per_second
+        self.height, self.width = self._stored(self.files[0]).shape[:2]
+
+    @property
+    def notes(self) -> list[str]:
+        """What is particular about the images, one line each."""
+        found = [self._left_out] if self._left_out else []
+        visible = [file for file in entries(self.path) if file.name[0] != "."]
+        if others := [file for file in visible if file.suffix.lower() in OTHER_IMAGES]:
+            kinds = ", ".join(sorted({file.suffix for file in others}))
+            found.append(f"{self.path.name}: {len(others)} images of other kinds ({kinds}) are not used")
+        stacks = [file for file in self.files if file.suffix.lower() in (".tif", ".tiff")]
+        if pages := sum(max(cv2.imcount(str(file)) - 1, 0) for file in stacks):
+            found.append(f"{self.path.name}: only the first image of each TIFF is used; {pages} more are not")
+        if self._bits != 8:
+            what = f"images of 16 bits a channel: {self._bits} of 16 bits are in use, which become 0 to 255"
+            found.append(f"{self.path.name}: {what}")
+        return found
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        return map(self.image, range(len(self.files)))
+
+    def image(self, index: int) -> SourceFrame:
+        """One image; raises InputError if it cannot be used."""
+        file = self.files[index]
+        stored = self._stored(file)
+        if stored.shape[:2] != (self.height, self.width):
+            got = f"{stored.shape[1]}x{stored.shape[0]}"
+            raise input_error(file, f"{self.width}x{self.height} px like the first image", got, "Make them equal.")
+        if stored.dtype == np.uint16:
+            stored = (stored >> (self._bits - 8)).astype(np.uint8)
+        return SourceFrame(index, self.times[index], np.ascontiguousarray(stored[..., ::-1]))
+
+    def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
+        """A few images (H, W, 3) from the whole time range."""
+        inside = [index for index, time in enumerate(self.times) if start <= time < end] or [0]
+        return [self.image(index).rgb_u8 for index in inside[:: max(len(inside) // count, 1)]]
+
+    @cached_property
+    def _bits(self) -> int:
+        """Bits a channel that are in use, at least 8. Medical cameras write 10 or 12 bits into files of 16."""
+        if self._stored(self.files[0]).dtype == np.uint8:
+            return 8
+        largest = max(int(image.max()) for image in map(self._stored, self.files) if image.dtype == np.uint16)
+        return max(largest.bit_length(), 8)
+
+    @staticmethod
+    def _stored(file: Path) -> NDArray:
+        """(H, W, 3) blue, green, red of 8 or 16 bits."""
+        pixels = decode_image(file, None, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+        if pixels.dtype not in (np.uint8, np.uint16):
+            raise input_error(file, "an image of 8 or 16 bits a channel", describe_pixels(pixels), "Save it as PNG.")
+        return pixels
+
+
+class Animation:
+    """An animated WebP file, which FFmpeg does not read."""
+
+    start, notes, was_damaged = 0.0, (), False
+
+    def __init__(self, path: Path) -> None:
+        """Read the durations; raises InputError if the file cannot be read."""
+        self.path = path
+        try:
+            with open_image(path) as file:
+                self.width, self.height = file.size
+                too_large = self.width * self.height > MOST_PIXELS
+                shown = [] if too_large else [_shown(file, index) for index in range(file.n_frames)]
+        except (OSError, ValueError, SyntaxError, DecompressionBombError) as error:
+            raise input_error(path, "a video", str(error).split("\n")[0], "Copy or export it again.") from None
+        if too_large:
+            raise too_many_pixels(path, self.width, self.height)
+        self.num_frames, self.times = len(shown), [0.0, *accumulate(shown[:-1])]
+        self.seconds = self.times[-1] + shown[-1]
+        self.frames_per_second = usual_rate(self.times, [])
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        with open_image(self.path) as file:
+            for index, time in enumerate(self.times):
+                file.seek(index)
+                yield SourceFrame(index, time, np.array(file.convert("RGB")))
+
+    def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
+        """A few images (H, W, 3) from the whole file."""
+        return [image.rgb_u8 for image in islice(self, 0, None, max(self.num_frames // count, 1))]
+
+
+def _shown(file: Image, index: int) -> float:
+    """How long an image is shown, s. Pillow knows it when the image is decoded."""
+    file.seek(index)
+    file.load()
+    return float(file.info.get("duration", 0)) / 1000
+
 
 Source = ImageFolder | Video | Animation
-
-__all__ = ["Source", "SourceFrame", "open_source"]
 
 
 def open_source(path: Path, frames_per_second: float = 25.0) -> Source:

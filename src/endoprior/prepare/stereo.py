@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import check_range, check_shape
+from ..core.checks import check_range
 from ..footage.stereo_matching import disagreement, match_both_ways
 from ..priors.specular import specular_likelihood
-from .disparity import drop_speckles, fill_small_holes, refine_disparity, smooth_disparity
 
 MATCHING_WIDTH = 960
 """Wider images are matched at a whole fraction of their size, px. The refinement uses the full size."""
@@ -23,6 +22,24 @@ TOLERANCE = 0.02
 """Relative difference up to which depths agree: about half a pixel of disparity at the usual distance."""
 SURROUNDINGS_PX = 15
 """Side of the square around a pixel that counts as its surroundings."""
+ROUNDS = 3
+"""Gauss-Newton steps of the refinement."""
+WINDOW_SIGMA_PX = 5.0
+"""Standard deviation of the Gaussian window over which one shift is estimated."""
+NOISE_VARIANCE = 4.0
+"""Sensor noise of the gray images, levels^2: weaker gradients do not change the disparity."""
+OUTLIER_LEVELS = 6.0
+"""Brightness difference between the cameras at which a pixel has half weight."""
+MAX_CHANGE_PX = 0.5
+"""Largest change by a step, and by the whole refinement; limits the damage of windows across a depth edge."""
+SMOOTHING_PX, SMOOTHING_SIGMA_PX = 15, 5.0
+"""Size and standard deviation of the smoothing window ..."""
+SMOOTHING_STEP_PX = 0.5
+"""... and the difference of disparity between neighbors on different surfaces, px."""
+SPECKLE_STEP_PX = 1.0
+"""Neighbors whose disparities differ by more belong to different regions."""
+PLANE_RESIDUAL_PX = 0.35
+"""A hole is filled if 90 % of its rim lies on a plane to within this, px of disparity."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +66,13 @@ class StereoConfig:
         check_range("far_mm", self.far_mm, 1, 1e5)
         if not self.near_mm < self.far_mm:
             raise ValueError(f"far_mm must be more than near_mm, got {self.far_mm:g} and {self.near_mm:g}")
-        check_range("block_px", self.block_px, 3, 15)
         if self.block_px % 2 == 0:
             raise ValueError(f"block_px must be odd, got {self.block_px}")
-        check_range("left_right_px", self.left_right_px, 0.1, 10)
-        check_range("speckle_px", self.speckle_px, 0, 1_000_000)
-        check_range("fill_px", self.fill_px, 0, 1_000_000)
-        check_range("min_confidence", self.min_confidence, 0, 1)
+        for name, low, high in (
+            ("block_px", 3, 15), ("left_right_px", 0.1, 10), ("speckle_px", 0, 1_000_000), ("fill_px", 0, 1_000_000),
+            ("min_confidence", 0, 1),
+        ):  # fmt: skip
+            check_range(name, getattr(self, name), low, high)
 
 
 @dataclass(frozen=True)
@@ -82,21 +99,15 @@ def stereo_depth(
 
     Args:
         left_u8, right_u8: (H, W, 3) rectified images, 0..255.
-        focal_px: focal length of the rectified images, > 0.
-        baseline_mm: distance between the cameras, > 0.
-        cfg: range and thresholds.
+        focal_px: focal length of the rectified images.
+        baseline_mm: distance between the cameras.
     Returns:
         depth within [near_mm, far_mm], and confidence: the product of left-right consistency, texture and absence of
         highlights.
     Raises:
-        ValueError: wrong shapes or types, or a depth range that is impossible for this image size.
+        ValueError: a depth range that is impossible for this image size.
     """
     cfg = cfg or StereoConfig()
-    check_shape("left_u8:H,W,3 right_u8:H,W,3", left_u8=left_u8, right_u8=right_u8)
-    if left_u8.dtype != np.uint8 or right_u8.dtype != np.uint8:
-        raise ValueError(f"images must be 8-bit, got {left_u8.dtype} and {right_u8.dtype}")
-    check_range("focal_px", focal_px, 1, 1e6)
-    check_range("baseline_mm", baseline_mm, 1e-3, 1e4)
     width = left_u8.shape[1]
     product = np.float64(focal_px * baseline_mm)  # so that NumPy divides by float32 disparities in float64
     lowest, highest = product / cfg.far_mm, min(product / cfg.near_mm, width - 1)
@@ -134,16 +145,9 @@ def temporal_median(window: Sequence[NDArray[np.float32]]) -> NDArray[np.float32
 
     Args:
         window: an odd number of (H, W) depth maps, mm, 0 where missing; the middle one is filtered.
-
     Returns:
         (H, W) depth, mm; 0 where missing.
-    Raises:
-        ValueError: an even number of maps, or maps of different sizes.
     """
-    if len(window) % 2 == 0:
-        raise ValueError(f"window must have an odd number of depth maps, got {len(window)}")
-    for depth in window:
-        check_shape("depth:H,W middle:H,W", depth=depth, middle=window[len(window) // 2])
     half = len(window) // 2
     middle = window[half]
     measured = middle > 0
@@ -194,3 +198,108 @@ def _mean_around(values: NDArray[np.float32], measured: NDArray[np.bool_]) -> ND
     total = cv2.blur(values * weight, (SURROUNDINGS_PX, SURROUNDINGS_PX))
     share = cv2.blur(weight, (SURROUNDINGS_PX, SURROUNDINGS_PX))
     return np.divide(total, share, out=np.zeros_like(total), where=share > 1e-6)
+
+
+def refine_disparity(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], disparity: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Refine each disparity by matching a Gaussian window of both images.
+
+    Semi-global matching prefers whole and half pixels ("pixel locking"). This function warps the right image onto the
+    left one and estimates the remaining shift by least squares on gradients (B. Lucas and T. Kanade, IJCAI 1981, along
+    rows only). It first removes smooth brightness differences; outliers get a low weight.
+
+    Args:
+        left, right: (H, W) gray.
+        disparity: (H, W) px; NaN where unknown.
+    Returns:
+        (H, W) disparity, px, NaN at the same pixels; (H, W) texture in [0, 1): near 1 where gradients along rows are
+        far above the noise.
+    """
+    known = np.isfinite(disparity)
+    trust = known.astype(np.float32)
+    total = _window(trust) + np.float32(1e-6)
+    start = np.where(known, disparity, np.float32(0))
+    moved = start
+    left_gray, right_gray = left.astype(np.float32), right.astype(np.float32)
+    column = np.arange(left.shape[1], dtype=np.float32)[None]
+    row = np.broadcast_to(np.arange(left.shape[0], dtype=np.float32)[:, None], left.shape).copy()
+    for _ in range(ROUNDS):
+        warped = cv2.remap(right_gray, column - moved, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        slope = cv2.filter2D((left_gray + warped) / 2, -1, np.array([[-0.5, 0, 0.5]], np.float32))
+        difference = left_gray - warped
+        difference -= _window(trust * difference) / total
+        weighted = trust / (1 + (difference / np.float32(OUTLIER_LEVELS)) ** 2) * slope
+        strength = _window(weighted * slope)
+        step = _window(weighted * difference) / (strength + np.float32(NOISE_VARIANCE))
+        step = np.clip(step, -MAX_CHANGE_PX, MAX_CHANGE_PX)
+        moved = np.clip(moved - step, start - MAX_CHANGE_PX, start + MAX_CHANGE_PX)
+    texture = strength / (strength + np.float32(NOISE_VARIANCE))
+    return np.where(known, moved, np.float32(np.nan)), texture
+
+
+def smooth_disparity(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) `disparity` after a bilateral filter, which keeps depth edges; NaN at the same pixels."""
+    known = np.isfinite(disparity)
+    if not known.any():
+        return disparity
+    apart = disparity[known].min() - 40 * np.float32(SMOOTHING_STEP_PX)  # so far that the weight is 0
+    smooth = cv2.bilateralFilter(np.where(known, disparity, apart), SMOOTHING_PX, SMOOTHING_STEP_PX, SMOOTHING_SIGMA_PX)
+    return np.where(known, smooth, np.float32(np.nan))
+
+
+def drop_speckles(disparity: NDArray[np.float32], smallest_px: int) -> NDArray[np.float32]:
+    """(H, W) `disparity` without isolated regions of fewer than `smallest_px` pixels."""
+    unknown = -(2**15)
+    sixteenths = np.where(np.isfinite(disparity), np.rint(disparity * 16), unknown).astype(np.int16)
+    cv2.filterSpeckles(sixteenths, unknown, smallest_px, 16 * SPECKLE_STEP_PX)
+    return np.where(sixteenths == unknown, np.float32(np.nan), disparity)
+
+
+def fill_small_holes(disparity: NDArray[np.float32], largest_px: int) -> NDArray[np.float32]:
+    """Fill holes of at most `largest_px` pixels whose rim lies on a plane; leave all others.
+
+    Holes at depth edges and at the image border stay. A plane in space is also a plane in disparity.
+
+    Args:
+        disparity: (H, W) px; NaN where unknown.
+    Returns:
+        (H, W) disparity, px.
+    """
+    filled = disparity.copy()
+    missing = np.isnan(disparity).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(missing, connectivity=8)
+    height, width = disparity.shape
+    square = np.ones((5, 5), np.uint8)
+    for label, (x, y, w, h, area) in enumerate(stats[1:], 1):
+        if area > largest_px or x == 0 or y == 0 or x + w == width or y + h == height:
+            continue
+        part = np.s_[max(y - 2, 0) : y + h + 2, max(x - 2, 0) : x + w + 2]
+        hole = labels[part] == label
+        around = disparity[part]
+        rim = (cv2.dilate(hole.astype(np.uint8), square) > 0) & np.isfinite(around)
+        plane = _plane(rim, around[rim])
+        if plane is not None:
+            filled[part][hole] = _coordinates(hole) @ plane
+    return filled
+
+
+def _plane(rim: NDArray[np.bool_], values: NDArray[np.float32]) -> NDArray[np.float64] | None:
+    """(3,) the plane through `values` at the pixels of `rim`; None if the residual is too large."""
+    if values.size < 8:
+        return None
+    at = _coordinates(rim)
+    plane, _, rank, _ = np.linalg.lstsq(at, values.astype(np.float64), rcond=None)
+    smooth = np.quantile(np.abs(at @ plane - values), 0.9) <= PLANE_RESIDUAL_PX
+    return plane if rank == 3 and smooth else None
+
+
+def _coordinates(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(n, 3) column, row and 1 of the pixels of `mask`."""
+    rows, columns = np.nonzero(mask)
+    return np.column_stack([columns, rows, np.ones(rows.size)]).astype(np.float64)
+
+
+def _window(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) Gaussian mean."""
+    return cv2.GaussianBlur(values, (0, 0), WINDOW_SIGMA_PX)

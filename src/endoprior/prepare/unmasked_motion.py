@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import check_shape
 from ..core.spread import spread
 from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
 from ..tool_masks.regions import disk, entering_regions
@@ -67,15 +66,13 @@ def moves_unmasked(first: NDArray[np.uint8], later: NDArray[np.uint8], view: Mas
         first, later: (H, W, 3) about 0.1 s apart.
         view: (H, W) True inside the endoscope's image.
         tool: (H, W) True on the masked tools of either frame.
-    Raises:
-        ValueError: shapes that do not match.
     """
-    check_shape("first:H,W,3 later:H,W,3 view:H,W tool:H,W", first=first, later=later, view=view, tool=tool)
     shrink = max(1, min(view.shape) // SIDE_PX)
     before, after = gray_for_flow(first, shrink), gray_for_flow(later, shrink)
     if min(before.shape) < MIN_SIZE_PX:
         return False
-    view, tool = (_resized(mask, before.shape) for mask in (view, tool))
+    size, how = before.shape[::-1], cv2.INTER_NEAREST
+    view, tool = (cv2.resize(mask.astype(np.uint8), size, interpolation=how) > 0 for mask in (view, tool))
     forward, backward = flow_pair(before, after)
     background = (cv2.erode(view.astype(np.uint8), disk(3)) > 0) & ~tool
     if not background.any() or _agree(forward, backward)[background].mean() < LEAST_AGREEING:
@@ -116,7 +113,3 @@ def _agree(forward: NDArray[np.float32], backward: NDArray[np.float32]) -> Mask:
     there = x + forward[..., 0], y + forward[..., 1]
     back = cv2.remap(backward, *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.linalg.norm(forward + back, axis=-1) < RETURN_PX + RETURN_SHARE * np.linalg.norm(forward, axis=-1)
-
-
-def _resized(mask: Mask, shape: tuple[int, int]) -> Mask:
-    return cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST) > 0

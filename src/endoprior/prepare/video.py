@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from itertools import islice
 from pathlib import Path
@@ -14,13 +15,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error
+from ..core.checks import InputError, input_error
 from ..core.shell import quoted
 from ..data.reading import MOST_PIXELS
 from ..data.video_files import open_container, starts_of_parts, what_it_is
-from .decoding import AVI, DecodedImage, Undecodable, choose_track, decode, is_cover, packet_times
-from .source_frame import SourceFrame
-from .timeline import Timeline, usual_rate
+from .decoding import AVI, DecodedImage, Timeline, choose_track, decode, is_cover, packet_times, usual_rate
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """One image of a source."""
+
+    index: int
+    """Position in the source, from 0."""
+    seconds: float
+    """Time since the first image. It may be before that of the image before, if the file has its times in disorder."""
+    rgb_u8: NDArray[np.uint8]
+    """(H, W, 3) of square pixels."""
+    damaged: bool = False
+    """Bytes of it, or of an image that it was predicted from, are missing or wrong."""
+
 
 LOST_SHARE, LOST_IMAGES = 0.02, 2
 """A video is truncated if more than this share of its duration and more than so many images are missing at its end."""
@@ -59,10 +73,10 @@ class Video:
             self.times: list[float] = sorted(time - times[0] for time in times) if times else []
             """Time of each image since the first one, s, before any is decoded."""
             self.num_frames = max(int(track.frames), 0)
-            self._aspect = _pixel_aspect(track)
-            self._unused = _other_tracks(container, track)
+            aspect = track.sample_aspect_ratio or Fraction(1)
+            self._aspect = aspect if PIXEL_ASPECTS[0] <= aspect <= PIXEL_ASPECTS[1] else Fraction(0)
             unread = _unread_parts(path, container.format.name, end)
-            self._unused += unread
+            self._unused = [*_other_tracks(container, track), *unread]
             # The duration may be that of all parts.
             self._announced_end = 0.0 if unread else _announced_end(container, track)
             self.clock_is_arbitrary = container.format.name in ARBITRARY_CLOCKS
@@ -100,7 +114,7 @@ class Video:
         return notes + self._found
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        timeline, lost = Timeline(self._step), Undecodable()
+        timeline, lost = Timeline(self._step), []
         began, last, shown_until = None, 0.0, 0.0
         index = interlaced = 0
         broken = ""
@@ -119,10 +133,10 @@ class Video:
                     index += 1
             except av.error.FFmpegError as error:
                 broken = error.strerror or str(error)
-        self.was_damaged |= lost.count > 0
+        self.was_damaged |= bool(lost)
         nothing_decodes = bool(self.times) and not index
         self._found = [] if nothing_decodes else self._check_end(index, began or 0.0, last, shown_until, broken)
-        self._found += self._oddities(timeline, lost.count, interlaced)
+        self._found += self._oddities(timeline, len(lost), interlaced)
 
     def glimpses(self, start: float, end: float, count: int) -> list[NDArray[np.uint8]]:
         """A few images (H, W, 3) from the whole time range, with all their rows; at least one."""
@@ -134,7 +148,7 @@ class Video:
             if any(image is not None for image in found):
                 return [image for image in found if image is not None]
         with self._open() as (container, track):
-            images = decode(container, track, Undecodable(), weave=True)
+            images = decode(container, track, [], weave=True)
             positions = {bisect_left(self.times, time) for time in wanted} if self.times else {0}
             positions = {min(position, LOOKED_AT - 1) for position in positions} | {0}
             return [
@@ -146,7 +160,7 @@ class Video:
         at, image = time + self.start, None
         try:
             container.seek(int(at / track.time_base), stream=track)
-            for image in islice(decode(container, track, Undecodable(), weave=True), LOOKED_AT):
+            for image in islice(decode(container, track, [], weave=True), LOOKED_AT):
                 if image.seconds is None or image.seconds >= at - self._step / 2:
                     break
         except av.error.FFmpegError:
@@ -202,24 +216,18 @@ class Video:
         if lost:
             notes.append(f"{name}: damaged images that cannot be decoded and are left out: {lost}")
         if timeline.restarts:
-            notes.append(
-                f"{name}: joined of {timeline.restarts + 1} parts, each with times of its own; they follow each other"
-            )
+            parts = f"{timeline.restarts + 1} parts, each with times of its own"
+            notes.append(f"{name}: joined of {parts}; they follow each other")
         if timeline.misplaced:
             notes.append(f"{name}: times in disorder, images that are shown too late: {timeline.misplaced}")
         if interlaced and not self.weave:
             notes.append(f"{name}: {interlaced} images are interlaced; one field of each is used, with its rows filled")
         return notes
 
-    def _demand_pixels(self, width: int, height: int) -> None:
-        """Reject images that are too large."""
-        if width * height > MOST_PIXELS:
-            hint = "Export the video at a smaller size."
-            raise input_error(self.path, f"images of at most {MOST_PIXELS // 1_000_000} Mpx", f"{width}x{height}", hint)
-
     def _demand_size(self, width: int, height: int, index: int) -> None:
         """Reject images that are too large, and a size that changes within the video."""
-        self._demand_pixels(max(width, self._shown_width(width)), height)
+        if max(width, self._shown_width(width)) * height > MOST_PIXELS:
+            raise too_many_pixels(self.path, max(width, self._shown_width(width)), height)
         self._size = self._size or (width, height)
         if (width, height) != self._size:
             want, got = "{}x{} px as in the first image".format(*self._size), f"{width}x{height} in image {index}"
@@ -241,10 +249,18 @@ class Video:
             if track is None:
                 got = "images in an unknown format" if container.streams.video else "a file without images"
                 raise input_error(self.path, "a video", got, "Check the path, or export it as H.264.")
-            self._demand_pixels(track.codec_context.width, track.codec_context.height)
+            width, height = track.codec_context.width, track.codec_context.height
+            if width * height > MOST_PIXELS:
+                raise too_many_pixels(self.path, width, height)
             # The size may change later, and that which the container states may be wrong.
             track.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
             yield container, track
+
+
+def too_many_pixels(path: Path, width: int, height: int) -> InputError:
+    """The error for a video of too large images."""
+    want = f"images of at most {MOST_PIXELS // 1_000_000} Mpx"
+    return input_error(path, want, f"{width}x{height}", "Export the video at a smaller size.")
 
 
 def _announced_end(container: av.container.InputContainer, track: av.VideoStream) -> float:
@@ -258,12 +274,6 @@ def _announced_end(container: av.container.InputContainer, track: av.VideoStream
         start = 0 if container.format.name in STATES_END else container.start_time or 0
         return (start + container.duration) / av.time_base
     return 0.0
-
-
-def _pixel_aspect(track: av.VideoStream) -> Fraction:
-    """Width of a pixel divided by its height; 1 if unknown, 0 if not plausible."""
-    aspect = track.sample_aspect_ratio or Fraction(1)
-    return aspect if PIXEL_ASPECTS[0] <= aspect <= PIXEL_ASPECTS[1] else Fraction(0)
 
 
 def _unread_parts(path: Path, format_name: str, end: int) -> list[str]:

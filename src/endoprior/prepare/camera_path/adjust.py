@@ -1,21 +1,24 @@
-"""Bundle adjustment: poses of keyframes and the points they see, by Levenberg-Marquardt with the points eliminated.
+"""Least squares for the camera path: bundle adjustment of poses and points, and the pose of one frame.
 
-`K` cameras, `P` points, `N` observations. Weights are those of Geman-McClure: one for each track, from the mean of its
-residuals over time, so that tissue that breathes or is pulled falls out by its history; one for each observation,
-against single mistakes; one for each measured depth. They are updated between the steps (iterative re-weighting).
+`K` cameras, `P` points, `N` observations. A pose is world-to-camera; it changes to [exp(w), v] o pose for a small step
+(w, v) in camera axes. Residuals are reprojection in px and measured depth in disparity. Weights are those of
+Geman-McClure: one for each track, from the mean of its residuals over time, so that tissue that breathes or is pulled
+falls out by its history; one for each observation, against single mistakes; one for each measured depth. They are
+updated between the steps (iterative re-weighting).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from .residuals import derivatives, geman_mcclure, moved, residuals
-
+NEAREST_MM = 1e-3
+"""Points nearer than this, or behind the camera, are held at it: finite residuals, far from any inlier."""
 TRACK_WIDTH = (1.5, 6.0)
 """Range of the width of a track's weight, standard deviations; between them twice the median over the tracks."""
 SINGLE_WIDTH = 4.0
@@ -24,6 +27,68 @@ DEPTH_WIDTH = 3.0
 """Width of the weight of one depth, standard deviations."""
 DENSE_LIMIT = 900
 """Up to this many unknowns of the cameras, their system is solved as a dense matrix."""
+INLIER_PX = 2.5
+"""Largest reprojection error of an inlier of RANSAC, px of an image 640 px wide."""
+FEWEST = 12
+"""With fewer points there is no pose."""
+
+
+def residuals(
+    matrix: NDArray, poses: NDArray, points: NDArray, pixels: NDArray, inverse_depth: NDArray, sigma: NDArray
+) -> NDArray[np.float64]:
+    """(N, 3) standardized residuals: u, v, and inverse depth 1/z (Eq.: disparity = f b / z).
+
+    Args:
+        matrix: (3, 3) K, px.
+        poses: (N, 4, 4) or (4, 4) world-to-camera.
+        points: (N, 3) world points, mm.
+        pixels: (N, 2) where they were seen, px.
+        inverse_depth: (N,) 1 / measured depth, 1/mm.
+        sigma: (N, 2) standard deviation of a pixel, px, and of the inverse depth, 1/mm; inf where none was measured.
+    """
+    seen = _in_camera(poses, points)
+    z = np.maximum(seen[:, 2], NEAREST_MM)
+    u = matrix[0, 0] * seen[:, 0] / z + matrix[0, 2] - pixels[:, 0]
+    v = matrix[1, 1] * seen[:, 1] / z + matrix[1, 2] - pixels[:, 1]
+    return np.stack([u / sigma[:, 0], v / sigma[:, 0], (1 / z - inverse_depth) / sigma[:, 1]], 1)
+
+
+def derivatives(
+    matrix: NDArray, poses: NDArray, points: NDArray, sigma: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Derivatives of `residuals`: (N, 3, 6) by the pose step (w, v), (N, 3, 3) by the point, (N, 3) by log f."""
+    seen = _in_camera(poses, points)
+    x, y = seen[:, 0], seen[:, 1]
+    z = np.maximum(seen[:, 2], NEAREST_MM)
+    zero = np.zeros_like(z)
+    a, b = matrix[0, 0] / z / sigma[:, 0], matrix[1, 1] / z / sigma[:, 0]
+    entries = a, zero, -a * x / z, zero, b, -b * y / z, zero, zero, -1 / (z * z * sigma[:, 1])
+    by_seen = np.stack(entries, 1).reshape(-1, 3, 3)
+    turned = np.stack([zero, seen[:, 2], -y, -seen[:, 2], zero, x, y, -x, zero], 1).reshape(-1, 3, 3)  # -[X]_x
+    by_pose = np.concatenate([by_seen @ turned, by_seen], 2)
+    by_focal = np.stack([a * x, b * y, zero], 1)
+    return by_pose, by_seen @ poses[..., :3, :3], by_focal
+
+
+def moved(poses: NDArray, steps: NDArray) -> NDArray[np.float64]:
+    """(K, 4, 4) poses after steps (K, 6) of rotation, rad, and translation, mm, in camera axes."""
+    out = poses.copy()
+    for k, step in enumerate(steps):
+        turn = cv2.Rodrigues(step[:3])[0]
+        out[k, :3, :3] = turn @ poses[k, :3, :3]
+        out[k, :3, 3] = turn @ poses[k, :3, 3] + step[3:]
+    return out
+
+
+def back_projected(matrix: NDArray, pose: NDArray, pixels: NDArray, z: NDArray) -> NDArray[np.float64]:
+    """(N, 3) world points of pixels (N, 2) at depth z (N,) mm, seen from a world-to-camera pose."""
+    x = (pixels[:, 0] - matrix[0, 2]) / matrix[0, 0] * z
+    y = (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1] * z
+    return (np.stack([x, y, z], 1) - pose[:3, 3]) @ pose[:3, :3]
+
+
+def _in_camera(poses: NDArray, points: NDArray) -> NDArray[np.float64]:
+    return (poses[..., :3, :3] @ points[:, :, None])[:, :, 0] + poses[..., :3, 3]
 
 
 @dataclass(frozen=True)
@@ -95,6 +160,11 @@ def adjust(
     return Adjusted(poses, points, track, float(np.exp(log_f)), focal_std)
 
 
+def geman_mcclure(squared: NDArray, width: float) -> NDArray[np.float64]:
+    """Weight in (0, 1] of residuals with these squares: (c^2 / (c^2 + r^2))^2."""
+    return (width * width / (width * width + squared)) ** 2
+
+
 def weights(
     error: NDArray, point: NDArray, count: int, wider: float = 1.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -110,14 +180,18 @@ def weights(
     usual = float(np.sqrt(np.median(history[number > 1]))) if (number > 1).any() else TRACK_WIDTH[1]
     width = wider * float(np.clip(2 * usual, *TRACK_WIDTH))
     track = geman_mcclure(history, width)
-    pixel = track[point] * geman_mcclure(squared, max(wider * SINGLE_WIDTH, 1.5 * width))
-    depth = track[point] * geman_mcclure(error[:, 2] ** 2, wider * DEPTH_WIDTH)
-    return np.stack([pixel, pixel, depth], 1), track
+    return _weights(error, track[point], max(wider * SINGLE_WIDTH, 1.5 * width), wider * DEPTH_WIDTH), track
+
+
+def _weights(error: NDArray, track: NDArray, width: float, depth_width: float = DEPTH_WIDTH) -> NDArray[np.float64]:
+    """(N, 3) weights of residuals whose tracks have these weights (N,)."""
+    pixel = track * geman_mcclure((error[:, :2] ** 2).sum(1), width)
+    return np.stack([pixel, pixel, track * geman_mcclure(error[:, 2] ** 2, depth_width)], 1)
 
 
 def _error(matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, log_f: float) -> NDArray[np.float64]:
-    scaled = _scaled(matrix, log_f)
-    return residuals(scaled, poses[seen.camera], points[seen.point], seen.pixels, seen.inverse_depth, seen.sigma)
+    here = poses[seen.camera], points[seen.point]
+    return residuals(_scaled(matrix, log_f), *here, seen.pixels, seen.inverse_depth, seen.sigma)
 
 
 def _cost(error: NDArray, weight: NDArray, log_f: float, focal_prior: float) -> float:
@@ -210,3 +284,79 @@ def _rows(values: NDArray, columns: NDArray, width: int) -> sparse.csr_matrix:
     count, _, each = values.shape
     indices = np.repeat(columns[:, None], 3, 1).ravel()
     return sparse.csr_matrix((values.ravel(), indices, np.arange(0, 3 * count * each + 1, each)), (3 * count, width))
+
+
+@dataclass(frozen=True)
+class Resected:
+    """A pose and how sure it is."""
+
+    pose: NDArray[np.float64]
+    """(4, 4) world-to-camera."""
+    inlier: NDArray[np.bool_]
+    """(N,) points that it explains."""
+    translation_std: float
+    """Of the camera center, mm; the points count as known."""
+    rotation_std: float
+    """rad."""
+
+
+def coarse_pose(
+    matrix: NDArray, points: NDArray, pixels: NDArray, guess: NDArray | None, inlier_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
+    """World-to-camera (4, 4) by perspective-n-point with RANSAC, and (N,) its inliers; None if there is none."""
+    if len(points) < FEWEST:
+        return None
+    turn = shift = None
+    if guess is not None:
+        turn, shift = cv2.Rodrigues(guess[:3, :3])[0], guess[:3, 3:].copy()
+    cv2.setRNGSeed(0)
+    done, turn, shift, found = cv2.solvePnPRansac(
+        points, pixels.astype(np.float64), matrix, None, turn, shift, guess is not None,
+        iterationsCount=200, reprojectionError=inlier_px, confidence=0.999,
+    )  # fmt: skip
+    if not done or found is None or len(found) < FEWEST or not np.isfinite(turn).all():
+        return None
+    inlier = np.zeros(len(points), bool)
+    inlier[found.ravel()] = True
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+    return pose, inlier
+
+
+def refined_pose(
+    matrix: NDArray, pose: NDArray, points: NDArray, pixels: NDArray, inverse_depth: NDArray, sigma: NDArray,
+    track_weight: NDArray, *, steps: int = 8, widest: float = 4.0,
+) -> Resected:  # fmt: skip
+    """Refine a pose; residuals in standard deviations are weighted by their track and by Geman-McClure.
+
+    Args:
+        sigma: (N, 2) px and 1/mm, as in `residuals`.
+        track_weight: (N,) 0..1.
+        widest: the weight's width starts at this multiple of its final one, and halves with each step.
+    """
+    for step in range(steps):
+        width = SINGLE_WIDTH * max(1.0, widest / 2**step)
+        error = residuals(matrix, pose, points, pixels, inverse_depth, sigma)
+        weight = _weights(error, track_weight, width)
+        normal, gradient = _normal(matrix, pose, points, sigma, error, weight)
+        change = -np.linalg.solve(normal + np.diag(1e-6 * np.diag(normal) + 1e-9), gradient)
+        pose = moved(pose[None], change[None])[0]
+        if width == SINGLE_WIDTH and np.abs(change).max() < 1e-7:
+            break
+    error = residuals(matrix, pose, points, pixels, inverse_depth, sigma)
+    squared = (error[:, :2] ** 2).sum(1)
+    weight = _weights(error, track_weight, SINGLE_WIDTH)
+    normal, _ = _normal(matrix, pose, points, sigma, error, weight)
+    # The residuals themselves say how large the errors are: the tracker's vary from clip to clip.
+    variance = float((weight[:, 0] * squared).sum() / max(2 * weight[:, 0].sum() - 6, 1))
+    covariance = np.linalg.inv(normal + 1e-9 * np.eye(6)) * variance
+    spread = np.sqrt(np.maximum([np.trace(covariance[3:, 3:]), np.trace(covariance[:3, :3])], 0))
+    return Resected(pose, squared < SINGLE_WIDTH**2, float(spread[0]), float(spread[1]))
+
+
+def _normal(
+    matrix: NDArray, pose: NDArray, points: NDArray, sigma: NDArray, error: NDArray, weight: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    by_pose = derivatives(matrix, pose, points, sigma)[0].reshape(-1, 6)
+    weighted = by_pose * weight.reshape(-1, 1)
+    return weighted.T @ by_pose, weighted.T @ error.ravel()

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from .adjust import Observations, summed_by, weights
+from .adjust import Observations, derivatives, moved, residuals, summed_by, weights
 from .follow import Follower
-from .residuals import derivatives, moved, residuals
 
 HARMONICS = 2
 CYCLES = 3.0

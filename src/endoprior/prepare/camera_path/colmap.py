@@ -1,7 +1,7 @@
 """The path by COLMAP (`pycolmap`, optional): SIFT, sequential matching and incremental mapping on the CPU.
 
-Its images are masked by tools, highlights and what our own tracks found to deform. Its scale is set by our depth;
-frames that it does not register are placed by our own tracks.
+Its images are masked by tools, highlights and what our own tracks found to deform. Its scale, like that of poses from a
+file, is set by our depth; frames that it does not register are placed by our own tracks.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from ...data.description import COLMAP_POSES
 from ...data.images import save_png
-from .corners import usable_tissue
+from .adjust import adjust, back_projected
+from .features import usable_tissue
 from .follow import Follower
-from .given import with_poses
 from .own import finished_path, place_frames
-from .seen import CameraPath, PoseInput
+from .tracks import CameraPath, PoseInput, Tracks
 
 ENOUGH_IMAGES, LARGEST_STRIDE = 150, 4
 """A longer clip is mapped by every second to fourth frame; our tracks place those between."""
@@ -41,6 +41,12 @@ LEAST_SECONDS = 60
 """Mapping may always take this long."""
 LEAST_SHARE = 0.3
 """A model with a smaller share of the frames is no path of the clip."""
+PARALLAX = 0.02
+"""Least spread of the rays to a point, rad, whose position counts for the scale."""
+FEWEST = 10
+"""With fewer such points in a frame, its scale is that of the frames around."""
+STRIDE = 3
+"""Points are placed by every third frame and all keyframes: neighbors add nothing."""
 
 
 def time_note(seconds: float, limit: float) -> list[str]:
@@ -111,10 +117,9 @@ def colmap_path(
     if found is None:
         return None
     poses, known, focal_factor, notes = found
-    base = _with_lens(follower, focal_factor)
-    unit = float(np.exp(np.median(np.log(with_poses(base, poses, known).scales[known]))))
+    unit = float(np.exp(np.median(np.log(with_poses(follower, poses, known, focal_factor).scales[known]))))
     poses[:, :3, 3] /= unit
-    world = with_poses(base, poses, known)
+    world = with_poses(follower, poses, known, focal_factor)
     if not world.lens.depth_is_relative:
         world.scales[:] = 1.0
     explained = known | (follower.segment == follower.segment[np.argmax(known)])
@@ -122,14 +127,6 @@ def colmap_path(
     explained = known | (explained & np.isfinite(stds[0]))
     path = finished_path(world, explained, *stds)
     return replace(path, method=COLMAP_POSES, focal_factor=focal_factor, notes=notes)
-
-
-def _with_lens(follower: Follower, focal_factor: float) -> Follower:
-    out = copy.copy(follower)
-    out.lens = follower.lens.with_focal(focal_factor)
-    out.tracks = follower.tracks.copy()
-    out.tracks.lens = out.lens
-    return out
 
 
 def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: bool) -> tuple[dict[int, Any], list[str]]:
@@ -178,3 +175,70 @@ def _file(folder: Path, part: str, index: int, more: str = "") -> Path:
     path = folder / part / f"{index:06d}.png{more}"
     path.parent.mkdir(exist_ok=True)
     return path
+
+
+def with_poses(
+    follower: Follower, poses: NDArray[np.float64], known: NDArray[np.bool_], focal_factor: float = 1.0
+) -> Follower:
+    """A copy of the tracks whose points lie where these poses see them, with the depth scale of each frame.
+
+    Args:
+        poses: (T, 4, 4) world-to-camera.
+        known: (T,) frames that have one.
+    """
+    out = copy.copy(follower)
+    tracks = out.tracks = follower.tracks.copy()
+    tracks.lens = out.lens = follower.lens.with_focal(focal_factor)
+    out.poses, out.scales = poses.copy(), np.ones(len(poses))
+    position, spread = ray_points(tracks, poses, known)
+    good = spread > PARALLAX
+    scales = np.full(len(poses), np.nan)
+    for f in np.flatnonzero(known):
+        ids, depths = tracks.ids[f], tracks.depths[f]
+        z = position[ids] @ poses[f][2, :3] + poses[f][2, 3]
+        use = good[ids] & (depths > 0) & (z > 0)
+        if use.sum() >= FEWEST:
+            scales[f] = np.median(z[use] / depths[use])
+    there = np.flatnonzero(np.isfinite(scales))
+    if len(there):
+        out.scales = np.exp(np.interp(np.arange(len(poses)), there, np.log(scales[there])))
+    keys = {k.frame for k in follower.keyframes}
+    frames = [int(f) for n, f in enumerate(np.flatnonzero(known)) if n % STRIDE == 0 or f in keys]
+    for f in reversed(frames):  # the first sight of a point stays
+        ids, pixels, z = tracks.ids[f], tracks.pixels[f].astype(np.float64), tracks.depths[f] * out.scales[f]
+        tracks.points[ids] = back_projected(out.lens.matrix, poses[f], pixels, z)
+    tracks.points[good] = position[good]
+    ids, seen = tracks.of_frames(frames, out.scales)
+    if len(ids):
+        fixed = np.ones(len(frames), bool)
+        done = adjust(out.lens.matrix, poses[frames], tracks.points[ids], seen, fixed, rounds=4, steps=2)
+        tracks.points[ids], tracks.weight[ids], tracks.adjusted[ids] = done.points, done.track_weight, True
+    return out
+
+
+def ray_points(
+    tracks: Tracks, poses: NDArray[np.float64], known: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(P, 3) point nearest to all rays of each track, and (P,) the spread of the rays, rad; 0 with less than two rays.
+
+    The point minimizes sum |(I - d d^T) (X - c)|^2 over rays with center c and direction d.
+    """
+    matrix, right, number = np.zeros((tracks.count, 9)), np.zeros((tracks.count, 3)), np.zeros(tracks.count)
+    inverse = np.linalg.inv(tracks.lens.matrix)
+    for f in np.flatnonzero(known):
+        ids = tracks.ids[f]
+        rays = np.concatenate([tracks.pixels[f], np.ones((len(ids), 1))], 1) @ inverse.T @ poses[f][:3, :3]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        across = np.eye(3) - rays[:, :, None] * rays[:, None]
+        center = -poses[f][:3, :3].T @ poses[f][:3, 3]
+        np.add.at(matrix, ids, across.reshape(-1, 9))
+        np.add.at(right, ids, across @ center)
+        np.add.at(number, ids, 1)
+    matrix = matrix.reshape(-1, 3, 3)
+    several = number > 1
+    points, spread = np.zeros((tracks.count, 3)), np.zeros(tracks.count)
+    values = np.linalg.eigvalsh(matrix[several]) if several.any() else np.zeros((0, 3))
+    spread[several] = np.sqrt(np.maximum(values[:, 0], 0) / number[several])
+    solvable = spread > 1e-6
+    points[solvable] = np.linalg.solve(matrix[solvable], right[solvable][:, :, None])[:, :, 0]
+    return points, spread

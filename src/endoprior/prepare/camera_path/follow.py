@@ -7,19 +7,14 @@ its world (relocalization), with the scale of its depth if that is relative. Onl
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.spread import spread
-from .adjust import adjust
-from .corners import MAX_CORNERS, REFRESH, Gray, followed, gray_of, new_corners, sampled, usable_tissue
-from .keyframes import Keyframe, Link, keyframe, link
-from .resection import INLIER_PX, coarse_pose, refined_pose
-from .residuals import back_projected
-from .seen import Lens, PoseInput
-from .tracks import Tracks
+from .adjust import INLIER_PX, adjust, back_projected, coarse_pose
+from .features import Keyframe, Link, View, followed, keyframe, link, new_corners, sampled, view_of
+from .tracks import Lens, PoseInput, Tracks
 
 MIN_TRACKS = 30
 """With fewer tracks a frame gets no pose from the frame before."""
@@ -37,15 +32,6 @@ RECENT, OLDER = 6, 14
 """Keyframes that a lost frame is compared with: the last ones, and others spread over the clip."""
 
 
-@dataclass
-class _View:
-    """The frame of which the next one is followed."""
-
-    gray: Gray
-    usable: NDArray[np.bool_]
-    depth: NDArray[np.float32]
-
-
 class Follower:
     """What is known about the path so far."""
 
@@ -58,18 +44,14 @@ class Follower:
         self.segment = np.full(count, -1)
         self.keyframes: list[Keyframe] = []
         self._ids, self._pixels = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
-        self._view: _View | None = None
+        self._view: View | None = None
         self._at_keyframe = self._ids, self._pixels
 
     def follow(self, index: int, seen: PoseInput) -> None:
         """Add the next frame."""
-        measured = np.isfinite(seen.depth) & (seen.depth > 0)
-        view = _View(gray_of(seen.rgb_u8), usable_tissue(seen), np.where(measured, seen.depth, np.float32(0)))
-        depths = np.zeros(0, np.float32)
-        if self._view is None:
-            lost = True
-        else:
-            kept, pixels = followed(self._view.gray, view.gray, self._pixels, view.usable)
+        view, lost = view_of(seen), True
+        if self._view is not None:
+            kept, pixels = followed(self._view, view, self._pixels)
             depths = sampled(view.depth, pixels).astype(np.float32)
             lost = not self._find_pose(index, self._ids[kept], self._pixels[kept], pixels, depths)
             if not lost:
@@ -97,10 +79,7 @@ class Follower:
         last, limit = self.poses[index - 1], INLIER_PX * lens.px
         found = coarse_pose(lens.matrix, tracks.points[ids], pixels, last, limit)
         if found is not None and found[1].mean() >= MIN_INLIERS:
-            inverse, sigma = tracks.measured(ids, depths, 1.0)
-            if lens.depth_is_relative:
-                sigma[:, 1] = np.inf
-            fine = refined_pose(lens.matrix, found[0], tracks.points[ids], pixels, inverse, sigma, tracks.weight[ids])
+            fine = tracks.refined(found[0], ids, tracks.points[ids], pixels, depths)
             pose, inlier = (fine.pose, fine.inlier) if fine.inlier.sum() >= 0.7 * found[1].sum() else found
         else:
             # Tissue that breathes leaves the place where it was first seen; from one frame to the next it moves little.
@@ -115,6 +94,13 @@ class Follower:
         self.poses[index], self.segment[index] = pose, self.segment[index - 1]
         self.scales[index] = self._scale(pose, ids[inlier], depths[inlier], self.scales[index - 1])
         return True
+
+    def set_scale(self, frame: int, usable: NDArray[np.bool_]) -> None:
+        """Set the factor of a frame's depth by its rigid points, of those that are usable (P,)."""
+        ids = self.tracks.ids[frame]
+        good = usable[ids] & (self.tracks.weight[ids] > 0.3)
+        found = self._scale(self.poses[frame], ids[good], self.tracks.depths[frame][good], self.scales[frame])
+        self.scales[frame] = found
 
     def _scale(self, pose: NDArray, ids: NDArray, depths: NDArray, otherwise: float) -> float:
         """Median ratio of the points' z to the measured depth; 1 where depth has a unit."""
@@ -146,7 +132,7 @@ class Follower:
     def _add_keyframe(self, index: int) -> None:
         """Describe the frame in `self._view`, link its segment if it stands alone, adjust the last keyframes."""
         assert self._view is not None
-        new = keyframe(index, self._view.gray.plain, self._view.usable, self._view.depth)
+        new = keyframe(index, self._view)
         segment = self.segment[index]
         others = [old for old in self.keyframes if self.segment[old.frame] != segment]
         self.keyframes.append(new)
@@ -188,21 +174,14 @@ class Follower:
         done = adjust(self.lens.matrix, self.poses[frames], self.tracks.points[ids], seen, fixed, rounds=2, steps=1)
         if not np.isfinite(done.poses).all():
             return
-        self.poses[frames], self.tracks.points[ids], self.tracks.weight[ids] = (
-            done.poses,
-            done.points,
-            done.track_weight,
-        )
+        tracks = self.tracks
+        self.poses[frames], tracks.points[ids], tracks.weight[ids] = done.poses, done.points, done.track_weight
         for frame in frames:
-            trusted = self.tracks.weight[self.tracks.ids[frame]] > 0.3
-            here = self.tracks.ids[frame][trusted], self.tracks.depths[frame][trusted]
-            self.scales[frame] = self._scale(self.poses[frame], *here, self.scales[frame])
+            self.set_scale(frame, np.ones(len(tracks.weight), bool))
 
-    def _refill(self, index: int, view: _View) -> None:
+    def _refill(self, index: int, view: View) -> None:
         """Detect new corners where tracks died; their points come from depth."""
-        if len(self._ids) >= REFRESH * MAX_CORNERS:
-            return
-        pixels = new_corners(view.gray, view.usable, view.depth, self._pixels)
+        pixels = new_corners(view, self._pixels)
         depths = sampled(view.depth, pixels).astype(np.float32)
         z = depths.astype(np.float64) * self.scales[index]
         points = back_projected(self.lens.matrix, self.poses[index], pixels.astype(np.float64), z)

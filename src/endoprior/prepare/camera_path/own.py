@@ -1,4 +1,8 @@
-"""Our own path: follow the camera, close loops, adjust all keyframes, then place the frames between them."""
+"""Our own path: follow the camera, close loops, adjust all keyframes, then place the frames between them.
+
+Keyframes that show the same place at different times share points, so that the path cannot drift. Where the camera
+rests, its pose is copied exactly, so that no jitter of the estimate reaches the scene.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...data.description import OWN_POSES
-from .adjust import adjust
+from .adjust import adjust, back_projected
 from .breathing import Breathing, separate_breathing
+from .features import Keyframe, link
 from .follow import Follower, follow_camera
-from .keyframes import Keyframe
-from .loops import close_loops
-from .resection import refined_pose
-from .rest import resting
-from .seen import CameraPath, Lens, PoseInput
+from .tracks import CameraPath, Lens, PoseInput, Tracks
 
 FOCAL_PRIOR = 0.2
 """Standard deviation of log f where the focal length is assumed."""
@@ -25,6 +26,20 @@ FOCAL_STD = 0.03
 BREATHES, NOT_CAMERA = "the tissue breathes", "what the view does in this rhythm is not counted as camera motion"
 MIN_POINTS = 20
 """With fewer adjusted points a frame keeps its pose relative to its keyframe."""
+OVERLAP = 0.3
+"""Least share of an old keyframe's points that lies in the new image."""
+SHARED = 0.3
+"""Keyframes that share more of their tracks than this need no loop."""
+PARTNERS = 3
+"""Old keyframes that each new one is matched with at most."""
+LOW_PX, HIGH_PX = 0.25, 0.5
+"""The camera rests while rigid tissue stays this near to where it was, px of an image 640 px wide; once at rest, it
+moves when it is beyond the second value (hysteresis)."""
+FEWEST_FRAMES = 8
+"""A shorter rest is none: slow motion looks the same."""
+RIGID = 0.5
+"""Weight of a track that counts as rigid tissue."""
+FEWEST_TRACKS = 20
 
 
 def own_path(
@@ -36,15 +51,7 @@ def own_path(
     refine_focal: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[CameraPath, Follower]:
-    """Estimate the camera pose of every frame.
-
-    Args:
-        frame: reads frame i; each is read once, in order.
-        size: (width, height) of the images, px.
-        refine_focal: the focal length is an assumption.
-    Returns:
-        The path, and the tracks it comes from.
-    """
+    """The path, and the tracks it comes from. Each frame is read once, in order. Args: as `choose.find_path`."""
     follower = follow_camera(frame, count, lens, progress)
     labels, frames = np.unique(follower.segment, return_counts=True)
     explained = follower.segment == labels[np.argmax(frames)]
@@ -91,19 +98,8 @@ def _adjust_all(follower: Follower, keyframes: list[Keyframe], refine_focal: boo
             factor *= done.focal_factor
             follower.lens = tracks.lens = follower.lens.with_focal(done.focal_factor)
         for f in frames:
-            follower.scales[f] = _frame_scale(follower, f)
+            follower.set_scale(f, tracks.adjusted)
     return factor
-
-
-def _frame_scale(follower: Follower, frame: int) -> float:
-    """Factor of the depth of a frame: median ratio of z of its adjusted rigid points to the depth."""
-    if not follower.lens.depth_is_relative:
-        return 1.0
-    tracks, ids, depths = follower.tracks, follower.tracks.ids[frame], follower.tracks.depths[frame]
-    pose = follower.poses[frame]
-    z = tracks.points[ids] @ pose[2, :3] + pose[2, 3]
-    good = tracks.adjusted[ids] & (tracks.weight[ids] > 0.3) & (depths > 0) & (z > 0)
-    return float(np.median(z[good] / depths[good])) if good.sum() >= 5 else float(follower.scales[frame])
 
 
 def place_frames(
@@ -119,7 +115,7 @@ def place_frames(
         starts: frames whose pose stays.
         followed: (T, 4, 4) poses before the adjustment: they say how a frame lies to its keyframe.
     """
-    tracks, lens = follower.tracks, follower.lens
+    tracks = follower.tracks
     stds = np.full((2, len(explained)), np.nan)
     for f in np.flatnonzero(explained) if len(starts) else ():
         at = starts[max(np.searchsorted(starts, f, "right") - 1, 0)]
@@ -130,19 +126,14 @@ def place_frames(
         if used.sum() < MIN_POINTS:
             continue
         ids, pixels, depths = ids[used], pixels[used].astype(np.float64), depths[used]
-        inverse, sigma = tracks.measured(ids, depths, 1.0)
-        if lens.depth_is_relative:
-            sigma[:, 1] = np.inf
-        start, points = follower.poses[f], tracks.points[ids]
-        if breathing is not None:
-            points = points + breathing.at(int(f), ids)
-        found = refined_pose(lens.matrix, start, points, pixels, inverse, sigma, tracks.weight[ids])
+        points = tracks.points[ids] if breathing is None else tracks.points[ids] + breathing.at(int(f), ids)
+        found = tracks.refined(follower.poses[f], ids, points, pixels, depths)
         if not np.isfinite(found.pose).all():
             continue
         stds[:, f] = found.translation_std, found.rotation_std
         if f not in starts:
             follower.poses[f] = found.pose
-            follower.scales[f] = _frame_scale(follower, f)
+            follower.set_scale(f, tracks.adjusted)
     return stds[0], stds[1]
 
 
@@ -165,13 +156,82 @@ def finished_path(
     poses[:, :3, 3] *= factor
     if len(spans) == 1 and spans[0] == (0, count - 1):
         poses = np.tile(np.eye(4), (count, 1, 1))
-    return CameraPath(
-        poses,
-        explained,
-        scales * factor,
-        OWN_POSES,
-        1.0,
-        translation_std * factor,
-        np.degrees(rotation_std),
-        still,
-    )
+    stds = translation_std * factor, np.degrees(rotation_std)
+    return CameraPath(poses, explained, scales * factor, OWN_POSES, 1.0, *stds, still)
+
+
+def close_loops(follower: Follower, keyframes: list[Keyframe], size: tuple[int, int]) -> None:
+    """Match keyframes of one world with older ones of the same place; matched keypoints become tracks.
+
+    Args:
+        size: (width, height) of the images, px.
+    """
+    tracks, lens = follower.tracks, follower.lens
+    poses, scales = follower.poses, follower.scales
+    points = [
+        back_projected(lens.matrix, poses[k.frame], k.pixels.astype(np.float64), k.depths * scales[k.frame])
+        for k in keyframes
+    ]
+    ids = [tracks.ids[k.frame] for k in keyframes]
+    for b, new in enumerate(keyframes):
+        overlap = np.array([_share_inside(lens.matrix, poses[new.frame], points[a], size) for a in range(b)])
+        partners: list[int] = []
+        for a in np.argsort(-overlap, kind="stable"):
+            if len(partners) == PARTNERS or overlap[a] < OVERLAP:
+                break
+            shared = len(np.intersect1d(ids[a], ids[b])) / max(min(len(ids[a]), len(ids[b])), 1)
+            if shared < SHARED and all(abs(a - other) > 2 for other in partners):
+                partners.append(int(a))
+        for a in partners:
+            old = keyframes[a]
+            match = link(lens, old, poses[old.frame], scales[old.frame], new)
+            if match is None:
+                continue
+            fresh = old.track[match.old] < 0
+            old.track[match.old[fresh]] = tracks.add_points(points[a][match.old[fresh]], keypoint=True)
+            _see(follower, old, match.old[fresh])
+            unseen = new.track[match.new] < 0
+            new.track[match.new[unseen]] = old.track[match.old[unseen]]
+            _see(follower, new, match.new[unseen])
+
+
+def _see(follower: Follower, key: Keyframe, which: NDArray[np.intp]) -> None:
+    follower.tracks.see(key.frame, key.track[which], key.pixels[which], key.depths[which])
+
+
+def _share_inside(matrix: NDArray, pose: NDArray, points: NDArray, size: tuple[int, int]) -> float:
+    """Share of points (N, 3) that lie in the image."""
+    seen = points @ pose[:3, :3].T + pose[:3, 3]
+    z = np.maximum(seen[:, 2], 1e-6)
+    u, v = matrix[0, 0] * seen[:, 0] / z + matrix[0, 2], matrix[1, 1] * seen[:, 1] / z + matrix[1, 2]
+    inside = (seen[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < size[0]) & (v < size[1])
+    return float(inside.mean()) if len(inside) else 0.0
+
+
+def resting(tracks: Tracks, explained: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Spans (first, last) of frames in which the camera rests: the median rigid track stays where it was at first."""
+    spans, first, count = [], 0, len(explained)
+    while first < count - 1:
+        if not explained[first]:
+            first += 1
+            continue
+        last, limit = first, LOW_PX * tracks.lens.px
+        while last + 1 < count and explained[last + 1] and _shift(tracks, first, last + 1) < limit:
+            last += 1
+            if last - first + 1 >= FEWEST_FRAMES:
+                limit = HIGH_PX * tracks.lens.px
+        if last - first + 1 >= FEWEST_FRAMES:
+            spans.append((first, last))
+            first = last
+        first += 1
+    return spans
+
+
+def _shift(tracks: Tracks, first: int, other: int) -> float:
+    """Median distance, px, of rigid tracks between two frames; inf if too few are seen in both."""
+    shared, a, b = np.intersect1d(tracks.ids[first], tracks.ids[other], return_indices=True)
+    rigid = (tracks.weight[shared] > RIGID) & ~tracks.keypoint[shared]
+    if rigid.sum() < FEWEST_TRACKS:
+        return np.inf
+    moved = tracks.pixels[other][b[rigid]] - tracks.pixels[first][a[rigid]]
+    return float(np.median(np.hypot(*moved.T)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +15,17 @@ from ...core.geometry import length_unit
 from ...core.pose_conventions import Convention, to_ours
 from ...data.writer import FARTHEST_UNIT
 from ...footage.camera_motion import camera_motion
-from ...footage.changes import find_changes
 from ...footage.pose_fit import View, measure_poses
 from .choose import How, find_path
+from .colmap import with_poses
 from .follow import follow_camera
-from .given import with_poses
 from .pose_file import is_model, read_model_poses, read_poses
-from .seen import CameraPath, Lens, PoseInput
+from .tracks import CameraPath, Lens, PoseInput
 
 NEGLIGIBLE_DEGREES = 1e-3
 PATH_RECORD = "camera_path.json"
 """In a sequence folder: how each pose was found, and how sure it is."""
-ASSUMED, CALIBRATED, REFINED = "assumed field of view", "calibration", "refined with the camera path"
+ASSUMED, CALIBRATED = "assumed field of view", "calibration"
 """Where the focal length comes from: `sources.lens` of `sequence.json`."""
 METHODS: dict[str, How] = {"auto": "best", "auto-own": "own", "estimate": "best", "own": "own", "colmap": "colmap"}
 """Values of --poses that estimate a path; `still` and files do not."""
@@ -59,12 +57,6 @@ class Reading:
             return []
         what = "given poses are those of the left camera before rectification"
         return [f"{what}; they are turned as its images are, by {angle:.2f} degrees"]
-
-    def scaled(self, stored: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The stored poses with positions in mm."""
-        scaled = stored.copy()
-        scaled[:, :3, 3] *= self.unit_mm
-        return scaled
 
     def ours(self, stored: NDArray[np.float64]) -> NDArray[np.float64]:
         """(T, 4, 4) camera-to-world of the frames, mm, OpenCV axes."""
@@ -105,15 +97,22 @@ def sequence_path(
     if how not in (*METHODS, "still"):
         known, notes = np.ones(count, bool), list(reading.notes)
         if is_model(Path(how)):
-            stored, known, rule = _of_model(Path(how), count, reading)
+            if reading.convention != AS_OURS.convention:
+                want = f"no convention for {how}, whose axes are known"
+                raise input_error("--poses-convention", want, "one", "Remove --poses-convention.")
+            sources = range(count) if reading.sources is None else reading.sources
+            stored, known, rule = read_model_poses(Path(how), sources, reading.image_names)
             notes.append(f"{how}: poses {rule}; their unit is that of --poses-unit-mm")
         else:
             stored = read_poses(Path(how), count, reading.sources)
-        path = replace(_unscaled(reading.ours(stored)), explained=known)
-        if not has_depth:
-            return path, notes
-        notes += _fit_notes(how, stored, frame, lens, reading)
-        return _scaled_to(path, frame, lens, progress), notes
+        path = CameraPath(reading.ours(stored), known, np.ones(count))
+        if has_depth:
+            notes += _fit_notes(how, stored, frame, lens, reading)
+        if has_depth and lens.depth_is_relative:  # its scale is that at which its points agree with the poses
+            follower = follow_camera(frame, count, lens, progress)
+            world = with_poses(follower, np.linalg.inv(path.camera_to_world), known)
+            path = replace(path, depth_scale=world.scales)
+        return path, notes
     if (reading.convention, reading.unit_mm) != (AS_OURS.convention, AS_OURS.unit_mm):
         got, fix = f"--poses {how}", "Remove --poses-convention and --poses-unit-mm."
         raise input_error("--poses-convention", "a file with --poses", got, fix)
@@ -125,62 +124,13 @@ def sequence_path(
     if not has_depth:
         return None, [f"the camera moves: {motion.reason}; without depth its path cannot be estimated"]
     path = find_path(frame, count, lens, size, METHODS[how], refine_focal=refine_focal, progress=progress)
-    return path, [f"the camera moves: {motion.reason}; {_reach(path, lens)}", *_quality(path, lens), *path.notes]
-
-
-def record_of_path(path: CameraPath) -> dict[str, Any]:
-    """What `camera_path.json` holds."""
-
-    def numbers(values: NDArray | None) -> list[float | None]:
-        found = np.full(len(path.explained), np.nan) if values is None else values
-        return [round(float(v), 5) if np.isfinite(v) else None for v in found]
-
-    return {
-        "method": path.method,
-        "focal_factor": round(path.focal_factor, 5),
-        "explained": path.explained.tolist(),
-        "still": [] if path.still is None else path.still.tolist(),
-        "translation_std_mm": numbers(path.translation_std),
-        "rotation_std_degrees": numbers(path.rotation_std),
-        "depth_scale": [round(float(v), 6) for v in path.depth_scale],
-    }
-
-
-def sources_with(sources: dict[str, str], path: CameraPath) -> dict[str, str]:
-    """`sources` of `sequence.json` with those of a path."""
-    return sources | {"poses": path.method} | ({"lens": REFINED} if path.focal_factor != 1 else {})
-
-
-def unexplained_frames(path: CameraPath | None, images: Iterable[NDArray[np.uint8]]) -> list[int]:
-    """Frames without an estimated pose, and frames whose color differs from the rest."""
-    lost = set() if path is None else set(np.flatnonzero(~path.explained).tolist())
-    return sorted(lost | set(find_changes(images).off_color))
+    return path, [*_estimate_notes(motion.reason, path, lens), *path.notes]
 
 
 def rescaled(stored: NDArray, scale: float) -> NDArray[np.uint16]:
     """Stored depth times a factor; 0, missing, stays, and what is too far for 16 bits becomes it."""
     units = np.round(stored.astype(np.float64) * scale)
     return np.where(units <= FARTHEST_UNIT, units, 0).astype(np.uint16)
-
-
-def _of_model(path: Path, count: int, reading: Reading) -> tuple[NDArray, NDArray[np.bool_], str]:
-    """See `read_model_poses`; such files say themselves what their axes are."""
-    if reading.convention != AS_OURS.convention:
-        fix = "Remove --poses-convention."
-        raise input_error("--poses-convention", f"no convention for {path}, whose axes are known", "one", fix)
-    sources = range(count) if reading.sources is None else reading.sources
-    return read_model_poses(path, sources, reading.image_names)
-
-
-def _scaled_to(
-    path: CameraPath, frame: Callable[[int], PoseInput], lens: Lens, progress: Callable[[int], None]
-) -> CameraPath:
-    """The given path; relative depth gets the scale at which its points agree with the poses."""
-    if not lens.depth_is_relative:
-        return path
-    poses = path.camera_to_world
-    follower = follow_camera(frame, len(poses), lens, progress)
-    return replace(path, depth_scale=with_poses(follower, np.linalg.inv(poses), path.explained).scales)
 
 
 def _fit_notes(how: str, stored: NDArray, frame: Callable[[int], PoseInput], lens: Lens, reading: Reading) -> list[str]:
@@ -190,9 +140,10 @@ def _fit_notes(how: str, stored: NDArray, frame: Callable[[int], PoseInput], len
         seen = frame(index)
         return seen.rgb_u8, seen.tissue_mask, np.nan_to_num(seen.depth)
 
+    scaled, turn = stored.copy(), np.eye(3) if reading.turn is None else reading.turn
+    scaled[:, :3, 3] *= reading.unit_mm
     relative = lens.depth_is_relative
-    turn = np.eye(3) if reading.turn is None else reading.turn
-    fit = measure_poses(view, lens.matrix, reading.scaled(stored), reading.convention, turn=turn, relative=relative)
+    fit = measure_poses(view, lens.matrix, scaled, reading.convention, turn=turn, relative=relative)
     if fit is not None and fit.another_fits:
         unit = f" --poses-unit-mm {fit.unit * reading.unit_mm:.4g}" if fit.unit * reading.unit_mm != 1 else ""
         words = f"the poses in {how} explain the images better in another way: {fit.reason}"
@@ -202,27 +153,15 @@ def _fit_notes(how: str, stored: NDArray, frame: Callable[[int], PoseInput], len
     return []
 
 
-def _unscaled(poses: NDArray) -> CameraPath:
-    return CameraPath(poses, np.ones(len(poses), bool), np.ones(len(poses)))
-
-
-def _reach(path: CameraPath, lens: Lens) -> str:
-    centers = path.camera_to_world[:, :3, 3]
-    reach, unit = np.linalg.norm(centers - centers[0], axis=1).max(), length_unit(lens.depth_is_relative)
-    return f"the estimated path reaches {reach:.0f} {unit} from its start"
-
-
-def _quality(path: CameraPath, lens: Lens) -> list[str]:
-    """How sure the path is, where the camera rests, and the focal length if it was refined."""
-    notes = []
+def _estimate_notes(reason: str, path: CameraPath, lens: Lens) -> list[str]:
+    """How far the path reaches and how sure it is, where the camera rests, and the focal length if it was refined."""
+    unit, centers = length_unit(lens.depth_is_relative), path.camera_to_world[:, :3, 3]
+    reach = np.linalg.norm(centers - centers[0], axis=1).max()
+    notes = [f"the camera moves: {reason}; the estimated path reaches {reach:.0f} {unit} from its start"]
     if path.translation_std is not None and path.rotation_std is not None and np.isfinite(path.translation_std).any():
-        unit, moved, turned = (
-            length_unit(lens.depth_is_relative),
-            *map(np.nanmedian, (path.translation_std, path.rotation_std)),
-        )
-        notes.append(
-            f"camera pose, standard deviation (median of the frames): {moved:.2f} {unit}, {turned:.3f} degrees"
-        )
+        moved, turned = np.nanmedian(path.translation_std), np.nanmedian(path.rotation_std)
+        stds = f"{moved:.2f} {unit}, {turned:.3f} degrees"
+        notes.append(f"camera pose, standard deviation (median of the frames): {stds}")
     if path.still is not None and path.still.any():
         notes.append(f"the camera rests in frames {number_ranges(np.flatnonzero(path.still).tolist())}")
     if path.focal_factor != 1:

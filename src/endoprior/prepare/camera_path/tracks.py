@@ -1,15 +1,18 @@
-"""All tracks of a clip: where each point was seen, and where it is. No image is kept. `P` points."""
+"""What camera tracking reads, keeps and returns: frames, lens, tracks of points, path. `T` frames, `P` points."""
 
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .adjust import Observations
-from .seen import Lens
+from .adjust import Observations, Resected, refined_pose
 
+REFINED = "refined with the camera path"
+"""Where the focal length may come from: `sources.lens` of `sequence.json`."""
 HELD_OUT = 8
 """One in this many tracks takes no part in any estimate: it measures how well a path explains the frames."""
 PIXEL_STD = 0.5
@@ -22,18 +25,119 @@ DEPTH_STD = {False: 0.02, True: 0.15}
 """Error of other depth as a share of it, by whether it is relative."""
 
 
+@dataclass(frozen=True)
+class PoseInput:
+    """One frame for camera tracking."""
+
+    rgb_u8: NDArray[np.uint8]
+    """(H, W, 3)."""
+    tissue_mask: NDArray[np.bool_]
+    """(H, W) True outside tools."""
+    depth: NDArray[np.float32]
+    """(H, W) mm, 0 where missing."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A pinhole camera whose depth was measured; pixel centers are counted from 0, as in OpenCV."""
+
+    matrix: NDArray[np.float64]
+    """(3, 3) K, px."""
+    width: int
+    """Of the image, px."""
+    depth_is_relative: bool
+    """Each frame's depth has a scale of its own."""
+    baseline_mm: float | None = None
+    """Distance between the cameras that measured the depth, mm."""
+
+    @classmethod
+    def centered_at_half(
+        cls, matrix: NDArray[np.float64], width: int, depth_is_relative: bool, baseline_mm: float | None = None
+    ) -> Lens:
+        """From K with the left-most pixel centered at 0.5."""
+        opencv = np.array(matrix, np.float64)
+        opencv[:2, 2] -= 0.5
+        return cls(opencv, width, depth_is_relative, baseline_mm)
+
+    def with_focal(self, factor: float) -> Lens:
+        """The lens with both focal lengths multiplied."""
+        matrix = self.matrix.copy()
+        matrix[[0, 1], [0, 1]] *= factor
+        return replace(self, matrix=matrix)
+
+    @property
+    def px(self) -> float:
+        """Length of a pixel of an image 640 px wide, in px of this one: thresholds are multiples of it."""
+        return self.width / 640
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Poses of all frames."""
+
+    camera_to_world: NDArray[np.float64]
+    """(T, 4, 4), translation in mm; an unexplained frame has the pose of the frame before it."""
+    explained: NDArray[np.bool_]
+    """(T,) whether the pose is linked to those of the other frames."""
+    depth_scale: NDArray[np.float64]
+    """(T,) factor that makes the depth of the frame agree with the path; 1 for depth in mm."""
+    method: str = "file"
+    """Where the poses come from."""
+    focal_factor: float = 1.0
+    """Refined focal length, as a multiple of the given one."""
+    translation_std: NDArray[np.float64] | None = None
+    """(T,) standard deviation of the camera center, mm; NaN where unexplained."""
+    rotation_std: NDArray[np.float64] | None = None
+    """(T,) standard deviation of the rotation, degrees."""
+    still: NDArray[np.bool_] | None = None
+    """(T,) whether the pose is a copy, because the camera rests."""
+    breathes: bool = False
+    """Whether periodic motion of the tissue was told apart from the camera's."""
+    notes: list[str] = field(default_factory=list)
+    """Notes for the user, one line each."""
+
+    @property
+    def lost(self) -> list[int]:
+        """Frames without a pose of their own."""
+        return np.flatnonzero(~self.explained).tolist()
+
+    def sources(self, old: dict[str, str]) -> dict[str, str]:
+        """`sources` of `sequence.json` with those of this path."""
+        return old | {"poses": self.method} | ({"lens": REFINED} if self.focal_factor != 1 else {})
+
+    def record(self) -> dict[str, Any]:
+        """What `camera_path.json` holds."""
+
+        def numbers(values: NDArray | None) -> list[float | None]:
+            found = np.full(len(self.explained), np.nan) if values is None else values
+            return [round(float(v), 5) if np.isfinite(v) else None for v in found]
+
+        return {
+            "method": self.method,
+            "focal_factor": round(self.focal_factor, 5),
+            "explained": self.explained.tolist(),
+            "still": [] if self.still is None else self.still.tolist(),
+            "translation_std_mm": numbers(self.translation_std),
+            "rotation_std_degrees": numbers(self.rotation_std),
+            "depth_scale": [round(float(v), 6) for v in self.depth_scale],
+        }
+
+
 class Tracks:
     """Observations by frame, and the points they belong to."""
 
     def __init__(self, lens: Lens) -> None:
         self.lens = lens
-        self.count = 0
         self.ids: list[NDArray[np.int32]] = []
         self.pixels: list[NDArray[np.float32]] = []
         self.depths: list[NDArray[np.float32]] = []
         self.points, self.weight = np.zeros((0, 3)), np.zeros(0)
-        self.keypoint = np.zeros(0, bool)
-        self.adjusted = np.zeros(0, bool)
+        self.keypoint, self.adjusted = np.zeros(0, bool), np.zeros(0, bool)
+
+    @property
+    def count(self) -> int:
+        """P."""
+        return len(self.points)
 
     def copy(self) -> Tracks:
         """The same observations; points and weights of its own."""
@@ -44,14 +148,11 @@ class Tracks:
 
     def add_points(self, points: NDArray, *, keypoint: bool) -> NDArray[np.int32]:
         """Ids of new points (N, 3)."""
-        first, self.count = self.count, self.count + len(points)
-        while self.count > len(self.points):
-            more = max(1024, len(self.points))
-            self.points = np.concatenate([self.points, np.zeros((more, 3))])
-            self.weight = np.concatenate([self.weight, np.ones(more)])
-            self.keypoint = np.concatenate([self.keypoint, np.zeros(more, bool)])
-            self.adjusted = np.concatenate([self.adjusted, np.zeros(more, bool)])
-        self.points[first : self.count], self.keypoint[first : self.count] = points, keypoint
+        first, more = self.count, len(points)
+        self.points = np.concatenate([self.points, points])
+        self.weight = np.append(self.weight, np.ones(more))
+        self.keypoint = np.append(self.keypoint, np.full(more, keypoint))
+        self.adjusted = np.append(self.adjusted, np.zeros(more, bool))
         return np.arange(first, self.count, dtype=np.int32)
 
     def see(self, frame: int, ids: NDArray, pixels: NDArray, depths: NDArray) -> None:
@@ -68,16 +169,23 @@ class Tracks:
         """(N,) which tracks take no part in estimates."""
         return ids % HELD_OUT == HELD_OUT - 1
 
-    def measured(self, ids: NDArray, depths: NDArray, scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def measured(self, ids: NDArray, depths: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(N,) inverse depth, 1/mm, and (N, 2) standard deviations of pixel and inverse depth."""
         lens, there = self.lens, depths > 0
-        inverse = 1 / np.where(there, depths.astype(np.float64) * scale, 1.0)
+        inverse = 1 / np.where(there, depths.astype(np.float64), 1.0)
         if lens.baseline_mm and not lens.depth_is_relative:
             std = np.full(len(ids), DISPARITY_STD / (lens.matrix[0, 0] * lens.baseline_mm))
         else:
             std = DEPTH_STD[lens.depth_is_relative] * inverse
         pixel = np.where(self.keypoint[ids], KEYPOINT_STD, PIXEL_STD) * lens.px
         return inverse, np.stack([pixel, np.where(there, std, np.inf)], 1)
+
+    def refined(self, start: NDArray, ids: NDArray, points: NDArray, pixels: NDArray, depths: NDArray) -> Resected:
+        """The pose of a frame that sees these points (N, 3); relative depth has an unknown scale and does not count."""
+        inverse, sigma = self.measured(ids, depths)
+        if self.lens.depth_is_relative:
+            sigma[:, 1] = np.inf
+        return refined_pose(self.lens.matrix, start, points, pixels, inverse, sigma, self.weight[ids])
 
     def of_frames(self, frames: list[int], scales: NDArray, least: int = 2) -> tuple[NDArray[np.int32], Observations]:
         """Points seen in at least `least` of the frames, and their observations, for an adjustment.
@@ -93,7 +201,7 @@ class Tracks:
         number = np.bincount(ids, minlength=self.count)
         keep = (number[ids] >= least) & ~self.held_out(ids)
         ids, camera, pixels, depths, scale = ids[keep], camera[keep], pixels[keep], depths[keep], scale[keep]
-        inverse, sigma = self.measured(ids, depths * scale.astype(np.float32), 1.0)
+        inverse, sigma = self.measured(ids, depths * scale.astype(np.float32))
         if self.lens.depth_is_relative:
             # The depth of one place is wrong in the same way in every frame: all of them count as one measurement.
             sigma[:, 1] *= np.sqrt(number[ids])

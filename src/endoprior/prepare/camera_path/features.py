@@ -1,0 +1,197 @@
+"""What is recognized in another frame: corners in the next one, SIFT keypoints (Lowe 2004) of keyframes in any.
+
+`N` corners, px counted from 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...footage.corner_flow import follow_both_ways
+from ...priors.specular import specular_likelihood
+from .adjust import back_projected, coarse_pose
+from .tracks import Lens, PoseInput
+
+MAX_CORNERS = 500
+REFRESH = 0.8
+"""New corners are detected when fewer than this share of `MAX_CORNERS` is left."""
+EDGE_STEP = 0.05
+"""No corners where depth changes by more than this share between neighbors: those are depth edges."""
+CELLS = (8, 6)
+"""The image is divided into these columns and rows; no cell holds more than twice its share of the corners."""
+FLAT_WIDTHS, FLAT_CONTRAST = 64, 300.0
+"""Shading is what is left after a blur by the image width divided by this; contrast of the rest, gray levels."""
+COARSE_HALVINGS, FINE_HALVINGS = 4, 1
+"""How often images are halved to follow corners: plain images, then flat ones."""
+FINE_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 0.01)
+FINE_PX = 2.0
+"""The two results differ by less than this."""
+RETURN_PX = 1.0
+"""Followed to the next frame and back, a corner returns within this distance."""
+KEYPOINTS = 600
+RATIO = 0.8
+"""The best match is nearer than the second best by this factor (Lowe's ratio test)."""
+FEWEST_INLIERS = 20
+"""Fewer matches that one pose explains may be chance."""
+INLIER_PX = 4.0
+"""Reprojection error of a match, px of an image 640 px wide: the tissue may have moved in between."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame as points are recognized in it."""
+
+    plain: NDArray[np.uint8]
+    """(H, W) brightness: finds large motion."""
+    flat: NDArray[np.uint8]
+    """(H, W) without shading: the light moves with the camera, and what it paints must not count as tissue."""
+    usable: NDArray[np.bool_]
+    """(H, W) see `usable_tissue`."""
+    depth: NDArray[np.float32]
+    """(H, W) 0 where missing."""
+
+
+def view_of(seen: PoseInput) -> View:
+    """Prepare a frame."""
+    plain = cv2.cvtColor(seen.rgb_u8, cv2.COLOR_RGB2GRAY)
+    bright = np.log(plain.astype(np.float32) + 8)
+    bright -= cv2.GaussianBlur(bright, (0, 0), max(plain.shape[1] / FLAT_WIDTHS, 2.0))
+    flat = np.clip(bright * FLAT_CONTRAST + 128, 0, 255).astype(np.uint8)
+    measured = np.isfinite(seen.depth) & (seen.depth > 0)
+    return View(plain, flat, usable_tissue(seen), np.where(measured, seen.depth, np.float32(0)))
+
+
+def usable_tissue(seen: PoseInput) -> NDArray[np.bool_]:
+    """(H, W) where the image shows tissue that belongs to a place: off tools, borders and highlights."""
+    height, width = seen.tissue_mask.shape
+    small = cv2.resize(seen.rgb_u8, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
+    glint = (specular_likelihood(small * np.float32(1 / 255)) > 0.5).astype(np.uint8)
+    glint = cv2.resize(cv2.dilate(glint, np.ones((3, 3))), (width, height), interpolation=cv2.INTER_NEAREST)
+    tissue, border = seen.tissue_mask.astype(np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
+    return (cv2.erode(tissue, np.ones((7, 7)), **border) & (1 - glint)).astype(bool)
+
+
+def new_corners(view: View, taken: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 2) corners on smooth tissue with depth, away from those `taken` (M, 2); none if these are enough."""
+    if len(taken) >= REFRESH * MAX_CORNERS:
+        return np.zeros((0, 2), np.float32)
+    depth = view.depth
+    near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
+    allowed = (view.usable & (near > 0) & (far - near < EDGE_STEP * depth)).astype(np.uint8)
+    height, width = depth.shape
+    apart = max(5, width // 80)
+    for x, y in taken:
+        cv2.circle(allowed, (round(float(x)), round(float(y))), apart, 0, -1)
+    found = cv2.goodFeaturesToTrack(view.flat, 3 * MAX_CORNERS, 0.002, apart, mask=allowed)
+    if found is None:
+        return np.zeros((0, 2), np.float32)
+    found = found.reshape(-1, 2)  # strongest first
+    cell, before = _cells(found, width, height), np.bincount(_cells(taken, width, height), minlength=np.prod(CELLS))
+    most = 2 * MAX_CORNERS // int(np.prod(CELLS))
+    order = np.argsort(cell, kind="stable")
+    first = np.searchsorted(cell[order], np.arange(np.prod(CELLS)))
+    rank = np.empty(len(found), int)
+    rank[order] = np.arange(len(found)) - first[cell[order]]
+    return found[rank + before[cell] < most][: max(MAX_CORNERS - len(taken), 0)]
+
+
+def _cells(pixels: NDArray, width: int, height: int) -> NDArray[np.intp]:
+    column = np.clip((pixels[:, 0] * CELLS[0] / width).astype(int), 0, CELLS[0] - 1)
+    return np.clip((pixels[:, 1] * CELLS[1] / height).astype(int), 0, CELLS[1] - 1) * CELLS[0] + column
+
+
+def followed(before: View, now: View, pixels: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Follow corners (N, 2) by Lucas-Kanade flow, forward and backward: indices of those kept, and their pixels."""
+    if not len(pixels):
+        return np.zeros(0, np.intp), pixels
+    near, good = follow_both_ways(before.plain, now.plain, pixels, RETURN_PX, halvings=COARSE_HALVINGS)
+    there, still_good = follow_both_ways(
+        before.flat, now.flat, pixels, RETURN_PX, halvings=FINE_HALVINGS, guess=near, criteria=FINE_CRITERIA
+    )
+    good &= still_good & (np.abs(there - near).max(1) < FINE_PX) & (sampled(now.usable, there) > 0)
+    kept = np.flatnonzero(good)
+    return kept, there[kept]
+
+
+def sampled(image: NDArray, pixels: NDArray) -> NDArray:
+    """(N,) values at the pixels nearest to (N, 2); 0 outside the image."""
+    height, width = image.shape
+    at = np.round(np.nan_to_num(pixels, nan=-9, posinf=-9, neginf=-9)).astype(int)
+    inside = (at >= 0).all(1) & (at[:, 0] < width) & (at[:, 1] < height)
+    at = np.where(inside[:, None], at, 0)
+    return np.where(inside, image[at[:, 1], at[:, 0]], 0)
+
+
+@dataclass
+class Keyframe:
+    """What is kept of a keyframe."""
+
+    frame: int
+    pixels: NDArray[np.float32]
+    """(M, 2) px."""
+    depths: NDArray[np.float32]
+    """(M,) mm before any scale, > 0."""
+    descriptors: NDArray[np.uint8]
+    """(M, 128)."""
+    track: NDArray[np.int32]
+    """(M,) id of the track of the keypoint, -1 without one."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """A keyframe recognized in another one."""
+
+    pose: NDArray[np.float64]
+    """(4, 4) world-to-camera of the new one, in the world of the old one."""
+    old: NDArray[np.intp]
+    """(N,) keypoints of the old one ..."""
+    new: NDArray[np.intp]
+    """... that are these of the new one."""
+    scale: float
+    """Depth in the world of the old one, as a multiple of the new one's own depth."""
+
+
+def keyframe(index: int, view: View) -> Keyframe:
+    """Describe a frame by its SIFT keypoints on tissue with depth."""
+    mask = (view.usable & (view.depth > 0)).astype(np.uint8)
+    found, descriptors = cv2.SIFT_create(KEYPOINTS, contrastThreshold=0.01).detectAndCompute(view.plain, mask)
+    if descriptors is None:
+        found, descriptors = (), np.zeros((0, 128), np.float32)
+    pixels = np.array([point.pt for point in found], np.float32).reshape(-1, 2)
+    depths = sampled(view.depth, pixels).astype(np.float32)
+    kept = depths > 0
+    no_track = np.full(kept.sum(), -1, np.int32)
+    return Keyframe(index, pixels[kept], depths[kept], descriptors[kept].astype(np.uint8), no_track)
+
+
+def link(lens: Lens, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe) -> Link | None:
+    """Find the pose of `new` from what it shares with `old`; None if that is too little."""
+    first, second = _matches(old.descriptors, new.descriptors)
+    if len(first) < FEWEST_INLIERS:
+        return None
+    points = back_projected(lens.matrix, old_pose, old.pixels[first], old.depths[first] * old_scale)
+    found = coarse_pose(lens.matrix, points, new.pixels[second], None, INLIER_PX * lens.px)
+    if found is None or found[1].sum() < max(FEWEST_INLIERS, 0.25 * len(first)):
+        return None
+    pose, inlier = found
+    z = points[inlier] @ pose[2, :3] + pose[2, 3]
+    scale = float(np.median(z / new.depths[second[inlier]]))
+    if not scale > 0:
+        return None
+    return Link(pose, first[inlier], second[inlier], scale)
+
+
+def _matches(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Mutual nearest neighbors that pass the ratio test."""
+    if len(first) < 2 or len(second) < 2:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    a, b = first.astype(np.float32), second.astype(np.float32)
+    distance = (a**2).sum(1)[:, None] + (b**2).sum(1)[None] - 2 * a @ b.T
+    best = np.argmin(distance, 1)
+    two = np.partition(distance, 1, 1)[:, :2]
+    good = (two[:, 0] < RATIO**2 * two[:, 1]) & (np.argmin(distance, 0)[best] == np.arange(len(a)))
+    return np.flatnonzero(good), best[good]
