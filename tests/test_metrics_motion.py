@@ -1,4 +1,4 @@
-"""Depth stability and track error against closed forms."""
+"""Depth stability, folds and tears of tracks, against closed forms."""
 
 from __future__ import annotations
 
@@ -8,17 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from endoprior.core.types import Camera
-from endoprior.evaluation.metrics import depth_instability, neighbor_breaks, track_error
+from endoprior.evaluation.scorers.depth import depth_instability
+from endoprior.evaluation.scorers.tracks import neighbor_breaks
 
 ALL = np.ones((6, 8), bool)
-
-
-def camera() -> Camera:
-    """A camera that is not at the origin: track error must not use its pose."""
-    pose = np.eye(4)
-    pose[:3, 3] = 5, 6, 7
-    return Camera(width=640, height=512, fx=500, fy=600, cx=320, cy=256, world_to_camera=pose)
 
 
 def test_instability_of_a_surface_that_moves_as_one():
@@ -44,66 +37,19 @@ def test_instability_without_a_common_pixel_is_nan():
 
 def test_instability_names_bad_input():
     depth = np.ones((6, 8))
-    with pytest.raises(ValueError, match="must be finite under both masks"):
+    with pytest.raises(ValueError, match="depth at valid pixels must be finite"):
         depth_instability(depth, np.full((6, 8), np.nan), ALL, ALL)
     with pytest.raises(ValueError, match="must be bool"):
         depth_instability(depth, depth, ALL, ALL.astype(int))
-    with pytest.raises(ValueError, match="depth_b must have shape"):
+    with pytest.raises(ValueError, match="must have shape"):
         depth_instability(depth, depth[1:], ALL, ALL)
 
 
 def test_metrics_import_without_torch():
-    module = "endoprior.evaluation.metrics.stability"
+    module = "endoprior.evaluation.scorers.depth"
     code = f"import sys, {module}; print('torch' in sys.modules, 'torchvision' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "False"]
-
-
-def points() -> np.ndarray:
-    """(3, 4, 3) points in camera axes at z = 50 mm."""
-    found = np.random.default_rng(0).uniform(-10, 10, (3, 4, 3))
-    found[..., 2] = 50
-    return found
-
-
-def test_track_error_of_a_constant_offset():
-    truth, visible = points(), np.ones((3, 4), bool)
-    error = track_error(truth + np.array([3, 4, 0]), truth, visible, camera())
-    assert error.mm == pytest.approx(5)
-    assert error.px == pytest.approx(np.hypot(500 * 3 / 50, 600 * 4 / 50))
-
-
-def test_track_error_counts_visible_points_alone():
-    truth, visible = points(), np.ones((3, 4), bool)
-    predicted = truth.copy()
-    predicted[1, 2] += [0, 5, 0]
-    predicted[0, 0] = np.nan
-    visible[0, 0] = False
-    error = track_error(predicted, truth, visible, camera())
-    assert error.mm == pytest.approx(5 / 11)
-    assert error.px == pytest.approx(600 * 5 / 50 / 11)
-
-
-def test_track_error_that_cannot_be_had_is_nan():
-    truth, visible = points(), np.ones((3, 4), bool)
-    assert np.isnan(track_error(truth, truth, ~visible, camera())).all()
-    behind = truth.copy()
-    behind[2, 3, 2] = -50
-    error = track_error(behind, truth, visible, camera())
-    assert error.mm == pytest.approx(100 / 12)
-    assert np.isnan(error.px)
-
-
-def test_track_error_names_bad_input():
-    truth, visible = points(), np.ones((3, 4), bool)
-    with pytest.raises(ValueError, match="truth must have z > 0"):
-        track_error(truth, -truth, visible, camera())
-    with pytest.raises(ValueError, match="must be finite where visible"):
-        track_error(truth * np.nan, truth, visible, camera())
-    with pytest.raises(ValueError, match="visible must be bool"):
-        track_error(truth, truth, visible.astype(int), camera())
-    with pytest.raises(ValueError, match="truth must have shape"):
-        track_error(truth, truth[:, :-1], visible, camera())
 
 
 # --- folds and tears

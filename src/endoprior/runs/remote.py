@@ -15,10 +15,9 @@ from ..model.windowed_scene import window_file
 from ..render import ON_GPU
 from ..system.ray_cluster import Cluster
 from ..system.threads import Threads
+from .checkpoint import CHECKPOINT_SECONDS
 from .folder import CONFIG, SCENE
-from .observers import CHECKPOINT_SECONDS
-from .training_run import TrainingRun
-from .windowed_run import WindowedRun, window_config
+from .training_run import TrainingRun, WindowedRun, window_config
 
 RESTARTS = 3
 """How often a training is resumed after its process died: a machine may be lost, or memory run out."""
