@@ -21,11 +21,6 @@ from endoprior.evaluation.scorers.image import (
 ALL = np.ones((16, 14), bool)
 
 
-def depth_rmse_endogaussian(depth: np.ndarray, target: np.ndarray, mask: np.ndarray) -> float:
-    """As that program prints it."""
-    return depth_rmse_8bit(depth, target, mask, mask.size)
-
-
 def random_image(seed: int) -> np.ndarray:
     """(16, 14, 3) float32 in [0, 1]."""
     return np.random.default_rng(seed).random((16, 14, 3), dtype=np.float32)
@@ -96,20 +91,13 @@ def test_depth_rmse_scores_valid_pixels_alone_and_counts_holes():
     assert depth_rmse(depth, target, valid) == pytest.approx(np.sqrt(50**2 / 2))
 
 
-@pytest.mark.parametrize(("error_mm", "square"), [(2, 4), (16, 0), (20, 144)])
-@pytest.mark.parametrize("sign", [-1, 1])
-def test_endogaussian_depth_wraps_modulo_256(error_mm, square, sign):
-    target = np.full((16, 14), 60.4)  # truncated to 60
-    got = depth_rmse_endogaussian(target + sign * error_mm, target, ALL)
-    assert got == pytest.approx(np.sqrt(square))
-    # Three quarters of the frame count, but the sum is still divided by all of it.
-    assert depth_rmse_endogaussian(target + sign * error_mm, target, half_mask()) == pytest.approx(
-        np.sqrt(square * 0.75)
-    )
-
-
-def test_endogaussian_depth_above_8_bits_wraps_too():
-    assert depth_rmse_endogaussian(np.full((16, 14), 258.9), np.full((16, 14), 0.9), ALL) == 2
+@pytest.mark.parametrize(("error_mm", "square"), [(2, 4), (16, 0), (20, 144), (-20, 144), (198.5, 36)])
+def test_8_bit_depth_wraps_and_is_divided_by_what_is_asked(error_mm, square):
+    target, mask = np.full((16, 14), 60.4), half_mask()  # truncated to 60
+    for pixels in (mask.size, int(mask.sum())):
+        got = depth_rmse_8bit(target + error_mm, target, mask, pixels)
+        assert got == pytest.approx(np.sqrt(square * mask.sum() / pixels))
+    assert np.isnan(depth_rmse_8bit(target, target, ~ALL, 20))
 
 
 @pytest.mark.parametrize("score", [psnr, psnr_tissue, ssim])
@@ -129,7 +117,7 @@ def test_bad_images_are_named(score):
         score(good, good[:-1], half_mask())
 
 
-@pytest.mark.parametrize("score", [depth_rmse, depth_rmse_endogaussian])
+@pytest.mark.parametrize("score", [depth_rmse, lambda *arrays: depth_rmse_8bit(*arrays, ALL.size)])
 def test_a_nan_among_valid_depths_is_an_error_and_not_a_lost_pixel(score):
     depth, target = np.ones((16, 14)), np.ones((16, 14))
     depth[5, 5] = np.nan
@@ -230,15 +218,3 @@ def test_ssim_of_complete_windows_needs_one():
     image, target, mask = (part[:10] for part in random_frames(6)[2])
     assert np.isnan(ssim_valid(image, target, mask))
     assert np.isnan(ssim_valid(*random_frames(6)[0][:2], np.zeros((18, 14), bool)))
-
-
-def test_8_bit_depth_wraps_and_is_divided_by_what_is_asked():
-    target = np.full((4, 5), 60, np.float32)
-    mask = np.zeros((4, 5), bool)
-    mask[:2] = True
-    for error, wrapped in ((2, 4), (16, 0), (20, 144), (-20, 144)):
-        depth = target + np.float32(error)
-        assert depth_rmse_8bit(depth, target, mask, 10) == pytest.approx(np.sqrt(wrapped))
-        assert depth_rmse_8bit(depth, target, mask, 20) == pytest.approx(np.sqrt(wrapped / 2))
-        assert depth_rmse_8bit(depth, target, mask, mask.size) == pytest.approx(np.sqrt(wrapped / 2))
-    assert np.isnan(depth_rmse_8bit(target, target, ~(mask | ~mask), 20))

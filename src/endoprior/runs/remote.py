@@ -67,20 +67,16 @@ def trainings(run: TrainingRun | WindowedRun, checkpoint_seconds: float = CHECKP
     assert run.out is not None, "other machines need a folder"
     out, threads = run.out.absolute(), Threads.of_this_process()
     if isinstance(run, TrainingRun):
-        sequence, cfg = run.trainer.sequence, run.trainer.cfg
-        data = sequence.path.absolute()
-        return [Training("the whole sequence", data, cfg, out, run.resume, threads, checkpoint_seconds)]
+        sequence, parts = run.trainer.sequence, [("the whole sequence", run.trainer.cfg, out, run.resume)]
+    else:
+        sequence = run.sequence
+        parts = [
+            (run.window_name(k), window_config(run.cfg, *run.plan[k]), window_file(out / SCENE, k).parent, False)
+            for k in run.waiting(out)
+        ]
+    data = sequence.path.absolute()
     return [
-        Training(
-            name=run.window_name(k),
-            data=run.sequence.path.absolute(),
-            cfg=window_config(run.cfg, *run.plan[k]),
-            folder=window_file(out / SCENE, k).parent,
-            resume=False,
-            threads=threads,
-            checkpoint_seconds=checkpoint_seconds,
-        )
-        for k in run.waiting(out)
+        Training(name, data, cfg, folder, resume, threads, checkpoint_seconds) for name, cfg, folder, resume in parts
     ]
 
 

@@ -80,15 +80,14 @@ class TrajectoryErrors(NamedTuple):
 def trajectory_errors(
     estimated: NDArray[np.floating], true: NDArray[np.floating], with_scale: bool
 ) -> TrajectoryErrors:
-    """Align the estimated path with the true one and compare them, all frames alike.
+    """Align the estimated path with the true one and compare them.
 
     The relative error of frames i, i + 1 is (Q_i^-1 Q_{i+1})^-1 (P_i^-1 P_{i+1}), with Q the true and P the estimated
     poses, whose lengths are scaled. It depends on no world axes. Two frames say little of a path: with scale, their
     absolute error is always 0.
 
     Args:
-        estimated: (T, 4, 4) camera-to-world; lengths in mm, or in any unit if `with_scale`.
-        true: (T, 4, 4) camera-to-world, mm.
+        estimated, true: (T, 4, 4) camera-to-world, mm; estimated lengths in any unit if `with_scale`.
         with_scale: align by a similarity, Sim(3), in place of a rigid motion, SE(3): for relative depth.
     Raises:
         ValueError: no frame, other shapes, numbers that are not finite, or matrices that are not rigid motions.
