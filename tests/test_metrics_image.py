@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 from endoprior.evaluation.context import to_uint8
 from endoprior.evaluation.score import mean_over_frames
-from endoprior.evaluation.scorers.depth import depth_rmse, depth_rmse_8bit
+from endoprior.evaluation.scorers.depth import depth_instability, depth_rmse, depth_rmse_8bit
 from endoprior.evaluation.scorers.image import (
     pooled_psnr,
     psnr,
@@ -218,3 +221,46 @@ def test_ssim_of_complete_windows_needs_one():
     image, target, mask = (part[:10] for part in random_frames(6)[2])
     assert np.isnan(ssim_valid(image, target, mask))
     assert np.isnan(ssim_valid(*random_frames(6)[0][:2], np.zeros((18, 14), bool)))
+
+
+# --- depth from frame to frame
+
+WHOLE = np.ones((6, 8), bool)
+
+
+def test_instability_of_a_surface_that_moves_as_one():
+    depth = np.linspace(40, 90, 48).reshape(6, 8)
+    assert depth_instability(depth, depth - 1.5, WHOLE, WHOLE) == pytest.approx(1.5)
+    assert depth_instability(depth, depth, WHOLE, WHOLE) == 0
+
+
+def test_instability_counts_pixels_that_are_tissue_and_drawn_in_both_frames():
+    depth_a, depth_b = np.full((1, 5), 10.0), np.full((1, 5), 12.0)
+    mask_a, mask_b = np.ones((1, 5), bool), np.ones((1, 5), bool)
+    depth_a[0, 0], depth_b[0, 1] = 0, 0  # not rendered in one of them
+    mask_a[0, 2] = mask_b[0, 3] = False
+    depth_b[0, 2] = depth_a[0, 3] = np.nan  # outside the masks: may be anything
+    depth_b[0, 4] = 17
+    assert depth_instability(depth_a, depth_b, mask_a, mask_b) == 7
+
+
+def test_instability_without_a_common_pixel_is_nan():
+    assert np.isnan(depth_instability(np.ones((6, 8)), np.ones((6, 8)), WHOLE, ~WHOLE))
+    assert np.isnan(depth_instability(np.zeros((6, 8)), np.ones((6, 8)), WHOLE, WHOLE))
+
+
+def test_instability_names_bad_input():
+    depth = np.ones((6, 8))
+    with pytest.raises(ValueError, match="depth at valid pixels must be finite"):
+        depth_instability(depth, np.full((6, 8), np.nan), WHOLE, WHOLE)
+    with pytest.raises(ValueError, match="must be bool"):
+        depth_instability(depth, depth, WHOLE, WHOLE.astype(int))
+    with pytest.raises(ValueError, match="must have shape"):
+        depth_instability(depth, depth[1:], WHOLE, WHOLE)
+
+
+def test_metrics_import_without_torch():
+    module = "endoprior.evaluation.scorers.depth"
+    code = f"import sys, {module}; print('torch' in sys.modules, 'torchvision' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False"]
