@@ -31,7 +31,7 @@ import llvmlite.binding
 import numba
 import torch
 
-from endoprior.runs.provenance import source_commit
+from endoprior.system.installation import source_commit
 
 Steps = dict[str, Callable[[Any], Any]]
 """One way to do a stage: what to call in turn, each with the result of the one before. `_names` are not reported."""

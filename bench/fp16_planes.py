@@ -13,7 +13,7 @@ import common
 import numpy as np
 
 from endoprior.data import FrameSequence, load_sequence
-from endoprior.evaluation import metrics
+from endoprior.evaluation.scorers.image import psnr_tissue
 from endoprior.evaluation.scoring import scored_data
 from endoprior.model.ops import TORCH
 from endoprior.model.scene import Scene
@@ -25,7 +25,7 @@ def scores(scene: Scene, sequence: FrameSequence) -> np.ndarray:
     found = []
     for frame in sequence.frames("test"):
         color = scene.render(frame.time, frame.camera).color.numpy()
-        found.append(metrics.psnr_tissue(color, frame.rgb, frame.tissue_mask))
+        found.append(psnr_tissue(color, frame.rgb, frame.tissue_mask))
     return np.array(found)
 
 

@@ -15,7 +15,7 @@ from tiny_training import tiny_config
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.runs.folder import read_log
+from endoprior.runs.log import read_log
 from endoprior.runs.train import train
 from endoprior.system.file_lock import exclusive, locked
 from endoprior.system.signals import all_interrupt

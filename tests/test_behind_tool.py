@@ -10,7 +10,7 @@ import pytest
 from endoprior.core.geometry import cells_at, project
 from endoprior.data import load_sequence
 from endoprior.evaluation.context import Evaluation, EvaluationContext
-from endoprior.evaluation.scorers import behind_tool
+from endoprior.evaluation.scorers import other_views
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.phantom.visibility import shown_elsewhere
 
@@ -65,7 +65,7 @@ def scored(sequence, split: str) -> Evaluation:
     context.result = Evaluation({})
     for name in ("add", "add_mean", "skip_if_unavailable"):
         setattr(context, name, getattr(EvaluationContext, name).__get__(context))
-    behind_tool.compute(context)
+    other_views.score_hidden(context)
     return context.result
 
 
@@ -80,5 +80,5 @@ def test_what_is_seen_and_what_is_guessed_are_scored_apart(sequence) -> None:
 def test_with_another_split_it_is_not_known_what_training_frames_show(sequence, split) -> None:
     """The truth names the frames that show it by the published split; the true tissue is that of every frame."""
     found = scored(sequence.with_test_phase(3), split)
-    assert found.skipped["psnr_behind_tool_seen"] == found.skipped["psnr_behind_tool_guessed"] == behind_tool.NO_SEEN
+    assert found.skipped["psnr_behind_tool_seen"] == found.skipped["psnr_behind_tool_guessed"] == other_views.NO_SEEN
     assert 20 < found.scores["psnr_behind_tool"] <= 40.01

@@ -9,7 +9,7 @@ import yaml
 from benchmark_runs import in_this_process
 
 from endoprior.core.checks import InputError
-from endoprior.runs.growth import Growth
+from endoprior.runs.log import Growth
 from endoprior_studies.matched_count import MOST_PROBES, Search, matched_table, next_threshold, search_thresholds
 from endoprior_studies.matrix import run_matrix
 from endoprior_studies.report import write_report

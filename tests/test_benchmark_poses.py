@@ -16,7 +16,7 @@ from endoprior.core.config import DataConfig
 from endoprior.core.geometry import camera_to_world
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.data.writer import SequenceMeta, SequenceWriter
-from endoprior.evaluation.metrics.trajectory import trajectory_errors
+from endoprior.evaluation.scorers.camera_path import trajectory_errors
 from endoprior.prepare.camera_path import choose
 from endoprior.tool_masks import FoundTools
 from endoprior_studies import found_masks

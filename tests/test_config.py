@@ -17,7 +17,7 @@ from endoprior.core.config_io import from_dict, to_dict
 from endoprior.model.attributes import motion_shape
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import SceneFacts
-from endoprior.runs.identity import reject_other_run
+from endoprior.runs.folder import reject_other_run
 
 PAPER_VALUES = json.loads((Path(__file__).parent / "paper_values.json").read_text())
 PRESETS = ("default", "best", "paper", "released", "endogaussian")

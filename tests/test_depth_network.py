@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from endoprior.core.checks import InputError
-from endoprior.evaluation.metrics.torchvision_compat import import_torchvision
+from endoprior.evaluation.networks import import_torchvision
 from endoprior.prepare import relative_depth
 from endoprior.prepare.hub_model import FILES
 from endoprior.prepare.relative_depth import DepthNetwork

@@ -61,7 +61,7 @@ def test_track_error_of_a_still_scene_is_how_far_the_tissue_moved(phantom):
     moved = np.linalg.norm(points - points[first, columns], axis=-1)[visible].mean()
     true = true_tracks(phantom)
     parts = parts_of(true, phantom)
-    scores = track_scores(by_scene(still_scene(phantom), true, phantom), true, parts, phantom.camera(0))
+    scores = track_scores(by_scene(still_scene(phantom), true, phantom), true, parts)
     assert scores["track_error_mm"] == pytest.approx(moved, rel=1e-3)
 
 

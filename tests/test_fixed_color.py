@@ -10,10 +10,9 @@ import torch
 from endoprior.core.geometry import back_project, project
 from endoprior.core.types import Camera, Frame
 from endoprior.data import FrameSequence
-from endoprior.evaluation.context import Evaluation, EvaluationContext
-from endoprior.evaluation.metrics import ScoreUnavailable
-from endoprior.evaluation.rendered import SceneFrames
-from endoprior.evaluation.scorers import color
+from endoprior.evaluation.context import Evaluation, EvaluationContext, SceneFrames
+from endoprior.evaluation.score import ScoreUnavailable
+from endoprior.evaluation.scorers import motion
 from endoprior.model.attributes import motion_layout
 from endoprior.model.basis import basis_weights
 from endoprior.model.fixed_color import with_fixed_color
@@ -21,7 +20,7 @@ from endoprior.model.gaussians import Gaussians, create_gaussians
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
-from endoprior.visualization.carried_texture import SQUARES, PaintedTissue
+from endoprior.visualization.tissue_layers import SQUARES, PaintedTissue
 
 WIDTH, HEIGHT, FOCAL, DEPTH, NUM_FRAMES = 160, 96, 200.0, 60.0, 10
 CAMERA = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, np.eye(4))
@@ -66,8 +65,7 @@ def color_share(scene: Scene) -> float:
         Path("none"), [CAMERA] * NUM_FRAMES, lambda i: Frame(i, i / NUM_FRAMES, CAMERA, rgb, mask, depth, mask)
     )  # fmt: skip
     context = EvaluationContext(SceneFrames(scene, sequence), sequence, "video", False, None, Evaluation({}))
-    color.compute(context)
-    return context.result.scores["color_share"]
+    return motion.color_share(context)
 
 
 def painted(scene: Scene, frame: int) -> np.ndarray:

@@ -24,7 +24,7 @@ from endoprior.data.formats import REGISTRY
 from endoprior.data.images import save_png
 from endoprior.data.window_plan import look_through
 from endoprior.export.time_steps import frame_indices
-from endoprior.runs.growth import Growth
+from endoprior.runs.log import Growth
 from endoprior_studies.matched_count import search_thresholds
 from endoprior_studies.matrix import KEY_DIGITS, SCORES_VERSION, frames_of, run_matrix
 from endoprior_studies.report import write_report

@@ -5,7 +5,7 @@ import json
 import torch
 
 from endoprior.core.config import DensityConfig
-from endoprior.runs.growth import growth_of
+from endoprior.runs.log import growth_of
 from endoprior.training.density import DensityStats, plan
 from endoprior_studies.matrix import Matrix
 from endoprior_studies.silent_rules import silent_rules

@@ -14,7 +14,7 @@ from endoprior.core.config_io import to_dict
 from endoprior.model.method import METHODS, method_named
 from endoprior.model.presets import preset
 from endoprior.runs import kernel_cache
-from endoprior.runs.warm_up import shortened, tiny_sequence
+from endoprior.runs.kernel_cache import shortened, tiny_sequence
 from endoprior.training.gaussian_trainer import GaussianTrainer
 
 

@@ -13,7 +13,7 @@ from endoprior.data import load_sequence
 from endoprior.data.mask_writing import note_found_masks
 from endoprior.runs.checkpoint import check_state, load_checkpoint, save_checkpoint
 from endoprior.runs.folder import CONFIG, LOG
-from endoprior.runs.missed_tools import missed_tools_line, missed_tools_of
+from endoprior.runs.log import missed_tools_line, missed_tools_of
 from endoprior.runs.train import train
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.left_out import LEAST_SHARE, VISITS, at_start, missed_tool_frames, record

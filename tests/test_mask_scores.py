@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections import Counter
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from endoprior import load_sequence
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data.frame_files import BY_NAME, BY_NUMBER
-from endoprior.evaluation.mask_scores import NO_VALUE, SCORES, TOLERANCE, MaskCounts, count, counted_pixels, tips
+from endoprior.evaluation.mask_scores import NO_VALUE, SCORES, TOLERANCE, count, counted_pixels, scores_of, tips
 from endoprior.evaluation.true_masks import TrueMasks, score_masks
 from endoprior.footage.border import Circle
 
@@ -33,7 +34,7 @@ def box(top, left, bottom, right, shape=SHAPE):
 
 
 def scores(found, truth, counted=None):
-    return count(found, truth, ALL if counted is None else counted).scores()
+    return scores_of(count(found, truth, ALL if counted is None else counted))
 
 
 def test_a_square_moved_by_a_quarter_of_its_side():
@@ -65,8 +66,8 @@ def test_frames_without_a_tool():
 def test_the_score_of_a_sequence_pools_pixels():
     small, large = box(0, 0, 10, 10), box(0, 0, 30, 30)
     none = np.zeros(SHAPE, bool)
-    total = count(none, small, ALL) + count(large, large, ALL) + count(small, none, ALL) + MaskCounts()
-    pooled = total.scores()
+    total = count(none, small, ALL) + count(large, large, ALL) + count(small, none, ALL)
+    pooled = scores_of(total)
     assert pooled["missed_area"] == pytest.approx(100 / 1000) and pooled["false_area"] == 0
     assert pooled["mask_iou"] == pytest.approx(900 / 1100)
     assert pooled["false_share_of_view"] == pytest.approx(100 / ALL.size)
@@ -146,13 +147,13 @@ def test_every_tool_has_a_tip_of_its_own_if_it_enters_the_image():
 def test_identities(data):
     shape = data.draw(st.tuples(SIDES, SIDES))
     found, truth, counted = (data.draw(masks(*shape)) for _ in range(3))
-    forth, back = count(found, truth, counted).scores(), count(truth, found, counted).scores()
+    forth, back = scores_of(count(found, truth, counted)), scores_of(count(truth, found, counted))
     for name in ("mask_iou", "boundary_f1"):
         assert forth[name] == pytest.approx(back[name], nan_ok=True)
     for name, value in forth.items():
         assert math.isnan(value) or value >= 0
         assert math.isnan(value) or value <= 1 or name == "false_area"
-    for name, value in count(truth, truth, counted).scores().items():
+    for name, value in scores_of(count(truth, truth, counted)).items():
         assert math.isnan(value) or value == (name in ("mask_iou", "boundary_f1"))
     assert not (tips(truth, counted) & ~(truth & counted)).any()
 
@@ -323,7 +324,7 @@ def test_a_photo_is_no_mask(sequence):
 
 
 def test_every_score_says_why_it_may_have_no_value():
-    assert [score.name for score in SCORES] == list(NO_VALUE) == list(MaskCounts().scores())
+    assert [score.name for score in SCORES] == list(NO_VALUE) == list(scores_of(Counter()))
 
 
 def test_real_clip(real_clip):
@@ -334,6 +335,6 @@ def test_real_clip(real_clip):
     counted = counted_pixels(images, np.logical_and.reduce(masked))
     assert not counted[:40, :100].any() and counted[50:].all()
     wide = cv2.dilate(masked[0].astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
-    found = count(wide, masked[0], counted).scores()
+    found = scores_of(count(wide, masked[0], counted))
     assert found["missed_area"] == found["missed_tips"] == 0 and 0.05 < found["false_area"] < 0.15
     assert 0.85 < found["mask_iou"] < 0.95 and found["boundary_f1"] > 0.99

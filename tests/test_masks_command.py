@@ -14,7 +14,7 @@ from endoprior.data import load_sequence
 from endoprior.data.images import read_tool_mask
 from endoprior.data.mask_writing import replace_masks, writable_masks
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.visualization.mask_sheet import mask_sheet
+from endoprior.visualization.image_tools import mask_sheet
 
 FRAMES = 4
 

@@ -8,13 +8,21 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from endoprior.core.types import Camera, Frame
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.data.truth import Tracks
-from endoprior.evaluation.metrics import ScoreUnavailable, track_accuracy
 from endoprior.evaluation.predicted_tracks import PredictedTracks, by_chained_flow, true_tracks, without_motion
-from endoprior.evaluation.scorers.tracks import near_tool, parts_of, seen_again, track_scores
+from endoprior.evaluation.score import ScoreUnavailable
+from endoprior.evaluation.scorers.tracks import (
+    near_tool,
+    neighbor_breaks,
+    parts_of,
+    seen_again,
+    track_accuracy,
+    track_scores,
+)
 from endoprior.phantom import PhantomConfig, write_phantom
 
 WIDTH, HEIGHT, NUM_FRAMES, DEPTH, FOCAL = 160, 128, 6, 50.0, 200.0
@@ -35,16 +43,16 @@ def test_accuracy_of_three_points_by_hand():
     distance = np.array([[0, 0, 0], [0.0, 10.0, 0.0]])
     accuracy = track_accuracy(distance, predicted, visible, rows("000", "111"))
     # within 4 and 8 px one of the two visible points, within 16, 32 and 64 px both
-    assert accuracy.delta_avg == pytest.approx((2 * 0.5 + 3 * 1) / 5)
+    assert accuracy["track_delta_avg"] == pytest.approx((2 * 0.5 + 3 * 1) / 5)
     # TP 1, FP 2 (far, hidden), FN 1 (far); then TP 2, FP 1 (hidden)
-    assert accuracy.average_jaccard == pytest.approx((2 * 1 / 4 + 3 * 2 / 3) / 5)
-    assert accuracy.occlusion_accuracy == pytest.approx(2 / 3)
+    assert accuracy["track_average_jaccard"] == pytest.approx((2 * 1 / 4 + 3 * 2 / 3) / 5)
+    assert accuracy["track_occlusion_accuracy"] == pytest.approx(2 / 3)
 
 
 def test_a_visible_point_predicted_hidden_is_near_but_no_true_positive():
     accuracy = track_accuracy(np.zeros((1, 2)), rows("10"), rows("11"), rows("11"))
-    assert accuracy == (1.0, 0.5, 0.5)
-    assert np.isnan(track_accuracy(np.zeros((1, 2)), rows("10"), rows("00"), rows("11"))).all()
+    assert list(accuracy.values()) == [1.0, 0.5, 0.5]
+    assert np.isnan(list(track_accuracy(np.zeros((1, 2)), rows("10"), rows("00"), rows("11")).values())).all()
 
 
 def test_accuracy_against_slow_loops():
@@ -69,8 +77,8 @@ def test_accuracy_against_slow_loops():
         deltas.append(near / total)
     right = [predicted[t, p] == visible[t, p] for t in range(7) for p in range(9) if counted[t, p]]
     accuracy = track_accuracy(distance, predicted, visible, counted)
-    assert accuracy == pytest.approx((np.mean(deltas), np.mean(jaccards), np.mean(right)))
-    assert accuracy.average_jaccard <= accuracy.delta_avg  # being seen can only cost
+    assert list(accuracy.values()) == pytest.approx([np.mean(deltas), np.mean(jaccards), np.mean(right)])
+    assert accuracy["track_average_jaccard"] <= accuracy["track_delta_avg"]  # being seen can only cost
 
 
 # --- true tracks ------------------------------------------------------------------------------------------------------
@@ -105,7 +113,7 @@ def moving_plane(
 
 def scored(predicted: PredictedTracks, true, sequence: FrameSequence) -> dict[str, float]:
     """All scores of a prediction."""
-    return track_scores(predicted, true, parts_of(true, sequence), sequence.camera(0))
+    return track_scores(predicted, true, parts_of(true, sequence))
 
 
 def perfect(true) -> PredictedTracks:
@@ -145,7 +153,7 @@ def test_points_behind_the_camera_are_infinitely_far():
     scores = scored(lost, true, moving_plane(1.0))
     assert (scores["track_delta_avg"], scores["track_average_jaccard"]) == (0, 0)
     assert scores["track_error_median_px"] == scores["track_error_p90_px"] == np.inf
-    assert np.isnan(scores["track_error_px"]) and np.isnan(scores["track_error_pulled_mm"])
+    assert scores["track_error_px"] == np.inf and np.isnan(scores["track_error_pulled_mm"])
 
 
 def test_a_point_that_appears_late_counts_from_the_frame_after():
@@ -239,3 +247,54 @@ def test_flow_needs_frames_of_some_size():
     sequence.truth = SimpleNamespace(tracks=Tracks(np.ones((3, 1, 3), np.float32), np.ones((3, 1), bool)))
     with pytest.raises(ScoreUnavailable, match="smaller than 32 px"):
         by_chained_flow(true_tracks(sequence), sequence)
+
+
+# --- folds and tears
+
+
+def grid_of_points(frames: int = 3) -> np.ndarray:
+    """(T, 16, 3) a resting 4 x 4 grid of points, 1 mm apart."""
+    x, y = np.meshgrid(np.arange(4.0), np.arange(4.0))
+    return np.tile(np.stack([x.ravel(), y.ravel(), np.full(16, 50.0)], -1), (frames, 1, 1))
+
+
+def breaks(predicted: np.ndarray, truth: np.ndarray, first: int = 0):
+    visible = np.ones(truth.shape[:2], bool)
+    visible[first] = False
+    return neighbor_breaks(predicted, truth, visible, np.full(truth.shape[1], first))
+
+
+def test_tissue_that_moves_or_turns_as_one_neither_folds_nor_tears():
+    truth = grid_of_points()
+    assert breaks(truth + np.array([3, -1, 2]), truth) == (0, 0)
+    angle = np.radians(80)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    assert breaks(truth @ turn.T, truth) == (0, 0)
+    assert breaks(truth * 1.9, truth) == (0, 0)
+
+
+def test_turned_inside_out_is_all_fold_and_stretched_is_all_tear():
+    truth = grid_of_points()
+    assert breaks(-truth, truth) == (1, 0)
+    assert breaks(truth * 2.1, truth) == (0, 1)
+
+
+def test_one_lost_point_tears_its_own_pairs_only():
+    truth = grid_of_points()
+    predicted = truth.copy()
+    predicted[2, 5] += [0, 0, 30]
+    pairs = {tuple(sorted((a, b))) for a in range(16) for b in nearest_four(truth[0], a)}
+    own = [pair for pair in pairs if 5 in pair]
+    fold, tear = breaks(predicted, truth)
+    assert fold == 0 and tear == pytest.approx(len(own) / (2 * len(pairs)))
+
+
+def nearest_four(points: np.ndarray, a: int) -> list[int]:
+    return [int(b) for b in cKDTree(points).query(points[a], k=5)[1] if b != a]
+
+
+def test_breaks_need_a_pair_that_both_frames_show():
+    truth = grid_of_points()
+    assert np.isnan(neighbor_breaks(truth, truth, np.zeros((3, 16), bool), np.zeros(16, int))).all()
+    alone = neighbor_breaks(truth[:, :2], truth[:, :2], np.ones((3, 2), bool), np.array([0, 1]))
+    assert np.isnan(alone).all()  # they start in different frames

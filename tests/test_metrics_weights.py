@@ -16,9 +16,8 @@ import torch
 from safetensors.torch import save_file
 
 from endoprior.core.checks import InputError
-from endoprior.evaluation.metrics import weights
-from endoprior.evaluation.metrics.weights import (
-    FoundWeights,
+from endoprior.evaluation import networks
+from endoprior.evaluation.networks import (
     WeightFiles,
     WeightsMissing,
     find_weights,
@@ -38,22 +37,22 @@ def places(tmp_path, monkeypatch):
     named.mkdir()
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setattr(torch.hub, "_hub_dir", None)
-    monkeypatch.setenv(weights.ENVIRONMENT_VARIABLE, str(named))
+    monkeypatch.setenv(networks.ENVIRONMENT_VARIABLE, str(named))
 
     def reject(*args, **kwargs):
         raise OSError("the network is down")
 
     monkeypatch.setattr(urllib.request, "urlopen", reject)
-    return {"weights folder": folder, weights.ENVIRONMENT_VARIABLE: named, "torch cache": cache / "checkpoints"}
+    return {"weights folder": folder, networks.ENVIRONMENT_VARIABLE: named, "torch cache": cache / "checkpoints"}
 
 
 def test_places_are_tried_in_order(places):
     for source in reversed(places):
         (places[source] / TOY.names[1]).write_bytes(b"")
         found = find_weights(TOY, places["weights folder"])
-        assert found == FoundWeights(places[source] / TOY.names[1], source)
+        assert found == places[source] / TOY.names[1]
     (places["weights folder"] / TOY.names[0]).write_bytes(b"")
-    assert find_weights(TOY, places["weights folder"]).path.name == TOY.names[0]
+    assert find_weights(TOY, places["weights folder"]).name == TOY.names[0]
 
 
 def test_missing_weights_say_where_they_were_sought_in_one_line(places):
@@ -70,7 +69,7 @@ def test_missing_weights_say_where_they_were_sought_in_one_line(places):
 def test_a_named_folder_that_is_none_is_an_input_error(places, monkeypatch, tmp_path):
     with pytest.raises(InputError, match="--weights-dir: expected a folder"):
         find_weights(TOY, tmp_path / "nowhere")
-    monkeypatch.setenv(weights.ENVIRONMENT_VARIABLE, str(tmp_path / "nowhere"))
+    monkeypatch.setenv(networks.ENVIRONMENT_VARIABLE, str(tmp_path / "nowhere"))
     with pytest.raises(InputError, match="ENDOPRIOR_WEIGHTS: expected a folder"):
         find_weights(TOY)
 
@@ -79,14 +78,14 @@ def test_a_named_folder_that_is_none_is_an_input_error(places, monkeypatch, tmp_
 def test_download_is_checked_against_its_hash(places, tmp_path, monkeypatch, right_hash):
     monkeypatch.undo()  # the real urlopen, on a file:// address
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.delenv(weights.ENVIRONMENT_VARIABLE, raising=False)
+    monkeypatch.delenv(networks.ENVIRONMENT_VARIABLE, raising=False)
     digest = hashlib.sha256(b"weights").hexdigest()[:8] if right_hash else "00000000"
     origin = tmp_path / f"net-{digest}.pth"
     origin.write_bytes(b"weights")
     files = WeightFiles("ToyNet", ("absent.safetensors",), origin.as_uri())
     target = places["torch cache"] / origin.name
     if right_hash:
-        assert find_weights(files) == FoundWeights(target, "download")
+        assert find_weights(files) == target
         assert target.read_bytes() == b"weights"
     else:
         with pytest.raises(WeightsMissing, match="invalid hash value"):
@@ -98,8 +97,8 @@ def test_download_is_checked_against_its_hash(places, tmp_path, monkeypatch, rig
 def test_a_server_that_does_not_answer_costs_no_more_than_the_timeout(monkeypatch):
     monkeypatch.undo()
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    monkeypatch.delenv(weights.ENVIRONMENT_VARIABLE, raising=False)
-    monkeypatch.setattr(weights, "NETWORK_TIMEOUT_S", 0.3)
+    monkeypatch.delenv(networks.ENVIRONMENT_VARIABLE, raising=False)
+    monkeypatch.setattr(networks, "NETWORK_TIMEOUT_S", 0.3)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/toy-0123abcd.pth"
         start = time.perf_counter()
@@ -117,7 +116,7 @@ def test_a_name_lookup_that_hangs_costs_no_more_than_the_timeout(monkeypatch):
         raise OSError("nobody waits for this any more")
 
     monkeypatch.setattr(urllib.request, "urlopen", hang)
-    monkeypatch.setattr(weights, "NETWORK_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(networks, "NETWORK_TIMEOUT_S", 0.3)
     start = time.perf_counter()
     with pytest.raises(WeightsMissing, match=r"no answer within 0.3 s"):
         find_weights(TOY)
@@ -130,7 +129,7 @@ def test_both_formats_are_read(tmp_path):
     save_file(tensors, tmp_path / "toy.safetensors")
     torch.save(tensors, tmp_path / "toy.pth")
     for name in ("toy.safetensors", "toy.pth"):
-        read = load_weights(FoundWeights(tmp_path / name, "weights folder"))
+        read = load_weights(tmp_path / name)
         assert torch.equal(read["a.weight"], tensors["a.weight"])
 
 
@@ -158,14 +157,14 @@ def test_unreadable_and_dangerous_files_are_rejected(tmp_path, kind):
     else:
         path.write_bytes(b"" if kind == "empty.pth" else b"not weights at all")
     with pytest.raises(WeightsMissing, match=f"{kind}: expected network weights") as caught:
-        load_weights(FoundWeights(path, "weights folder"))
+        load_weights(path)
     assert "\n" not in str(caught.value)
     assert not evidence.exists()
 
 
 def test_names_and_shapes_must_be_those_of_the_network(tmp_path):
     save_file({"a": torch.zeros(2), "unused": torch.zeros(1)}, tmp_path / "toy.safetensors")
-    found = FoundWeights(tmp_path / "toy.safetensors", "weights folder")
+    found = tmp_path / "toy.safetensors"
     assert list(select_weights(found, {"net.a": torch.ones(2)}, {"net.a": "a"})) == ["net.a"]
     with pytest.raises(WeightsMissing, match=r"expected a of shape \(3,\), got shape \(2,\)"):
         select_weights(found, {"net.a": torch.ones(3)}, {"net.a": "a"})

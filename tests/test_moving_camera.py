@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.data.truth import Tracks, Truth
-from endoprior.evaluation.context import Evaluation, EvaluationContext
+from endoprior.evaluation.context import Evaluation, EvaluationContext, SceneFrames
 from endoprior.evaluation.predicted_tracks import by_scene, true_tracks, without_motion
-from endoprior.evaluation.rendered import SceneFrames
 from endoprior.evaluation.scorers import camera_path
 from endoprior.evaluation.scorers.tracks import parts_of, track_end_error_mm, track_scores
 from endoprior.evaluation.scoring import evaluate
@@ -124,10 +123,10 @@ def test_points_at_rest_are_followed_by_a_scene_at_rest(phantom, scene, monkeypa
     set_tracks(monkeypatch, phantom, Tracks(points, visible))
     true = true_tracks(sequence)
     for predicted in (by_scene(resting, true, sequence), without_motion(true, sequence)):
-        scores = track_scores(predicted, true, parts_of(true, sequence), sequence.camera(0))
+        scores = track_scores(predicted, true, parts_of(true, sequence))
         assert scores["track_error_mm"] < 1e-3 and scores["track_error_p90_px"] < 0.01
     still = without_motion(true, phantom)  # poses that do not move: now the points do
-    assert track_scores(still, true, parts_of(true, phantom), phantom.camera(0))["track_error_mm"] > 1
+    assert track_scores(still, true, parts_of(true, phantom))["track_error_mm"] > 1
 
     visible[0], visible[1:-1] = True, False
     set_tracks(monkeypatch, phantom, Tracks(points, visible, paired=False))

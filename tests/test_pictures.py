@@ -14,9 +14,8 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data.frame_files import BY_NAME, BY_NUMBER
 from endoprior.data.images import save_png
-from endoprior.evaluation.context import NO_SCENE
+from endoprior.evaluation.context import NO_DEPTH, NO_SCENE
 from endoprior.evaluation.pictures import Pictures
-from endoprior.evaluation.rendered import NO_DEPTH
 from endoprior.evaluation.scoring import evaluate
 
 TOTAL, TEST = 17, [1, 9]

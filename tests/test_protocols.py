@@ -16,10 +16,12 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.images import save_png
-from endoprior.evaluation import metrics
+from endoprior.evaluation.networks import WeightsMissing
 from endoprior.evaluation.pictures import Pictures
-from endoprior.evaluation.protocols.table import OURS, PROTOCOLS, SCORES, Protocol, chosen_protocols
-from endoprior.evaluation.protocols.tags import KEYS, NETWORKS, rows_of
+from endoprior.evaluation.protocols.compute import NETWORKS, rows_of
+from endoprior.evaluation.protocols.table import KEYS, OURS, PROTOCOLS, SCORES, Protocol, chosen_protocols
+from endoprior.evaluation.scorers.image import ssim, ssim_valid
+from endoprior.evaluation.scorers.lpips import LpipsDistance
 from endoprior.evaluation.scoring import evaluate
 
 TAGS = Path(__file__).parents[1] / "docs" / "results" / "published_tags.csv"
@@ -135,8 +137,8 @@ def test_scores_of_each_protocol_by_hand(sequence, scored):
     cut = [(a, b, np.concatenate([m[:-12], ZEROS[:12]]), f) for a, b, m, f in tools]
     each = np.mean([-10 * np.log10(mse([frame], "frame")) for frame in cut])
     assert found["surgicalgaussian"]["psnr"] == pytest.approx(each, abs=1e-6)
-    assert found["surgicalgaussian"]["ssim"] == pytest.approx(np.mean([metrics.ssim(*f[:3]) for f in cut]), abs=1e-9)
-    valid = np.mean([metrics.ssim_valid(*f[:3]) for f in plain])
+    assert found["surgicalgaussian"]["ssim"] == pytest.approx(np.mean([ssim(*f[:3]) for f in cut]), abs=1e-9)
+    valid = np.mean([ssim_valid(*f[:3]) for f in plain])
     assert found["endosurf"]["ssim"] == pytest.approx(valid, abs=1e-9)
     first, second = ((mask & frame.depth_valid).sum() for _, _, mask, frame in plain)
     pooled = np.sqrt((4 * first + 16 * second) / (first + second))
@@ -264,11 +266,11 @@ def test_each_classifier_is_loaded_once_and_sees_the_range_of_the_protocol(tmp_p
     def load(backbone, weights_dir, *, download):
         asked.append((backbone, download))
         if backbone == "vgg":
-            raise metrics.WeightsMissing("no weights for VGG16")
-        return metrics.LpipsDistance(lambda a, b: (a - b).abs().mean())
+            raise WeightsMissing("no weights for VGG16")
+        return LpipsDistance(lambda a, b: (a - b).abs().mean())
 
     folder = noisy(tmp_path / "theirs", sequence)
-    monkeypatch.setattr(metrics, "lpips_distance", load)
+    monkeypatch.setattr("endoprior.evaluation.protocols.compute.lpips_distance", load)
     monkeypatch.setattr("endoprior.evaluation.scoring.scorers", dict)
     found = evaluate(Pictures(folder / "rgb", sequence, "test"), sequence, protocols=NAMES).protocols
     assert sorted(asked) == [("alex", True), ("vgg", False)]

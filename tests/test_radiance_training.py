@@ -17,7 +17,7 @@ from endoprior.core.config import Config
 from endoprior.core.types import Frame
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.evaluation import context
-from endoprior.evaluation.scorers import speed
+from endoprior.evaluation.scorers import model
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
@@ -258,7 +258,7 @@ def test_files_that_no_training_writes_are_rejected(
 
 
 def test_scores_that_need_gaussians_are_skipped(sequence: FrameSequence, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(speed, "LONGEST_SECONDS", 0.0)
+    monkeypatch.setattr(model, "LONGEST_SECONDS", 0.0)
     scene: RadianceScene = started(sequence, "endonerf").scene()
     found = evaluate(scene, sequence, networks=False)
     assert {"psnr_tissue", "depth_rmse_mm", "fps"} <= found.scores.keys()

@@ -14,7 +14,7 @@ from endoprior.cli import main
 from endoprior.cli.start_config import resume_command, start_config, typed
 from endoprior.core.checks import InputError
 from endoprior.model.presets import preset
-from endoprior.runs.stored_run import config_of_run, read_config
+from endoprior.runs.folder import config_of_run, read_config
 
 QUICK = [
     "--preset", "paper", "--seed", "3", "--init-budget", "200", "--schedule.coarse-iterations", "2",

@@ -16,9 +16,8 @@ from endoprior.core.config import DataConfig
 from endoprior.core.geometry import back_project, project
 from endoprior.core.types import Camera, RenderedView
 from endoprior.data import load_sequence
-from endoprior.evaluation.context import NO_SCENE, Evaluation, EvaluationContext
-from endoprior.evaluation.rendered import SceneFrames
-from endoprior.evaluation.scorers import right_eye
+from endoprior.evaluation.context import NO_SCENE, Evaluation, EvaluationContext, SceneFrames
+from endoprior.evaluation.scorers import other_views
 from endoprior.footage.right_view import NEAREST, measured_disparity, right_camera, right_disparity, warp_to_right
 from endoprior.phantom import PhantomConfig, write_phantom
 
@@ -242,7 +241,7 @@ def scored(sequence, render=None):
     """Scores, reasons, and the rows of frames. `render`: of a scene; None for rendered images only."""
     result = Evaluation({"split": "test"}, per_frame=[{"index": i} for i in sequence.indices("test")])
     reconstruction = SceneFrames(SimpleNamespace(render=render), sequence) if render else SimpleNamespace()
-    right_eye.compute(EvaluationContext(reconstruction, sequence, "test", False, None, result))
+    other_views.score_right_eye(EvaluationContext(reconstruction, sequence, "test", False, None, result))
     return result
 
 
@@ -268,7 +267,7 @@ def test_the_right_picture_itself_is_perfect_and_the_left_one_is_not(stereo):
 
 def test_the_perceptual_distance_is_of_the_same_pixels(stereo, monkeypatch):
     sequence, asked = load_sequence(stereo), []
-    monkeypatch.setattr(right_eye, "squeeze_distance", lambda context, name: lambda *args: asked.append(args) or 0.25)
+    monkeypatch.setattr(other_views, "squeeze_distance", lambda context, name: lambda *args: asked.append(args) or 0.25)
     gray = torch.full((128, 160, 3), 0.5)
     result = scored(sequence, lambda time, camera: RenderedView(gray, gray[..., 0], gray[..., 0]))
     ((view, true, counted),) = asked
@@ -306,7 +305,7 @@ def test_a_frame_without_tissue_has_a_reason(pair):
     for mask in (pair / "masks").glob("*.png"):
         assert cv2.imwrite(str(mask), np.full((40, 48), 255, np.uint8))
     result = scored(load_sequence(pair))
-    assert result.scores == {} and result.skipped["right_psnr_warp"] == right_eye.NO_TISSUE
+    assert result.scores == {} and result.skipped["right_psnr_warp"] == other_views.NO_RIGHT
 
 
 # --- training ---------------------------------------------------------------------------------------------------------

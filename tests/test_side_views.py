@@ -12,9 +12,8 @@ from endoprior.core.checks import InputError
 from endoprior.core.geometry import back_project, bilinear, project
 from endoprior.core.types import Camera, RenderedView
 from endoprior.data import load_sequence
-from endoprior.evaluation.context import Evaluation, EvaluationContext
-from endoprior.evaluation.rendered import SceneFrames
-from endoprior.evaluation.scorers import sides
+from endoprior.evaluation.context import Evaluation, EvaluationContext, SceneFrames
+from endoprior.evaluation.scorers import other_views
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.phantom.side_views import side_eyes
 
@@ -71,7 +70,7 @@ def scored(folder, render):
     result = Evaluation({"split": "test"}, per_frame=[{"index": 1}])
     reconstruction = SceneFrames.__new__(SceneFrames)
     object.__setattr__(reconstruction, "scene", scene)
-    sides.compute(EvaluationContext(reconstruction, sequence, "test", False, None, result))
+    other_views.score_sides(EvaluationContext(reconstruction, sequence, "test", False, None, result))
     return result.scores
 
 

@@ -41,7 +41,7 @@ PRINTS = {
     "render/trial.py",
 }  # fmt: skip
 """The console; a module below it; lines that are replaced on a terminal; a trial, which prints its answer."""
-NO_TORCH = ("priors", "data", "evaluation/metrics/stability.py", "phantom", "core", "footage", "check")
+NO_TORCH = ("priors", "data", "evaluation/scorers/depth.py", "phantom", "core", "footage", "check")
 
 
 @cache

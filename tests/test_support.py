@@ -12,7 +12,7 @@ from endoprior.core.geometry import project
 from endoprior.core.types import Camera, Frame
 from endoprior.model.scene import Scene
 from endoprior.model.support import WindowSupport, window_support
-from endoprior.visualization.support_map import SupportMap
+from endoprior.visualization.tissue_layers import SupportMap
 
 
 def frames_of(scene: Scene, masks: list[np.ndarray]) -> list[Frame]:

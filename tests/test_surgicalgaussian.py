@@ -12,7 +12,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
-from endoprior.evaluation import metrics
+from endoprior.evaluation.scorers import image as metrics
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.presets import preset
 from endoprior.training.density import DensityStats

@@ -19,7 +19,7 @@ from endoprior.data import load_sequence
 from endoprior.evaluation.scoring import evaluate
 from endoprior.model.presets import preset, preset_names
 from endoprior.runs.folder import CONFIG
-from endoprior.runs.mask_facts import MARGIN, mask_facts
+from endoprior.runs.log import MARGIN, mask_facts
 from endoprior.runs.train import start_run, train
 from endoprior.tool_masks.color_reach import LEAST_POINTS, MOST, WIDTH_PX, ColorReach, color_reach
 from endoprior.tool_masks.margin import away_from_tools, with_tool_margin

@@ -10,7 +10,7 @@ import pytest
 
 from endoprior.data.found_tools import FILE, FrameRow, drop_rows, mark_moving, read_rows, write_rows
 from endoprior.prepare.unmasked_motion import difference_from_background, frames_with_unmasked_motion, moves_unmasked
-from endoprior.runs.missed_tools import missed_tools_line
+from endoprior.runs.log import missed_tools_line
 
 SHAPE = (160, 200)
 VIEW = np.ones(SHAPE, bool)

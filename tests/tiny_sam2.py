@@ -17,7 +17,7 @@ def write_tiny_sam2(folder: Path, *, processor: bool = False) -> Path:
     import torch
 
     if find_spec("torchvision") is not None:
-        from endoprior.evaluation.metrics.torchvision_compat import import_torchvision
+        from endoprior.evaluation.networks import import_torchvision
 
         import_torchvision()
     from transformers import (

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from endoprior.runs.growth import Growth
+from endoprior.runs.log import Growth
 
 from .spec import Cell, MatchSpec, Spec
 

@@ -22,7 +22,7 @@ from endoprior.core.config_io import to_dict
 from endoprior.data.files import read_json
 from endoprior.evaluation.pictures import fingerprint
 from endoprior.evaluation.true_masks import SCORES_FILE
-from endoprior.runs.growth import Growth, growth_of
+from endoprior.runs.log import Growth, growth_of
 
 from .execute import Executor
 from .matched_count import Place, Search, search_thresholds

@@ -13,7 +13,7 @@ from endoprior.model.presets import PRESETS, preset, preset_names
 
 if TYPE_CHECKING:
     from endoprior.data import FrameSequence
-    from endoprior.evaluation.rendered import Reconstruction
+    from endoprior.evaluation.context import Reconstruction
     from endoprior.model.scene import Scene
 
 PICTURES = "pictures"

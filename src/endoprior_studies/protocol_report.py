@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from endoprior.evaluation.protocols.table import PROTOCOLS, SCORES
-from endoprior.evaluation.protocols.tags import KEYS
+from endoprior.evaluation.protocols.table import KEYS, PROTOCOLS, SCORES
 
 from .matrix import Matrix, scores_of
 from .results import Results

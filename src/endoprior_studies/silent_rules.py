@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from endoprior.runs.growth import growth_of
+from endoprior.runs.log import growth_of
 
 from .matrix import Matrix
 

@@ -85,7 +85,7 @@ def work(job: Job) -> None:
     from endoprior.evaluation.scoring import evaluate, scored_data
     from endoprior.evaluation.true_masks import SCORES_FILE
     from endoprior.model.scene import RenderedScene
-    from endoprior.runs.growth import growth_of
+    from endoprior.runs.log import growth_of
 
     from .method import PICTURES, method_named, origin_of
 

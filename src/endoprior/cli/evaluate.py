@@ -74,7 +74,7 @@ def run(argv: list[str]) -> None:
     """Score and print."""
     args = parse(Eval, argv, "eval", HELP)
     from ..evaluation.protocols.table import chosen_protocols
-    from ..runs.stored_run import sequence_of_run
+    from ..runs.folder import sequence_of_run
     from .output_paths import require_writable_folder
 
     if args.masks:
@@ -115,8 +115,7 @@ def evaluate_run(
     """
     from ..data import load_sequence
     from ..evaluation.scoring import evaluate, scored_data
-    from ..runs.growth import growth_of
-    from ..runs.mask_facts import mask_facts
+    from ..runs.log import growth_of, mask_facts
 
     sequence = load_sequence(data, scored_data(scene.config.data))
     result = evaluate(scene, sequence, split, networks=networks, weights_dir=weights_dir, protocols=protocols)

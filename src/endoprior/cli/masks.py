@@ -75,8 +75,7 @@ def _find_all(args: Masks) -> None:
     from ..data.mask_writing import note_found_masks, replace_masks, writable_masks
     from ..prepare.sam2 import open_sam2
     from ..tool_masks.mask_store import MaskStore
-    from ..visualization.image_tools import write_png
-    from ..visualization.mask_sheet import mask_sheet
+    from ..visualization.image_tools import mask_sheet, write_png
 
     sequence = load_sequence(args.data, DataConfig())
     writable_masks(sequence)
@@ -114,8 +113,7 @@ def _add_clicked(args: Masks) -> None:
     from ..data.mask_writing import replace_masks, writable_masks
     from ..tool_masks.clicked_tools import find_clicked, parse_click
     from ..tool_masks.mask_store import MaskStore
-    from ..visualization.image_tools import write_png
-    from ..visualization.mask_sheet import mask_sheet
+    from ..visualization.image_tools import mask_sheet, write_png
 
     sequence = load_sequence(args.data, DataConfig())
     writable_masks(sequence)

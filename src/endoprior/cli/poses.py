@@ -75,7 +75,7 @@ def run(argv: list[str]) -> None:
 
 def _say_errors(truth: Path, found: FolderPath) -> None:
     """Compare with the true path."""
-    from ..evaluation.metrics.trajectory import trajectory_errors
+    from ..evaluation.scorers.camera_path import trajectory_errors
     from ..prepare.camera_path.pose_file import read_poses
 
     true = read_poses(truth, len(found.camera_to_world))

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..evaluation.context import Evaluation
-from ..evaluation.protocols.table import SCORES
-from ..evaluation.protocols.tags import KEYS
+from ..evaluation.protocols.table import KEYS, SCORES
 
 OURS = "ours"
 COLUMNS = 3

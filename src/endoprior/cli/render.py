@@ -99,12 +99,11 @@ def render(scene: RenderedScene, args: Render) -> None:
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
     from ..model.highlights import without_highlights
-    from ..runs.stored_run import sequence_of_run
+    from ..runs.folder import sequence_of_run
     from ..system.atomic import removed_on_failure
     from ..visualization.camera_paths import read_path, sway_path, times_path
-    from ..visualization.carried_texture import write_texture_film
     from ..visualization.rendered_views import depth_span, write_views
-    from ..visualization.support_map import SupportMap, write_support_film
+    from ..visualization.tissue_layers import SupportMap, write_support_film, write_texture_film
 
     frames, sequence, total = None, None, len(scene.cameras)
     if bad := [t for t in args.times if not 0 <= t <= 1]:

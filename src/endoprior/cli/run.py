@@ -70,7 +70,7 @@ def run(argv: list[str]) -> None:
     from ..pipeline import STEPS, estimate, notes_of, open_folder, problems, run_step, seconds_if_moving
     from ..prepare.sam2 import is_sam2
     from ..runs import kernel_cache
-    from ..runs.missed_tools import missed_tools_line
+    from ..runs.log import missed_tools_line
 
     began = clock.perf_counter()
     job = job_of(args, say)

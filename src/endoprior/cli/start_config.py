@@ -27,7 +27,7 @@ def start_config(argv: Sequence[str]) -> tuple[PresetName, Config]:
         raise input_error("--preset", f"one of {', '.join(get_args(PresetName))}", repr(name), "`--preset default`.")
     if (file := typed(argv, "--config")) is None:
         return name, preset(name)
-    from ..runs.stored_run import read_config
+    from ..runs.folder import read_config
 
     return name, read_config(Path(file), preset(name))
 
@@ -43,7 +43,7 @@ def run_to_resume(data: Path, out: Path | None, argv: Sequence[str]) -> tuple[Pa
     Raises:
         InputError: `config.json` of the run cannot be used, or its sequence does not exist any more.
     """
-    from ..runs.stored_run import config_of_run, sequence_of_run
+    from ..runs.folder import config_of_run, sequence_of_run
 
     run = out or data
     # With both folders given, a run can be resumed that lost its config.json.

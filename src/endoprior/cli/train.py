@@ -113,7 +113,7 @@ def train_and_evaluate(
         ray: address of a Ray cluster that trains; None trains in this process.
     """
     from ..data import load_sequence
-    from ..runs.missed_tools import missed_tools_line
+    from ..runs.log import missed_tools_line
     from ..runs.remote import complete_on
     from ..runs.train import start_run
     from ..system.ray_cluster import connected
@@ -149,7 +149,7 @@ def train_and_evaluate(
 
 def _logged_seconds(log: Path) -> float:
     """Iterations per second: the reciprocal of the mean time of the logged iterations."""
-    from ..runs.folder import read_log
+    from ..runs.log import read_log
 
     seconds = [line["seconds"] for line in read_log(log, "seconds")]
     return len(seconds) / max(sum(seconds), 1e-9) if seconds else 0.0

@@ -72,7 +72,7 @@ def sequence_of(scene: RenderedScene, run: Path, data: Path | None, without: str
     """
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
-    from ..runs.stored_run import sequence_of_run
+    from ..runs.folder import sequence_of_run
 
     try:
         sequence = load_sequence(data or sequence_of_run(run), scored_data(scene.config.data))

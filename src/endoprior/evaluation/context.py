@@ -1,4 +1,4 @@
-"""What a scorer gets to see: the frames, the rendered frames, the scene if there is one, and where its scores go."""
+"""What is scored, and what a scorer gets to see: frames, rendered frames, the scene if any, and where scores go."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.checks import InputError
+from ..core.types import Camera
 from ..data import FrameList, FrameSequence, Split
 from ..model.scene import RenderedScene, Scene
 from ..system.atomic import write_json
-from .metrics import ScoreUnavailable, mean_over_frames
-from .rendered import Reconstruction, RenderedFrames, SceneFrames
+from ..system.memory import BoundedCache, cache_bytes
+from .score import ScoreUnavailable, mean_over_frames
 
 OUTLIER_DB = 3.0
 """A frame whose PSNR lies this far below the median of its split is an outlier."""
@@ -27,6 +29,107 @@ NETWORKS_OFF = "network scores were not asked for"
 NO_SCENE = "needs a scene; there are rendered images only"
 TOO_SLOW = "needs every frame of the video, which a radiance field renders for hours on a CPU"
 NO_GAUSSIANS = "needs the Gaussians of a scene; this one has none"
+NO_DEPTH = "needs depth, which was not rendered for every frame"
+Rendering = tuple[NDArray[np.float32], NDArray[np.float32] | None]
+"""Color (H, W, 3) in [0, 1], and depth (H, W) in mm as z, 0 where nothing is; None for no depth."""
+
+
+def to_uint8(color: NDArray) -> NDArray[np.uint8]:
+    """(H, W, 3) color as an 8-bit file stores it: clipped to [0, 1], times 255, halves rounded up."""
+    return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+class Reconstruction(Protocol):
+    """The result of a method, as it is scored. `SceneFrames` makes one of a scene.
+
+    It may have an attribute `provenance`, a dict in JSON's types, which is saved in `metrics.json` beside the scores.
+    """
+
+    def render(self, index: int) -> Rendering:
+        """Frame `index` of the sequence, 0-based, at its time and from its camera, without tool.
+
+        Raises:
+            ScoreUnavailable: there is no such image; scores that need it are skipped with this reason.
+        """
+        ...
+
+
+class SceneFrames:
+    """A scene, rendered at the times and from the cameras of a sequence."""
+
+    def __init__(self, scene: RenderedScene, sequence: FrameSequence) -> None:
+        """Args: scene: what to render. sequence: times and cameras."""
+        self.scene, self._sequence = scene, sequence
+
+    def render(self, index: int) -> Rendering:
+        """See `Reconstruction.render`."""
+        frame = self._sequence.frame(index)
+        out = self.scene.render(frame.time, frame.camera)
+        return out.color.cpu().numpy(), out.depth.cpu().numpy()
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """One rendered frame."""
+
+    color: NDArray[np.float32] | None
+    """(H, W, 3) in [0, 1], not rounded; kept for frames of the split only."""
+    rgb_u8: NDArray[np.uint8]
+    """(H, W, 3) rounded to 8 bits: what the published protocol scores."""
+    rendered_depth: NDArray[np.float32] | None
+    """(H, W) z, mm; None if there is none."""
+
+    @property
+    def rgb(self) -> NDArray[np.float32]:
+        """(H, W, 3) `rgb_u8` in [0, 1]."""
+        return self.rgb_u8 / np.float32(255)
+
+    @property
+    def depth(self) -> NDArray[np.float32]:
+        """(H, W) z, mm; of a scene the sum of weight * z.
+
+        Raises:
+            ScoreUnavailable: no depth was rendered.
+        """
+        if self.rendered_depth is None:
+            raise ScoreUnavailable(NO_DEPTH)
+        return self.rendered_depth
+
+    @property
+    def nbytes(self) -> int:
+        """Memory it takes."""
+        return sum(array.nbytes for array in (self.color, self.rgb_u8, self.rendered_depth) if array is not None)
+
+
+class RenderedFrames:
+    """Rendered frames by index: each is rendered when first asked for, and kept as memory allows."""
+
+    def __init__(self, reconstruction: Reconstruction, sequence: FrameSequence, split: Split) -> None:
+        """Args: sequence: size of the frames. split: frames that keep their unrounded color."""
+        self._reconstruction, self._sequence = reconstruction, sequence
+        self._scored = set(sequence.indices(split))
+        self._cache: BoundedCache[RenderedFrame] = BoundedCache(cache_bytes(), lambda rendered: rendered.nbytes)
+
+    def __getitem__(self, index: int) -> RenderedFrame:
+        return self._cache.get(index, lambda: self._render(index))
+
+    def _render(self, index: int) -> RenderedFrame:
+        color, depth = self._reconstruction.render(index)
+        if problem := _problem(color, depth, self._sequence.camera(index)):
+            maker = type(self._reconstruction).__name__
+            raise InputError(f"{maker}.render({index}): {problem}. Fix: Correct the method that returned it.")
+        return RenderedFrame(color if index in self._scored else None, to_uint8(color), depth)
+
+
+def _problem(color: NDArray, depth: NDArray | None, camera: Camera) -> str:
+    """What is wrong with a rendered frame; empty if nothing is."""
+    size = (camera.height, camera.width)
+    for name, array, shape in (("color", color, (*size, 3)), ("depth", depth, size)):
+        if array is not None and (array.shape != shape or array.dtype != np.float32):
+            return f"expected {name} of shape {shape} and type float32, got {array.shape} and {array.dtype}"
+    if not (color.min() >= 0 and color.max() <= 1):  # NaN fails too
+        return f"expected color in [0, 1], got {color.min():g} to {color.max():g}"
+    return ""
 
 
 @dataclass
@@ -138,7 +241,7 @@ class EvaluationContext:
         return self.rendered_scene
 
     def add(self, name: str, value: float, reason: str = "not finite") -> None:
-        """Record a score, or `reason` where it is not finite; an int stays one."""
+        """See `Evaluation.add`."""
         self.result.add(name, value, reason)
 
     def skip(self, name: str, reason: str) -> None:
@@ -150,11 +253,10 @@ class EvaluationContext:
         self.add(name, mean_over_frames(values), EXACT if math.inf in values else reason)
 
     def add_frames(self, rows: Sequence[dict[str, float]], reason: str) -> None:
-        """Record scores that every frame has: finite values in `per_frame`, their mean as the score.
+        """Record scores that every frame has: finite values in `per_frame`, their mean, or `reason`, as the score.
 
         Args:
             rows: one value by score name for each frame of the split.
-            reason: of a score without a finite value.
         """
         for stored, row in zip(self.result.per_frame, rows, strict=True):
             stored |= {name: float(value) for name, value in row.items() if math.isfinite(value)}

@@ -5,8 +5,8 @@ Shared letters: `H, W` image size. Masks are (H, W), True on tools; `counted` is
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
 
 import cv2
 import numpy as np
@@ -83,80 +83,50 @@ NO_VALUE = {
 """Why a score has no value."""
 
 
-@dataclass(frozen=True)
-class MaskCounts:
-    """Numbers of pixels in one frame, or in several frames added up."""
-
-    tool: int = 0
-    """True tool."""
-    hit: int = 0
-    """True tool that is marked."""
-    false_beside_tool: int = 0
-    """Marked, but no tool, in frames that show a tool."""
-    false_without_tool: int = 0
-    """Marked in frames that show no tool."""
-    view_without_tool: int = 0
-    """Pixels that count, in frames that show no tool."""
-    outline: int = 0
-    """Outline of what is marked ..."""
-    outline_hit: int = 0
-    """... near the true one."""
-    true_outline: int = 0
-    """Outline of the true tool ..."""
-    true_outline_hit: int = 0
-    """... near that of what is marked."""
-    tip: int = 0
-    """True tips."""
-    tip_hit: int = 0
-    """True tips that are marked."""
-
-    def __add__(self, other: MaskCounts) -> MaskCounts:
-        """The counts of both."""
-        return MaskCounts(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
-
-    def scores(self) -> dict[str, float]:
-        """The value of each of `SCORES`; NaN where there is none (`NO_VALUE`)."""
-        false = self.false_beside_tool + self.false_without_tool
-        return {
-            "mask_iou": _ratio(self.hit, self.tool + false),
-            "missed_area": _ratio(self.tool - self.hit, self.tool),
-            "false_area": _ratio(self.false_beside_tool, self.tool),
-            "false_share_of_view": _ratio(self.false_without_tool, self.view_without_tool),
-            "boundary_f1": self._boundary_f1(),
-            "missed_tips": _ratio(self.tip - self.tip_hit, self.tip),
-        }
-
-    def _boundary_f1(self) -> float:
-        """0 where only one of the masks has an outline."""
-        if not self.outline and not self.true_outline:
-            return float("nan")
-        precision = self.outline_hit / max(self.outline, 1)
-        recall = self.true_outline_hit / max(self.true_outline, 1)
-        return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
-
-
-def count(found: Mask, truth: Mask, counted: Mask) -> MaskCounts:
-    """Compare the mask of one frame with the true one.
+def count(found: Mask, truth: Mask, counted: Mask) -> Counter[str]:
+    """Compare the mask of one frame with the true one. Counts of several frames can be added.
 
     Args:
         found, truth, counted: (H, W).
+    Returns:
+        Numbers of pixels: true tools (`tool`), their outline and tips (`true_outline`, `tip`), `outline` of what is
+        marked; `_hit`, those of them that are marked, or outlines near the other one; `false_beside_tool` and
+        `false_without_tool`, marked, but no tool, in frames that show one and in others; `view_without_tool`, all that
+        count in the others.
     """
     found, truth = found & counted, truth & counted
-    tool, false = int(truth.sum()), int((found & ~truth).sum())
     outline, true_outline, tip = boundary(found, counted), boundary(truth, counted), tips(truth, counted)
-    return MaskCounts(
-        tool=tool,
-        hit=int((found & truth).sum()),
-        false_beside_tool=false if tool else 0,
-        false_without_tool=0 if tool else false,
-        view_without_tool=0 if tool else int(counted.sum()),
-        outline=int(outline.sum()),
-        outline_hit=int((outline & near(true_outline)).sum()),
-        true_outline=int(true_outline.sum()),
-        true_outline_hit=int((true_outline & near(outline)).sum()),
-        tip=int(tip.sum()),
-        tip_hit=int((tip & found).sum()),
-    )
+    pixels = {
+        "tool": truth,
+        "hit": found & truth,
+        "outline": outline,
+        "outline_hit": outline & near(true_outline),
+        "true_outline": true_outline,
+        "true_outline_hit": true_outline & near(outline),
+        "tip": tip,
+        "tip_hit": tip & found,
+    }
+    if truth.any():
+        pixels["false_beside_tool"] = found & ~truth
+    else:
+        pixels |= {"false_without_tool": found, "view_without_tool": counted}
+    return Counter({name: int(mask.sum()) for name, mask in pixels.items()})
+
+
+def scores_of(pixels: Counter[str]) -> dict[str, float]:
+    """The value of each of `SCORES` by `count`; NaN where there is none (`NO_VALUE`)."""
+    tool, beside, without = (pixels[name] for name in ("tool", "false_beside_tool", "false_without_tool"))
+    precision = pixels["outline_hit"] / max(pixels["outline"], 1)
+    recall = pixels["true_outline_hit"] / max(pixels["true_outline"], 1)
+    f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+    return {
+        "mask_iou": _ratio(pixels["hit"], tool + beside + without),
+        "missed_area": _ratio(tool - pixels["hit"], tool),
+        "false_area": _ratio(beside, tool),
+        "false_share_of_view": _ratio(without, pixels["view_without_tool"]),
+        "boundary_f1": f1 if pixels["outline"] or pixels["true_outline"] else float("nan"),
+        "missed_tips": _ratio(pixels["tip"] - pixels["tip_hit"], pixels["tip"]),
+    }
 
 
 def counted_pixels(images: Sequence[NDArray[np.uint8]], always_masked: Mask) -> Mask:

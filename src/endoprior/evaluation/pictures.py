@@ -17,8 +17,8 @@ from ..data.files import entries, files_with
 from ..data.frame_files import HINT, match_names
 from ..data.images import decode_image, describe_pixels, single_channel
 from ..data.reading import kind_of
-from .metrics import ScoreUnavailable
-from .rendered import Rendering
+from .context import Rendering
+from .score import ScoreUnavailable
 
 FULL_SCALE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.geometry import back_project, bilinear, cells_at, project
+from ..core.geometry import back_project, bilinear, camera_to_world, cells_at, project
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, gray_for_flow
@@ -20,7 +20,7 @@ from ..model.carry import carry_points
 from ..model.scene import Scene
 from ..model.surface import project_visible, render_surface, shown_pixels
 from ..system.memory import workers
-from .metrics import ScoreUnavailable
+from .score import ScoreUnavailable
 
 RETURN_PX, RETURN_SHARE = 1.0, 0.05
 """Chained flow loses a point where flow and backward flow disagree by more than this, plus this share of the step."""
@@ -145,7 +145,7 @@ def _in_frames(world: NDArray[np.floating], sequence: FrameSequence) -> Predicte
 
 def _world_starts(true: TrueTracks, sequence: FrameSequence) -> NDArray[np.float64]:
     """(P, 3) world position of each point in the frame it starts in, mm."""
-    to_world = np.stack([np.linalg.inv(sequence.camera(i).world_to_camera) for i in range(len(sequence))])[true.first]
+    to_world = camera_to_world(sequence.camera(i) for i in range(len(sequence)))[true.first]
     return np.einsum("pij,pj->pi", to_world[:, :3, :3], true.at_start(true.points)) + to_world[:, :3, 3]
 
 

@@ -17,19 +17,13 @@ if TYPE_CHECKING:
 
 SCORERS = (
     "image",
-    "seams",
     "depth",
-    "flow",
-    "color",
+    "motion",
     "lpips",
-    "stability",
-    "primitives",
-    "behind_tool",
-    "sides",
-    "right_eye",
+    "other_views",
     "tracks",
     "camera_path",
-    "speed",
+    "model",
 )
 """Modules of `scorers/`, in the order in which they run. Each has `SCORES` and `compute(context)`."""
 
@@ -54,8 +48,7 @@ def _problem(found: Any) -> str:
         return f"SCORES of type {type(scores).__name__}"
     if not callable(getattr(found, "compute", None)):
         return "no function compute"
-    names = {score.name for name in SCORERS for score in _builtin(name).SCORES} | _mask_scores().keys()
-    again = [score.name for score in scores if score.name in names]
+    again = [score.name for score in scores if score.name in _builtin_scores()]
     return f"another score {again[0]}, which is built in" if again else ""
 
 
@@ -87,9 +80,10 @@ def scorers() -> dict[str, Scorer]:
 
 @cache
 def all_scores() -> dict[str, Score]:
-    """Every score by name: those of scenes, then those of tool masks, which need no scene."""
-    return {score.name: score for scorer in scorers().values() for score in scorer.SCORES} | _mask_scores()
+    """Every score by name: those of scenes, those of tool masks, which need no scene, and those of plugins."""
+    return _builtin_scores() | {score.name: score for scorer in scorers().values() for score in scorer.SCORES}
 
 
-def _mask_scores() -> dict[str, Score]:
-    return {score.name: score for score in import_module(".mask_scores", __package__).SCORES}
+def _builtin_scores() -> dict[str, Score]:
+    modules = [*map(_builtin, SCORERS), import_module(".mask_scores", __package__)]
+    return {score.name: score for module in modules for score in module.SCORES}

@@ -1,15 +1,33 @@
-"""What is known of a score before it is computed: its name, its unit, and which way is better."""
+"""What every score has: name, unit, which way is better; and what it is when it cannot be computed."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args
+
+import numpy as np
 
 from ..core.geometry import length_unit
 
 Group = Literal["image", "depth", "motion", "model", "speed", "masks", "other"]
 GROUPS: tuple[Group, ...] = get_args(Group)
 """What a score is about, in the order of the printed table."""
+
+
+class ScoreUnavailable(RuntimeError):
+    """A score cannot be computed here; the text is the one-line reason to report instead."""
+
+
+def mean_over_frames(values: Iterable[float]) -> float:
+    """Mean of the finite values; NaN when there is none.
+
+    NaN marks a frame on which the score is undefined (no tissue, no depth, no tool). Infinity is the PSNR of two equal
+    images; it is ignored too, because one such frame would hide all others.
+    """
+    array = np.asarray(list(values), dtype=np.float64)
+    finite = array[np.isfinite(array)]
+    return float(finite.mean()) if finite.size else float("nan")
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,12 @@ from ..core.config import DataConfig
 from ..data import FrameSequence, Split
 from ..model.scene import RenderedScene
 from ..system.devices import name_of
-from .context import Evaluation, EvaluationContext
-from .metrics import ScoreUnavailable
-from .protocols.compute import score_protocols
+from .context import Evaluation, EvaluationContext, Reconstruction, SceneFrames
+from .protocols.compute import score_protocols, tags_of
 from .protocols.table import OURS
-from .protocols.tags import tags_of
 from .registry import REGISTRY, SCORERS, Scorer, scorers
-from .rendered import Reconstruction, SceneFrames
-from .scorers.speed import FPS_RENDERS, LONGEST_SECONDS
+from .score import ScoreUnavailable
+from .scorers.model import FPS_RENDERS, LONGEST_SECONDS
 
 
 def evaluate(
@@ -77,14 +75,11 @@ def evaluate(
 
 def _compute(name: str, scorer: Scorer, context: EvaluationContext) -> None:
     """Run a scorer. An error in a plugin costs its own scores only."""
-    if name in SCORERS:
-        scorer.compute(context)
-        return
     try:
         scorer.compute(context)
-    except ScoreUnavailable:
-        raise
     except Exception as error:
+        if name in SCORERS or isinstance(error, ScoreUnavailable):
+            raise
         raise ScoreUnavailable(REGISTRY.failure(name, error)) from error
 
 

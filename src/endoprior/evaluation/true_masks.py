@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +21,8 @@ from ..data.images import read_color
 from ..data.mask_files import MASK_SUFFIXES, demand_known, read_user_mask, rule_of_files, tool_polarity
 from ..data.reading import kind_of
 from ..system.atomic import write_json
-from .mask_scores import NO_VALUE, TIP, TOLERANCE, MaskCounts, count, counted_pixels
+from .context import Evaluation
+from .mask_scores import NO_VALUE, TIP, TOLERANCE, count, counted_pixels, scores_of
 from .pictures import fingerprint, frames_of_files
 
 SCORES_FILE = "mask_scores.json"
@@ -117,17 +117,8 @@ def _thumbnail(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     return cv2.resize(image, (64, 48), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-@dataclass
-class MaskEvaluation:
-    """Scores of the masks of one sequence."""
-
-    protocol: dict[str, Any]
-    scores: dict[str, float]
-    """By name, of the pixels of all scored frames together."""
-    skipped: dict[str, str]
-    """Why a score has no value, by name."""
-    per_frame: list[dict[str, Any]]
-    """One row for each scored frame: `index`, `time`, and the scores that have a value there."""
+class MaskEvaluation(Evaluation):
+    """Scores of the masks of one sequence: of the pixels of all frames together that have a true mask, and of each."""
 
     def save(self, folder: Path) -> Path:
         """Write `mask_scores.json` and `mask_scores_per_frame.json`; returns the first."""
@@ -150,12 +141,12 @@ def score_masks(sequence: FrameSequence, truth: TrueMasks) -> MaskEvaluation:
         always_true &= truth.tool(index)
     samples = [sequence.frame(index).rgb_u8 for index in spread(len(sequence), SAMPLES)]
     counted = counted_pixels(samples, always_found | always_true)
-    total, tools, rows = MaskCounts(), 0, []
+    total, tools, rows = Counter[str](), 0, []
     for index in truth.indices:
         counts = count(~sequence.frame(index).tissue_mask, truth.tool(index), counted)
-        values = {name: value for name, value in counts.scores().items() if math.isfinite(value)}
+        values = {name: value for name, value in scores_of(counts).items() if math.isfinite(value)}
         rows.append({"index": index, "time": index / len(sequence)} | values)
-        total, tools = total + counts, tools + bool(counts.tool)
+        total, tools = total + counts, tools + bool(counts["tool"])
     protocol = {
         "data": str(sequence.path.resolve()),
         "data_fingerprint": sequence.fingerprint(),
@@ -169,6 +160,7 @@ def score_masks(sequence: FrameSequence, truth: TrueMasks) -> MaskEvaluation:
         "boundary_tolerance_px": float(TOLERANCE * np.hypot(*shape)),
         "tip": f"distance from the edge inside the tool, at least {TIP:g} of the largest",
     }
-    scores = total.scores()
-    skipped = {name: NO_VALUE[name] for name, value in scores.items() if not math.isfinite(value)}
-    return MaskEvaluation(protocol, {n: v for n, v in scores.items() if n not in skipped}, skipped, rows)
+    result = MaskEvaluation(protocol, per_frame=rows)
+    for name, value in scores_of(total).items():
+        result.add(name, value, NO_VALUE[name])
+    return result

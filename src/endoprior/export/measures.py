@@ -16,7 +16,7 @@ from ..model.scene import Scene
 from ..model.surface import render_surface
 from ..model.surface_motion import SurfaceMotion
 from ..system.atomic import whole_folder
-from ..visualization.measures import displacement_span, measures_csv, stretch_span, value_colors
+from ..visualization.measures import MeasuresFigure, displacement_span, measures_csv, stretch_span, value_colors
 from .axes import points_in_axes
 from .formats import Axes, Format, Progress
 from .mesh import Mesh, depth_grid
@@ -36,8 +36,6 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         InputError: a frame is not in the sequence, the file of points cannot be read, or a point or the whole frame
             shows no surface.
     """
-    from ..visualization.measures_figure import MeasuresFigure  # Matplotlib takes long to import
-
     last = len(scene.cameras) - 1
     since, until = options.from_frame, last if options.to_frame is None else options.to_frame
     for name, frame in (("--from-frame", since), ("--to-frame", until)):

@@ -12,7 +12,7 @@ from ..core.checks import InputError
 from ..prepare.pipeline import Progress
 from ..render import ON_GPU
 from ..runs.remote import RESTARTS, Training, start_training_on, trainings
-from ..runs.windowed_run import WindowedRun
+from ..runs.training_run import WindowedRun
 from ..system.atomic import write_text
 from ..system.ray_cluster import Cluster
 from ..system.threads import Threads

@@ -16,7 +16,7 @@ from typing import TypeVar
 from ..core.config import Config
 from ..data import load_sequence
 from ..data.window_plan import windows_by_length
-from ..evaluation.scorers.speed import FPS_RENDERS, FPS_WARM_UP
+from ..evaluation.scorers.model import FPS_RENDERS, FPS_WARM_UP
 from ..evaluation.scoring import evaluate, scored_data
 from ..model.method import method_of
 from ..prepare import prepare

@@ -26,11 +26,10 @@ from ..model.scene_file import load_scene
 from ..prepare import prepare
 from ..prepare.pipeline import Progress
 from ..runs.folder import CHECKPOINT, CONFIG
-from ..runs.mask_facts import mask_facts
+from ..runs.log import mask_facts
 from ..runs.report import write_report
 from ..runs.train import start_run
-from ..runs.training_run import TrainingRun
-from ..runs.windowed_run import WindowedRun
+from ..runs.training_run import TrainingRun, WindowedRun
 from ..system.atomic import write_json
 from ..visualization.image_tools import colorize, label, tile, to_u8
 from ..visualization.rendered_views import depth_span

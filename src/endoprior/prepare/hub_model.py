@@ -82,8 +82,8 @@ def _import_transformers(option: str, extra: str, class_name: str) -> ModuleType
     """The transformers library, in which the class can be imported; InputError if it cannot, or is too old."""
     if find_spec("torchvision") is not None:
         # transformers imports torchvision if it is installed, even one that does not fit the installed torch.
-        from ..evaluation.metrics.torchvision_compat import import_torchvision
-        from ..evaluation.metrics.weights import ScoreUnavailable
+        from ..evaluation.networks import import_torchvision
+        from ..evaluation.score import ScoreUnavailable
 
         with suppress(ScoreUnavailable):
             import_torchvision()

@@ -1,9 +1,12 @@
-"""The state of a training run as one safetensors file: written whole, named, versioned, no pickle."""
+"""The state of a training run as one safetensors file, and when it is written: at intervals, and before it stops."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import signal
+import time as clock
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,14 +14,61 @@ from ..core.checks import InputError
 from ..core.config_io import to_dict
 from ..model.hexplane import TOUCHED
 from ..system.arrays_file import ArraySpec, load_arrays, rejecting, save_arrays
-from ..training.stage import Stage, stage_length
+from ..system.signals import handled_by
+from ..training.stage import Stage, StepReport, stage_length
 from ..training.trainer import Trainer
-from .identity import reject_other_run
+from .folder import reject_other_run
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 FORMAT = "endoprior-checkpoint-1"
+CHECKPOINT_SECONDS = 60.0
+"""Longest time of work that a crash can cost, besides the iteration in progress, unless told otherwise."""
+CHECKPOINT_SHARE = 0.05
+"""Share of the time that writing checkpoints may take: large states are written less often."""
+
+
+class CheckpointWriter:
+    """Writes a checkpoint every `seconds`, and before an interruption takes effect."""
+
+    def __init__(self, path: Path, fingerprint: str, seconds: float, interrupted: Callable[[], bool]) -> None:
+        """Args: fingerprint: of the sequence. interrupted: whether the user asked to stop."""
+        self._path, self._fingerprint, self._seconds, self._interrupted = path, fingerprint, seconds, interrupted
+        self._due_at = clock.monotonic() + seconds
+
+    def __call__(self, report: StepReport, trainer: Trainer) -> None:
+        """See `Observer`.
+
+        Raises:
+            KeyboardInterrupt: the user asked to stop; the checkpoint has been written.
+        """
+        stop, began = self._interrupted(), clock.monotonic()
+        if stop or began >= self._due_at:
+            trainer.synchronize()
+            save_checkpoint(trainer, self._path, self._fingerprint)
+            now = clock.monotonic()
+            self._due_at = now + max(self._seconds, (now - began) / CHECKPOINT_SHARE)
+        if stop:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Hold back Ctrl-C and the signals of schedulers and closing terminals until an iteration is complete.
+
+    Yields a function that says whether to stop. A second Ctrl-C stops at once.
+    """
+    pressed = False
+
+    def note(signum: int, frame: Any) -> None:
+        nonlocal pressed
+        if pressed and signum == signal.SIGINT:
+            raise KeyboardInterrupt
+        pressed = True
+
+    with handled_by(note):
+        yield lambda: pressed
 
 
 def save_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
@@ -64,10 +114,8 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
         before = stage_length(cfg, Stage.COARSE) if stage is Stage.FINE else 0  # a method may keep its optimizer
         check_state(arrays, before + iteration)
         num_frames = len(trainer.sequence.indices("train"))
-        axes = {name: spec.shape.index("F") for name, spec in trainer.schema().items() if "F" in spec.shape}
-        counts = {name: arrays[name].shape[axis] for name, axis in axes.items()}
-        for name, got in counts.items():
-            if got != num_frames:
+        for name, spec in trainer.schema().items():
+            if "F" in spec.shape and (got := arrays[name].shape[spec.shape.index("F")]) != num_frames:
                 raise InputError(f"expected {num_frames} training frames in {name}; got {got}.")
     trainer.restore(stage, iteration, arrays)
 

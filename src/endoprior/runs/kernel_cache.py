@@ -3,6 +3,8 @@
 The code that Numba compiles in a process is not always the code that it loads from its cache in the next one: parallel
 loops are optimized once more when they are linked for the cache, and sums that may be reordered then differ in their
 last bits. A run and its repetition, or its resumed part, must not use both (docs/log.md).
+
+`python -m endoprior.runs.kernel_cache < config.json` compiles every kernel by training and scoring something tiny.
 """
 
 from __future__ import annotations
@@ -14,11 +16,16 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from ..core.config import Config
 from ..core.config_io import to_dict
-from ..model.method import method_of
+from ..core.types import Camera, Frame
+from ..data import FrameSequence
+from ..model.method import config_from, method_of
 from ..render import ON_GPU
 from ..system.file_lock import exclusive
 from ..system.own_python import python_command
@@ -26,6 +33,8 @@ from ..system.own_python import python_command
 PACKAGE = Path(__file__).parents[1]
 LIMIT_S = 900.0
 """Longest time to wait, s; then, or when the process fails, kernels are compiled when they are first used."""
+WIDTH, HEIGHT, FRAMES = 64, 48, 10
+"""Size of what is trained to compile, px, and its number of frames."""
 _filled: set[str] = set()
 
 
@@ -51,7 +60,7 @@ def fill(cfg: Config, say: Callable[[str], None] = lambda text: None) -> None:
                 return
             say("compiling kernels, once after installation (about a minute)")
             config = json.dumps(to_dict(cfg))
-            words = python_command("endoprior.runs.warm_up")
+            words = python_command("endoprior.runs.kernel_cache")
             done = subprocess.run(words, input=config.encode(), capture_output=True, timeout=LIMIT_S, check=False)
             if done.returncode == 0:
                 marker.touch()
@@ -78,3 +87,48 @@ def _cache_folder() -> Path:
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(given)
     return PACKAGE / "__pycache__" if os.access(PACKAGE, os.W_OK) else Path.home() / ".cache" / "endoprior"
+
+
+def tiny_sequence() -> FrameSequence:
+    """A sequence made in memory: textured, moving, with a tool and with missing depth."""
+    camera = Camera(WIDTH, HEIGHT, 60.0, 60.0, WIDTH / 2, HEIGHT / 2, np.eye(4))
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+
+    def read_frame(index: int) -> Frame:
+        shift = 2 * np.sin(index)
+        waves = [np.sin((0.3 + 0.1 * c) * (x + shift)) * np.cos((0.2 + 0.1 * c) * y) for c in range(3)]
+        rgb_u8 = np.clip(128 + 90 * np.stack(waves, -1), 0, 255).astype(np.uint8)
+        depth = (50 + 3 * np.sin(0.1 * (x + shift))).astype(np.float32)
+        valid, tissue = depth > 48, ~((x > 40) & (abs(y - 24) < 6))
+        return Frame(index, index / FRAMES, camera, rgb_u8, tissue, np.where(valid, depth, 0), valid)
+
+    return FrameSequence(Path("warm-up"), [camera] * FRAMES, read_frame)
+
+
+def shortened(cfg: Config) -> Config:
+    """The config with a few iterations in which everything runs: stages, growth, temporal term, half resolution."""
+    return replace(
+        cfg,
+        data=replace(cfg.data, eyes="left"),
+        init=replace(cfg.init, budget=400, cleanup=False, erosion_px=3),
+        schedule=replace(cfg.schedule, coarse_iterations=2, fine_iterations=8, half_resolution_iterations=1),
+        density=replace(cfg.density, start_iteration=0, every=3, grow_threshold=1e-7),
+        temporal=replace(cfg.temporal, start_iteration=2, min_points=8, min_valid=0),
+        loss=replace(cfg.loss, min_depth_pixels=1),
+    )
+
+
+def main() -> None:
+    """Read the config, train, score."""
+    from ..evaluation.scoring import evaluate  # which takes long to import
+
+    cfg, sequence = shortened(config_from(json.load(sys.stdin))), tiny_sequence()
+    trainer = method_of(cfg).trainer(sequence, cfg)
+    trainer.start()
+    while not trainer.finished:
+        trainer.step()
+    evaluate(trainer.scene(), sequence, networks=False)
+
+
+if __name__ == "__main__":
+    main()

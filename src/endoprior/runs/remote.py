@@ -15,10 +15,9 @@ from ..model.windowed_scene import window_file
 from ..render import ON_GPU
 from ..system.ray_cluster import Cluster
 from ..system.threads import Threads
+from .checkpoint import CHECKPOINT_SECONDS
 from .folder import CONFIG, SCENE
-from .observers import CHECKPOINT_SECONDS
-from .training_run import TrainingRun
-from .windowed_run import WindowedRun, window_config
+from .training_run import TrainingRun, WindowedRun, window_config
 
 RESTARTS = 3
 """How often a training is resumed after its process died: a machine may be lost, or memory run out."""
@@ -68,20 +67,16 @@ def trainings(run: TrainingRun | WindowedRun, checkpoint_seconds: float = CHECKP
     assert run.out is not None, "other machines need a folder"
     out, threads = run.out.absolute(), Threads.of_this_process()
     if isinstance(run, TrainingRun):
-        sequence, cfg = run.trainer.sequence, run.trainer.cfg
-        data = sequence.path.absolute()
-        return [Training("the whole sequence", data, cfg, out, run.resume, threads, checkpoint_seconds)]
+        sequence, parts = run.trainer.sequence, [("the whole sequence", run.trainer.cfg, out, run.resume)]
+    else:
+        sequence = run.sequence
+        parts = [
+            (run.window_name(k), window_config(run.cfg, *run.plan[k]), window_file(out / SCENE, k).parent, False)
+            for k in run.waiting(out)
+        ]
+    data = sequence.path.absolute()
     return [
-        Training(
-            name=run.window_name(k),
-            data=run.sequence.path.absolute(),
-            cfg=window_config(run.cfg, *run.plan[k]),
-            folder=window_file(out / SCENE, k).parent,
-            resume=False,
-            threads=threads,
-            checkpoint_seconds=checkpoint_seconds,
-        )
-        for k in run.waiting(out)
+        Training(name, data, cfg, folder, resume, threads, checkpoint_seconds) for name, cfg, folder, resume in parts
     ]
 
 

@@ -19,12 +19,11 @@ from ..model.scene import Scene
 from ..priors import joint_texture_prior
 from ..system.atomic import whole_file
 from ..visualization.camera_paths import tissue_distance, turned
-from ..visualization.carried_texture import PaintedTissue
 from ..visualization.image_tools import colorize, to_u8
 from ..visualization.rendered_views import depth_span
-from ..visualization.support_map import SupportMap
-from .folder import LOG, read_log
-from .observers import LOG_EVERY
+from ..visualization.tissue_layers import PaintedTissue, SupportMap
+from .folder import LOG
+from .log import LOG_EVERY, read_log
 
 SHOWN_SCORES = (
     "psnr_tissue",

@@ -17,11 +17,10 @@ from ..model.scene import RenderedScene
 from ..system.console import complain
 from ..training.ignored_options import note_on_budget, reject_ignored_options
 from ..training.trainer import Observer
-from .observers import CHECKPOINT_SECONDS
+from .checkpoint import CHECKPOINT_SECONDS
+from .folder import config_of_run, sequence_of_run
 from .progress import is_watched, training_progress
-from .stored_run import config_of_run, sequence_of_run
-from .training_run import TrainingRun
-from .windowed_run import WindowedRun
+from .training_run import TrainingRun, WindowedRun
 
 log = logging.getLogger(__name__)
 

@@ -1,7 +1,8 @@
-"""Helpers for images: color maps, labels, tiling, PNG files."""
+"""Helpers for images: color maps, labels, tiling, sheets of frames with their masks, PNG files."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,8 @@ from ..system.atomic import whole_file
 
 SOLID_ALPHA = 0.5
 """There is no surface where alpha is lower."""
+MASK_COLOR = (0, 200, 255)
+"""RGB of masks: cyan, which tissue never has."""
 
 
 def write_png(path: Path, rgb_u8: NDArray[np.uint8]) -> None:
@@ -56,3 +59,25 @@ def tile(images: list[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
     padded = images + [blank] * (-len(images) % columns)
     rows = [np.concatenate(padded[i : i + columns], 1) for i in range(0, len(padded), columns)]
     return np.concatenate(rows, 0)
+
+
+def mask_sheet(
+    frames: Sequence[tuple[NDArray[np.uint8], NDArray[np.bool_], str]], columns: int, width_px: int
+) -> NDArray[np.uint8]:
+    """Frames with their masks tinted and outlined.
+
+    Args:
+        frames: image (H, W, 3), mask (H, W), text in its corner.
+        width_px: of a frame on the sheet.
+    Returns:
+        (rows * h, columns * width_px, 3).
+    """
+    tiles = []
+    for rgb_u8, mask, text in frames:
+        size = (width_px, round(rgb_u8.shape[0] * width_px / rgb_u8.shape[1]))
+        image = cv2.resize(rgb_u8, size, interpolation=cv2.INTER_AREA)
+        tool = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        image[tool > 0] = (0.6 * image[tool > 0] + 0.4 * np.array(MASK_COLOR)).astype(np.uint8)
+        outlines, _ = cv2.findContours(tool, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        tiles.append(label(cv2.drawContours(image, outlines, -1, MASK_COLOR, 1), text))
+    return tile(tiles, columns)

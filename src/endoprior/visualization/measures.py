@@ -1,4 +1,4 @@
-"""Measures over time for people and spreadsheets: a CSV table, and the color scales of the surface maps."""
+"""Measures over time for people and spreadsheets: a CSV table, maps of the surface, curves."""
 
 from __future__ import annotations
 
@@ -6,12 +6,18 @@ import csv
 import io
 import math
 from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.measures import Measures
+from ..system.atomic import whole_file
 from .image_tools import colorize
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 UNKNOWN_GRAY = 128
 LEAST_DISPLACEMENT, LEAST_STRETCH = 1e-3, 0.05
@@ -71,3 +77,79 @@ def measures_csv(found: Measures, frames_per_second: float, unit: str, confidenc
 
 def _texts(values: NDArray) -> list[str]:
     return [f"{value:.4f}" if math.isfinite(value) else "" for value in values]
+
+
+class MeasuresFigure:
+    """A figure: surface maps on top, curves over time below them."""
+
+    def __init__(self, title: str, with_curves: bool) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg  # which takes long to import
+        from matplotlib.figure import Figure
+
+        # An own canvas: `pyplot` would choose a backend for the whole process.
+        self._figure = Figure(figsize=(13, 10 if with_curves else 4.2), layout="constrained", dpi=100)
+        FigureCanvasAgg(self._figure)
+        self._figure.suptitle(title, fontsize=11, parse_math=False)
+        parts = self._figure.subfigures(
+            2 if with_curves else 1, 1, squeeze=False, height_ratios=[4, 6][: 1 + with_curves]
+        )
+        self._maps = parts[0, 0].subplots(1, 3)
+        self._top, self._curves = parts[0, 0], parts[1, 0] if with_curves else None
+        for axis in self._maps:
+            axis.set_axis_off()
+
+    def show_points(self, image: NDArray, pixels: NDArray) -> None:
+        """The image (H, W, 3) with the points (P, 2), px, numbered as in the table."""
+        axis = self._maps[0]
+        axis.imshow(image, extent=(0, image.shape[1], image.shape[0], 0))
+        axis.set_title("points", fontsize=9)
+        if len(pixels) > 1:
+            axis.plot(*np.concatenate([pixels, pixels[:1]]).T, color="yellow", linewidth=0.8)
+        for p, (x, y) in enumerate(pixels):
+            axis.plot(x, y, "o", color=f"C{p}", markeredgecolor="white", markersize=6)
+            axis.annotate(str(p), (x, y), (5, 4), textcoords="offset points", color="white", fontsize=9)
+        axis.set(xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
+
+    def show_map(
+        self, place: int, title: str, pixels: NDArray, triangles: NDArray, values: NDArray, span: tuple[float, float]
+    ) -> None:
+        """Values (V,) of mesh vertices at pixels (V, 2), as a map in place 1 or 2."""
+        axis = self._maps[place]
+        faces = np.ma.masked_invalid(values[triangles].mean(1))
+        shown = axis.tripcolor(*pixels.T, triangles, facecolors=faces, cmap="turbo", vmin=span[0], vmax=span[1])
+        axis.set_title(title, fontsize=9)
+        axis.set(xlim=self._maps[0].get_xlim(), ylim=self._maps[0].get_ylim(), aspect="equal")
+        self._top.colorbar(shown, ax=axis, fraction=0.04, pad=0.01).ax.tick_params(labelsize=8)
+
+    def show_curves(self, found: Measures, frames_per_second: float, unit: str) -> None:
+        """Every measure over time, in seconds; points in the colors of the image."""
+        seconds = np.arange(len(found.displacement)) / frames_per_second
+        axes = self._curves.subplots(2, 3).ravel()
+        _plot(axes[0], f"distance of points 0 and 1, {unit}", seconds, found.distance[:, None], "black")
+        _plot(axes[1], f"area of the polygon, {unit}²", seconds, found.area[:, None], "black")
+        _plot(axes[3], f"displacement since frame {found.since}, {unit}", seconds, found.displacement)
+        _plot(axes[4], f"stretch since frame {found.since}; 1: unchanged", seconds, found.stretch)
+        _plot(axes[2], f"path length, {unit}; dotted: without smoothing", seconds, found.path_length)
+        for p in range(found.path_length_raw.shape[1]):
+            axes[2].plot(seconds, found.path_length_raw[:, p], color=f"C{p}", linewidth=0.8, linestyle=":")
+        axes[5].set_axis_off()
+        for axis in axes[:5]:
+            axis.set_xlabel("s", fontsize=8)
+        handles, labels = axes[3].get_legend_handles_labels()
+        axes[5].legend(handles, labels, title="point", loc="upper left", fontsize=8, ncols=3)
+
+    def save(self, path: Path) -> None:
+        """Write the PNG file, completely or not at all."""
+        with whole_file(path) as temporary:
+            self._figure.savefig(temporary)
+
+
+def _plot(axis: Axes, title: str, seconds: NDArray, values: NDArray, color: str | None = None) -> None:
+    """Curves (T, P); an empty panel that says so where nothing is known."""
+    axis.set_title(title, fontsize=9)
+    axis.tick_params(labelsize=8)
+    axis.grid(alpha=0.3)
+    if not np.isfinite(values).any():
+        axis.text(0.5, 0.5, "none", ha="center", color="gray", transform=axis.transAxes)
+    for p in range(values.shape[1]):
+        axis.plot(seconds, values[:, p], color=color or f"C{p}", linewidth=1.2, label=str(p))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +19,7 @@ AT_A_TIME = 8
 """Number of views that a GPU renders in one call."""
 
 
-def write_views(
-    scene: Scene,
-    views: list[View],
-    out: Path,
-    video: Path,
-    frames: list[Frame] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> None:
+def write_views(scene: Scene, views: list[View], out: Path, video: Path, frames: Sequence[Frame] | None = None) -> None:
     """Write each view to `out/rgb/*.png`, `out/depth/*.npy` (mm, float32) and `out/side_by_side/*.png`, and a video.
 
     Args:
@@ -35,21 +28,45 @@ def write_views(
     """
     span = depth_span(scene)
 
-    def images() -> Iterator[NDArray[np.uint8]]:
+    def pictures() -> Iterator[list[NDArray[np.uint8]]]:
         for k, rendered in enumerate(_render(scene, views)):
             color, depth = to_u8(rendered.color.cpu().numpy()), rendered.depth.cpu().numpy()
-            name = f"{frames[k].index if frames else k:06d}"
-            write_png(out / "rgb" / f"{name}.png", color)
-            with whole_file(out / "depth" / f"{name}.npy") as temporary:
+            write_png(out / "rgb" / f"{file_stem(k, frames)}.png", color)
+            with whole_file(out / "depth" / f"{file_stem(k, frames)}.npy") as temporary:
                 np.save(temporary, depth)
-            parts = [label(frames[k].rgb_u8, "input")] if frames else []
-            parts += [label(color, "EndoPrior-GS"), label(colorize(depth, *span, depth > 0), "depth")]
-            beside = tile(parts, len(parts))
-            write_png(out / "side_by_side" / f"{name}.png", beside)
-            progress(k + 1, len(views))
-            yield beside
+            yield [label(color, "EndoPrior-GS"), label(colorize(depth, *span, depth > 0), "depth")]
 
-    write_video(video, images(), scene.frames_per_second)
+    write_film(pictures(), out / "side_by_side", video, scene.frames_per_second, frames)
+
+
+def write_film(
+    pictures: Iterable[list[NDArray[np.uint8]]],
+    out: Path,
+    video: Path,
+    frames_per_second: float,
+    frames: Sequence[Frame] | None = None,
+) -> None:
+    """Write the pictures of each view beside each other as `out/*.png`, and all of them as a video.
+
+    Args:
+        pictures: (H, W, 3) images of one size for each view.
+        frames: the input frames, one per view, which then stand at the left.
+        video: path of the mp4.
+    """
+
+    def images() -> Iterator[NDArray[np.uint8]]:
+        for k, parts in enumerate(pictures):
+            beside = [label(frames[k].rgb_u8, "input"), *parts] if frames else parts
+            image = tile(beside, len(beside))
+            write_png(out / f"{file_stem(k, frames)}.png", image)
+            yield image
+
+    write_video(video, images(), frames_per_second)
+
+
+def file_stem(k: int, frames: Sequence[Frame] | None) -> str:
+    """Name of the files of view `k`: by its input frame, if there is one."""
+    return f"{frames[k].index if frames else k:06d}"
 
 
 def _render(scene: Scene, views: list[View]) -> Iterator[RenderedView]:

@@ -1,4 +1,4 @@
-"""Score the frames of a reconstruction as the evaluation scripts of other papers do.
+"""Score the frames of a reconstruction as the evaluation scripts of other papers do, with what makes scores comparable.
 
 Every number stands under the name of its protocol. What a protocol needs and this machine or sequence lacks is a
 skipped score with its reason, as everywhere.
@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Literal
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +19,19 @@ from ...core.checks import InputError
 from ...core.config import DataConfig
 from ...core.types import Frame
 from ...data import FrameSequence, load_sequence
-from .. import metrics
-from ..context import EXACT, NETWORKS_OFF, EvaluationContext
-from ..metrics import ScoreUnavailable
-from ..rendered import RenderedFrame
-from .table import PROTOCOLS, Protocol
-from .tags import rows_of, tags_of
+from ...model.method import method_of
+from ..context import EXACT, NETWORKS_OFF, EvaluationContext, RenderedFrame, SceneFrames
+from ..score import ScoreUnavailable, mean_over_frames
+from ..scorers.depth import depth_rmse, depth_rmse_8bit
+from ..scorers.image import SquaredErrors, pooled_psnr, squared_errors, ssim, ssim_valid
+from ..scorers.lpips import LpipsDistance, lpips_distance
+from .table import KEYS, PROTOCOLS, Protocol
 
 NO_TISSUE = "no tissue in the frames"
 NO_DEPTH = "no tissue with measured depth"
-Load = Callable[[str, int], metrics.LpipsDistance]
+BACKGROUNDS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
+NETWORKS = {"alex": "AlexNet", "vgg": "VGG16"}
+Load = Callable[[str], LpipsDistance | ScoreUnavailable]
 
 
 def score_protocols(names: Sequence[str], context: EvaluationContext, reading: DataConfig) -> dict[str, dict[str, Any]]:
@@ -41,7 +44,17 @@ def score_protocols(names: Sequence[str], context: EvaluationContext, reading: D
         By name a dict in JSON's types: `title`, `source`, `tags`, `paper`, `differs`, `scores` and `skipped`. `tags` is
         empty where the masks of the protocol are missing, and all scores are skipped.
     """
-    load = _loader(context.networks, context.weights_dir)
+
+    @cache
+    def load(backbone: str) -> LpipsDistance | ScoreUnavailable:
+        """Each classifier once, for all protocols; why not where it cannot be had."""
+        if not context.networks:
+            return ScoreUnavailable(NETWORKS_OFF)
+        try:  # VGG16 has 530 MB, too much to download unasked
+            return lpips_distance(backbone, context.weights_dir, download=backbone == "alex")
+        except ScoreUnavailable as reason:
+            return reason
+
     return {name: _score(PROTOCOLS.load(name), context, reading, load) for name in names}
 
 
@@ -49,11 +62,14 @@ def _score(about: Protocol, context: EvaluationContext, reading: DataConfig, loa
     result: dict[str, Any] = {"title": about.title, "source": about.source, "tags": {}, "paper": dict(about.paper)}
     result |= {"differs": list(about.differs), "scores": {}, "skipped": {}}
     skipped = result["skipped"]
-    measures: dict[str, Callable[[_View], float]] = {"ssim": _ssim_by(about)}
-    try:
-        measures["lpips"] = _lpips_by(load(about.lpips, about.lpips_lowest))
-    except ScoreUnavailable as reason:
-        skipped["lpips"] = str(reason)
+    structure = ssim_valid if about.ssim_valid else ssim
+    measures: dict[str, Callable[[_View], float]] = {"ssim": lambda view: structure(view.image, view.target, view.mask)}
+    network = load(about.lpips)
+    if isinstance(network, ScoreUnavailable):
+        skipped["lpips"] = str(network)
+    else:
+        distance = replace(network, lowest=about.lpips_lowest)
+        measures["lpips"] = lambda view: distance(view.image, view.target, view.mask)
     if about.depth:
         measures["depth_rmse_mm" if about.depth.startswith("mm") else "depth_rmse_8bit"] = _depth_by(about)
     try:
@@ -63,23 +79,24 @@ def _score(about: Protocol, context: EvaluationContext, reading: DataConfig, loa
         return result
     indices = [i for i in context.sequence.indices(context.split) if not (about.skips_first and i == 0)]
     result["tags"] = tags_of(about, context, indices, masks.mask_folder, reading.shrink)
-    errors: list[metrics.SquaredErrors] = []
+    errors: list[SquaredErrors] = []
     counts: list[int] = []
     values: dict[str, list[float]] = {name: [] for name in measures}
     for index in indices:
         view = _view(about, masks.frame(index), context.rendered[index], reading.shrink)
-        errors.append(metrics.squared_errors(view.image, view.target, view.mask))
+        errors.append(squared_errors(view.image, view.target, view.mask))
         counts.append(int(view.measured.sum()))
         for name in [name for name in measures if name not in skipped]:
             try:
                 values[name].append(measures[name](view))
             except ScoreUnavailable as reason:
                 skipped[name] = str(reason)
-    found = {"psnr": _psnr(about, errors)}
-    found |= {name: metrics.mean_over_frames(values[name]) for name in measures if name not in skipped}
+    together = [errors] if about.pooled else [[error] for error in errors]
+    found = {"psnr": mean_over_frames(pooled_psnr(group, over_frame=about.over_frame) for group in together)}
+    found |= {name: mean_over_frames(values[name]) for name in measures if name not in skipped}
     if about.depth == "mm, pooled" and "depth_rmse_mm" in found:
         totals = [n * error**2 if n else 0.0 for n, error in zip(counts, values["depth_rmse_mm"], strict=True)]
-        found["depth_rmse_mm"] = metrics.pooled_rmse(totals, counts)
+        found["depth_rmse_mm"] = float(np.sqrt(sum(totals) / sum(counts))) if sum(counts) else math.nan
     for name, value in found.items():
         if math.isfinite(value):
             result["scores"][name] = value
@@ -115,27 +132,12 @@ def _view(about: Protocol, frame: Frame, rendered: RenderedFrame, shrink: int) -
     return _View(image[:kept], frame.rgb[:kept], mask, mask & frame.depth_valid[:kept], frame, rendered)
 
 
-def _psnr(about: Protocol, errors: Sequence[metrics.SquaredErrors]) -> float:
-    if about.pooled:
-        return metrics.pooled_psnr(errors, over_frame=about.over_frame)
-    return metrics.mean_over_frames(metrics.pooled_psnr([error], over_frame=about.over_frame) for error in errors)
-
-
-def _ssim_by(about: Protocol) -> Callable[[_View], float]:
-    ssim = metrics.ssim_valid if about.ssim_valid else metrics.ssim
-    return lambda view: ssim(view.image, view.target, view.mask)
-
-
-def _lpips_by(distance: metrics.LpipsDistance) -> Callable[[_View], float]:
-    return lambda view: distance(view.image, view.target, view.mask)
-
-
 def _depth_by(about: Protocol) -> Callable[[_View], float]:
     """The depth error of one frame; NaN where nothing was measured."""
 
     def in_mm(view: _View) -> float:
         rows = len(view.mask)
-        return metrics.depth_rmse(view.rendered.depth[:rows], view.frame.depth[:rows], view.measured)
+        return depth_rmse(view.rendered.depth[:rows], view.frame.depth[:rows], view.measured)
 
     def in_8_bits(view: _View) -> float:
         rows, frame = len(view.mask), view.frame
@@ -145,30 +147,10 @@ def _depth_by(about: Protocol) -> Callable[[_View], float]:
         # The readers of these programs set missing depth to the nearest measured one, and score it.
         target = np.where(frame.depth_valid, frame.depth, frame.depth[frame.depth_valid].min())[:rows]
         if about.depth == "8-bit, tissue":
-            return metrics.depth_rmse_8bit(depth, target, view.mask, int(view.mask.sum()))
-        return metrics.depth_rmse_8bit(depth, target, view.mask & (np.fmod(target, 256) >= 1), view.mask.size)
+            return depth_rmse_8bit(depth, target, view.mask, int(view.mask.sum()))
+        return depth_rmse_8bit(depth, target, view.mask & (np.fmod(target, 256) >= 1), view.mask.size)
 
     return in_mm if about.depth.startswith("mm") else in_8_bits
-
-
-def _loader(networks: bool, weights_dir: Path | None) -> Load:
-    """Loads each classifier once, for all protocols; ScoreUnavailable each time where it cannot be had."""
-    known: dict[str, metrics.LpipsDistance | ScoreUnavailable] = {}
-
-    def load(backbone: Literal["alex", "vgg"], lowest: Literal[-1, 0]) -> metrics.LpipsDistance:
-        if not networks:
-            raise ScoreUnavailable(NETWORKS_OFF)
-        if backbone not in known:
-            try:  # VGG16 has 530 MB, too much to download unasked
-                known[backbone] = metrics.lpips_distance(backbone, weights_dir, download=backbone == "alex")
-            except ScoreUnavailable as reason:
-                known[backbone] = reason
-        found = known[backbone]
-        if isinstance(found, ScoreUnavailable):
-            raise found
-        return replace(found, lowest=lowest)
-
-    return load
 
 
 def masks_of(protocol: Protocol, sequence: FrameSequence, reading: DataConfig) -> FrameSequence:
@@ -194,3 +176,47 @@ def masks_of(protocol: Protocol, sequence: FrameSequence, reading: DataConfig) -
     if len(again) != len(sequence):
         raise ScoreUnavailable(f"needs other masks of {len(sequence)} frames; {sequence.path} has {len(again)}")
     return again
+
+
+def tags_of(
+    protocol: Protocol, context: EvaluationContext, indices: Sequence[int], mask_folder: str, shrink: int
+) -> dict[str, str]:
+    """The tags of one evaluation under a protocol, by the names of `KEYS`.
+
+    Args:
+        indices: the frames that are scored.
+        mask_folder: `FrameSequence.mask_folder` of the masks in use.
+        shrink: what the size of the frames was divided by.
+    """
+    made, is_scene = context.reconstruction, isinstance(context.reconstruction, SceneFrames)
+    seen, total = len({*indices} - {*context.sequence.indices("test")}), len(indices)
+    height = context.sequence.camera(0).height
+    kept, masked = rows_of(protocol, height, shrink)
+    rows = f"0..{kept - 1} of {height}" if kept < height else f"all {height}"
+    without = protocol.skips_first and 0 in context.sequence.indices(context.split)
+    phase = context.sequence.test_phase
+    values = {
+        "split": f"{context.split}{f' {phase}/8' if phase else ''}, {total} {'without 0' if without else 'frames'}",
+        "saw_test_frames": (f"yes: {seen} of {total}" if seen else "no") if is_scene else "not known",
+        "mask_folder": mask_folder or "none: by the reader",
+        "rows": rows + (f", {masked} masked" if masked else ""),
+        "background": BACKGROUNDS[method_of(made.scene.config).background] if is_scene else "of the images",
+        "color": "8 bits" if protocol.rounded else "not rounded",
+        "psnr_over": "all pixels" if protocol.over_frame else "tissue pixels",
+        "psnr_mean": "all frames together" if protocol.pooled else "mean of frames",
+        "ssim": "complete windows" if protocol.ssim_valid else "zeros around",
+        "lpips": f"{NETWORKS[protocol.lpips]}, [{protocol.lpips_lowest}, 1]",
+        "depth": protocol.depth or "not scored",
+    }
+    return {name: values[name] for name in KEYS}
+
+
+def rows_of(protocol: Protocol, height: int, shrink: int) -> tuple[int, int]:
+    """How many rows from the top are scored, and how many of these at the bottom count as tool.
+
+    Args:
+        height: of a frame as it is read, px.
+        shrink: what its size was divided by. Rows of the table are those of full size.
+    """
+    kept = min(height, protocol.kept_rows // shrink) if protocol.kept_rows else height
+    return kept, min(kept, -(-protocol.masked_rows // shrink))

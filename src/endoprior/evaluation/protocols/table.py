@@ -50,6 +50,20 @@ class Protocol:
     """What is computed here in another way than by the script, one sentence each."""
 
 
+KEYS = {
+    "split": "split",
+    "saw_test_frames": "seen in training",
+    "mask_folder": "mask folder",
+    "rows": "rows",
+    "background": "background",
+    "color": "color",
+    "psnr_over": "PSNR over",
+    "psnr_mean": "PSNR is",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "depth": "depth",
+}
+"""Tags, in order, and what tables call them."""
 OURS = Protocol("EndoPrior-GS", "docs/scores.md", "masks", depth="mm, mean of frames")
 """The protocol of `psnr`, `ssim`, `lpips` and `depth_rmse_mm`, for tags that compare line by line."""
 

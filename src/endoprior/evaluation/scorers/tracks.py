@@ -2,7 +2,10 @@
 
 The true tracks either cover all frames, as on a phantom, or are two sets of unpaired points, those of the first frame
 and those of the last, as in STIR, which does not say which point became which. Scores of paired tracks stand beside
-the same scores of chained optical flow and of no motion.
+the same scores of chained optical flow and of no motion. `T` frames, `P` points.
+
+Delta_avg: Schmidt et al., "Point Tracking in Surgery: the 2024 Surgical Tattoos in Infrared (STIR) Challenge".
+Average Jaccard and occlusion accuracy: Doersch et al., "TAP-Vid: A Benchmark for Tracking Any Point in a Video".
 """
 
 from __future__ import annotations
@@ -14,19 +17,25 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from ...core.geometry import cells_at
-from ...core.types import Camera, Frame
+from ...core.geometry import camera_to_world, cells_at
+from ...core.types import Frame
 from ...data import FrameSequence, nearest_end_errors
 from ...model.carry import carry_points
 from ...model.scene import Scene
-from .. import metrics
 from ..context import EvaluationContext
 from ..predicted_tracks import PredictedTracks, TrueTracks, by_chained_flow, by_scene, true_tracks, without_motion
 from ..score import Score
 
 NEAR_TOOL_PX = 40
 """Points within this distance of the tool mask are near the tool; px of an image 640 px wide."""
+THRESHOLDS_PX = (4, 8, 16, 32, 64)
+"""Distances within which a point counts as followed, px of the frame: those of STIR 2024."""
+NEIGHBORS = 4
+"""Nearest neighbors of each point whose connection is checked."""
+TEAR_STRETCH = 2.0
+"""A connection between neighbors that is this many times too long is torn."""
 END_ERROR = Score(
     "track_end_error_mm", "track end error", "mm", False, 3,
     "Mean distance of points carried to the last frame to the nearest true one there, as in STIR's benchmark.",
@@ -145,7 +154,7 @@ def compute(context: EvaluationContext) -> None:
         for score in (*ACCURACY, *BREAKS):
             context.skip(score.name, NO_TRACKS)
         return
-    parts, camera = parts_of(true, sequence), sequence.camera(0)
+    parts = parts_of(true, sequence)
     predictions: dict[str, Callable[[], PredictedTracks]] = {
         "": lambda: by_scene(scene, true, sequence),
         "_dis": lambda: by_chained_flow(true, sequence),
@@ -154,44 +163,95 @@ def compute(context: EvaluationContext) -> None:
     for end, predict in predictions.items():
         with context.skip_if_unavailable(*(score.name + end for score in ACCURACY)):
             predicted = predict()
-            for name, value in track_scores(predicted, true, parts, camera).items():
+            for name, value in track_scores(predicted, true, parts).items():
                 context.add(name + end, value, WHY_NOT.get(name, BEHIND))
             if not end:
-                add_breaks(context, predicted, true)
-
-
-def add_breaks(context: EvaluationContext, predicted: PredictedTracks, true: TrueTracks) -> None:
-    """Add folds and tears between neighboring points."""
-    rates = metrics.neighbor_breaks(predicted.points, true.points, true.visible & true.counted, true.first)
-    context.add("track_fold_rate", rates.fold, NO_PAIRS)
-    context.add("track_tear_rate", rates.tear, NO_PAIRS)
+                rates = neighbor_breaks(predicted.points, true.points, true.visible & true.counted, true.first)
+                for score, rate in zip(BREAKS, rates, strict=True):
+                    context.add(score.name, rate, NO_PAIRS)
 
 
 def track_scores(
-    predicted: PredictedTracks, true: TrueTracks, parts: Mapping[str, NDArray[np.bool_]], camera: Camera
+    predicted: PredictedTracks, true: TrueTracks, parts: Mapping[str, NDArray[np.bool_]]
 ) -> dict[str, float]:
     """Every score of `ACCURACY` by name; NaN where nothing counts, infinite for predictions without an image.
 
     Args:
-        parts: by `parts_of`. camera: intrinsics of the frames.
+        parts: by `parts_of`.
     """
     visible = true.visible & true.counted
     # A hidden truth may lie behind the camera: its distance does not count.
-    distance = np.linalg.norm(predicted.pixels - np.where(np.isfinite(true.pixels), true.pixels, 0), axis=-1)
-    error = metrics.track_error(predicted.points, true.points, visible, camera)
-    of_parts = {
-        f"track_error_{part}_mm": metrics.track_error(predicted.points, true.points, visible & chosen, camera).mm
-        for part, chosen in parts.items()
-    }
-    accuracy = metrics.track_accuracy(distance, predicted.visible, true.visible, true.counted)
+    distance_px = np.linalg.norm(predicted.pixels - np.where(np.isfinite(true.pixels), true.pixels, 0), axis=-1)
+    distance_mm = np.linalg.norm(predicted.points.astype(np.float64) - true.points, axis=-1)
     return {
-        "track_error_mm": error.mm,
-        "track_error_px": error.px,
-        "track_error_median_px": _quantile(distance[visible], 0.5),
-        "track_error_p90_px": _quantile(distance[visible], 0.9),
-        **of_parts,
-        **{f"track_{name}": value for name, value in accuracy._asdict().items()},
+        "track_error_mm": _mean(distance_mm[visible]),
+        "track_error_px": _mean(distance_px[visible]),
+        "track_error_median_px": _quantile(distance_px[visible], 0.5),
+        "track_error_p90_px": _quantile(distance_px[visible], 0.9),
+        **{f"track_error_{part}_mm": _mean(distance_mm[visible & chosen]) for part, chosen in parts.items()},
+        **track_accuracy(distance_px, predicted.visible, true.visible, true.counted),
     }
+
+
+def track_accuracy(
+    distance_px: NDArray[np.floating],
+    predicted_visible: NDArray[np.bool_],
+    visible: NDArray[np.bool_],
+    counted: NDArray[np.bool_],
+) -> dict[str, float]:
+    """Shares in [0, 1] by the name of the score, over every (frame, point) that counts; NaN where nothing does.
+
+    A point is a true positive if it is visible, predicted visible and near; a false positive if it is predicted
+    visible, but is hidden or far; a false negative if it is visible, but predicted hidden or far.
+
+    Args:
+        distance_px: (T, P) distance of predicted and true pixel; infinite where a prediction has no image. Where the
+            truth is hidden, it does not matter.
+        predicted_visible, visible: (T, P) prediction and truth.
+        counted: (T, P) True where a point counts: after the frame it starts in.
+    """
+    visible, predicted_visible = visible & counted, predicted_visible & counted
+    if not visible.any():
+        return dict.fromkeys(("track_delta_avg", "track_average_jaccard", "track_occlusion_accuracy"), math.nan)
+    deltas, jaccards = [], []
+    for threshold in THRESHOLDS_PX:
+        near = visible & (distance_px <= threshold)
+        found = near & predicted_visible
+        wrong, missed = predicted_visible & ~found, visible & ~found
+        deltas.append(near.sum() / visible.sum())
+        jaccards.append(found.sum() / (found.sum() + wrong.sum() + missed.sum()))
+    return {
+        "track_delta_avg": float(np.mean(deltas)),
+        "track_average_jaccard": float(np.mean(jaccards)),
+        "track_occlusion_accuracy": float((visible == predicted_visible)[counted].mean()),
+    }
+
+
+def neighbor_breaks(
+    predicted: NDArray, truth: NDArray, visible: NDArray[np.bool_], first: NDArray[np.integer]
+) -> tuple[float, float]:
+    """Folds and tears between each point and its nearest neighbors that start in the same frame.
+
+    Args:
+        predicted, truth: (T, P, 3) positions, mm. visible: (T, P) True where a point counts.
+        first: (P,) frame each point starts in; `truth` is known there.
+    Returns:
+        Share of (frame, pair), both ends of which count, in which the predicted connection points against the true one;
+        and in which it is more than `TEAR_STRETCH` times as long. NaN without any pair.
+    """
+    folds = tears = total = 0
+    for start in np.unique(first):
+        group = np.flatnonzero(first == start)
+        k = min(NEIGHBORS + 1, len(group))
+        _, nearest = cKDTree(truth[start, group]).query(truth[start, group], k=k)
+        a, b = np.repeat(group, k), group[np.reshape(nearest, -1)]
+        a, b = np.unique(np.sort(np.stack([a, b]), 0)[:, a != b], axis=1)  # each pair once
+        both = visible[:, a] & visible[:, b]
+        wanted, got = (truth[:, a] - truth[:, b])[both], (predicted[:, a] - predicted[:, b])[both]
+        folds += int(((wanted * got).sum(-1) < 0).sum())
+        tears += int((np.linalg.norm(got, axis=-1) > TEAR_STRETCH * np.linalg.norm(wanted, axis=-1)).sum())
+        total += len(wanted)
+    return (folds / total, tears / total) if total else (math.nan, math.nan)
 
 
 def parts_of(true: TrueTracks, sequence: FrameSequence) -> dict[str, NDArray[np.bool_]]:
@@ -224,6 +284,10 @@ def _near_tool(frame: Frame) -> NDArray[np.bool_]:
     return distance <= NEAR_TOOL_PX * frame.camera.width / 640
 
 
+def _mean(values: NDArray[np.floating]) -> float:
+    return float(values.mean()) if len(values) else math.nan
+
+
 def _quantile(values: NDArray[np.floating], share: float) -> float:
     """Linear between values as `np.quantile`, but infinite where one of the two is; NaN without values."""
     if not len(values):
@@ -241,15 +305,10 @@ def track_end_error_mm(scene: Scene, sequence: FrameSequence) -> float:
     tracks = sequence.truth and sequence.truth.tracks
     if not tracks or tracks.paired or not (tracks.visible[0].any() and tracks.visible[-1].any()):
         return math.nan
-    first, last = scene.cameras[0], scene.cameras[-1]
-    start = _to_world(tracks.points[0, tracks.visible[0]].astype(np.float64), first)
-    ends = _to_world(tracks.points[-1, tracks.visible[-1]].astype(np.float64), last)
+    start, ends = (
+        tracks.points[i, tracks.visible[i]].astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
+        for i, to_world in zip((0, -1), camera_to_world([scene.cameras[0], scene.cameras[-1]]), strict=True)
+    )
     last_time = (len(scene.cameras) - 1) / len(scene.cameras)
     carried = carry_points(scene, start, np.zeros(len(start), np.intp), [0.0, last_time])
     return float(nearest_end_errors(carried[1], ends).mean())
-
-
-def _to_world(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """(P, 3) points in camera axes, in world axes."""
-    to_world = np.linalg.inv(camera.world_to_camera)
-    return points @ to_world[:3, :3].T + to_world[:3, 3]

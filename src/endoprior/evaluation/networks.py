@@ -1,11 +1,12 @@
-"""Find the weights of a network, and read them without executing anything they contain.
+"""What scores by networks need: torchvision, and weights, which are read without executing anything they contain.
 
-Places, in this order: the caller's folder, the folder in `ENDOPRIOR_WEIGHTS`, torch's cache, torchvision's published
-file, which is downloaded into that cache. The result is the requested network or an error with the reason.
+Weights are looked for in this order: the caller's folder, the folder in `ENDOPRIOR_WEIGHTS`, torch's cache,
+torchvision's published file, which is downloaded into that cache. Nothing else is taken in their place.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import socket
@@ -17,9 +18,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import TYPE_CHECKING
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-from ...core.checks import input_error
+from ..core.checks import input_error
+from ..core.extras import install_command, missing_package
+from .score import ScoreUnavailable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,33 +34,20 @@ NETWORK_TIMEOUT_S = 4.0
 """Timeout of the download server, s; short, because many machines have no network."""
 
 
-class ScoreUnavailable(RuntimeError):
-    """A score cannot be computed here; the text is the one-line reason to report instead."""
-
-
 class WeightsMissing(ScoreUnavailable):
     """The weights of a network are missing or cannot be read."""
 
 
 @dataclass(frozen=True)
 class WeightFiles:
-    """The files any of which holds the weights of one network."""
+    """The files any of which holds the weights of one network, under torchvision's keys."""
 
     network: str
     """The network's name in messages."""
     names: tuple[str, ...]
-    """File names to look for; the first match is used. Keys are torchvision's."""
+    """File names to look for; the first match is used."""
     url: str
     """Address at which torchvision publishes them; the file name ends in the start of its SHA-256."""
-
-
-@dataclass(frozen=True)
-class FoundWeights:
-    """A weights file and the place it is in."""
-
-    path: Path
-    source: str
-    """"weights folder", "ENDOPRIOR_WEIGHTS", "torch cache" or "download"."""
 
 
 def _published(network: str, folder_name: str, url_name: str) -> WeightFiles:
@@ -71,34 +62,33 @@ VGG16 = _published("VGG16", "vgg16_features.safetensors", "vgg16-397923af.pth")
 SQUEEZENET = _published("SqueezeNet 1.1", "squeezenet1_1_features.safetensors", "squeezenet1_1-b8a52dc0.pth")
 
 
-def find_weights(files: WeightFiles, weights_dir: Path | None = None, *, download: bool = True) -> FoundWeights:
+def find_weights(files: WeightFiles, weights_dir: Path | None = None, *, download: bool = True) -> Path:
     """Find the weights of a network; the module lists the places.
 
     Args:
-        files: what to look for.
         weights_dir: a folder to look in first.
         download: False never touches the network.
-    Returns:
-        The file and its place.
     Raises:
         InputError: `weights_dir` or `ENDOPRIOR_WEIGHTS` is not a folder.
         WeightsMissing: the file is in none of the places and could not be downloaded, with the reason.
     """
-    cache = _torch_cache()
+    import torch
+
+    cache = Path(torch.hub.get_dir()) / "checkpoints"  # where torch keeps downloaded weights
     places: list[tuple[str, Path]] = []
     if weights_dir is not None:
         places.append(("weights folder", _existing_folder("--weights-dir", Path(weights_dir))))
     if named := os.environ.get(ENVIRONMENT_VARIABLE):
         places.append((ENVIRONMENT_VARIABLE, _existing_folder(ENVIRONMENT_VARIABLE, Path(named))))
     places.append(("torch cache", cache))
-    for source, folder in places:
-        for name in files.names:
-            if (folder / name).is_file():
-                return FoundWeights(folder / name, source)
+    for file in (folder / name for _, folder in places for name in files.names):
+        if file.is_file():
+            return file
     if download:
-        failure = _download(files.url, cache / files.url.rsplit("/", 1)[-1])
+        target = cache / files.url.rsplit("/", 1)[-1]
+        failure = _download(files.url, target)
         if failure is None:
-            return FoundWeights(cache / files.url.rsplit("/", 1)[-1], "download")
+            return target
         tried = f"the download of {files.url} failed ({failure})"
     else:
         tried = "downloads are off"
@@ -109,7 +99,7 @@ def find_weights(files: WeightFiles, weights_dir: Path | None = None, *, downloa
     )
 
 
-def load_weights(found: FoundWeights) -> Mapping[str, Tensor]:
+def load_weights(file: Path) -> Mapping[str, Tensor]:
     """Read named tensors from a `.safetensors` or `.pth` file; a `.pth` may contain data only.
 
     Raises:
@@ -120,41 +110,38 @@ def load_weights(found: FoundWeights) -> Mapping[str, Tensor]:
     from safetensors.torch import load_file
 
     try:
-        if found.path.suffix == ".safetensors":
-            return load_file(found.path)
+        if file.suffix == ".safetensors":
+            return load_file(file)
         with warnings.catch_warnings():
             # torch warns of pickles of other protocols, also of those it can read.
             warnings.filterwarnings("ignore", message="Detected pickle protocol", category=UserWarning)
-            stored = torch.load(found.path, map_location="cpu", weights_only=True)
+            stored = torch.load(file, map_location="cpu", weights_only=True)
     except (OSError, EOFError, RuntimeError, ValueError, UnpicklingError, SafetensorError) as error:
         raise WeightsMissing(
-            f"{found.path}: expected network weights, got an unreadable file ({_first_line(error)}). Fix: Replace it."
+            f"{file}: expected network weights, got an unreadable file ({_first_line(error)}). Fix: Replace it."
         ) from error
     if not (isinstance(stored, Mapping) and all(isinstance(value, torch.Tensor) for value in stored.values())):
-        raise WeightsMissing(f"{found.path}: expected network weights, got no named tensors. Fix: Replace it.")
+        raise WeightsMissing(f"{file}: expected network weights, got no named tensors. Fix: Replace it.")
     return stored
 
 
-def select_weights(found: FoundWeights, keys: Mapping[str, Tensor], origin: Mapping[str, str]) -> dict[str, Tensor]:
+def select_weights(file: Path, keys: Mapping[str, Tensor], origin: Mapping[str, str]) -> dict[str, Tensor]:
     """The tensors a network needs, selected from a weights file by name and checked for shape.
 
     Args:
-        found: the file.
         keys: the network's own state: name -> tensor of the right shape.
-        origin: name in the network -> name in the file.
-    Returns:
-        Name in the network -> tensor of the file, for every name in `origin`.
+        origin: name in the network -> name in the file, of all that is wanted.
     Raises:
         WeightsMissing: the file cannot be read, lacks a name, or holds another shape under it.
     """
-    stored = load_weights(found)
+    stored = load_weights(file)
     selected = {}
     for name, stored_name in origin.items():
         tensor = stored.get(stored_name)
         if tensor is None or tensor.shape != keys[name].shape:
             got = "nothing" if tensor is None else f"shape {tuple(tensor.shape)}"
             raise WeightsMissing(
-                f"{found.path}: expected {stored_name} of shape {tuple(keys[name].shape)}, got {got}. "
+                f"{file}: expected {stored_name} of shape {tuple(keys[name].shape)}, got {got}. "
                 "Replace the file with torchvision's weights of this network."
             )
         selected[name] = tensor
@@ -166,13 +153,6 @@ def _existing_folder(name: str, folder: Path) -> Path:
     if not folder.is_dir():
         raise input_error(name, "a folder of network weights", f"{folder}, which is not one", "check the path.")
     return folder
-
-
-def _torch_cache() -> Path:
-    """The folder in which torch keeps downloaded weights."""
-    import torch
-
-    return Path(torch.hub.get_dir()) / "checkpoints"
 
 
 def _download(url: str, target: Path) -> str | None:
@@ -224,3 +204,44 @@ def _first_line(error: BaseException) -> str:
     """The first line of an error."""
     text = str(error).strip()
     return text.splitlines()[0] if text else type(error).__name__
+
+
+MISSING_OPERATORS = (
+    "nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
+    "qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
+)
+"""Schemas of the operators that torchvision describes while it is imported."""
+_declared: list[Any] = []  # torch drops the declarations when the library object is garbage-collected
+
+
+def import_torchvision() -> ModuleType:
+    """The torchvision module. Only this function and the lpips package import it.
+
+    A CUDA build of torchvision with a CPU-only torch cannot load its compiled operators, and its import then fails with
+    "operator torchvision::nms does not exist". RAFT and the classifiers use none of them: two names are declared, and
+    it is imported again.
+
+    Raises:
+        ScoreUnavailable: torchvision is not installed, or does not work with this torch.
+    """
+    import torch
+
+    try:
+        try:
+            importlib.import_module("torchvision.models.optical_flow")
+        except RuntimeError as error:
+            if "operator torchvision::" not in str(error):
+                raise
+            if not _declared:
+                _declared.append(torch.library.Library("torchvision", "DEF"))
+                for schema in MISSING_OPERATORS:
+                    _declared[0].define(schema)
+            importlib.import_module("torchvision.models.optical_flow")
+        return importlib.import_module("torchvision")
+    except ImportError as error:
+        raise ScoreUnavailable(missing_package("torchvision", "networks", error)) from error
+    except RuntimeError as error:
+        fix = f"`{install_command('networks')}`."
+        raise ScoreUnavailable(
+            f"torchvision does not work beside torch {torch.__version__} ({_first_line(error)}). Fix: {fix}"
+        ) from error
