@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
 from endoprior.core.config import TemporalConfig
-from endoprior.training import losses_torch, temporal, temporal_numba, temporal_torch
+from endoprior.training import losses, temporal, temporal_numba
 from endoprior.training.losses_numba import supervised_losses
 from endoprior.training.temporal_numba import median
 
@@ -47,12 +47,12 @@ def test_supervised_terms_are_finite_and_those_of_the_definition(made, weights):
     assert torch.isfinite(terms).all() and (terms >= 0).all()
     assert torch.isfinite(color.grad).all() and torch.isfinite(depth.grad).all()
     c, d = (t.detach().double().requires_grad_() for t in (color, depth))
-    shown = losses_torch.inverse_depth(d)
+    shown = losses.inverse_depth(d)
     want = torch.stack([
-        weights[0] * losses_torch.color_l1(c, target.double() / 255, mask),
-        weights[1] * losses_torch.inverse_depth_l1(shown, inverse.double(), measured),
-        weights[2] * (losses_torch.total_variation(c) + losses_torch.total_variation(shown)),
-        weights[3] * losses_torch.edge_l1(c, target.double() / 255, mask),
+        weights[0] * losses.color_l1(c, target.double() / 255, mask),
+        weights[1] * losses.inverse_depth_l1(shown, inverse.double(), measured),
+        weights[2] * (losses.total_variation(c) + losses.total_variation(shown)),
+        weights[3] * losses.edge_l1(c, target.double() / 255, mask),
     ])  # fmt: skip
     want.sum().backward()
     # Each row is summed in float32.
@@ -78,7 +78,7 @@ def test_a_perfect_picture_of_one_color_costs_nothing(made):
 def with_torch(now, before, indices, pair_weights, cfg):
     """The PyTorch implementation, given the arrays that the Numba one takes."""
     indices, pair_weights = torch.as_tensor(indices), torch.as_tensor(pair_weights)
-    return temporal_torch.local_motion(now, before, indices, pair_weights, cfg)
+    return temporal.local_motion(now, before, indices, pair_weights, cfg)
 
 
 @st.composite

@@ -10,7 +10,7 @@ from reference import temporal as reference
 
 from endoprior.core.config import TemporalConfig
 from endoprior.model.presets import preset
-from endoprior.training import temporal, temporal_numba, temporal_torch
+from endoprior.training import temporal, temporal_numba
 
 CFG = TemporalConfig()
 
@@ -22,7 +22,7 @@ def points(num=40, seed=0):
 def with_torch(now, before, indices, pair_weights, cfg):
     """The PyTorch implementation, given the arrays that the Numba one takes."""
     indices, pair_weights = torch.as_tensor(indices), torch.as_tensor(pair_weights)
-    return temporal_torch.local_motion(now, before, indices, pair_weights, cfg)
+    return temporal.local_motion(now, before, indices, pair_weights, cfg)
 
 
 def loss(now, before, weights=None, cfg=CFG):
@@ -158,7 +158,7 @@ def test_a_rigid_motion_costs_no_distance():
 
 def test_released_huber_is_the_literal_one_over_delta():
     x = torch.tensor([0.0, 0.003, 0.01, 0.5])
-    literal, scaled = temporal_torch.huber(x, 0.01, "literal"), temporal_torch.huber(x, 0.01, "released")
+    literal, scaled = temporal.huber(x, 0.01, "literal"), temporal.huber(x, 0.01, "released")
     assert literal.tolist() == pytest.approx([0, 4.5e-6, 5e-5, 0.01 * 0.495])
     torch.testing.assert_close(scaled, literal / 0.01)
 
@@ -274,7 +274,7 @@ def test_median_is_numpys(num, kind):
 def test_pairs_without_weight_keep_a_little():
     p = points(30)
     indices, distances = temporal_numba.neighbors(p, 4)
-    assert (temporal_numba.affinity(distances, indices, np.zeros(30)) == temporal_torch.SUM_EPS).all()
+    assert (temporal_numba.affinity(distances, indices, np.zeros(30)) == temporal.SUM_EPS).all()
 
 
 def test_a_point_at_nan_shows():

@@ -13,11 +13,9 @@ from .. import render
 from ..core.config import Config
 from ..core.types import Camera, Splats
 from ..system.arrays_file import part, save_arrays
-from .deformation import Offsets
-from .field import Field
 from .gaussians import Gaussians
 from .method import motion_of
-from .motion import Motion
+from .motion import Field, Motion, Offsets
 from .ops import ops_for
 from .scene import Scene, Window
 from .scene_facts import MOST_GAUSSIANS, SceneFacts, camera_arrays, demand, scene_facts

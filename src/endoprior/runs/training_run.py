@@ -17,7 +17,7 @@ from ..system.heap import freed_memory_kept
 from ..system.leftovers import remove_leftovers
 from ..tool_masks.margin import with_tool_margin
 from ..training.divergence import Diverged
-from ..training.memory_check import reject_too_large
+from ..training.preflight import reject_too_large
 from ..training.trainer import Observer
 from . import kernel_cache
 from .checkpoint import load_checkpoint, save_checkpoint
@@ -95,7 +95,8 @@ class TrainingRun:
     def _begin(self, out: Path, fingerprint: str) -> None:
         """Start or restore the trainer, and write what must be known to repeat the run."""
         trainer, checkpoint, about = self.trainer, out / CHECKPOINT, out / CONFIG
-        if self.resume and checkpoint.is_file():
+        restored = self.resume and checkpoint.is_file()
+        if restored:
             load_checkpoint(trainer, checkpoint, fingerprint)
         elif self.resume and about.is_file():  # stopped before its first checkpoint
             reject_other_start(about, trainer.cfg, fingerprint, trainer.sequence.path)
@@ -104,7 +105,7 @@ class TrainingRun:
         remove_leftovers(out)  # not before the run was accepted and has the lock
         facts = run_facts(trainer.sequence, trainer.cfg, fingerprint)
         write_json(about, facts if self.tool_margin_px is None else facts | {MARGIN: self.tool_margin_px})
-        if trainer.state is None:
+        if not restored:
             trainer.start()
         cut_log(out / LOG, trainer.state.stage, trainer.state.iteration)
 

@@ -1,6 +1,6 @@
 """The temporal term, Eqs. (10) and (11), in Numba: few passes, value and gradient together. CPU.
 
-Computes what `temporal_torch.py` computes. Shared letters: `P` points, `K` neighbors.
+Computes what `temporal.py` computes. Shared letters: `P` points, `K` neighbors.
 
 A pair (i, j) pulls on both of its points. Each point therefore visits its own neighbors and then those whose neighbor
 it is, in order of their index, so no task writes another's row. Sums are taken per run of points, then over runs in
@@ -22,14 +22,14 @@ from ..compute.fastmath import REORDERED
 from ..compute.neighbors import MAX_COORDINATE, nearest
 from ..core.checks import check_shape
 from ..core.config import TemporalConfig
-from .temporal_torch import SQRT_EPS, SUM_EPS
+from .temporal import SQRT_EPS, SUM_EPS
 
 _POINTS_PER_TASK = 256
 _SAMPLE_ROWS, _SAMPLE_MARGIN = 512, 0.08
 
 
 def local_consistency(now: Tensor, before: Tensor, weights: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
-    """See `temporal_torch.local_consistency`."""
+    """See `temporal.local_consistency`."""
     indices, distances = neighbors(before.detach().numpy(), cfg.num_neighbors)
     return local_motion(now, before, indices, affinity(distances, indices, weights.numpy()), cfg)
 
@@ -53,7 +53,7 @@ def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
 
 
 def affinity(distances: NDArray[np.float64], indices: NDArray[np.intp], weights: NDArray) -> NDArray[np.float64]:
-    """(P, K) pair weights: see `temporal_torch.affinity`."""
+    """(P, K) pair weights: see `temporal.affinity`."""
     sigma = max(median(distances), 1e-8)
     out = np.empty(distances.shape)
     _weigh_pairs(distances, indices, weights, 1 / (2 * sigma**2), out)
@@ -63,7 +63,7 @@ def affinity(distances: NDArray[np.float64], indices: NDArray[np.intp], weights:
 def local_motion(
     now: Tensor, before: Tensor, indices: NDArray[np.intp], pair_weights: NDArray, cfg: TemporalConfig
 ) -> tuple[Tensor, Tensor]:
-    """See `temporal_torch.local_motion`; the gradient flows to `now` and `before`.
+    """See `temporal.local_motion`; the gradient flows to `now` and `before`.
 
     Raises:
         ValueError: shapes or types disagree, or an index is out of range.

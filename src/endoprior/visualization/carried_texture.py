@@ -17,7 +17,7 @@ from .. import render
 from ..core.geometry import pixel_centers, project
 from ..core.types import Camera, Frame
 from ..model.carry import centers_then
-from ..model.fixed_color import with_fixed_color
+from ..model.colors import with_fixed_color
 from ..model.gaussians import with_colors
 from ..model.scene import Scene
 from ..model.surface import project_visible, render_surface

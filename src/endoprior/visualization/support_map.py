@@ -15,7 +15,7 @@ from ..core.geometry import pixel_centers
 from ..core.types import Camera, Frame
 from ..model.gaussians import with_colors
 from ..model.scene import Scene
-from ..model.support import FramesOf, Support
+from ..model.surface import FramesOf, Support
 from ..system.atomic import whole_file
 from .camera_paths import View
 from .image_tools import SOLID_ALPHA, label, tile, to_u8, write_png

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...model.fixed_color import changes_color, with_fixed_color
+from ...model.colors import changes_color, with_fixed_color
 from .. import metrics
 from ..context import EvaluationContext
 from ..rendered import SceneFrames
