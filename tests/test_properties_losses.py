@@ -15,7 +15,6 @@ from hypothesis_profiles import examples
 from endoprior.core.config import TemporalConfig
 from endoprior.training import losses, temporal, temporal_numba
 from endoprior.training.losses_numba import supervised_losses
-from endoprior.training.temporal_numba import median
 
 
 @st.composite
@@ -139,19 +138,6 @@ def test_what_moves_as_one_costs_nothing(points, seed):
     turned = torch.tensor(points @ turn.T + shift)
     assert distance < 1e-9 * (1 + size)
     assert temporal_numba.local_motion(turned, before, indices, pair_weights, TemporalConfig())[1] < 1e-9 * (1 + size)
-
-
-@given(SEEDS, st.integers(1, 400), st.integers(1, 8), st.sampled_from(["random", "equal", "two values", "sorted"]))
-def test_the_median_has_the_bits_of_numpys(seed, rows, columns, kind):
-    rng = np.random.default_rng(seed)
-    values = rng.random((rows, columns))
-    if kind == "equal":
-        values[:] = 0.25
-    elif kind == "two values":
-        values = np.rint(values)
-    elif kind == "sorted":
-        values = np.sort(values, axis=None).reshape(rows, columns)
-    assert median(values) == float(np.median(values))
 
 
 @given(SEEDS, st.integers(0, 300), st.integers(1, 100), st.sampled_from([0.0, -300.0, 30.0]))

@@ -256,21 +256,6 @@ def test_the_number_of_threads_changes_no_bit():
         assert torch.equal(one, many)
 
 
-@pytest.mark.parametrize("num", [1, 2, 5, 600, 3001])
-@pytest.mark.parametrize("kind", ["smooth", "ties", "equal", "two values", "skewed rows"])
-def test_median_is_numpys(num, kind):
-    rng = np.random.default_rng(num)
-    values = {
-        "smooth": lambda: np.sort(rng.gamma(3, size=(num, 7)), 1),
-        "ties": lambda: rng.integers(0, 9, (num, 7)) / 8,
-        "equal": lambda: np.full((num, 7), 0.3),
-        "two values": lambda: rng.integers(0, 2, (num, 8)) / 3,
-        # The rows that are looked at first tell nothing of the others.
-        "skewed rows": lambda: rng.gamma(3, size=(num, 8)) + 100 * (np.arange(num) % max(num // 512, 1) == 0)[:, None],
-    }[kind]()
-    assert temporal_numba.median(values) == np.median(values)
-
-
 def test_pairs_without_weight_keep_a_little():
     p = points(30)
     indices, distances = temporal_numba.neighbors(p, 4)

@@ -23,9 +23,9 @@ from endoprior.model.carry import carry, carry_points, centers_then
 from endoprior.model.colors import with_fixed_color
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.motion import Offsets
-from endoprior.model.playback import Playback
+from endoprior.model.playback import Playback, faded, joined
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene, faded, faded_in, joined
+from endoprior.model.scene import Scene, faded_in
 from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.model.surface import Support

@@ -21,7 +21,7 @@ from ..core.checks import InputError
 from ..core.config import Config
 from ..core.config_deformation import DeformationConfig
 from ..core.types import Splats
-from .method import motion_of
+from .method import method_of
 
 if TYPE_CHECKING:
     from .motion import Offsets, RankOneGradient, UnstoredGradient
@@ -190,4 +190,4 @@ def create_gaussians(
     }
     # Everything else starts at zero: color that does not depend on the view, and is one in each Gaussian.
     zeros = {name: torch.zeros(num, *shape) for name, shape in attribute_shapes(cfg).items() if name not in tensors}
-    return Gaussians(tensors | zeros | motion_of(cfg).first_tensors(num, cfg))
+    return Gaussians(tensors | zeros | method_of(cfg).motion(cfg).first_tensors(num, cfg))

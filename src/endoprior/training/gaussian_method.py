@@ -61,7 +61,7 @@ class GaussianMethod(Method):
 
     def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> SingleScene:
         """See `Method.scene`."""
-        return SingleScene.of_arrays(arrays, cameras, facts)
+        return SingleScene.of_arrays(arrays, cameras, facts, self.motion(facts.config))
 
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
         """The Gaussians before training, from the training frames.

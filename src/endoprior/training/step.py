@@ -151,15 +151,15 @@ class TrainingStep:
         if fine and not is_right and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration:
             before = self.frames.before(position)
 
-        gaussians, deformation, model_ops = state.gaussians, state.field, self.ops.model
+        gaussians, model_ops = state.gaussians, self.ops.model
         offsets = means_before = None
-        if fine and before and cfg.temporal.gradient == "both" and isinstance(deformation, HexPlaneField):
-            offsets, displacement = deformation.offsets_and_displacement(
+        if fine and before and cfg.temporal.gradient == "both" and isinstance(state.field, HexPlaneField):
+            offsets, displacement = state.field.offsets_and_displacement(
                 gaussians["means"], frame.time, before.time, model_ops
             )
             means_before = gaussians["means"] + displacement
         elif fine:
-            offsets = self.motion.offsets(gaussians, deformation, frame.time, cfg, model_ops)
+            offsets = self.motion.offsets(gaussians, state.field, frame.time, cfg, model_ops)
         splats = gaussians.splats(offsets, sh_degree(cfg, state.stage, iteration))
 
         draw = partial(
@@ -184,7 +184,7 @@ class TrainingStep:
             is_right=is_right,
             left_out=left_out,
             gaussians=gaussians,
-            field=deformation,
+            field=state.field,
             offsets=offsets,
             means_before=means_before,
             splats=splats,

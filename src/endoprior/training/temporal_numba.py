@@ -25,7 +25,6 @@ from ..core.config import TemporalConfig
 from .temporal import SQRT_EPS, SUM_EPS
 
 _POINTS_PER_TASK = 256
-_SAMPLE_ROWS, _SAMPLE_MARGIN = 512, 0.08
 
 
 def local_consistency(now: Tensor, before: Tensor, weights: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
@@ -54,7 +53,7 @@ def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
 
 def affinity(distances: NDArray[np.float64], indices: NDArray[np.intp], weights: NDArray) -> NDArray[np.float64]:
     """(P, K) pair weights: see `temporal.affinity`."""
-    sigma = max(median(distances), 1e-8)
+    sigma = max(float(np.median(distances)), 1e-8)
     out = np.empty(distances.shape)
     _weigh_pairs(distances, indices, weights, 1 / (2 * sigma**2), out)
     return out
@@ -81,20 +80,6 @@ def local_motion(
         raise ValueError(f"indices must be in [0, {len(now) - 1}]; got {indices.min()} to {indices.max()}")
     factor = 1 / cfg.huber_delta if cfg.huber_scale == "released" else 1.0
     return _LocalMotion.apply(now, before, indices, pair_weights, cfg.huber_delta, factor)
-
-
-def median(values: NDArray[np.float64]) -> float:
-    """`np.median` of all (P, K) values, bit-identical: a sample of the rows rules most of them out first."""
-    num = values.size
-    sample = np.sort(values[:: max(len(values) // _SAMPLE_ROWS, 1)], axis=None)
-    low, high = (sample[int((0.5 + sign * _SAMPLE_MARGIN) * (len(sample) - 1))] for sign in (-1, 1))
-    inside = values[(values >= low) & (values <= high)]
-    below = np.count_nonzero(values < low)
-    first, last = (num - 1) // 2 - below, num // 2 - below
-    if not 0 <= first <= last < len(inside):
-        return float(np.median(values))
-    middle = np.partition(inside, (first, last))
-    return float((middle[first] + middle[last]) / 2)
 
 
 class _LocalMotion(torch.autograd.Function):
