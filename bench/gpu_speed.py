@@ -17,7 +17,7 @@ from gpu_parity import Target
 
 from endoprior import render
 from endoprior.core.types import Camera, Splats
-from endoprior.model.deformation import HexPlaneField
+from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 

@@ -19,7 +19,7 @@ import torch
 from endoprior.core.config import Config
 from endoprior.data import FrameSequence, load_sequence
 from endoprior.model import motion
-from endoprior.model.deformation import HexPlaneField
+from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.render import numba as numba_backend

@@ -15,15 +15,13 @@ import torch
 
 from endoprior.compute.relu_network import relu_network, relu_network_torch
 from endoprior.core.config_deformation import DeformationConfig
-from endoprior.model.attributes import motion_shape
-from endoprior.model.basis import RankOneGradient, basis_offsets
-from endoprior.model.deformation import HexPlaneField
+from endoprior.model.gaussians import motion_shape
+from endoprior.model.hexplane_field import HexPlaneField
+from endoprior.model.motion import RankOneGradient, basis_offsets
 from endoprior.model.presets import preset
-from endoprior.training.adam import AdamState
+from endoprior.training.adam import AdamState, PlaneAdam
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
-from endoprior.training.optimizer import Optimizer
-from endoprior.training.plane_adam import PlaneAdam
-from endoprior.training.rates import motion_rates, rate_of
+from endoprior.training.optimizer import Optimizer, motion_rates, rate_of
 from endoprior_baselines.time_network import DEPTH, INPUTS, SKIP_AFTER, WIDTH, layer_shapes
 
 TIME, RATE, EPSILON = 0.4, 1e-3, 1e-15

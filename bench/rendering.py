@@ -13,7 +13,7 @@ import torch
 from endoprior.core.config import Config
 from endoprior.core.types import Camera, RenderOutput, Splats
 from endoprior.model import motion
-from endoprior.model.deformation import HexPlaneField
+from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.playback import Playback
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene

@@ -10,8 +10,7 @@ from torch import Tensor
 from endoprior.compute.morton import morton_order
 from endoprior.core.config import Config
 from endoprior.core.types import Camera, Splats
-from endoprior.model.attributes import motion_shape
-from endoprior.model.gaussians import Gaussians
+from endoprior.model.gaussians import Gaussians, motion_shape
 
 FOCAL_PER_WIDTH = 0.9
 """Of an endoscope; also the phantom's."""

@@ -17,6 +17,7 @@ from pathlib import Path
 from statistics import median
 
 import common  # noqa: F401, before torch
+import numpy as np
 import torch
 import yaml
 
@@ -24,7 +25,7 @@ from endoprior.core.config import Config
 from endoprior.core.config_io import from_dict, override, to_dict
 from endoprior.data import load_sequence
 from endoprior.model.presets import preset
-from endoprior.training import losses_torch
+from endoprior.training import losses
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.stage import Stage, stage_length
 
@@ -39,12 +40,13 @@ WANTED = (0.01, 0.1, 0.5)
 def shares(trainer: GaussianTrainer) -> dict[str, float]:
     """Norm of the gradient of each term in the next iteration, as a share of the color term's."""
     # The compiled loss differentiates its terms together.
-    apart = replace(trainer.ops, supervised_losses=losses_torch.supervised_losses)
-    done = replace(trainer.step_once, ops=apart).compare(trainer.state)
+    apart = replace(trainer.ops, supervised_losses=losses.supervised_losses)
+    step, state = replace(trainer.step_once, ops=apart), trainer.state
+    drawn = step.draw(state, np.random.default_rng([trainer.cfg.seed, int(state.stage), state.iteration + 1]))
     norms = {}
-    for name, term in done.terms.items():
+    for name, term in step.loss(state, drawn)[0].items():
         if term.requires_grad:
-            (gradient,) = torch.autograd.grad(term, done.splats.means, retain_graph=True, allow_unused=True)
+            (gradient,) = torch.autograd.grad(term, drawn.splats.means, retain_graph=True, allow_unused=True)
             norms[name] = 0.0 if gradient is None else float(gradient.norm())
     return {name: norm / norms["color"] for name, norm in norms.items()}
 

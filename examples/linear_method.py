@@ -3,15 +3,13 @@
 from torch import Tensor
 
 from endoprior.core.config import Config, DensityConfig, ScheduleConfig, TemporalConfig
-from endoprior.model.deformation import Offsets
-from endoprior.model.field import Field
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import Motion
+from endoprior.model.motion import Field, Motion, Offsets
 from endoprior.model.ops import ModelOps
-from endoprior.training.drawn import Drawn
 from endoprior.training.gaussian_method import GaussianMethod
 from endoprior.training.ops import TrainingOps
-from endoprior.training.rates import Rate
+from endoprior.training.optimizer import Rate
+from endoprior.training.step import Drawn
 
 
 class LinearMotion(Motion):

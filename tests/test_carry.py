@@ -11,8 +11,8 @@ from export_scenes import moving_scene
 
 from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.model.carry import NUM_CARRIERS, carry, carry_points, confidence_of
-from endoprior.model.deformation import HexPlaneField
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.model.single_scene import SingleScene
 from endoprior.model.surface import project_visible, render_surface, shown_pixels

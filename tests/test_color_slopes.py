@@ -11,13 +11,12 @@ from export_scenes import moving_scene
 from render_scenes import camera, one
 
 from endoprior import render
-from endoprior.model.attributes import attribute_shapes
-from endoprior.model.gaussians import SH_C0, create_gaussians, with_colors
-from endoprior.model.one_color import FEW_ITERATIONS, one_color
+from endoprior.model.colors import FEW_ITERATIONS, one_color
+from endoprior.model.gaussians import SH_C0, attribute_shapes, create_gaussians, with_colors
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.render.constants import BLUR_PX2
-from endoprior.training.densify import split_children
+from endoprior.training.density import split_children
 from endoprior.view.view_settings import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 

@@ -14,7 +14,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config, DensityConfig
 from endoprior.core.config_deformation import BasisConfig, HexPlaneConfig
 from endoprior.core.config_io import from_dict, to_dict
-from endoprior.model.attributes import motion_shape
+from endoprior.model.gaussians import motion_shape
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import SceneFacts
 from endoprior.runs.folder import reject_other_run

@@ -16,10 +16,9 @@ from torch import Tensor
 
 from endoprior.core.checks import InputError
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig, HexPlaneConfig
-from endoprior.model.attributes import motion_layout, motion_shape
-from endoprior.model.basis import basis_offsets, basis_weights
-from endoprior.model.deformation import HexPlaneField, Offsets, box_of_points
-from endoprior.model.heads import OffsetHeads
+from endoprior.model.gaussians import motion_layout, motion_shape
+from endoprior.model.hexplane_field import HexPlaneField, OffsetHeads, box_of_points, head_shapes
+from endoprior.model.motion import Offsets, basis_offsets, basis_weights
 from endoprior.model.ops import NUMBA
 
 SMALL = DeformationConfig(hexplane=HexPlaneConfig((6, 5, 4), 8, 12, (1, 2)))
@@ -153,8 +152,9 @@ def test_offsets_of_no_gaussians_and_of_a_subset() -> None:
 
 def test_heads_start_as_stated() -> None:
     width, features = 32, 256
-    default = OffsetHeads(features, width, {"means": 3, "quats": 4}, "default", torch.Generator().manual_seed(1))
-    zero = OffsetHeads(features, width, {"means": 3, "quats": 4}, "zero", torch.Generator().manual_seed(1))
+    shapes = head_shapes(features, width, {"means": 3, "quats": 4})
+    default = OffsetHeads(shapes, "default", torch.Generator().manual_seed(1))
+    zero = OffsetHeads(shapes, "zero", torch.Generator().manual_seed(1))
     for name, value in default.parameters.items():
         fan_in = features if name.startswith("trunk") else width
         if name.endswith("weight"):
@@ -163,7 +163,7 @@ def test_heads_start_as_stated() -> None:
         else:
             assert 0 < value.abs().max() <= 1 / math.sqrt(fan_in)
             assert not zero.parameters[name].any()
-    again = OffsetHeads(features, width, {"means": 3, "quats": 4}, "default", torch.Generator().manual_seed(1))
+    again = OffsetHeads(shapes, "default", torch.Generator().manual_seed(1))
     assert all(torch.equal(a, b) for a, b in zip(default.parameters.values(), again.parameters.values(), strict=True))
 
 

@@ -12,11 +12,9 @@ from endoprior.core.config import Config, DensityConfig
 from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
 from endoprior.training import density, density_numba
-from endoprior.training.densify import apply_plan, split_children
-from endoprior.training.density import DensityStats, Plan
+from endoprior.training.density import DensityStats, Plan, apply_plan, split_children
 from endoprior.training.ops import NUMBA
-from endoprior.training.optimizer import Optimizer
-from endoprior.training.rates import rate_of
+from endoprior.training.optimizer import Optimizer, rate_of
 
 CFG = DensityConfig()
 

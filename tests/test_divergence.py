@@ -28,11 +28,10 @@ from endoprior.training.divergence import (
     unusable_numbers,
 )
 from endoprior.training.gaussian_trainer import GaussianTrainer
-from endoprior.training.losses_torch import color_l1
+from endoprior.training.losses import color_l1
 from endoprior.training.ops import NUMBA, TORCH
-from endoprior.training.optimizer import Optimizer
+from endoprior.training.optimizer import Optimizer, rate_of
 from endoprior.training.own_method import OwnMethod
-from endoprior.training.rates import rate_of
 
 BAD = [float("nan"), float("inf"), -float("inf"), 2 * LARGEST_GRADIENT, -1e30]
 
@@ -87,10 +86,10 @@ def test_every_method_is_watched_by_its_error_on_tissue(tiny_sequence, name, mon
     )
     trainer = GaussianTrainer(load_sequence(tiny_sequence), cfg)
     trainer.start()
-    done = trainer.step_once.compare(trainer.state)
-    frame = done.batch.frame
-    expected = float(color_l1(done.out.color.detach(), frame.rgb, frame.tissue_mask))
-    assert float(done.color_error.detach()) == pytest.approx(expected, rel=1e-5)
+    drawn = trainer.step_once.draw(trainer.state, np.random.default_rng(0))
+    expected = float(color_l1(drawn.out.color.detach(), drawn.frame.rgb, drawn.frame.tissue_mask))
+    _, error = trainer.step_once.loss(trainer.state, drawn)
+    assert float(error.detach()) == pytest.approx(expected, rel=1e-5)
     with torch.no_grad():
         trainer.state.gaussians["opacity_logits"].fill_(-40)
     for _ in range(3):

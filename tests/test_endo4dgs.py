@@ -11,15 +11,15 @@ from scipy.spatial.transform import Rotation
 from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.core.types import RenderOutput, Splats
 from endoprior.data import load_sequence
-from endoprior.model.deformation import HexPlaneField
 from endoprior.model.gaussians import SH_C0, create_gaussians
+from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.runs.train import train
 from endoprior.training.density import DensityStats
-from endoprior.training.drawn import Drawn
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA
 from endoprior.training.stage import Stage
+from endoprior.training.step import Drawn
 from endoprior_baselines.endo4dgs import METHOD
 from endoprior_baselines.endo4dgs_terms import (
     confident_error,

@@ -15,12 +15,12 @@ from endoprior.model.hexplane import FRESH, PLANE_NAMES, PlaneGrid
 from endoprior.model.presets import preset
 from endoprior.runs.train import train
 from endoprior.training.density import DensityStats
-from endoprior.training.drawn import Drawn
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.gaussian_method import in_epochs
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH
 from endoprior.training.stage import Stage
+from endoprior.training.step import Drawn
 from endoprior_baselines.endogs import METHOD, depth_huber
 from endoprior_baselines.endogs_field import JointField
 from endoprior_baselines.plane_terms import PlaneWeights, plane_term

@@ -14,8 +14,8 @@ from export_scenes import moving_scene, plane_camera
 from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.export.axes import ROTATIONS
 from endoprior.export.formats import FORMATS
-from endoprior.model.deformation import HexPlaneField
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene

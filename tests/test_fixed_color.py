@@ -13,10 +13,9 @@ from endoprior.data import FrameSequence
 from endoprior.evaluation.context import Evaluation, EvaluationContext, SceneFrames
 from endoprior.evaluation.score import ScoreUnavailable
 from endoprior.evaluation.scorers import motion
-from endoprior.model.attributes import motion_layout
-from endoprior.model.basis import basis_weights
-from endoprior.model.fixed_color import with_fixed_color
-from endoprior.model.gaussians import Gaussians, create_gaussians
+from endoprior.model.colors import with_fixed_color
+from endoprior.model.gaussians import Gaussians, create_gaussians, motion_layout
+from endoprior.model.motion import basis_weights
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene

@@ -11,14 +11,13 @@ import torch
 from endoprior.core.config_deformation import BasisConfig, DeformationConfig
 from endoprior.core.geometry import back_project, pixel_centers, quaternion_to_matrix
 from endoprior.core.types import Camera, Frame
-from endoprior.initialization.cleanup import PointCloud
-from endoprior.initialization.first_gaussians import first_gaussians
-from endoprior.initialization.normals import flat_along, surface_normals
-from endoprior.model.basis import basis_offsets, basis_weights
+from endoprior.initialization.first_gaussians import first_gaussians, flat_along, surface_normals
+from endoprior.initialization.sampling import PointCloud
 from endoprior.model.gaussians import create_gaussians
+from endoprior.model.motion import basis_offsets, basis_weights
 from endoprior.model.ops import NUMBA
 from endoprior.model.presets import preset
-from endoprior.training.scale_limit import limit_scales
+from endoprior.training.step import limit_scales
 
 WIDTH, HEIGHT = 160, 120
 

@@ -13,8 +13,7 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.core.geometry import back_project
 from endoprior.core.types import Camera, Frame
-from endoprior.model.attributes import motion_layout
-from endoprior.model.gaussians import SH_C0, create_gaussians
+from endoprior.model.gaussians import SH_C0, create_gaussians, motion_layout
 from endoprior.model.highlights import without_highlights
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene

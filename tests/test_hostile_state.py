@@ -23,7 +23,7 @@ from endoprior.core.config import Config
 from endoprior.core.config_io import from_dict, to_dict
 from endoprior.export.html import write_html
 from endoprior.model import hexplane
-from endoprior.model.deformation import HexPlaneField
+from endoprior.model.hexplane_field import HexPlaneField
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.system.arrays_file import LARGEST_HEADER

@@ -13,8 +13,7 @@ from endoprior.model.method import METHODS, method_named
 from endoprior.model.presets import preset, preset_names
 from endoprior.runs.train import start_run
 from endoprior.training.gaussian_trainer import GaussianTrainer
-from endoprior.training.ignored_options import note_on_budget, reject_ignored_options
-from endoprior.training.memory_check import first_count
+from endoprior.training.preflight import first_count, note_on_budget, reject_ignored_options
 
 WITHOUT_PRIOR = [name for name in METHODS.names() if not getattr(method_named(name), "uses_prior", True)]
 FIELDS = [name for name in METHODS.names() if not method_named(name).has_gaussians]

@@ -16,13 +16,15 @@ from endoprior.core.config import InitConfig, PriorConfig, SalienceConfig, Specu
 from endoprior.core.geometry import project
 from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
-from endoprior.initialization.cleanup import PointCloud, merge_voxels, remove_outliers
 from endoprior.initialization.sampling import (
+    PointCloud,
     eroded_mask,
     initial_log_scales,
     initial_points,
+    merge_voxels,
     pixel_probability,
     quotas,
+    remove_outliers,
     sample_pixels,
     sampling_distribution,
 )

@@ -7,7 +7,7 @@ import torch
 
 from endoprior.core.config import LossConfig
 from endoprior.core.types import RenderOutput
-from endoprior.training import losses_torch
+from endoprior.training import losses
 from endoprior.training.losses import supervised_terms
 from endoprior.training.losses_numba import supervised_losses
 from endoprior.training.ops import NUMBA
@@ -31,23 +31,23 @@ def test_color_l1_of_a_constant_offset_is_the_offset():
     mask[0] = False
     color = target + 0.25
     color[0] = 9  # not tissue: must not count
-    assert losses_torch.color_l1(color, target, mask).item() == pytest.approx(0.25, abs=1e-6)
+    assert losses.color_l1(color, target, mask).item() == pytest.approx(0.25, abs=1e-6)
 
 
 def test_edges_are_differences_of_the_error_between_two_pixels_of_tissue():
     """An even error costs nothing, a step of it counts where both of its sides are tissue."""
     target, mask = torch.rand(4, 5, 3), torch.ones(4, 5, dtype=torch.bool)
-    assert losses_torch.edge_l1(target + 0.25, target, mask).item() == pytest.approx(0, abs=1e-6)
+    assert losses.edge_l1(target + 0.25, target, mask).item() == pytest.approx(0, abs=1e-6)
     error = torch.zeros(4, 5, 3)
     error[:, 2:] = 0.5  # a step in each of 4 rows
-    assert losses_torch.edge_l1(target + error, target, mask).item() == pytest.approx(4 * 0.5 / 20, abs=1e-6)
+    assert losses.edge_l1(target + error, target, mask).item() == pytest.approx(4 * 0.5 / 20, abs=1e-6)
     mask[0, 2] = mask[1, 1] = False  # two of the steps end beside tissue
-    assert losses_torch.edge_l1(target + error, target, mask).item() == pytest.approx(2 * 0.5 / 18, abs=1e-6)
+    assert losses.edge_l1(target + error, target, mask).item() == pytest.approx(2 * 0.5 / 18, abs=1e-6)
 
 
 def test_inverse_depth_keeps_zero_where_nothing_is_drawn():
     depth = torch.tensor([[0.0, 2.0]], requires_grad=True)
-    inverse = losses_torch.inverse_depth(depth)
+    inverse = losses.inverse_depth(depth)
     assert inverse.tolist() == [[0.0, 0.5]]
     inverse.sum().backward()
     assert depth.grad.tolist() == [[0.0, -0.25]]
@@ -56,7 +56,7 @@ def test_inverse_depth_keeps_zero_where_nothing_is_drawn():
 def test_total_variation_of_a_step():
     image = torch.zeros(4, 4)
     image[:, 2:] = 1  # one jump in each of 4 rows, 16 values
-    assert losses_torch.total_variation(image).item() == pytest.approx(4 / 16)
+    assert losses.total_variation(image).item() == pytest.approx(4 / 16)
 
 
 def test_total_variation_is_the_double_loop():
@@ -67,17 +67,17 @@ def test_total_variation_is_the_double_loop():
             for c in range(3):
                 total += abs(image[y + 1, x, c] - image[y, x, c]).item() if y < 4 else 0
                 total += abs(image[y, x + 1, c] - image[y, x, c]).item() if x < 6 else 0
-    assert losses_torch.total_variation(image).item() == pytest.approx(total / image.numel(), rel=1e-5)
+    assert losses.total_variation(image).item() == pytest.approx(total / image.numel(), rel=1e-5)
 
 
 def test_total_variation_leaves_out_differences_between_two_such_pixels():
     image = torch.tensor([[0.0, 1.0, 3.0], [7.0, 15.0, 31.0]])
     left_out = torch.tensor([[True, True, False], [False, True, True]])
     # right: 2 (1 -> 3), 8 (7 -> 15); down: 7 (0 -> 7), 28 (3 -> 31); left out: 0 -> 1, 15 -> 31, 1 -> 15.
-    assert losses_torch.total_variation(image, left_out).item() == pytest.approx((2 + 8 + 7 + 28) / 6)
+    assert losses.total_variation(image, left_out).item() == pytest.approx((2 + 8 + 7 + 28) / 6)
     everywhere = torch.ones_like(left_out)
-    assert losses_torch.total_variation(image, everywhere) == 0
-    assert losses_torch.total_variation(image, ~everywhere) == losses_torch.total_variation(image)
+    assert losses.total_variation(image, everywhere) == 0
+    assert losses.total_variation(image, ~everywhere) == losses.total_variation(image)
 
 
 @pytest.mark.parametrize("tv_on_tissue", [True, False])
@@ -86,7 +86,7 @@ def test_fused_terms_and_gradients_agree_with_the_torch_implementation(seed, tv_
     color, depth, *rest = scene(seed)
     weights = (1.0, 0.7, 0.03, 0.4)
     grads, values = [], []
-    for function in (losses_torch.supervised_losses, supervised_losses):
+    for function in (losses.supervised_losses, supervised_losses):
         c, d = color.clone().requires_grad_(), depth.clone().requires_grad_()
         terms = function(c, d, *rest, weights, tv_on_tissue)
         terms.sum().backward()
@@ -116,7 +116,7 @@ def test_fused_terms_of_a_frame_without_tissue_are_finite():
 def test_fused_terms_of_degenerate_images(shape):
     color, depth, *rest = scene(2, *shape)
     args = (color, depth, *rest, (1.0, 1.0, 1.0, 1.0))
-    torch.testing.assert_close(supervised_losses(*args), losses_torch.supervised_losses(*args), rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(supervised_losses(*args), losses.supervised_losses(*args), rtol=1e-5, atol=1e-7)
 
 
 def test_holes_cost_only_where_tissue_is_hidden():

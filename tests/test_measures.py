@@ -15,6 +15,7 @@ from plyfile import PlyData
 from endoprior.cli import main
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.measures import (
+    SurfaceMotion,
     area,
     distance,
     measures_of,
@@ -27,7 +28,6 @@ from endoprior.model.measures import (
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
-from endoprior.model.surface_motion import SurfaceMotion
 from endoprior.visualization.measures import displacement_span, measures_csv, stretch_span, value_colors
 
 

@@ -17,8 +17,7 @@ from endoprior.data.images import read_tool_mask, save_png
 from endoprior.data.mask_writing import note_found_masks
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.training.gaussian_trainer import GaussianTrainer
-from endoprior.training.mask_doubt import MaskDoubt
-from endoprior.training.missed_tools import missed_tools
+from endoprior.training.missed_tools import MaskDoubt, missed_tools
 
 VIEW = np.ones((128, 160), bool)
 NOWHERE = np.zeros_like(VIEW)

@@ -18,8 +18,7 @@ from endoprior.evaluation.predicted_tracks import by_scene, true_tracks, without
 from endoprior.evaluation.scorers import camera_path
 from endoprior.evaluation.scorers.tracks import parts_of, track_end_error_mm, track_scores
 from endoprior.evaluation.scoring import evaluate
-from endoprior.model.attributes import motion_layout
-from endoprior.model.gaussians import Gaussians
+from endoprior.model.gaussians import Gaussians, motion_layout
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
 from endoprior.phantom import PhantomConfig, write_phantom

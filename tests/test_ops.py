@@ -14,7 +14,7 @@ from tiny_training import tiny_config
 from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.core.types import RenderOutput
 from endoprior.data import load_sequence
-from endoprior.model.basis import RankOneGradient
+from endoprior.model.motion import RankOneGradient
 from endoprior.model.scene_file import load_scene
 from endoprior.training.adam import AdamState
 from endoprior.training.density import DensityStats

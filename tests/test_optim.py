@@ -7,15 +7,13 @@ import pytest
 import torch
 
 from endoprior.core.config import Config, OptimConfig
-from endoprior.model.attributes import motion_layout
-from endoprior.model.basis import RankOneGradient
-from endoprior.model.gaussians import create_gaussians
+from endoprior.model.gaussians import create_gaussians, motion_layout
+from endoprior.model.motion import RankOneGradient
 from endoprior.model.presets import preset
 from endoprior.training import adam_numba
 from endoprior.training.adam import AdamState
 from endoprior.training.ops import NUMBA
-from endoprior.training.optimizer import Optimizer
-from endoprior.training.rates import late_share, log_linear, motion_rates, rate_of
+from endoprior.training.optimizer import Optimizer, late_share, log_linear, motion_rates, rate_of
 
 
 def test_update_is_torchs_adam():

@@ -7,8 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from endoprior.initialization.cleanup import PointCloud, concatenated, merge_voxels, remove_outliers
-from endoprior.initialization.sampling import initial_log_scales
+from endoprior.initialization.sampling import (
+    PointCloud,
+    concatenated,
+    initial_log_scales,
+    merge_voxels,
+    remove_outliers,
+)
 
 
 def cloud_of(points: np.ndarray, colors: np.ndarray) -> PointCloud:

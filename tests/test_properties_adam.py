@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
-from endoprior.model.basis import RankOneGradient
+from endoprior.model.motion import RankOneGradient
 from endoprior.training import adam_numba
 from endoprior.training.adam import BETA1, BETA2, AdamState
 

@@ -17,11 +17,9 @@ from endoprior.core.config import Config, DensityConfig
 from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
 from endoprior.training import density, density_numba
-from endoprior.training.densify import apply_plan
-from endoprior.training.density import DensityStats
+from endoprior.training.density import DensityStats, apply_plan
 from endoprior.training.ops import NUMBA
-from endoprior.training.optimizer import Optimizer
-from endoprior.training.rates import rate_of
+from endoprior.training.optimizer import Optimizer, rate_of
 
 SEEDS = st.integers(0, 2**31 - 1)
 EMPTY = torch.zeros(0)

@@ -15,7 +15,7 @@ from endoprior.compute.morton import morton_order
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, bilinear, expected_depth, pixel_centers, project, quaternion_to_matrix
 from endoprior.data.shrink import shrunk_camera
-from endoprior.model.basis import basis_weights
+from endoprior.model.motion import basis_weights
 from endoprior.training.temporal_numba import neighbors
 
 SEEDS = st.integers(0, 2**31 - 1)

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from hypothesis_profiles import examples
 
 from endoprior.core.config import TemporalConfig
-from endoprior.training import losses_torch, temporal, temporal_numba, temporal_torch
+from endoprior.training import losses, temporal, temporal_numba
 from endoprior.training.losses_numba import supervised_losses
-from endoprior.training.temporal_numba import median
 
 
 @st.composite
@@ -47,12 +46,12 @@ def test_supervised_terms_are_finite_and_those_of_the_definition(made, weights):
     assert torch.isfinite(terms).all() and (terms >= 0).all()
     assert torch.isfinite(color.grad).all() and torch.isfinite(depth.grad).all()
     c, d = (t.detach().double().requires_grad_() for t in (color, depth))
-    shown = losses_torch.inverse_depth(d)
+    shown = losses.inverse_depth(d)
     want = torch.stack([
-        weights[0] * losses_torch.color_l1(c, target.double() / 255, mask),
-        weights[1] * losses_torch.inverse_depth_l1(shown, inverse.double(), measured),
-        weights[2] * (losses_torch.total_variation(c) + losses_torch.total_variation(shown)),
-        weights[3] * losses_torch.edge_l1(c, target.double() / 255, mask),
+        weights[0] * losses.color_l1(c, target.double() / 255, mask),
+        weights[1] * losses.inverse_depth_l1(shown, inverse.double(), measured),
+        weights[2] * (losses.total_variation(c) + losses.total_variation(shown)),
+        weights[3] * losses.edge_l1(c, target.double() / 255, mask),
     ])  # fmt: skip
     want.sum().backward()
     # Each row is summed in float32.
@@ -78,7 +77,7 @@ def test_a_perfect_picture_of_one_color_costs_nothing(made):
 def with_torch(now, before, indices, pair_weights, cfg):
     """The PyTorch implementation, given the arrays that the Numba one takes."""
     indices, pair_weights = torch.as_tensor(indices), torch.as_tensor(pair_weights)
-    return temporal_torch.local_motion(now, before, indices, pair_weights, cfg)
+    return temporal.local_motion(now, before, indices, pair_weights, cfg)
 
 
 @st.composite
@@ -139,19 +138,6 @@ def test_what_moves_as_one_costs_nothing(points, seed):
     turned = torch.tensor(points @ turn.T + shift)
     assert distance < 1e-9 * (1 + size)
     assert temporal_numba.local_motion(turned, before, indices, pair_weights, TemporalConfig())[1] < 1e-9 * (1 + size)
-
-
-@given(SEEDS, st.integers(1, 400), st.integers(1, 8), st.sampled_from(["random", "equal", "two values", "sorted"]))
-def test_the_median_has_the_bits_of_numpys(seed, rows, columns, kind):
-    rng = np.random.default_rng(seed)
-    values = rng.random((rows, columns))
-    if kind == "equal":
-        values[:] = 0.25
-    elif kind == "two values":
-        values = np.rint(values)
-    elif kind == "sorted":
-        values = np.sort(values, axis=None).reshape(rows, columns)
-    assert median(values) == float(np.median(values))
 
 
 @given(SEEDS, st.integers(0, 300), st.integers(1, 100), st.sampled_from([0.0, -300.0, 30.0]))

@@ -19,13 +19,15 @@ from endoprior.core.geometry import project
 from endoprior.core.types import Camera, Frame
 from endoprior.data.sequence import FrameSequence
 from endoprior.data.shrink import shrunk
-from endoprior.initialization.cleanup import PointCloud, merge_voxels, remove_outliers
 from endoprior.initialization.flow_tracks import initial_motion
 from endoprior.initialization.sampling import (
+    PointCloud,
     initial_log_scales,
     initial_points,
+    merge_voxels,
     pixel_probability,
     quotas,
+    remove_outliers,
     sample_pixels,
 )
 from endoprior.model.presets import preset

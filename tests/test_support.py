@@ -11,7 +11,7 @@ from export_scenes import moving_scene
 from endoprior.core.geometry import project
 from endoprior.core.types import Camera, Frame
 from endoprior.model.scene import Scene
-from endoprior.model.support import WindowSupport, window_support
+from endoprior.model.surface import WindowSupport, window_support
 from endoprior.visualization.tissue_layers import SupportMap
 
 

@@ -10,7 +10,7 @@ from reference import temporal as reference
 
 from endoprior.core.config import TemporalConfig
 from endoprior.model.presets import preset
-from endoprior.training import temporal, temporal_numba, temporal_torch
+from endoprior.training import temporal, temporal_numba
 
 CFG = TemporalConfig()
 
@@ -22,7 +22,7 @@ def points(num=40, seed=0):
 def with_torch(now, before, indices, pair_weights, cfg):
     """The PyTorch implementation, given the arrays that the Numba one takes."""
     indices, pair_weights = torch.as_tensor(indices), torch.as_tensor(pair_weights)
-    return temporal_torch.local_motion(now, before, indices, pair_weights, cfg)
+    return temporal.local_motion(now, before, indices, pair_weights, cfg)
 
 
 def loss(now, before, weights=None, cfg=CFG):
@@ -158,7 +158,7 @@ def test_a_rigid_motion_costs_no_distance():
 
 def test_released_huber_is_the_literal_one_over_delta():
     x = torch.tensor([0.0, 0.003, 0.01, 0.5])
-    literal, scaled = temporal_torch.huber(x, 0.01, "literal"), temporal_torch.huber(x, 0.01, "released")
+    literal, scaled = temporal.huber(x, 0.01, "literal"), temporal.huber(x, 0.01, "released")
     assert literal.tolist() == pytest.approx([0, 4.5e-6, 5e-5, 0.01 * 0.495])
     torch.testing.assert_close(scaled, literal / 0.01)
 
@@ -256,25 +256,10 @@ def test_the_number_of_threads_changes_no_bit():
         assert torch.equal(one, many)
 
 
-@pytest.mark.parametrize("num", [1, 2, 5, 600, 3001])
-@pytest.mark.parametrize("kind", ["smooth", "ties", "equal", "two values", "skewed rows"])
-def test_median_is_numpys(num, kind):
-    rng = np.random.default_rng(num)
-    values = {
-        "smooth": lambda: np.sort(rng.gamma(3, size=(num, 7)), 1),
-        "ties": lambda: rng.integers(0, 9, (num, 7)) / 8,
-        "equal": lambda: np.full((num, 7), 0.3),
-        "two values": lambda: rng.integers(0, 2, (num, 8)) / 3,
-        # The rows that are looked at first tell nothing of the others.
-        "skewed rows": lambda: rng.gamma(3, size=(num, 8)) + 100 * (np.arange(num) % max(num // 512, 1) == 0)[:, None],
-    }[kind]()
-    assert temporal_numba.median(values) == np.median(values)
-
-
 def test_pairs_without_weight_keep_a_little():
     p = points(30)
     indices, distances = temporal_numba.neighbors(p, 4)
-    assert (temporal_numba.affinity(distances, indices, np.zeros(30)) == temporal_torch.SUM_EPS).all()
+    assert (temporal_numba.affinity(distances, indices, np.zeros(30)) == temporal.SUM_EPS).all()
 
 
 def test_a_point_at_nan_shows():

@@ -10,7 +10,7 @@ import torch
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.types import Camera
 from endoprior.data import load_sequence
-from endoprior.model.basis import basis_weights
+from endoprior.model.motion import basis_weights
 from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH

@@ -16,11 +16,10 @@ from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, bilinear, project
 from endoprior.core.types import Camera, Frame
 from endoprior.data import load_sequence
-from endoprior.initialization import anchor_flow, track_kernels
 from endoprior.initialization import flow_tracks as tracks
-from endoprior.initialization.cleanup import PointCloud
 from endoprior.initialization.neighbor_motion import fill_gaps, smooth_motion
-from endoprior.model.basis import basis_weights
+from endoprior.initialization.sampling import PointCloud
+from endoprior.model.motion import basis_weights
 from endoprior.model.presets import preset
 from endoprior.training.gaussian_trainer import GaussianTrainer
 
@@ -115,8 +114,8 @@ def test_flow_to_a_distant_frame_does_not_drift():
         shift = np.array([[1, 0, 1.3 * k], [0, 1, 0]], np.float32)
         moved = cv2.warpAffine(noise, shift, (160, 96), borderMode=cv2.BORDER_REFLECT)
         grays.append((moved + np.random.default_rng(k).normal(0, 4, moved.shape)).clip(0, 255).astype(np.uint8))
-    neighbors = [anchor_flow.neighbor_flows(grays, k) for k in range(23)]
-    flow = anchor_flow.anchor_flow(grays, neighbors, 0)
+    neighbors = [tracks.neighbor_flows(grays, k) for k in range(23)]
+    flow = tracks.anchor_flow(grays, neighbors, 0)
     assert list(flow.there) == list(range(24)) == list(flow.back)
     inside = np.s_[20:-20, 30:100]
     straight = np.abs(flow.there[23][inside] - [1.3 * 23, 0]).mean()
@@ -125,9 +124,9 @@ def test_flow_to_a_distant_frame_does_not_drift():
 
 
 def test_anchors_are_the_middles_of_equal_parts():
-    assert anchor_flow.anchors(1) == [0]
-    assert anchor_flow.anchors(7) == [0, 2, 4, 6]
-    assert anchor_flow.anchors(42) == [5, 15, 26, 36]
+    assert tracks.anchors(1) == [0]
+    assert tracks.anchors(7) == [0, 2, 4, 6]
+    assert tracks.anchors(42) == [5, 15, 26, 36]
 
 
 def test_a_step_agrees_with_arrays():
@@ -144,7 +143,7 @@ def test_a_step_agrees_with_arrays():
     found = ((end >= 0) & (end <= (WIDTH, HEIGHT))).all(-1) & tissue_mask[y, x]
     assert 500 < found.sum() < 3500
     got_end, got_cycle = np.empty_like(start), np.empty(len(start))
-    track_kernels.follow(start, there, back, tissue_mask, got_end, got_cycle)
+    tracks.follow(start, there, back, tissue_mask, got_end, got_cycle)
     np.testing.assert_allclose(got_end, end, rtol=1e-6, atol=1e-5)  # float32 flow
     np.testing.assert_allclose(got_cycle, np.where(found, cycle_px, np.inf), rtol=1e-5, atol=1e-5)
 

@@ -24,7 +24,7 @@ from endoprior.model.scene_file import load_scene
 from endoprior.runs.train import train
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA
-from endoprior.training.rates import log_linear
+from endoprior.training.optimizer import log_linear
 from endoprior.training.stage import Stage
 from endoprior.training.step import sh_degree
 

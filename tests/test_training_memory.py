@@ -9,8 +9,8 @@ from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.model.presets import preset
 from endoprior.runs.train import train
-from endoprior.training import memory_check as training_memory
-from endoprior.training.memory_check import LEAST_BYTES, PICTURE_BYTES, least_bytes
+from endoprior.training import preflight as training_memory
+from endoprior.training.preflight import LEAST_BYTES, PICTURE_BYTES, least_bytes
 
 
 def test_by_hand():

@@ -9,9 +9,9 @@ import pytest
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, pixel_centers, project
 from endoprior.core.types import Camera, Frame
-from endoprior.initialization.cleanup import PointCloud, concatenated
+from endoprior.initialization.sampling import PointCloud, concatenated
 from endoprior.initialization.unseen import CELLS, convex_hull, laplace_fill, unseen_points
-from endoprior.model.basis import basis_weights
+from endoprior.model.motion import basis_weights
 
 WIDTH, HEIGHT = 320, 240
 SIZE = WIDTH // CELLS

@@ -20,15 +20,15 @@ from endoprior.core.types import Camera, Splats
 from endoprior.data import load_sequence
 from endoprior.data.window_plan import Looks, look_through, plan_windows, windows_by_length
 from endoprior.model.carry import carry, carry_points, centers_then
-from endoprior.model.deformation import Offsets
-from endoprior.model.fixed_color import with_fixed_color
+from endoprior.model.colors import with_fixed_color
 from endoprior.model.gaussians import create_gaussians
-from endoprior.model.playback import Playback
+from endoprior.model.motion import Offsets
+from endoprior.model.playback import Playback, faded, joined
 from endoprior.model.presets import preset
-from endoprior.model.scene import Scene, faded, faded_in, joined
+from endoprior.model.scene import Scene, faded_in
 from endoprior.model.scene_file import load_scene
 from endoprior.model.single_scene import SingleScene
-from endoprior.model.support import Support
+from endoprior.model.surface import Support
 from endoprior.model.windowed_scene import Span, WindowedScene, save_index, window_file
 from endoprior.runs.train import start_run, train
 from endoprior.view.view_settings import ViewSettings

@@ -14,13 +14,11 @@ from torch import Tensor
 from endoprior.core.config import Config, DensityConfig, LossConfig, OptimConfig, ScheduleConfig, TemporalConfig
 from endoprior.core.types import Frame
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
-from endoprior.model.deformation import Offsets
-from endoprior.model.field import Field
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import Motion
+from endoprior.model.motion import Field, Motion, Offsets
 from endoprior.model.ops import ModelOps
 from endoprior.training.gaussian_method import GaussianMethod
-from endoprior.training.rates import Rate, rate_of
+from endoprior.training.optimizer import Rate, rate_of
 
 from .deform3dgs_points import SHARE, first_points
 from .learned_basis import COEFFICIENTS, value_at

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from endoprior.core.checks import input_error
 from endoprior.core.geometry import back_project, project
 from endoprior.core.types import Frame
-from endoprior.initialization.cleanup import PointCloud, concatenated
-from endoprior.initialization.sampling import MIN_POINTS, has_surface
+from endoprior.initialization.sampling import MIN_POINTS, PointCloud, concatenated, has_surface
 
 MOVING_PERCENTILE = 95.0
 """A pixel moves if its gray level departs from its mean over time by more than this percentile of all departures."""

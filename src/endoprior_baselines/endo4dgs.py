@@ -15,14 +15,15 @@ from endoprior.core.config_deformation import DeformationConfig, HexPlaneConfig
 from endoprior.core.types import Frame
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import HexPlaneMotion, Motion
+from endoprior.model.hexplane_field import HexPlaneMotion
+from endoprior.model.motion import Motion
 from endoprior.training.density import DensityStats, Plan
-from endoprior.training.drawn import Drawn
 from endoprior.training.gaussian_method import GaussianMethod, in_epochs
-from endoprior.training.losses_torch import total_variation
+from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
-from endoprior.training.rates import Rate, rate_of
+from endoprior.training.optimizer import Rate, rate_of
 from endoprior.training.stage import Stage
+from endoprior.training.step import Drawn
 
 from .endo4dgs_terms import (
     confident_error,

@@ -16,13 +16,13 @@ from endoprior.core.config_deformation import DeformationConfig, HexPlaneConfig
 from endoprior.model.gaussians import Gaussians
 from endoprior.model.motion import Motion
 from endoprior.training.density import DensityStats, Plan
-from endoprior.training.drawn import Drawn
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.gaussian_method import GaussianMethod, in_epochs
-from endoprior.training.losses_torch import total_variation
+from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
-from endoprior.training.rates import Rate, rate_of
+from endoprior.training.optimizer import Rate, rate_of
 from endoprior.training.stage import Stage
+from endoprior.training.step import Drawn
 
 from .endogs_field import UNIT_MM, JointMotion
 from .plane_terms import PlaneWeights, plane_term

@@ -15,10 +15,9 @@ from torch.nn.functional import relu
 from endoprior.compute.relu_network import relu_network
 from endoprior.core.config import Config
 from endoprior.core.config_deformation import DeformationConfig
-from endoprior.model.deformation import HexPlaneField, Offsets, num_features
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.heads import LinearLayers
-from endoprior.model.motion import HexPlaneMotion
+from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion, LinearLayers, num_features
+from endoprior.model.motion import Offsets
 from endoprior.model.ops import ModelOps
 
 UNIT_MM = 10.0

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from endoprior.model.basis import UnstoredGradient
+from endoprior.model.motion import UnstoredGradient
 
 from . import learned_basis_numba
 

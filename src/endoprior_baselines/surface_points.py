@@ -9,8 +9,7 @@ import numpy as np
 from endoprior.core.checks import input_error
 from endoprior.core.geometry import back_project
 from endoprior.core.types import Frame
-from endoprior.initialization.cleanup import PointCloud, concatenated
-from endoprior.initialization.sampling import MIN_POINTS, has_surface
+from endoprior.initialization.sampling import MIN_POINTS, PointCloud, concatenated, has_surface
 
 
 def grid_points(frames: Sequence[Frame], every_px: int, first_px: int) -> PointCloud:

@@ -17,18 +17,17 @@ from endoprior.compute.neighbors import nearest
 from endoprior.core.config import Config, DensityConfig, OptimConfig, ScheduleConfig, TemporalConfig
 from endoprior.core.types import Frame, Splats
 from endoprior.initialization.first_gaussians import FirstGaussians, resting_spheres
-from endoprior.model.deformation import Offsets
 from endoprior.model.gaussians import Gaussians
-from endoprior.model.motion import Motion
+from endoprior.model.motion import Motion, Offsets
 from endoprior.model.ops import ModelOps
 from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan
-from endoprior.training.drawn import Drawn
 from endoprior.training.gaussian_method import GaussianMethod, in_epochs
-from endoprior.training.losses_torch import total_variation
+from endoprior.training.losses import total_variation
 from endoprior.training.ops import TrainingOps
-from endoprior.training.rates import Rate, log_linear, rate_of
+from endoprior.training.optimizer import Rate, log_linear, rate_of
 from endoprior.training.stage import Stage
+from endoprior.training.step import Drawn
 
 from .surface_points import grid_points
 from .surgicalgaussian_terms import covariances, distance_change, ssim

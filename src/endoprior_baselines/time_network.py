@@ -14,7 +14,7 @@ from torch import Tensor
 
 from endoprior.compute.relu_network import relu_network
 from endoprior.core.checks import InputError
-from endoprior.model.field import Field
+from endoprior.model.motion import Field
 
 PLACE_BANDS, TIME_BANDS = 10, 4
 WIDTH, DEPTH, SKIP_AFTER = 256, 8, 4

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from endoprior.model.deformation import HexPlaneField
 from endoprior.model.hexplane import PLANE_NAMES
+from endoprior.model.hexplane_field import HexPlaneField
 
 
 def features(planes: list[list[Tensor]], unit: Tensor, coordinate: float) -> Tensor:

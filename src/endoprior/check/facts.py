@@ -34,7 +34,7 @@ from .remake import Remakes, find_remakes
 from .stereo_facts import StereoFacts, measure_stereo
 
 if TYPE_CHECKING:
-    from ..initialization.cleanup import PointCloud
+    from ..initialization.sampling import PointCloud
 
 SAMPLES = 20
 """Number of evenly spaced frames for expensive measurements."""

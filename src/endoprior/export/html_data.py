@@ -22,7 +22,8 @@ import torch
 from numpy.typing import NDArray
 
 from ..core.types import Camera, Splats
-from ..model.scene import Scene, Shown, faded
+from ..model.playback import faded
+from ..model.scene import Scene, Shown
 from ..render.constants import ALPHA_MIN, NEAR_Z
 from ..render.projection import color_slopes
 from ..render.sh import colors

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from ..core.checks import input_error
 from ..core.geometry import length_unit, project
 from ..model.carry import carry, carry_points
-from ..model.measures import distance, measures_of
+from ..model.measures import SurfaceMotion, distance, measures_of
 from ..model.scene import Scene
 from ..model.surface import render_surface
-from ..model.surface_motion import SurfaceMotion
 from ..system.atomic import whole_folder
 from ..visualization.measures import MeasuresFigure, displacement_span, measures_csv, stretch_span, value_colors
 from .axes import points_in_axes

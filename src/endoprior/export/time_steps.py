@@ -10,7 +10,7 @@ from ..core.checks import input_error, read_ranges
 from ..core.config import DataConfig
 from ..core.types import Camera, Splats
 from ..data.sequence import Split, is_test_frame
-from ..model.one_color import one_color
+from ..model.colors import one_color
 from ..model.scene import Scene
 from .axes import splats_in_axes
 from .formats import Axes

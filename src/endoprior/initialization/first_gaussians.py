@@ -1,8 +1,14 @@
-"""What the first Gaussians are: where, how large and how turned, how opaque, and how they move."""
+"""What the first Gaussians are: where, how large and how turned, how opaque, and how they move.
+
+They can start flat along the surface, whose normals come from measured depth. A plane has an inverse depth that is
+linear in the pixel: 1 / z = a x' + b y' + c with x' = (x - cx) / fx and y' alike, and (a, b, c) is along its normal.
+`P` points, `W` pixels of a window.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +16,83 @@ from numpy.typing import NDArray
 
 from ..compute.morton import morton_order
 from ..core.config import Config
+from ..core.geometry import cells_at, project
 from ..core.types import Frame
-from .cleanup import PointCloud, concatenated
+from ..system.memory import workers
 from .flow_tracks import InitialMotion, initial_motion
-from .normals import flat_along, surface_normals
-from .sampling import initial_log_scales, initial_points
+from .sampling import PointCloud, concatenated, has_surface, initial_log_scales, initial_points
 from .unseen import unseen_points
+
+WINDOW_SHARE = 1 / 60
+"""Width of the window in which a plane is fitted, as a share of the image's."""
+SAME_SURFACE = 0.03
+"""Pixels whose depth differs by more than this share belong to other tissue."""
+PLAIN = 1e-4
+"""Pull towards a plane at right angles to the ray, where a window holds too few pixels: share of the fit's weight."""
+BYTES_PER_POINT = 100
+"""Memory for each pixel of each window, bytes."""
+
+
+def surface_normals(cloud: PointCloud, frames: Sequence[Frame]) -> NDArray[np.float32]:
+    """(P, 3) unit normals in world axes, away from the camera, each from the depth around its point's source pixel.
+
+    Args:
+        frames: those that the points were sampled from; `cloud.origins` are their positions.
+    """
+    normals = np.zeros((len(cloud), 3), np.float32)
+
+    def fill(position: int) -> None:
+        rows = np.flatnonzero(cloud.origins == position)
+        if len(rows):
+            normals[rows] = _normals_of_frame(cloud.points[rows].astype(np.float64), frames[position])
+
+    most = int(np.bincount(cloud.origins, minlength=1).max(initial=0))
+    with ThreadPoolExecutor(workers(BYTES_PER_POINT * most * _window(frames[0]) ** 2)) as pool:
+        list(pool.map(fill, range(len(frames))))
+    return normals
+
+
+def flat_along(normals: NDArray) -> NDArray[np.float32]:
+    """(P, 4) quaternions wxyz that turn the third axis of a Gaussian to the unit `normals` (P, 3)."""
+    x, y, z = normals.T.astype(np.float64)
+    quats = np.stack([1 + z, -y, x, np.zeros_like(z)], -1)
+    quats[z < -1 + 1e-9] = (0, 1, 0, 0)  # half a turn
+    return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _window(frame: Frame) -> int:
+    """Width of the window, px: odd, 5 or more."""
+    return max(int(frame.camera.width * WINDOW_SHARE) // 2 * 2 + 1, 5)
+
+
+def _normals_of_frame(points: NDArray, frame: Frame) -> NDArray:
+    """Weighted least squares in the window around each point; (P, 3)."""
+    camera, reach = frame.camera, _window(frame) // 2
+    pixels, _ = project(points, camera)
+    x, y = cells_at(pixels, camera.width, camera.height)
+    usable = frame.tissue_mask & has_surface(frame)
+    inverse = np.divide(1.0, frame.depth, out=np.zeros(frame.depth.shape), where=usable)
+    steps = np.arange(-reach, reach + 1)
+    dy, dx = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
+    column, row = x[:, None] + dx, y[:, None] + dy
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    found = np.where(inside, inverse[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)], 0)
+    center = inverse[y, x][:, None]
+    weight = (np.abs(found - center) < SAME_SURFACE * center).astype(np.float64)
+    # Coordinates around the point, in windows: the normal equations stay well conditioned.
+    terms = np.stack([dx / reach, dy / reach, np.ones(len(dx))])
+    normal = np.einsum("iw,pw,jw->pij", terms, weight, terms)
+    normal[:, [0, 1], [0, 1]] += PLAIN * len(dx)
+    normal[:, 2, 2] += 1e-9
+    sums = np.einsum("iw,pw->pi", terms, weight * found)
+    slope_x, slope_y, level = np.linalg.solve(normal, sums[..., None])[..., 0].T
+    a, b = slope_x / reach * camera.fx, slope_y / reach * camera.fy
+    c = level - a * (x + 0.5 - camera.cx) / camera.fx - b * (y + 0.5 - camera.cy) / camera.fy
+    n = np.stack([a, b, c], -1)
+    length = np.linalg.norm(n, axis=1, keepdims=True)
+    n = np.where(length > 0, n / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
+    return n @ camera.world_to_camera[:3, :3]
+
 
 UNSEEN_OPACITY = 0.9
 """Initial opacity of what no frame shows: no color asks for it."""

@@ -4,11 +4,13 @@ Coefficients that start at zero learn motion from color alone, whose gradient re
 moves farther between frames is then explained by Gaussians that fade in and out. Tracking each point by dense inverse
 search (Kroeger et al. 2016, OpenCV) provides an initial motion, which training refines.
 
-A point goes from its source frame to an anchor, and from there to every other frame: two steps of flow, each checked by
-the flow back. Of all anchors, the one counts whose two steps close best. Where none closes, the point is lost, and
-moves as the points around it do (`neighbor_motion`).
+Chained from frame to frame, flow drifts. The flow straight from an anchor frame to a distant frame does not; it is
+found because its search starts from the flow to the frame between. A point goes from its source frame to an anchor, and
+from there to every other frame: two steps of flow, each checked by the flow back. Of all anchors, the one counts whose
+two steps close best. Where none closes, the point is lost, and moves as the points around it do (`neighbor_motion`).
 
-Shared letters: `T` training frames, `N` points, `B` basis functions.
+`T` training frames, `N` points, `B` basis functions, `h, w` size of the gray images. Pixels are float64 with centers at
+half integers.
 """
 
 from __future__ import annotations
@@ -18,20 +20,77 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..core.config_deformation import BasisConfig
 from ..core.geometry import back_project, cells_at, project
 from ..core.types import Frame
-from ..footage.optical_flow import MIN_SIZE_PX, fine_shrink, gray_for_flow
-from ..model.basis import basis_weights
+from ..footage.optical_flow import MIN_SIZE_PX, fine_flow, fine_shrink, gray_for_flow
+from ..model.motion import basis_weights
 from ..system.memory import workers
-from . import track_kernels as kernels
-from .anchor_flow import REACH, AnchorFlow, anchor_flow, anchors, neighbor_flows
-from .cleanup import PointCloud
 from .neighbor_motion import fill_gaps, smooth_motion
-from .sampling import has_surface
+from .sampling import PointCloud, has_surface
+
+SPACING = 12
+"""Largest number of frames between two anchors. With 6 the tracks of the phantoms are no better."""
+LEAST_ANCHORS = 4
+"""Also of a short sequence: a point that is hidden in one anchor is followed by way of another."""
+REACH = 48
+"""Frames to both sides of an anchor to which flow is computed."""
+Flow = NDArray[np.float16]
+"""(h, w, 2) px of the gray images. Half precision: 0.01 px at 30 px, and all flows of an anchor fit in memory."""
+
+
+@dataclass(frozen=True)
+class AnchorFlow:
+    """The flows between one anchor and the frames around it."""
+
+    anchor: int
+    there: dict[int, Flow]
+    """By frame: flow from the anchor to it."""
+    back: dict[int, Flow]
+    """By frame: flow from it to the anchor."""
+
+
+def anchors(count: int) -> list[int]:
+    """Positions of the anchors among `count` frames: the middles of equal parts of at most `SPACING` frames."""
+    parts = max(-(-count // SPACING), min(count, LEAST_ANCHORS))
+    return [int((i + 0.5) * count / parts) for i in range(parts)]
+
+
+def neighbor_flows(grays: Sequence[NDArray[np.uint8]], k: int) -> tuple[Flow, Flow]:
+    """Flow from image `k` to the next one, and back."""
+    first, second = grays[k], grays[k + 1]
+    return fine_flow(first, second).astype(np.float16), fine_flow(second, first).astype(np.float16)
+
+
+def anchor_flow(grays: Sequence[NDArray[np.uint8]], neighbors: Sequence[tuple[Flow, Flow]], anchor: int) -> AnchorFlow:
+    """The flows between image `anchor` and those up to `REACH` from it.
+
+    Args:
+        grays: T gray images. neighbors: T - 1 results of `neighbor_flows`.
+    """
+    still = np.zeros((*grays[0].shape, 2), np.float16)
+    there, back = {anchor: still}, {anchor: still}
+    for last, step in ((min(anchor + REACH, len(grays) - 1), 1), (max(anchor - REACH, 0), -1)):
+        for k in range(anchor, last, step):
+            onward, returning = neighbors[k] if step > 0 else neighbors[k - 1][::-1]
+            guess_there, guess_back = _composed(there[k], onward), _composed(returning, back[k])
+            there[k + step] = fine_flow(grays[anchor], grays[k + step], guess_there).astype(np.float16)
+            back[k + step] = fine_flow(grays[k + step], grays[anchor], guess_back).astype(np.float16)
+    return AnchorFlow(anchor, there, back)
+
+
+def _composed(first: Flow, second: Flow) -> NDArray[np.float32]:
+    """(h, w, 2) flow that goes along `first` and from there along `second`."""
+    first, second = first.astype(np.float32), second.astype(np.float32)
+    row, column = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
+    x, y = column + first[..., 0], row + first[..., 1]
+    return first + cv2.remap(second, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
 
 CYCLE_PX = 0.25
 """A point is lost where forward and backward flow of its two steps disagree by more than this, px of the flow."""
@@ -136,7 +195,7 @@ def _followed(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pixels (N, 2) after one step, and by how much the step back misses (N,), px; infinite off the tissue `mask`."""
     end, cycle_px = np.empty_like(pixels), np.empty(len(pixels))
-    kernels.follow(pixels, there.astype(np.float32), back.astype(np.float32), mask, end, cycle_px)
+    follow(pixels, there.astype(np.float32), back.astype(np.float32), mask, end, cycle_px)
     return end, cycle_px
 
 
@@ -160,3 +219,46 @@ def fit_basis(offsets: NDArray[np.floating], times: list[float], cfg: BasisConfi
     solve = np.linalg.solve(normal, weights.T)
     fitted = solve @ offsets.reshape(len(times), -1)
     return np.ascontiguousarray(fitted.reshape(cfg.num_bases, -1, 3).transpose(1, 0, 2), np.float32)
+
+
+@njit(parallel=True, cache=True)
+def follow(pixels, there, back, tissue_mask, out, cycle_px):
+    """Move pixels (N, 2) along the flow `there` (h, w, 2), and measure by how much `back` misses their start.
+
+    `cycle_px` is infinite where the point leaves the image or the tissue (H, W). Flow is in px of its own size, all
+    else in px of the mask.
+    """
+    height, width = tissue_mask.shape
+    scale_x, scale_y = width / there.shape[1], height / there.shape[0]
+    for n in prange(len(pixels)):
+        x, y = pixels[n]
+        step_x, step_y = _flow(there, x / scale_x, y / scale_y)
+        x, y = x + step_x * scale_x, y + step_y * scale_y
+        out[n, 0], out[n, 1] = x, y
+        cycle_px[n] = np.inf
+        if 0 <= x <= width and 0 <= y <= height and tissue_mask[_cell(y, height), _cell(x, width)]:
+            back_x, back_y = _flow(back, x / scale_x, y / scale_y)
+            cycle_px[n] = np.hypot((step_x + back_x) * scale_x, (step_y + back_y) * scale_y)
+
+
+@njit(inline="always")
+def _flow(flow, x, y):
+    # Bilinear, as in `geometry.bilinear`; outside of the image, the border value is repeated.
+    height, width = flow.shape[:2]
+    u, v = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
+    column, row = int(u), int(v)
+    fx, fy = u - column, v - row
+    x = y = 0.0
+    for i, j, weight in (
+        (row, column, (1 - fx) * (1 - fy)),
+        (row, min(column + 1, width - 1), fx * (1 - fy)),
+        (min(row + 1, height - 1), column, (1 - fx) * fy),
+        (min(row + 1, height - 1), min(column + 1, width - 1), fx * fy),
+    ):
+        x, y = x + weight * flow[i, j, 0], y + weight * flow[i, j, 1]
+    return x, y
+
+
+@njit(inline="always")
+def _cell(position, size):
+    return min(int(position), size - 1)

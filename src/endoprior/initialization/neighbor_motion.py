@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections import defaultdict
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from . import track_kernels as kernels
-
+LEAST_SHARE = 0.34
+"""Neighbors carry a point as long as those that are known have this share of the weight."""
 CARRIERS = 12
 """Known points that carry a lost one."""
 COMPANIONS, COMPANION_STEP = 128, 4
@@ -54,7 +55,7 @@ def _swept(
         if not len(lost) or len(carriers) < CARRIERS:
             continue
         distances, nearest = cKDTree(carried[t, carriers]).query(carried[t, lost], k=CARRIERS)
-        ends = kernels.carry(carried, known, t, step, lost, carriers[nearest], weights_by_distance(distances), age)
+        ends = carry(carried, known, t, step, lost, carriers[nearest], weights_by_distance(distances), age)
         for end in np.unique(ends[ends >= 0]):
             waiting[int(end)].append(lost[ends == end])
     return carried, age
@@ -87,7 +88,7 @@ def smooth_motion(positions: NDArray[np.floating], origins: NDArray[np.integer])
         own = np.flatnonzero(origins == source)
         tree = cKDTree(positions[source])
         distances, nearest = tree.query(positions[source, own], k=np.arange(1, count + 1, COMPANION_STEP), workers=-1)
-        kernels.mean_displacement(positions, source, own, nearest, weights_by_distance(distances), offsets)
+        mean_displacement(positions, source, own, nearest, weights_by_distance(distances), offsets)
     return offsets
 
 
@@ -95,3 +96,56 @@ def weights_by_distance(distances: NDArray[np.floating]) -> NDArray[np.floating]
     """(P, k) a Gaussian of the distance (P, k) whose width is the mean of the row; of sum 1."""
     weights = np.exp(-0.5 * (distances / np.maximum(distances.mean(1, keepdims=True), 1e-6)) ** 2)
     return weights / weights.sum(1, keepdims=True)
+
+
+@njit(parallel=True, cache=True)
+def carry(positions, known, start, step, points, neighbors, weights, age):
+    """Carry points that are lost after frame `start` by the mean displacement of neighbors since then.
+
+    Args:
+        positions: (T, N, 3), NaN where nothing is known; written in the frames in which a point is carried.
+        known: (T, N) True where a position was measured.
+        step: +1 or -1: the direction in time.
+        points: (P,) points whose position at `start` is set. neighbors: (P, k) points known at `start`.
+        weights: (P, k), of sum 1.
+        age: (T, N) frames since the position was measured; written beside `positions`.
+    Returns:
+        (P,) frame from which the neighbors no longer suffice, and the point needs others; -1 if they do.
+    """
+    num_frames = len(positions)
+    ends = np.full(len(points), -1)
+    for p in prange(len(points)):
+        n = points[p]
+        t = start + step
+        while 0 <= t < num_frames and not known[t, n]:
+            total = x = y = z = 0.0
+            for k in range(neighbors.shape[1]):
+                j = neighbors[p, k]
+                if known[t, j]:
+                    total += weights[p, k]
+                    x += weights[p, k] * (positions[t, j, 0] - positions[start, j, 0])
+                    y += weights[p, k] * (positions[t, j, 1] - positions[start, j, 1])
+                    z += weights[p, k] * (positions[t, j, 2] - positions[start, j, 2])
+            if total < LEAST_SHARE:
+                ends[p] = t - step
+                break
+            positions[t, n, 0] = positions[start, n, 0] + x / total
+            positions[t, n, 1] = positions[start, n, 1] + y / total
+            positions[t, n, 2] = positions[start, n, 2] + z / total
+            age[t, n] = age[t - step, n] + 1
+            t += step
+    return ends
+
+
+@njit(parallel=True, cache=True)
+def mean_displacement(positions, source, points, neighbors, weights, offsets):
+    """Set offsets (T, N, 3) of `points` (P,) to the mean displacement of `neighbors` (P, k) since frame `source`."""
+    for p in prange(len(points)):
+        for t in range(len(positions)):
+            x = y = z = 0.0
+            for k in range(neighbors.shape[1]):
+                j = neighbors[p, k]
+                x += weights[p, k] * (positions[t, j, 0] - positions[source, j, 0])
+                y += weights[p, k] * (positions[t, j, 1] - positions[source, j, 1])
+                z += weights[p, k] * (positions[t, j, 2] - positions[source, j, 2])
+            offsets[t, points[p], 0], offsets[t, points[p], 1], offsets[t, points[p], 2] = x, y, z

@@ -22,10 +22,9 @@ from scipy.spatial import cKDTree
 from ..core.config_deformation import BasisConfig
 from ..core.geometry import back_project, cells_at, project
 from ..core.types import Frame
-from ..model.basis import basis_weights
-from .cleanup import PointCloud, concatenated
+from ..model.motion import basis_weights
 from .neighbor_motion import CARRIERS, weights_by_distance
-from .sampling import eroded_mask, has_surface
+from .sampling import PointCloud, concatenated, eroded_mask, has_surface
 
 CELLS = 80
 """Columns of cells: one for 8 px of an image 640 px wide."""

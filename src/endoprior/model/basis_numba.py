@@ -15,7 +15,7 @@ _AHEAD = 8  # Gaussians between asking for the coefficients of one and reading t
 
 
 def weighted_sum(motion: Tensor, weights: NDArray) -> Tensor:
-    """See `basis_torch.weighted_sum`."""
+    """See `motion.weighted_sum`."""
     coefficients = motion.contiguous().numpy()
     out = np.empty((len(coefficients), coefficients.shape[2]), dtype=coefficients.dtype)
     _weighted_sum(coefficients, weights.astype(out.dtype), *_support(weights), out)
@@ -23,7 +23,7 @@ def weighted_sum(motion: Tensor, weights: NDArray) -> Tensor:
 
 
 def weighted_sum_backward(v_out: Tensor, weights: NDArray) -> Tensor:
-    """See `basis_torch.weighted_sum_backward`."""
+    """See `motion.weighted_sum_backward`."""
     gradient = v_out.contiguous().numpy()
     v_motion = np.zeros((len(gradient), len(weights), gradient.shape[1]), dtype=gradient.dtype)
     _weighted_sum_backward(gradient, weights.astype(gradient.dtype), *_support(weights), v_motion)

@@ -27,7 +27,7 @@ CHUNK = 2048
 def hexplane_linear(
     grid: PlaneGrid, unit: Tensor, times: tuple[float, ...], weight: Tensor, bias: Tensor
 ) -> tuple[Tensor, ...]:
-    """See `hexplane_torch.hexplane_linear`."""
+    """See `hexplane.hexplane_linear`."""
     check_shape(f"unit:N,3 weight:W,{grid.num_features} bias:W", unit=unit, weight=weight, bias=bias)
     return _Linear.apply(unit, weight, bias, times, grid)
 

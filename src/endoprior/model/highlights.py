@@ -21,14 +21,12 @@ from ..core.checks import InputError
 from ..core.geometry import cells_at
 from ..core.types import Frame
 from ..priors.specular import specular_likelihood
-from .attributes import motion_layout
-from .basis import basis_weights
-from .fixed_color import changes_color
-from .gaussians import SH_C0, Gaussians
+from .colors import changes_color
+from .gaussians import SH_C0, Gaussians, motion_layout
+from .motion import basis_weights
 from .scene import Scene
 from .single_scene import SingleScene
-from .support import FramesOf
-from .surface import project_visible, render_surface
+from .surface import FramesOf, project_visible, render_surface
 
 REACH_PX = 11
 """Side of the square around a pixel whose largest likelihood counts, in an image 640 px wide: a Gaussian's footprint,

@@ -121,12 +121,3 @@ def config_from(values: Any) -> Config:
     """
     name = values.get("method", OWN) if isinstance(values, dict) else OWN
     return from_dict(method_named(name).config_type if isinstance(name, str) else Config, values)
-
-
-def motion_of(cfg: Config) -> Motion:
-    """How the Gaussians of a config move.
-
-    Raises:
-        TypeError: its method has none.
-    """
-    return method_of(cfg).motion(cfg)

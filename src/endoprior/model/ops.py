@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from . import basis_numba, basis_torch, hexplane_numba, hexplane_torch
+from . import basis_numba, hexplane, hexplane_numba, motion
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class ModelOps:
 
     name: str
     weighted_sum: Callable[..., Tensor]
-    """Offsets from temporal coefficients: see `basis_torch.weighted_sum`."""
+    """Offsets from temporal coefficients: see `motion.weighted_sum`."""
     weighted_sum_backward: Callable[..., Tensor]
-    """Its gradient: see `basis_torch.weighted_sum_backward`."""
+    """Its gradient: see `motion.weighted_sum_backward`."""
     hexplane_linear: Callable[..., tuple[Tensor, ...]]
-    """A linear layer on HexPlane features: see `hexplane_torch.hexplane_linear`."""
+    """A linear layer on HexPlane features: see `hexplane.hexplane_linear`."""
     fuse_heads: bool
     """Compute the hidden layers of all heads as one matrix product: fewer and larger launches on a GPU."""
 
@@ -38,9 +38,9 @@ NUMBA = ModelOps(
 )
 TORCH = ModelOps(
     "torch",
-    basis_torch.weighted_sum,
-    basis_torch.weighted_sum_backward,
-    hexplane_torch.hexplane_linear,
+    motion.weighted_sum,
+    motion.weighted_sum_backward,
+    hexplane.hexplane_linear,
     fuse_heads=True,
 )
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,15 +18,11 @@ import torch
 from .. import render
 from ..core.config import Config
 from ..core.types import Camera, RenderedView, Splats
-from .method import method_of
+from .method import Method, method_of
+from .playback import Background, faded, joined, rendered, rendered_many
 
 if TYPE_CHECKING:
     from .single_scene import SingleScene
-
-
-Background = tuple[float, float, float]
-"""Color in [0, 1]."""
-BLACK = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -199,10 +196,15 @@ class Scene(RenderedScene):
         """
         return rendered_many([self.parts_at(time) for time in times], cameras, self.backend, self.background)
 
+    @cached_property
+    def method(self) -> Method:
+        """The method that trained it."""
+        return method_of(self.config)
+
     @property
     def background(self) -> Background:
         """Color behind everything: that of its method."""
-        return method_of(self.config).background
+        return self.method.background
 
     @property
     def backend(self) -> render.Backend:
@@ -226,48 +228,3 @@ def _shown(window: Window, position: float, weight: float) -> Shown:
     """Args: position: in frames from the start of the sequence."""
     length = window.stop - window.start
     return Shown(window, min(max((position - window.start) / length, 0.0), 1.0), weight)
-
-
-def rendered(
-    parts: Sequence[tuple[Splats, float]], camera: Camera, backend: render.Backend, background: Background = BLACK
-) -> RenderedView:
-    """The weighted mean of what `camera` sees of each of some Gaussians."""
-    rasterize, behind = render.load(backend), parts[0][0].means.new_tensor(background)
-    return mixed([(rasterize(splats, camera, background=behind).view, weight) for splats, weight in parts])
-
-
-def rendered_many(
-    parts: Sequence[Sequence[tuple[Splats, float]]],
-    cameras: Sequence[Camera],
-    backend: render.Backend,
-    background: Background = BLACK,
-) -> list[RenderedView]:
-    """`rendered` for several cameras, in one call where the backend can."""
-    every = [(splats, camera) for some, camera in zip(parts, cameras, strict=True) for splats, _ in some]
-    behind = every[0][0].means.new_tensor(background)
-    outputs = render.load_many(backend)([s for s, _ in every], [camera for _, camera in every], background=behind)
-    views = iter(out.view for out in outputs)
-    return [mixed([(next(views), weight) for _, weight in some]) for some in parts]
-
-
-def mixed(views: Sequence[tuple[RenderedView, float]]) -> RenderedView:
-    """The weighted mean of pictures of one size; the weights add up to 1."""
-    if len(views) == 1:
-        return views[0][0]
-    names = [field.name for field in fields(RenderedView)]
-    return RenderedView(*(sum(weight * getattr(view, name) for view, weight in views) for name in names))
-
-
-def faded(splats: Splats, weight: float) -> Splats:
-    """`splats` with their optical depth multiplied by `weight` in (0, 1]."""
-    if weight == 1:
-        return splats
-    return Splats(**splats.tensors | {"opacities": 1 - (1 - splats.opacities) ** weight})
-
-
-def joined(parts: Sequence[Splats]) -> Splats:
-    """The Gaussians of all `parts`, which have the same tensors."""
-    if len(parts) == 1:
-        return parts[0]
-    names = [field.name for field in fields(Splats) if getattr(parts[0], field.name) is not None]
-    return Splats(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

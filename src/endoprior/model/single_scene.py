@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -13,11 +14,8 @@ from .. import render
 from ..core.config import Config
 from ..core.types import Camera, Splats
 from ..system.arrays_file import part, save_arrays
-from .deformation import Offsets
-from .field import Field
 from .gaussians import Gaussians
-from .method import motion_of
-from .motion import Motion
+from .motion import Field, Motion, Offsets
 from .ops import ops_for
 from .scene import Scene, Window
 from .scene_facts import MOST_GAUSSIANS, SceneFacts, camera_arrays, demand, scene_facts
@@ -74,10 +72,10 @@ class SingleScene(Scene):
         held = min(max(time, self.trained_from), self.trained_until)
         return self.motion.offsets(gaussians, self.field, held, self.config, ops_for(self.device))
 
-    @property
+    @cached_property
     def motion(self) -> Motion:
         """How its Gaussians move."""
-        return motion_of(self.config)
+        return self.method.motion(self.config)
 
     @torch.no_grad()
     def canonical(self) -> Splats:
@@ -116,7 +114,9 @@ class SingleScene(Scene):
         return change(self, self.windows[0])
 
     @staticmethod
-    def of_arrays(arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> SingleScene:
+    def of_arrays(
+        arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts, motion: Motion
+    ) -> SingleScene:
         """The scene that `save` wrote as these arrays, which fit its method's `schema`.
 
         Raises:
@@ -130,7 +130,7 @@ class SingleScene(Scene):
         )
         return SingleScene(
             Gaussians(part(arrays, "gaussians.")),
-            motion_of(facts.config).field_of(part(arrays, "field."), facts.config),
+            motion.field_of(part(arrays, "field."), facts.config),
             facts.config,
             cameras,
             facts.frames_per_second,

@@ -15,7 +15,7 @@ from ..data.window_plan import look_through, plan_windows
 from ..model.method import method_of
 from ..model.scene import RenderedScene
 from ..system.console import complain
-from ..training.ignored_options import note_on_budget, reject_ignored_options
+from ..training.preflight import note_on_budget, reject_ignored_options
 from ..training.trainer import Observer
 from .checkpoint import CHECKPOINT_SECONDS
 from .folder import config_of_run, sequence_of_run

@@ -24,7 +24,7 @@ from ..system.heap import freed_memory_kept
 from ..system.leftovers import remove_leftovers
 from ..tool_masks.margin import with_tool_margin
 from ..training.divergence import Diverged
-from ..training.memory_check import reject_too_large
+from ..training.preflight import reject_too_large
 from ..training.trainer import DEFAULT_FRAMES_PER_SECOND, Observer
 from . import kernel_cache
 from .checkpoint import CHECKPOINT_SECONDS, CheckpointWriter, deferred_interrupt, load_checkpoint, save_checkpoint
@@ -100,7 +100,8 @@ class TrainingRun:
         """Start or restore the trainer, and write what must be known to repeat the run."""
         trainer, checkpoint = self.trainer, out / CHECKPOINT
         trainer.sequence.demand_unchanged()  # what was read before is of the same state
-        if self.resume and checkpoint.is_file():
+        restored = self.resume and checkpoint.is_file()
+        if restored:
             load_checkpoint(trainer, checkpoint, fingerprint)
         elif self.resume and (out / CONFIG).is_file():  # stopped before its first checkpoint
             accept_resumed(out, trainer.cfg, fingerprint, trainer.sequence.path)
@@ -109,7 +110,7 @@ class TrainingRun:
         remove_leftovers(out)  # not before the run was accepted and has the lock
         facts = run_facts(trainer.sequence, trainer.cfg, fingerprint)
         write_json(out / CONFIG, facts if self.tool_margin_px is None else facts | {MARGIN: self.tool_margin_px})
-        if trainer.state is None:
+        if not restored:
             trainer.start()
         cut_log(out / LOG, trainer.state.stage, trainer.state.iteration)
 

@@ -20,7 +20,7 @@ _ONE = np.float32(1)
 
 
 def add_gradient(stats: DensityStats, out: RenderOutput, width: int, height: int, skip: Tensor | None = None) -> None:
-    """See `density_torch.add_gradient`; `skip` has no use here: the divergence check comes first on a CPU."""
+    """See `density.add_gradient`; `skip` has no use here: the divergence check comes first on a CPU."""
     gradient = out.means2d.grad.contiguous().numpy()
     half = np.float32(width / 2), np.float32(height / 2)
     _add_gradient(out.radii.numpy(), gradient, *half, stats.grad2d_ndc_sum.numpy(), stats.num_seen.numpy())
@@ -35,7 +35,7 @@ def add_score(
     scale: float = 1.0,
     skip: Tensor | None = None,
 ) -> None:
-    """See `density_torch.add_score`; `skip` has no use here."""
+    """See `density.add_score`; `skip` has no use here."""
     _add_score(
         out.means2d.detach().contiguous().numpy(), out.radii.contiguous().numpy(), np.float32(scale), prior.numpy(),
         tissue_mask.numpy(), opacities.detach().numpy(), stats.score_sum.numpy(), stats.opacity_sum.numpy(),
@@ -44,7 +44,7 @@ def add_score(
 
 
 def valid_projection(means2d: Tensor, radii: Tensor, tissue_mask: Tensor) -> Tensor:
-    """See `density_torch.valid_projection`."""
+    """See `density.valid_projection`."""
     found = np.empty(len(radii), np.bool_)
     _valid(means2d.detach().contiguous().numpy(), radii.contiguous().numpy(), tissue_mask.numpy(), found)
     return torch.from_numpy(found)

@@ -18,18 +18,17 @@ from ..initialization.first_gaussians import FirstGaussians, first_gaussians
 from ..model.gaussians import Gaussians
 from ..model.method import Method
 from ..model.scene_facts import SceneFacts
-from ..model.schema import gaussians_schema
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import ArraySpec
 from . import density
 from .density import DensityStats, Plan
-from .drawn import Drawn
 from .frames import TrainingFrames
 from .gaussian_trainer import GaussianTrainer
 from .losses import supervised_terms
 from .ops import TrainingOps
-from .rates import Rate, rate_of
+from .optimizer import Rate, rate_of
 from .stage import Stage
+from .step import Drawn
 from .trainer import Trainer
 
 EPOCHS = 2**31
@@ -58,11 +57,11 @@ class GaussianMethod(Method):
     def schema(self, cfg: Config) -> dict[str, ArraySpec]:
         """See `Method.schema`."""
         per_gaussian = {name: ArraySpec("float32", ("N",)) for name in ("prior_score", "num_valid")}
-        return gaussians_schema(self.motion(cfg), cfg) | per_gaussian
+        return self.motion(cfg).schema(cfg) | per_gaussian
 
     def scene(self, arrays: Mapping[str, Tensor], cameras: tuple[Camera, ...], facts: SceneFacts) -> SingleScene:
         """See `Method.scene`."""
-        return SingleScene.of_arrays(arrays, cameras, facts)
+        return SingleScene.of_arrays(arrays, cameras, facts, self.motion(facts.config))
 
     def first_gaussians(self, frames: Sequence[Frame], cfg: Config) -> FirstGaussians:
         """The Gaussians before training, from the training frames.

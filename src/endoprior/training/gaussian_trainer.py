@@ -1,11 +1,13 @@
-"""Training of Gaussians: their start, the two stages, and the scene that results.
+"""Training of Gaussians: what changes in it, the start, the two stages, and the scene that results.
 
 Two stages. Coarse: the first training frame alone, nothing deforms. Fine: a random training frame each time, deformed.
+`N` Gaussians, `K` touched cells of planes, `P` tracks, `F` training frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -18,20 +20,17 @@ from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.shell import command
 from ..data import FrameSequence
-from ..model.attributes import motion_layout
-from ..model.field import Field
-from ..model.gaussians import Gaussians, create_gaussians
+from ..model.gaussians import Gaussians, create_gaussians, motion_layout
+from ..model.hexplane import plane_shapes
 from ..model.method import method_of
+from ..model.motion import Field, Motion
 from ..model.scene_file import check_cameras
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import ArraySpec, part
-from . import left_out
 from .density import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
-from .gaussians_schema import state_schema
-from .gaussians_state import GaussiansState
-from .mask_doubt import MaskDoubt
+from .missed_tools import VISITS, MaskDoubt
 from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
 from .stage import Stage, StepReport, stage_length
@@ -43,8 +42,68 @@ if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
 
 
+@dataclass
+class GaussiansState:
+    """All that changes while training; a checkpoint holds exactly this."""
+
+    stage: Stage
+    iteration: int
+    """Iterations of this stage already done."""
+    gaussians: Gaussians
+    field: Field | None
+    optimizer: Optimizer
+    stats: DensityStats
+    tracks: StartTracks | None = None
+    """Where motion started from optical flow and is held to it."""
+    left_out: Tensor | None = None
+    """(F, VISITS) share of the view that was left out as a missed tool in the last visits of each training frame."""
+
+    def arrays(self) -> dict[str, Tensor]:
+        """Every tensor by the name that it has in a checkpoint."""
+        arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
+        arrays |= {f"stats.{name}": value for name, value in self.stats.tensors().items()}
+        arrays |= {f"optimizer.{name}": value for name, value in self.optimizer.state_arrays().items()}
+        if self.tracks is not None:
+            arrays |= {f"tracks.{name}": value for name, value in self.tracks.tensors().items()}
+        if self.left_out is not None:
+            arrays["left_out"] = self.left_out
+        if self.field is not None:
+            arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
+        return arrays
+
+
+def state_schema(motion: Motion, cfg: Config, *, doubts: bool) -> dict[str, ArraySpec]:
+    """The arrays of a `GaussiansState`: the model, Adam's moments, statistics of density control, and tracks, if any.
+
+    Args:
+        doubts: also how much of each frame was left out as a missed tool.
+    """
+    model = motion.schema(cfg)
+    trained = {name.removeprefix("gaussians."): spec for name, spec in model.items() if name.startswith("gaussians.")}
+    trained |= {name: ArraySpec("float32", shape) for name, shape in motion.parameter_shapes(cfg).items()}
+    optimizer = {f"{name}.{moment}": spec for name, spec in trained.items() for moment in ("first", "second")}
+    for name, spec in trained.items():
+        optimizer[f"{name}.steps"] = ArraySpec("int64", (spec.shape[1] if name == "motion" else 1,))
+    planes = motion.planes(cfg)
+    if planes is not None:
+        moments = ArraySpec("float32", ("K", planes.channels))
+        cells = sum(rows * columns for scale in plane_shapes(planes) for rows, columns in scale.values())
+        of_planes = {"marks": ArraySpec("uint8", (cells,)), "exp_avg": moments, "exp_avg_sq": moments}
+        of_planes["steps"] = ArraySpec("int64", (1,))
+        optimizer |= {f"plane_adam.{name}": spec for name, spec in of_planes.items()}
+    found = {f"optimizer.{name}": spec for name, spec in optimizer.items()}
+    found |= {f"stats.{field.name}": ArraySpec("float32", ("N",)) for field in fields(DensityStats)}
+    found |= {"left_out": ArraySpec("float32", ("F", VISITS))} if doubts else {}
+    if cfg.loss.track_weight and cfg.init.motion == "flow":
+        found["tracks.coefficients"] = ArraySpec("float32", ("P", cfg.deformation.basis.num_bases, 3))
+        found |= {"tracks.followed": ArraySpec("float32", ("P", "F")), "tracks.rows": ArraySpec("int64", ("N",))}
+    return model | found
+
+
 class GaussianTrainer(Trainer):
     """See `Trainer`."""
+
+    state: GaussiansState
 
     def __init__(self, sequence: FrameSequence, cfg: Config, ops: TrainingOps | None = None) -> None:
         """Prepare; nothing is computed yet.
@@ -60,6 +119,7 @@ class GaussianTrainer(Trainer):
             raise input_error(sequence.path, "right/ and baseline_mm for --eyes both", "no right eye", fix)
         self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
         self.method: GaussianMethod = method_of(cfg)
+        self.motion = self.method.motion(self.cfg)
         self.device = device_for(cfg.render.backend)
         self.ops = ops or ops_for(self.device)
         self.cameras = tuple(sequence.camera(i) for i in range(len(sequence)))
@@ -72,6 +132,7 @@ class GaussianTrainer(Trainer):
         self.spatial_scale = spatial_scale(centers, cfg)
         self.step_once = TrainingStep(
             self.method,
+            self.motion,
             self.cfg,
             frames,
             centers,
@@ -81,7 +142,6 @@ class GaussianTrainer(Trainer):
             MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
             torch.tensor(self.method.background, device=self.device),
         )
-        self.state: GaussiansState | None = None
 
     def start(self) -> None:
         """See `Trainer.start`."""
@@ -94,23 +154,22 @@ class GaussianTrainer(Trainer):
             gaussians["motion"].detach()[..., motion_layout(cfg.deformation)["means"]] = coefficients
             if cfg.loss.track_weight:
                 tracks = StartTracks.of_first(coefficients, torch.from_numpy(motion.followed).float()).to(self.device)
-        field = self.method.motion(cfg).field(gaussians["means"].detach(), cfg)
+        field = self.motion.field(gaussians["means"].detach(), cfg)
         stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
-        shares = left_out.at_start(len(self.sequence.indices("train"))) if self.step_once.doubt else None
+        shares = torch.zeros(len(self.sequence.indices("train")), VISITS) if self.step_once.doubt else None
         self._enter(stage, gaussians.to(self.device), field and field.to(self.device), tracks, shares)
 
     def restore(self, stage: Stage, iteration: int, arrays: Mapping[str, Tensor]) -> None:
         """See `Trainer.restore`."""
         gaussians = Gaussians(part(arrays, "gaussians.")).to(self.device)
-        field = self.method.motion(self.cfg).field_of(part(arrays, "field."), self.cfg)
+        field = self.motion.field_of(part(arrays, "field."), self.cfg)
         held = part(arrays, "tracks.")
         tracks = StartTracks(**held).to(self.device) if held else None
         self._enter(stage, gaussians, field and field.to(self.device), tracks, arrays.get("left_out"))
         self.state.iteration = iteration
         self.state.optimizer.load_state_arrays(part(arrays, "optimizer."))
-        self.state.stats = DensityStats(
-            **{name: value.to(self.device) for name, value in part(arrays, "stats.").items()}
-        )
+        stats = {name: value.to(self.device) for name, value in part(arrays, "stats.").items()}
+        self.state.stats = DensityStats(**stats)
 
     def _enter(
         self,
@@ -127,7 +186,7 @@ class GaussianTrainer(Trainer):
 
     def schema(self) -> dict[str, ArraySpec]:
         """See `Trainer.schema`."""
-        return state_schema(self.method.motion(self.cfg), self.cfg, doubts=self.step_once.doubt is not None)
+        return state_schema(self.motion, self.cfg, doubts=self.step_once.doubt is not None)
 
     def step(self) -> StepReport:
         """See `Trainer.step`, and `TrainingStep` for what happens in it.
@@ -155,7 +214,7 @@ class GaussianTrainer(Trainer):
     def scene(self) -> SingleScene:
         """See `Trainer.scene`."""
         state, trained, num = self.state, self.step_once.frames.indices, len(self.sequence)
-        holds = self.method.motion(self.cfg).stays_at_the_ends
+        holds = self.motion.stays_at_the_ends
         return SingleScene(
             gaussians=state.gaussians.to("cpu"),
             field=state.field and state.field.to("cpu"),

@@ -1,13 +1,105 @@
-"""The supervised terms of one rendered image against its frame, weighted as in Eq. (12)."""
+"""The supervised terms of Eq. (12) of one rendered image: masked color, inverse depth, total variation; and edges."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+import torch
 from torch import Tensor
 
 from ..core.config import LossConfig
 from ..core.types import RenderOutput
 from .frames import TrainingFrame
-from .ops import TrainingOps
+
+if TYPE_CHECKING:
+    from .ops import TrainingOps
+
+
+def color_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
+    """L_rgb: mean absolute color difference over tissue pixels and channels.
+
+    Args:
+        color, target: (H, W, 3). tissue_mask: (H, W) bool, True on tissue.
+    """
+    count = (tissue_mask.sum() * color.shape[-1]).clamp(min=1)
+    return ((color - target).abs() * tissue_mask[..., None]).sum() / count
+
+
+def edge_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
+    """L_edge: absolute difference of image gradients, summed over both axes, mean over tissue pixels and channels.
+
+    Gradients are forward differences between two pixels of tissue, as in the gradient difference loss of Mathieu
+    et al. 2016, but of gradients with their signs.
+
+    Args:
+        color, target: (H, W, 3). tissue_mask: (H, W) bool, True on tissue.
+    """
+    error = color - target
+    down = (error[1:] - error[:-1]).abs() * (tissue_mask[1:] & tissue_mask[:-1])[..., None]
+    right = (error[:, 1:] - error[:, :-1]).abs() * (tissue_mask[:, 1:] & tissue_mask[:, :-1])[..., None]
+    return (down.sum() + right.sum()) / (tissue_mask.sum() * color.shape[-1]).clamp(min=1)
+
+
+def inverse_depth(depth: Tensor) -> Tensor:
+    """1 / depth where depth is not 0, else 0; same shape, 1 / mm."""
+    rendered = depth != 0
+    return torch.where(rendered, 1 / torch.where(rendered, depth, 1), 0)
+
+
+def inverse_depth_l1(inverse: Tensor, target: Tensor, measured: Tensor) -> Tensor:
+    """L_depth: mean absolute difference of inverse depths over measured tissue pixels, 1 / mm.
+
+    Args:
+        inverse, target: (H, W) 1 / mm. measured: (H, W) bool, True where tissue has a depth.
+    """
+    return ((inverse - target).abs() * measured).sum() / measured.sum().clamp(min=1)
+
+
+def total_variation(image: Tensor, left_out: Tensor | None = None) -> Tensor:
+    """Sum of absolute forward differences along both axes, divided by the number of values.
+
+    Args:
+        image: (H, W) or (H, W, C).
+        left_out: (H, W) bool; a difference between two such pixels does not count. None: all count.
+    """
+    down, right = (image[1:] - image[:-1]).abs(), (image[:, 1:] - image[:, :-1]).abs()
+    if left_out is not None:
+        shape = (*left_out.shape, *[1] * (image.ndim - 2))
+        counted = ~left_out.reshape(shape)
+        down, right = down * (counted[1:] | counted[:-1]), right * (counted[:, 1:] | counted[:, :-1])
+    return (down.sum() + right.sum()) / image.numel()
+
+
+def supervised_losses(
+    color: Tensor,
+    depth: Tensor,
+    target_u8: Tensor,
+    target_inverse: Tensor,
+    tissue_mask: Tensor,
+    measured: Tensor,
+    weights: tuple[float, float, float, float],
+    tv_on_tissue: bool = True,
+) -> Tensor:
+    """Weighted color, depth, total-variation and edge terms.
+
+    Args:
+        color: (H, W, 3) float32. depth: (H, W) float32 mm, 0 where nothing is rendered.
+        target_u8: (H, W, 3) uint8. target_inverse: (H, W) 1 / mm.
+        tissue_mask, measured: (H, W) bool, True where color, respectively depth, is compared.
+        weights: factors of the four terms; the depth term is 0 where its factor is.
+        tv_on_tissue: whether the total variation counts between two pixels of tissue.
+    Returns:
+        (4,) the weighted terms, differentiable in `color` and `depth`.
+    """
+    inverse, left_out = inverse_depth(depth), None if tv_on_tissue else tissue_mask
+    target = target_u8.float() / 255
+    terms = [
+        color_l1(color, target, tissue_mask),
+        inverse_depth_l1(inverse, target_inverse, measured),
+        total_variation(color, left_out) + total_variation(inverse, left_out),
+        edge_l1(color, target, tissue_mask),
+    ]
+    return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)])
 
 
 def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, ops: TrainingOps) -> dict[str, Tensor]:

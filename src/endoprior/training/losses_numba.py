@@ -1,6 +1,6 @@
 """The supervised terms of Eq. (12) in Numba: values and gradients in one pass over the image. CPU, float32.
 
-Computes what `losses_torch.py` computes. A dozen small torch operations and their backward passes each read the whole
+Computes what `losses.py` computes. A dozen small torch operations and their backward passes each read the whole
 image, which costs as much as rendering it; here each row of pixels is read once. Sums run over rows, then over the rows
 in order, so they are bit-identical whatever the number of threads.
 """
@@ -28,7 +28,7 @@ def supervised_losses(
     weights: tuple[float, float, float, float],
     tv_on_tissue: bool = True,
 ) -> Tensor:
-    """See `losses_torch.supervised_losses`. The terms must be summed, not scaled: their gradients are added already."""
+    """See `losses.supervised_losses`. The terms must be summed, not scaled: their gradients are added already."""
     return _SupervisedLosses.apply(
         color, depth, target_u8, target_inverse, tissue_mask, measured, weights, tv_on_tissue
     )

@@ -1,22 +1,33 @@
 """Tool pixels that a mask misses, found while training: a tool is what the scene cannot explain.
 
-Found masks miss jaws, blurred ends, and tools that are there for a moment. Trained as tissue, they become a ghost. The
-scene is shared by all frames, so a few frames of a tool do not change it much at first: the error of the rendered
-image shows the tool. Where the error stays far above that of the frame, in a region that continues a masked tool or
-enters from the border as tools do, and of which the tool network is not sure of tissue, pixels do not count in this
-iteration. The decision is made anew each time a frame is drawn: no state, and what the scene learns to explain counts
-again.
+Masks that a program found miss jaws, blurred ends, and tools that are there for a moment. Trained as tissue, they
+become a ghost. The scene is shared by all frames, so a few frames of a tool do not change it much at first: the error
+of the rendered image shows the tool. Where the error stays far above that of the frame, in a region that continues a
+masked tool or enters from the border as tools do, and of which the tool network is not sure of tissue, pixels do not
+count in this iteration. The decision is made anew each time a frame is rendered: no state, and what the scene learns to
+explain counts again. How much of each frame was left out in its last visits says which masks are likely wrong.
 
-`H, W` image size, `h, w` size of the resized image, 160 px on its longer side.
+`H, W` image size, `h, w` size of the resized image, 160 px on its longer side, `F` training frames.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from ..core.spread import spread
+from ..data import FrameSequence
+from ..system.memory import BoundedCache, cache_bytes
+from ..tool_masks import ToolFinder
 from ..tool_masks.regions import disk, entering_regions, filled
+from ..tool_masks.sequence import view_of
+from .frames import TrainingFrame
 
 WORK_PX = 160
 """Longer side of the resized image, px: a shaft is about 12 px wide, a jaw 3."""
@@ -72,3 +83,91 @@ def missed_tools(
     added = cv2.morphologyEx(added.astype(np.uint8), cv2.MORPH_OPEN, disk(2)) > 0
     entering = entering_regions((added | tools).astype(np.uint8), view) & added
     return (cv2.dilate(entering.astype(np.uint8), disk(1)) > 0) & tissue_mask
+
+
+SAMPLES = 12
+"""Frames from which the border of the view is taken."""
+
+
+class MaskDoubt:
+    """Takes pixels that show a tool in spite of the mask out of a training frame."""
+
+    def __init__(self, sequence: FrameSequence) -> None:
+        """Find the border of the view in the training frames of `sequence`."""
+        indices = sequence.indices("train")
+        frames = [sequence.frame(indices[k]) for k in spread(len(indices), SAMPLES)]
+        self._sequence, self._view = sequence, view_of(frames)
+        self._finder = ToolFinder()
+        self._tissue: BoundedCache[NDArray[np.bool_]] = BoundedCache(cache_bytes() // 4, lambda found: found.nbytes)
+
+    def counted(self, frame: TrainingFrame, color: Tensor) -> TrainingFrame:
+        """The frame without the pixels that show a missed tool.
+
+        Args:
+            color: (H, W, 3) the rendered frame, in [0, 1].
+        """
+        mask, size = frame.tissue_mask.cpu().numpy(), self._size(WORK_PX)
+        rendered, target = (_resized(x.detach().cpu().numpy(), size) for x in (color, frame.rgb))
+        tissue, view = (_resized_mask(x, size) for x in (mask, self._view))
+        surely_tissue = self._tissue.get(frame.index, lambda: self._surely_tissue(frame.index, size))
+        missed = missed_tools(rendered, target, tissue, view, surely_tissue)
+        if not missed.any():
+            return frame
+        keep = torch.from_numpy(~_resized_mask(missed, mask.shape[::-1])).to(frame.tissue_mask.device)
+        measured = frame.measured & keep
+        return replace(frame, tissue_mask=frame.tissue_mask & keep, measured=measured, num_measured=int(measured.sum()))
+
+    def share(self, frame: TrainingFrame, counted: TrainingFrame) -> float:
+        """Share of the view, 0..1, that `counted` leaves out of the frame from which it was made."""
+        if counted is frame:
+            return 0.0
+        left_out = float((frame.tissue_mask & ~counted.tissue_mask).float().mean())
+        return min(left_out / max(float(self._view.mean()), 1e-6), 1.0)
+
+    def _surely_tissue(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_]:
+        """(h, w) True where the tool network is sure of tissue; `size` is (w, h)."""
+        log_odds = self._finder.log_odds(self._sequence.frame(index).rgb_u8, self._view, mirrored=False)
+        return _resized(log_odds, size) < SURELY_TISSUE
+
+    def _size(self, longer_px: int) -> tuple[int, int]:
+        """(w, h) with that longer side: one for a frame at full and at half resolution, which round differently."""
+        height, width = self._view.shape
+        scale = longer_px / max(height, width)
+        return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _resized(image: NDArray, size: tuple[int, int]) -> NDArray:
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR)
+
+
+def _resized_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+
+VISITS = 4
+"""Number of visits that are kept of each frame: early ones show what the scene had not learned yet."""
+LEAST_SHARE = 0.005
+"""Share of the view above which a visit speaks for a missed tool: about 40 px square at 640x512."""
+LEAST_VISITS = 2
+"""So many of the last visits must; a single one may be a highlight."""
+
+
+def record_visit(shares: Tensor, position: int, share: float) -> None:
+    """Append a visit of frame number `position`, and forget its oldest one.
+
+    Args:
+        shares: (F, VISITS) oldest first; changed in place.
+        share: of the view that did not count, 0..1.
+    """
+    shares[position] = torch.cat((shares[position, 1:], shares.new_tensor([share])))
+
+
+def missed_tool_frames(shares: Tensor, indices: Sequence[int]) -> tuple[int, ...]:
+    """The frames whose masks likely miss a tool, ascending.
+
+    Args:
+        shares: (F, VISITS).
+        indices: number of each training frame in the sequence.
+    """
+    often = (shares > LEAST_SHARE).sum(1) >= LEAST_VISITS
+    return tuple(index for index, missed in zip(indices, often.tolist(), strict=True) if missed)

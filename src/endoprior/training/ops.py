@@ -1,35 +1,22 @@
 """The operations of training that have one implementation per kind of device: chosen once, then passed on.
 
-`numba` runs compiled kernels on the CPU, `torch` runs wherever torch does. Both compute the same; tests compare them.
+`NUMBA` runs compiled kernels on the CPU, `TORCH` runs wherever torch does. Both compute the same; tests compare them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType
 
 import torch
 
 from ..model import ops as model_ops
-from . import (
-    adam_numba,
-    adam_torch,
-    density_numba,
-    density_torch,
-    gradients_numba,
-    gradients_torch,
-    losses_numba,
-    losses_torch,
-    plane_adam_numba,
-    temporal_numba,
-    temporal_torch,
-)
+from . import adam, adam_numba, density, density_numba, losses, losses_numba, temporal, temporal_numba
 
 
 @dataclass(frozen=True)
 class TrainingOps:
-    """One implementation of each operation; the torch modules document them."""
+    """One implementation of each operation; those in PyTorch document them."""
 
     model: model_ops.ModelOps
     supervised_losses: Callable
@@ -44,17 +31,32 @@ class TrainingOps:
     adam_planes_step: Callable
 
 
-def _collect(model: model_ops.ModelOps, *modules: ModuleType) -> TrainingOps:
-    """Each operation from the one of the modules that defines it."""
-    found = {name: value for module in modules for name, value in vars(module).items()}
-    names = [name for name in TrainingOps.__dataclass_fields__ if name != "model"]
-    return TrainingOps(model, **{name: found[name] for name in names})
-
-
-NUMBA = _collect(
-    model_ops.NUMBA, adam_numba, plane_adam_numba, density_numba, gradients_numba, losses_numba, temporal_numba
+NUMBA = TrainingOps(
+    model=model_ops.NUMBA,
+    supervised_losses=losses_numba.supervised_losses,
+    local_consistency=temporal_numba.local_consistency,
+    add_gradient=density_numba.add_gradient,
+    add_score=density_numba.add_score,
+    valid_projection=density_numba.valid_projection,
+    count_unusable=adam_numba.count_unusable,
+    count_unusable_in_planes=adam_numba.count_unusable_in_planes,
+    adam_step=adam_numba.adam_step,
+    adam_basis_step=adam_numba.adam_basis_step,
+    adam_planes_step=adam_numba.adam_planes_step,
 )
-TORCH = _collect(model_ops.TORCH, adam_torch, density_torch, gradients_torch, losses_torch, temporal_torch)
+TORCH = TrainingOps(
+    model=model_ops.TORCH,
+    supervised_losses=losses.supervised_losses,
+    local_consistency=temporal.local_consistency,
+    add_gradient=density.add_gradient,
+    add_score=density.add_score,
+    valid_projection=density.valid_projection,
+    count_unusable=adam.count_unusable,
+    count_unusable_in_planes=adam.count_unusable_in_planes,
+    adam_step=adam.adam_step,
+    adam_basis_step=adam.adam_basis_step,
+    adam_planes_step=adam.adam_planes_step,
+)
 
 
 def ops_for(device: torch.device) -> TrainingOps:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ..core.config import Config
-from ..model.motion import BasisMotion, HexPlaneMotion, Motion
+from ..model.hexplane_field import HexPlaneMotion
+from ..model.motion import BasisMotion, Motion
 from .gaussian_method import GaussianMethod
 
 MOTIONS: dict[str, Motion] = {"hexplane": HexPlaneMotion(), "basis": BasisMotion()}

@@ -1,8 +1,9 @@
-"""One training iteration, from the choice of a frame to the update: `TrainingStep.__call__` and `compare` show it."""
+"""One training iteration: batch, deform, render, loss, backward, check, update, density (`TrainingStep.__call__`)."""
 
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -12,64 +13,61 @@ import torch
 from torch import Tensor
 
 from ..core.config import Config
-from ..core.types import RenderOutput, Splats
-from ..model.deformation import HexPlaneField, Offsets
+from ..core.types import Camera, RenderOutput, Splats
+from ..model.gaussians import Gaussians
+from ..model.hexplane_field import HexPlaneField
+from ..model.motion import Field, Motion, Offsets
 from ..render import Rasterizer
-from . import density, left_out
-from .densify import apply_plan, reset_opacities
+from . import density
 from .divergence import ADVICE, Diverged, DivergenceCheck
-from .drawn import Drawn
 from .frames import TrainingFrame, TrainingFrames
-from .gaussians_state import GaussiansState
-from .losses_torch import color_l1
-from .mask_doubt import MaskDoubt
-from .missed_tools import START
+from .losses import color_l1
+from .missed_tools import START, MaskDoubt, missed_tool_frames, record_visit
 from .ops import TrainingOps
-from .scale_limit import limit_scales
 from .stage import Stage, StepReport, stage_length
 from .temporal import temporal_terms
 from .track_loss import track_term
 
 if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
-
+    from .gaussian_trainer import GaussiansState
 
 RESET_OPACITY = 0.01
 """Where methods that reset opacities lower them to (3DGS)."""
 
 
 @dataclass(frozen=True)
-class Batch:
-    """The data of one iteration: one frame, and what the terms of the loss need beside it."""
+class Drawn:
+    """A training frame that was rendered, and what it was rendered from: what the loss of a method sees."""
 
-    frame: TrainingFrame
+    stage: Stage
+    iteration: int
+    """1-based, within the stage."""
     position: int
-    """Its place among the training frames."""
+    """Place of the frame among the training frames."""
+    frame: TrainingFrame
+    """What is compared: `unmasked` without the pixels that show a tool in spite of the mask."""
+    unmasked: TrainingFrame
+    """The frame as it is in the sequence."""
     before: TrainingFrame | None
     """The frame before, where the temporal term takes part."""
-    prior: Tensor | None
-    """(H, W) rho of the frame at full resolution, where it is sampled, and"""
-    prior_mask: Tensor | None
-    """(H, W) bool, its tissue."""
-
-
-@dataclass(frozen=True)
-class Compared:
-    """The forward pass of one iteration."""
-
-    iteration: int
-    rng: np.random.Generator
-    """Of this iteration."""
-    batch: Batch
-    splats: Splats
-    """The Gaussians at the frame."""
-    out: RenderOutput
-    terms: dict[str, Tensor]
-    """Weighted terms of the loss, () each."""
-    color_error: Tensor
-    """() mean absolute color error over tissue, which the divergence check watches."""
+    is_right: bool
+    """Of the right eye: only its picture and depth are compared."""
     left_out: float | None
-    """Share of the view that does not count because it shows a missed tool; None where that was not asked."""
+    """Share of the view that does not count as it shows a missed tool; None where that was not asked."""
+    gaussians: Gaussians
+    field: Field | None
+    offsets: Offsets | None
+    """What moved them; None in the coarse stage."""
+    means_before: Tensor | None
+    """(N, 3) centers at the frame before, mm, if they are known already."""
+    splats: Splats
+    """The Gaussians as they were rendered."""
+    out: RenderOutput
+    draw: Callable[[Splats], RenderOutput]
+    """Renders other Gaussians from the same camera."""
+    context: Any
+    """What the method's `context` made of all training frames."""
 
 
 @dataclass
@@ -80,6 +78,8 @@ class TrainingStep:
     """
 
     method: GaussianMethod
+    motion: Motion
+    """That of the method."""
     cfg: Config
     frames: TrainingFrames
     camera_centers: Tensor
@@ -98,7 +98,7 @@ class TrainingStep:
         return self.method.context(self.frames, self.cfg)
 
     def __call__(self, state: GaussiansState) -> StepReport:
-        """Deform, render, compare, differentiate, check, update, then grow or prune.
+        """One iteration.
 
         Where the report has a `divergence`, the state is the one after the last good iteration.
 
@@ -106,150 +106,125 @@ class TrainingStep:
             Diverged: no Gaussian is left, or a split would give one of infinite size. The state is then the one before
                 density control.
         """
-        began = clock.perf_counter()
-        done = self.compare(state)
-        sum(done.terms.values()).backward()
-
-        fine, last = state.stage is Stage.FINE, done.iteration == stage_length(self.cfg, state.stage)
-        densify = self.method.density_due(state.stage, done.iteration, last, self.cfg)
+        began, cfg, method = clock.perf_counter(), self.cfg, self.method
+        iteration = state.iteration + 1
+        rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
+        fine, last = state.stage is Stage.FINE, iteration == stage_length(cfg, state.stage)
+        densify = method.density_due(state.stage, iteration, last, cfg)
         # After the last iteration nothing would train the lowered opacities again.
-        reset = self.method.reset_due(state.stage, done.iteration, self.cfg) and not (fine and last)
-        divergence = self.check.after_backward(
-            done.iteration,
-            done.terms,
-            state.optimizer.count_unusable(),
-            done.color_error,
-            self.method.empty_error(done.batch.frame.brightness),
-            wait=densify or reset or last,
-        )
+        reset = method.reset_due(state.stage, iteration, cfg) and not (fine and last)
+
+        drawn = self.draw(state, rng)
+        terms, color_error = self.loss(state, drawn)
+        sum(terms.values()).backward()
+        unusable, empty_error = state.optimizer.count_unusable(), method.empty_error(drawn.frame.brightness)
+        wait = densify or reset or last
+        divergence = self.check.after_backward(iteration, terms, unusable, color_error, empty_error, wait=wait)
         event: dict[str, int] | None = None
         if divergence is not None:
             state.optimizer.drop_gradients()
             state.iteration = divergence.last_good
         else:
             with torch.no_grad():
-                event = self._update(state, done, densify, reset)
-        losses = {name: value.detach() for name, value in done.terms.items()}
+                self._observe(state, drawn)
+                self._update(state, drawn)
+                state.iteration = iteration  # what follows may raise, and must leave a state that can be resumed
+                if densify:
+                    event = self._densify(state, iteration, rng)
+                if reset:
+                    density.reset_opacities(state.optimizer, RESET_OPACITY)
+        losses = {name: value.detach() for name, value in terms.items()}
         seconds = clock.perf_counter() - began
         missed = None
         if fine and last and state.left_out is not None:
-            missed = left_out.missed_tool_frames(state.left_out, self.frames.indices)
-        return StepReport(state.stage, done.iteration, losses, len(state.gaussians), seconds, event, divergence, missed)
+            missed = missed_tool_frames(state.left_out, self.frames.indices)
+        return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, event, divergence, missed)
 
-    def compare(self, state: GaussiansState) -> Compared:
-        """The forward pass of the next iteration, up to the terms of the loss; nothing is changed."""
+    def draw(self, state: GaussiansState, rng: np.random.Generator) -> Drawn:
+        """Batch, deform, render; nothing is changed. `rng` belongs to the iteration."""
         cfg, iteration, fine = self.cfg, state.iteration + 1, state.stage is Stage.FINE
-        rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
         position = self.method.position(cfg.seed, state.stage, iteration, len(self.frames), rng)
-        right = fine and cfg.data.eyes == "both" and rng.random() < 0.5
-        batch = self._right_batch(iteration, position) if right else self._batch(iteration, position, fine)
+        is_right = fine and cfg.data.eyes == "both" and rng.random() < 0.5
+        half = fine and iteration <= cfg.schedule.half_resolution_iterations
+        frame = counted = self.frames.frame(position, half=half, right=is_right)
+        before = None
+        if fine and not is_right and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration:
+            before = self.frames.before(position)
 
-        splats, offsets, means_before = self._deform(state, batch, iteration)
+        gaussians, model_ops = state.gaussians, self.ops.model
+        offsets = means_before = None
+        if fine and before and cfg.temporal.gradient == "both" and isinstance(state.field, HexPlaneField):
+            offsets, displacement = state.field.offsets_and_displacement(
+                gaussians["means"], frame.time, before.time, model_ops
+            )
+            means_before = gaussians["means"] + displacement
+        elif fine:
+            offsets = self.motion.offsets(gaussians, state.field, frame.time, cfg, model_ops)
+        splats = gaussians.splats(offsets, sh_degree(cfg, state.stage, iteration))
+
         draw = partial(
             self.rasterize,
-            camera=batch.frame.camera,
+            camera=frame.camera,
             background=self.background,
             depth_grad_to_means=cfg.render.depth_grad_to_means,
         )
         out = draw(splats)
         out.means2d.retain_grad()
-        counted, share = batch.frame, None
-        if self.doubt and fine and not right and iteration > START * stage_length(cfg, Stage.FINE):
-            counted = self.doubt.counted(counted, out.color)
-            share = self.doubt.share(batch.frame, counted)
-        drawn = Drawn(
+        left_out = None
+        if self.doubt and fine and not is_right and iteration > START * stage_length(cfg, Stage.FINE):
+            counted = self.doubt.counted(frame, out.color)
+            left_out = self.doubt.share(frame, counted)
+        return Drawn(
             stage=state.stage,
             iteration=iteration,
             position=position,
             frame=counted,
-            gaussians=state.gaussians,
+            unmasked=frame,
+            before=before,
+            is_right=is_right,
+            left_out=left_out,
+            gaussians=gaussians,
             field=state.field,
             offsets=offsets,
+            means_before=means_before,
             splats=splats,
             out=out,
             draw=draw,
             context=self.context,
         )
+
+    def loss(self, state: GaussiansState, drawn: Drawn) -> tuple[dict[str, Tensor], Tensor]:
+        """Weighted terms, () each; and the mean absolute color error over tissue, (), that the check watches."""
+        cfg, frame = self.cfg, drawn.frame
         terms = self.method.terms(drawn, cfg, self.ops)
-        color_error = (
-            terms["color"]
-            if self.method.color_is_error
-            else color_l1(out.color.detach(), counted.rgb, counted.tissue_mask)
-        )
-        if offsets is not None and state.tracks is not None:
-            terms |= self._track_terms(state, batch, offsets)
-        if batch.before is not None:
-            terms |= temporal_terms(state, batch.frame, batch.before, splats.means, means_before, out, cfg, self.ops)
-        return Compared(iteration, rng, batch, splats, out, terms, color_error, share)
+        is_error = self.method.color_is_error
+        error = terms["color"] if is_error else color_l1(drawn.out.color.detach(), frame.rgb, frame.tissue_mask)
+        if drawn.offsets is not None and state.tracks is not None:
+            means, basis = drawn.gaussians["means"], cfg.deformation.basis
+            term = track_term(means, drawn.offsets.means, state.tracks, frame, drawn.position, basis, self.ops)
+            terms |= {"track": cfg.loss.track_weight * term}
+        if drawn.before is not None:
+            terms |= temporal_terms(drawn, self.motion, state.stats, cfg, self.ops)
+        return terms, error
 
-    def _update(self, state: GaussiansState, done: Compared, densify: bool, reset: bool) -> dict[str, int] | None:
-        """Apply the gradients of an iteration, then grow or prune; what density control did, if it did anything."""
-        cfg, batch, event = self.cfg, done.batch, None
-        self._observe(state, batch, done.out)
-        if state.left_out is not None and done.left_out is not None:
-            left_out.record(state.left_out, batch.position, done.left_out)
-        state.optimizer.step(done.iteration, self.check.skip)
-        if cfg.density.max_scale_share:
-            log_scales = state.gaussians["log_scales"].detach()
-            limit_scales(log_scales, done.splats.means, batch.frame.camera, cfg.density.max_scale_share)
-        state.iteration = done.iteration  # what follows may raise, and must leave a state that can be resumed
-        if densify:
-            event = self._densify(state, done.iteration, done.rng)
-        if reset:
-            reset_opacities(state.optimizer, RESET_OPACITY)
-        return event
+    def _observe(self, state: GaussiansState, drawn: Drawn) -> None:
+        """Add to the running statistics: the gradient always, the prior's score where it is sampled."""
+        camera, skip, cfg = drawn.frame.camera, self.check.skip, self.cfg.density
+        self.ops.add_gradient(state.stats, drawn.out, camera.width, camera.height, skip)
+        sampled = cfg.score_mode == "every" or density.due(drawn.iteration, False, cfg)
+        if sampled and self.method.uses_prior and not drawn.is_right:
+            prior, tissue_mask = self.frames.prior(drawn.position)
+            scale, opacities = prior.shape[1] / camera.width, state.gaussians.opacities
+            self.ops.add_score(state.stats, drawn.out, prior, tissue_mask, opacities, scale, skip)
+        if state.left_out is not None and drawn.left_out is not None:
+            record_visit(state.left_out, drawn.position, drawn.left_out)
 
-    def _batch(self, iteration: int, position: int, fine: bool) -> Batch:
-        """Training frame number `position`, at half resolution early in the fine stage."""
-        cfg = self.cfg
-        compared = fine and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration
-        sampled = cfg.density.score_mode == "every" or density.due(iteration, False, cfg.density)
-        sampled &= self.method.uses_prior
-        prior, prior_mask = self.frames.prior(position) if sampled else (None, None)
-        return Batch(
-            position=position,
-            frame=self.frames.frame(position, half=fine and iteration <= cfg.schedule.half_resolution_iterations),
-            before=self.frames.before(position) if compared else None,
-            prior=prior,
-            prior_mask=prior_mask,
-        )
-
-    def _right_batch(self, iteration: int, position: int) -> Batch:
-        """The right eye of training frame number `position`: only its picture and depth are compared."""
-        half = iteration <= self.cfg.schedule.half_resolution_iterations
-        return Batch(self.frames.frame(position, half=half, right=True), position, None, None, None)
-
-    def _deform(
-        self, state: GaussiansState, batch: Batch, iteration: int
-    ) -> tuple[Splats, Offsets | None, Tensor | None]:
-        """The Gaussians at the frame, what moved them, and (N, 3) centers at the frame before if known already."""
-        gaussians, field, time, before = state.gaussians, state.field, batch.frame.time, batch.before
-        offsets: Offsets | None = None
-        means_before = None
-        motion = self.method.motion(self.cfg)
-        if state.stage is Stage.FINE:
-            if before is None or self.cfg.temporal.gradient != "both" or not isinstance(field, HexPlaneField):
-                offsets = motion.offsets(gaussians, field, time, self.cfg, self.ops.model)
-            else:
-                offsets, displacement = field.offsets_and_displacement(
-                    gaussians["means"], time, before.time, self.ops.model
-                )
-                means_before = gaussians["means"] + displacement
-        return gaussians.splats(offsets, sh_degree(self.cfg, state.stage, iteration)), offsets, means_before
-
-    def _track_terms(self, state: GaussiansState, batch: Batch, offsets: Offsets) -> dict[str, Tensor]:
-        means, basis = state.gaussians["means"], self.cfg.deformation.basis
-        term = track_term(means, offsets.means, state.tracks, batch.frame, batch.position, basis, self.ops)
-        return {"track": self.cfg.loss.track_weight * term}
-
-    def _observe(self, state: GaussiansState, batch: Batch, out: RenderOutput) -> None:
-        """Add to the running statistics: the gradient always, the prior's score where there is a prior."""
-        camera, skip = batch.frame.camera, self.check.skip
-        self.ops.add_gradient(state.stats, out, camera.width, camera.height, skip)
-        if batch.prior is not None:
-            scale = batch.prior.shape[1] / camera.width
-            opacities = state.gaussians.opacities
-            self.ops.add_score(state.stats, out, batch.prior, batch.prior_mask, opacities, scale, skip)
+    def _update(self, state: GaussiansState, drawn: Drawn) -> None:
+        """Apply the gradients."""
+        state.optimizer.step(drawn.iteration, self.check.skip)
+        share = self.cfg.density.max_scale_share
+        if share:
+            limit_scales(state.gaussians["log_scales"].detach(), drawn.splats.means, drawn.frame.camera, share)
 
     def _densify(self, state: GaussiansState, iteration: int, rng: np.random.Generator) -> dict[str, int]:
         gaussians = state.gaussians
@@ -258,7 +233,7 @@ class TrainingStep:
         if bool(planned.remove.all()):
             lost = f"after iteration {iteration} all {len(planned.remove):,} faded"
             raise Diverged(f"expected Gaussians that explain the frames; {lost}. {ADVICE}")
-        state.stats, parents = apply_plan(state.optimizer, planned, state.stats, rng)
+        state.stats, parents = density.apply_plan(state.optimizer, planned, state.stats, rng)
         state.tracks = state.tracks and state.tracks.inherited(parents)
         return planned.counts()
 
@@ -269,3 +244,17 @@ def sh_degree(cfg: Config, stage: Stage, iteration: int) -> int:
     if stage is Stage.FINE:
         done += cfg.schedule.coarse_iterations // cfg.schedule.sh_every
     return min(done, cfg.schedule.sh_degree)
+
+
+def limit_scales(log_scales: Tensor, means: Tensor, camera: Camera, share: float) -> None:
+    """Lower `log_scales` in place to the log of `share` of the distance to the camera.
+
+    A Gaussian that spans much of the picture costs the loss nothing where the camera looks from, and hangs before the
+    tissue as soon as the camera turns. Called after every step with the camera of its frame: the nearest one decides.
+
+    Args:
+        log_scales: (N, 3) log of mm. means: (N, 3) centers in world axes, mm. share: above 0.
+    """
+    center = torch.as_tensor(camera.center).to(means)
+    largest = (share * (means - center).norm(dim=1)).clamp(min=torch.finfo(means.dtype).tiny).log()
+    torch.minimum(log_scales, largest[:, None], out=log_scales)

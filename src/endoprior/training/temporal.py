@@ -1,10 +1,13 @@
 """Texture-aware temporal consistency: neighbors move together, the more so the better their texture. Eqs. (9)-(11).
 
-Here: which Gaussians take part in an iteration, with which motion weights, and where they were before. The term itself
-is computed by `temporal_numba.py` or `temporal_torch.py`. `N` Gaussians of the scene, `P` of them chosen.
+First which Gaussians take part in an iteration, with which motion weights, and where they were before; then the term
+itself in PyTorch, for any device (`temporal_numba.py` computes the same). `N` Gaussians of the scene, `P` of them
+chosen, `K` neighbors of each. "now" is frame t, "before" the adjacent training frame t - dt.
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,16 +16,24 @@ from torch import Tensor
 
 from ..core.config import Config, TemporalConfig
 from ..core.geometry import project
-from ..core.types import RenderOutput
-from ..model.method import motion_of
+from ..model.motion import Motion
+from .density import DensityStats
 from .frames import TrainingFrame
-from .gaussians_state import GaussiansState
-from .ops import TrainingOps
+
+if TYPE_CHECKING:
+    from .ops import TrainingOps
+    from .step import Drawn
 
 MIN_WEIGHT = 1e-4
 """Motion weights up to this are treated as zero (released code)."""
 EVALUATIONS, RELAX_THRESHOLD_STEP, RELAX_TEMPERATURE_FACTOR = 8, 0.05, 1.5
 RELAX_THRESHOLD_FLOOR, RELAX_TEMPERATURE_CAP = 0.25, 0.30
+SQRT_EPS = 1e-8
+"""Under the root of the displacement norm, mm**2: a finite gradient at zero."""
+SUM_EPS = 1e-8
+"""Least pair weight, and least sum of them; a larger one would silence the term: typical weights are near 0.002."""
+POINTS_AT_A_TIME = 4096
+"""Points whose distances to all others are held at once."""
 
 
 def motion_weight(score: NDArray, threshold: float, temperature: float) -> NDArray:
@@ -107,26 +118,13 @@ def least_points(cfg: TemporalConfig) -> int:
 
 
 def temporal_terms(
-    state: GaussiansState,
-    frame: TrainingFrame,
-    before: TrainingFrame,
-    means: Tensor,
-    means_before: Tensor | None,
-    out: RenderOutput,
-    cfg: Config,
-    ops: TrainingOps,
+    drawn: Drawn, motion: Motion, stats: DensityStats, cfg: Config, ops: TrainingOps
 ) -> dict[str, Tensor]:
-    """L_local of Eq. (11), weighted, () each; nothing with few Gaussians.
-
-    Args:
-        frame, before: at t and t - dt.
-        means: (N, 3) deformed centers at t, mm. means_before: those at t - dt, if they are known already.
-        out: the rendered image at t.
-    """
-    temporal, stats = cfg.temporal, state.stats
+    """L_local of Eq. (11), weighted, () each; nothing with few Gaussians. `drawn` has a frame before."""
+    temporal, out, means, before = cfg.temporal, drawn.out, drawn.splats.means, drawn.before
     seen = out.radii > 0
     if temporal.valid_at_both:
-        seen = ops.valid_projection(out.means2d, out.radii, frame.tissue_mask)
+        seen = ops.valid_projection(out.means2d, out.radii, drawn.unmasked.tissue_mask)
     eligible = seen & (stats.num_valid >= temporal.min_valid)
     score = stats.score(cfg.density.unobserved_score)
     index, weights = (
@@ -135,7 +133,7 @@ def temporal_terms(
     )
     if not len(index):
         return {}
-    earlier = _means_before(state, before.time, index, cfg, ops) if means_before is None else means_before[index]
+    earlier = _means_before(drawn, motion, index, cfg, ops)
     if temporal.valid_at_both:
         kept = _on_tissue(earlier.detach(), before, ops)
         index, weights, earlier = index[kept], weights[kept], earlier[kept]
@@ -148,16 +146,16 @@ def temporal_terms(
     }
 
 
-def _means_before(state: GaussiansState, time: float, index: Tensor, cfg: Config, ops: TrainingOps) -> Tensor:
-    """(P, 3) centers of the chosen Gaussians at an earlier time, with a gradient only if that end is trained."""
-    motion = motion_of(cfg)
+def _means_before(drawn: Drawn, motion: Motion, index: Tensor, cfg: Config, ops: TrainingOps) -> Tensor:
+    """(P, 3) centers of the chosen Gaussians at the frame before, with a gradient only if that end is trained."""
+    if drawn.means_before is not None:
+        return drawn.means_before[index]
+    means, known = drawn.gaussians["means"], (drawn.gaussians, drawn.field, drawn.before.time, cfg, ops.model)
     if cfg.temporal.gradient == "both":
         # Moving all and then choosing is cheaper than the scattered gradient of choosing first.
-        moved = state.gaussians["means"] + motion.offsets(state.gaussians, state.field, time, cfg, ops.model).means
-        return moved[index]
+        return (means + motion.offsets(*known).means)[index]
     with torch.no_grad():
-        offsets = motion.offsets(state.gaussians, state.field, time, cfg, ops.model, index)
-        return state.gaussians["means"][index] + offsets.means
+        return means[index] + motion.offsets(*known, index).means
 
 
 def _on_tissue(points: Tensor, frame: TrainingFrame, ops: TrainingOps) -> Tensor:
@@ -165,3 +163,63 @@ def _on_tissue(points: Tensor, frame: TrainingFrame, ops: TrainingOps) -> Tensor
     pixels, z = project(points.cpu().numpy(), frame.camera)
     means2d, in_front = torch.from_numpy(pixels.astype(np.float32)), torch.from_numpy(z > 0).int()
     return ops.valid_projection(means2d.to(points.device), in_front.to(points.device), frame.tissue_mask)
+
+
+def local_consistency(now: Tensor, before: Tensor, weights: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
+    """L_local, Eq. (11), unweighted: neighbors are found and weighed at t - dt, then compared.
+
+    Args:
+        now, before: (P, 3) deformed centers at t and t - dt, mm, P > K. Detach `before` to train one end only.
+        weights: (P,) motion weights > 0, from `temporal.choose`.
+    Returns:
+        Mean |d_i - d_j| (mm) and mean Huber penalty of the change of |mu_i - mu_j|, both weighted by w_ij.
+    """
+    indices, distances = neighbors(before.detach(), cfg.num_neighbors)
+    return local_motion(now, before, indices, affinity(distances, indices, weights), cfg)
+
+
+def neighbors(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """(P, k) indices of the nearest other points of each of (P, 3) points, nearest first, and (P, k) distances, mm."""
+    found = []
+    for start in range(0, len(points), POINTS_AT_A_TIME):
+        distances = torch.cdist(
+            points[start : start + POINTS_AT_A_TIME], points, compute_mode="donot_use_mm_for_euclid_dist"
+        )
+        distances.diagonal(start).fill_(torch.inf)
+        found.append(distances.topk(k, largest=False))
+    return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
+
+
+def affinity(distances: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
+    """(P, K) pair weights w_ij = exp(-|mu_i - mu_j|^2 / (2 sigma_loc^2)) w_i w_j, Eq. (10), floored at `SUM_EPS`.
+
+    sigma_loc, which the paper leaves open, is the median neighbor distance of the iteration (released code).
+
+    Args:
+        distances: (P, K) mm. indices: (P, K) of the neighbors. weights: (P,) motion weights.
+    """
+    sigma = distances.flatten().quantile(0.5).clamp(min=1e-8)  # as in NumPy, between the middle two of an even number
+    return ((-(distances**2) / (2 * sigma**2)).exp() * weights[:, None] * weights[indices]).clamp(min=SUM_EPS)
+
+
+def local_motion(
+    now: Tensor, before: Tensor, indices: Tensor, pair_weights: Tensor, cfg: TemporalConfig
+) -> tuple[Tensor, Tensor]:
+    """The two weighted means of Eq. (11), displacement and distance, of given (P, K) neighbors and pair weights."""
+    weight = pair_weights.to(now.dtype)
+    weight = weight / weight.sum().clamp(min=SUM_EPS)
+    displacement = now - before
+    difference = displacement[:, None] - displacement[indices]
+    apart = (difference.square().sum(-1) + SQRT_EPS).sqrt()
+    stretch = (_length(now[:, None] - now[indices]) - _length(before[:, None] - before[indices])).abs()
+    return (weight * apart).sum(), (weight * huber(stretch, cfg.huber_delta, cfg.huber_scale)).sum()
+
+
+def huber(x: Tensor, delta: float, scale: str) -> Tensor:
+    """Huber's penalty of x >= 0: x^2 / 2 up to delta, delta (x - delta / 2) above; `released` divides it by delta."""
+    literal = torch.where(x <= delta, 0.5 * x * x, delta * (x - 0.5 * delta))
+    return literal / delta if scale == "released" else literal
+
+
+def _length(vectors: Tensor) -> Tensor:
+    return (vectors.square().sum(-1) + SQRT_EPS**2).sqrt()

@@ -1,6 +1,6 @@
 """The temporal term, Eqs. (10) and (11), in Numba: few passes, value and gradient together. CPU.
 
-Computes what `temporal_torch.py` computes. Shared letters: `P` points, `K` neighbors.
+Computes what `temporal.py` computes. Shared letters: `P` points, `K` neighbors.
 
 A pair (i, j) pulls on both of its points. Each point therefore visits its own neighbors and then those whose neighbor
 it is, in order of their index, so no task writes another's row. Sums are taken per run of points, then over runs in
@@ -22,14 +22,13 @@ from ..compute.fastmath import REORDERED
 from ..compute.neighbors import MAX_COORDINATE, nearest
 from ..core.checks import check_shape
 from ..core.config import TemporalConfig
-from .temporal_torch import SQRT_EPS, SUM_EPS
+from .temporal import SQRT_EPS, SUM_EPS
 
 _POINTS_PER_TASK = 256
-_SAMPLE_ROWS, _SAMPLE_MARGIN = 512, 0.08
 
 
 def local_consistency(now: Tensor, before: Tensor, weights: Tensor, cfg: TemporalConfig) -> tuple[Tensor, Tensor]:
-    """See `temporal_torch.local_consistency`."""
+    """See `temporal.local_consistency`."""
     indices, distances = neighbors(before.detach().numpy(), cfg.num_neighbors)
     return local_motion(now, before, indices, affinity(distances, indices, weights.numpy()), cfg)
 
@@ -53,8 +52,8 @@ def neighbors(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray]:
 
 
 def affinity(distances: NDArray[np.float64], indices: NDArray[np.intp], weights: NDArray) -> NDArray[np.float64]:
-    """(P, K) pair weights: see `temporal_torch.affinity`."""
-    sigma = max(median(distances), 1e-8)
+    """(P, K) pair weights: see `temporal.affinity`."""
+    sigma = max(float(np.median(distances)), 1e-8)
     out = np.empty(distances.shape)
     _weigh_pairs(distances, indices, weights, 1 / (2 * sigma**2), out)
     return out
@@ -63,7 +62,7 @@ def affinity(distances: NDArray[np.float64], indices: NDArray[np.intp], weights:
 def local_motion(
     now: Tensor, before: Tensor, indices: NDArray[np.intp], pair_weights: NDArray, cfg: TemporalConfig
 ) -> tuple[Tensor, Tensor]:
-    """See `temporal_torch.local_motion`; the gradient flows to `now` and `before`.
+    """See `temporal.local_motion`; the gradient flows to `now` and `before`.
 
     Raises:
         ValueError: shapes or types disagree, or an index is out of range.
@@ -81,20 +80,6 @@ def local_motion(
         raise ValueError(f"indices must be in [0, {len(now) - 1}]; got {indices.min()} to {indices.max()}")
     factor = 1 / cfg.huber_delta if cfg.huber_scale == "released" else 1.0
     return _LocalMotion.apply(now, before, indices, pair_weights, cfg.huber_delta, factor)
-
-
-def median(values: NDArray[np.float64]) -> float:
-    """`np.median` of all (P, K) values, bit-identical: a sample of the rows rules most of them out first."""
-    num = values.size
-    sample = np.sort(values[:: max(len(values) // _SAMPLE_ROWS, 1)], axis=None)
-    low, high = (sample[int((0.5 + sign * _SAMPLE_MARGIN) * (len(sample) - 1))] for sign in (-1, 1))
-    inside = values[(values >= low) & (values <= high)]
-    below = np.count_nonzero(values < low)
-    first, last = (num - 1) // 2 - below, num // 2 - below
-    if not 0 <= first <= last < len(inside):
-        return float(np.median(values))
-    middle = np.partition(inside, (first, last))
-    return float((middle[first] + middle[last]) / 2)
 
 
 class _LocalMotion(torch.autograd.Function):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..core.config_deformation import BasisConfig
 from ..core.types import Camera
-from ..model.basis import basis_weights
+from ..model.motion import basis_weights
 from .frames import TrainingFrame
 from .ops import TrainingOps
 

@@ -44,7 +44,7 @@ class Trainer(ABC):
     """Fitted to the length of the sequence."""
     device: torch.device
     state: Any
-    """A `State`; None before `start` or `restore`."""
+    """A `State`, from `start` or `restore` on."""
 
     @abstractmethod
     def start(self) -> None:

@@ -15,14 +15,12 @@ from ..core.geometry import back_project, expected_depth, length_unit, project, 
 from ..core.types import Camera, RenderOutput, Splats
 from ..data import FrameSequence
 from ..model.carry import CarriedPoints, carry, centers_then
+from ..model.colors import FEW_ITERATIONS, one_color
 from ..model.gaussians import SH_C0, with_colors
-from ..model.measures import distance
-from ..model.one_color import FEW_ITERATIONS, one_color
+from ..model.measures import SurfaceMotion, distance
 from ..model.playback import Playback
 from ..model.scene import Scene
-from ..model.support import Support
-from ..model.surface import Surface, project_visible, shown_pixels
-from ..model.surface_motion import SurfaceMotion
+from ..model.surface import Support, Surface, project_visible, shown_pixels
 from ..visualization.image_tools import gray, to_u8
 from ..visualization.measures import displacement_span, stretch_span, value_colors
 from ..visualization.rendered_views import depth_span

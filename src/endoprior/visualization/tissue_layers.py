@@ -17,11 +17,10 @@ from .. import render
 from ..core.geometry import pixel_centers, project
 from ..core.types import Camera, Frame, Splats
 from ..model.carry import centers_then
-from ..model.fixed_color import with_fixed_color
+from ..model.colors import with_fixed_color
 from ..model.gaussians import with_colors
 from ..model.scene import Scene
-from ..model.support import FramesOf, Support
-from ..model.surface import project_visible, render_surface
+from ..model.surface import FramesOf, Support, project_visible, render_surface
 from ..system.atomic import whole_file
 from .camera_paths import View
 from .image_tools import SOLID_ALPHA, label, to_u8

@@ -38,6 +38,8 @@ class RadianceTrainer(Trainer):
     Every random choice is a pure function of (seed, iteration), so a resumed run repeats an uninterrupted one.
     """
 
+    state: RadianceState
+
     def __init__(self, sequence: FrameSequence, cfg: Config, kind: type[RadianceField]) -> None:
         """Prepare; nothing is computed yet.
 
@@ -54,7 +56,6 @@ class RadianceTrainer(Trainer):
         except InputError as error:
             raise InputError(f"{sequence.path}: {error} Check the calibration and the unit of the poses.") from None
         self.frames = RayFrames(sequence, only_measured=kind.only_measured)
-        self.state: RadianceState | None = None
         self._watch = Watch(ADVICE)
 
     def start(self) -> None:

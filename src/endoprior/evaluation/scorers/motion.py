@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...core.checks import check_shape
 from ...core.types import Frame
-from ...model.fixed_color import changes_color, with_fixed_color
+from ...model.colors import changes_color, with_fixed_color
 from ..context import NETWORKS_OFF, EvaluationContext, SceneFrames
 from ..networks import RAFT_LARGE, RAFT_SMALL, find_weights, import_torchvision, select_weights
 from ..score import Score, ScoreUnavailable

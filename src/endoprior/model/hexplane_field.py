@@ -1,6 +1,7 @@
-"""How canonical Gaussians move: the offsets at one time, and the HexPlane field that predicts them.
+"""The paper's deformation field: HexPlane features, one shared linear trunk, one head per attribute.
 
-Offsets are added to the raw parameters: centers (mm), log scales, quaternions before normalization, opacity logits.
+trunk: linear F -> W. Head: ReLU, linear W -> W, ReLU, linear W -> outputs (EndoGaussian). Weights start Xavier
+uniform, so the offsets are not zero at the start.
 """
 
 from __future__ import annotations
@@ -8,48 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import linear, relu
+from torch.nn.init import xavier_uniform_
 
 from ..core.checks import InputError, check_shape
-from ..core.config_deformation import DeformationConfig
-from .attributes import offset_widths
-from .field import Field
-from .heads import LinearLayers, OffsetHeads, head_shapes
+from ..core.config import Config
+from ..core.config_deformation import DeformationConfig, HexPlaneConfig
+from .gaussians import Gaussians, offset_widths
 from .hexplane import PLANE_NAMES, PlaneGrid, plane_shapes
+from .motion import Field, Motion, Offsets
 from .ops import ModelOps
-
-
-@dataclass(frozen=True)
-class Offsets:
-    """What one time step adds to the raw parameters of N Gaussians; None where nothing is added."""
-
-    means: Tensor
-    """(N, 3) displacement of the centers, mm."""
-    log_scales: Tensor | None = None
-    """(N, 3)."""
-    quats: Tensor | None = None
-    """(N, 4), added before normalization."""
-    opacity_logits: Tensor | None = None
-    """(N,)."""
-    sh_dc: Tensor | None = None
-    """(N, 3), added to the spherical-harmonic coefficient of degree 0."""
-    sh_rest: Tensor | None = None
-    """(N, (D+1)**2 - 1, 3), added to those of the other degrees."""
-
-    @staticmethod
-    def from_channels(channels: dict[str, Tensor], cfg: DeformationConfig) -> Offsets:
-        """Offsets from tensors (N, width) by name, as `attributes.offset_widths` names them; scales within bounds."""
-        if "opacity_logits" in channels:
-            channels["opacity_logits"] = channels["opacity_logits"][:, 0]
-        if "log_scales" in channels and cfg.max_scale_change > 1:
-            limit = math.log(cfg.max_scale_change)
-            channels["log_scales"] = channels["log_scales"].clamp(-limit, limit)
-        return Offsets(**channels)
 
 
 class HexPlaneField(Field):
@@ -76,7 +50,7 @@ class HexPlaneField(Field):
     @classmethod
     def make_heads(cls, cfg: DeformationConfig, generator: torch.Generator) -> LinearLayers:
         """Trunk and heads with fresh weights."""
-        return OffsetHeads(num_features(cfg), cfg.hexplane.width, offset_widths(cfg), cfg.hexplane.bias_init, generator)
+        return OffsetHeads(cls.layer_shapes(cfg), cfg.hexplane.bias_init, generator)
 
     @classmethod
     def layer_shapes(cls, cfg: DeformationConfig) -> dict[str, tuple[int, int]]:
@@ -187,6 +161,121 @@ class HexPlaneField(Field):
                     "Load the scene with the configuration it was trained with."
                 )
             target.copy_(found)
+
+
+class HexPlaneMotion(Motion):
+    """The paper's: a field of space-time planes."""
+
+    field_class: type[HexPlaneField] = HexPlaneField
+
+    def field(self, points: Tensor, cfg: Config) -> HexPlaneField:
+        """See `Motion.field`."""
+        return self.field_class.from_points(points, cfg.deformation, torch.Generator().manual_seed(cfg.seed))
+
+    def field_of(self, arrays: Mapping[str, Tensor], cfg: Config) -> HexPlaneField:
+        """See `Motion.field_of`."""
+        return self.field_class.from_state_arrays(arrays, cfg.deformation)
+
+    def field_shapes(self, cfg: Config) -> dict[str, tuple[int, ...]]:
+        """See `Motion.field_shapes`."""
+        return self.field_class.state_shapes(cfg.deformation)
+
+    def parameter_shapes(self, cfg: Config) -> dict[str, tuple[int, ...]]:
+        """See `Motion.parameter_shapes`."""
+        return self.field_class.parameter_shapes(cfg.deformation)
+
+    def planes(self, cfg: Config) -> HexPlaneConfig:
+        """See `Motion.planes`."""
+        return cfg.deformation.hexplane
+
+    def offsets(
+        self,
+        gaussians: Gaussians,
+        field: HexPlaneField,
+        time: float,
+        cfg: Config,
+        ops: ModelOps,
+        chosen: Tensor | None = None,
+    ) -> Offsets:
+        """See `Motion.offsets`."""
+        means = gaussians["means"]
+        return field.offsets(means if chosen is None else means[chosen], time, ops)
+
+
+class LinearLayers:
+    """Linear layers by name; `parameters` names every trained tensor. The layer `trunk` reads a field's features."""
+
+    def __init__(
+        self, shapes: dict[str, tuple[int, int]], bias_init: Literal["default", "zero"], generator: torch.Generator
+    ) -> None:
+        """Draw the weights from `generator`.
+
+        Args:
+            shapes: outputs and inputs of each layer by name.
+            bias_init: `default` draws biases from U[-1, 1] / sqrt(inputs) as PyTorch does; `zero` sets them to 0.
+        """
+        self.parameters: dict[str, Tensor] = {}
+        for layer, (fan_out, fan_in) in shapes.items():
+            weight, bias = torch.empty(fan_out, fan_in), torch.zeros(fan_out)
+            xavier_uniform_(weight, generator=generator)
+            if bias_init == "default":
+                bias.uniform_(-1 / math.sqrt(fan_in), 1 / math.sqrt(fan_in), generator=generator)
+            self.parameters[f"{layer}.weight"] = weight.requires_grad_(True)
+            self.parameters[f"{layer}.bias"] = bias.requires_grad_(True)
+
+    def to(self, device: torch.device) -> Self:
+        """A copy on a device."""
+        moved = copy(self)
+        moved.parameters = {
+            name: value.detach().to(device).requires_grad_(True) for name, value in self.parameters.items()
+        }
+        return moved
+
+    @property
+    def trunk(self) -> tuple[Tensor, Tensor]:
+        """Weight (W, F) and bias (W,) of the linear trunk; `ops.hexplane_linear` applies it to the features."""
+        return self.layer("trunk")
+
+    def layer(self, name: str) -> tuple[Tensor, Tensor]:
+        """Weight (outputs, inputs) and bias (outputs,) of a layer."""
+        return self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"]
+
+    def linear(self, layer: str, inputs: Tensor) -> Tensor:
+        """One linear layer by name."""
+        return linear(inputs, *self.layer(layer))
+
+
+def head_shapes(num_features: int, width: int, outputs: dict[str, int]) -> dict[str, tuple[int, int]]:
+    """Outputs and inputs of the layers of `OffsetHeads`, by name.
+
+    Args:
+        num_features: F, width of the feature. width: W, hidden width.
+        outputs: what to predict and how many numbers of each, as `gaussians.offset_widths` gives them.
+    """
+    shapes = {"trunk": (width, num_features)}
+    for name, num in outputs.items():
+        shapes |= {f"{name}.hidden": (width, width), f"{name}.output": (num, width)}
+    return shapes
+
+
+class OffsetHeads(LinearLayers):
+    """Trunk and heads, of `head_shapes`."""
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """What the heads predict."""
+        return tuple(name.removesuffix(".output.weight") for name in self.parameters if name.endswith(".output.weight"))
+
+    def __call__(self, trunk: Tensor, ops: ModelOps, only: tuple[str, ...] | None = None) -> dict[str, Tensor]:
+        """Offsets (N, outputs) by name from the output of the trunk, (N, W); of the heads in `only`, if given."""
+        shared, names = relu(trunk), only or self.outputs
+        if ops.fuse_heads:
+            weight = torch.cat([self.parameters[f"{name}.hidden.weight"] for name in names])
+            bias = torch.cat([self.parameters[f"{name}.hidden.bias"] for name in names])
+            hidden = linear(shared, weight, bias).chunk(len(names), -1)
+        else:
+            hidden = [self.linear(f"{name}.hidden", shared) for name in names]
+        return {name: self.linear(f"{name}.output", relu(part)) for name, part in zip(names, hidden, strict=True)}
 
 
 def num_features(cfg: DeformationConfig) -> int:

@@ -1,7 +1,8 @@
-"""The least memory that a training needs, so that one that cannot succeed is rejected at once, with a number.
+"""What is rejected before a training starts: options that its method ignores, and more than fits in memory.
 
-Closed form, calibrated on measured runs (docs/reliability.md). Frames are read again when they do not fit; parameters,
-Adam's moments, the tracks of the first points and the buffers of one image must be in memory at once.
+The least memory that a training needs is a closed form, calibrated on measured runs (docs/reliability.md). Frames are
+read again when they do not fit; parameters, Adam's moments, the tracks of the first points and the buffers of one image
+must be in memory at once.
 """
 
 from __future__ import annotations
@@ -10,12 +11,44 @@ import math
 
 import numpy as np
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..data import FrameSequence
 from ..initialization.sampling import has_surface
 from ..model.method import method_of
+from ..model.presets import preset, preset_names
 from ..system.memory import available_bytes
+
+
+def reject_ignored_options(cfg: Config) -> None:
+    """Reject a value that has no effect with the method of a config.
+
+    Raises:
+        InputError: names the option, and the only value that its method takes.
+    """
+    method = method_of(cfg)
+    only = dict(method.only)
+    if method.has_gaussians and not method.uses_prior:
+        only["temporal.weight"] = 0.0  # the term weighs Gaussians by the prior
+    if method.has_gaussians and not method.starts_from_flow:
+        only["init.motion"] = "rest"
+    for name, value in only.items():
+        section, _, field = name.partition(".")
+        got = getattr(getattr(cfg, section), field)
+        if got != value:
+            fix = f"Start from --preset {cfg.method}, without --{name.replace('_', '-')}."
+            raise input_error(name, f"{value} with method {cfg.method}, which does not use it", str(got), fix)
+
+
+def note_on_budget(cfg: Config) -> str | None:
+    """A line for the user if `init.budget` was set and has no effect; not an error, as benchmark specs set it."""
+    method = method_of(cfg)
+    usual = preset(cfg.method) if cfg.method in preset_names() else cfg
+    if (method.has_gaussians and not method.first_share) or cfg.init.budget == usual.init.budget:
+        return None
+    start = "starts from the pixels of frames" if method.has_gaussians else "has no Gaussians"
+    return f"init.budget {cfg.init.budget} (--gaussians) has no effect: {cfg.method} {start}"
+
 
 FLOAT = 4
 PICTURE_BYTES = 150
