@@ -47,20 +47,10 @@ class Drawn:
     """Place of the frame among the training frames."""
     frame: TrainingFrame
     """What is compared: `unmasked` without the pixels that show a tool in spite of the mask."""
-    unmasked: TrainingFrame
-    """The frame as it is in the sequence."""
-    before: TrainingFrame | None
-    """The frame before, where the temporal term takes part."""
-    is_right: bool
-    """Of the right eye: only its picture and depth are compared."""
-    left_out: float | None
-    """Share of the view that does not count as it shows a missed tool; None where that was not asked."""
     gaussians: Gaussians
     field: Field | None
     offsets: Offsets | None
     """What moved them; None in the coarse stage."""
-    means_before: Tensor | None
-    """(N, 3) centers at the frame before, mm, if they are known already."""
     splats: Splats
     """The Gaussians as they were rendered."""
     out: RenderOutput
@@ -68,6 +58,16 @@ class Drawn:
     """Renders other Gaussians from the same camera."""
     context: Any
     """What the method's `context` made of all training frames."""
+    unmasked: TrainingFrame | None = None
+    """The frame as it is in the sequence; it goes with `before`."""
+    before: TrainingFrame | None = None
+    """The frame before, where the temporal term takes part."""
+    means_before: Tensor | None = None
+    """(N, 3) centers at the frame before, mm, if they are known already."""
+    is_right: bool = False
+    """Of the right eye: only its picture and depth are compared."""
+    left_out: float | None = None
+    """Share of the view that does not count as it shows a missed tool; None where that was not asked."""
 
 
 @dataclass
