@@ -145,15 +145,35 @@ def adam_planes_step(planes: PlaneAdam, rate: float, skip: Tensor | None = None)
     """See `adam.adam_planes_step`; `skip` has no use here: the divergence check comes first on a CPU."""
     grid = planes.grid
     planes.steps += 1
-    step = int(planes.steps)
+    buffers = (grid.values, grid.grads, planes.exp_avg, planes.exp_avg_sq, grid.marks)
+    step_cells(*buffers, int(planes.steps), rate, planes.epsilon)
+
+
+def step_cells(
+    values: Tensor,
+    grads: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    marks: Tensor,
+    step: int,
+    rate: float,
+    epsilon: float,
+) -> None:
+    """Update, in place, the rows of `values` that `marks` calls touched, and clear their gradients.
+
+    Args:
+        values, grads, exp_avg, exp_avg_sq: (cells, C) float32, contiguous; rows with mark 0 must have zero gradient.
+        marks: (cells,) uint8 of `TOUCHED` and `FRESH` bits; FRESH is cleared.
+        step: number of this step, from 1. rate: learning rate.
+    """
     _step_cells(
-        *(t.numpy() for t in (grid.values, grid.grads, planes.exp_avg, planes.exp_avg_sq, grid.marks)),
+        *(t.numpy() for t in (values, grads, exp_avg, exp_avg_sq, marks)),
         np.float32(1 - BETA1),
         np.float32(BETA2),
         np.float32(1 - BETA2),
         np.float32(rate / (1 - BETA1**step)),
         np.float32(1 / math.sqrt(1 - BETA2**step)),
-        np.float32(planes.epsilon),
+        np.float32(epsilon),
     )
 
 
@@ -171,8 +191,6 @@ def _update(i, c, g, values, exp_avg, exp_avg_sq, blend1, beta2, blend2, rate, c
 
 @njit(parallel=True, cache=True, fastmath={"contract", "nsz"})
 def _step_cells(values, grads, exp_avg, exp_avg_sq, marks, blend1, beta2, blend2, rate, correction, epsilon):
-    # Adam of the rows (cells, C) that `marks` calls touched; their gradients are cleared, FRESH too. Rows with mark 0
-    # must have zero gradient.
     # Tasks take groups of cells in turn, because touched cells lie in clusters. Cells are independent of each other.
     cells, channels = values.shape
     for task in prange(_TASKS):
