@@ -1,12 +1,10 @@
 """`prepare.json` in a prepared folder: from what, and with which options, `prepare` made it.
 
-`check` uses it to print a complete command. The file names files of the user; nothing else needs it.
+It names files of the user. `check` repeats what is particular about the video; points of a video find their frame.
 """
 
 from __future__ import annotations
 
-import re
-import unicodedata
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,15 +18,8 @@ from ..system.atomic import write_json
 from .files import read_json
 
 RECORD = "prepare.json"
-OPTION = re.compile(r"--[a-z][a-z0-9.-]*")
-CONTROLS = {"Cc", "Zl", "Zp"}
-"""Unicode categories of characters that no path or option has: control characters and line separators."""
-SURROGATES = "Cs"
-"""That of bytes in a path that are no text: it can be opened, but not printed."""
 STEPS, NEAR_PX = 40, 0.5
 """Steps to find a source point in the frame, and how near it they end, px, unless it lies outside of the frame."""
-EDGE_POINTS = 65
-"""Points along each edge of a rectangle that are taken to the source."""
 
 
 @dataclass(frozen=True)
@@ -49,27 +40,6 @@ class PrepareRecord:
     def save(self, folder: Path) -> None:
         """Write `prepare.json`."""
         write_json(folder / RECORD, asdict(self))
-
-    @property
-    def categories(self) -> set[str]:
-        """Unicode categories of all characters of the video's path, of the options and of the notes."""
-        words = [self.video, *self.video_notes, *(word for words in self.options.values() for word in words)]
-        return {unicodedata.category(character) for word in words for character in word}
-
-    def crop(self, left: float, top: float, right: float, bottom: float) -> tuple[int, int, int, int]:
-        """x, y, width, height of the largest source rectangle that shows nothing outside a part of the frame.
-
-        Args:
-            left, top, right, bottom: the part, as shares of the frame's width and height.
-        """
-        across, down = np.linspace(left, right, EDGE_POINTS), np.linspace(top, bottom, EDGE_POINTS)
-        x0 = max(self._source(np.full_like(down, left), down)[:, 0].max(), 0)
-        x1 = min(self._source(np.full_like(down, right), down)[:, 0].min(), self.source_size[0])
-        y0 = max(self._source(across, np.full_like(across, top))[:, 1].max(), 0)
-        y1 = min(self._source(across, np.full_like(across, bottom))[:, 1].min(), self.source_size[1])
-        # The grid is exact to 0.1 px: so much of a neighbor is not seen.
-        x, y = int(np.ceil(x0 - 0.1)), int(np.ceil(y0 - 0.1))
-        return x, y, max(int(x1 + 0.1) - x, 1), max(int(y1 + 0.1) - y, 1)
 
     def in_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where points of the source lie in the frame: through the rectification, or undistortion, and the crop.
@@ -96,14 +66,6 @@ class PrepareRecord:
         off = np.linalg.norm(missed(at), axis=1)
         return np.where(off[:, None] < NEAR_PX, at, np.nan)
 
-    def _source(self, x: NDArray, y: NDArray) -> NDArray[np.float64]:
-        """(K, 2) x, y in the source, px, of K points given as shares of the frame."""
-        from scipy.interpolate import RegularGridInterpolator
-
-        grid = np.array(self.source_px)
-        axes = [np.linspace(0, 1, count) for count in grid.shape[:2]]
-        return RegularGridInterpolator(axes, grid)(np.stack([y, x], 1))
-
 
 def read_record(folder: Path) -> PrepareRecord | None:
     """The record of a folder; None if it has none.
@@ -111,17 +73,15 @@ def read_record(folder: Path) -> PrepareRecord | None:
     Raises:
         InputError: the file is damaged.
     """
-    file, fix = folder / RECORD, "remove it, `check` then repeats `prepare` from the frames."
+    file, fix = folder / RECORD, "remove it, or prepare the folder again."
     if not file.exists():
         return None
     try:
         record = from_dict(PrepareRecord, read_json(file, fix), "record")
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
-    if not all(OPTION.fullmatch(name) for name in record.options) or record.categories & CONTROLS:
-        raise input_error(file, "names of options and text in one line", "something else", fix)
-    shape = [len(record.source_px), *{len(row) for row in record.source_px}]
+    widths = {len(row) for row in record.source_px}
     pairs = all(len(point) == 2 for row in record.source_px for point in row)
-    if len(shape) != 2 or min(shape) < 2 or not pairs or min(record.source_size) < 1:
+    if not pairs or len(widths) != 1 or min(len(record.source_px), *widths, 2) < 2 or min(record.source_size) < 1:
         raise input_error(file, "source_px as rows of x, y", "another shape", fix)
     return record
