@@ -17,7 +17,7 @@ from sequence_edits import describe
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
-from endoprior.data.depth_fill import is_measured
+from endoprior.data.pixels import is_measured
 from endoprior.data.writer import SequenceMeta, SequenceWriter
 
 UNCLIPPED = DataConfig(depth_clip_low_percentile=0, depth_clip_high_percentile=100)

@@ -3,14 +3,12 @@
 No torch here: images are NumPy arrays.
 """
 
-from .depth import clean_depth
 from .depth_files import read_depth_file
 from .load import load_sequence
-from .right_eye import RightEye
+from .pixels import clean_depth, shrunk
 from .sequence import FrameList, FrameSequence, Split
-from .shrink import shrunk
 from .stir import nearest_end_errors, write_stir_tracks
-from .truth import Truth
+from .truth import RightEye, Truth
 
 __all__ = [
     "FrameList",

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.extras import install_command
-from .depth_fill import is_measured
 from .images import decode_image, single_channel
-from .numpy_files import read_only_array
-from .reading import MOST_PIXELS, demand_file
+from .pixels import is_measured
+from .reading import MOST_PIXELS, demand_file, read_only_array
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
 """Suffixes of the files this module reads, in lower case."""

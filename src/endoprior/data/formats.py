@@ -1,4 +1,4 @@
-"""Every folder layout that can be opened. To add one, write a module with a `FORMAT` here and name it in `FORMATS`.
+"""Every folder layout that can be opened. To add one, write a module with a `Format` here and name it in `FORMATS`.
 
 docs/datasets.md describes each layout, and shows how to add one.
 """
@@ -17,19 +17,19 @@ from ..system.plugins import Registry, report
 if TYPE_CHECKING:
     from .sequence import FrameSequence
 
-FORMATS = (
-    "scared",
-    "c3vd",
-    "stir",
-    "stereomis",  # before EndoNeRF, whose layout it extends
-    "hamlyn",  # likewise
-    "no_depth",
-    "nerfstudio",
-    "colmap",
-    "endonerf",
-    "plain",  # last: it recognizes every folder with images
-)
-"""Modules of this package by the name that `DataConfig.format` takes, in the order in which `auto` tries them."""
+FORMATS = {
+    "scared": "scared.FORMAT",
+    "c3vd": "c3vd.FORMAT",
+    "stir": "stir.FORMAT",
+    "stereomis": "stereomis.FORMAT",  # before EndoNeRF, whose layout it extends
+    "hamlyn": "hamlyn.FORMAT",  # likewise
+    "no_depth": "endonerf.NO_DEPTH",
+    "nerfstudio": "nerfstudio.FORMAT",
+    "colmap": "colmap.FORMAT",
+    "endonerf": "endonerf.FORMAT",
+    "plain": "endonerf.PLAIN",  # last: it recognizes every folder with images
+}
+"""Module and name of each layout that `DataConfig.format` takes, in the order in which `auto` tries them."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,17 @@ def _problem(found: Any) -> str:
     return "" if isinstance(found, Format) else f"an object of type {type(found).__name__}"
 
 
+def _load(name: str) -> Format:
+    module, _, attribute = FORMATS[name].partition(".")
+    return getattr(import_module(f".{module}", __package__), attribute)
+
+
 REGISTRY: Registry[Format] = Registry(
     "datasets",
     "a Format of endoprior.data.formats",
     _problem,
-    modules=FORMATS,
-    load_module=lambda name: import_module(f".{name}", __package__).FORMAT,
+    modules=tuple(FORMATS),
+    load_module=_load,
     reserved=("auto",),
 )
 """The layouts above, and those of plugins."""
@@ -59,7 +64,8 @@ REGISTRY: Registry[Format] = Registry(
 
 def recognizing(path: Path) -> str | None:
     """Name of the first layout that recognizes a folder; plugins come after the built-in layouts, before `plain`."""
-    for name in FORMATS[:-1]:
+    *first, last = FORMATS
+    for name in first:
         if REGISTRY.load(name).recognizes(path):
             return name
     for name, layout in REGISTRY.usable():
@@ -68,4 +74,4 @@ def recognizing(path: Path) -> str | None:
                 return name
         except Exception as error:  # a plugin's fault must not keep other folders from opening
             report(REGISTRY.failure(name, error))
-    return FORMATS[-1] if REGISTRY.load(FORMATS[-1]).recognizes(path) else None
+    return last if REGISTRY.load(last).recognizes(path) else None

@@ -17,14 +17,13 @@ from ..core.spread import spread
 from ..core.types import Camera
 from ..footage.black_margin import black_margin
 from .assemble import Pixels, assemble, kept_frames
-from .camera_matrix import MATRIX_FILE, matrix_of_images, read_camera_matrix
 from .depth_files import read_depth_file
 from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, list_files
 from .formats import Format
 from .frame_files import files_of_images
 from .images import read_color, read_tool_mask
-from .poses import identity_poses
+from .poses import MATRIX_FILE, identity_poses, matrix_of_images, read_camera_matrix
 from .sequence import FrameSequence
 
 FULL_SIZE = (640, 480)
@@ -168,9 +167,8 @@ def _assembled(
     """The sequence of a static camera; `matrix` is in px of the whole image, with centers at halves."""
     path, crop, (width, height) = files.path, files.crop, size
     remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
-    kept = [
-        i for i in kept_frames(len(files.images), cfg) if i in files.depths and (i in files.masks or not files.masks)
-    ]
+    columns = [files.depths, files.masks] if files.masks else [files.depths]
+    kept = kept_frames(len(files.images), cfg, having=columns)
     images, depths = [files.images[i] for i in kept], [files.depths[i] for i in kept]
     masks = [files.masks[i] for i in kept] if files.masks else []
     margin = black_margin([read_color(images[i], size)[:, crop:] for i in spread(len(images), SAMPLES)])

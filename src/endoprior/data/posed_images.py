@@ -17,12 +17,11 @@ from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .depth_files import DEPTH_SUFFIXES, read_depth_file
 from .files import list_files
-from .frame_files import files_of_images
+from .frame_files import Kind, files_of_images
 from .images import read_color, read_tool_mask
 from .lens import Lens, Undistorter
 from .poses import demand_rotations
 from .sequence import FrameSequence
-from .series import Kind
 
 ROUNDED_PX = 1.0
 """Scaled images may differ from the exact shape by rounding."""
@@ -74,7 +73,7 @@ def load_posed(
     depths = _depths(path, files[0], source, posed, remarks)
     if mm_per_unit is None:
         remarks.append(f"{source}: the scale of its poses is unknown; lengths are not millimeters")
-    kept = [i for i in kept_frames(len(posed), cfg) if all(i in files for files in (masks, depths) if files)]
+    kept = kept_frames(len(posed), cfg, having=[files for files in (masks, depths) if files])
     images = [posed[i].file for i in kept]
     scale = mm_per_unit or 1.0
     unit = cfg.depth_unit_mm or 1.0

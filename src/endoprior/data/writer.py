@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.atomic import reject_occupied, whole_folder
+from .folder_edits import depth_bounds, pose_table
 from .images import decode_image, save_png
-from .pose_writing import depth_bounds, pose_table
 
 FARTHEST_UNIT = 65534
 """Of the depth files; 65535 stands for missing depth in the files of many programs."""

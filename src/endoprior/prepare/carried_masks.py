@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ..core.config import DataConfig
 from ..data import load_sequence
+from ..data.folder_edits import found_source, write_mask
 from ..data.found_tools import FrameRow, write_rows
 from ..data.images import read_color, save_png
-from ..data.mask_writing import found_source, write_mask
 from ..data.writer import TOOL_VALUE, FrameFiles
 from ..tool_masks.carry import VideoSegmenter
 from ..tool_masks.mask_store import MaskStore, read_state, write_state

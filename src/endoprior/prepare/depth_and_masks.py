@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from ..core.checks import InputError, input_error
 from ..core.spread import spread
 from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
-from ..data.depth_fill import is_measured
 from ..data.description import TOOLS_FOUND
 from ..data.found_tools import FoundTools
 from ..data.frame_files import match_files, match_names
 from ..data.mask_files import tool_polarity
 from ..data.mask_folders import MaskFrame, open_mask_folder
+from ..data.pixels import is_measured
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit

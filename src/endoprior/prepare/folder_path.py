@@ -14,9 +14,7 @@ from ..core.checks import input_error
 from ..data.description import ESTIMATED_POSES, intrinsics_of, read_description
 from ..data.endonerf import read_poses_bounds
 from ..data.files import list_files
-from ..data.frame_files import match_names
-from ..data.images import decode_image, read_color, read_depth, read_tool_mask
-from ..data.pose_writing import (
+from ..data.folder_edits import (
     POSES,
     demand_writable,
     depth_bounds,
@@ -24,6 +22,8 @@ from ..data.pose_writing import (
     replace_depth,
     replace_poses,
 )
+from ..data.frame_files import match_names
+from ..data.images import decode_image, read_color, read_depth, read_tool_mask
 from ..system.atomic import write_json
 from .camera_path.seen import CameraPath, Lens, PoseInput
 from .camera_path.sequence_path import (

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..data.files import entries, files_with
+from ..data.frame_files import one_per_frame
 from ..data.images import decode_image, describe_pixels
-from ..data.series import one_per_frame
 from ..data.video_files import STILL_SUFFIXES
 from .source_frame import SourceFrame
 

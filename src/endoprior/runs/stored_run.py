@@ -11,8 +11,7 @@ from ..core.checks import InputError, input_error
 from ..core.config import Config
 from ..core.config_io import to_dict
 from ..data.files import read_json
-from ..data.reading import kind_of, read_text
-from ..data.yaml_text import load_yaml
+from ..data.reading import kind_of, load_yaml, read_text
 from ..model.method import config_from
 
 

@@ -6,16 +6,12 @@ from pathlib import Path
 
 from ...core.checks import input_error
 from ..files import entries, files_with, in_order
-from ..mask_files import MASK_SUFFIXES, demand_known, rule_of_files
-from ..mask_values import name
+from ..frame_files import one_per_frame
+from ..mask_files import MASK_SUFFIXES, demand_known, name, rule_of_files
 from ..reading import kind_of
-from ..series import one_per_frame
-from .cvat import segmentation_masks
-from .cvat_xml import annotations
-from .frames import MaskFolder, MaskFrame, union_of_files
-from .label_studio import brush_export
-from .labels import OPTION
-from .nerfstudio import ignore_masks
+from .cvat import annotations, segmentation_masks
+from .others import brush_export, ignore_masks
+from .parts import OPTION, MaskFolder, MaskFrame, union_of_files
 from .sam2 import object_folders, palette_folder, sav_file
 
 __all__ = ["MaskFolder", "MaskFrame", "open_mask_folder"]
