@@ -9,7 +9,7 @@ from endoprior.core.checks import InputError, read_ranges
 from endoprior.core.config import DataConfig
 from endoprior.core.options import changed_options, command_of
 from endoprior.data import load_sequence
-from endoprior.data.prepare_record import PrepareRecord, read_record
+from endoprior.data.description import PrepareRecord, read_record
 from endoprior.prepare import PrepareConfig
 
 PLAIN = PrepareRecord("/v.mp4", {}, (1280, 720), (((0.0, 0.0), (1280.0, 0.0)), ((0.0, 720.0), (1280.0, 720.0))))

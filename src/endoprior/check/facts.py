@@ -17,11 +17,10 @@ from ..core.config import DataConfig
 from ..core.spread import spread
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
-from ..data.description import read_description
+from ..data.description import PrepareRecord, read_description, read_record
 from ..data.files import in_order
-from ..data.found_tools import UNCERTAIN, confidence_of, read_rows
+from ..data.found_tools import UNCERTAIN, read_rows
 from ..data.images import read_color
-from ..data.prepare_record import PrepareRecord, read_record
 from ..data.window_plan import look_through, plan_windows
 from ..footage.border import Circle, Outline, Strips, find_outline, masked_border
 from ..footage.camera_motion import CameraMotion, camera_motion
@@ -233,11 +232,11 @@ def _confidence(sequence: FrameSequence) -> NDArray[np.float64]:
 
     The rows count the frames of the folder; of those that are read, the number in the image's name tells which it is.
     """
-    rows, names = read_rows(sequence.path), sequence.image_names
-    if len(rows) == len(sequence):
-        return confidence_of(rows, range(len(sequence)))
-    numbered = len(names) == len(sequence) and all(name.isdecimal() for name in names)
-    return confidence_of(rows, [int(name) for name in names]) if numbered else np.full(len(sequence), np.nan)
+    rows, names, count = read_rows(sequence.path), sequence.image_names, len(sequence)
+    numbered = len(names) == count and all(name.isdecimal() for name in names)
+    places = range(count) if len(rows) == count else [int(name) for name in names] if numbered else [-1] * count
+    known = {row.frame: row.confidence for row in rows}
+    return np.array([known.get(place, np.nan) for place in places], np.float64)
 
 
 def _camera_path(cameras: list[Camera]) -> tuple[float, float]:

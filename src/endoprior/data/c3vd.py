@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -21,10 +20,9 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .depth_files import read_values
 from .files import list_files, read_table
 from .formats import Format
-from .images import read_color
+from .images import read_color, read_values
 from .poses import demand_rotations, world_to_camera
 from .reading import read_text
 from .sequence import FrameSequence
@@ -113,11 +111,7 @@ def is_c3vd(path: Path) -> bool:
 
 
 def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Open a registered video.
-
-    Raises:
-        InputError: files are missing or cannot be used, or the camera is unknown.
-    """
+    """Open a registered video."""
     images = list_files(path, (".png",), "C3VD", "_color")
     stored = {_number(file): file for file in list_files(path, (".tiff", ".tif"), "C3VD", "_depth")}
     missing = [file for file in images if _number(file) not in stored]
@@ -131,9 +125,8 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     if (width, height) != (lens.width, lens.height):
         hint = "put the camera's width, height, cx, cy, a0, a2, a3, a4, c, d, e into config.ini beside them."
         raise input_error(images[0], f"{lens.width}x{lens.height} px, the calibrated size", f"{width}x{height}", hint)
-    undistorter = Undistorter(lens)
     try:
-        _ = undistorter.maps
+        maps = lens.pinhole_maps()
     except ValueError as error:
         raise input_error(calibration, "the calibration of a camera", str(error), "correct it or remove it.") from None
     focal, cx, cy = lens.pinhole()
@@ -146,9 +139,11 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     mm_per_unit = cfg.depth_unit_mm or 100 / FARTHEST
 
     def decode(index: int) -> Pixels:
-        units = undistorter.nearest(read_values(depths[index], (width, height)))
+        # The nearest depth, so that depths do not mix across an edge; 0 outside of the original, where no tissue is.
+        units = cv2.remap(read_values(depths[index], (width, height)), *maps, cv2.INTER_NEAREST)
         depth = np.where(units < FARTHEST, units * np.float32(mm_per_unit), np.float32(0))
-        return undistorter.smooth(read_color(images[index], (width, height))), units > 0, depth
+        color = read_color(images[index], (width, height))
+        return cv2.remap(color, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), units > 0, depth
 
     return assemble(
         path,
@@ -164,34 +159,10 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     )
 
 
-class Undistorter:
-    """Resamples images of an omnidirectional lens to its pinhole camera; the maps are computed at first use."""
-
-    def __init__(self, lens: Omnidirectional) -> None:
-        """Args: lens: of the images."""
-        self.lens = lens
-
-    @cached_property
-    def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """See `Omnidirectional.pinhole_maps`."""
-        return self.lens.pinhole_maps()
-
-    def smooth(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) bilinear; outside the original the border's color is repeated; no tissue is there."""
-        return cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-    def nearest(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) nearest pixel, so that depths do not mix across an edge; 0 outside the original."""
-        return cv2.remap(image, *self.maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-
-
 def camera_to_world(path: Path, count: int) -> NDArray[np.float64]:
     """(N, 4, 4) poses of `pose.txt`, translation in mm.
 
     The files are column-major, although C3VD's page says row-major; the position of (0, 0, 0, 1) decides.
-
-    Raises:
-        InputError: not `count` rows of 16 numbers, or not rigid.
     """
     rows = read_table(path, POSES_HINT)
     if rows.shape != (count, 16):
@@ -204,11 +175,7 @@ def camera_to_world(path: Path, count: int) -> NDArray[np.float64]:
 
 
 def read_lens(path: Path) -> Omnidirectional:
-    """The camera in a file of lines `name = number` (or with a colon); other lines are ignored.
-
-    Raises:
-        InputError: unreadable, or a parameter is missing.
-    """
+    """The camera in a file of lines `name = number` (or with a colon); other lines are ignored."""
     text = read_text(path, "camera parameters", "write it again.")
     entries = dict(re.findall(r"^\s*(\w+)\s*[=:]\s*([-+.\deE]+)\s*;?\s*$", text, re.MULTILINE))
     values = {}

@@ -24,6 +24,8 @@ from .sequence import FrameSequence
 
 FIX = "export the model again."
 MOST_IMAGES = 1_000_000
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+"""Where programs put the model."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +51,7 @@ class RegisteredImage:
 
 
 def read_colmap(folder: Path) -> tuple[list[RegisteredImage], list[Path]]:
-    """The registered images of a model, in the order of its file, and the files that were read.
-
-    Raises:
-        InputError: a file is missing or damaged, or a lens has a model that is not supported.
-    """
+    """The registered images of a model, in the order of its file, and the files that were read."""
     suffix = ".bin" if (folder / "images.bin").exists() else ".txt"
     cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
     lenses = {number: _lens(cameras, each) for number, each in read_cameras(cameras).items()}
@@ -77,11 +75,7 @@ def read_colmap(folder: Path) -> tuple[list[RegisteredImage], list[Path]]:
 
 
 def read_cameras(path: Path) -> dict[int, StoredCamera]:
-    """The cameras of `cameras.txt` or `cameras.bin` by their numbers.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """The cameras of `cameras.txt` or `cameras.bin` by their numbers."""
     try:
         return _cameras_of_bytes(path) if path.suffix == ".bin" else _cameras_of_text(path)
     except (struct.error, IndexError, UnicodeDecodeError):
@@ -172,21 +166,13 @@ def _images_of_bytes(path: Path) -> list[tuple[str, int, NDArray[np.float64]]]:
     return rows
 
 
-PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
-"""Where programs put the model."""
-
-
 def is_colmap(path: Path) -> bool:
     """Whether a folder has images and a model, and no poses of its own."""
     return (path / "images").is_dir() and not (path / "poses_bounds.npy").exists() and model_folder(path) is not None
 
 
 def load_colmap(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Open the registered images, in the order of their names.
-
-    Raises:
-        InputError: the model or an image cannot be used.
-    """
+    """Open the registered images, in the order of their names."""
     model = model_folder(path)
     if model is None:
         fix = "pass the folder that holds images/ and sparse/0/."
@@ -207,11 +193,7 @@ def load_colmap(path: Path, cfg: DataConfig) -> FrameSequence:
 
 
 def present(source: Path, posed: list[PosedImage], remarks: list[str]) -> list[PosedImage]:
-    """The images whose files are there; a remark counts the others.
-
-    Raises:
-        InputError: none is there.
-    """
+    """The images whose files are there; a remark counts the others."""
     there = [each for each in posed if each.file.is_file()]
     if not there:
         got = f"none of {len(posed)}, such as {posed[0].file}" if posed else "none"

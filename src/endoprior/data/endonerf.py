@@ -15,12 +15,11 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .depth_files import DEPTH_SUFFIXES, read_depth_file
 from .description import check_frames, intrinsics_of, read_description
 from .files import IMAGE_SUFFIXES, list_files
 from .formats import Format
 from .frame_files import files_of_images, one_per_frame
-from .images import read_color, read_depth, read_tool_mask
+from .images import DEPTH_SUFFIXES, read_color, read_depth, read_depth_file, read_tool_mask
 from .poses import MATRIX_FILE, demand_rotations, identity_poses, read_camera_matrix, world_to_camera
 from .reading import read_numpy
 from .sequence import FrameSequence
@@ -56,9 +55,6 @@ def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a folder of images, with masks, depth and poses if there are any; else the camera is static.
 
     A remark names everything that is missing and assumed.
-
-    Raises:
-        InputError: no images, numbers of files that differ, or files that cannot be used.
     """
     return load_endonerf(path, cfg, complete=False)
 
@@ -82,8 +78,6 @@ def load_endonerf(
         facts: entries of `sequence.json` that a dataset has elsewhere; the file itself overrides them.
         fact_files: the files they come from.
         complete: masks, depth and poses must be there, as PNG; see `load_plain`.
-    Raises:
-        InputError: the folder is not a sequence.
     """
     layout, kinds = ("EndoNeRF", (".png",)) if complete else ("plain", IMAGE_SUFFIXES)
     remarks: list[str] = []
@@ -187,11 +181,7 @@ def _cameras(
 
 
 def read_poses_bounds(path: Path, num_frames: int) -> NDArray[np.float64]:
-    """(N, 3, 5) camera-to-world [R | t | (height, width, focal)] from `poses_bounds.npy`, checked.
-
-    Raises:
-        InputError: missing, of another shape, not finite, or not rotations.
-    """
+    """(N, 3, 5) camera-to-world [R | t | (height, width, focal)] from `poses_bounds.npy`, checked."""
     if not path.exists():
         raise input_error(path, "camera poses", "no such file", STILL_HINT)
     stored = read_numpy(path, "a NumPy file", POSES_HINT)
@@ -209,9 +199,6 @@ def focal_at(path: Path, stored: NDArray[np.float64], width: int, height: int, r
 
     Files often hold the size of the original video beside smaller images; then the focal length is scaled, and a remark
     says so.
-
-    Raises:
-        InputError: not above 0, or the stored size has another shape, so that the images were cut.
     """
     old_height, old_width, focal = stored
     if focal <= 0:

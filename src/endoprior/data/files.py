@@ -25,6 +25,8 @@ DEPTH_WORDS = {"depth", "depths", "disp", "disparity", "z"}
 """A file with one of these words in its name is a depth map."""
 OTHER_WORDS = {"normal", "normals", "flow", "occlusion", "overlay", "confidence", "uncertainty", "visualization", "vis"}
 """A file with one of these words in its name is no frame either."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+"""Color images that readers accept."""
 
 
 def words_of(stem: str) -> set[str]:
@@ -85,16 +87,8 @@ def _are_decimals(stems: Sequence[str]) -> bool:
     return len({len(fraction) for fraction in fractions}) > 1 and not ends
 
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-"""Color images that readers accept."""
-
-
 def entries(folder: Path) -> list[Path]:
-    """The entries of a folder, unordered.
-
-    Raises:
-        InputError: the folder is not readable.
-    """
+    """The entries of a folder, unordered."""
     try:
         return list(folder.iterdir())
     except OSError as error:
@@ -110,11 +104,7 @@ def in_order(files: Iterable[Path]) -> list[Path]:
 
 
 def files_with(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The entries of a folder with one of the suffixes, in natural order; hidden ones do not count.
-
-    Raises:
-        InputError: the folder is not readable.
-    """
+    """The entries of a folder with one of the suffixes, in natural order; hidden ones do not count."""
     usable = [file for file in entries(folder) if file.suffix.lower() in suffixes and not file.name.startswith(".")]
     return in_order(usable)
 
@@ -127,8 +117,6 @@ def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str
         suffixes: in lower case, with the dot.
         layout: name of the expected layout, for the message.
         ending: what the stem must end with.
-    Raises:
-        InputError: no such folder, or no such file in it.
     """
     kind = "/".join(sorted({suffix.removeprefix(".").upper() for suffix in suffixes} - {"JPEG", "TIF"}, reverse=True))
     if not folder.is_dir():
@@ -143,29 +131,23 @@ def list_files(folder: Path, suffixes: tuple[str, ...], layout: str, ending: str
     return in_order(files)
 
 
-def read_json(path: Path, fix: str = "correct it or remove it.") -> dict[str, Any]:
-    """The object in a JSON file.
-
-    Raises:
-        InputError: unreadable, not JSON, or not an object.
-    """
+def read_json(
+    path: Path, fix: str = "correct it or remove it.", expected: str = "a JSON object", kind: type = dict
+) -> Any:
+    """The object in a JSON file; of another `kind`, its list."""
     try:
-        stored = json.loads(read_text(path, "a JSON object", fix))
+        stored = json.loads(read_text(path, expected, fix))
     except (ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise input_error(path, "a JSON object", str(error).split("\n")[0], fix) from None
-    if not isinstance(stored, dict):
-        raise input_error(path, "a JSON object", type(stored).__name__, fix)
+        raise input_error(path, expected, str(error).split("\n")[0], fix) from None
+    if not isinstance(stored, kind):
+        raise input_error(path, expected, type(stored).__name__, fix)
     return stored
 
 
 def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """The finite matrix `key` of an object read from `path`; dots in the key go into nested objects.
-
-    Raises:
-        InputError: missing, of another shape, or with entries that are not finite numbers.
-    """
+    """The finite matrix `key` of an object read from `path`; dots in the key go into nested objects."""
     value: Any = stored
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None
@@ -183,11 +165,7 @@ def read_matrix(path: Path, stored: dict[str, Any], key: str, shape: tuple[int, 
 
 
 def read_table(path: Path, fix: str) -> NDArray[np.float64]:
-    """(N, K) numbers of a text file, separated by commas or blanks, one row per line; '#' starts a comment.
-
-    Raises:
-        InputError: unreadable, not numbers, or rows of different lengths.
-    """
+    """(N, K) numbers of a text file, separated by commas or blanks, one row per line; '#' starts a comment."""
     lines = read_text(path, "rows of numbers", fix).splitlines()
     try:
         rows = [re.split(r"[,\s]+", line.split("#")[0].strip(", \t")) for line in lines]

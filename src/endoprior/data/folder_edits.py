@@ -20,6 +20,7 @@ from .sequence import FrameSequence
 
 NOTE = "changes.json"
 """In the folder of the original masks: the files that were changed, and by how many pixels."""
+POSES, BACKUP = "poses_bounds.npy", "poses_bounds_before.npy"
 
 
 def replace_masks(sequence: FrameSequence, masks: Mapping[int, NDArray[np.bool_]]) -> None:
@@ -56,9 +57,8 @@ def writable_masks(sequence: FrameSequence) -> list[Path]:
         fix = "Convert it to a sequence folder, or make a video of it for `endoprior prepare`."
         raise input_error(sequence.path, "a sequence folder with one mask file per frame", "another dataset", fix)
     for place in (files[0].parent, files[0].parent.parent):
-        if place.exists() and not os.access(place, os.W_OK):
-            fix = "Copy the data folder to a place of your own, and use the copy."
-            raise input_error(place, "a folder that can be written", "a read-only one", fix)
+        if place.exists():
+            demand_writable(place)
     return files
 
 
@@ -99,9 +99,6 @@ def changes(kept: Path, folder: Path, tool_value: int) -> dict[str, dict[str, in
         before, now = (read_tool_mask(file, tool_value) for file in (original, folder / original.name))
         found[original.name] = {"added_px": int((now & ~before).sum()), "removed_px": int((before & ~now).sum())}
     return found
-
-
-POSES, BACKUP = "poses_bounds.npy", "poses_bounds_before.npy"
 
 
 def pose_table(

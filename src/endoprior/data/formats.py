@@ -1,4 +1,4 @@
-"""Every folder layout that can be opened. To add one, write a module with a `Format` here and name it in `FORMATS`.
+"""Every folder layout that can be opened. To add one, write a module with a `FORMAT` here and name it in `FORMATS`.
 
 docs/datasets.md describes each layout, and shows how to add one.
 """
@@ -17,19 +17,21 @@ from ..system.plugins import Registry, report
 if TYPE_CHECKING:
     from .sequence import FrameSequence
 
-FORMATS = {
-    "scared": "scared.FORMAT",
-    "c3vd": "c3vd.FORMAT",
-    "stir": "stir.FORMAT",
-    "stereomis": "stereomis.FORMAT",  # before EndoNeRF, whose layout it extends
-    "hamlyn": "hamlyn.FORMAT",  # likewise
-    "no_depth": "endonerf.NO_DEPTH",
-    "nerfstudio": "nerfstudio.FORMAT",
-    "colmap": "colmap.FORMAT",
-    "endonerf": "endonerf.FORMAT",
-    "plain": "endonerf.PLAIN",  # last: it recognizes every folder with images
-}
-"""Module and name of each layout that `DataConfig.format` takes, in the order in which `auto` tries them."""
+FORMATS = (
+    "scared",
+    "c3vd",
+    "stir",
+    "stereomis",  # before EndoNeRF, whose layout it extends
+    "hamlyn",  # likewise
+    "no_depth",
+    "nerfstudio",
+    "colmap",
+    "endonerf",
+    "plain",  # last: it recognizes every folder with images
+)
+"""Modules of this package by the name that `DataConfig.format` takes, in the order in which `auto` tries them."""
+PARTIAL = {"no_depth": "NO_DEPTH", "plain": "PLAIN"}
+"""Layouts that lack parts of EndoNeRF's, which its module reads too."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +49,16 @@ def _problem(found: Any) -> str:
 
 
 def _load(name: str) -> Format:
-    module, _, attribute = FORMATS[name].partition(".")
-    return getattr(import_module(f".{module}", __package__), attribute)
+    if name in PARTIAL:
+        return getattr(import_module(".endonerf", __package__), PARTIAL[name])
+    return import_module(f".{name}", __package__).FORMAT
 
 
 REGISTRY: Registry[Format] = Registry(
     "datasets",
     "a Format of endoprior.data.formats",
     _problem,
-    modules=tuple(FORMATS),
+    modules=FORMATS,
     load_module=_load,
     reserved=("auto",),
 )
@@ -64,8 +67,7 @@ REGISTRY: Registry[Format] = Registry(
 
 def recognizing(path: Path) -> str | None:
     """Name of the first layout that recognizes a folder; plugins come after the built-in layouts, before `plain`."""
-    *first, last = FORMATS
-    for name in first:
+    for name in FORMATS[:-1]:
         if REGISTRY.load(name).recognizes(path):
             return name
     for name, layout in REGISTRY.usable():
@@ -74,4 +76,4 @@ def recognizing(path: Path) -> str | None:
                 return name
         except Exception as error:  # a plugin's fault must not keep other folders from opening
             report(REGISTRY.failure(name, error))
-    return last if REGISTRY.load(last).recognizes(path) else None
+    return FORMATS[-1] if REGISTRY.load(FORMATS[-1]).recognizes(path) else None

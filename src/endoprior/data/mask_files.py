@@ -32,6 +32,13 @@ LEAST_SHARE = 0.05
 """Values between that are a smaller share of such an area are errors, not labels."""
 COLOR = 1 << 56
 """Colors are numbers from here on, with 16 bits for each of red, green and blue; black and grays are their level."""
+MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz")
+LOSSY = (".jpg", ".jpeg", ".webp")
+MOST_LABEL_COLORS = 256
+"""A file with more colors is a photo, not a mask."""
+LEAST_CERTAINTY = 0.5
+"""If the detected polarity is less certain, high values mark tools by convention."""
+LABELS = "--mask-labels"
 
 
 @dataclass(frozen=True)
@@ -160,15 +167,6 @@ def _on_slope(values: NDArray, error: int) -> NDArray[np.bool_]:
     return (low + error < numbers) & (numbers + error < high)
 
 
-MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz")
-LOSSY = (".jpg", ".jpeg", ".webp")
-MOST_LABEL_COLORS = 256
-"""A file with more colors is a photo, not a mask."""
-LEAST_CERTAINTY = 0.5
-"""If the detected polarity is less certain, high values mark tools by convention."""
-LABELS = "--mask-labels"
-
-
 def read_user_mask(path: Path, size: tuple[int, int], rule: HighValues | None = None) -> NDArray[np.bool_]:
     """Read a mask in any usual format.
 
@@ -183,8 +181,6 @@ def read_user_mask(path: Path, size: tuple[int, int], rule: HighValues | None = 
         rule: which values of its folder are high, from `rule_of_files`; None decides by this file alone.
     Returns:
         (H, W) True where the value is high. `tool_polarity` tells whether high values mark tools.
-    Raises:
-        InputError: the file is unreadable, has another size or values that are not finite, or is not a mask.
     """
     rule = rule or rule_of_files([path])
     high = rule.of(_numbers(path))
@@ -201,8 +197,6 @@ def rule_of_files(files: Sequence[Path], asked: str = "") -> HighValues:
     Args:
         files: of one clip; a label that occurs in a single frame counts.
         asked: labels that are high, separated by commas: numbers, or colors such as `#ff5500`; empty for all above 0.
-    Raises:
-        InputError: a file is no mask, or has no labels of these names.
     """
     tally, odd = Tally(), None
     for file in files:

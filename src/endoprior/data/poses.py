@@ -12,6 +12,11 @@ from .files import read_table
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R^T R - I of a valid rotation: far above float32 rounding, far below a real scale."""
+MATRIX_FILE = "intrinsics.txt"
+OFF_CENTER = 0.2
+"""Largest distance of the principal point from the image center, as a share of the image's sides."""
+SAME_SHAPE = 0.01
+"""Largest relative difference of the scales along both sides."""
 
 
 def demand_rotations(path: Path, rotations: NDArray[np.float64], where: str, fix: str) -> None:
@@ -35,20 +40,10 @@ def identity_poses(count: int) -> list[NDArray[np.float64]]:
     return [np.eye(4) for _ in range(count)]
 
 
-MATRIX_FILE = "intrinsics.txt"
-OFF_CENTER = 0.2
-"""Largest distance of the principal point from the image center, as a share of the image's sides."""
-SAME_SHAPE = 0.01
-"""Largest relative difference of the scales along both sides."""
-
-
 def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     """(3, 3) camera matrix, px, of a text file with 3x3, 3x4 or 4x4 numbers.
 
     Pixel centers of the file are integers, ours are halves: 0.5 is added to the principal point.
-
-    Raises:
-        InputError: unreadable, or other numbers.
     """
     fix = "write the 3x3 camera matrix of the images (fx 0 cx; 0 fy cy; 0 0 1)."
     rows = read_table(path, fix)
@@ -66,9 +61,6 @@ def matrix_of_images(
     """The matrix in px of images of this (width, height): as it is, or scaled from images of the `usual` size.
 
     The file does not state its size. The principal point tells which of both it is; a remark tells of a change.
-
-    Raises:
-        InputError: it fits neither.
     """
     if size == usual or _centered(matrix, size):
         return matrix

@@ -31,6 +31,14 @@ MOST_TEXT_BYTES = 64 << 20
 """Largest size of a JSON, YAML or text file."""
 ACCESS_HINT = "check the path and its permissions."
 Kind = Literal["a file", "a folder", "nothing", "a device or a pipe"]
+MOST_ARRAYS = 1000
+"""Largest number of arrays in one .npz file."""
+ZIP_START = b"PK"
+_BROKEN = (OSError, ValueError, TypeError, EOFError, BadZipFile, zlib.error, LZMAError)
+_UNUSUAL = (RuntimeError, MemoryError, OverflowError)  # encrypted, unknown compression, nested header
+MOST_NODES = 100_000
+"""Largest number of entries, each alias counted as often as it is used."""
+MOST_NESTED = 50
 
 
 def kind_of(path: Path) -> Kind:
@@ -119,13 +127,6 @@ def demand_file(path: Path, expected: str, fix: str, most: int = MOST_BYTES) -> 
         raise input_error(path, f"at most {most >> 20} MB", f"{size >> 20} MB", fix)
 
 
-MOST_ARRAYS = 1000
-"""Largest number of arrays in one .npz file."""
-ZIP_START = b"PK"
-_BROKEN = (OSError, ValueError, TypeError, EOFError, BadZipFile, zlib.error, LZMAError)
-_UNUSUAL = (RuntimeError, MemoryError, OverflowError)  # encrypted, unknown compression, nested header
-
-
 def read_numpy(path: Path, expected: str, fix: str) -> NDArray | dict[str, NDArray]:
     """The array of an .npy file, or the named arrays of an .npz file; no pickles.
 
@@ -178,11 +179,6 @@ def _array(stored: bytes) -> NDArray:
         raise ValueError(f"a header of shape {shape} for {len(stored) - file.tell()} bytes")
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)
-
-
-MOST_NODES = 100_000
-"""Largest number of entries, each alias counted as often as it is used."""
-MOST_NESTED = 50
 
 
 class BoundedLoader(yaml.SafeLoader):

@@ -22,7 +22,8 @@ from .poses import ROTATION_TOLERANCE, demand_rotations
 from .reading import read_bytes, read_numpy
 
 _AGAIN = "write the truth again."
-_FILE = ("a NumPy file", _AGAIN)
+FOLDER = "right"
+"""Name of the folder of the right images."""
 
 
 @dataclass(frozen=True)
@@ -52,23 +53,24 @@ class Truth:
         path = self.folder / "tissue" / f"{self._names[index]}.png"
         return read_color(path) if path.parent.is_dir() else None
 
+    def _array(self, name: str) -> NDArray | dict[str, NDArray] | None:
+        """What a NumPy file of the folder holds; None without."""
+        path = self.folder / name
+        return read_numpy(path, "a NumPy file", _AGAIN) if path.exists() else None
+
     def depth(self, index: int) -> NDArray[np.float32] | None:
         """(H, W) exact z of the tissue of frame `index`, tool ignored, mm."""
         path = self.folder / "depth" / f"{self._names[index]}.npy"
-        return np.asarray(read_numpy(path, *_FILE), np.float32) if path.parent.is_dir() else None
+        return np.asarray(read_numpy(path, "a NumPy file", _AGAIN), np.float32) if path.parent.is_dir() else None
 
     def seen(self, index: int) -> NDArray[np.bool_] | None:
         """(H, W) True behind the tool of frame `index` where some training frame shows that tissue; None without."""
-        path = self.folder / "seen" / f"{self._names[index]}.npy"
-        return np.asarray(read_numpy(path, *_FILE), bool) if path.exists() else None
+        stored = self._array(f"seen/{self._names[index]}.npy")
+        return None if stored is None else np.asarray(stored, bool)
 
     @cached_property
     def side_poses(self) -> dict[str, NDArray[np.float64]]:
-        """Cameras beside the endoscope by name: (4, 4) rigid transforms from the frame's camera axes; empty without.
-
-        Raises:
-            InputError: the file holds something else.
-        """
+        """Cameras beside the endoscope by name: (4, 4) rigid transforms from the frame's camera axes; empty without."""
         path = self.folder / "side" / "world_to_camera.json"
         if not path.exists():
             return {}
@@ -87,22 +89,17 @@ class Truth:
 
         Both are 0 where the endoscope does not see the tissue.
         """
-        path = self.folder / "side" / name / f"{self._names[index]}.npy"
-        if not path.exists():
-            return None
-        return read_color(path.with_suffix(".png")), np.asarray(read_numpy(path, *_FILE), np.float32)
+        file = f"side/{name}/{self._names[index]}"
+        depth = self._array(f"{file}.npy")
+        return None if depth is None else (read_color(self.folder / f"{file}.png"), np.asarray(depth, np.float32))
 
     @cached_property
     def camera_to_world(self) -> NDArray[np.float64] | None:
-        """(T, 4, 4) true pose of each frame's camera, mm, OpenCV axes; its world axes may differ from the sequence's.
-
-        Raises:
-            InputError: the file holds something else.
-        """
-        path = self.folder / "camera_to_world.npy"
-        if not path.exists():
+        """(T, 4, 4) true pose of each frame's camera, mm, OpenCV axes; world axes may differ from the sequence's."""
+        path, stored = self.folder / "camera_to_world.npy", self._array("camera_to_world.npy")
+        if stored is None:
             return None
-        stored, shape = read_numpy(path, *_FILE), (len(self._names), 4, 4)
+        shape = (len(self._names), 4, 4)
         if isinstance(stored, dict) or stored.dtype.kind not in "iuf" or stored.shape != shape:
             got = "several arrays" if isinstance(stored, dict) else f"{stored.shape} of {stored.dtype}"
             raise input_error(path, f"numbers of shape {shape}", got, _AGAIN)
@@ -117,10 +114,9 @@ class Truth:
     @cached_property
     def tracks(self) -> Tracks | None:
         """All tracks, or None."""
-        path = self.folder / "tracks.npz"
-        if not path.exists():
+        path, stored = self.folder / "tracks.npz", self._array("tracks.npz")
+        if stored is None:
             return None
-        stored = read_numpy(path, *_FILE)
         if not isinstance(stored, dict) or not {"points", "visible"} <= stored.keys():
             got = ", ".join(stored) if isinstance(stored, dict) else "one array"
             raise input_error(path, "arrays points and visible", got, _AGAIN)
@@ -135,10 +131,6 @@ class Truth:
         if region is not None and region.shape != (count,):
             raise input_error(path, f"a region of shape ({count},)", f"{region.shape}", _AGAIN)
         return tracks
-
-
-FOLDER = "right"
-"""Name of the folder of the right images."""
 
 
 class RightEye:
@@ -164,11 +156,7 @@ class RightEye:
         return RightEye(self.files[start:stop], self.baseline_mm, self._size, self._shrink)
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """(H, W, 3) right picture of frame `index` at the size of the left one, 0..255.
-
-        Raises:
-            InputError: the file cannot be used, or has another size than the left one.
-        """
+        """(H, W, 3) right picture of frame `index` at the size of the left one, 0..255."""
         return shrunk_color(read_color(self.files[index], self._size), self._shrink)
 
 
@@ -194,8 +182,6 @@ def open_right_eye(
         shrink: see `RightEye`.
         remarks: gets the reason, or that the files are matched in order.
         relative: whether the scale of depth is unknown: then a baseline in mm does not fit the scene.
-    Raises:
-        InputError: the folder or its first picture cannot be read.
     """
     folder = path / FOLDER
     if not folder.is_dir():

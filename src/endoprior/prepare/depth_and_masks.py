@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 from ..core.spread import spread
-from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
 from ..data.description import TOOLS_FOUND
 from ..data.found_tools import FoundTools
 from ..data.frame_files import match_files, match_names
+from ..data.images import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
 from ..data.mask_files import tool_polarity
 from ..data.mask_folders import MaskFrame, open_mask_folder
 from ..data.pixels import is_measured

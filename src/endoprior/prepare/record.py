@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.options import changed_options
-from ..data.prepare_record import PrepareRecord
+from ..data.description import PrepareRecord
 from .config import PrepareConfig
 from .depth_and_masks import NETWORK
 from .frame_geometry import FrameGeometry

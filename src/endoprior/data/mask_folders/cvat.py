@@ -27,6 +27,12 @@ from .parts import Mask, MaskFolder, MaskFrame, Size, demand_size, mask_of_runs,
 CLASSES, LABELS, LISTED = "SegmentationClass", "labelmap.txt", Path("ImageSets", "Segmentation", "default.txt")
 PNG_HINT = "Export the task from CVAT as `Segmentation mask 1.1` again."
 Color = tuple[int, int, int]
+SHAPES = ("mask", "polygon")
+XML_HINT = "Export the task from CVAT as `CVAT for images 1.1`."
+MOST_PX = 1 << 16
+"""Largest coordinate of a point."""
+Shape = tuple[str, Mapping[str, str]]
+"""Tag and attributes."""
 
 
 def segmentation_masks(folder: Path, asked: str) -> MaskFolder | None:
@@ -48,11 +54,7 @@ def segmentation_masks(folder: Path, asked: str) -> MaskFolder | None:
 
 
 def read_labelmap(file: Path) -> dict[str, Color]:
-    """Label -> color (red, green, blue), in the order of the file.
-
-    Raises:
-        InputError: a line of another form, or no label.
-    """
+    """Label -> color (red, green, blue), in the order of the file."""
     found: dict[str, Color] = {}
     for line in read_text(file, "CVAT's labels", PNG_HINT).splitlines():
         if not line.strip() or line.startswith("#"):
@@ -102,20 +104,8 @@ def _packed(colors: NDArray) -> NDArray[np.int64]:
     return colors.astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
 
 
-SHAPES = ("mask", "polygon")
-XML_HINT = "Export the task from CVAT as `CVAT for images 1.1`."
-MOST_PX = 1 << 16
-"""Largest coordinate of a point."""
-Shape = tuple[str, Mapping[str, str]]
-"""Tag and attributes."""
-
-
 def annotations(file: Path, asked: str) -> MaskFolder | None:
-    """The masks in an XML file of CVAT; None for another XML file.
-
-    Raises:
-        InputError: damaged, of a video task, without images, or labels that do not tell which are tools.
-    """
+    """The masks in an XML file of CVAT; None for another XML file."""
     text = read_text(file, "an XML file", XML_HINT)
     if "<annotations" not in text:
         return None

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
 
 from ...core.checks import InputError
@@ -21,52 +21,29 @@ from ..reading import kind_of, read_text
 from .parts import Mask, MaskFolder, MaskFrame, Size, sorted_frames, tool_labels, union_of_files, words_about
 
 NAME = re.compile(r"task-(\d+)-annotation-(\d+)-by-([^-]*)-(.*)-(\d+)")
-
-
-@dataclass(frozen=True)
-class _Region:
-    task: int
-    annotation: int
-    label: str
-    file: Path
+TRANSFORMS = "transforms.json"
+SHRUNK = (2, 4, 8)
 
 
 def brush_export(folder: Path, asked: str) -> MaskFolder | None:
-    """The regions of each task, in the order of the tasks; None for a folder with other files.
-
-    Raises:
-        InputError: labels that do not tell which are tools.
-    """
-    regions = _regions(folder)
-    if not regions:
+    """The regions of each task of Label Studio, in the order of the tasks; None for a folder with other files."""
+    # Of a PNG and its NumPy twin, the PNG.
+    files = {file.stem: file for suffix in (".npy", ".png") for file in files_with(folder, (suffix,))}
+    found = [(match, file) for stem, file in files.items() if (match := NAME.fullmatch(stem))]
+    if not found:
         return None
-    labels = sorted({region.label for region in regions})
+    # Names of tags seldom have a dash, those of labels may.
+    regions = [(int(m[1]), int(m[2]), m[4].partition("-")[2] or m[4], file) for m, file in found]
+    labels = sorted({label for _, _, label, _ in regions})
     tools = tool_labels(folder, labels, asked)
-    tasks = sorted({region.task for region in regions})
-    of_task = {task: [region for region in regions if region.task == task] for task in tasks}
-    frames = [
-        MaskFrame(f"task-{task}", union_of_files([region.file for region in of_task[task] if region.label in tools]))
-        for task in tasks
-    ]
-    several = sum(len({region.annotation for region in of_task[task]}) > 1 for task in tasks)
+    frames, several = [], 0
+    for task in sorted({each[0] for each in regions}):
+        own = [each for each in regions if each[0] == task]
+        several += len({annotation for _, annotation, _, _ in own}) > 1
+        frames.append(MaskFrame(f"task-{task}", union_of_files([file for *_, label, file in own if label in tools])))
     note = f"Label Studio brush labels; {words_about(labels, tools)}; tasks are matched to frames in order"
     note += f"; {several} tasks have several annotations, which are merged" if several else ""
     return MaskFolder(frames, note, True, in_order_only=True)
-
-
-def _regions(folder: Path) -> list[_Region]:
-    """The regions of all files; of a PNG and its NumPy twin, the PNG."""
-    files = {file.stem: file for suffix in (".npy", ".png") for file in files_with(folder, (suffix,))}
-    found = [(match, file) for stem, file in files.items() if (match := NAME.fullmatch(stem))]
-    return [
-        # Names of tags seldom have a dash, those of labels may.
-        _Region(int(match[1]), int(match[2]), match[4].partition("-")[2] or match[4], file)
-        for match, file in found
-    ]
-
-
-TRANSFORMS = "transforms.json"
-SHRUNK = (2, 4, 8)
 
 
 def ignore_masks(folder: Path) -> MaskFolder | None:
@@ -103,12 +80,8 @@ def _reader(mask: Path) -> Callable[[Size], Mask]:
             return read_user_mask(mask, size)
         except InputError:
             for name in _siblings(mask.parent.name)[1:]:
-                other = mask.parent.with_name(name) / mask.name
-                if kind_of(other) == "a file":
-                    try:
-                        return read_user_mask(other, size)
-                    except InputError:
-                        continue
+                with suppress(InputError):
+                    return read_user_mask(mask.parent.with_name(name) / mask.name, size)
             raise
 
     return read

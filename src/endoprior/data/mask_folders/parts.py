@@ -18,6 +18,25 @@ from ..reading import MOST_PIXELS
 Mask = NDArray[np.bool_]
 Size = tuple[int, int]
 """(width, height), px."""
+OPTION = "--mask-labels"
+NEVER = {
+    "background", "bg", "ignore", "ignored", "unlabeled", "unlabelled", "unknown", "void", "none", "no", "not", "non",
+    "border", "outside", "other", "others",
+}  # fmt: skip
+"""A label with one of these words is not a tool."""
+TISSUE = {
+    "tissue", "organ", "anatomy", "mucosa", "blood", "fat", "muscle", "vessel", "artery", "vein", "nerve", "liver",
+    "gallbladder", "bowel", "intestine", "colon", "stomach", "kidney", "uterus", "prostate", "bladder", "lung", "heart",
+    "wall", "polyp", "tumor", "tumour", "lesion", "skin", "bone", "cartilage", "smoke", "highlight", "reflection",
+}  # fmt: skip
+"""A label with one of these words is not a tool, unless it has a word of a tool too: tissue forceps."""
+TOOLS = {
+    "tool", "instrument", "device", "shaft", "wrist", "clasper", "jaw", "tip", "grasper", "forceps", "forcep", "needle",
+    "driver", "holder", "scissors", "scissor", "hook", "clip", "clipper", "applier", "stapler", "suction", "irrigator",
+    "cautery", "coagulator", "electrode", "bipolar", "monopolar", "probe", "trocar", "retractor", "knife", "scalpel",
+    "snare", "catheter", "thread", "suture", "wire", "gauze", "robot", "arm", "hand", "glove", "drill", "ultrasound",
+}  # fmt: skip
+"""Words of things that are not part of the scene."""
 
 
 @dataclass(frozen=True)
@@ -71,27 +90,6 @@ def demand_size(subject: Path | str, got: Size, size: Size) -> None:
         raise input_error(subject, want, f"{got[0]}x{got[1]}", "Export masks at the size of the images.")
 
 
-OPTION = "--mask-labels"
-NEVER = {
-    "background", "bg", "ignore", "ignored", "unlabeled", "unlabelled", "unknown", "void", "none", "no", "not", "non",
-    "border", "outside", "other", "others",
-}  # fmt: skip
-"""A label with one of these words is not a tool."""
-TISSUE = {
-    "tissue", "organ", "anatomy", "mucosa", "blood", "fat", "muscle", "vessel", "artery", "vein", "nerve", "liver",
-    "gallbladder", "bowel", "intestine", "colon", "stomach", "kidney", "uterus", "prostate", "bladder", "lung", "heart",
-    "wall", "polyp", "tumor", "tumour", "lesion", "skin", "bone", "cartilage", "smoke", "highlight", "reflection",
-}  # fmt: skip
-"""A label with one of these words is not a tool, unless it has a word of a tool too: tissue forceps."""
-TOOLS = {
-    "tool", "instrument", "device", "shaft", "wrist", "clasper", "jaw", "tip", "grasper", "forceps", "forcep", "needle",
-    "driver", "holder", "scissors", "scissor", "hook", "clip", "clipper", "applier", "stapler", "suction", "irrigator",
-    "cautery", "coagulator", "electrode", "bipolar", "monopolar", "probe", "trocar", "retractor", "knife", "scalpel",
-    "snare", "catheter", "thread", "suture", "wire", "gauze", "robot", "arm", "hand", "glove", "drill", "ultrasound",
-}  # fmt: skip
-"""Words of things that are not part of the scene."""
-
-
 def tool_labels(subject: Path, labels: Sequence[str], asked: str) -> list[str]:
     """The labels that are tools.
 
@@ -99,8 +97,6 @@ def tool_labels(subject: Path, labels: Sequence[str], asked: str) -> list[str]:
         subject: file or folder of the labels, for error messages.
         labels: all of them.
         asked: names separated by commas; empty to tell by the names of the labels.
-    Raises:
-        InputError: a name that is no label, or labels whose names do not tell.
     """
     known = ", ".join(labels)
     if asked:
