@@ -1,4 +1,4 @@
-"""What `prepare` records about itself, so that `check` can print the command that repeats it."""
+"""What `prepare` records about itself, so that the command can be repeated."""
 
 from __future__ import annotations
 
