@@ -15,7 +15,7 @@ from relief import HEIGHT, MATRIX, WIDTH, path, view
 from endoprior.core.config import DataConfig
 from endoprior.core.geometry import camera_to_world
 from endoprior.data import FrameSequence, load_sequence
-from endoprior.data.writer import SequenceMeta, SequenceWriter
+from endoprior.data.writer import SequenceMeta, new_sequence
 from endoprior.evaluation.scorers.camera_path import trajectory_errors
 from endoprior.prepare.camera_path import choose
 from endoprior.tool_masks import FoundTools
@@ -38,7 +38,7 @@ def write_clip(folder: Path, poses: np.ndarray = TRUE, sources: dict[str, str] |
     meta = SequenceMeta(
         WIDTH, HEIGHT, fx=fx, fy=fx, cx=cx, cy=cy, frames_per_second=25, depth_scale=0.01, sources=sources or {}
     )
-    with SequenceWriter(folder, meta) as writer:
+    with new_sequence(folder, meta) as writer:
         for pose in TRUE:
             seen = view(pose)
             tool = ~seen.tissue_mask

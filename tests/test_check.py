@@ -93,6 +93,44 @@ def only(folder: Path, code: str) -> Finding:
     return found[code]
 
 
+COMMANDS = re.compile(r"`--data\.(\S+) (\S+)`")
+EDIT = re.compile(r"(?:set|write) {?(.*?)}? (?:in|to) \S+/sequence\.json")
+
+
+@pytest.mark.parametrize(
+    ("code", "change", "ways"),
+    [
+        ("mask-polarity", lambda data: edit(data / "masks", lambda mask, _: 255 - mask), 1),
+        ("depth-metres", lambda data: describe(data, depth_scale=1e-5), 2),
+        ("intrinsics", lambda data: describe(data, fx=2880.0, fy=2880.0), 1),
+        ("duplicate-frames", lambda data: shutil.copy(data / "images/000004.png", data / "images/000005.png"), 1),
+    ],
+)
+def test_edits_and_options_of_a_fix_end_the_problem(data, code, change, ways):
+    """Every edit of `sequence.json` and every `--data` option that a fix names."""
+    change(data)
+    fix, done = only(data, code).fix, 0
+    for name, value in COMMANDS.findall(fix):
+        key = name.replace("-", "_")
+        cfg = DataConfig(**{key: type(getattr(DataConfig(), key))(value)})
+        assert code not in {finding.code for finding in find(measure(load_sequence(data, cfg), cfg))}
+        done += 1
+    if values := EDIT.search(fix):
+        describe(data, **json.loads("{" + values[1] + "}"))
+        assert code not in findings(data)
+        done += 1
+    assert done == ways
+
+
+def test_docs_name_every_problem():
+    root = Path(__file__).parents[1]
+    lines = re.findall(r"^- (`.*?) \(", (root / "docs" / "check.md").read_text(), re.MULTILINE)
+    source = (root / "src" / "endoprior" / "check" / "findings.py").read_text()
+    codes = set(re.findall(r"`([a-z0-9-]+)`", " ".join(lines)))
+    assert codes and all(f'"{code}"' in source for code in codes)
+    assert codes >= set(re.findall(r'Finding\("([a-z0-9-]+)"', source))
+
+
 def test_windows_and_their_cost(facts):
     """A note only where there is more than one; twice the pixels cost nearly twice the time."""
     assert facts.windows == ((0, FRAMES),)
@@ -131,7 +169,7 @@ def test_depth_in_metres(data):
     assert finding.severity == "error"
     assert finding.what == "depth looks like m, not mm (the median is 0.07772, which in m is 78 mm away)"
     assert finding.fix == (
-        f'set "depth_scale": 0.01 in {data}/sequence.json, or `endoprior train {data} RUN --data.depth-unit-mm 0.01`'
+        f'set "depth_scale": 0.01 in {data}/sequence.json, or train with `--data.depth-unit-mm 0.01`'
     )
 
 
@@ -150,7 +188,7 @@ def test_disparity_instead_of_depth(data):
     edit(data / "depth", lambda depth, _: np.where(depth > 0, 4e7 / np.maximum(depth, 1), 0).astype(np.uint16))
     fix = only(data, "depth-disparity").fix
     assert fix.startswith(
-        "store depth in mm: focal length (px) x baseline (mm) / disparity (px), or `endoprior prepare "
+        "store depth in mm: focal length (px) x baseline (mm) / disparity (px), or run `prepare` with "
     )
 
 
@@ -170,8 +208,7 @@ def test_console_strip(data):
     edit(data / "images", paint)
     finding = only(data, "console-strip")
     assert finding.what == "a bar or console strip of 20 px at the bottom counts as tissue"
-    assert finding.fix.startswith(f"`endoprior prepare {data}/images {data}_2 ")
-    assert finding.fix.endswith(" --crop 0,0,256,172`, or mark it in the masks")
+    assert finding.fix == "run `prepare` with `--crop X,Y,WIDTH,HEIGHT`, without it, or mark it in the masks"
     edit(data / "masks", lambda mask, _: np.vstack([mask[:-20], np.full_like(mask[-20:], 255)]))
     assert findings(data) == {}, "the strip is masked now"
 
@@ -200,10 +237,8 @@ def test_swapped_eyes(stereo):
     (stereo / "left").rename(stereo / "right")
     found = findings(stereo)
     assert found["swapped-eyes"].severity == "error"
-    assert found["swapped-eyes"].fix.startswith(f"`endoprior prepare {stereo}/right {stereo}_2 ")
-    describe(stereo, baseline_mm=None)
     by_hand = f"swap the folders {stereo}/images and {stereo}/right, and measure depth again"
-    assert findings(stereo)["swapped-eyes"].fix == by_hand
+    assert "`--swap-eyes`" in found["swapped-eyes"].fix and found["swapped-eyes"].fix.endswith(by_hand)
 
 
 @pytest.mark.slow
@@ -219,14 +254,17 @@ def test_duplicated_frames(data):
     finding = only(data, "duplicate-frames")
     assert finding.frames == (5, 6, 11)
     assert finding.what == "3 of 12 frames repeat the one before: frames 5-6, 11"
-    assert finding.fix == f"`endoprior train {data} RUN --data.skip-frames 5-6,11`"
+    assert finding.fix == "train with `--data.skip-frames 5-6,11`"
+    given = DataConfig(shrink=2, skip_frames="2-3")
+    found = {each.code: each for each in find(measure(load_sequence(data, given), given))}
+    assert found["duplicate-frames"].fix == "train with `--data.skip-frames 2-3,5-6,11`"
 
 
 def test_doubled_frame_rate_suggests_a_stride(data):
     files = sorted((data / "images").iterdir())
     for copy in range(1, FRAMES, 2):
         shutil.copy(files[copy - 1], files[copy])
-    assert only(data, "duplicate-frames").fix == f"`endoprior train {data} RUN --data.stride 2`"
+    assert only(data, "duplicate-frames").fix == "train with `--data.stride 2`"
 
 
 @pytest.mark.slow
@@ -235,7 +273,7 @@ def test_exposure_jump(data):
     finding = only(data, "exposure-jump")
     assert str(finding) == (
         "warning: exposure-jump: the brightness of the whole image jumps at frame 11. "
-        f"Fix: `endoprior train {data} RUN --data.first-frames 11`"
+        "Fix: train with `--data.first-frames 11`"
     )
 
 
@@ -281,7 +319,7 @@ def test_masks_that_are_full_or_empty(data):
     finding = only(data, "tool-fraction")
     assert finding.severity == "warning"
     assert finding.what == "no tools were found; if tools are in view, they become tissue"
-    assert finding.fix.startswith("nothing if no tool is in view; else `endoprior prepare ")
+    assert finding.fix.startswith(f"nothing if no tool is in view; else find them: `endoprior masks {data}`, or paint ")
 
 
 def test_a_masked_border_is_no_tool(data, facts):
@@ -308,8 +346,7 @@ def test_masks_of_the_border_alone_hold_no_tools(data):
     (finding,) = find(facts)
     assert (finding.code, finding.severity) == ("tool-fraction", "warning")
     assert "the masks cover only the border; if tools are in view, they become tissue" in finding.what
-    assert f"paint them white (255) in {data}/masks, or `endoprior prepare " in finding.fix
-    assert "--masks FOLDER" in finding.fix
+    assert finding.fix.endswith(f"else paint them white (255) in {data}/masks, or run `prepare` with `--masks FOLDER`")
 
 
 def test_relative_lengths_are_not_called_mm(facts):
@@ -368,7 +405,7 @@ def test_findings_from_edited_facts(facts):
     much = find(replace(facts, masks=replace(facts.masks, tool_fraction=np.full(FRAMES, 0.7))))
     assert [f.what for f in much] == ["70% of the pixels inside the border are tool"]
     cut = find(replace(facts, changes=replace(facts.changes, cuts=(3,))))
-    assert [f.fix for f in cut] == [f"`endoprior train {facts.path} RUN --data.skip-frames 0-2`"]
+    assert [f.fix for f in cut] == ["train with `--data.skip-frames 0-2`"]
     for left in (0, 1):  # a command that leaves out (nearly) all frames would only fail
         (odd,) = find(replace(facts, changes=replace(facts.changes, blurred=tuple(range(FRAMES - left)))))
         assert odd.fix == f"look at the images in {facts.path}: they may not be one video of one scene"

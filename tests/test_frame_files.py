@@ -13,11 +13,9 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
-from endoprior.data.file_names import bare, numbers_of
-from endoprior.data.files import in_order
-from endoprior.data.frame_files import BY_NAME, BY_NUMBER, match_files, match_names
+from endoprior.data.files import bare, in_order, numbers_of
+from endoprior.data.frame_files import BY_NAME, BY_NUMBER, match_files, match_names, one_per_frame
 from endoprior.data.mask_folders import open_mask_folder
-from endoprior.data.series import one_per_frame
 
 FOLDER = Path("m")
 

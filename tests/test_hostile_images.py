@@ -23,7 +23,7 @@ import resource, sys
 from pathlib import Path
 from endoprior.core.checks import InputError
 from endoprior.data import images
-from endoprior.data.image_header import ImageHeader
+from endoprior.data.images import ImageHeader
 from endoprior.prepare.video import Video
 
 def peak():

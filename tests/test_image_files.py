@@ -11,8 +11,7 @@ from PIL import Image, ImageOps
 
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.data.image_header import read_header
-from endoprior.data.images import decode_image, read_color
+from endoprior.data.images import decode_image, read_color, read_header
 from endoprior.prepare.source import open_source
 
 RNG = np.random.default_rng(0)

@@ -12,8 +12,7 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data.images import read_tool_mask
 from endoprior.data.mask_folders import open_mask_folder
-from endoprior.data.mask_folders.labels import tool_labels
-from endoprior.data.mask_folders.run_lengths import mask_of_coco, mask_of_runs
+from endoprior.data.mask_folders.parts import mask_of_coco, mask_of_runs, tool_labels
 from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.first_pass import source_facts
 

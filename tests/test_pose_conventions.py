@@ -10,7 +10,7 @@ from endoprior.check import find, measure
 from endoprior.cli import main
 from endoprior.core.pose_conventions import CONVENTIONS, to_ours
 from endoprior.data import load_sequence
-from endoprior.data.writer import SequenceMeta, SequenceWriter
+from endoprior.data.writer import SequenceMeta, new_sequence
 from endoprior.footage.pose_fit import measure_poses
 
 COUNT = 16
@@ -48,7 +48,7 @@ def data(tmp_path_factory, seen):
         WIDTH, HEIGHT, **focal, frames_per_second=25, baseline_mm=4.0, depth_scale=0.01, depth_relative=False,
         sources={"depth": "rendered", "lens": "calibration"},
     )  # fmt: skip
-    with SequenceWriter(folder, meta) as writer:
+    with new_sequence(folder, meta) as writer:
         for frame in seen:
             writer.add(frame.rgb_u8, ~frame.tissue_mask, frame.depth)
     return folder

@@ -11,7 +11,7 @@ from endoprior.cli import main
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 from endoprior.data.images import decode_image
-from endoprior.data.writer import SequenceMeta, SequenceWriter
+from endoprior.data.writer import SequenceMeta, new_sequence
 
 COUNT = 16
 TRUE = path(COUNT, 1.3)
@@ -24,7 +24,7 @@ def write(out, relative):
         WIDTH, HEIGHT, **focal, frames_per_second=25, baseline_mm=None if relative else 4.0, depth_scale=0.01,
         depth_relative=relative, sources=sources,
     )  # fmt: skip
-    with SequenceWriter(out, meta) as writer:
+    with new_sequence(out, meta) as writer:
         for i, pose in enumerate(TRUE):
             seen = view(pose)
             factor = np.float32(1 + 0.3 * np.sin(i) if relative else 1)
@@ -147,7 +147,7 @@ def test_bad_input_gives_one_line_and_changes_nothing(metric, tmp_path, kind, ca
         np.save(tmp_path / "few.npy", TRUE[:3])
         options = ["--poses", str(tmp_path / "few.npy")]
     else:
-        monkeypatch.setattr("endoprior.data.pose_writing.os.access", lambda *args: False)
+        monkeypatch.setattr("endoprior.data.folder_edits.os.access", lambda *args: False)
     before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
     assert main(["poses", str(folder), *options]) == 2
     said = capsys.readouterr().err.strip().splitlines()

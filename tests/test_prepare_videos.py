@@ -15,8 +15,8 @@ from endoprior.check.facts import measure
 from endoprior.check.findings import find
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
+from endoprior.data.description import read_record
 from endoprior.data.images import read_color
-from endoprior.data.prepare_record import read_record
 from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.frame_selection import pair_by_time
 from endoprior.prepare.video import SourceFrame

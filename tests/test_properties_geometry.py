@@ -14,7 +14,7 @@ from render_scenes import camera
 from endoprior.compute.morton import morton_order
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import back_project, bilinear, expected_depth, pixel_centers, project, quaternion_to_matrix
-from endoprior.data.shrink import shrunk_camera
+from endoprior.data.pixels import shrunk_camera
 from endoprior.model.motion import basis_weights
 from endoprior.training.temporal_numba import neighbors
 

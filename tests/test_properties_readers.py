@@ -17,8 +17,8 @@ from sequence_edits import describe
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
-from endoprior.data.depth_fill import is_measured
-from endoprior.data.writer import SequenceMeta, SequenceWriter
+from endoprior.data.pixels import is_measured
+from endoprior.data.writer import SequenceMeta, new_sequence
 
 UNCLIPPED = DataConfig(depth_clip_low_percentile=0, depth_clip_high_percentile=100)
 
@@ -51,7 +51,7 @@ def recordings(draw):
 
 def written(folder: Path, meta, frames, poses):
     """The folder, after the frames were written to it."""
-    with SequenceWriter(folder, meta) as writer:
+    with new_sequence(folder, meta) as writer:
         for rgb, tool, depth in frames:
             writer.add(rgb, tool, depth)
         writer.camera_to_world = poses

@@ -17,8 +17,8 @@ from endoprior.core.config import InitConfig, PriorConfig
 from endoprior.core.config_deformation import BasisConfig
 from endoprior.core.geometry import project
 from endoprior.core.types import Camera, Frame
+from endoprior.data.pixels import shrunk
 from endoprior.data.sequence import FrameSequence
-from endoprior.data.shrink import shrunk
 from endoprior.initialization.flow_tracks import initial_motion
 from endoprior.initialization.sampling import (
     PointCloud,

@@ -16,8 +16,7 @@ from endoprior.check.facts import measure
 from endoprior.check.findings import find
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
-from endoprior.data.c3vd import CF_HQ190L, camera_to_world, read_lens
-from endoprior.data.omnidirectional import Omnidirectional
+from endoprior.data.c3vd import CF_HQ190L, Omnidirectional, camera_to_world, read_lens
 
 LENS = Omnidirectional(135, 108, 67.4, 53.8, 77.0, -8.1e-3, 6.3e-5, -1.2e-6, 0.9999, 0.003, -0.003)
 FRAMES = 11

@@ -16,7 +16,7 @@ from video_files import write_video
 from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence, write_stir_tracks
-from endoprior.data.prepare_record import PrepareRecord
+from endoprior.data.description import PrepareRecord
 from endoprior.data.stir import nearest_end_errors, stir_tracks, tattoo_centers
 
 SCALE = 2

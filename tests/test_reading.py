@@ -17,12 +17,10 @@ import yaml
 
 from endoprior.core.checks import InputError
 from endoprior.core.config import DataConfig
-from endoprior.data import numpy_files, reading
+from endoprior.data import reading
 from endoprior.data.files import in_order
-from endoprior.data.image_header import read_header
-from endoprior.data.numpy_files import read_numpy
-from endoprior.data.reading import kind_of, read_bytes, read_text
-from endoprior.data.yaml_text import MOST_NODES, load_yaml
+from endoprior.data.images import read_header
+from endoprior.data.reading import MOST_NODES, kind_of, load_yaml, read_bytes, read_numpy, read_text
 from endoprior.phantom import PhantomConfig
 from endoprior.prepare import PrepareConfig
 from endoprior.prepare.stereo import StereoConfig
@@ -105,7 +103,7 @@ def test_sound_arrays_are_read_as_numpy_reads_them(tmp_path, array):
 
 
 def test_an_archive_is_measured_before_it_is_unfolded(tmp_path, monkeypatch):
-    monkeypatch.setattr(numpy_files, "MOST_BYTES", 1 << 20)
+    monkeypatch.setattr(reading, "MOST_BYTES", 1 << 20)
     np.savez_compressed(tmp_path / "a.npz", a=np.zeros(1 << 18))
     with pytest.raises(InputError, match="1 arrays of 2 MB; at most 1 MB"):
         read_numpy(tmp_path / "a.npz", "numbers", HINT)

@@ -14,7 +14,7 @@ from PIL import Image
 from video_files import encode, ffmpeg, psnr, smooth
 
 from endoprior.core.checks import InputError
-from endoprior.data.recognize import is_video
+from endoprior.data.load import is_video
 from endoprior.prepare.decoding import Timeline, usual_rate
 from endoprior.prepare.source import open_source
 

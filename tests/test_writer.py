@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from endoprior.core.checks import InputError
-from endoprior.data.writer import SequenceMeta, SequenceWriter
+from endoprior.data.writer import SequenceMeta, new_sequence
 
 META = SequenceMeta(width=6, height=4, fx=5.0, fy=5.5, cx=3.0, cy=2.0, frames_per_second=25.0, depth_source="test")
 
@@ -26,7 +26,7 @@ def test_round_trip(tmp_path):
     mask[1, 2] = True
     depth = np.full((4, 6), 51.234, np.float32)
     depth[0, 0], depth[0, 1], depth[0, 2] = np.nan, -3, 60
-    with SequenceWriter(tmp_path / "out", META) as writer:
+    with new_sequence(tmp_path / "out", META) as writer:
         writer.add(image(), mask, depth)
         assert not (tmp_path / "out").exists()  # it appears whole
     assert np.array_equal(cv2.imread(str(tmp_path / "out/images/000000.png"))[..., ::-1], image())
@@ -43,26 +43,25 @@ def test_round_trip(tmp_path):
 
 def test_an_empty_folder_is_taken_over(tmp_path):
     (tmp_path / "out").mkdir()
-    with SequenceWriter(tmp_path / "out", META) as writer:
+    with new_sequence(tmp_path / "out", META) as writer:
         writer.add(image(), np.zeros((4, 6), bool))
     assert (tmp_path / "out/images/000000.png").exists() and not (tmp_path / "out/depth").exists()
 
 
 def test_nothing_is_left_after_an_error(tmp_path):
-    with pytest.raises(RuntimeError), SequenceWriter(tmp_path / "deep/out", META) as writer:
+    with pytest.raises(RuntimeError), new_sequence(tmp_path / "deep/out", META) as writer:
         writer.add(image(), np.zeros((4, 6), bool))
         raise RuntimeError
     assert not list((tmp_path / "deep").iterdir())
-    with pytest.raises(ValueError, match="at least one frame"), SequenceWriter(tmp_path / "out", META):
+    with pytest.raises(ValueError, match="at least one frame"), new_sequence(tmp_path / "out", META):
         pass
     assert [p.name for p in tmp_path.iterdir()] == ["deep"]
 
 
 def test_unusable_places_and_arrays_are_named(tmp_path):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="file"):
-        SequenceWriter(tmp_path / "file", META)
-    with pytest.raises(InputError, match="under"):
-        SequenceWriter(tmp_path / "file" / "under", META)
-    with pytest.raises(ValueError, match="tool_mask"), SequenceWriter(tmp_path / "out", META) as writer:
+    for place in ("file", "file/under"):
+        with pytest.raises(InputError, match=place), new_sequence(tmp_path / place, META):
+            pass
+    with pytest.raises(ValueError, match="tool_mask"), new_sequence(tmp_path / "out", META) as writer:
         writer.add(image(), np.zeros((6, 4), bool))

@@ -9,7 +9,7 @@ import numpy as np
 from endoprior.core.checks import InputError, input_error
 from endoprior.data import FrameSequence
 from endoprior.data.description import read_description
-from endoprior.data.pose_writing import BACKUP, POSES
+from endoprior.data.folder_edits import BACKUP, POSES
 from endoprior.prepare.folder_path import write_folder_path
 from endoprior.system.atomic import write_json
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from endoprior.core.checks import input_error
 from endoprior.data import FrameSequence
-from endoprior.data.mask_writing import note_found_masks, write_mask
+from endoprior.data.folder_edits import note_found_masks, write_mask
 from endoprior.evaluation.true_masks import TrueMasks, score_masks
 from endoprior.tool_masks.sequence import find_in_sequence
 

@@ -14,9 +14,8 @@ import yaml
 from endoprior.core.checks import InputError, input_error
 from endoprior.core.config_io import from_dict
 from endoprior.data.formats import REGISTRY as LAYOUTS
-from endoprior.data.reading import read_text
+from endoprior.data.reading import load_yaml, read_text
 from endoprior.data.sequence import TEST_EVERY
-from endoprior.data.yaml_text import load_yaml
 from endoprior.evaluation.protocols.table import PROTOCOLS
 from endoprior.evaluation.registry import all_scores
 from endoprior.model.presets import preset_names

@@ -17,21 +17,21 @@ from ..core.config import DataConfig
 from ..core.spread import spread
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
-from ..data.description import read_description
-from ..data.found_tools import UNCERTAIN, confidence_of, read_rows
+from ..data.description import PrepareRecord, read_description, read_record
+from ..data.files import in_order
+from ..data.found_tools import UNCERTAIN, read_rows
+from ..data.images import read_color
 from ..data.window_plan import look_through, plan_windows
-from ..footage.border import find_outline, masked_border
+from ..footage.border import Circle, Outline, Strips, find_outline, masked_border
 from ..footage.camera_motion import CameraMotion, camera_motion
 from ..footage.changes import Changes, find_changes
+from ..footage.overlays import find_static_overlays
 from ..footage.polarity import Polarity, mask_polarity
-from ..footage.pose_fit import PoseFit
+from ..footage.pose_fit import PoseFit, View, measure_poses
+from ..footage.stereo_order import StereoOrder, stereo_order, vertical_offset_px
 from ..initialization.sampling import initial_points
 from ..model.presets import preset
-from .border_facts import BorderFacts, measure_border
 from .depth_facts import DepthFacts, measure_depth
-from .pose_facts import measure_pose_fit
-from .remake import Remakes, find_remakes
-from .stereo_facts import StereoFacts, measure_stereo
 
 if TYPE_CHECKING:
     from ..initialization.sampling import PointCloud
@@ -44,6 +44,11 @@ CERTAIN = 0.5
 """Least certainty to report masks as inverted."""
 POINT_FRAMES = 24
 """Largest number of training frames for the initial points."""
+LABEL_ON_TISSUE = 0.75
+"""Least share of a text box that the masks mark as tissue."""
+COMPARED = 3
+"""Number of stereo pairs to compare, evenly spaced."""
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,40 @@ class MaskFacts:
     def tissue(self, frame: Frame) -> NDArray[np.bool_]:
         """(H, W) True on the tissue of a frame; inverted masks are corrected."""
         return ~frame.tissue_mask if self.inverted else frame.tissue_mask
+
+
+@dataclass(frozen=True)
+class BorderFacts:
+    """Borders around the endoscope image, and how much of them the masks mark as tissue."""
+
+    strips: Strips
+    """Static or black strips at the sides, px."""
+    strips_as_tissue: float
+    """Share of the strips' pixels that are marked as tissue; 0 without strips."""
+    circle: Circle | None
+    """Round border of the endoscope image."""
+    outside_as_tissue: float
+    """Share of the pixels outside the circle that are marked as tissue; 0 without a circle."""
+    overlays: tuple[tuple[int, int, int, int], ...]
+    """x, y, width, height of burned-in labels that are marked as tissue, px."""
+    masked: Mask
+    """(H, W) True on the pixels that the masks exclude as border, not as tool: see `footage.border.masked_border`."""
+
+
+@dataclass(frozen=True)
+class StereoFacts:
+    """Consistency of the left and right images."""
+
+    order: StereoOrder
+    """Share of the image that matches in either order, mean over the compared frames."""
+    vertical_px: float
+    """Median vertical offset of matching features, px, >= 0; NaN if there are too few matches."""
+
+    @property
+    def reason(self) -> str:
+        """The measurements in one line."""
+        rows = f"rows {self.vertical_px:.1f} px apart" if np.isfinite(self.vertical_px) else "too few matches"
+        return f"{self.order.as_given:.0%} of the image matches as given, {self.order.exchanged:.0%} swapped; {rows}"
 
 
 @dataclass(frozen=True)
@@ -119,13 +158,18 @@ class Facts:
     """Initial points from at most 24 training frames; None if there are none."""
     data: DataConfig
     """Options with which the sequence was opened."""
-    remakes: Remakes
-    """What the sequence can be made from again."""
+    record: PrepareRecord | None
+    """How `prepare` made the folder, if it did."""
 
     @property
     def camera_is_fixed(self) -> bool:
         """Whether the camera is static in the stored poses."""
         return self.camera_path_mm < 1e-3 and self.camera_turn_deg < 1e-3
+
+    @property
+    def view_deg(self) -> float:
+        """Angle across the width of the image, degrees."""
+        return float(2 * np.degrees(np.arctan(self.camera.width / 2 / self.camera.fx)))
 
 
 def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
@@ -171,15 +215,15 @@ def measure(sequence: FrameSequence, cfg: DataConfig | None = None) -> Facts:
         motion=camera_motion([f.rgb_u8 for f in followed], [masks.tissue(f) for f in followed]),
         motion_step=step,
         windows=tuple(plan_windows(cameras, look_through(sequence), preset("default").windows)),
-        pose_fit=measure_pose_fit(sequence),
+        pose_fit=_pose_fit(sequence),
         changes=find_changes(frame.rgb_u8 for frame in frames),
         masks=masks,
-        border=measure_border(outline, images, tissue, masked),
+        border=_border(outline, images, tissue, masked),
         depth=measure_depth(sequence, samples, tissue, described, cfg),
-        stereo=measure_stereo(sequence),
+        stereo=_stereo(sequence),
         cloud=_first_points(sequence),
         data=cfg,
-        remakes=find_remakes(sequence, described, cfg),
+        record=read_record(sequence.path),
     )
 
 
@@ -188,11 +232,11 @@ def _confidence(sequence: FrameSequence) -> NDArray[np.float64]:
 
     The rows count the frames of the folder; of those that are read, the number in the image's name tells which it is.
     """
-    rows, names = read_rows(sequence.path), sequence.image_names
-    if len(rows) == len(sequence):
-        return confidence_of(rows, range(len(sequence)))
-    numbered = len(names) == len(sequence) and all(name.isdecimal() for name in names)
-    return confidence_of(rows, [int(name) for name in names]) if numbered else np.full(len(sequence), np.nan)
+    rows, names, count = read_rows(sequence.path), sequence.image_names, len(sequence)
+    numbered = len(names) == count and all(name.isdecimal() for name in names)
+    places = range(count) if len(rows) == count else [int(name) for name in names] if numbered else [-1] * count
+    known = {row.frame: row.confidence for row in rows}
+    return np.array([known.get(place, np.nan) for place in places], np.float64)
 
 
 def _camera_path(cameras: list[Camera]) -> tuple[float, float]:
@@ -212,3 +256,68 @@ def _first_points(sequence: FrameSequence) -> PointCloud | None:
         return initial_points(frames)
     except InputError:  # too few tissue pixels with depth; a finding reports it
         return None
+
+
+def _border(outline: Outline, images: list[NDArray[np.uint8]], tissue_masks: list[Mask], masked: Mask) -> BorderFacts:
+    """Measure how the masks mark the outline and the labels.
+
+    Args:
+        images, tissue_masks: of the samples; inverted masks are corrected.
+        masked: from `footage.border.masked_border`.
+    """
+    tissue = np.mean(tissue_masks, axis=0)
+    return BorderFacts(
+        outline.strips,
+        _mean(tissue[outline.in_strip]),
+        outline.circle,
+        _mean(tissue[outline.outside]),
+        tuple(b for b in find_static_overlays(images) if _is_label(b, tissue, outline.in_strip | outline.outside)),
+        masked,
+    )
+
+
+def _is_label(box: tuple[int, int, int, int], tissue: NDArray[np.floating], border: Mask) -> bool:
+    """Whether a text box lies inside the border, and the masks mark most of it as tissue."""
+    x, y, width, height = box
+    inside = slice(y, y + height), slice(x, x + width)
+    return _mean(tissue[inside]) > LABEL_ON_TISSUE and _mean(border[inside]) < 0.5
+
+
+def _mean(values: NDArray) -> float:
+    return float(values.mean()) if values.size else 0.0
+
+
+def _pose_fit(sequence: FrameSequence) -> PoseFit | None:
+    """Reproject depth between frames with the stored poses; None for a static camera or without enough corners."""
+    first = sequence.camera(0)
+
+    def view(index: int) -> View:
+        frame = sequence.frame(index)
+        return frame.rgb_u8, frame.tissue_mask, np.where(frame.depth_valid, frame.depth, np.float32(0))
+
+    matrix = np.array([[first.fx, 0, first.cx - 0.5], [0, first.fy, first.cy - 0.5], [0, 0, 1]])
+    poses = np.linalg.inv(np.array([sequence.camera(i).world_to_camera for i in range(len(sequence))]))
+    return measure_poses(view, matrix, poses, relative=sequence.depth_is_relative)
+
+
+def _stereo(sequence: FrameSequence) -> StereoFacts | None:
+    """Compare both cameras in a few frames; None without a right image for each frame.
+
+    Args:
+        sequence: its folder may have `right/`, with one PNG for each of its frames.
+    Raises:
+        InputError: a right image cannot be read, or has another size.
+    """
+    files = in_order((sequence.path / "right").glob("*.png"))
+    camera, count = sequence.camera(0), len(sequence)
+    if len(files) != count or read_color(files[0]).shape[:2] != (camera.height, camera.width):
+        return None  # shrunk, or only a part of the folder: the matching of images to frames is unknown
+    pairs = [
+        (sequence.frame(int(i)).rgb_u8, read_color(files[int(i)], (camera.width, camera.height)))
+        for i in np.linspace(0, count - 1, COMPARED).round()
+    ]
+    orders = [stereo_order(*pair) for pair in pairs]
+    offsets = [vertical_offset_px(*pair) for pair in pairs]
+    known = [offset for offset in offsets if np.isfinite(offset)]
+    mean = StereoOrder(*(float(np.mean([getattr(o, name) for o in orders])) for name in ("as_given", "exchanged")))
+    return StereoFacts(mean, float(np.median(known)) if known else float("nan"))

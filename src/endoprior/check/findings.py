@@ -5,40 +5,23 @@ The codes are stable; docs/check.md explains each.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
 
-from ..core.checks import number_ranges
+from ..core.checks import number_ranges, read_ranges
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
+from ..core.shell import command
 from ..core.text import quotation
-from ..core.types import Camera
 from ..data.description import SIZE_NOT_STATED
 from ..footage.camera_motion import MOVING_FRACTION
 from ..footage.units import FAR_MM
 from ..model.presets import preset
 from .facts import Facts
-from .fixes import (
-    convert_poses,
-    correct_masks,
-    detect_tools,
-    estimate_poses,
-    in_stored_px,
-    longest_part,
-    mark_in_masks,
-    mask_tools,
-    measure_depth_again,
-    move_rows,
-    rescale_camera,
-    set_values,
-    skip,
-    state_size,
-    train,
-)
-from .remake import field_of_view, swapped
 
 Severity = Literal["error", "warning", "note"]
 
@@ -46,8 +29,8 @@ TOOL_MOST = 0.6
 """With a larger share of tool pixels there is too little tissue for training."""
 COVERED = 0.5
 """Depth on a smaller share of the tissue is sparse."""
-FEW_FRAMES = 10
-"""Fewer frames contain little motion and leave one test frame."""
+FEW_FRAMES, FEWEST_FRAMES = 10, 2
+"""Fewer than the first contain little motion and leave one test frame; training needs the second."""
 SEEN_AS_TISSUE = 0.5
 """A border is reported if the masks mark a larger share of it as tissue."""
 VERTICAL_PX = 1.5
@@ -59,7 +42,8 @@ OFF_SCALE, SAME_SCALE = 0.2, 0.1
 USUAL_FOCAL = 0.9
 """Focal length of a usual endoscope, image widths: 58 degrees."""
 ITERATION_S, USUAL_PIXELS, FIXED_SHARE = 0.09, 640 * 512, 0.3
-"""Seconds of a training iteration at this size of the image, and the share that does not depend on it."""
+"""Seconds of a training iteration with `default` on two cores, start included, at this size of the image, and the share
+that does not depend on it (docs/measurements.md)."""
 DARK = 0.05
 """Images with a smaller mean, of 1, are nearly black."""
 FAR_SHARE = 1e-3
@@ -79,7 +63,7 @@ class Finding:
     what: str
     """The problem, on one line."""
     fix: str
-    """What to do: commands in backticks, or an edit. A complete command unless only the user knows a value."""
+    """What to do: an edit, or a command or options of one in backticks. Numbers of frames are those of this check."""
     frames: tuple[int, ...] = ()
     """Affected frames; empty for all."""
 
@@ -89,16 +73,22 @@ class Finding:
 
 def find(facts: Facts) -> list[Finding]:
     """All findings, errors first."""
-    found = [finding for check in CHECKS for finding in check(facts)]
-    order = {"error": 0, "warning": 1, "note": 2}
-    return sorted(found, key=lambda finding: order[finding.severity])
-
-
-def _size(facts: Facts) -> Iterator[Finding]:
-    if facts.frames < FEW_FRAMES:
-        what = f"{facts.frames} frames, {facts.test_frames} of them to test"
-        yield Finding("few-frames", "warning", what, f"give at least {FEW_FRAMES}; 50 to 200 are usual")
-    yield from _intrinsics(facts)
+    checks = (
+        _masks,
+        _depth,
+        _unit,
+        _border,
+        _stereo,
+        _motion,
+        _poses,
+        _windows,
+        _changes,
+        _video,
+        _intrinsics,
+        _rest,
+    )
+    order = ("error", "warning", "note")
+    return sorted((found for check in checks for found in check(facts)), key=lambda found: order.index(found.severity))
 
 
 def _intrinsics(facts: Facts) -> Iterator[Finding]:
@@ -108,25 +98,25 @@ def _intrinsics(facts: Facts) -> Iterator[Finding]:
             "the calibration does not state the size of its images, and its principal point fits "
             f"{camera.width}x{camera.height} px; if they had another size, every length is wrong"
         )
-        yield Finding("calibration-size", "note", what, state_size(facts))
-    view = field_of_view(camera)
+        fix = "nothing if that is so; else run `prepare` with `--calibration-size WIDTHxHEIGHT`"
+        yield Finding("calibration-size", "note", what, fix)
     center = np.array([camera.cx / camera.width, camera.cy / camera.height])
     scale = 2 * float(center.mean())
     # Both halves of the center off by one factor: numbers for images of another size. A crop moves them apart.
     other_size = abs(scale - 1) > OFF_SCALE and abs(center[0] - center[1]) < SAME_SCALE * center.mean()
-    odd = not ODD_VIEW_DEG[0] <= view <= ODD_VIEW_DEG[1] or not 0.8 < camera.fx / camera.fy < 1.25
+    odd = not ODD_VIEW_DEG[0] <= facts.view_deg <= ODD_VIEW_DEG[1] or not 0.8 < camera.fx / camera.fy < 1.25
     if not (odd or other_size or np.abs(center - 0.5).max() > 0.2):
         return
     what = (
-        f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px give {view:.0f} degrees across "
-        f"{camera.width}x{camera.height} px; they may belong to images of another size"
+        f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px give {facts.view_deg:.0f} degrees "
+        f"across {camera.width}x{camera.height} px; they may belong to images of another size"
     )
     if other_size:
-        yield Finding("intrinsics", "warning", what, rescale_camera(facts, scale))
+        yield Finding("intrinsics", "warning", what, _rescale_camera(facts, scale))
         return
-    width, height = in_stored_px(facts, camera.width, camera.height)
+    width, height = camera.width * facts.data.shrink, camera.height * facts.data.shrink
     usual = {"fx": USUAL_FOCAL * width, "fy": USUAL_FOCAL * width, "cx": width / 2, "cy": height / 2}
-    fix = set_values(facts, **{name: f"{value:g}" for name, value in usual.items()})
+    fix = _set_values(facts, **{name: f"{value:g}" for name, value in usual.items()})
     fix += f", which is usual for endoscopes, or what the calibration says for {width}x{height} px"
     if facts.sources.get("depth", "").startswith("stereo"):
         fix += ", and measure depth again: it comes from the same numbers"
@@ -138,26 +128,25 @@ def _masks(facts: Facts) -> Iterator[Finding]:
     if masks.inverted:
         what = f"tissue and tool are swapped in the masks ({masks.reason})"
         value = 0 if facts.described.get("mask_tool_value", 255) == 255 else 255
-        yield Finding("mask-polarity", "error", what, set_values(facts, mask_tool_value=value))
+        yield Finding("mask-polarity", "error", what, _set_values(facts, mask_tool_value=value))
     elif mean > TOOL_MOST:
         what = f"{mean:.0%} of the pixels inside the border are tool"
-        again = f", or {command} finds tools" if (command := detect_tools(facts)) else ""
+        again = "" if "tools found" in facts.sources.get("masks", "") else ", or find tools by `endoprior masks`"
         yield Finding("tool-fraction", "warning", what, f"correct the masks, 5 % to 40 % are usual{again}")
     elif not masks.tool_fraction.any():
         only = ": the masks cover only the border" if facts.border.masked.any() else ""
         what = f"no tools were found{only}; if tools are in view, they become tissue"
-        yield Finding("tool-fraction", "warning", what, f"nothing if no tool is in view; else {mask_tools(facts)}")
-
-
-def _uncertain(facts: Facts) -> Iterator[Finding]:
+        yield Finding("tool-fraction", "warning", what, f"nothing if no tool is in view; else {_add_tools(facts)}")
     if unsure := facts.masks.uncertain:
         what = f"the program that found the tools is unsure in {_frames(unsure)}"
-        yield Finding("uncertain-masks", "warning", what, correct_masks(facts), unsure)
+        fix = f"look at them and correct them: `{command('view', facts.path)}`"
+        yield Finding("uncertain-masks", "warning", what, fix, unsure)
 
 
 def _depth(facts: Facts) -> Iterator[Finding]:
     depth, path, unit = facts.depth, facts.path, facts.depth.unit
-    again = measure_depth_again(facts)
+    again = _measure_again(facts)
+    or_again = f", or {again}" if again else ""
     # With inverted masks, depth on tissue cannot be checked.
     empty = tuple(int(i) for i in np.flatnonzero(depth.coverage == 0))
     if len(empty) == facts.frames and unit.unit == "none":
@@ -165,7 +154,7 @@ def _depth(facts: Facts) -> Iterator[Finding]:
         return
     if empty and not facts.masks.inverted:
         what = f"no depth on tissue in {_frames(empty)}"
-        fix = again if again and len(empty) > facts.frames / 2 else skip(facts, empty)
+        fix = again if again and len(empty) > facts.frames / 2 else _skip(facts, empty)
         yield Finding("no-depth-frames", "warning", what, fix, empty)
     covered = float(np.median(depth.coverage))
     if 0 < covered < COVERED and not facts.masks.inverted:
@@ -174,77 +163,60 @@ def _depth(facts: Facts) -> Iterator[Finding]:
     if depth.bits == 8:
         known = f" {length_unit(True) if depth.relative else unit.unit}" if unit.mm_per_unit else ""
         what = f"8 bits a value, steps of {depth.step:.3g}{known}"
-        fix = f"export {path}/depth as 16-bit PNG{f', or {again} measures it again' if again else ''}"
-        yield Finding("depth-8-bit", "warning", what, fix)
+        yield Finding("depth-8-bit", "warning", what, f"export {path}/depth as 16-bit PNG{or_again}")
     if depth.relative:
         fix = "nothing for rendering; for lengths in mm use a stereo video or measured depth"
         yield Finding("relative-depth", "note", "the scale of the depth is unknown or assumed", fix)
-    yield from _unit(facts)
     beyond = tuple(int(i) for i in np.flatnonzero(depth.far > FAR_SHARE))
     if beyond and unit.unit == "mm" and not depth.relative:
         share = float(depth.far[list(beyond)].mean())
         what = f"depth beyond {FAR_MM:g} mm on {share:.1%} of the tissue with depth in {_frames(beyond)}"
-        fix = f"store 0 where depth is missing, in {path}/depth{f', or {again} measures it again' if again else ''}"
+        fix = f"store 0 where depth is missing, in {path}/depth{or_again}"
         yield Finding("depth-far", "warning", what, fix, beyond)
     steps = np.abs(np.diff(np.log(np.where(depth.median > 0, depth.median, np.nan))))
     usual = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     jumps = tuple(int(i) + 1 for i in np.flatnonzero(steps > max(DEPTH_JUMP, 6 * usual)))
     if jumps:
         what = f"the median depth jumps at {_frames(jumps)}"
-        fix = f"bring the depth of all frames to one scale{f', or {again} measures it again' if again else ''}"
+        fix = f"bring the depth of all frames to one scale{or_again}"
         yield Finding("depth-jumps", "warning", what, fix, jumps)
 
 
 def _unit(facts: Facts) -> Iterator[Finding]:
     unit = facts.depth.unit
     if unit.unit == "disparity":
-        fix, remake = "store depth in mm: focal length (px) x baseline (mm) / disparity (px)", facts.remakes.best
-        if remake and "--depth" in remake.options:
-            command = remake.command({"--depth-relative": ("disparity",), "--depth-unit-mm": None})
-            fix += f", or {command} for relative depth"
+        fix = "store depth in mm: focal length (px) x baseline (mm) / disparity (px)"
+        fix += ", or run `prepare` with `--depth-relative disparity` for relative depth"
         yield Finding("depth-disparity", "error", unit.reason, fix)
     elif facts.depth.relative or unit.unit in ("mm", "none"):
         return
     elif unit.mm_per_unit is None:
-        fix = f"{_set_scale(facts, None)}, so that the tissue is some 20 to 250 mm away"
+        fix = f"{_set_values(facts, depth_scale='MM_PER_UNIT')}, so that the tissue is some 20 to 250 mm away"
         yield Finding("depth-unit", "error", unit.reason, fix)
     else:
         code = {"m": "depth-metres", "cm": "depth-centimetres"}.get(unit.unit, "depth-unit")
         what = f"depth looks like {unit.unit}, not mm ({unit.reason})"
-        yield Finding(code, "error", what, _set_scale(facts, unit.mm_per_unit))
-
-
-def _set_scale(facts: Facts, factor: float | None) -> str:
-    """What multiplies depth by `factor`; None if the factor is unknown."""
-    if factor is None:
-        return set_values(facts, depth_scale="MM_PER_UNIT")
-    scale = float(f"{facts.depth.scale * factor:.6g}")
-    return f"{set_values(facts, depth_scale=f'{scale:g}')}, or {train(facts, depth_unit_mm=scale)}"
+        scale = f"{facts.depth.scale * unit.mm_per_unit:.6g}"
+        fix = f"{_set_values(facts, depth_scale=scale)}, or train with `--data.depth-unit-mm {scale}`"
+        yield Finding(code, "error", what, fix)
 
 
 def _border(facts: Facts) -> Iterator[Finding]:
-    border, camera, remakes = facts.border, facts.camera, facts.remakes
-    strips, frames = border.strips, remakes.from_frames
-    if border.strips_as_tissue > SEEN_AS_TISSUE and strips:
-        sides = " and ".join(f"{size} px at the {name}" for name, size in vars(strips).items() if size)
+    border = facts.border
+    in_masks = "mark it in the masks" if facts.takes_masks else "nothing can mask it: this layout has no masks"
+    if border.strips_as_tissue > SEEN_AS_TISSUE and border.strips:
+        sides = " and ".join(f"{size} px at the {name}" for name, size in vars(border.strips).items() if size)
         what = f"a bar or console strip of {sides} counts as tissue"
-        width, height = camera.width, camera.height
-        x0, x1 = strips.left / width, 1 - strips.right / width
-        y0, y1 = strips.top / height, 1 - strips.bottom / height
-        command = remakes.crop(x0, y0, x1, y1, in_stored_px(facts, width, height))
-        by_hand = mark_in_masks(facts, "it")
-        fix = f"{command}, or {by_hand}" if command else by_hand
+        fix = f"run `prepare` with `--crop X,Y,WIDTH,HEIGHT`, without it, or {in_masks}"
         yield Finding("console-strip", "warning", what, fix)
     if border.circle and border.outside_as_tissue > SEEN_AS_TISSUE:
         what = f"the image is round (radius {border.circle.radius:.0f} px) and its outside counts as tissue"
-        command = frames and frames.command({"--border": None})
-        yield Finding("round-border", "warning", what, command or mark_in_masks(facts, "the outside"))
+        yield Finding("round-border", "warning", what, f"run `prepare` with `--border auto`, or {in_masks}")
     if border.overlays:
         boxes = ", ".join(f"{width}x{height} px at {x}, {y}" for x, y, width, height in border.overlays[:3])
         what = f"burned-in text counts as tissue: {boxes}{' and more' if len(border.overlays) > 3 else ''}"
-        blank = tuple(",".join(map(str, in_stored_px(facts, *box))) for box in border.overlays)
-        command = frames and frames.command({"--blank": blank})
-        yield Finding("burned-in-text", "warning", what, command or mark_in_masks(facts, "it"))
+        fix = f"run `prepare` with `--blank X,Y,WIDTH,HEIGHT`, or {in_masks}"
+        yield Finding("burned-in-text", "warning", what, fix)
 
 
 def _motion(facts: Facts) -> Iterator[Finding]:
@@ -254,10 +226,8 @@ def _motion(facts: Facts) -> Iterator[Finding]:
     first = int(beyond[0]) * facts.motion_step if len(beyond) else 0
     what = f"the camera moves, but it is static in the stored poses ({facts.motion.reason})"
     enough = first >= max(FEW_FRAMES, facts.frames / 2)
-    remake = facts.remakes.best
-    fixes = [remake.command({"--poses": ("estimate",)})] if remake else []
-    fixes += [train(facts, first_frames=first)] if enough else []
-    yield Finding("camera-moves", "warning", what, ", or ".join(fixes) or "store the poses of the camera")
+    still = f", or train with `--data.first-frames {first}`" if enough else ""
+    yield Finding("camera-moves", "warning", what, f"run `prepare` with `--poses estimate`{still}")
 
 
 def _poses(facts: Facts) -> Iterator[Finding]:
@@ -266,10 +236,11 @@ def _poses(facts: Facts) -> Iterator[Finding]:
         return
     if fit.another_fits:
         what = f"the camera poses explain the images better in another convention: depth reprojects to {fit.reason}"
-        yield Finding("poses-convention", "error", what, convert_poses(facts, fit.best, fit.unit))
+        yield Finding("poses-convention", "error", what, _convert_poses(facts, fit.best, fit.unit))
     elif fit.none_fits:
         what = f"the camera poses do not explain the images in any convention: depth reprojects to {fit.reason}"
-        yield Finding("poses-convention", "warning", what, estimate_poses(facts))
+        fix = f"match each pose to its frame, or `{command('poses', facts.path, '--poses', 'estimate')}`"
+        yield Finding("poses-convention", "warning", what, fix)
 
 
 def _windows(facts: Facts) -> Iterator[Finding]:
@@ -278,7 +249,8 @@ def _windows(facts: Facts) -> Iterator[Finding]:
     lengths = [stop - start for start, stop in facts.windows]
     spans = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"
     iterations = len(lengths) * preset("default").schedule.fine_iterations
-    minutes = iterations * iteration_seconds(facts.camera) / 60
+    share = FIXED_SHARE + (1 - FIXED_SHARE) * facts.camera.width * facts.camera.height / USUAL_PIXELS
+    minutes = iterations * ITERATION_S * share / 60
     why = "a long video" if facts.camera_is_fixed else "the camera moves far"
     what = (
         f"{why}: it is trained in {len(lengths)} windows of {spans} frames, in about {minutes:.0f} min on two cores, "
@@ -286,11 +258,6 @@ def _windows(facts: Facts) -> Iterator[Finding]:
     )
     fix = "nothing; `--ray ADDRESS` trains windows on several machines, and `--windows.longest` changes their length"
     yield Finding("windows", "note", what, fix)
-
-
-def iteration_seconds(camera: Camera) -> float:
-    """Time of a training iteration with `default` on two cores, start included (docs/results.md)."""
-    return ITERATION_S * (FIXED_SHARE + (1 - FIXED_SHARE) * camera.width * camera.height / USUAL_PIXELS)
 
 
 def _changes(facts: Facts) -> Iterator[Finding]:
@@ -301,15 +268,15 @@ def _changes(facts: Facts) -> Iterator[Finding]:
         stride = originals[1] if len(originals) > 1 else 0
         regular = stride > 1 and originals == list(range(0, facts.frames, stride))
         regular = regular and facts.data in (DataConfig(), DataConfig(shrink=facts.data.shrink))
-        fix = train(facts, stride=stride) if regular else skip(facts, copies)
+        fix = f"train with `--data.stride {stride}`" if regular else _skip(facts, copies)
         yield Finding("duplicate-frames", "warning", what, fix, copies)
-    for code, frames, what in (
-        ("exposure-jump", changes.exposure_jumps, "the brightness of the whole image jumps at"),
-        ("scene-cut", changes.cuts, "the view changes abruptly at"),
-    ):
+    jumps: tuple[tuple[str, Severity, tuple[int, ...], str], ...] = (
+        ("exposure-jump", "warning", changes.exposure_jumps, "the brightness of the whole image jumps at"),
+        ("scene-cut", "error", changes.cuts, "the view changes abruptly at"),
+    )
+    for code, severity, frames, what in jumps:
         if frames:
-            severity: Severity = "error" if code == "scene-cut" else "warning"
-            yield Finding(code, severity, f"{what} {_frames(frames)}", longest_part(facts, frames), frames)
+            yield Finding(code, severity, f"{what} {_frames(frames)}", _longest_part(facts, frames), frames)
     # Frames that `prepare` marked count from the first one of the folder.
     whole = facts.data == DataConfig(shrink=facts.data.shrink)
     marked = facts.described.get("unexplained_frames", []) if whole else []
@@ -317,7 +284,7 @@ def _changes(facts: Facts) -> Iterator[Finding]:
     if odd:
         reasons = "blurred, covered or outside the body" + (", damaged, or without a camera pose" if marked else "")
         what = f"{reasons}: {_frames(odd)}"
-        yield Finding("unexplained-frames", "warning", what, skip(facts, odd), odd)
+        yield Finding("unexplained-frames", "warning", what, _skip(facts, odd), odd)
 
 
 def _video(facts: Facts) -> Iterator[Finding]:
@@ -326,10 +293,8 @@ def _video(facts: Facts) -> Iterator[Finding]:
     if brightness < DARK:
         what = f"the images are nearly black: their mean is {255 * brightness:.0f} of 255"
         yield Finding("dark-images", "warning", what, "export them again, with all values from 0 to 255 in use")
-    record = facts.remakes.record
-    for note in record.video_notes if record else ():
-        fix = "nothing if you expect this; else copy or export the video again"
-        yield Finding("video", "note", quotation(note), fix)
+    fix = "nothing if you expect this; else copy or export the video again"
+    yield from (Finding("video", "note", quotation(n), fix) for n in (facts.record.video_notes if facts.record else ()))
 
 
 def _stereo(facts: Facts) -> Iterator[Finding]:
@@ -337,44 +302,98 @@ def _stereo(facts: Facts) -> Iterator[Finding]:
     if stereo is None:
         return
     if stereo.order.swapped:
-        by_hand = f"swap the folders {path}/images and {path}/right, and measure depth again"
+        fix = "run `prepare` with `--swap-eyes`, or without it where it was given; "
+        fix += f"by hand: swap the folders {path}/images and {path}/right, and measure depth again"
         what = f"left and right images are swapped ({stereo.reason})"
-        yield Finding("swapped-eyes", "error", what, swapped(facts.remakes) or by_hand)
+        yield Finding("swapped-eyes", "error", what, fix)
     if stereo.vertical_px > VERTICAL_PX:
         what = f"the rows of left and right images are {stereo.vertical_px:.1f} px apart"
-        yield Finding("vertical-offset", "warning", what, move_rows(facts))
+        moved = facts.record and "--row-offset" in facts.record.options
+        fix = "the calibration of this video" if moved else "`--row-offset auto`, or the calibration of this video"
+        yield Finding("vertical-offset", "warning", what, f"run `prepare` with {fix}")
 
 
-def _points(facts: Facts) -> Iterator[Finding]:
+def _rest(facts: Facts) -> Iterator[Finding]:
+    if facts.frames < FEW_FRAMES:
+        what = f"{facts.frames} frames, {facts.test_frames} of them to test"
+        yield Finding("few-frames", "warning", what, f"give at least {FEW_FRAMES}; 50 to 200 are usual")
     explained = facts.depth.unit.unit in ("none", "m", "0.01 mm") or facts.masks.inverted
     if facts.cloud is None and not explained:
         what = "no pixel is tissue and has depth, so training has no initial points"
         yield Finding("no-points", "error", what, "check masks and depth in the figure")
-
-
-def _reader_notes(facts: Facts) -> Iterator[Finding]:
     for note in facts.notes:
         yield Finding("reader", "note", note, "check the files")
-
-
-CHECKS: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
-    _masks,
-    _uncertain,
-    _depth,
-    _border,
-    _stereo,
-    _motion,
-    _poses,
-    _windows,
-    _changes,
-    _video,
-    _size,
-    _points,
-    _reader_notes,
-)
-"""In the order of the report."""
 
 
 def _frames(frames: tuple[int, ...]) -> str:
     """Frame numbers as text, at most six ranges: `frames 3-7, 9`."""
     return f"frame{'s' if len(frames) > 1 else ''} {number_ranges(frames, 6)}"
+
+
+def _set_values(facts: Facts, **values: Any) -> str:
+    """The edit that sets entries of `sequence.json`; it may not exist yet."""
+    entries = ", ".join(f'"{name}": {value}' for name, value in values.items())
+    file = facts.path / "sequence.json"
+    return f"set {entries} in {file}" if facts.described else f"write {{{entries}}} to {file}"
+
+
+def _skip(facts: Facts, frames: tuple[int, ...]) -> str:
+    """Train without some frames; a look at the files if too few are left."""
+    if facts.frames - len(set(frames)) < FEWEST_FRAMES:
+        return f"look at the images in {facts.path}: they may not be one video of one scene"
+    before = read_ranges("skip_frames", facts.data.skip_frames)
+    # Positions of the frames of this check among those that it would have without `skip_frames`.
+    places = [place for place in range(facts.frames + len(before)) if place not in before]
+    left_out = sorted({*before, *(places[frame] for frame in frames)})
+    return f"train with `--data.skip-frames {number_ranges(left_out, len(left_out)).replace(' ', '')}`"
+
+
+def _longest_part(facts: Facts, jumps: tuple[int, ...]) -> str:
+    """Train on the longest part between jumps, each the first frame of a part."""
+    first, end = max(pairwise([0, *jumps, facts.frames]), key=lambda part: part[1] - part[0])
+    if first == 0 and not facts.data.skip_frames:
+        return f"train with `--data.first-frames {end}`"
+    return _skip(facts, (*range(first), *range(end, facts.frames)))
+
+
+def _measure_again(facts: Facts) -> str:
+    """Measure depth by another method than the present one; empty if there is none."""
+    present = facts.sources.get("depth", "")
+    if present == "shading":
+        return ""
+    return f"run `prepare` {'with `--depth shading`' if present.startswith('stereo') else 'without `--depth`'}"
+
+
+def _add_tools(facts: Facts) -> str:
+    """What adds tools to masks without any."""
+    if not facts.takes_masks:
+        return "leave out its frames with `--data.skip-frames`; this layout has no masks"
+    by_hand = f"paint them white (255) in {facts.path / 'masks'}, or run `prepare` with `--masks FOLDER`"
+    if "tools found" in facts.sources.get("masks", ""):
+        return by_hand
+    return f"find them: `{command('masks', facts.path)}`, or {by_hand}"
+
+
+def _rescale_camera(facts: Facts, factor: float) -> str:
+    """Correct a camera for images `factor` times as large, and stereo depth, which comes from the same numbers."""
+    camera, record = facts.camera, facts.record
+    numbers = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    values = {name: f"{value * facts.data.shrink / factor:g}" for name, value in numbers.items()}
+    if facts.sources.get("depth", "").startswith("stereo"):
+        values["depth_scale"] = f"{facts.depth.scale / factor:.6g}"
+    fix = f"{_set_values(facts, **values)}, or what the calibration says for these images"
+    if record and "--calibration" in record.options:
+        size = "x".join(str(round(side * factor)) for side in record.source_size)
+        fix += f"; or run `prepare` with `--calibration-size {size}`, if the calibration was made at this size"
+    return fix
+
+
+def _convert_poses(facts: Facts, convention: str, unit: float) -> str:
+    """The command that reads the stored poses in another convention, in the folder itself where that is possible."""
+    file = facts.path / "poses_bounds.npy"
+    if not file.is_file():
+        return "store camera-to-world matrices in mm with OpenCV axes (x right, y down, z forward)"
+    options = ["--poses-convention", convention] if convention != "opencv" else []
+    options += ["--poses-unit-mm", f"{unit:.4g}"] if unit != 1 else []
+    in_place = command("poses", facts.path, "--poses", file, *options)
+    return f"`{in_place}`, which keeps the old ones in poses_bounds_before.npy"

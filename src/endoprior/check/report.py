@@ -19,7 +19,6 @@ def table(facts: Facts) -> list[tuple[str, str]]:
     camera, depth, border, changes = facts.camera, facts.depth, facts.border, facts.changes
     rate = facts.frames_per_second
     seconds = f", {facts.frames / rate:.1f} s at {rate:g} frames/s" if rate else ", rate unknown"
-    view = 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx))
     tool, unit = facts.masks.tool_fraction, length_unit(depth.relative)
     value = "high" if facts.described.get("mask_tool_value", 255) == 255 else "low"
     rows = [
@@ -27,7 +26,7 @@ def table(facts: Facts) -> list[tuple[str, str]]:
         ("images", f"{camera.width} x {camera.height} px{', stereo' if facts.stereo else ''}"),
         (
             "intrinsics",
-            f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px; {view:.0f} degrees",
+            f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} px; {facts.view_deg:.0f} degrees",
         ),
         ("camera", _camera_words(facts)),
         *([("poses fit", facts.pose_fit.reason)] if facts.pose_fit else []),

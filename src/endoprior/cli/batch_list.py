@@ -11,8 +11,8 @@ from pathlib import Path
 
 from ..core.checks import InputError, input_error
 from ..core.options import Options
+from ..data.load import is_sequence
 from ..data.reading import kind_of, read_text
-from ..data.recognize import is_sequence
 from ..pipeline import Entry, SequenceJob
 from .devices import with_device
 from .options import option_name

@@ -71,8 +71,8 @@ def _find_all(args: Masks) -> None:
     """Find the tools of every frame."""
     from ..core.config import DataConfig
     from ..data import load_sequence
+    from ..data.folder_edits import note_found_masks, replace_masks, writable_masks
     from ..data.found_tools import FrameRow, uncertain_frames, write_rows
-    from ..data.mask_writing import note_found_masks, replace_masks, writable_masks
     from ..prepare.sam2 import open_sam2
     from ..tool_masks.mask_store import MaskStore
     from ..visualization.image_tools import mask_sheet, write_png
@@ -109,8 +109,8 @@ def _add_clicked(args: Masks) -> None:
         raise input_error("--tool", f"no {other}", other, fix)
     from ..core.config import DataConfig
     from ..data import load_sequence
+    from ..data.folder_edits import replace_masks, writable_masks
     from ..data.found_tools import read_rows, write_rows
-    from ..data.mask_writing import replace_masks, writable_masks
     from ..tool_masks.clicked_tools import find_clicked, parse_click
     from ..tool_masks.mask_store import MaskStore
     from ..visualization.image_tools import mask_sheet, write_png

@@ -50,7 +50,7 @@ HELP = Help(examples=(("DATA",), ("DATA", "--poses", "estimate")))
 def run(argv: list[str]) -> None:
     """Find the camera path and write it."""
     args = parse(Poses, argv, "poses", HELP)
-    from ..data.pose_writing import POSES
+    from ..data.folder_edits import POSES
     from ..prepare.camera_path.sequence_path import Reading
     from ..prepare.folder_path import write_folder_path
 

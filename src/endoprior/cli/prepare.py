@@ -48,7 +48,7 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Prepare the sequence."""
     args = parse(Prepare, argv, "prepare", HELP)
-    from ..data.prepare_record import RECORD
+    from ..data.description import RECORD
     from ..prepare import prepare
 
     with Counting() as progress:

@@ -26,7 +26,7 @@ def open_scene(run: Path) -> RenderedScene:
     Raises:
         InputError: there is no scene that can be read.
     """
-    from ..data.recognize import not_a_run
+    from ..data.load import not_a_run
     from ..model.scene_file import load_scene
 
     try:

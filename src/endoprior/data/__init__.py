@@ -1,16 +1,15 @@
 """Sequences: folders in the layouts of the public datasets, read lazily, split into training and test frames.
 
-No torch here: images are NumPy arrays.
+No torch here: images are NumPy arrays. What cannot be used, a file, a folder or an option, raises `InputError`, which
+names it, what was expected, what was found and the fix. Only other errors, and unusual cases, are named at a function.
 """
 
-from .depth import clean_depth
-from .depth_files import read_depth_file
+from .images import read_depth_file
 from .load import load_sequence
-from .right_eye import RightEye
+from .pixels import clean_depth, shrunk
 from .sequence import FrameList, FrameSequence, Split
-from .shrink import shrunk
 from .stir import nearest_end_errors, write_stir_tracks
-from .truth import Truth
+from .truth import RightEye, Truth
 
 __all__ = [
     "FrameList",

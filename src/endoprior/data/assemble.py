@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,9 @@ from ..core.checks import input_error, read_ranges
 from ..core.config import DataConfig
 from ..core.geometry import FARTHEST_MM
 from ..core.types import Camera, Frame
-from .depth import clean_depth
-from .right_eye import RightEye
+from .pixels import clean_depth, shrunk, shrunk_camera
 from .sequence import FrameSequence
-from .shrink import shrunk, shrunk_camera
-from .truth import Truth
+from .truth import RightEye
 
 Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]]
 """(H, W, 3) color 0..255, (H, W) True on usable tissue, (H, W) depth in mm with 0 where it is missing."""
@@ -25,13 +24,14 @@ LEAST_FOCAL_PX, MOST_PX = 1e-2, 1e6
 """Range of focal lengths; the principal point, too, lies within the upper one."""
 
 
-def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1) -> list[int]:
+def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1, having: Sequence[Container[int]] = ()) -> list[int]:
     """Positions in the folder of the frames to read.
 
     Args:
         count: frames in the folder.
         cfg: `stride`, `first_frames`, which counts frames after striding, and `skip_frames`, which counts what is left.
         own_stride: the dataset's published stride, used where `cfg.stride` is 0.
+        having: frames that are not in all of these, such as those with a mask, are left out.
     Raises:
         InputError: `skip_frames` leaves none.
     """
@@ -42,7 +42,7 @@ def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1) -> list[int]:
     if kept and not left:
         want = f"frames that leave some of 0 to {len(kept) - 1}"
         raise input_error("data.skip_frames", want, cfg.skip_frames, "shorten it, or leave it out for all frames.")
-    return left
+    return [frame for frame in left if all(frame in each for each in having)]
 
 
 def assemble(
@@ -54,16 +54,11 @@ def assemble(
     images: list[Path],
     files: Sequence[Path] = (),
     clip_depth: bool = True,
-    frames_per_second: float | None = None,
-    truth: Truth | None = None,
     right_eye: RightEye | None = None,
-    remarks: list[str] | None = None,
     mask_folder: str = "masks",
-    mask_files: list[Path] | None = None,
-    new_mask_files: list[Path] | None = None,
-    mask_tool_value: int = 255,
-    depth_is_relative: bool = False,
-    sources: dict[str, str] | None = None,
+    mask_files: Sequence[Path] = (),
+    new_mask_files: Sequence[Path] = (),
+    **about: Any,
 ) -> FrameSequence:
     """A lazy sequence of the kept frames, shrunk as configured.
 
@@ -76,8 +71,10 @@ def assemble(
         files: the other files of the sequence, for its fingerprint.
         clip_depth: clip each frame's depth to its percentiles (`clean_depth`); False where the extremes of depth are
             reliable, because it was measured or rendered.
-        frames_per_second, truth, right_eye, remarks, mask_folder, depth_is_relative, sources: see `FrameSequence`.
-        mask_files, new_mask_files, mask_tool_value: see `FrameSequence`; at full size.
+        right_eye: see `FrameSequence`.
+        mask_folder, mask_files, new_mask_files: see `FrameSequence`; at full size.
+        about: `frames_per_second`, `truth`, `remarks`, `mask_tool_value`, `depth_is_relative`, `sources` of
+            `FrameSequence`.
     Raises:
         InputError: fewer than 2 frames or no pixel would be left, or a camera has impossible numbers.
     """
@@ -90,10 +87,7 @@ def assemble(
 
     def read_frame(index: int) -> Frame:
         rgb_u8, tissue_mask, measured = decode(index)
-        if clip_depth:
-            depth, depth_valid = clean_depth(measured, cfg)
-        else:
-            depth, depth_valid = measured, measured > 0
+        depth, depth_valid = clean_depth(measured, cfg) if clip_depth else (measured, measured > 0)
         frame = Frame(index, index / count, cameras[index], rgb_u8, tissue_mask, depth, depth_valid)
         return shrunk(frame, cfg.shrink)
 
@@ -101,18 +95,13 @@ def assemble(
         path,
         [shrunk_camera(camera, cfg.shrink) for camera in cameras],
         read_frame,
-        frames_per_second=frames_per_second,
-        mask_folder=mask_folder,
-        mask_files=mask_files if cfg.shrink == 1 else None,
-        new_mask_files=new_mask_files if cfg.shrink == 1 else None,
-        mask_tool_value=mask_tool_value,
-        images=images,
+        image_names=[image.stem for image in images],
         files=[*images, *files, *(right_eye.files if right_eye else [])],
-        truth=truth,
         right_eye=right_eye,
-        remarks=remarks,
-        depth_is_relative=depth_is_relative,
-        sources=sources,
+        mask_name=mask_folder,
+        mask_files=list(mask_files) if cfg.shrink == 1 else [],
+        new_mask_files=list(new_mask_files) if cfg.shrink == 1 else [],
+        **about,
     )
 
 

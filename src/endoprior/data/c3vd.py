@@ -1,12 +1,15 @@
 """Reader of C3VD's registered videos: colonoscope images of a phantom, with depth rendered from its registered model.
 
-The images are omnidirectional; the reader resamples them, and their depth, to a pinhole camera.
+The images are omnidirectional; the reader resamples them, and their depth, to a pinhole camera. Scaramuzza's model: a
+pixel at (u, v) from the center looks along (x, y, p(rho)), where (x, y) = A^-1 (u, v), rho = |(x, y)| and
+p(rho) = a0 + a2 rho^2 + a3 rho^3 + a4 rho^4, with A = [[c, d], [e, 1]]. Pixel centers are integers there.
 """
 
 from __future__ import annotations
 
+import math
 import re
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -17,14 +20,71 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .depth_files import read_values
 from .files import list_files, read_table
 from .formats import Format
-from .images import read_color
-from .omnidirectional import Omnidirectional
+from .images import read_color, read_values
 from .poses import demand_rotations, world_to_camera
 from .reading import read_text
 from .sequence import FrameSequence
+
+TABLE_STEPS_PER_PX = 16
+"""Entries of the table that inverts p, per pixel of radius: the error is far below 1/1000 px."""
+
+
+@dataclass(frozen=True)
+class Omnidirectional:
+    """Intrinsics, px; `cx, cy` count pixel centers as integers."""
+
+    width: int
+    height: int
+    cx: float
+    cy: float
+    a0: float
+    a2: float
+    a3: float
+    a4: float
+    c: float
+    d: float
+    e: float
+
+    def forward(self, rho: NDArray[np.float64]) -> NDArray[np.float64]:
+        """p(rho): how far forward a pixel at radius rho looks, in px."""
+        return self.a0 + rho**2 * (self.a2 + rho * (self.a3 + rho * self.a4))
+
+    def pinhole(self) -> tuple[float, float, float]:
+        """(focal length, cx, cy), px, of the pinhole image of equal size; here pixel centers are halves.
+
+        Its axis is the camera's own, and its nearest edge shows what the nearest edge of the original shows.
+        """
+        cx, cy = self.cx + 0.5, self.cy + 0.5
+        nearest = min(cx, cy, self.width - cx, self.height - cy)
+        return float(self.forward(np.float64(nearest))), cx, cy
+
+    def pinhole_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """x and y, (H, W) each, of the original pixel that each pixel of the pinhole image shows (`cv2.remap`).
+
+        Raises:
+            ValueError: p does not describe a camera: its angle does not grow with the radius.
+        """
+        focal, cx, cy = self.pinhole()
+        x = (np.arange(self.width) + 0.5 - cx) / focal
+        y = (np.arange(self.height)[:, None] + 0.5 - cy) / focal
+        slope = np.hypot(x, y)  # tangent of the angle to the axis
+        far = math.hypot(self.width, self.height)
+        radii = np.linspace(0, far, math.ceil(far) * TABLE_STEPS_PER_PX)
+        angles = np.arctan2(radii, self.forward(radii))
+        # Beyond its last valid pixel a fitted polynomial may decrease again; the image must not reach that far.
+        turns = np.flatnonzero(np.diff(angles) <= 0)
+        valid = slice(0, turns[0] + 1 if turns.size else None)
+        angle = np.arctan(slope)
+        if focal <= 0 or angle.max() > angles[valid][-1]:
+            raise ValueError("the polynomial a0, a2, a3, a4 does not describe a camera; correct the calibration")
+        rho = np.interp(angle, angles[valid], radii[valid])
+        # rho / slope has the limit p(0) on the axis.
+        scale = np.where(slope > 1e-9, rho / np.maximum(slope, 1e-9), self.a0)
+        x, y = x * scale, y * scale
+        return (self.c * x + self.d * y + self.cx).astype(np.float32), (self.e * x + y + self.cy).astype(np.float32)
+
 
 CF_HQ190L = Omnidirectional(
     width=1350,
@@ -51,11 +111,7 @@ def is_c3vd(path: Path) -> bool:
 
 
 def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Open a registered video.
-
-    Raises:
-        InputError: files are missing or cannot be used, or the camera is unknown.
-    """
+    """Open a registered video."""
     images = list_files(path, (".png",), "C3VD", "_color")
     stored = {_number(file): file for file in list_files(path, (".tiff", ".tif"), "C3VD", "_depth")}
     missing = [file for file in images if _number(file) not in stored]
@@ -69,9 +125,8 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     if (width, height) != (lens.width, lens.height):
         hint = "put the camera's width, height, cx, cy, a0, a2, a3, a4, c, d, e into config.ini beside them."
         raise input_error(images[0], f"{lens.width}x{lens.height} px, the calibrated size", f"{width}x{height}", hint)
-    undistorter = Undistorter(lens)
     try:
-        _ = undistorter.maps
+        maps = lens.pinhole_maps()
     except ValueError as error:
         raise input_error(calibration, "the calibration of a camera", str(error), "correct it or remove it.") from None
     focal, cx, cy = lens.pinhole()
@@ -84,9 +139,11 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     mm_per_unit = cfg.depth_unit_mm or 100 / FARTHEST
 
     def decode(index: int) -> Pixels:
-        units = undistorter.nearest(read_values(depths[index], (width, height)))
+        # The nearest depth, so that depths do not mix across an edge; 0 outside of the original, where no tissue is.
+        units = cv2.remap(read_values(depths[index], (width, height)), *maps, cv2.INTER_NEAREST)
         depth = np.where(units < FARTHEST, units * np.float32(mm_per_unit), np.float32(0))
-        return undistorter.smooth(read_color(images[index], (width, height))), units > 0, depth
+        color = read_color(images[index], (width, height))
+        return cv2.remap(color, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), units > 0, depth
 
     return assemble(
         path,
@@ -102,34 +159,10 @@ def load_c3vd(path: Path, cfg: DataConfig) -> FrameSequence:
     )
 
 
-class Undistorter:
-    """Resamples images of an omnidirectional lens to its pinhole camera; the maps are computed at first use."""
-
-    def __init__(self, lens: Omnidirectional) -> None:
-        """Args: lens: of the images."""
-        self.lens = lens
-
-    @cached_property
-    def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """See `Omnidirectional.pinhole_maps`."""
-        return self.lens.pinhole_maps()
-
-    def smooth(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) bilinear; outside the original the border's color is repeated; no tissue is there."""
-        return cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-    def nearest(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) nearest pixel, so that depths do not mix across an edge; 0 outside the original."""
-        return cv2.remap(image, *self.maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-
-
 def camera_to_world(path: Path, count: int) -> NDArray[np.float64]:
     """(N, 4, 4) poses of `pose.txt`, translation in mm.
 
     The files are column-major, although C3VD's page says row-major; the position of (0, 0, 0, 1) decides.
-
-    Raises:
-        InputError: not `count` rows of 16 numbers, or not rigid.
     """
     rows = read_table(path, POSES_HINT)
     if rows.shape != (count, 16):
@@ -142,11 +175,7 @@ def camera_to_world(path: Path, count: int) -> NDArray[np.float64]:
 
 
 def read_lens(path: Path) -> Omnidirectional:
-    """The camera in a file of lines `name = number` (or with a colon); other lines are ignored.
-
-    Raises:
-        InputError: unreadable, or a parameter is missing.
-    """
+    """The camera in a file of lines `name = number` (or with a colon); other lines are ignored."""
     text = read_text(path, "camera parameters", "write it again.")
     entries = dict(re.findall(r"^\s*(\w+)\s*[=:]\s*([-+.\deE]+)\s*;?\s*$", text, re.MULTILINE))
     values = {}

@@ -1,11 +1,23 @@
-"""`sequence.json`: the description of a sequence folder, checked. Every key is optional."""
+"""What `sequence.json` and `prepare.json` say of a sequence folder, checked. Every key of the first is optional.
+
+The second is how `prepare` made the folder. It names files of the user; `check` repeats what is particular about the
+video, and points of a video find their frame.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core.checks import input_error
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.checks import InputError, input_error
+from ..core.config_io import from_dict
+from ..core.options import Options
+from ..system.atomic import write_json
 from .files import read_json
 
 LEAST, MOST = 1e-6, 1e6
@@ -19,15 +31,28 @@ SIZE_NOT_STATED = "calibration, the size of its images not stated"
 """Source of a lens whose calibration file has no image size: the principal point decided."""
 FORMAT_VERSION = 1
 """Newest `format_version` this program can read; a file without one is of version 1."""
+CORRECT = "correct it or remove it."
 POSITIVE = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")
+KEYS: dict[str, tuple[str, Callable[[Any], bool], str]] = {
+    "depth_unit": ("mm", lambda unit: unit == "mm", "give mm, and mm per stored unit as depth_scale."),
+    "mask_tool_value": ("255 or 0", lambda value: value in (0, 255), "give the one that marks tools."),
+    "depth_relative": ("true or false", lambda value: isinstance(value, bool), CORRECT),
+    "sources": ("to map names to texts", lambda value: _is_all(value, dict, str), CORRECT),
+    "unexplained_frames": ("to be a list of frame numbers", lambda value: _is_all(value, list, int), CORRECT),
+    "format_version": (
+        f"1 to {FORMAT_VERSION}",
+        lambda value: type(value) is int and 1 <= value <= FORMAT_VERSION,
+        "update endoprior, or prepare the folder again.",
+    ),
+}
+"""Other keys: what is expected, whether a value is that, and the fix."""
+RECORD = "prepare.json"
+STEPS, NEAR_PX = 40, 0.5
+"""Steps to find a source point in the frame, and how near it they end, px, unless it lies outside of the frame."""
 
 
 def read_description(path: Path) -> dict[str, Any]:
-    """The checked contents of `sequence.json`, or an empty dict when there is none. Unknown keys are kept.
-
-    Raises:
-        InputError: not a JSON object, or a known key has an invalid value.
-    """
+    """The checked contents of `sequence.json`, or an empty dict when there is none. Unknown keys are kept."""
     if not path.exists():
         return {}
     described = {key: value for key, value in read_json(path).items() if value is not None}
@@ -35,15 +60,16 @@ def read_description(path: Path) -> dict[str, Any]:
         value = described.get(key, 1)
         if isinstance(value, bool) or not isinstance(value, int | float) or not LEAST <= value <= MOST:
             want = f"{key} to be a number in [{LEAST:g}, {MOST:g}]"
-            raise input_error(path, want, repr(value)[:60], "correct it or remove it.")
-    if described.get("depth_unit", "mm") != "mm":
-        hint = "give mm, and mm per stored unit as depth_scale."
-        raise input_error(path, "depth_unit mm", repr(described["depth_unit"]), hint)
-    if described.get("mask_tool_value", 255) not in (0, 255):
-        hint = "give the one that marks tools."
-        raise input_error(path, "mask_tool_value 255 or 0", repr(described["mask_tool_value"]), hint)
-    _check_origins(path, described)
+            raise input_error(path, want, repr(value)[:60], CORRECT)
+    for key, (want, is_right, hint) in KEYS.items():
+        if key in described and not is_right(described[key]):
+            raise input_error(path, f"{key} {want}", repr(described[key]), hint)
     return described
+
+
+def _is_all(value: Any, kind: type, of: type) -> bool:
+    """Whether a value is a list or a dict, and all in it are of one type; a bool is no int."""
+    return type(value) is kind and all(type(each) is of for each in (value.values() if kind is dict else value))
 
 
 def check_frames(path: Path, described: dict[str, Any], count: int) -> list[str]:
@@ -51,7 +77,7 @@ def check_frames(path: Path, described: dict[str, Any], count: int) -> list[str]
     marked = described.get("unexplained_frames", [])
     outside = [index for index in marked if not 0 <= index < count]
     if outside:
-        raise input_error(path, f"unexplained_frames in 0..{count - 1}", str(outside[0]), "correct it or remove it.")
+        raise input_error(path, f"unexplained_frames in 0..{count - 1}", str(outside[0]), CORRECT)
     if not marked:
         return []
     return [f"{path}: {len(marked)} frames are marked as unexplained, the first is frame {min(marked)}"]
@@ -60,11 +86,7 @@ def check_frames(path: Path, described: dict[str, Any], count: int) -> list[str]
 def intrinsics_of(
     path: Path, described: dict[str, Any], width: int, height: int, focal: float
 ) -> tuple[float, float, float, float]:
-    """(fx, fy, cx, cy), px: those described, else `focal` and the image center.
-
-    Raises:
-        InputError: the description is for images of another size.
-    """
+    """(fx, fy, cx, cy), px: those described, else `focal` and the image center."""
     if {"width", "height"} <= described.keys() and (described["width"], described["height"]) != (width, height):
         got = f"{described['width']}x{described['height']}"
         hint = "scale fx, fy, cx, cy to the images, or remove the file."
@@ -74,19 +96,62 @@ def intrinsics_of(
     return fx, fy, float(described.get("cx", width / 2)), float(described.get("cy", height / 2))
 
 
-def _check_origins(path: Path, described: dict[str, Any]) -> None:
-    """Raise InputError for wrong values of the keys that describe how a sequence was made."""
-    hint = "correct it or remove it."
-    relative = described.get("depth_relative", False)
-    if not isinstance(relative, bool):
-        raise input_error(path, "depth_relative true or false", repr(relative), hint)
-    sources = described.get("sources", {})
-    if not isinstance(sources, dict) or not all(isinstance(value, str) for value in sources.values()):
-        raise input_error(path, "sources to map names to texts", repr(sources), hint)
-    frames = described.get("unexplained_frames", [])
-    if not isinstance(frames, list) or not all(type(index) is int for index in frames):
-        raise input_error(path, "unexplained_frames to be a list of frame numbers", repr(frames), hint)
-    version = described.get("format_version", FORMAT_VERSION)
-    if type(version) is not int or not 1 <= version <= FORMAT_VERSION:
-        hint = "update endoprior, or prepare the folder again."
-        raise input_error(path, f"format_version 1 to {FORMAT_VERSION}", repr(version), hint)
+@dataclass(frozen=True)
+class PrepareRecord:
+    """How a folder was prepared."""
+
+    video: str
+    """Absolute path of the source."""
+    options: Options
+    """All options that differ from their defaults; paths are absolute."""
+    source_size: tuple[int, int]
+    """(width, height) of one camera's image in the source, px: what `--crop` and `--blank` count."""
+    source_px: tuple[tuple[tuple[float, ...], ...], ...]
+    """(R, C, 2) x, y in that image, px, of an even grid over the frame, from corner to corner; R, C at least 2."""
+    video_notes: tuple[str, ...] = ()
+    """What is particular about the video, and which of its images were not used, one line each."""
+
+    def save(self, folder: Path) -> None:
+        """Write `prepare.json`."""
+        write_json(folder / RECORD, asdict(self))
+
+    def in_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where points of the source lie in the frame: through the rectification, or undistortion, and the crop.
+
+        Args:
+            points: (P, 2) x, y in the source, px.
+        Returns:
+            (P, 2) x, y as shares of the frame's width and height; NaN for points that the frame does not show.
+        """
+        from scipy.interpolate import RectBivariateSpline  # slow to import, and every reader imports this module
+
+        grid = np.array(self.source_px)
+        rows, columns = (np.linspace(0, 1, count) for count in grid.shape[:2])
+        order = {"kx": min(3, len(rows) - 1), "ky": min(3, len(columns) - 1)}
+        splines = [RectBivariateSpline(rows, columns, grid[..., axis], **order) for axis in (0, 1)]
+
+        def missed(at: NDArray[np.float64]) -> NDArray[np.float64]:
+            """(P, 2) from where shares of the frame lie in the source to the points, px."""
+            return points - np.stack([spline.ev(at[:, 1], at[:, 0]) for spline in splines], 1)
+
+        at, extent = np.full(points.shape, 0.5), grid[-1, -1] - grid[0, 0]
+        for _ in range(STEPS):  # the map is nearly a scaling and a shift
+            at = np.clip(at + missed(at) / extent, 0, 1)
+        off = np.linalg.norm(missed(at), axis=1)
+        return np.where(off[:, None] < NEAR_PX, at, np.nan)
+
+
+def read_record(folder: Path) -> PrepareRecord | None:
+    """The record of a folder; None if it has none."""
+    file, fix = folder / RECORD, "remove it, or prepare the folder again."
+    if not file.exists():
+        return None
+    try:
+        record = from_dict(PrepareRecord, read_json(file, fix), "record")
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+    widths = {len(row) for row in record.source_px}
+    pairs = all(len(point) == 2 for row in record.source_px for point in row)
+    if not pairs or len(widths) != 1 or min(len(record.source_px), *widths, 2) < 2 or min(record.source_size) < 1:
+        raise input_error(file, "source_px as rows of x, y", "another shape", fix)
+    return record

@@ -1,4 +1,4 @@
-"""Reader of the EndoNeRF layout: `images/ masks/ depth/`, `poses_bounds.npy`, `sequence.json`.
+"""Reader of the EndoNeRF layout, `images/ masks/ depth/ poses_bounds.npy sequence.json`, and of folders with less.
 
 `N` frames. Cheap facts (counts, poses, the description) are checked on loading, files when they are decoded.
 """
@@ -16,26 +16,47 @@ from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
 from .description import check_frames, intrinsics_of, read_description
-from .files import list_files
+from .files import IMAGE_SUFFIXES, list_files
 from .formats import Format
-from .frame_files import files_of_images
-from .images import read_color, read_depth, read_tool_mask
-from .numpy_files import read_numpy
-from .poses import demand_rotations, world_to_camera
-from .right_eye import open_right_eye
+from .frame_files import files_of_images, one_per_frame
+from .images import DEPTH_SUFFIXES, read_color, read_depth, read_depth_file, read_tool_mask
+from .poses import MATRIX_FILE, demand_rotations, identity_poses, read_camera_matrix, world_to_camera
+from .reading import read_numpy
 from .sequence import FrameSequence
-from .truth import Truth
+from .truth import Truth, open_right_eye
 
+POSES = "poses_bounds.npy"
 POSES_HINT = "write one row of 17 numbers per frame: 3x5 [R | t | (H, W, focal)], near, far."
+STILL_HINT = f"{POSES_HINT[:-1]}; for a static camera, set data.format to plain."
 ROUNDED_PX = 1.0
 """Scaled images may differ from the exact shape by rounding."""
-STILL_HINT = f"{POSES_HINT[:-1]}; for a static camera, set data.format to plain."
+ASSUMED_FOCAL = 0.9
+"""Focal length in image widths if none is given: a field of view of 58 degrees, typical of endoscopes."""
 
 
 def is_endonerf(path: Path) -> bool:
     """Whether a folder has stored poses, or PNG files in the three folders that belong to them."""
-    has_poses = (path / "poses_bounds.npy").exists()
-    return has_poses or all(any((path / name).glob("*.png")) for name in ("images", "masks", "depth"))
+    return (path / POSES).exists() or all(any((path / name).glob("*.png")) for name in ("images", "masks", "depth"))
+
+
+def is_without_depth(path: Path) -> bool:
+    """Whether a prepared folder has poses and no depth; that of others may have depth under another name."""
+    written = all((path / name).is_file() for name in (POSES, "sequence.json"))
+    return written and (path / "images").is_dir() and not (path / "depth").exists()
+
+
+def is_plain(path: Path) -> bool:
+    """Whether a folder has images in `images/`."""
+    folder = path / "images"
+    return folder.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in folder.iterdir())
+
+
+def load_plain(path: Path, cfg: DataConfig) -> FrameSequence:
+    """Open a folder of images, with masks, depth and poses if there are any; else the camera is static.
+
+    A remark names everything that is missing and assumed.
+    """
+    return load_endonerf(path, cfg, complete=False)
 
 
 def load_endonerf(
@@ -45,6 +66,7 @@ def load_endonerf(
     pose_axes: Literal["opencv", "opengl"] = "opencv",
     facts: dict[str, Any] | None = None,
     fact_files: list[Path] | None = None,
+    complete: bool = True,
 ) -> FrameSequence:
     """Open a folder in the EndoNeRF layout.
 
@@ -55,66 +77,111 @@ def load_endonerf(
             z forward; as stored by EndoNeRF) or `opengl` (x right, y up, z backward).
         facts: entries of `sequence.json` that a dataset has elsewhere; the file itself overrides them.
         fact_files: the files they come from.
-    Raises:
-        InputError: the folder is not a sequence.
+        complete: masks, depth and poses must be there, as PNG; see `load_plain`.
     """
-    folders = ("images", "gt_masks" if cfg.use_gt_masks else "masks", "depth")
-    images, masks, depths = (list_files(path / name, (".png",), "EndoNeRF") for name in folders)
+    layout, kinds = ("EndoNeRF", (".png",)) if complete else ("plain", IMAGE_SUFFIXES)
+    remarks: list[str] = []
+    images, note = one_per_frame(path / "images", list_files(path / "images", kinds, layout), "images")
     if len(images) < 2:
         raise input_error(path / "images", "at least 2 frames, 1 to train and 1 to test", "1", "add frames.")
-    own_description = read_description(path / "sequence.json")
-    described = (facts or {}) | own_description
-    height, width = read_color(images[0]).shape[:2]
-    remarks: list[str] = []
-    masks = files_of_images(path / folders[1], masks, "masks", images, remarks)
-    depths = files_of_images(path / folders[2], depths, "depth", images, remarks)
-    poses = read_poses_bounds(path / "poses_bounds.npy", len(images))
-    cameras = _cameras(poses, described, width, height, pose_axes, path, remarks)
+    remarks += [note] if note else []
+    mask_folder = "gt_masks" if cfg.use_gt_masks else "masks"
+    masks: dict[int, Path] = {}
+    if complete or cfg.use_gt_masks or (path / mask_folder).is_dir():  # a folder that the user names must exist
+        listed = list_files(path / mask_folder, (".png",), layout)
+        masks = files_of_images(path / mask_folder, listed, "masks", images, remarks)
+    else:
+        remarks.append(f"{path / 'masks'}: missing, every pixel counts as tissue")
+    depths: dict[int, Path] = {}
+    if complete or (path / "depth").is_dir():
+        listed = list_files(path / "depth", (".png",) if complete else DEPTH_SUFFIXES, layout)
+        depths = files_of_images(path / "depth", listed, "depth", images, remarks)
+    else:
+        remarks.append(f"{path / 'depth'}: missing; endoprior prepare adds it")
+    described = (facts or {}) | read_description(path / "sequence.json")
     remarks += check_frames(path / "sequence.json", described, len(images))
-    kept = [i for i in kept_frames(len(images), cfg) if i in masks and i in depths]
-    size, scale = (width, height), cfg.depth_unit_mm or described.get("depth_scale", 1.0)
-    relative = described.get("depth_relative", False)
+    unit = cfg.depth_unit_mm or described.get("depth_scale")
+    if depths and not unit and not complete:
+        remarks.append(f"{path / 'depth'}: no unit given, mm assumed; set data.depth_unit_mm")
+    height, width = read_color(images[0]).shape[:2]
+    size = (width, height)
+    cameras = _cameras(path, described, size, len(images), pose_axes, remarks, complete=complete)
+    kept = kept_frames(len(images), cfg, having=[files for files in (masks, depths) if files or complete])
+    relative = described.get("depth_relative", not unit and not complete)
     right_eye = open_right_eye(path, images, kept, size, described, cfg.shrink, remarks, relative=relative)
-    images, masks, depths = ([files[i] for i in kept] for files in (images, masks, depths))
+    new_masks = [] if masks or len(kept) < len(images) else [path / "masks" / f"{image.stem}.png" for image in images]
+    images = [images[i] for i in kept]
+    mask_files, depth_files = ([files[i] for i in kept] if files else [] for files in (masks, depths))
     tool_value = described.get("mask_tool_value", 255)
 
     def decode(index: int) -> Pixels:
-        tool = read_tool_mask(masks[index], tool_value, size)
-        return read_color(images[index], size), ~tool, read_depth(depths[index], scale, size)
+        tissue, depth = np.ones((height, width), bool), np.zeros((height, width), np.float32)
+        if mask_files:
+            tissue = ~read_tool_mask(mask_files[index], tool_value, size)
+        if depth_files:
+            depth = (read_depth if complete else read_depth_file)(depth_files[index], unit or 1.0, size)
+        return read_color(images[index], size), tissue, depth
 
     truth = None
-    if (path / "truth").is_dir():
-        truth = Truth(path / "truth", [file.stem for file in images])
+    if complete and (path / "truth").is_dir():
         if cfg.shrink > 1 or len(kept) < len(cameras):
-            truth = None
             remarks.append(f"{path / 'truth'}: ignored, because it belongs to the whole sequence at full size")
+        else:
+            truth = Truth(path / "truth", [file.stem for file in images])
     rate = described.get("frames_per_second")
-    description = [path / "sequence.json"] if own_description else []
+    facts_here = [path / name for name in ("sequence.json", POSES, *([] if complete else [MATRIX_FILE]))]
     return assemble(
         path,
         cfg,
         [cameras[i] for i in kept],
         decode,
         images=images,
-        files=[*masks, *depths, path / "poses_bounds.npy", *description, *(fact_files or [])],
+        files=[*mask_files, *depth_files, *filter(Path.exists, facts_here), *(fact_files or [])],
         frames_per_second=float(rate) / (cfg.stride or 1) if rate is not None else None,
         truth=truth,
         right_eye=right_eye,
         remarks=remarks,
-        mask_folder=folders[1],
-        mask_files=masks,
+        mask_folder=mask_folder,
+        mask_files=mask_files,
+        new_mask_files=new_masks,
         mask_tool_value=tool_value,
         depth_is_relative=relative,
-        sources=described.get("sources"),
+        sources=described.get("sources") or {},
     )
 
 
-def read_poses_bounds(path: Path, num_frames: int) -> NDArray[np.float64]:
-    """(N, 3, 5) camera-to-world [R | t | (height, width, focal)] from `poses_bounds.npy`, checked.
+def _cameras(
+    path: Path,
+    described: dict[str, Any],
+    size: tuple[int, int],
+    count: int,
+    pose_axes: Literal["opencv", "opengl"],
+    remarks: list[str],
+    *,
+    complete: bool,
+) -> list[Camera]:
+    """One camera per frame. Intrinsics come from `sequence.json` where it has them, else from row 0 of the poses."""
+    width, height = size
+    if not complete and "fx" not in described and (path / MATRIX_FILE).is_file():
+        matrix = read_camera_matrix(path / MATRIX_FILE)
+        described |= {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+    focal, poses = ASSUMED_FOCAL * width, identity_poses(count)
+    if complete or (path / POSES).exists():
+        stored = read_poses_bounds(path / POSES, count)
+        flip = np.array([1.0, 1.0, 1.0] if pose_axes == "opencv" else [1.0, -1.0, -1.0])
+        poses = [world_to_camera(pose[:, :3] * flip, pose[:, 3]) for pose in stored]
+        if "fx" not in described:
+            focal = focal_at(path / POSES, stored[0, :, 4], width, height, remarks)
+    else:
+        remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
+        if "fx" not in described:
+            remarks.append(f"{path}: no focal length given, {ASSUMED_FOCAL:g} image widths ({focal:g} px) are assumed")
+    intrinsics = intrinsics_of(path / "sequence.json", described, width, height, focal)
+    return [Camera(width, height, *intrinsics, pose) for pose in poses]
 
-    Raises:
-        InputError: missing, of another shape, not finite, or not rotations.
-    """
+
+def read_poses_bounds(path: Path, num_frames: int) -> NDArray[np.float64]:
+    """(N, 3, 5) camera-to-world [R | t | (height, width, focal)] from `poses_bounds.npy`, checked."""
     if not path.exists():
         raise input_error(path, "camera poses", "no such file", STILL_HINT)
     stored = read_numpy(path, "a NumPy file", POSES_HINT)
@@ -132,9 +199,6 @@ def focal_at(path: Path, stored: NDArray[np.float64], width: int, height: int, r
 
     Files often hold the size of the original video beside smaller images; then the focal length is scaled, and a remark
     says so.
-
-    Raises:
-        InputError: not above 0, or the stored size has another shape, so that the images were cut.
     """
     old_height, old_width, focal = stored
     if focal <= 0:
@@ -151,22 +215,7 @@ def focal_at(path: Path, stored: NDArray[np.float64], width: int, height: int, r
     return float(focal * scale)
 
 
-def _cameras(
-    poses: NDArray[np.float64],
-    described: dict[str, Any],
-    width: int,
-    height: int,
-    pose_axes: Literal["opencv", "opengl"],
-    path: Path,
-    remarks: list[str],
-) -> list[Camera]:
-    """One camera per frame. Intrinsics come from `sequence.json` where it has them, else from row 0 of the poses."""
-    focal = 0.0
-    if "fx" not in described:
-        focal = focal_at(path / "poses_bounds.npy", poses[0, :, 4], width, height, remarks)
-    intrinsics = intrinsics_of(path / "sequence.json", described, width, height, focal)
-    flip = np.array([1.0, 1.0, 1.0] if pose_axes == "opencv" else [1.0, -1.0, -1.0])
-    return [Camera(width, height, *intrinsics, world_to_camera(pose[:, :3] * flip, pose[:, 3])) for pose in poses]
-
-
 FORMAT = Format(is_endonerf, load_endonerf)
+NO_DEPTH = Format(is_without_depth, load_plain)
+"""What `endoprior prepare --depth none` leaves, to add depth to."""
+PLAIN = Format(is_plain, load_plain)

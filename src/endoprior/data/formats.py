@@ -30,6 +30,8 @@ FORMATS = (
     "plain",  # last: it recognizes every folder with images
 )
 """Modules of this package by the name that `DataConfig.format` takes, in the order in which `auto` tries them."""
+PARTIAL = {"no_depth": "NO_DEPTH", "plain": "PLAIN"}
+"""Layouts that lack parts of EndoNeRF's, which its module reads too."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +48,18 @@ def _problem(found: Any) -> str:
     return "" if isinstance(found, Format) else f"an object of type {type(found).__name__}"
 
 
+def _load(name: str) -> Format:
+    if name in PARTIAL:
+        return getattr(import_module(".endonerf", __package__), PARTIAL[name])
+    return import_module(f".{name}", __package__).FORMAT
+
+
 REGISTRY: Registry[Format] = Registry(
     "datasets",
     "a Format of endoprior.data.formats",
     _problem,
     modules=FORMATS,
-    load_module=lambda name: import_module(f".{name}", __package__).FORMAT,
+    load_module=_load,
     reserved=("auto",),
 )
 """The layouts above, and those of plugins."""

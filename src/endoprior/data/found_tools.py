@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import InputError, input_error
+from ..core.checks import input_error
 from ..system.atomic import write_json
-from .reading import read_text
+from .files import read_json
 
 FILE = "tool_masks.json"
 UNCERTAIN = 0.5
@@ -67,32 +67,20 @@ def write_rows(folder: Path, rows: Iterable[FrameRow]) -> None:
 
 
 def read_rows(folder: Path) -> list[FrameRow]:
-    """The rows of a sequence folder; none if no program found its tools.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """The rows of a sequence folder; none if no program found its tools."""
     file = folder / FILE
-    return [_row(file, value) for value in _entries(file)] if file.is_file() else []
+    return [_row(file, value) for value in read_json(file, FIX, WANTED, list)] if file.is_file() else []
 
 
 def drop_rows(folder: Path, frames: Iterable[int]) -> None:
-    """Remove the rows of frames whose masks a person has corrected: they are not in doubt any more.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """Remove the rows of frames whose masks a person has corrected: they are not in doubt any more."""
     corrected = set(frames)
     if rows := read_rows(folder):
         write_rows(folder, [row for row in rows if row.frame not in corrected])
 
 
 def mark_moving(folder: Path, frames: Iterable[int]) -> None:
-    """Note the frames in which something moves that no mask covers.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """Note the frames in which something moves that no mask covers."""
     moving = set(frames)
     if moving and (rows := read_rows(folder)):
         write_rows(folder, [replace(row, moves_unmasked=row.frame in moving) for row in rows])
@@ -101,12 +89,6 @@ def mark_moving(folder: Path, frames: Iterable[int]) -> None:
 def uncertain_frames(rows: Iterable[FrameRow]) -> list[int]:
     """The frames whose masks should be looked at."""
     return [row.frame for row in rows if row.confidence < UNCERTAIN]
-
-
-def confidence_of(rows: Iterable[FrameRow], places: Sequence[int]) -> NDArray[np.float64]:
-    """(T,) confidence of frames at these places of the whole sequence; NaN where it is unknown."""
-    known = {row.frame: row.confidence for row in rows}
-    return np.array([known.get(place, np.nan) for place in places], np.float64)
 
 
 class RowLog:
@@ -138,9 +120,8 @@ class RowLog:
     def _read(self) -> list[FrameRow]:
         """The rows of an interrupted run, up to the first line that is not complete."""
         rows: list[FrameRow] = []
-        if not self._file.is_file():
-            return rows
-        for line in self._file.read_text(encoding="utf-8", errors="replace").splitlines():
+        lines = self._file.read_text(encoding="utf-8", errors="replace").splitlines() if self._file.is_file() else []
+        for line in lines:
             try:
                 row = FrameRow(**json.loads(line))
             except (ValueError, TypeError):
@@ -151,24 +132,12 @@ class RowLog:
         return rows
 
 
-def _line(row: FrameRow) -> str:
-    return json.dumps(_stored(row)) + "\n"
-
-
 def _stored(row: FrameRow) -> dict[str, Any]:
     return {name: value for name, value in asdict(row).items() if name != "moves_unmasked" or value}
 
 
-def _entries(file: Path) -> list[Any]:
-    try:
-        values = json.loads(read_text(file, WANTED, FIX))
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise input_error(file, WANTED, str(error).split("\n")[0], FIX) from None
-    if not isinstance(values, list):
-        raise input_error(file, WANTED, type(values).__name__, FIX)
-    return values
+def _line(row: FrameRow) -> str:
+    return json.dumps(_stored(row)) + "\n"
 
 
 def _row(file: Path, value: Any) -> FrameRow:

@@ -1,26 +1,94 @@
-"""Match files to frames: by their names, by the numbers in them, or in order. Every pairing by names is done here.
+"""Which file belongs to which frame: by names, by the numbers in them, or in order. Every pairing is done here.
 
 Numbers come first: as many files as frames may still be of other frames, if one is missing and one is too many. Order
-is used only where the numbers agree with it, or where there are none.
+is used only where the numbers agree with it, or where there are none. A folder may also hold more than one file per
+frame: images with their masks beside them, or each image twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from ..core.checks import input_error
-from .file_names import bare, numbers_of
-from .files import files_with
-from .series import Kind, one_per_frame
+from .files import DEPTH_WORDS, MASK_WORDS, OTHER_WORDS, bare, files_with, numbers_of, pattern_of, words_of
 
+Kind = Literal["images", "masks", "depth"]
 HINT = "Add the missing files, or name each file by its frame number."
 BY_NAME, BY_NUMBER = "matched by name", "matched by the numbers in the names"
 COUNTED = "matched in order, their numbers are counted otherwise"
+
+
+@dataclass(frozen=True)
+class Series:
+    """Files whose names differ in numbers only."""
+
+    name: str
+    """As the files are called, with # in place of a number: `frame_#_mask.png`."""
+    files: tuple[Path, ...]
+
+    def is_kind(self, kind: Kind) -> bool:
+        """Whether its name says that it holds masks, or depth; or, for images, that it holds nothing else."""
+        words = words_of(Path(self.name).stem)
+        if kind == "images":
+            return not words & (MASK_WORDS | DEPTH_WORDS | OTHER_WORDS)
+        return bool(words & (MASK_WORDS if kind == "masks" else DEPTH_WORDS))
+
+    def shows_frames_of(self, other: Series) -> bool:
+        """Whether both have files of the same frames: most numbers of one are also in the other."""
+        if min(len(self.files), len(other.files)) == 1:
+            return bool({bare(file.stem) for file in self.files} & {bare(file.stem) for file in other.files})
+        numbers = [set(numbers_of([file.stem for file in each.files]) or ()) for each in (self, other)]
+        fewer = min(len(each) for each in numbers)
+        return bool(fewer) and len(numbers[0] & numbers[1]) > fewer / 2
+
+
+def series_of(files: Sequence[Path]) -> list[Series]:
+    """The series among the files of a folder, in order of their first file."""
+    found: dict[str, list[Path]] = {}
+    for file in files:
+        found.setdefault(pattern_of(file.stem) + file.suffix.lower(), []).append(file)
+    return [Series(name, tuple(each)) for name, each in found.items()]
+
+
+def one_per_frame(folder: Path, files: Sequence[Path], kind: Kind) -> tuple[list[Path], str]:
+    """The files of one kind, where a folder has several files of a frame.
+
+    Args:
+        folder: for messages.
+        files: in order.
+        kind: what is looked for.
+    Returns:
+        The files in the same order, and a note on those left out; all files and no note where no frame has two.
+    """
+    every = series_of(files)
+    if not _overlap(every):
+        return list(files), ""
+    wanted = [series for series in every if series.is_kind(kind)]
+    if not wanted or _overlap(wanted):
+        found = ", ".join(f"{series.name} ({len(series.files)})" for series in every[:6])
+        more = f" and {len(every) - 6} more" if len(every) > 6 else ""
+        fix = "put one of them into a folder of its own, and pass that."
+        raise input_error(folder, f"one series of {kind}, one file per frame", found + more, fix)
+    kept = {file for series in wanted for file in series.files}
+    out = ", ".join(f"{series.name} ({len(series.files)})" for series in every if series not in wanted)
+    return [
+        file for file in files if file in kept
+    ], f"{folder}: {len(kept)} of {len(files)} files are {kind}; not {out}"
+
+
+def _overlap(series: Sequence[Series]) -> bool:
+    """Whether two series have files of the same frames."""
+    several = [each for each in series if len(each.files) > 1]
+    if any(a.shows_frames_of(b) for i, a in enumerate(several) for b in several[:i]):
+        return True
+    names = [bare(file.stem) for each in series if len(each.files) == 1 for file in each.files]
+    names += sorted({bare(file.stem) for each in several for file in each.files})
+    return len(set(names)) < len(names)
 
 
 @dataclass(frozen=True)
@@ -42,8 +110,6 @@ def match_files(
         folder: files of other types in it are ignored.
         suffixes: in lower case, with the dot.
         what: which series is meant, if there are several.
-    Raises:
-        InputError: no folder, no files, several series, or frames without a file.
     """
     if not folder.is_dir():
         got = "a file" if folder.exists() else "no such folder"
@@ -78,19 +144,16 @@ def match_names(
         names: of all images of a source folder, without suffixes; empty for a video.
         required: those of `indices` that must have a file, while others may have none; None: all of them.
         in_order_only: the numbers in the names of the files say nothing about frames.
-    Raises:
-        InputError: frames without a file, or names that do not tell.
     """
-    stems = [Path(file).stem for file in files]
-    numbers = None if in_order_only else numbers_of(stems)
-    matched = _of_all(files, stems, numbers, indices, names, in_order_only=in_order_only)
+    given = _Names(files, names, in_order_only)
+    matched = given.of_all(indices)
     if matched is None and required is not None and not in_order_only:
-        matched = _of_some(folder, files, stems, numbers, indices, names, required)
+        matched = given.of_some(folder, indices, required)
         if matched is None and required:
-            matched = _of_all(files, stems, numbers, required, names)
+            matched = given.of_all(required)
     if matched is not None:
         return matched
-    wanted = required or indices
+    wanted, numbers = required or indices, given.numbers
     counts = f"{len(files)} files for {len(wanted)} frames"
     if in_order_only:
         hint = "Export one for each frame, or name each file by its frame number."
@@ -98,7 +161,7 @@ def match_names(
     if numbers is None:
         want = "one file per frame, or a number of its own in each name"
         raise input_error(folder, want, f"{counts}, such as {files[0]} and {files[-1]}", HINT)
-    missing = [f"{number:g}" for number in _wanted(numbers, wanted, names) if number not in numbers]
+    missing = [f"{number:g}" for number in given.wanted(wanted) if number not in numbers]
     some = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
     raise input_error(folder, "one file per frame", f"{counts}, none numbered {some}", HINT)
 
@@ -112,8 +175,6 @@ def files_of_images(
         folder: of the files, for messages.
         files: in natural order; those of another kind are left out.
         remarks: say where order decides, and count images without a file and files without an image.
-    Raises:
-        InputError: the names do not tell which file belongs to which image.
     """
     files, note = one_per_frame(folder, files, kind)
     names = [file.name for file in files], [image.stem for image in images]
@@ -127,81 +188,98 @@ def files_of_images(
     return {index: files[position] for index, position in matched.files.items()}
 
 
-def _of_all(
-    files: Sequence[str],
-    stems: Sequence[str],
-    numbers: Sequence[float] | None,
-    indices: Sequence[int],
-    names: Sequence[str],
-    *,
-    in_order_only: bool = False,
-) -> Matched | None:
-    """A file for every frame; None where the names do not give one to each."""
-    if numbers is None:
-        if by_name := _by_name(stems, indices, names):
-            return Matched(by_name, BY_NAME)
-        why = "their numbers are not those of frames" if in_order_only else "each has no number of its own"
-        if len(files) == len(indices):
-            return Matched(dict(zip(indices, range(len(files)), strict=True)), f"matched in order, {why}")
-        return Matched({i: i for i in indices}, f"matched in order, {why}") if len(files) == len(names) else None
-    own = numbers_of(names) if names else None
-    if by_name := _by_name(stems, range(len(names)), names):
-        return Matched({index: by_name[index] for index in indices}, BY_NAME)
-    if own is not None:
-        if {*own} <= {*numbers}:
-            return Matched(_places(numbers, indices, [own[index] for index in indices]), BY_NUMBER)
-        if len(files) == len(names) and _agree(numbers, own):
-            return Matched({index: index for index in indices}, f"{COUNTED}: {files[0]} for image {names[0]}")
-        if by_name := _by_name(stems, indices, names):
-            return Matched(by_name, BY_NAME)
-    wanted = _wanted(numbers, indices, names)
-    if {*wanted} <= {*numbers}:
-        found = _places(numbers, indices, wanted)
-        return Matched(found, BY_NUMBER if own is not None else _rule_of_positions(files, numbers, found))
-    chosen = wanted if own is not None else list(map(float, indices))
-    if len(files) == len(indices) and _agree(numbers, chosen):
-        shown = f"image {names[indices[0]]}" if names else f"frame {indices[0]}"
-        return Matched(dict(zip(indices, range(len(files)), strict=True)), f"{COUNTED}: {files[0]} for {shown}")
-    return None
+class _Names:
+    """The names of some files and of the images that they may belong to, and the rules that find one for the other."""
 
+    def __init__(self, files: Sequence[str], names: Sequence[str], in_order_only: bool) -> None:
+        self.files, self.names, self.in_order_only = files, names, in_order_only
+        self.stems = [Path(file).stem for file in files]
+        self.numbers = None if in_order_only else numbers_of(self.stems)
+        """The number of each file; None if the names do not tell."""
+        self.own = numbers_of(names) if names else None
+        """The number of each image; None for a video."""
 
-def _of_some(
-    folder: Path,
-    files: Sequence[str],
-    stems: Sequence[str],
-    numbers: Sequence[float] | None,
-    indices: Sequence[int],
-    names: Sequence[str],
-    required: Sequence[int],
-) -> Matched | None:
-    """The rule that finds a file for most frames and for all that are required; None if there is no such rule."""
-    found: list[Matched] = []
-    for form in (str, bare) if names else ():
-        wanted = [form(names[index]) for index in indices]
-        found.append(Matched(_places([form(stem) for stem in stems], indices, wanted), BY_NAME))
-    if numbers is not None:
-        own = numbers_of(names) if names else None
+    def of_all(self, indices: Sequence[int]) -> Matched | None:
+        """A file for every frame; None where the names do not give one to each."""
+        files, names, numbers, own = self.files, self.names, self.numbers, self.own
+        if numbers is None:
+            if by_name := self._by_name(indices):
+                return Matched(by_name, BY_NAME)
+            why = "their numbers are not those of frames" if self.in_order_only else "each has no number of its own"
+            if len(files) == len(indices):
+                return Matched(dict(zip(indices, range(len(files)), strict=True)), f"matched in order, {why}")
+            return Matched({i: i for i in indices}, f"matched in order, {why}") if len(files) == len(names) else None
+        if by_name := self._by_name(range(len(names))):
+            return Matched({index: by_name[index] for index in indices}, BY_NAME)
         if own is not None:
-            here, before, after = (len({own[i] + by for i in indices} & {*numbers}) for by in (0, -1, 1))
-            if here >= max(before, after):  # else they are counted otherwise, and some are missing
-                found.append(Matched(_places(numbers, indices, [own[i] for i in indices]), BY_NUMBER))
-        for first in _starts(numbers, indices) if required or not names else ():
-            by_position = _places(numbers, indices, [index + first for index in indices])
-            found.append(Matched(by_position, _rule_of_positions(files, numbers, by_position)))
-    fitting = [each for each in found if each.files and {*required} <= each.files.keys()]
-    if required and names and any(each.files != fitting[0].files for each in fitting):
-        got = f"{len(files)} names that are those of the images and also numbers of other frames"
-        raise input_error(folder, "names that tell the frames", got, "Name each file by its frame, counted from 0.")
-    return max(fitting, key=lambda each: len(each.files), default=None)
+            if {*own} <= {*numbers}:
+                return Matched(_places(numbers, indices, [own[index] for index in indices]), BY_NUMBER)
+            if len(files) == len(names) and _agree(numbers, own):
+                return Matched({index: index for index in indices}, f"{COUNTED}: {files[0]} for image {names[0]}")
+            if by_name := self._by_name(indices):
+                return Matched(by_name, BY_NAME)
+        wanted = self.wanted(indices)
+        if {*wanted} <= {*numbers}:
+            found = _places(numbers, indices, wanted)
+            return Matched(found, BY_NUMBER if own is not None else self._rule_of_positions(found))
+        chosen = wanted if own is not None else list(map(float, indices))
+        if len(files) == len(indices) and _agree(numbers, chosen):
+            shown = f"image {names[indices[0]]}" if names else f"frame {indices[0]}"
+            return Matched(dict(zip(indices, range(len(files)), strict=True)), f"{COUNTED}: {files[0]} for {shown}")
+        return None
 
+    def of_some(self, folder: Path, indices: Sequence[int], required: Sequence[int]) -> Matched | None:
+        """The rule that finds a file for most frames and all that are required; None if there is no such rule."""
+        names, numbers, own = self.names, self.numbers, self.own
+        found = [Matched(self._named(form, indices), BY_NAME) for form in ((str, bare) if names else ())]
+        if numbers is not None:
+            if own is not None:
+                here, before, after = (len({own[i] + by for i in indices} & {*numbers}) for by in (0, -1, 1))
+                if here >= max(before, after):  # else they are counted otherwise, and some are missing
+                    found.append(Matched(_places(numbers, indices, [own[i] for i in indices]), BY_NUMBER))
+            for first in self._starts(indices) if required or not names else ():
+                by_position = _places(numbers, indices, [index + first for index in indices])
+                found.append(Matched(by_position, self._rule_of_positions(by_position)))
+        fitting = [each for each in found if each.files and {*required} <= each.files.keys()]
+        if required and names and any(each.files != fitting[0].files for each in fitting):
+            got = f"{len(self.files)} names that are those of the images and also numbers of other frames"
+            raise input_error(folder, "names that tell the frames", got, "Name each file by its frame, counted from 0.")
+        return max(fitting, key=lambda each: len(each.files), default=None)
 
-def _by_name(stems: Sequence[str], indices: Sequence[int], names: Sequence[str]) -> dict[int, int] | None:
-    """The file called like each image, whatever its words for mask or depth; None if there is not one for each."""
-    for form in (str, bare) if names else ():
-        found = _places([form(stem) for stem in stems], indices, [form(names[index]) for index in indices])
-        if found and len(found) == len(indices):
-            return found
-    return None
+    def wanted(self, indices: Sequence[int]) -> list[float]:
+        """The number that the file of each frame should have."""
+        if self.own is not None:
+            return [self.own[index] for index in indices]
+        first = self._starts(indices)[0]
+        return [float(index + first) for index in indices]
+
+    def _by_name(self, indices: Sequence[int]) -> dict[int, int] | None:
+        """The file called like each image, whatever its words for mask or depth; None if not each has one."""
+        for form in (str, bare) if self.names else ():
+            found = self._named(form, indices)
+            if found and len(found) == len(indices):
+                return found
+        return None
+
+    def _named(self, form: Callable[[str], str], indices: Sequence[int]) -> dict[int, int]:
+        return _places([form(stem) for stem in self.stems], indices, [form(self.names[index]) for index in indices])
+
+    def _starts(self, indices: Sequence[int]) -> tuple[int, int]:
+        """Whether files of a video are counted from 0 or from 1: the likelier one first."""
+        numbers = self.numbers or []
+        from_zero, from_one = (len({index + first for index in indices} & {*numbers}) for first in (0, 1))
+        # Names that begin at 1 are counted from 1; what begins later may be either.
+        is_one = from_one > from_zero or (from_one == from_zero and min(numbers) == 1)
+        return (1, 0) if is_one else (0, 1)
+
+    def _rule_of_positions(self, found: dict[int, int]) -> str:
+        if not found or self.numbers is None:
+            return ""
+        index, numbers = min(found), self.numbers
+        first = int(numbers[found[index]]) - index
+        is_doubtful = first == 0 and min(numbers) > 1 and all(i + 1 in {*numbers} for i in found)
+        doubt = "; if they are counted from 1, number them anew" if is_doubtful else ""
+        return f"{BY_NUMBER}, counted from {first}: {self.files[found[index]]} for frame {index}{doubt}"
 
 
 def _places(of_files: Sequence[Any], indices: Sequence[int], wanted: Sequence[Any]) -> dict[int, int]:
@@ -209,31 +287,6 @@ def _places(of_files: Sequence[Any], indices: Sequence[int], wanted: Sequence[An
     place = {value: position for position, value in enumerate(of_files)}
     found = {index: place[value] for index, value in zip(indices, wanted, strict=True) if value in place}
     return found if len({*found.values()}) == len(found) else {}
-
-
-def _wanted(numbers: Sequence[float], indices: Sequence[int], names: Sequence[str]) -> list[float]:
-    """The number that the file of each frame should have."""
-    own = numbers_of(names) if names else None
-    first = _starts(numbers, indices)[0]
-    return [float(index + first) if own is None else own[index] for index in indices]
-
-
-def _starts(numbers: Sequence[float], indices: Sequence[int]) -> tuple[int, int]:
-    """Whether files of a video are counted from 0 or from 1: the likelier one first."""
-    from_zero, from_one = (len({index + first for index in indices} & {*numbers}) for first in (0, 1))
-    # Names that begin at 1 are counted from 1; what begins later may be either.
-    is_one = from_one > from_zero or (from_one == from_zero and min(numbers) == 1)
-    return (1, 0) if is_one else (0, 1)
-
-
-def _rule_of_positions(files: Sequence[str], numbers: Sequence[float], found: dict[int, int]) -> str:
-    if not found:
-        return ""
-    index = min(found)
-    first = int(numbers[found[index]]) - index
-    is_doubtful = first == 0 and min(numbers) > 1 and all(i + 1 in {*numbers} for i in found)
-    doubt = "; if they are counted from 1, number them anew" if is_doubtful else ""
-    return f"{BY_NUMBER}, counted from {first}: {files[found[index]]} for frame {index}{doubt}"
 
 
 def _agree(numbers: Sequence[float], others: Sequence[float]) -> bool:

@@ -6,7 +6,7 @@ None has camera poses: the camera is assumed to be static. Rectification leaves 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +17,12 @@ from ..core.spread import spread
 from ..core.types import Camera
 from ..footage.black_margin import black_margin
 from .assemble import Pixels, assemble, kept_frames
-from .camera_matrix import MATRIX_FILE, matrix_of_images, read_camera_matrix
-from .depth_files import read_depth_file
 from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, list_files
 from .formats import Format
 from .frame_files import files_of_images
-from .images import read_color, read_tool_mask
-from .poses import identity_poses
+from .images import read_color, read_depth_file, read_tool_mask
+from .poses import MATRIX_FILE, identity_poses, matrix_of_images, read_camera_matrix
 from .sequence import FrameSequence
 
 FULL_SIZE = (640, 480)
@@ -45,11 +43,71 @@ def is_hamlyn(path: Path) -> bool:
 def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a Hamlyn sequence.
 
-    Raises:
-        InputError: files are missing, their numbers differ, or they cannot be used.
+    Forplane's have `images/`, `gt_masks/` or `masks/`, depth, and a camera: `intrinsics.txt`, else `poses_bounds.npy`.
+    Rectified videos have images, depth in mm and a camera matrix; no masks.
     """
-    folders = _rectified_folders(path)
-    return _load_forplane(path, cfg) if folders is None else _load_rectified(path, cfg, *folders)
+    remarks: list[str] = []
+    if rectified := _rectified_folders(path):
+        layout, kinds, mask_folder, (image_folder, depth_folder) = "Hamlyn", IMAGE_SUFFIXES, "", rectified
+    else:
+        layout, kinds, image_folder = "Forplane", (".png",), "images"
+        mask_folder = "gt_masks" if (path / "gt_masks").is_dir() else "masks"
+        depth_folder = next((name for name in ("gt_depth", "pred_disp") if (path / name).is_dir()), "depth")
+    images = list_files(path / image_folder, kinds, layout)
+    columns = [
+        files_of_images(path / folder, list_files(path / folder, (".png",), layout), kind, images, remarks)
+        for folder, kind in ((depth_folder, "depth"), (mask_folder, "masks"))
+        if folder
+    ]
+    height, width = read_color(images[0]).shape[:2]
+    size, crop = (width, height), 0
+    if rectified:
+        camera_file = _matrix_file(path)
+        matrix = read_camera_matrix(camera_file)
+        remarks.append(f"{path}: no tool masks, tools count as tissue")
+    else:
+        if _is_named(path) or (path / MATRIX_FILE).exists() or width * 3 == height * 4:
+            crop = round(CROPPED_PX * width / FULL_SIZE[0])
+            remarks.append(f"{path}: {crop} empty columns at the left are cropped, as in Forplane")
+        else:
+            got = f"{width}x{height} px is no Hamlyn video"
+            remarks.append(f"{path}: {got}; read as EndoNeRF's, without Forplane's crop")
+        matrix, camera_file = _forplane_matrix(path, size, crop, len(images), remarks)
+        if depth_folder == "pred_disp":
+            remarks.append(f"{path / depth_folder}: read as depth, as Forplane does, though its name says disparity")
+        if not cfg.depth_unit_mm:
+            remarks.append(f"{path / depth_folder}: its unit is not documented, mm assumed; set data.depth_unit_mm")
+    remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
+    kept = kept_frames(len(images), cfg, having=columns)
+    images = [images[i] for i in kept]
+    depths, *masks = ([files[i] for i in kept] for files in columns)
+    margin = black_margin([read_color(images[i], size)[:, crop:] for i in spread(len(images), SAMPLES)])
+    if margin.any():
+        remarks.append(f"{path}: a black margin, {margin.mean():.0%} of a frame, is no tissue")
+
+    def decode(index: int) -> Pixels:
+        depth = read_depth_file(depths[index], cfg.depth_unit_mm or 1.0, size)[:, crop:]
+        tissue = ~margin
+        for files in masks:
+            tissue = tissue & ~read_tool_mask(files[index], 255, size)[:, crop:]
+        color = read_color(images[index], size)[:, crop:]
+        return np.ascontiguousarray(color), tissue, np.ascontiguousarray(depth)
+
+    # The principal point moves by the whole crop; Forplane moves it by half of that, which is a different camera.
+    shape = (width - crop, height, matrix[0, 0], matrix[1, 1], matrix[0, 2] - crop, matrix[1, 2])
+    return assemble(
+        path,
+        cfg,
+        [Camera(*shape, pose) for pose in identity_poses(len(kept))],
+        decode,
+        images=images,
+        # A calibration outside the folder has no name below it, which the fingerprint needs.
+        files=[*depths, *chain(*masks), *([camera_file] if camera_file.is_relative_to(path) else [])],
+        remarks=remarks,
+        mask_folder=mask_folder or image_folder,
+        depth_is_relative=not rectified and not cfg.depth_unit_mm,
+        sources={"depth": "stereo matching" if rectified else "stereo matching, by Forplane"},
+    )
 
 
 def _is_named(path: Path) -> bool:
@@ -77,32 +135,6 @@ def _rectified_folders(path: Path) -> tuple[str, str] | None:
     return None
 
 
-def _load_forplane(path: Path, cfg: DataConfig) -> FrameSequence:
-    """`images/`, `gt_masks/` or `masks/`, depth, and a camera: `intrinsics.txt`, else `poses_bounds.npy`."""
-    mask_folder = "gt_masks" if (path / "gt_masks").is_dir() else "masks"
-    depth_folder = next((name for name in ("gt_depth", "pred_disp") if (path / name).is_dir()), "depth")
-    folders = ("images", mask_folder, depth_folder)
-    images, masks, depths = (list_files(path / name, (".png",), "Forplane") for name in folders)
-    height, width = read_color(images[0]).shape[:2]
-    remarks: list[str] = []
-    masks_of = files_of_images(path / mask_folder, masks, "masks", images, remarks)
-    depths_of = files_of_images(path / depth_folder, depths, "depth", images, remarks)
-    is_hamlyn_video = _is_named(path) or (path / MATRIX_FILE).exists() or width * 3 == height * 4
-    crop = round(CROPPED_PX * width / FULL_SIZE[0]) if is_hamlyn_video else 0
-    matrix, camera_file = _forplane_matrix(path, (width, height), crop, len(images), remarks)
-    if crop:
-        remarks.append(f"{path}: {crop} empty columns at the left are cropped, as in Forplane")
-    else:
-        remarks.append(f"{path}: {width}x{height} px is no Hamlyn video; read as EndoNeRF's, without Forplane's crop")
-    if depth_folder == "pred_disp":
-        remarks.append(f"{path / depth_folder}: read as depth, as Forplane does, though its name says disparity")
-    if not cfg.depth_unit_mm:
-        remarks.append(f"{path / depth_folder}: its unit is not documented, mm assumed; set data.depth_unit_mm")
-    source, relative = "stereo matching, by Forplane", not cfg.depth_unit_mm
-    files = _Files(path, images, masks_of, depths_of, crop, camera_file, mask_folder, source, relative)
-    return _assembled(files, cfg, (width, height), matrix, remarks)
-
-
 def _forplane_matrix(
     path: Path, size: tuple[int, int], crop: int, count: int, remarks: list[str]
 ) -> tuple[NDArray[np.float64], Path]:
@@ -121,19 +153,6 @@ def _forplane_matrix(
     return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), poses
 
 
-def _load_rectified(path: Path, cfg: DataConfig, image_folder: str, depth_folder: str) -> FrameSequence:
-    """Images, depth in mm and a camera matrix; no masks."""
-    images = list_files(path / image_folder, IMAGE_SUFFIXES, "Hamlyn")
-    depths = list_files(path / depth_folder, (".png",), "Hamlyn")
-    calibration = _matrix_file(path)
-    matrix = read_camera_matrix(calibration)
-    height, width = read_color(images[0]).shape[:2]
-    remarks = [f"{path}: no tool masks, tools count as tissue"]
-    depths_of = files_of_images(path / depth_folder, depths, "depth", images, remarks)
-    files = _Files(path, images, {}, depths_of, 0, calibration, image_folder, "stereo matching", relative=False)
-    return _assembled(files, cfg, (width, height), matrix, remarks)
-
-
 def _matrix_file(path: Path) -> Path:
     """The camera matrix of a rectified video: beside its frames, or with those of the other videos."""
     number = (re.findall(r"[0-9]+", path.name) or [""])[-1]
@@ -142,64 +161,6 @@ def _matrix_file(path: Path) -> Path:
     places = [path / MATRIX_FILE, path / own, path / "intrinsic" / "intrinsic_color.txt", path.parent / own]
     places += [calibration / number / MATRIX_FILE, calibration / own]
     return next((place for place in places if place.is_file()), places[0])
-
-
-@dataclass(frozen=True)
-class _Files:
-    """Files of a folder; masks and depth by position of their image, no masks at all where a video has none."""
-
-    path: Path
-    images: list[Path]
-    masks: dict[int, Path]
-    depths: dict[int, Path]
-    crop: int
-    """Columns to leave out at the left, px."""
-    camera: Path
-    mask_folder: str
-    """Its name, for messages."""
-    depth_source: str
-    relative: bool
-    """Whether the unit of depth is unknown."""
-
-
-def _assembled(
-    files: _Files, cfg: DataConfig, size: tuple[int, int], matrix: NDArray[np.float64], remarks: list[str]
-) -> FrameSequence:
-    """The sequence of a static camera; `matrix` is in px of the whole image, with centers at halves."""
-    path, crop, (width, height) = files.path, files.crop, size
-    remarks.append(f"{path}: no camera poses, the camera is assumed to be static")
-    kept = [
-        i for i in kept_frames(len(files.images), cfg) if i in files.depths and (i in files.masks or not files.masks)
-    ]
-    images, depths = [files.images[i] for i in kept], [files.depths[i] for i in kept]
-    masks = [files.masks[i] for i in kept] if files.masks else []
-    margin = black_margin([read_color(images[i], size)[:, crop:] for i in spread(len(images), SAMPLES)])
-    if margin.any():
-        remarks.append(f"{path}: a black margin, {margin.mean():.0%} of a frame, is no tissue")
-
-    def decode(index: int) -> Pixels:
-        depth = read_depth_file(depths[index], cfg.depth_unit_mm or 1.0, size)[:, crop:]
-        tissue = ~margin
-        if masks:
-            tissue = tissue & ~read_tool_mask(masks[index], 255, size)[:, crop:]
-        color = read_color(images[index], size)[:, crop:]
-        return np.ascontiguousarray(color), tissue, np.ascontiguousarray(depth)
-
-    # The principal point moves by the whole crop; Forplane moves it by half of that, which is a different camera.
-    shape = (width - crop, height, matrix[0, 0], matrix[1, 1], matrix[0, 2] - crop, matrix[1, 2])
-    return assemble(
-        path,
-        cfg,
-        [Camera(*shape, pose) for pose in identity_poses(len(kept))],
-        decode,
-        images=images,
-        # A calibration outside the folder has no name below it, which the fingerprint needs.
-        files=[*masks, *depths, *([files.camera] if files.camera.is_relative_to(path) else [])],
-        remarks=remarks,
-        mask_folder=files.mask_folder,
-        depth_is_relative=files.relative,
-        sources={"depth": files.depth_source},
-    )
 
 
 FORMAT = Format(is_hamlyn, load_hamlyn)

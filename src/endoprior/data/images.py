@@ -1,33 +1,99 @@
-"""Image files to arrays; error messages name the file, what is expected and what it holds."""
+"""Image and depth files to arrays; error messages name the file, what is expected and what it holds.
+
+Pillow reads the header of an image first, so that one that is too large is never decoded; OpenCV decodes. Depth and
+disparity may also be NumPy or EXR files. `size` is the (width, height) that a file must have, px; None accepts any. All
+readers raise InputError for a file that is unreadable, of another kind or of another size.
+"""
 
 from __future__ import annotations
 
+import io
+import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.ExifTags import Base as Tag
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+from PIL.WebPImagePlugin import WebPImageFile
 
 from ..core.checks import input_error
-from .depth_fill import is_measured
-from .image_header import TIFF_STARTS, TURNED, read_header
-from .reading import MOST_PIXELS, read_bytes
+from ..core.extras import install_command
+from .pixels import is_measured
+from .reading import MOST_PIXELS, demand_file, read_bytes, read_only_array
 
+READERS = {b"\x89PNG": PngImageFile, b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"RIFF": WebPImageFile}
+"""Pillow's readers, by the first bytes of a file. `PIL.Image.open` has a limit of its own, for the whole process."""
+TIFF_STARTS = (b"II", b"MM")
+"""First bytes of TIFF files: the order of bytes in a number. Pillow's own reader knows fewer kinds of pixels."""
+BIG_TIFF = 43
+JPEG_END = b"\xff\xd9"
+TURNED = range(5, 9)
+"""Orientations that exchange width and height."""
+warnings.filterwarnings("ignore", module=r"PIL\.\w+Plugin")  # of damaged tags, which are read as missing
 PNG_END = b"IEND\xaeB`\x82"
 """Last bytes of every PNG file."""
+DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".tiff", ".tif", ".exr")
+"""Suffixes of the files this module reads, in lower case."""
+
+
+class ImageHeader(NamedTuple):
+    """An image before it is decoded."""
+
+    width: int
+    """Of the image as it is shown, px."""
+    height: int
+    orientation: int
+    """How the stored pixels lie, by EXIF: 1 as they are shown, 2 to 8 mirrored or turned; 1 if nothing is said."""
+
+
+def read_header(encoded: bytes) -> ImageHeader | None:
+    """The header of a PNG, JPEG, TIFF, BMP or WebP image.
+
+    Returns:
+        None if it is none of these, or damaged. Decoders check the pixels of most kinds, but print to stderr for a PNG
+        with a wrong checksum and a JPEG without its end. What phones and editors add after the end does not count.
+    """
+    try:
+        if encoded.startswith(TIFF_STARTS):
+            tags = ImageFileDirectory_v2(encoded[: 16 if encoded[2] == BIG_TIFF else 8])
+            file = io.BytesIO(encoded)
+            file.seek(tags.next)
+            tags.load(file)
+            (width, height), orientation = (tags[Tag.ImageWidth], tags[Tag.ImageLength]), tags.get(Tag.Orientation)
+        else:
+            (width, height), orientation = _read_by_pillow(encoded)
+    except Exception:  # Pillow raises many kinds for damaged files
+        return None
+    if not (isinstance(width, int) and isinstance(height, int)):
+        return None
+    orientation = orientation if orientation in range(1, 9) else 1
+    return ImageHeader(*((height, width) if orientation in TURNED else (width, height)), orientation)
+
+
+def _read_by_pillow(encoded: bytes) -> tuple[tuple[int, int], int | None]:
+    """Stored size, px, and orientation; raises what Pillow raises if the file is damaged."""
+    file = io.BytesIO(encoded)
+    image = next(reader for start, reader in READERS.items() if encoded.startswith(start))(file)
+    if isinstance(image, JpegImageFile):
+        encoded.index(JPEG_END, file.tell())  # Pillow stops at the compressed pixels, which hold no such bytes
+    if isinstance(image, PngImageFile):
+        if "exif" not in image.info:  # behind the pixels, where Pillow finds it only after decoding them
+            image.info["exif"] = encoded.partition(b"eXIf")[2]
+        image.verify()
+    try:
+        return image.size, image.getexif().get(Tag.Orientation)
+    except Exception:  # damaged EXIF says nothing
+        return image.size, None
 
 
 def read_color(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """Read an 8-bit color image.
-
-    Args:
-        path: the file; an alpha channel is dropped.
-        size: (width, height) it must have, px; None accepts any.
-    Returns:
-        (H, W, 3) red, green, blue, 0..255.
-    Raises:
-        InputError: unreadable, not 8-bit color, or of another size.
-    """
+    """(H, W, 3) red, green, blue, 0..255, of an 8-bit color image; an alpha channel is dropped."""
     pixels = decode_image(path, size)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
         raise input_error(path, "an 8-bit RGB image", describe_pixels(pixels), "convert it to 8-bit RGB.")
@@ -35,16 +101,10 @@ def read_color(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.ui
 
 
 def read_tool_mask(path: Path, tool_value: int = 255, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
-    """Read a binary mask file.
+    """(H, W) True on tools, of an 8-bit image with values 0 and 255 only, gray or with equal channels.
 
     Args:
-        path: an 8-bit image with values 0 and 255 only, gray or with equal channels.
         tool_value: 255, or 0 where the file marks tissue instead of tools.
-        size: (width, height) it must have, px; None accepts any.
-    Returns:
-        (H, W) True on tools.
-    Raises:
-        InputError: unreadable, of another size or depth, or with other values.
     """
     pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype != np.uint8:
@@ -55,21 +115,18 @@ def read_tool_mask(path: Path, tool_value: int = 255, size: tuple[int, int] | No
         values = np.unique(other)
         zero_and_one = values.tolist() == [1] and not high.any()
         hint = "multiply it by 255." if zero_and_one else "threshold it, without smoothing."
-        raise input_error(path, "mask values 0 and 255", _list_some(values), hint)
+        got = ", ".join(str(v) for v in values[:4].tolist()) + (" and more" if len(values) > 4 else "")
+        raise input_error(path, "mask values 0 and 255", got, hint)
     return high if tool_value == 255 else ~high
 
 
 def read_depth(path: Path, scale: float = 1.0, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
-    """Read a depth image.
+    """(H, W) depth, mm, of an 8-bit or 16-bit image, gray or with equal channels.
+
+    It is 0 where the file has 0, and with 16 bits what else stands for missing (`is_measured`).
 
     Args:
-        path: an 8-bit or 16-bit image, gray or with equal channels.
         scale: mm per unit of the file.
-        size: (width, height) it must have, px; None accepts any.
-    Returns:
-        (H, W) depth, mm; 0 where the file has 0, and with 16 bits what else stands for missing (`is_measured`).
-    Raises:
-        InputError: unreadable, of another size or depth.
     """
     pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype not in (np.uint8, np.uint16):
@@ -82,13 +139,9 @@ def decode_image(path: Path, size: tuple[int, int] | None, flags: int = cv2.IMRE
     """Decode a PNG, JPEG, TIFF, BMP or WebP file.
 
     Args:
-        path: the file.
-        size: (width, height) it must have, px; None accepts any.
         flags: of `cv2.imdecode`: as stored, or converted.
     Returns:
         The array, (H, W) or (H, W, C) with channels in OpenCV's order (blue first), upright: turned as EXIF says.
-    Raises:
-        InputError: unreadable, of another format, truncated, of more than `MOST_PIXELS`, or of another size.
     """
     encoded = read_bytes(path)
     data = encoded.tobytes()
@@ -125,13 +178,9 @@ def _upright(pixels: NDArray, orientation: int) -> NDArray:
 
 
 def save_png(path: Path, pixels: NDArray, compression: int = 1) -> None:
-    """Write a PNG. It is encoded in memory first, because libpng prints to stderr when the disk is full.
+    """Write a PNG; OSError if the disk is full, else as `encode_png`.
 
-    Args:
-        pixels, compression: as `encode_png`.
-    Raises:
-        OSError: the disk is full or not writable.
-        MemoryError: as `encode_png`.
+    It is encoded in memory first, because libpng prints to stderr when the disk is full.
     """
     path.write_bytes(encode_png(pixels, compression))
 
@@ -170,6 +219,89 @@ def describe_pixels(pixels: NDArray) -> str:
     return f"{kind}, {channels} channel{'s' if channels > 1 else ''}"
 
 
-def _list_some(values: NDArray) -> str:
-    """At most four of the values, comma separated."""
-    return ", ".join(str(v) for v in values[:4].tolist()) + (" and more" if len(values) > 4 else "")
+def read_depth_file(
+    path: Path, mm_per_unit: float = 1.0, size: tuple[int, int] | None = None, *, relative: bool = False
+) -> NDArray[np.float32]:
+    """Read a depth image.
+
+    Args:
+        path: PNG or TIFF (8 or 16 bit, TIFF also float), NPY, NPZ with one array, or EXR with one channel.
+        mm_per_unit: mm per stored unit.
+        size: (width, height) it must have, px; None accepts any.
+        relative: the depth is only scaled, see `is_measured`.
+    Returns:
+        (H, W) depth, mm; 0 where it is missing (`is_measured`).
+    Raises:
+        InputError: unreadable, of another size or kind, or EXR without the OpenEXR package.
+    """
+    stored = read_stored(path, size)
+    depth = _as_float32(stored) * np.float32(mm_per_unit)
+    return np.where(is_measured(stored, relative=relative) & np.isfinite(depth), depth, np.float32(0))
+
+
+def read_values(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+    """(H, W) numbers of a one-channel file, none of them missing; kinds, `size` and errors as `read_depth_file`."""
+    return _as_float32(read_stored(path, size))
+
+
+def read_stored(path: Path, size: tuple[int, int] | None = None) -> NDArray:
+    """(H, W) numbers of a one-channel file in their own type; kinds, `size` and errors as `read_depth_file`."""
+    suffix = path.suffix.lower()
+    if suffix not in DEPTH_SUFFIXES:
+        raise input_error(path, f"one of {', '.join(DEPTH_SUFFIXES)}", suffix or "no suffix", "convert the file.")
+    if suffix in (".npy", ".npz"):
+        pixels = _read_numpy(path)
+    elif suffix == ".exr":
+        pixels = _read_exr(path)
+    else:
+        pixels = single_channel(path, decode_image(path, size))
+    if pixels.dtype.kind not in "iuf":
+        raise input_error(path, "integers or floats", str(pixels.dtype), "save it as float or 16-bit.")
+    if size is not None and pixels.shape != (size[1], size[0]):
+        got = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        raise input_error(path, f"{size[0]}x{size[1]} px like the first image", got, "bring all files to one size.")
+    return pixels
+
+
+def _as_float32(stored: NDArray) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinity, which is missing
+        return stored.astype(np.float32)
+
+
+def _read_numpy(path: Path) -> NDArray:
+    """The (H, W) array of an .npy file, or of an .npz file that holds nothing else; no pickles.
+
+    Axes of length 1 in front of the others or behind them are dropped.
+    """
+    hint = "write it again with numpy.save."
+    array = read_only_array(path, hint)
+    while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):
+        array = array[0] if array.shape[0] == 1 else array[..., 0]
+    if array.ndim != 2:
+        raise input_error(path, "an array of shape (H, W)", f"shape {array.shape}", hint)
+    return array
+
+
+def _read_exr(path: Path) -> NDArray:
+    """The (H, W) channel of an EXR file: its only one, `Z`, or several that are equal."""
+    try:
+        import OpenEXR  # optional: the packages of OpenCV have no EXR decoder
+    except ImportError:
+        raise input_error(path, "the OpenEXR package", "none", f"`{install_command('exr')}`.") from None
+    demand_file(path, "an EXR image", "write the file again.")
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            (left, top), (right, bottom) = (np.asarray(corner, int).tolist() for corner in file.header()["dataWindow"])
+        if (right - left + 1) * (bottom - top + 1) > MOST_PIXELS:
+            raise ValueError(f"{right - left + 1}x{bottom - top + 1} px by its header")
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except Exception as error:  # the library raises many kinds, RuntimeError among them
+        raise input_error(path, "an EXR image", str(error).split("\n")[0], "write the file again.") from None
+    if "Z" in channels:
+        return channels["Z"]
+    first, *others = [channels[name] for name in channels if name != "A"] or [None]
+    if first is None or any(not np.array_equal(first, other, equal_nan=True) for other in others):
+        hint = "save depth alone, as channel Z."
+        raise input_error(path, "one channel, or one called Z", ", ".join(channels) or "none", hint)
+    return first

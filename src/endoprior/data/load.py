@@ -1,18 +1,31 @@
-"""Open a folder of any known layout."""
+"""Open a folder of any known layout, or say what else lies there and which command makes use of it."""
 
 from __future__ import annotations
 
+import os
+import re
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
-from ..core.checks import input_error, read_ranges
+from ..core.checks import InputError, input_error, read_ranges
 from ..core.config import DataConfig
+from ..core.shell import command, quoted
 from .endonerf import load_endonerf
-from .files import entries
+from .files import entries, read_json
 from .formats import REGISTRY, recognizing
 from .reading import kind_of
-from .recognize import not_a_sequence
 from .sequence import FrameSequence
+from .video_files import STILL_SUFFIXES, VIDEO_SUFFIXES, is_video
+
+ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".7z", ".rar")
+CALIBRATIONS = (".ini", ".yaml", ".yml", ".npz")
+RUN_FILES = ("scene.safetensors", "checkpoint.safetensors", "log.jsonl")
+WINDOWS = "windows"
+"""Folder of a run in windows, which has none of these files before its last window is trained."""
+SIDE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
+"""The word of a name that tells the left camera from the right one."""
 
 
 def load_sequence(
@@ -39,17 +52,15 @@ def load_sequence(
         raise input_error(path, "a sequence folder", got, "pass the folder that holds images/, masks/ and depth/.")
     name = find_format(path, cfg)
     if pose_axes == "opencv":
-        return _as_asked(REGISTRY.load(name).load(path, cfg), cfg)
-    if name != "endonerf":
+        sequence = REGISTRY.load(name).load(path, cfg)
+    elif name == "endonerf":
+        sequence = load_endonerf(path, cfg, pose_axes=pose_axes)
+    else:
         raise ValueError(f"pose_axes must be opencv for the {name} layout, which defines it; got {pose_axes!r}")
-    return _as_asked(load_endonerf(path, cfg, pose_axes=pose_axes), cfg)
-
-
-def _as_asked(sequence: FrameSequence, cfg: DataConfig) -> FrameSequence:
-    """The frames to use, and which of them are held out; here, so that readers of other packages cannot differ."""
-    chosen = _window_of(sequence.with_test_phase(cfg.test_phase), cfg.window)
-    chosen.reading = cfg
-    return chosen
+    # Which frames are used and held out is decided here, so that readers of other packages cannot differ.
+    sequence = _window_of(sequence.with_test_phase(cfg.test_phase), cfg.window)
+    sequence.reading = cfg
+    return sequence
 
 
 def _window_of(sequence: FrameSequence, window: str) -> FrameSequence:
@@ -82,3 +93,133 @@ def find_format(path: Path, cfg: DataConfig) -> str:
     got = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     known = ", ".join(REGISTRY.names())
     raise input_error(path, f"one of the layouts {known}", got or "an empty folder", "see docs/datasets.md.")
+
+
+def is_sequence(folder: Path) -> bool:
+    """Whether a folder has one of the layouts of docs/datasets.md."""
+    try:
+        return recognizing(folder) is not None
+    except OSError:  # not readable
+        return False
+
+
+def is_run(folder: Path) -> bool:
+    """Whether `train` wrote a folder."""
+    return (folder / "config.json").is_file() and any((folder / name).exists() for name in (*RUN_FILES, WINDOWS))
+
+
+def not_a_sequence(path: Path) -> InputError | None:
+    """The error for a path that is no sequence folder but can be used otherwise; None if nothing is recognized.
+
+    Raises:
+        InputError: the path cannot be read.
+    """
+    kind = kind_of(path)
+    if kind == "a file":
+        found = _file(path)
+    else:
+        found = _folder(path) if kind == "a folder" else None
+    return found and input_error(path, "a sequence folder", *found)
+
+
+def not_a_run(path: Path) -> InputError | None:
+    """The error for a path that is no run folder but holds one or leads to one; None for others."""
+    kind = kind_of(path)
+    if kind == "nothing":
+        got, fix = f"no such {'file' if path.name == RUN_FILES[0] else 'folder'}", "Correct the path, or make a run: "
+        return input_error(path, "a run folder", got, f"{fix}`{command('train', 'DATA', path)}`.")
+    if kind == "a folder" and is_sequence(path):
+        fix = f"`{command('train', path, 'RUN')}`, then pass RUN."
+        return input_error(path, "a run folder", "a sequence folder", fix)
+    if kind == "a folder" and is_run(path / "run"):
+        return input_error(path, "a run folder", "a folder with a run in it", f"pass {quoted(path / 'run')}.")
+    if (kind == "a file" and is_video(path)) or (kind == "a folder" and not is_run(path) and _has_images(path)):
+        what, out = "a video" if kind == "a file" else "a folder of images", _beside(path, "out")
+        fix = f"`{command('run', path, out)}`, then pass {quoted(out / 'run')}."
+        return input_error(path, "a run folder", what, fix)
+    return None
+
+
+def _file(path: Path) -> tuple[str, str] | None:
+    """What a file is, and the fix; None if it is not recognized."""
+    if path.suffix.lower() in ARCHIVES:
+        return "an archive", "unpack it and pass the folder."
+    if path.name in RUN_FILES:
+        return "a file of a run", f"`{command('view', path.parent)}`, or pass the sequence folder of the run."
+    return ("a video", f"{_prepare(path)}.") if is_video(path) else None
+
+
+def _folder(path: Path) -> tuple[str, str] | None:
+    """What a folder is, and the fix; None if it is not recognized."""
+    if is_run(path):
+        return "a run folder", _fix_of_run(path)
+    parent = Path(os.path.abspath(path)).parent
+    if is_sequence(parent):
+        return "a part of a sequence folder", f"pass {quoted(parent)}."
+    inside = sorted(entry for entry in entries(path) if not entry.name.startswith("."))
+    folders = [entry for entry in inside if entry.is_dir()]
+    sequences = [folder for folder in folders if is_sequence(folder)]
+    if len(sequences) == 1 and is_run(path / "run"):
+        fix = f"pass {quoted(sequences[0])}; the run is {quoted(path / 'run')}."
+        return "a folder with a sequence and a run in it", fix
+    if len(sequences) == 1:
+        return "a folder with one sequence folder in it", f"pass {quoted(sequences[0])}."
+    videos = [entry for entry in inside if entry.suffix.lower() in VIDEO_SUFFIXES and entry.is_file()]
+    if len(videos) == 1:
+        return "a folder with a video", f"{_prepare(videos[0])}."
+    for what, pair in (("videos", _pair(videos)), ("image folders", _pair([f for f in folders if _has_images(f)]))):
+        if pair:
+            return f"{what} of two cameras", f"{_prepare_pair(*pair, inside)}."
+    if not sequences and _has_images(path):
+        return "a folder of images", f"{_prepare(path)}."
+    return None
+
+
+def _fix_of_run(path: Path) -> str:
+    is_done = (path / "scene.safetensors").is_file()
+    use = command("view", path) if is_done else command("train", "--resume", path)
+    data = None
+    with suppress(InputError):  # a damaged file: the run can still be named
+        data = read_json(path / "config.json").get("data")
+    place = data.get("path") if isinstance(data, dict) else None
+    sequence = f"pass its sequence, {quoted(place)}" if isinstance(place, str) and place else "pass a sequence folder"
+    return f"`{use}` {'shows' if is_done else 'resumes'} the run; else {sequence}."
+
+
+def _prepare(path: Path, *options: str | Path) -> str:
+    """The command that does every step, or those that make a sequence folder beside `path` and check it."""
+    data = _beside(path, "data")
+    every_step = command("run", path, _beside(path, "out"), *options)
+    return f"`{command('prepare', path, data, *options)}`, then `{command('check', data)}`; every step: `{every_step}`"
+
+
+def _beside(path: Path, ending: str) -> Path:
+    """A folder beside `path`, named after it: `clip_data` for `clip.mp4`."""
+    whole = path if path.name not in ("", "..") else Path(os.path.abspath(path))
+    return whole.with_name(f"{whole.stem if whole.is_file() else whole.name}_{ending}")
+
+
+def _prepare_pair(left: Path, right: Path, inside: Sequence[Path]) -> str:
+    files = [entry for entry in inside if entry.suffix.lower() in CALIBRATIONS]
+    files += [entry for entry in inside if entry.suffix == ".json" and "calib" in entry.name.lower()]
+    return _prepare(left, "--right", right, "--calibration", files[0] if len(files) == 1 else "FILE")
+
+
+def _pair(paths: Sequence[Path]) -> tuple[Path, Path] | None:
+    """(left, right) if there are two paths whose names differ in that word only."""
+    sides = {}
+    for path in paths:
+        if (words := SIDE.findall(path.stem)) and len(words) == 1:
+            sides[words[0][0].lower()] = path
+    if len(paths) != 2 or set(sides) != {"l", "r"}:
+        return None
+    rest = {SIDE.sub("", path.stem) for path in paths}
+    return (sides["l"], sides["r"]) if len(rest) == 1 else None
+
+
+def _has_images(folder: Path) -> bool:
+    """Whether a folder has two images or more."""
+    try:
+        return sum(entry.suffix.lower() in STILL_SUFFIXES and entry.name[0] != "." for entry in folder.iterdir()) > 1
+    except OSError:  # not readable
+        return False

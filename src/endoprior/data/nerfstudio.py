@@ -41,11 +41,7 @@ def is_nerfstudio(path: Path) -> bool:
 
 
 def load_nerfstudio(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Open the images that the file names, by their times if it has them, else in the order of their names.
-
-    Raises:
-        InputError: the file or an image cannot be used.
-    """
+    """Open the images that the file names, by their times if it has them, else in the order of their names."""
     file = path / FILE
     stored, frames = _frames(file)
     lenses: dict[str, Lens] = {}
@@ -65,11 +61,7 @@ def load_nerfstudio(path: Path, cfg: DataConfig) -> FrameSequence:
 
 
 def read_poses(file: Path) -> list[tuple[str, NDArray[np.float64]]]:
-    """The name of the image of each frame, and its (4, 4) camera-to-world in OpenCV axes, in units of the file.
-
-    Raises:
-        InputError: the file cannot be used.
-    """
+    """The name of the image of each frame, and its (4, 4) camera-to-world in OpenCV axes, in units of the file."""
     return [(_name(file, frame, i), _to_world(file, frame)) for i, frame in enumerate(_frames(file)[1])]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +14,12 @@ from ..core.config import DataConfig
 from ..core.shell import command
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .depth_files import DEPTH_SUFFIXES, read_depth_file
 from .files import list_files
-from .frame_files import files_of_images
-from .images import read_color, read_tool_mask
+from .frame_files import Kind, files_of_images
+from .images import DEPTH_SUFFIXES, read_color, read_depth_file, read_tool_mask
 from .lens import Lens, Undistorter
 from .poses import demand_rotations
 from .sequence import FrameSequence
-from .series import Kind
 
 ROUNDED_PX = 1.0
 """Scaled images may differ from the exact shape by rounding."""
@@ -58,30 +55,28 @@ def load_posed(
         files: that describe them; the first one holds the lens.
         remarks: what is unusual, so far.
         mm_per_unit: of positions; None if their scale is unknown, and depth is then in their units. Else it is in mm.
-    Raises:
-        InputError: images of several sizes, or other than those of the lens, or files that cannot be used.
     """
     demand_rotations(
         source, np.stack([each.world_to_camera[:3, :3] for each in posed]), "the poses", "export them again."
     )
     height, width = read_color(posed[0].file).shape[:2]
     size = (width, height)
-    lenses = _lenses(source, [each.lens for each in posed], size, remarks)
-    undistorters = {id(lens): Undistorter(lens) for lens in lenses}
-    if any(lens.is_bent for lens in lenses):
+    own = {id(each.lens): each.lens for each in posed}  # images share lenses
+    lenses = {key: Undistorter(_fitted(source, lens, size, remarks)) for key, lens in own.items()}
+    if any(each.lens.is_bent for each in lenses.values()):
         remarks.append(f"{source}: the lens is distorted; frames are undistorted, without part of the periphery")
     masks, tool_value = _masks(path, posed, remarks)
     depths = _depths(path, files[0], source, posed, remarks)
     if mm_per_unit is None:
         remarks.append(f"{source}: the scale of its poses is unknown; lengths are not millimeters")
-    kept = [i for i in kept_frames(len(posed), cfg) if all(i in files for files in (masks, depths) if files)]
+    kept = kept_frames(len(posed), cfg, having=[files for files in (masks, depths) if files])
     images = [posed[i].file for i in kept]
     scale = mm_per_unit or 1.0
     unit = cfg.depth_unit_mm or 1.0
 
     def decode(index: int) -> Pixels:
         at = kept[index]
-        undistorter = undistorters[id(lenses[at])]
+        undistorter = lenses[id(posed[at].lens)]
         tissue = undistorter.shown
         if mask := masks.get(at):
             tool = read_tool_mask(mask, tool_value, size)
@@ -90,7 +85,7 @@ def load_posed(
         return undistorter.smooth(read_color(images[index], size)), tissue, undistorter.nearest(depth)
 
     def camera(at: int) -> Camera:
-        matrix, pose = lenses[at].matrix, posed[at].world_to_camera.copy()
+        matrix, pose = lenses[id(posed[at].lens)].lens.matrix, posed[at].world_to_camera.copy()
         pose[:3, 3] *= scale
         return Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], pose)
 
@@ -109,29 +104,20 @@ def load_posed(
     )
 
 
-def _lenses(source: Path, lenses: Sequence[Lens], size: tuple[int, int], remarks: list[str]) -> list[Lens]:
-    """The lens of each image, in px of the images."""
-
-    @cache
-    def fitted(index: int) -> Lens:
-        lens = by_id[index]
-        if (lens.width, lens.height) == size:
-            return lens
-        scale = size[0] / lens.width
-        if abs(scale * lens.height - size[1]) > ROUNDED_PX:
-            want, fix = (
-                f"images of {lens.width}x{lens.height} px, or of that shape",
-                "pass the images that it was made of.",
-            )
-            raise input_error(source, want, f"{size[0]}x{size[1]}", fix)
-        remarks.append(
-            f"{source}: its lens is that of {lens.width}x{lens.height} px; fx {lens.matrix[0, 0]:g} px is scaled to "
-            f"{lens.matrix[0, 0] * scale:g} px for {size[0]}x{size[1]}"
-        )
-        return lens.scaled(*size)
-
-    by_id = {id(lens): lens for lens in lenses}
-    return [fitted(id(lens)) for lens in lenses]
+def _fitted(source: Path, lens: Lens, size: tuple[int, int], remarks: list[str]) -> Lens:
+    """The lens in px of images of that size."""
+    if (lens.width, lens.height) == size:
+        return lens
+    scale, shape = size[0] / lens.width, f"{lens.width}x{lens.height} px"
+    if abs(scale * lens.height - size[1]) > ROUNDED_PX:
+        fix = "pass the images that it was made of."
+        raise input_error(source, f"images of {shape}, or of that shape", f"{size[0]}x{size[1]}", fix)
+    focal = lens.matrix[0, 0]
+    remarks.append(
+        f"{source}: its lens is that of {shape}; fx {focal:g} px is scaled to {focal * scale:g} px for "
+        f"{size[0]}x{size[1]}"
+    )
+    return lens.scaled(*size)
 
 
 def _masks(path: Path, posed: Sequence[PosedImage], remarks: list[str]) -> tuple[Mapping[int, Path | None], int]:

@@ -1,4 +1,4 @@
-"""Camera poses as files hold them: checked, and converted to `world_to_camera`. `N` frames."""
+"""Camera poses and camera matrices as files hold them, checked and converted to ours. `N` frames."""
 
 from __future__ import annotations
 
@@ -8,9 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from .files import read_table
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R^T R - I of a valid rotation: far above float32 rounding, far below a real scale."""
+MATRIX_FILE = "intrinsics.txt"
+OFF_CENTER = 0.2
+"""Largest distance of the principal point from the image center, as a share of the image's sides."""
+SAME_SHAPE = 0.01
+"""Largest relative difference of the scales along both sides."""
 
 
 def demand_rotations(path: Path, rotations: NDArray[np.float64], where: str, fix: str) -> None:
@@ -32,3 +38,45 @@ def world_to_camera(rotation: NDArray[np.float64], center: NDArray[np.float64]) 
 def identity_poses(count: int) -> list[NDArray[np.float64]]:
     """`world_to_camera` of a static camera at the origin, once per frame."""
     return [np.eye(4) for _ in range(count)]
+
+
+def read_camera_matrix(path: Path) -> NDArray[np.float64]:
+    """(3, 3) camera matrix, px, of a text file with 3x3, 3x4 or 4x4 numbers.
+
+    Pixel centers of the file are integers, ours are halves: 0.5 is added to the principal point.
+    """
+    fix = "write the 3x3 camera matrix of the images (fx 0 cx; 0 fy cy; 0 0 1)."
+    rows = read_table(path, fix)
+    fits = rows.shape in ((3, 3), (3, 4), (4, 4)) and np.isfinite(rows).all()
+    if not fits or min(rows[0, 0], rows[1, 1]) <= 0 or not np.array_equal(rows[2, :3], (0, 0, 1)):
+        raise input_error(path, "a 3x3 camera matrix", f"shape {rows.shape} or other numbers", fix)
+    matrix = rows[:3, :3].copy()
+    matrix[:2, 2] += 0.5
+    return matrix
+
+
+def matrix_of_images(
+    path: Path, matrix: NDArray[np.float64], size: tuple[int, int], usual: tuple[int, int], remarks: list[str]
+) -> NDArray[np.float64]:
+    """The matrix in px of images of this (width, height): as it is, or scaled from images of the `usual` size.
+
+    The file does not state its size. The principal point tells which of both it is; a remark tells of a change.
+    """
+    if size == usual or _centered(matrix, size):
+        return matrix
+    across, down = size[0] / usual[0], size[1] / usual[1]
+    if abs(across / down - 1) > SAME_SHAPE or not _centered(matrix, usual):
+        got = f"cx {matrix[0, 2]:g}, cy {matrix[1, 2]:g}"
+        fix = "scale fx, fy, cx, cy to the size of the images."
+        raise input_error(path, f"a principal point near the center of {size[0]}x{size[1]} px", got, fix)
+    scaled = np.diag([across, down, 1.0]) @ matrix
+    remarks.append(
+        f"{path}: its principal point is that of {usual[0]}x{usual[1]} px; fx {matrix[0, 0]:g} px is scaled to "
+        f"{scaled[0, 0]:g} px for {size[0]}x{size[1]}"
+    )
+    return scaled
+
+
+def _centered(matrix: NDArray[np.float64], size: tuple[int, int]) -> bool:
+    off = np.abs(matrix[:2, 2] / size - 0.5)
+    return bool(off.max() <= OFF_CENTER)

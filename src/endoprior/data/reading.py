@@ -1,14 +1,24 @@
-"""Read bytes and text of user files: regular files only, of bounded size."""
+"""Read files of users: bytes, text, arrays and YAML. Regular files only, of bounded size; nothing in them is executed.
+
+A few lines of YAML with nested anchors can stand for billions of entries, and nesting can exhaust the stack.
+"""
 
 from __future__ import annotations
 
+import io
+import math
 import stat
+import zlib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from lzma import LZMAError
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
@@ -21,6 +31,14 @@ MOST_TEXT_BYTES = 64 << 20
 """Largest size of a JSON, YAML or text file."""
 ACCESS_HINT = "check the path and its permissions."
 Kind = Literal["a file", "a folder", "nothing", "a device or a pipe"]
+MOST_ARRAYS = 1000
+"""Largest number of arrays in one .npz file."""
+ZIP_START = b"PK"
+_BROKEN = (OSError, ValueError, TypeError, EOFError, BadZipFile, zlib.error, LZMAError)
+_UNUSUAL = (RuntimeError, MemoryError, OverflowError)  # encrypted, unknown compression, nested header
+MOST_NODES = 100_000
+"""Largest number of entries, each alias counted as often as it is used."""
+MOST_NESTED = 50
 
 
 def kind_of(path: Path) -> Kind:
@@ -107,3 +125,111 @@ def demand_file(path: Path, expected: str, fix: str, most: int = MOST_BYTES) -> 
         raise input_error(path, expected, "No such file" if kind == "nothing" else kind, fix)
     if (size := path.stat().st_size) > most:
         raise input_error(path, f"at most {most >> 20} MB", f"{size >> 20} MB", fix)
+
+
+def read_numpy(path: Path, expected: str, fix: str) -> NDArray | dict[str, NDArray]:
+    """The array of an .npy file, or the named arrays of an .npz file; no pickles.
+
+    Raises:
+        InputError: unreadable, not NumPy's, or larger than `MOST_BYTES`.
+    """
+    stored = read_bytes(path, expected, fix).tobytes()
+    try:
+        return _archive(stored) if stored.startswith(ZIP_START) else _array(stored)
+    except (*_BROKEN, *_UNUSUAL) as error:
+        problem = (str(error) or type(error).__name__).split("\n")[0][:120]
+    raise input_error(path, expected, problem, fix)
+
+
+def read_only_array(path: Path, fix: str) -> NDArray:
+    """The array of an .npy file, or the only one of an .npz file; otherwise as `read_numpy`."""
+    stored = read_numpy(path, "a NumPy file", fix)
+    arrays = [stored] if isinstance(stored, np.ndarray) else list(stored.values())
+    if len(arrays) != 1:
+        raise input_error(path, "one array", f"{len(arrays)}", fix)
+    return arrays[0]
+
+
+def _archive(stored: bytes) -> dict[str, NDArray]:
+    """The arrays of an .npz file; ValueError if they would be too large."""
+    with ZipFile(io.BytesIO(stored)) as archive:
+        members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
+        # Python's zipfile never decompresses a member to more than its header says.
+        size = sum(member.file_size for member in members)
+        if size > MOST_BYTES or len(members) > MOST_ARRAYS:
+            raise ValueError(f"{len(members)} arrays of {size >> 20} MB; at most {MOST_BYTES >> 20} MB are read")
+        return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}
+
+
+def _array(stored: bytes) -> NDArray:
+    """The array in the bytes of an .npy file; ValueError or another error if they are not one."""
+    file = io.BytesIO(stored)
+    if not stored.startswith(np.lib.format.MAGIC_PREFIX):
+        raise ValueError("pickled objects or something else" if stored else "an empty file")
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(file)
+    if version not in readers:
+        raise ValueError(f"format version {version[0]}.{version[1]}")
+    shape, _, dtype = readers[version](file)
+    if dtype.hasobject:
+        raise ValueError("pickled objects")
+    if dtype.kind not in "biufcSU":
+        raise ValueError(f"values of type {dtype}")
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(stored) - file.tell():
+        raise ValueError(f"a header of shape {shape} for {len(stored) - file.tell()} bytes")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
+
+
+class BoundedLoader(yaml.SafeLoader):
+    """Safe YAML of bounded nesting and size."""
+
+    _depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """One node of the text; an error if it is nested too deeply, before the parser's own stack overflows."""
+        self._depth += 1
+        if self._depth > MOST_NESTED:
+            raise yaml.YAMLError(f"entries nested more than {MOST_NESTED} deep")
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self._depth -= 1
+
+    def get_single_node(self) -> Any:
+        """The whole text; an error if it has too many entries, or one name twice."""
+        node = super().get_single_node()
+        if node is not None and (size := _unfolded(node, {}, 0)) > MOST_NODES:
+            raise yaml.YAMLError(f"{size:.0e} entries, aliases counted as often as used; at most {MOST_NODES} are read")
+        return node
+
+
+def load_yaml(text: str, loader: type[BoundedLoader] = BoundedLoader) -> Any:
+    """The data in a YAML text.
+
+    Raises:
+        yaml.YAMLError, ValueError: not YAML, tags of objects, too deep, or too many entries.
+    """
+    try:
+        return yaml.load(text, loader)  # a safe loader, see above
+    except RecursionError:
+        raise yaml.YAMLError("entries nested too deeply") from None
+
+
+def _unfolded(node: yaml.Node, known: dict[int, int], depth: int) -> int:
+    """Entries that a node stands for; ValueError if it contains itself or if aliases nest too deeply."""
+    if id(node) in known:
+        if not known[id(node)]:
+            raise yaml.YAMLError("an entry that contains itself")
+        return known[id(node)]
+    if depth > MOST_NESTED:
+        raise yaml.YAMLError(f"entries nested more than {MOST_NESTED} deep")
+    known[id(node)] = 0  # not known yet
+    parts = node.value if isinstance(node, yaml.CollectionNode) else []
+    if isinstance(node, yaml.MappingNode):
+        names = Counter(key.value for key, _ in parts if isinstance(key, yaml.ScalarNode) and key.value != "<<")
+        if twice := [name for name, count in names.items() if count > 1]:
+            raise yaml.YAMLError(f"the name {twice[0]!r} twice in one place")
+    flat = [part for pair in parts for part in pair] if isinstance(node, yaml.MappingNode) else parts
+    known[id(node)] = 1 + sum(_unfolded(part, known, depth + 1) for part in flat)
+    return known[id(node)]

@@ -20,10 +20,9 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .depth_files import read_values
 from .files import list_files, read_json, read_matrix
 from .formats import Format
-from .images import read_color
+from .images import read_color, read_values
 from .poses import demand_rotations
 from .sequence import FrameSequence
 
@@ -46,11 +45,7 @@ def is_scared(path: Path) -> bool:
 
 
 def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Open a processed keyframe folder; poses are relative to the first frame.
-
-    Raises:
-        InputError: raw or incomplete data, mixed versions, or files that cannot be used.
-    """
+    """Open a processed keyframe folder; poses are relative to the first frame."""
     data = path / "data"
     for folder in ("frame_data", *FOLDERS):
         if not (data / folder).is_dir():
@@ -62,16 +57,18 @@ def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
         if odd:
             got = f"{len(others)}; {odd[0]} is in one of the two only"
             raise input_error(data / folder, f"the {len(records)} frames of frame_data", got, HINT)
-    number = dataset_number(path)
-    remarks = _remarks(path, number, cfg)
+    number, remarks = dataset_number(path), []
+    if number is None and not cfg.stride:
+        remarks.append(f"{path}: no folder dataset_k in its path, so every frame is kept; set data.stride")
+    if number in BADLY_CALIBRATED:
+        remarks.append(f"{path}: dataset {number} of SCARED is badly calibrated; its depth does not fit its images")
     records = [records[i] for i in kept_frames(len(records), cfg, STRIDES.get(number or 0, 1))]
     names = [file.stem for file in records]
     images, disparities, geometries = ([data / f / f"{n}{s}" for n in names] for f, s in FOLDERS.items())
     height, width = read_color(images[0]).shape[:2]
     size = (width, height)
     geometry = [_geometry(*files, size) for files in zip(records, geometries, strict=True)]
-    versions = sorted({one.version for one in geometry})
-    if len(versions) > 1:
+    if len({one.version for one in geometry}) > 1:
         hint = "process all frames by the same program."
         raise input_error(data / "reprojection_data", "files of one version", "versions 1 and 2", hint)
     if not all(one.is_turned for one in geometry):
@@ -136,14 +133,11 @@ def dataset_number(path: Path) -> int | None:
 
 
 class _Geometry(NamedTuple):
-    """Of one frame after rectification."""
+    """Of one frame after rectification: K (3, 3), integer pixel centers; (4, 4) pose, mm; (4, 4) Q."""
 
     matrix: NDArray[np.float64]
-    """(3, 3) camera matrix, integer pixel centers."""
     world_to_camera: NDArray[np.float64]
-    """(4, 4), mm."""
     reprojection: NDArray[np.float64]
-    """(4, 4) Q."""
     version: int
     is_turned: bool
     """Whether the rotation of the rectification is known."""
@@ -152,7 +146,9 @@ class _Geometry(NamedTuple):
 def _geometry(record: Path, geometry: Path, size: tuple[int, int]) -> _Geometry:
     about, stored = read_json(record, HINT), read_json(geometry, HINT)
     pose = read_matrix(record, about, "camera-pose", (4, 4))
-    version = _version(geometry, stored)
+    version = stored.get("schema_version", 2 if VERSION_2[0] in stored else 1)
+    if type(version) is not int or version not in (1, 2):
+        raise input_error(geometry, "schema_version 1 or 2", repr(version), HINT)
     if version == 1:
         reprojection = read_matrix(geometry, stored, "reprojection-matrix", (4, 4))
         focal, cx, cy = reprojection[2, 3], -reprojection[0, 3], -reprojection[1, 3]
@@ -163,11 +159,9 @@ def _geometry(record: Path, geometry: Path, size: tuple[int, int]) -> _Geometry:
         matrix = read_matrix(geometry, stored, VERSION_2[1], (3, 4))[:, :3]
         reprojection = read_matrix(geometry, stored, VERSION_2[2], (4, 4))
         if stored.get("image_size", list(size)) != list(size):
-            got = f"{stored['image_size']}"
-            raise input_error(geometry, f"image_size {list(size)} like the image", got, HINT)
+            raise input_error(geometry, f"image_size {list(size)} like the image", f"{stored['image_size']}", HINT)
     if min(matrix[0, 0], matrix[1, 1]) <= 0:
-        got = f"{matrix[0, 0]:g}, {matrix[1, 1]:g}"
-        raise input_error(geometry, "focal lengths > 0 px", got, HINT)
+        raise input_error(geometry, "focal lengths > 0 px", f"{matrix[0, 0]:g}, {matrix[1, 1]:g}", HINT)
     if rotation is not None:
         pose[:3] = rotation @ pose[:3]
     return _Geometry(matrix, pose, reprojection, version, rotation is not None)
@@ -187,24 +181,6 @@ def _rectifying_rotation(record: Path, about: dict[str, Any], size: tuple[int, i
     if not shift.any():
         raise input_error(record, "a right camera beside the left one", "T of 0 mm", HINT)
     return cv2.stereoRectify(left, None, right, None, size, turn, shift[:, None])[0]
-
-
-def _version(path: Path, stored: dict[str, Any]) -> int:
-    """1 or 2: the file's `schema_version`, or what its keys imply."""
-    version = stored.get("schema_version", 2 if VERSION_2[0] in stored else 1)
-    if type(version) is not int or version not in (1, 2):
-        raise input_error(path, "schema_version 1 or 2", repr(version), HINT)
-    return version
-
-
-def _remarks(path: Path, number: int | None, cfg: DataConfig) -> list[str]:
-    """What is unusual about the keyframe as a whole."""
-    remarks = []
-    if number is None and not cfg.stride:
-        remarks.append(f"{path}: no folder dataset_k in its path, so every frame is kept; set data.stride")
-    if number in BADLY_CALIBRATED:
-        remarks.append(f"{path}: dataset {number} of SCARED is badly calibrated; its depth does not fit its images")
-    return remarks
 
 
 FORMAT = Format(is_scared, load_scared)

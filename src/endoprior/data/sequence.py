@@ -10,9 +10,9 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Protocol, overload
+from typing import Any, Literal, Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,7 @@ from ..footage.right_view import right_frame
 from ..system.memory import BoundedCache, cache_bytes, workers
 from .description import ESTIMATED_POSES, TOOLS_FOUND
 from .reading import reading
-from .right_eye import RightEye
-from .truth import Truth
+from .truth import RightEye, Truth
 
 Split = Literal["train", "test", "video"]
 TEST_EVERY = 8
@@ -44,72 +43,47 @@ class FrameSpan(Protocol):
     def stop(self) -> int: ...
 
 
+@dataclass(eq=False, repr=False)
 class FrameSequence:
     """Frames of one scene, decoded when they are used; a cache keeps as many as memory allows, 1 MB per 110,000 px."""
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: list[Camera],
-        read_frame: Callable[[int], Frame],
-        *,
-        frames_per_second: float | None = None,
-        images: list[Path] | None = None,
-        files: list[Path] | None = None,
-        truth: Truth | None = None,
-        right_eye: RightEye | None = None,
-        remarks: list[str] | None = None,
-        mask_folder: str = "masks",
-        mask_files: list[Path] | None = None,
-        new_mask_files: list[Path] | None = None,
-        mask_tool_value: int = 255,
-        depth_is_relative: bool = False,
-        sources: dict[str, str] | None = None,
-    ) -> None:
-        """Describe a sequence; nothing is decoded yet.
+    path: Path
+    """Folder of the sequence, for messages."""
+    _cameras: list[Camera]
+    _read_frame: Callable[[int], Frame]
+    """Decodes frame i; called again if the frame is no longer in the cache."""
+    _: KW_ONLY
+    frames_per_second: float | None = None
+    """Of the video, None if unknown."""
+    image_names: list[str] = field(default_factory=list)
+    """Name of each frame's color image, without its suffix; empty if frames are not files of their own."""
+    files: list[Path] = field(default_factory=list)
+    """Every file that makes up the sequence."""
+    truth: Truth | None = None
+    """Ground truth of a synthetic sequence."""
+    right_eye: RightEye | None = None
+    """Pictures of the right camera, to score against."""
+    remarks: list[str] = field(default_factory=list)
+    """What is unusual but usable, one line each."""
+    mask_name: str = "masks"
+    """Name of the folder of the masks; another than `masks` or `gt_masks` where the layout has none."""
+    mask_files: list[Path] = field(default_factory=list)
+    """The PNG of each frame's mask at the size of the frame; empty if there are no such files."""
+    new_mask_files: list[Path] = field(default_factory=list)
+    """Where there are none: the PNG of each frame that becomes its mask if all of them are made."""
+    mask_tool_value: int = 255
+    """Value of tools in these files, 255 or 0."""
+    depth_is_relative: bool = False
+    """The scale of depth is unknown or assumed, so that lengths are not in mm."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """Origin of each part, such as {"depth": "stereo"}."""
+    reading: DataConfig | None = None
+    """How `load_sequence` read it; None for a sequence that was made in another way."""
 
-        Args:
-            path: folder of the sequence, for messages.
-            cameras: the camera of each frame.
-            read_frame: decodes frame i; called again if the frame is no longer in the cache.
-            frames_per_second: of the video, None if unknown.
-            images: the color image of each frame, None if frames are not files of their own.
-            files: every file that makes up the sequence, for `fingerprint`.
-            truth: ground truth of a synthetic sequence.
-            right_eye: pictures of the right camera, to score against.
-            remarks: what is unusual but usable, one line each.
-            mask_folder: name of the folder of the masks, for messages.
-            mask_files: the PNG of each frame's mask at the size of the frame; None if there are no such files.
-            new_mask_files: where there are none: the PNG of each frame that becomes its mask if all of them are made.
-            mask_tool_value: value of tools in these files, 255 or 0.
-            depth_is_relative: the scale of depth is unknown or assumed, so that lengths are not in mm.
-            sources: origin of each part, such as {"depth": "stereo"}.
-        """
-        self.path = path
-        self.depth_is_relative = depth_is_relative
-        self.sources = dict(sources or {})
-        self.frames_per_second = frames_per_second
-        self.truth, self.right_eye = truth, right_eye
-        self.image_names = [image.stem for image in images or []]
-        """Name of each frame's color image, without its suffix; empty if frames are not files of their own."""
-        self.mask_files, self.mask_tool_value = list(mask_files or []), mask_tool_value
-        self.new_mask_files = list(new_mask_files or [])
-        self._cameras = cameras
-        self._read_frame = read_frame
-        self.files = list(files or [])
-        """Every file that makes up the sequence."""
+    def __post_init__(self) -> None:
         self._states = [_state(file) for file in self.files]
-        self.reading: DataConfig | None = None
-        """How `load_sequence` read it; None for a sequence that was made in another way."""
-        self._remarks = remarks or []
-        self._masks = path / mask_folder
         self._cache: BoundedCache[Frame] = BoundedCache(cache_bytes(), _frame_bytes)
         self._holds_out, self._first, self._test_phase = False, 0, 0
-
-    @property
-    def remarks(self) -> list[str]:
-        """What is unusual but usable, one line each."""
-        return list(self._remarks)
 
     @property
     def masks_are_found(self) -> bool:
@@ -122,14 +96,14 @@ class FrameSequence:
         return self.sources.get("poses") in ESTIMATED_POSES
 
     @property
-    def mask_folder(self) -> str:
-        """Name of the folder of the masks that are read; empty where the layout has none, or it is missing."""
-        return self._masks.name if self._masks.name in ("masks", "gt_masks") and self._masks.is_dir() else ""
-
-    @property
     def takes_masks(self) -> bool:
         """Whether the layout has a folder of masks, so that masks that are painted there are read."""
-        return self._masks.name in ("masks", "gt_masks")
+        return self.mask_name in ("masks", "gt_masks")
+
+    @property
+    def mask_folder(self) -> str:
+        """Name of the folder of the masks that are read; empty where the layout has none, or it is missing."""
+        return self.mask_name if self.takes_masks and (self.path / self.mask_name).is_dir() else ""
 
     def __len__(self) -> int:
         return len(self._cameras)
@@ -184,8 +158,7 @@ class FrameSequence:
         Raises:
             InputError: it is too short, so that no frame would be held out.
         """
-        view = copy(self)
-        view._test_phase = phase
+        view = self._with(_test_phase=phase)
         if phase and not view.indices("test"):
             expected = f"a phase that leaves a test frame of {len(self)} frames"
             raise input_error("data.test_phase", expected, str(phase), "choose a lower one; 0 is the published split.")
@@ -197,22 +170,31 @@ class FrameSequence:
 
     def training_view(self) -> FrameSequence:
         """What a method trains on: no ground truth and no right eye, and reading a test frame is an error."""
-        view = copy(self)
-        view.truth, view.right_eye, view._holds_out = None, None, True
-        return view
+        return self._with(truth=None, right_eye=None, _holds_out=True)
 
     def part(self, start: int, stop: int) -> FrameSequence:
         """Frames `start` to `stop` - 1 as a sequence of its own, without ground truth; held-out frames stay held out.
 
         Indices and times of its frames count from its start.
         """
-        view, num = copy(self), stop - start
-        view._cameras, view._first = self._cameras[start:stop], self._first + start
-        view._read_frame = lambda index: replace(self._read_frame(start + index), index=index, time=index / num)
-        view._cache = BoundedCache(cache_bytes(), _frame_bytes)
-        view.image_names, view.mask_files = self.image_names[start:stop], self.mask_files[start:stop]
-        view.new_mask_files = []  # the reader wants those of all frames
-        view.truth, view.right_eye = None, self.right_eye and self.right_eye.part(start, stop)
+        num = stop - start
+        return self._with(
+            _cameras=self._cameras[start:stop],
+            _first=self._first + start,
+            _read_frame=lambda index: replace(self._read_frame(start + index), index=index, time=index / num),
+            image_names=self.image_names[start:stop],
+            mask_files=self.mask_files[start:stop],
+            new_mask_files=[],  # the reader wants those of all frames
+            truth=None,
+            right_eye=self.right_eye and self.right_eye.part(start, stop),
+        )
+
+    def _with(self, **changes: Any) -> FrameSequence:
+        """A view of this sequence with other attributes; frames that are read in another way are cached anew."""
+        view = copy(self)
+        vars(view).update(changes)
+        if "_read_frame" in changes:
+            view._cache = BoundedCache(cache_bytes(), _frame_bytes)
         return view
 
     def training_part(self, span: FrameSpan) -> FrameList:
@@ -235,10 +217,7 @@ class FrameSequence:
             frame = self._read_frame(index)
             return replace(frame, tissue_mask=tissue_of(frame))
 
-        view = copy(self)
-        view._read_frame = read
-        view._cache = BoundedCache(cache_bytes(), _frame_bytes)
-        return view
+        return self._with(_read_frame=read)
 
     def with_poses(self, cameras: Sequence[Camera]) -> FrameSequence:
         """This sequence with the poses of other cameras, one for each frame; lenses and sizes stay.
@@ -248,11 +227,10 @@ class FrameSequence:
         poses = [camera.world_to_camera for camera in cameras]
         if all(np.array_equal(own.world_to_camera, pose) for own, pose in zip(self._cameras, poses, strict=True)):
             return self
-        view = copy(self)
-        view._cameras = [replace(own, world_to_camera=p) for own, p in zip(self._cameras, poses, strict=True)]
-        view._read_frame = lambda index: replace(self._read_frame(index), camera=view._cameras[index])
-        view._cache = BoundedCache(cache_bytes(), _frame_bytes)
-        return view
+        cameras = [replace(own, world_to_camera=p) for own, p in zip(self._cameras, poses, strict=True)]
+        return self._with(
+            _cameras=cameras, _read_frame=lambda index: replace(self._read_frame(index), camera=cameras[index])
+        )
 
     def fingerprint(self) -> str:
         """SHA-256, in hex, of the names (below the folder) and contents of all files of the sequence."""
@@ -294,17 +272,19 @@ class FrameSequence:
         tissue = [share for share, _, _ in contents]
         if not any(tissue):
             hint = "the polarity may be inverted: masks are 255 on tools."
-            raise input_error(self._masks, "tissue in at least one frame", "tool everywhere", hint)
+            raise input_error(self.path / self.mask_name, "tissue in at least one frame", "tool everywhere", hint)
         if not any(has_depth for _, has_depth, _ in contents):
             hint = "provide depth in mm, 0 where it is missing."
             raise input_error(self.path / "depth", "depth > 0 in at least one frame", "0 everywhere", hint)
         if not any(contents[index][2] for index in self.indices("train")):
             hint = "the mask's polarity may be inverted, or the depth may be of the tool only."
             raise input_error(self.path / "depth", "depth on tissue in a training frame", "none", hint)
-        remarks = self.remarks
+        remarks = list(self.remarks)
         tool = 1 - sum(tissue) / len(tissue)
         if tool > TOOL_FRACTION_WARNING:
-            remarks.append(f"{self._masks}: {tool:.0%} of all pixels are masked; the polarity may be inverted")
+            remarks.append(
+                f"{self.path / self.mask_name}: {tool:.0%} of all pixels are masked; the polarity may be inverted"
+            )
         if self.depth_is_relative:
             remarks.append(f"{self.path}: the scale of its depth is unknown or assumed; lengths are not millimeters")
         empty = [index for index, (_, _, has_tissue_depth) in enumerate(contents) if not has_tissue_depth]

@@ -13,11 +13,10 @@ import numpy as np
 from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..core.shell import command
-from .depth_files import read_values
 from .endonerf import load_endonerf
 from .files import list_files, read_json
 from .formats import Format
-from .images import decode_image
+from .images import decode_image, read_values
 from .sequence import FrameSequence, is_test_frame
 
 RAW_FILE, POSES_FILE = "StereoCalibration.ini", "groundtruth.txt"
@@ -32,9 +31,6 @@ def load_stereomis(path: Path, cfg: DataConfig) -> FrameSequence:
     """Open a prepared sequence.
 
     8-bit depth is Omnidata's relative depth of unknown scale; 16-bit depth is in mm.
-
-    Raises:
-        InputError: a raw sequence, another split than every 8th frame, or files that cannot be used.
     """
     if not (path / "images").is_dir():
         raise input_error(path / RAW_FILE, "a prepared sequence", "a raw one", f"`{_preparing(path)}`.")

@@ -19,10 +19,10 @@ from ..core.config import DataConfig
 from ..core.shell import command
 from ..core.types import Frame
 from ..system.atomic import whole_file
+from .description import RECORD, read_record
 from .endonerf import load_endonerf
 from .formats import Format
 from .images import decode_image, single_channel
-from .prepare_record import RECORD, read_record
 from .reading import kind_of
 from .sequence import FrameSequence
 from .truth import Tracks
@@ -41,11 +41,7 @@ def is_stir(path: Path) -> bool:
 
 
 def load_stir(path: Path, cfg: DataConfig) -> FrameSequence:
-    """Explain how to prepare a clip, by stereo if the right camera and the calibration are there.
-
-    Raises:
-        InputError: always.
-    """
+    """Explain how to prepare a clip, by stereo if the right camera and the calibration are there."""
     clips = [path] if (path / SEGMENTATIONS[0]).exists() else sorted(path.glob("left*/seq*"))
     clip = clips[0] if clips else path
     recording = Path(os.path.abspath(clip)).parents[1]
@@ -75,8 +71,6 @@ def tattoo_centers(path: Path) -> NDArray[np.float64]:
     Returns:
         (P, 2) x, y of the middle of each connected region's bounding box, as in STIR's benchmark, px of the image.
         The top-left pixel is centered at (0.5, 0.5).
-    Raises:
-        InputError: unreadable, or with differing color channels.
     """
     marked = (single_channel(path, decode_image(path, None)) > 0).astype(np.uint8)
     _, _, boxes, _ = cv2.connectedComponentsWithStats(marked, connectivity=8)
@@ -133,8 +127,6 @@ def write_stir_tracks(clip: Path, prepared: Path) -> Path:
     Args:
         clip: STIR's `left/seqNN` folder.
         prepared: the folder that `endoprior prepare` wrote for its video, all frames.
-    Raises:
-        InputError: no record, no segmentations, those of other images, or no spot with depth.
     """
     sequence = load_endonerf(Path(prepared), DataConfig(lift_missing_depth=False))
     record = read_record(Path(prepared))

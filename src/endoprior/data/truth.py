@@ -1,23 +1,29 @@
-"""Ground truth of a synthetic sequence: tissue behind the tool, exact depth, material points, the camera path."""
+"""What frames are scored against, never trained on: the truth of a synthetic sequence, and the right eye's pictures."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import input_error
+from ..core.checks import InputError, input_error
 from ..core.geometry import FARTHEST_MM
-from .files import read_json
-from .images import read_color
-from .numpy_files import read_numpy
+from .description import LEAST, MOST
+from .files import IMAGE_SUFFIXES, files_with, read_json
+from .frame_files import match_names
+from .images import read_color, read_header
+from .pixels import shrunk_color
 from .poses import ROTATION_TOLERANCE, demand_rotations
+from .reading import read_bytes, read_numpy
 
 _AGAIN = "write the truth again."
-_FILE = ("a NumPy file", _AGAIN)
+FOLDER = "right"
+"""Name of the folder of the right images."""
 
 
 @dataclass(frozen=True)
@@ -47,23 +53,24 @@ class Truth:
         path = self.folder / "tissue" / f"{self._names[index]}.png"
         return read_color(path) if path.parent.is_dir() else None
 
+    def _array(self, name: str) -> NDArray | dict[str, NDArray] | None:
+        """What a NumPy file of the folder holds; None without."""
+        path = self.folder / name
+        return read_numpy(path, "a NumPy file", _AGAIN) if path.exists() else None
+
     def depth(self, index: int) -> NDArray[np.float32] | None:
         """(H, W) exact z of the tissue of frame `index`, tool ignored, mm."""
         path = self.folder / "depth" / f"{self._names[index]}.npy"
-        return np.asarray(read_numpy(path, *_FILE), np.float32) if path.parent.is_dir() else None
+        return np.asarray(read_numpy(path, "a NumPy file", _AGAIN), np.float32) if path.parent.is_dir() else None
 
     def seen(self, index: int) -> NDArray[np.bool_] | None:
         """(H, W) True behind the tool of frame `index` where some training frame shows that tissue; None without."""
-        path = self.folder / "seen" / f"{self._names[index]}.npy"
-        return np.asarray(read_numpy(path, *_FILE), bool) if path.exists() else None
+        stored = self._array(f"seen/{self._names[index]}.npy")
+        return None if stored is None else np.asarray(stored, bool)
 
     @cached_property
     def side_poses(self) -> dict[str, NDArray[np.float64]]:
-        """Cameras beside the endoscope by name: (4, 4) rigid transforms from the frame's camera axes; empty without.
-
-        Raises:
-            InputError: the file holds something else.
-        """
+        """Cameras beside the endoscope by name: (4, 4) rigid transforms from the frame's camera axes; empty without."""
         path = self.folder / "side" / "world_to_camera.json"
         if not path.exists():
             return {}
@@ -82,22 +89,17 @@ class Truth:
 
         Both are 0 where the endoscope does not see the tissue.
         """
-        path = self.folder / "side" / name / f"{self._names[index]}.npy"
-        if not path.exists():
-            return None
-        return read_color(path.with_suffix(".png")), np.asarray(read_numpy(path, *_FILE), np.float32)
+        file = f"side/{name}/{self._names[index]}"
+        depth = self._array(f"{file}.npy")
+        return None if depth is None else (read_color(self.folder / f"{file}.png"), np.asarray(depth, np.float32))
 
     @cached_property
     def camera_to_world(self) -> NDArray[np.float64] | None:
-        """(T, 4, 4) true pose of each frame's camera, mm, OpenCV axes; its world axes may differ from the sequence's.
-
-        Raises:
-            InputError: the file holds something else.
-        """
-        path = self.folder / "camera_to_world.npy"
-        if not path.exists():
+        """(T, 4, 4) true pose of each frame's camera, mm, OpenCV axes; world axes may differ from the sequence's."""
+        path, stored = self.folder / "camera_to_world.npy", self._array("camera_to_world.npy")
+        if stored is None:
             return None
-        stored, shape = read_numpy(path, *_FILE), (len(self._names), 4, 4)
+        shape = (len(self._names), 4, 4)
         if isinstance(stored, dict) or stored.dtype.kind not in "iuf" or stored.shape != shape:
             got = "several arrays" if isinstance(stored, dict) else f"{stored.shape} of {stored.dtype}"
             raise input_error(path, f"numbers of shape {shape}", got, _AGAIN)
@@ -112,10 +114,9 @@ class Truth:
     @cached_property
     def tracks(self) -> Tracks | None:
         """All tracks, or None."""
-        path = self.folder / "tracks.npz"
-        if not path.exists():
+        path, stored = self.folder / "tracks.npz", self._array("tracks.npz")
+        if stored is None:
             return None
-        stored = read_numpy(path, *_FILE)
         if not isinstance(stored, dict) or not {"points", "visible"} <= stored.keys():
             got = ", ".join(stored) if isinstance(stored, dict) else "one array"
             raise input_error(path, "arrays points and visible", got, _AGAIN)
@@ -130,3 +131,79 @@ class Truth:
         if region is not None and region.shape != (count,):
             raise input_error(path, f"a region of shape ({count},)", f"{region.shape}", _AGAIN)
         return tracks
+
+
+class RightEye:
+    """The right pictures of a rectified pair; each is decoded when it is used.
+
+    The right camera has the lens of the left one, turned like it, and stands `baseline_mm` along its +x axis.
+    """
+
+    def __init__(self, files: list[Path], baseline_mm: float, size: tuple[int, int], shrink: int = 1) -> None:
+        """Describe the pictures; nothing is decoded yet.
+
+        Args:
+            files: the right picture of each frame.
+            baseline_mm: distance of the cameras, > 0.
+            size: (width, height) of the files, px.
+            shrink: pictures are this many times smaller than the files.
+        """
+        self.files, self.baseline_mm = files, baseline_mm
+        self._size, self._shrink = size, shrink
+
+    def part(self, start: int, stop: int) -> RightEye:
+        """The pictures of frames `start` to `stop` - 1."""
+        return RightEye(self.files[start:stop], self.baseline_mm, self._size, self._shrink)
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """(H, W, 3) right picture of frame `index` at the size of the left one, 0..255."""
+        return shrunk_color(read_color(self.files[index], self._size), self._shrink)
+
+
+def open_right_eye(
+    path: Path,
+    images: list[Path],
+    kept: list[int],
+    size: tuple[int, int],
+    described: dict[str, Any],
+    shrink: int,
+    remarks: list[str],
+    *,
+    relative: bool,
+) -> RightEye | None:
+    """The right eye of a sequence folder, if it has one that can be used; else a remark says why not.
+
+    Args:
+        path: the folder; nothing is said of one without `right/`.
+        images: the left picture of every frame in the folder.
+        kept: positions in `images` of the frames to read.
+        size: (width, height) of the left pictures, px.
+        described: contents of `sequence.json`, of which `baseline_mm` is used.
+        shrink: see `RightEye`.
+        remarks: gets the reason, or that the files are matched in order.
+        relative: whether the scale of depth is unknown: then a baseline in mm does not fit the scene.
+    """
+    folder = path / FOLDER
+    if not folder.is_dir():
+        return None
+    files, baseline = files_with(folder, IMAGE_SUFFIXES), described.get("baseline_mm")
+    reason, matched = "", None
+    with suppress(InputError):
+        names = [file.stem for file in images]
+        matched = match_names(folder, [file.name for file in files], range(len(images)), names) if files else None
+    if matched is None:
+        reason = f"it has {len(files)} images, not one of the name or number of each of the {len(images)} in images/"
+    elif baseline is None:
+        reason = "sequence.json has no baseline_mm, the distance between the cameras"
+    elif isinstance(baseline, bool) or not isinstance(baseline, int | float) or not LEAST <= baseline <= MOST:
+        reason = f"baseline_mm in sequence.json is {repr(baseline)[:60]}, not a number in [{LEAST:g}, {MOST:g}]"
+    elif relative:
+        reason = "the scale of the depth is unknown, and the distance between the cameras is in mm"
+    elif not (found := read_header(read_bytes(files[matched.files[0]]).tobytes())) or found[:2] != size:
+        got = f"{found.width}x{found.height} px" if found else "no size that can be read"
+        reason = f"its first image has {got}, and the left one {size[0]}x{size[1]} px"
+    if reason or matched is None:
+        remarks.append(f"{folder}: ignored, because {reason}")
+        return None
+    remarks += [f"{folder}: {matched.rule}"] if "in order" in matched.rule else []
+    return RightEye([files[matched.files[i]] for i in kept], float(baseline), size, shrink)

@@ -60,6 +60,17 @@ def plan_windows(cameras: Sequence[Camera], looks: Looks, cfg: WindowConfig) -> 
     centers = np.stack([camera.center for camera in cameras])
     moving = bool(np.ptp(centers, axis=0).any() or np.ptp(rotations, axis=0).any())
     usual_mm = float(np.nanmedian(looks.depth_mm)) if np.isfinite(looks.depth_mm).any() else np.inf
+
+    def has_changed(first: int, index: int) -> bool:
+        """Whether one of the rules ends a window that starts at `first` before frame `index`."""
+        depth_mm = looks.depth_mm[first] if np.isfinite(looks.depth_mm[first]) else usual_mm
+        cosine = (np.trace(rotations[first] @ rotations[index].T) - 1) / 2
+        return bool(
+            np.degrees(np.arccos(np.clip(cosine, -1, 1))) > cfg.turn_degrees
+            or np.linalg.norm(centers[index] - centers[first]) > cfg.shift_share * depth_mm
+            or np.abs(looks.thumbnails[index] - looks.thumbnails[first]).mean() > cfg.picture_change
+        )
+
     starts, first = [0], 0
     for index in range(1, num):
         length = index - first
@@ -67,8 +78,7 @@ def plan_windows(cameras: Sequence[Camera], looks: Looks, cfg: WindowConfig) -> 
             if num - first > cfg.longest and num - cfg.shortest >= first + cfg.overlap:
                 starts.append(num - cfg.shortest)
             break
-        due = moving and length >= cfg.shortest and _has_changed(first, index, rotations, centers, looks, usual_mm, cfg)
-        if due or length + cfg.overlap >= cfg.longest:
+        if (moving and length >= cfg.shortest and has_changed(first, index)) or length + cfg.overlap >= cfg.longest:
             first = index
             starts.append(first)
     stops = [min(start + cfg.overlap, num) for start in starts[1:]] + [num]
@@ -78,22 +88,3 @@ def plan_windows(cameras: Sequence[Camera], looks: Looks, cfg: WindowConfig) -> 
 def windows_by_length(num_frames: int, cfg: WindowConfig) -> int:
     """Number of windows where nothing but the length cuts: what a static camera needs."""
     return max(-(-(num_frames - cfg.overlap) // (cfg.longest - cfg.overlap)), 1)
-
-
-def _has_changed(
-    first: int,
-    index: int,
-    rotations: NDArray[np.float64],
-    centers: NDArray[np.float64],
-    looks: Looks,
-    usual_mm: float,
-    cfg: WindowConfig,
-) -> bool:
-    """Whether one of the rules ends a window that starts at `first` before frame `index`."""
-    depth_mm = looks.depth_mm[first] if np.isfinite(looks.depth_mm[first]) else usual_mm
-    cosine = (np.trace(rotations[first] @ rotations[index].T) - 1) / 2
-    return bool(
-        np.degrees(np.arccos(np.clip(cosine, -1, 1))) > cfg.turn_degrees
-        or np.linalg.norm(centers[index] - centers[first]) > cfg.shift_share * depth_mm
-        or np.abs(looks.thumbnails[index] - looks.thumbnails[first]).mean() > cfg.picture_change
-    )

@@ -1,23 +1,24 @@
 """Writes a sequence folder: the EndoNeRF layout plus `sequence.json`.
 
-`FrameFiles` writes into an existing folder. `SequenceWriter` writes a whole sequence: everything goes into a hidden
+`FrameFiles` writes into an existing folder. `new_sequence` writes a whole sequence: everything goes into a hidden
 folder beside the target, which gets the target's name when it is complete.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.atomic import reject_occupied, whole_folder
+from ..system.atomic import whole_folder
+from .folder_edits import depth_bounds, pose_table
 from .images import decode_image, save_png
-from .pose_writing import depth_bounds, pose_table
 
 FARTHEST_UNIT = 65534
 """Of the depth files; 65535 stands for missing depth in the files of many programs."""
@@ -63,6 +64,8 @@ class FrameFiles:
     def __init__(self, folder: Path, meta: SequenceMeta, count: int = 0) -> None:
         """Args: folder: to write to. meta: the facts. count: complete frames that are already in the folder."""
         self.folder, self.meta, self.count = folder, meta, count
+        self.camera_to_world: NDArray[np.float64] | None = None
+        """(T, 4, 4) poses of a camera that moves, for `new_sequence`; see `finish`."""
 
     def add(
         self,
@@ -134,25 +137,8 @@ class FrameFiles:
         cameras = np.broadcast_to(np.eye(4), (self.count, 4, 4)) if camera_to_world is None else camera_to_world
         bounds = np.array([self._depth_bounds(index) for index in range(self.count)])
         self.write_array("poses_bounds.npy", pose_table(cameras, meta.height, meta.width, meta.fx, bounds))
-        described = {
-            "format_version": 1,
-            "width": meta.width,
-            "height": meta.height,
-            "fx": meta.fx,
-            "fy": meta.fy,
-            "cx": meta.cx,
-            "cy": meta.cy,
-            "baseline_mm": meta.baseline_mm,
-            "frames_per_second": meta.frames_per_second,
-            "depth_unit": "mm",
-            "depth_scale": meta.depth_scale,
-            "mask_tool_value": TOOL_VALUE,
-            "depth_source": meta.depth_source,
-            "depth_relative": meta.depth_relative,
-            "sources": meta.sources,
-            "unexplained_frames": unexplained_frames or [],
-            "note": meta.note,
-        }
+        fixed = {"format_version": 1, "depth_unit": "mm", "mask_tool_value": TOOL_VALUE}
+        described = fixed | asdict(meta) | {"unexplained_frames": unexplained_frames or []}
         self.write_json("sequence.json", described)
 
     def file(self, folder: str, index: int) -> Path:
@@ -172,35 +158,14 @@ class FrameFiles:
         return path
 
 
-class SequenceWriter(FrameFiles):
-    """Collects the frames of one sequence; use it as a context manager.
+@contextmanager
+def new_sequence(out: Path, meta: SequenceMeta) -> Iterator[FrameFiles]:
+    """Collect the frames of one sequence; `out` appears complete when the block ends, and not at all after an error.
 
-    Leaving the `with` block normally completes the folder; leaving it by an exception removes what was written.
+    Raises:
+        InputError: `out` is a file or a folder that is not empty, or cannot be created.
     """
-
-    def __init__(self, out: Path, meta: SequenceMeta) -> None:
-        """Prepare to write `out`.
-
-        Raises:
-            InputError: `out` is a file or a folder that is not empty, or cannot be created.
-        """
-        self.out = Path(out)
-        reject_occupied(self.out)
-        self._whole = whole_folder(self.out)
-        super().__init__(self._whole.__enter__(), meta)
-        self.camera_to_world: NDArray[np.float64] | None = None
-        """(T, 4, 4) poses of a camera that moves, to be set before the block ends; see `finish`."""
-
-    def __enter__(self) -> SequenceWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            try:
-                self.finish(self.camera_to_world)
-            except BaseException as error:
-                self._whole.__exit__(type(error), error, error.__traceback__)
-                raise
-        self._whole.__exit__(kind, value, trace)
+    with whole_folder(Path(out)) as folder:
+        files = FrameFiles(folder, meta)
+        yield files
+        files.finish(files.camera_to_world)

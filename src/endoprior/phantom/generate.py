@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.sequence import is_test_frame
-from ..data.writer import SequenceMeta, SequenceWriter
+from ..data.writer import SequenceMeta, new_sequence
 from .camera_path import build_camera_path, widened
 from .config import PhantomConfig
 from .eye import STILL, Eye
@@ -158,7 +158,7 @@ def write_phantom(out: Path, cfg: PhantomConfig, progress: Callable[[int, int], 
         depth_source="synthetic stereo",
         note=_NOTE.format(seed=cfg.seed, kinds=kinds),
     )
-    with SequenceWriter(out, meta) as writer:
+    with new_sequence(out, meta) as writer:
         scene = build_scene(cfg)
         tracked = choose_tracks(scene)
         lens = vignette(cfg.width, cfg.height)

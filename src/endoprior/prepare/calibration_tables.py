@@ -18,11 +18,9 @@ import numpy as np
 import yaml
 
 from ..core.checks import InputError, input_error
-from ..data.colmap_model import StoredCamera, read_cameras
+from ..data.colmap import StoredCamera, read_cameras
 from ..data.lens import MODELS, UNSUPPORTED
-from ..data.numpy_files import read_numpy
-from ..data.reading import read_bytes, read_text
-from ..data.yaml_text import BoundedLoader, load_yaml
+from ..data.reading import BoundedLoader, load_yaml, read_bytes, read_numpy, read_text
 
 Table = dict[str, Any]
 """Numbers, arrays and texts, by name in lower case without punctuation."""

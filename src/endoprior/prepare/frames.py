@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.spread import spread
-from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
-from ..data.depth_fill import is_measured
 from ..data.found_tools import FoundTools
 from ..data.frame_files import match_files
+from ..data.images import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
+from ..data.pixels import is_measured
 from ..data.writer import FrameFiles
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px

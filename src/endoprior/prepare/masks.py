@@ -15,12 +15,12 @@ from ..core.checks import input_error
 from ..core.config import DataConfig
 from ..data import load_sequence
 from ..data.description import TOOLS_FOUND
+from ..data.folder_edits import found_source, write_mask
 from ..data.found_tools import FoundTools, FrameRow, write_rows
 from ..data.frame_files import match_names
 from ..data.images import read_color, save_png
 from ..data.mask_files import tool_polarity
 from ..data.mask_folders import open_mask_folder
-from ..data.mask_writing import found_source, write_mask
 from ..data.writer import TOOL_VALUE, FrameFiles
 from .config import PrepareConfig
 from .first_pass import Depth, FirstPass, Mask, MeasuredFrame

@@ -1,4 +1,4 @@
-"""What `prepare` records about itself, so that `check` can print the command that repeats it."""
+"""What `prepare` records about itself, so that the command can be repeated."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.options import changed_options
-from ..data.prepare_record import PrepareRecord
+from ..data.description import PrepareRecord
 from .config import PrepareConfig
 from .frame_geometry import FrameGeometry
 from .frames import NETWORK

@@ -18,9 +18,9 @@ from PIL.Image import open as open_image
 
 from ..core.checks import input_error
 from ..data.files import entries, files_with
+from ..data.frame_files import one_per_frame
 from ..data.images import decode_image, describe_pixels
 from ..data.reading import MOST_PIXELS, kind_of
-from ..data.series import one_per_frame
 from ..data.video_files import STILL_SUFFIXES, is_animated_webp
 from .decoding import usual_rate
 from .video import SourceFrame, Video, too_many_pixels

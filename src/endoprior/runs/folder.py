@@ -18,8 +18,7 @@ from ..core.config_io import to_dict
 from ..core.shell import command
 from ..data import FrameSequence
 from ..data.files import read_json
-from ..data.reading import kind_of, read_text
-from ..data.yaml_text import load_yaml
+from ..data.reading import kind_of, load_yaml, read_text
 from ..model.method import config_from
 from ..render import ON_GPU
 from ..system.atomic import reject_occupied

@@ -6,16 +6,12 @@ from pathlib import Path
 
 from ...core.checks import input_error
 from ..files import entries, files_with, in_order
-from ..mask_files import MASK_SUFFIXES, demand_known, rule_of_files
-from ..mask_values import name
+from ..frame_files import one_per_frame
+from ..mask_files import MASK_SUFFIXES, demand_known, name, rule_of_files
 from ..reading import kind_of
-from ..series import one_per_frame
-from .cvat import segmentation_masks
-from .cvat_xml import annotations
-from .frames import MaskFolder, MaskFrame, union_of_files
-from .label_studio import brush_export
-from .labels import OPTION
-from .nerfstudio import ignore_masks
+from .cvat import annotations, segmentation_masks
+from .others import brush_export, ignore_masks
+from .parts import OPTION, MaskFolder, MaskFrame, union_of_files
 from .sam2 import object_folders, palette_folder, sav_file
 
 __all__ = ["MaskFolder", "MaskFrame", "open_mask_folder"]
@@ -27,26 +23,23 @@ def open_mask_folder(path: Path, labels: str = "") -> MaskFolder:
     Args:
         path: a folder, or the XML of CVAT or the JSON of SA-V.
         labels: names of the labels that are tools, separated by commas; empty to tell by their names.
-    Raises:
-        InputError: no masks there, or labels that do not tell which are tools.
     """
     kind = kind_of(path)
-    if kind == "a file":
-        found = _in_file(path, labels)
-        if found is None:
-            fix = "Pass the folder that holds one file per frame."
-            raise input_error(path, "a folder of masks, CVAT's XML or SA-V's JSON", "a file", fix)
+    if kind == "a folder":
+        return _in_folder(path, labels)
+    if kind == "a file" and (found := _in_file(path, labels)):
         return found
-    if kind != "a folder":
-        fix = "Pass the folder that holds one file per frame."
-        raise input_error(path, "a folder of masks", "no such folder", fix)
-    return _in_folder(path, labels)
+    got, fix = "a file" if kind == "a file" else "no such folder", "Pass the folder that holds one file per frame."
+    raise input_error(path, "a folder of masks, CVAT's XML or SA-V's JSON", got, fix)
 
 
 def _in_folder(folder: Path, labels: str) -> MaskFolder:
-    named = segmentation_masks(folder, labels) or brush_export(folder, labels)
-    if named or (named := ignore_masks(folder)):
-        return _without_labels(named, labels) if named.tool_is_high is False else named
+    if found := segmentation_masks(folder, labels) or brush_export(folder, labels):
+        return found
+    if found := ignore_masks(folder):
+        if labels:
+            raise input_error(OPTION, "masks with labels", "masks of one kind", f"Remove {OPTION}.")
+        return found
     if found := palette_folder(folder, labels) or object_folders(folder, labels):
         return found
     files = files_with(folder, MASK_SUFFIXES)
@@ -86,13 +79,5 @@ def _plain(folder: Path, files: list[Path], labels: str) -> MaskFolder:
 
 def _in_file(file: Path, labels: str) -> MaskFolder | None:
     """The masks in an XML or JSON file; None if it holds something else."""
-    readers = {".xml": annotations, ".json": sav_file}
-    reader = readers.get(file.suffix.lower())
+    reader = {".xml": annotations, ".json": sav_file}.get(file.suffix.lower())
     return reader(file, labels) if reader else None
-
-
-def _without_labels(found: MaskFolder, labels: str) -> MaskFolder:
-    """The masks; an error if labels were asked for that such masks do not have."""
-    if labels:
-        raise input_error(OPTION, "masks with labels", "masks of one kind", f"Remove {OPTION}.")
-    return found

@@ -1,13 +1,20 @@
-"""Masks that CVAT exports: *Segmentation mask 1.1* (colors, and their labels in `labelmap.txt`), *CVAT for images 1.1*.
+"""Masks that CVAT exports: *Segmentation mask 1.1* and *CVAT for images 1.1*.
 
-A line of `labelmap.txt` is `label:red,green,blue:parts:actions`. Names of frames are those of the images of the task.
+The first has colors, and their labels in `labelmap.txt`: lines of `label:red,green,blue:parts:actions`. The second is
+one XML: <image name width height> holds <mask label rle left top width height> and <polygon label points>. `rle` counts
+pixels of the box row by row: outside, inside, outside, ... of the object. Points are `x,y;x,y`, px from the image's
+corner. Names of frames are those of the images of the task.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,12 +22,17 @@ from ...core.checks import input_error
 from ..files import files_with, in_order
 from ..images import decode_image
 from ..reading import kind_of, read_text
-from .frames import Mask, MaskFolder, MaskFrame, Size, demand_size
-from .labels import tool_labels, words_about
+from .parts import Mask, MaskFolder, MaskFrame, Size, demand_size, mask_of_runs, sorted_frames, tool_labels, words_about
 
 CLASSES, LABELS, LISTED = "SegmentationClass", "labelmap.txt", Path("ImageSets", "Segmentation", "default.txt")
-HINT = "Export the task from CVAT as `Segmentation mask 1.1` again."
+PNG_HINT = "Export the task from CVAT as `Segmentation mask 1.1` again."
 Color = tuple[int, int, int]
+SHAPES = ("mask", "polygon")
+XML_HINT = "Export the task from CVAT as `CVAT for images 1.1`."
+MOST_PX = 1 << 16
+"""Largest coordinate of a point."""
+Shape = tuple[str, Mapping[str, str]]
+"""Tag and attributes."""
 
 
 def segmentation_masks(folder: Path, asked: str) -> MaskFolder | None:
@@ -42,13 +54,9 @@ def segmentation_masks(folder: Path, asked: str) -> MaskFolder | None:
 
 
 def read_labelmap(file: Path) -> dict[str, Color]:
-    """Label -> color (red, green, blue), in the order of the file.
-
-    Raises:
-        InputError: a line of another form, or no label.
-    """
+    """Label -> color (red, green, blue), in the order of the file."""
     found: dict[str, Color] = {}
-    for line in read_text(file, "CVAT's labels", HINT).splitlines():
+    for line in read_text(file, "CVAT's labels", PNG_HINT).splitlines():
         if not line.strip() or line.startswith("#"):
             continue
         try:
@@ -57,10 +65,10 @@ def read_labelmap(file: Path) -> dict[str, Color]:
             if not all(0 <= value <= 255 for value in (red, green, blue)):
                 raise ValueError
         except ValueError:
-            raise input_error(file, "label:red,green,blue:parts:actions", line[:60], HINT) from None
+            raise input_error(file, "label:red,green,blue:parts:actions", line[:60], PNG_HINT) from None
         found[name.strip()] = red, green, blue
     if not found:
-        raise input_error(file, "at least one label", "none", HINT)
+        raise input_error(file, "at least one label", "none", PNG_HINT)
     return found
 
 
@@ -68,7 +76,9 @@ def _listed(file: Path) -> list[str]:
     """Names of the images of the task; none if there is no list."""
     if kind_of(file) != "a file":
         return []
-    return [Path(line.strip()).name for line in read_text(file, "a list of images", HINT).splitlines() if line.strip()]
+    return [
+        Path(line.strip()).name for line in read_text(file, "a list of images", PNG_HINT).splitlines() if line.strip()
+    ]
 
 
 def _reader(file: Path | None, colors: dict[str, Color], wanted: list[Color]) -> Callable[[Size], Mask]:
@@ -83,7 +93,7 @@ def _reader(file: Path | None, colors: dict[str, Color], wanted: list[Color]) ->
         known = _packed(np.array([*colors.values(), (0, 0, 0)]))  # black: the background, if it is not listed
         if other := sorted({*np.unique(packed).tolist()} - {*known.tolist()}):
             got = f"{other[0] >> 16},{other[0] >> 8 & 255},{other[0] & 255}"
-            raise input_error(file, f"only colors of {LABELS}", got, HINT)
+            raise input_error(file, f"only colors of {LABELS}", got, PNG_HINT)
         return np.isin(packed, _packed(np.array(wanted)))
 
     return read
@@ -92,3 +102,79 @@ def _reader(file: Path | None, colors: dict[str, Color], wanted: list[Color]) ->
 def _packed(colors: NDArray) -> NDArray[np.int64]:
     """One number per color (..., 3)."""
     return colors.astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
+
+
+def annotations(file: Path, asked: str) -> MaskFolder | None:
+    """The masks in an XML file of CVAT; None for another XML file."""
+    text = read_text(file, "an XML file", XML_HINT)
+    if "<annotations" not in text:
+        return None
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # CVAT writes neither; entities can expand without end
+        raise input_error(file, "CVAT's XML", "a document type", XML_HINT)
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise input_error(file, "CVAT's XML", str(error), XML_HINT) from None
+    images = root.findall("image")
+    if not images:
+        got = "tracks of a video" if root.find("track") is not None else "no images"
+        raise input_error(file, "images with masks or polygons", got, XML_HINT)
+    used = [shape.get("label", "") for image in images for shape in image if shape.tag in SHAPES]
+    named = [each.text or "" for each in root.iterfind(".//labels/label/name")]
+    labels = [*dict.fromkeys([*named, *used])]
+    tools = tool_labels(file, labels, asked)
+    skipped = Counter(shape.tag for image in images for shape in image if shape.get("label") in tools)
+    frames = sorted_frames([_frame(file, image, tools) for image in images])
+    left_out = ", ".join(f"{count} of {tag}" for tag, count in sorted(skipped.items()) if tag not in SHAPES)
+    note = f"CVAT for images; {words_about(labels, tools)}" + (f"; shapes left out: {left_out}" if left_out else "")
+    return MaskFolder(frames, note, True)
+
+
+def _frame(file: Path, image: ElementTree.Element, tools: list[str]) -> MaskFrame:
+    name = Path(image.get("name", "")).name
+    shapes = [(shape.tag, shape.attrib) for shape in image if shape.tag in SHAPES and shape.get("label") in tools]
+
+    def read(size: Size) -> Mask:
+        mask = np.zeros(size[::-1], bool)
+        with _damage_named(f"{file}: {name}"):
+            own_size = int(image.get("width", 0)), int(image.get("height", 0))
+        demand_size(f"{file}: {name}", own_size, size)
+        with _damage_named(f"{file}: {name}"):
+            for shape in shapes:
+                _paint(mask, shape)
+        return mask
+
+    return MaskFrame(name, read)
+
+
+@contextmanager
+def _damage_named(subject: str) -> Iterator[None]:
+    """Turn errors of damaged numbers into one that names the image."""
+    try:
+        yield
+    except KeyError as error:
+        raise input_error(subject, f"the attribute {error}", "none", XML_HINT) from None
+    except (OverflowError, ValueError) as error:
+        raise input_error(subject, "masks and polygons", str(error)[:80], XML_HINT) from None
+
+
+def _paint(mask: Mask, shape: Shape) -> None:
+    """Add a shape to a mask (H, W). ValueError or KeyError if it is not one."""
+    tag, given = shape
+    if tag == "polygon":
+        pairs = [point.split(",") for point in given["points"].split(";")]
+        if any(len(pair) != 2 for pair in pairs):
+            raise ValueError("points that are not x,y;x,y")
+        points = np.array(pairs, float)
+        if not (np.abs(points) < MOST_PX).all():
+            raise ValueError("points far outside of the image")
+        painted = mask.astype(np.uint8)
+        # OpenCV counts centers of pixels from 0.
+        cv2.fillPoly(painted, [np.round(points - 0.5).astype(np.int32)], 1)
+        mask |= painted > 0
+        return
+    left, top, width, height = (int(float(given[side])) for side in ("left", "top", "width", "height"))
+    if min(left, top) < 0 or min(width, height) < 1 or left + width > mask.shape[1] or top + height > mask.shape[0]:
+        raise ValueError("a box outside of the image")
+    runs = [int(part) for part in given["rle"].split(",")]
+    mask[top : top + height, left : left + width] |= mask_of_runs(runs, width * height).reshape(height, width)

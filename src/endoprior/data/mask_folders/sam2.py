@@ -17,9 +17,7 @@ from ..files import entries, files_with, in_order
 from ..images import decode_image
 from ..mask_files import MASK_SUFFIXES
 from ..reading import read_bytes, read_text
-from .frames import Mask, MaskFolder, MaskFrame, Size, demand_size, union, union_of_files
-from .labels import chosen_objects
-from .run_lengths import mask_of_coco
+from .parts import Mask, MaskFolder, MaskFrame, Size, chosen_objects, demand_size, mask_of_coco, union, union_of_files
 
 PALETTE_IMAGE = 3
 """Color type in the header of a PNG."""

@@ -11,12 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from ...core.checks import input_error
 from ...data import nerfstudio
-from ...data.colmap import model_folder
-from ...data.colmap_model import read_colmap
+from ...data.colmap import model_folder, read_colmap
 from ...data.files import in_order, read_table
 from ...data.frame_files import match_names
-from ...data.numpy_files import read_numpy
 from ...data.poses import demand_rotations
+from ...data.reading import read_numpy
 
 HINT = "Write (T, 4, 4) camera-to-world matrices in mm, OpenCV axes."
 TEXT_SUFFIXES = (".txt", ".tum", ".freiburg", ".csv")

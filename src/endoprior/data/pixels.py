@@ -1,0 +1,128 @@
+"""Decoded pixels made ready: which depth is measured, outliers clipped, frames at a fraction of their size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.config import DataConfig
+from ..core.types import Camera, Frame
+
+GAP = 1.5
+"""A number is a filling if it is larger than all others by this factor ..."""
+FEWEST = 8
+"""... and occurs in at least so many pixels, which measured depth at such a distance does not."""
+FARTHEST = 20.0
+"""Depth beyond so many times the median of an image is an error of measurement."""
+LEAST_PIXELS = 100
+"""The median of fewer says nothing."""
+
+
+def is_measured(stored: NDArray, *, relative: bool = False) -> NDArray[np.bool_]:
+    """(H, W) True where a depth file holds a measurement.
+
+    Missing is what is not finite, 0 or less; the largest number of a type of 16 bits or more; a number that occurs
+    often and far above all others, such as 10000 or 1e6; and single numbers far above the median.
+
+    Args:
+        stored: (H, W) numbers of any type, in any unit.
+        relative: the depth is only scaled, so that the largest number of a type may be the farthest pixel.
+    """
+    with np.errstate(invalid="ignore"):  # NaN compares as missing
+        measured = np.isfinite(stored) & (stored > 0)
+    if stored.dtype.kind in "iu" and stored.dtype.itemsize > 1 and not relative:
+        measured &= stored != np.iinfo(stored.dtype).max
+    while measured.any():
+        values = stored[measured]
+        largest = values.max()
+        is_largest = values == largest
+        count = int(is_largest.sum())
+        if FEWEST <= count < values.size and largest > GAP * float(values[~is_largest].max()):
+            measured &= stored != largest
+            continue
+        if values.size < LEAST_PIXELS or largest <= FARTHEST * float(values.min()):  # then none is beyond
+            break
+        return measured & (stored <= FARTHEST * float(np.median(values)))
+    return measured
+
+
+def clean_depth(
+    raw: NDArray[np.floating], cfg: DataConfig | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Separate measured from missing depth, and clip the measured values to two of their own percentiles.
+
+    Args:
+        raw: (H, W) depth, mm; missing where 0, negative or not finite.
+        cfg: percentiles, and `lift_missing_depth`, which treats missing depth as near, as EndoGaussian does.
+    Returns:
+        (H, W) depth, mm, 0 where missing, and (H, W) bool, True where measured. A frame without any measured depth
+        is all 0 and False, lifted or not.
+    """
+    cfg = cfg or DataConfig()
+    raw = np.asarray(raw, np.float32)
+    valid = np.isfinite(raw) & (raw > 0)
+    measured = raw[valid]
+    if measured.size == 0:
+        return np.zeros_like(raw), valid
+    near, far = np.percentile(measured, (cfg.depth_clip_low_percentile, cfg.depth_clip_high_percentile))
+    missing = near if cfg.lift_missing_depth else 0
+    depth = np.where(valid, np.clip(raw, np.float32(near), np.float32(far)), np.float32(missing))
+    return depth, np.ones_like(valid) if cfg.lift_missing_depth else valid
+
+
+def _steps(width: int, height: int, factor: int) -> tuple[int, int]:
+    """Columns and rows of the blocks that become one pixel: `factor`, or the whole side if it is shorter."""
+    return min(factor, width), min(factor, height)
+
+
+def shrunk_camera(camera: Camera, factor: int) -> Camera:
+    """The camera of images that are `factor` times smaller: sizes rounded down, at least 1 px."""
+    across, down = _steps(camera.width, camera.height, factor)
+    return replace(
+        camera,
+        width=camera.width // across,
+        height=camera.height // down,
+        fx=camera.fx / across,
+        fy=camera.fy / down,
+        cx=camera.cx / across,
+        cy=camera.cy / down,
+    )
+
+
+def shrunk_color(rgb_u8: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """(H, W, 3) color at 1 / `factor` of its size, as `shrunk` has it: each pixel is the mean of its block."""
+    if factor == 1:
+        return rgb_u8
+    across, down = _steps(rgb_u8.shape[1], rgb_u8.shape[0], factor)
+    width, height = rgb_u8.shape[1] // across, rgb_u8.shape[0] // down
+    return cv2.resize(rgb_u8[: down * height, : across * width], (width, height), interpolation=cv2.INTER_AREA)
+
+
+def shrunk(frame: Frame, factor: int) -> Frame:
+    """The frame at 1 / `factor` of its width and height, rounded down; a side shorter than `factor` becomes 1 px.
+
+    A pixel is tissue, or has a depth, where all pixels of its block do; its depth is their mean.
+    """
+    if factor == 1:
+        return frame
+    camera = shrunk_camera(frame.camera, factor)
+    steps, width, height = _steps(frame.camera.width, frame.camera.height, factor), camera.width, camera.height
+    with np.errstate(over="ignore"):  # a mean beyond float32 counts as missing
+        depth = _blocks(frame.depth, width, height, steps).mean((1, 3), dtype=np.float32)
+    valid = _blocks(frame.depth_valid, width, height, steps).all((1, 3)) & np.isfinite(depth)
+    return replace(
+        frame,
+        camera=camera,
+        rgb_u8=shrunk_color(frame.rgb_u8, factor),
+        tissue_mask=_blocks(frame.tissue_mask, width, height, steps).all((1, 3)),
+        depth=np.where(valid, depth, np.float32(0)),
+        depth_valid=valid,
+    )
+
+
+def _blocks(image: NDArray, width: int, height: int, steps: tuple[int, int]) -> NDArray:
+    across, down = steps
+    return image[: down * height, : across * width].reshape(height, down, width, across)
