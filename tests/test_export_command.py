@@ -16,8 +16,8 @@ from plyfile import PlyData
 
 from endoprior.cli import main
 from endoprior.export.axes import points_in_axes
-from endoprior.export.depth import depth_png
 from endoprior.export.formats import FORMATS, formats_of, load_format
+from endoprior.export.frames import depth_png
 from endoprior.model.scene_file import load_scene
 from endoprior.render import sh
 

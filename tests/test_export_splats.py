@@ -14,12 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from endoprior.core.checks import InputError
 from endoprior.core.types import Splats
-from endoprior.export.compressed_ply import encode_compressed_ply
 from endoprior.export.gltf import encode_glb
+from endoprior.export.packed_splats import encode_compressed_ply, encode_sog, encode_splat, encode_spz
 from endoprior.export.ply import encode_ply
-from endoprior.export.sog import encode_sog
-from endoprior.export.splat import encode_splat
-from endoprior.export.spz import encode_spz
 
 DC = 0.28209479177387814
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..core.config import DataConfig
 from ..core.spread import spread
 from ..core.types import Camera
-from ..footage.black_margin import black_margin
+from ..footage.border import black_margin
 from .assemble import Pixels, assemble, kept_frames
 from .camera_matrix import MATRIX_FILE, matrix_of_images, read_camera_matrix
 from .depth_files import read_depth_file

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .corner_flow import follow_both_ways
+from .optical_flow import follow_both_ways
 
 WORK_WIDTH = 320
 """Images are resized to this width, px: enough for hundreds of corners, and fast."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.pose_conventions import CONVENTIONS, Convention, to_ours
 from ..core.spread import spread
-from .corner_flow import follow_both_ways
+from .optical_flow import follow_both_ways
 
 View = tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]]
 """Of a frame: (H, W, 3) image, (H, W) True on tissue, (H, W) depth in mm, 0 where missing."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_range, check_shape
-from ..footage.stereo_matching import disagreement, match_both_ways
+from ..footage.stereo_order import disagreement, match_both_ways
 from ..priors.specular import specular_likelihood
 from .disparity import drop_speckles, fill_small_holes, refine_disparity, smooth_disparity
 
