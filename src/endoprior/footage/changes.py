@@ -84,8 +84,8 @@ def find_changes(images: Iterable[NDArray[np.uint8]]) -> Changes:
         duplicates=find_duplicates(difference),
         exposure_jumps=tuple(i for i in _exposure_jumps(pairs) if i not in cuts),
         cuts=cuts,
-        blurred=_blurred(sharp),
-        off_color=_off_color(np.array(shares)),
+        blurred=_places(sharp < BLUR_RATIO * np.array([np.median(window) for window in _windows(sharp)])),
+        off_color=_places(np.abs(shares - np.median(shares, axis=0)).max(1) > COLOR_DISTANCE),
     )
 
 
@@ -96,10 +96,9 @@ def find_duplicates(difference: NDArray[np.floating]) -> tuple[int, ...]:
         difference: (T - 1,) mean absolute difference of successive images, levels of 255.
     """
     # A high percentile, not the median: half of the images are duplicates if the frame rate was doubled.
-    windows = (difference[max(0, i - NEIGHBORS) : i + NEIGHBORS + 1] for i in range(len(difference)))
-    usual = np.array([np.percentile(window, 80) for window in windows])
+    usual = np.array([np.percentile(window, 80) for window in _windows(difference)])
     limit = np.maximum(SAME_LEVELS, np.minimum(COPY_LEVELS, COPY_SHARE * usual))
-    return tuple(int(i) + 1 for i in np.flatnonzero(difference < limit))
+    return tuple(i + 1 for i in _places(difference < limit))
 
 
 def _exposure_jumps(pairs: list[tuple[NDArray, NDArray]]) -> list[int]:
@@ -132,10 +131,9 @@ def _reduced(image: NDArray, share: float) -> NDArray:
     return cv2.resize(image, None, fx=fx, fy=fy, interpolation=cv2.INTER_AREA)
 
 
-def _blurred(sharpness: NDArray[np.float64]) -> tuple[int, ...]:
-    windows = (sharpness[max(0, i - NEIGHBORS) : i + NEIGHBORS + 1] for i in range(len(sharpness)))
-    usual = np.array([np.median(window) for window in windows])
-    return tuple(int(i) for i in np.flatnonzero(sharpness < BLUR_RATIO * usual))
+def _windows(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
+    """Each value with its neighbors."""
+    return [values[max(0, i - NEIGHBORS) : i + NEIGHBORS + 1] for i in range(len(values))]
 
 
 def color_share(image: NDArray) -> NDArray[np.float64]:
@@ -144,9 +142,8 @@ def color_share(image: NDArray) -> NDArray[np.float64]:
     return mean[:2] / max(mean.sum(), 1.0)
 
 
-def _off_color(shares: NDArray[np.float64]) -> tuple[int, ...]:
-    distance = np.abs(shares - np.median(shares, axis=0)).max(1)
-    return tuple(int(i) for i in np.flatnonzero(distance > COLOR_DISTANCE))
+def _places(found: NDArray[np.bool_]) -> tuple[int, ...]:
+    return tuple(np.flatnonzero(found).tolist())
 
 
 def _correlation(a: NDArray, b: NDArray) -> float:

@@ -20,9 +20,6 @@ HALVED_FROM_PX = 256
 FINE_SIDE_PX = 256
 """Fine flow is computed on images shrunk by a whole number to at least this shorter side."""
 
-FlowPair = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Flow (h, w, 2) from a frame to the next and back, in px of the image it was computed on."""
-
 
 def flow_shrink(height: int, width: int) -> int:
     """Divisor of the image size for the flow: 2 for frames of at least `HALVED_FROM_PX`, else 1."""
@@ -42,22 +39,17 @@ def gray_for_flow(rgb_u8: NDArray[np.uint8], shrink: int | None = None) -> NDArr
     return cv2.resize(gray, (width // shrink, height // shrink), interpolation=cv2.INTER_AREA)
 
 
-def flow_pair(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> FlowPair:
-    """Flow from the first (h, w) gray image to the second, and back; both sides at least `MIN_SIZE_PX`."""
+def flow_pair(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Flow (h, w, 2) from the first (h, w) gray image to the second, and back, px; sides at least `MIN_SIZE_PX`."""
     estimator = _estimator()
     forward = estimator.calc(first, second, None)
     return forward, estimator.calc(second, first, None)
 
 
-def flow_between(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Flow (h, w, 2) from the first (h, w) gray image to the second; both sides at least `MIN_SIZE_PX`."""
-    return _estimator().calc(first, second, None)
-
-
 def fine_flow(
     first: NDArray[np.uint8], second: NDArray[np.uint8], start: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """Flow as by `flow_between`, but refined on the full image: twice as slow, less than half the error.
+    """Flow to the second image as by `flow_pair`, but refined on the full image: twice as slow, half the error.
 
     Larger steps between patches and fewer iterations than OpenCV's preset: half the time, the same error.
 
