@@ -219,6 +219,15 @@ def test_displacement_and_stretch_are_since_the_reference_frame(scene):
     assert alpha[24, 23].min() > 200 and not stretch[24, 23].any()
 
 
+def test_each_gaussian_has_a_color_also_behind_the_camera(scene):
+    turned = np.eye(4)
+    turned[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # looks along the wall, from its middle
+    turned[:3, 3] = -turned[:3, :3] @ [0, 0, 50]
+    cameras = tuple(replace(camera, world_to_camera=turned) for camera in scene.cameras)
+    cloud = ViewableScene(replace(scene, cameras=cameras), "wall").cloud(ViewSettings(layer="prior"))
+    assert len(cloud.colors) == len(cloud.points) == len(scene)
+
+
 def test_play_advances_and_pauses(viewer, client):
     client.set(viewer.panel.speed, "0.5x")
     client.set(viewer.panel.play, True)

@@ -74,11 +74,10 @@ def write_html(
 ) -> Path:
     """Write a single-file player of `scene`: a web page that opens from disk and needs nothing else.
 
-    It renders the Gaussians at `times`, from the cameras of the sequence or from a free view. Rounding
-    moves centers by at most 0.05 mm and an eighth of a pixel per axis at the working distance of a window, rotations by
-    half a degree, scales by 1 %, opacities by 0.0005, colors by half of an 8-bit level. Colors are always those seen
-    from the sequence's camera at that time. A page that would be too large is an error: nothing is left out or rounded
-    further.
+    It renders the Gaussians at `times`, from the cameras of the sequence or from a free view. Rounding moves centers by
+    at most 0.05 mm and an eighth of a pixel per axis at the working distance of a window, rotations by half a degree,
+    scales by 1 %, opacities by 0.0005, colors by half of an 8-bit level. Colors are always those seen from the
+    sequence's camera at that time. A page that would be too large is an error: nothing is left out or rounded further.
 
     Args:
         out: file to write; an existing one is replaced, and missing folders are created.
@@ -105,10 +104,10 @@ def write_html(
         data, coded = pack(block.values)
         scaled = zip(block.low.tolist(), block.step.tolist(), coded, strict=True)
         channels = [{"low": low, "step": step, **stream} for low, step, stream in scaled]
-        size_of_block = {"first": block.first, "steps": len(block.steps), "gaussians": block.values.shape[2]}
-        blocks.append(size_of_block | {"channels": channels})
+        _, num_steps, num_gaussians = block.values.shape
+        blocks.append({"first": block.first, "steps": num_steps, "gaussians": num_gaussians, "channels": channels})
         streams.append(data)
-        num_shown[block.steps] += block.values.shape[2]
+        num_shown[block.steps] += num_gaussians
         focus[(block.steps.start + block.steps.stop - 1) / 2] = block.focus
         near, far = min(near, block.depth_range[0]), max(far, block.depth_range[1])
         size = 4 * math.ceil(sum(map(len, streams)) / 3)  # in Base64

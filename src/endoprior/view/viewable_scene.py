@@ -253,13 +253,14 @@ def _value_colors(values: Tensor) -> Tensor:
 
 
 def _clipped(splats: Splats, camera: Camera, near: float, far: float) -> Splats:
-    """The Gaussians whose centers lie between two depths of `camera`, mm."""
-    if near <= 0 and far == float("inf"):
-        return splats
+    """The Gaussians whose centers lie between two depths of `camera`, mm; all of them without limits."""
     return Splats(**{name: _rows(value, splats, camera, near, far) for name, value in splats.tensors.items()})
 
 
 def _rows(values: Tensor, splats: Splats, camera: Camera, near: float, far: float) -> Tensor:
+    """The rows of `values` (N, ...) of these Gaussians."""
+    if near <= 0 and far == float("inf"):
+        return values
     pose = torch.from_numpy(camera.world_to_camera[2]).to(splats.means)
     z = splats.means @ pose[:3] + pose[3]
     return values[(z >= near) & (z <= far)]
