@@ -23,7 +23,7 @@ from endoprior.data import FrameSequence
 from endoprior.model.scene import Scene
 from endoprior.priors import joint_texture_prior, salience, specular_likelihood
 from endoprior.training.temporal import motion_weight
-from endoprior.view.view_settings import ViewSettings
+from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.visualization.camera_paths import turned
 

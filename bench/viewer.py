@@ -26,7 +26,7 @@ from endoprior.model.presets import preset
 from endoprior.model.single_scene import SingleScene
 from endoprior.view import browsers
 from endoprior.view.panel import control_id
-from endoprior.view.view_settings import IDLE_SECONDS, ViewSettings
+from endoprior.view.viewable import IDLE_SECONDS, ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 
 FRAMES = 24

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from endoprior.core.types import Camera
-from endoprior.export.html_data import CHANNELS
+from endoprior.export.html import CHANNELS
 from endoprior.model import scene as scenes
 from endoprior.model.gaussians import create_gaussians
 from endoprior.model.presets import preset

@@ -13,6 +13,10 @@ SIDE = 40
 NO_MASK = np.zeros((HEIGHT, WIDTH), bool)
 
 
+def carried(frames, masks, frame, edited):
+    return carry_mask_edit(frames.__getitem__, masks.__getitem__, len(frames), frame, edited)
+
+
 def texture(seed: int, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
     """(height, width, 3) smooth noise over the whole range of levels."""
     noise = cv2.GaussianBlur(np.random.default_rng(seed).random((height, width, 3)), (0, 0), 3)
@@ -52,7 +56,7 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 def test_a_painted_region_follows_a_known_motion_both_ways(scale, step):
     frames, true = moving_square([(50 + step[0] * k, 40 + step[1] * k) for k in range(-4, 5)], scale=scale)
     nothing = [np.zeros_like(true[0])] * 9
-    done = carry_mask_edit(frames, nothing, 4, true[4])
+    done = carried(frames, nothing, 4, true[4])
     assert list(done.masks) == [0, 1, 2, 3, 5, 6, 7, 8]
     assert all(overlap(mask, true[k]) > 0.95 for k, mask in done.masks.items())
     assert (done.before, done.after) == ("the first frame", "the last frame")
@@ -62,7 +66,7 @@ def test_errors_of_noisy_frames_do_not_add_up():
     frames, true = moving_square([(round(55 + 30 * np.sin(k / 4)), round(40 + 20 * np.sin(k / 5))) for k in range(30)])
     rng = np.random.default_rng(0)
     noisy = [np.clip(frame + rng.normal(0, 12, frame.shape), 0, 255).astype(np.uint8) for frame in frames]
-    done = carry_mask_edit(noisy, [NO_MASK] * 30, 0, true[0])
+    done = carried(noisy, [NO_MASK] * 30, 0, true[0])
     assert len(done.masks) == 29 and all(overlap(mask, true[k]) > 0.97 for k, mask in done.masks.items())
 
 
@@ -70,7 +74,7 @@ def test_an_erased_region_follows_too_and_the_rest_stays():
     frames, square = moving_square([(40 + 2 * k, 40) for k in range(5)])
     other = square_at(110, 80)
     masks = [mask | other for mask in square]
-    done = carry_mask_edit(frames, masks, 0, other)
+    done = carried(frames, masks, 0, other)
     assert list(done.masks) == [1, 2, 3, 4]
     for mask in done.masks.values():
         assert (mask & other).sum() == other.sum()
@@ -81,21 +85,21 @@ def test_an_erased_region_follows_too_and_the_rest_stays():
 def test_it_stops_at_a_cut():
     before, true = moving_square([(50 + k, 40) for k in range(4)])
     after = [texture(10 + k) for k in range(3)]
-    done = carry_mask_edit([*before, *after], [NO_MASK] * 7, 1, true[1])
+    done = carried([*before, *after], [NO_MASK] * 7, 1, true[1])
     assert list(done.masks) == [0, 2, 3] and done.after.startswith("frame 4: the motion is uncertain")
 
 
 def test_it_stops_where_the_color_changes_but_the_motion_does_not():
     frames, true = moving_square([(50, 40)] * 4)
     darker = [frame if k < 2 else (frame // 3) for k, frame in enumerate(frames)]
-    done = carry_mask_edit(darker, [NO_MASK] * 4, 0, true[0])
+    done = carried(darker, [NO_MASK] * 4, 0, true[0])
     assert list(done.masks) == [1] and "color" in done.after and done.after.startswith("frame 2: ")
 
 
 def test_it_stops_when_the_region_leaves():
     steps = [(60 - 6 * k, 40) for k in range(20)]
     frames, true = moving_square(steps)
-    done = carry_mask_edit(frames, [NO_MASK] * 20, 0, true[0])
+    done = carried(frames, [NO_MASK] * 20, 0, true[0])
     last = max(done.masks)
     assert "left" in done.after and 0.5 <= true[last].mean() / true[0].mean() < 0.7
     assert all(overlap(mask, true[k]) > 0.95 for k, mask in done.masks.items())
@@ -104,27 +108,27 @@ def test_it_stops_when_the_region_leaves():
 def test_a_mask_that_has_the_correction_already_is_left_alone_but_later_ones_are_not():
     frames, true = moving_square([(50 + k, 40) for k in range(4)])
     known = cv2.dilate(true[1].astype(np.uint8), np.ones((5, 5))) > 0
-    done = carry_mask_edit(frames, [NO_MASK, known, NO_MASK, NO_MASK], 0, true[0])
+    done = carried(frames, [NO_MASK, known, NO_MASK, NO_MASK], 0, true[0])
     assert list(done.masks) == [2, 3]
 
 
 def test_without_a_correction_nothing_changes():
     frames, true = moving_square([(50, 40)] * 3)
-    done = carry_mask_edit(frames, true, 1, true[1])
+    done = carried(frames, true, 1, true[1])
     assert not done.masks and done.before == done.after == "nothing was corrected"
 
 
 def test_arguments_are_not_changed_and_wrong_ones_are_rejected():
     frames, true = moving_square([(50, 40)] * 3)
     masks = [NO_MASK.copy() for _ in frames]
-    carry_mask_edit(frames, masks, 0, true[0])
+    carried(frames, masks, 0, true[0])
     assert not any(mask.any() for mask in masks)
     with pytest.raises(IndexError, match="frame_index"):
-        carry_mask_edit(frames, masks, 3, true[0])
+        carried(frames, masks, 3, true[0])
     with pytest.raises(ValueError, match="edited"):
-        carry_mask_edit(frames, masks, 0, true[0][1:])
+        carried(frames, masks, 0, true[0][1:])
     with pytest.raises(ValueError, match="32 px"):
-        carry_mask_edit([frame[:20] for frame in frames], [mask[:20] for mask in masks], 0, true[0][:20])
+        carried([frame[:20] for frame in frames], [mask[:20] for mask in masks], 0, true[0][:20])
 
 
 def test_sampling_equals_a_slow_loop():

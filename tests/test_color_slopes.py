@@ -17,7 +17,7 @@ from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.render.constants import BLUR_PX2
 from endoprior.training.density import split_children
-from endoprior.view.view_settings import ViewSettings
+from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 
 BACKENDS = ["reference", "numba"]

@@ -140,23 +140,6 @@ def test_the_command_says_what_to_type_in_blender(run, tmp_path, capsys, times, 
     assert (scene.render.fps, scene.frame_start, scene.frame_end) == (25, first, last) and opened == [str(out)]
 
 
-@pytest.mark.parametrize(
-    ("out", "options", "said"),
-    [
-        ("a.mrb", (), ".glb"),
-        ("a.glb", ("--times", "0.5"), "two or more"),
-        ("a.glb", ("--times", "0.2", "0.2"), "in order"),
-        ("a.glb", ("--canonical",), "--canonical"),
-        ("a.glb", ("--mesh-format", "obj"), "--mesh-format"),
-    ],
-)
-def test_a_mistake_is_one_line_and_leaves_nothing(run, tmp_path, capsys, out, options, said):
-    assert main(["export", str(run), str(tmp_path / out), "--format", "animation", *options]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.slow
 def test_blender_shows_the_same_motion_and_colors(file, expected, tmp_path):
     blender = os.environ.get("ENDOPRIOR_BLENDER") or shutil.which("blender")

@@ -11,7 +11,7 @@ from export_scenes import covariances, moving_scene, random_splats
 from scipy.spatial.transform import Rotation
 
 from endoprior import render
-from endoprior.export.axes import ROTATIONS, points_in_axes, quaternion_product, rotated, splats_in_axes
+from endoprior.export.axes import ROTATIONS, points_in_axes, rotated, splats_in_axes
 from endoprior.render import sh
 
 
@@ -22,17 +22,6 @@ def test_axes_are_what_the_documentation_says():
     assert np.array_equal(lps, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # left, inferior, posterior
     ras = points_in_axes(np.stack([right, down, forward]), "ras")
     assert np.array_equal(ras, lps * [-1, -1, 1])
-
-
-@pytest.mark.parametrize("name", ROTATIONS)
-def test_axes_are_proper_rotations(name):
-    matrix = ROTATIONS[name]
-    assert np.array_equal(matrix @ matrix.T, np.eye(3)) and np.linalg.det(matrix) == pytest.approx(1)
-
-
-def test_opencv_leaves_every_bit():
-    splats = random_splats()
-    assert splats_in_axes(splats, "opencv") is splats
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -52,13 +41,6 @@ def test_turned_gaussians_look_the_same_from_the_turned_side(degree, seed):
     torch.testing.assert_close(turned_colors, colors, rtol=0, atol=2e-6)
     if degree:
         assert not torch.allclose(sh.colors(splats.sh.double(), torch.from_numpy(directions @ rotation.T)), colors)
-
-
-def test_quaternion_product_is_one_turn_after_the_other():
-    first, second = Rotation.random(2, random_state=4)
-    left, right = (torch.from_numpy(np.roll(r.as_quat(), 1)) for r in (second, first))
-    both = np.roll(quaternion_product(left, right).numpy(), -1)
-    assert Rotation.from_quat(both).as_matrix() == pytest.approx((second * first).as_matrix(), abs=1e-12)
 
 
 @pytest.mark.parametrize("name", ROTATIONS)

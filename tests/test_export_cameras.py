@@ -50,8 +50,3 @@ def test_an_exported_gaussian_is_on_the_pixel_of_the_image(scene, tmp_path, axes
     rows, columns = np.indices(alpha.shape) + 0.5
     shown = (alpha * columns).sum() / alpha.sum(), (alpha * rows).sum() / alpha.sum()
     assert z > 0 and pixel == pytest.approx(shown, abs=0.2)
-
-
-def test_the_cameras_of_chosen_time_steps(scene, tmp_path):
-    assert export(scene[1], tmp_path / "a.json", "cameras", "--split", "test") == 0
-    assert [c["img_name"] for c in json.loads((tmp_path / "a.json").read_text())] == ["000001", "000009"]

@@ -16,8 +16,8 @@ from plyfile import PlyData
 
 from endoprior.cli import main
 from endoprior.export.axes import points_in_axes
-from endoprior.export.depth import depth_png
 from endoprior.export.formats import FORMATS, formats_of, load_format
+from endoprior.export.frames import depth_png
 from endoprior.model.scene_file import load_scene
 from endoprior.render import sh
 
@@ -264,6 +264,14 @@ def test_scene_is_the_file_of_the_run(run, tmp_path):
         ("a", ("tracks", "--points", "missing.csv"), "missing.csv"),
         ("full", ("ply",), "empty folder"),
         ("file/x.ply", ("ply", "--times", "0"), "file"),
+        ("a.mrb", ("animation",), ".glb"),
+        ("a.glb", ("animation", "--times", "0.5"), "two or more"),
+        ("a.glb", ("animation", "--times", "0.2", "0.2"), "in order"),
+        ("a.glb", ("animation", "--canonical"), "--canonical"),
+        ("a.seq.mrb", ("slicer",), "a.mrb"),
+        ("a.mrb", ("slicer", "--frame", "ras"), "--frame"),
+        ("a.mrb", ("slicer", "--points", "missing.csv"), "missing.csv"),
+        ("a.mrb", ("slicer", "--max-slope", "0.01", "--mesh-step", "20", "--min-alpha", "1"), "--min-alpha"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(run, tmp_path, capsys, out, options, said):

@@ -12,9 +12,8 @@ from plyfile import PlyData
 
 from endoprior.core.checks import InputError
 from endoprior.core.types import Camera
-from endoprior.export.mesh import depth_grid, split_at_touching_corners
-from endoprior.export.mesh_files import encode_mesh
-from endoprior.export.tsdf import fused_mesh, viewpoints
+from endoprior.export.axes import points_in_axes
+from endoprior.export.mesh import Mesh, depth_grid, encode_mesh, fused_mesh, split_at_touching_corners, viewpoints
 from endoprior.model.surface import Surface, render_surface
 
 CENTER, RADIUS = np.array([1.0, -2.0, 70.0]), 20.0
@@ -84,7 +83,8 @@ def test_no_vertex_where_nothing_is_seen():
 
 def test_fusion_of_a_sphere_from_several_sides():
     views = [sphere(plane_camera(shift=shift), back=120.0) for shift in (-20.0, 0.0, 20.0)]
-    vertices, triangles, colors = fused_mesh(views, 1.0)
+    fused = fused_mesh(views, 1.0)
+    vertices, triangles, colors = fused.vertices, fused.triangles, fused.colors
     radius = np.linalg.norm(vertices - CENTER, axis=1)
     front = (radius < RADIUS + 3) & (vertices[:, 2] < 60)
     assert front.sum() > 500 and np.abs(radius[front] - RADIUS).mean() < 0.2  # a fifth of a voxel
@@ -121,32 +121,33 @@ def test_surface_is_freed_from_the_background():
 
 
 @pytest.fixture
-def triangle_mesh() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def triangle_mesh() -> Mesh:
     """Two triangles with corners and colors that are all different."""
     vertices = np.float32([[0, 0, 10], [4, 0, 11], [0, 3, 12], [5, 6, 13.5]])
-    return vertices, np.int32([[0, 2, 1], [1, 2, 3]]), np.uint8([[255, 0, 0], [0, 200, 0], [0, 0, 100], [9, 8, 7]])
+    colors = np.uint8([[255, 0, 0], [0, 200, 0], [0, 0, 100], [9, 8, 7]])
+    return Mesh(vertices, np.int32([[0, 2, 1], [1, 2, 3]]), colors)
 
 
 @pytest.mark.parametrize("kind", ["ply", "obj", "stl"])
 def test_mesh_files_read_back(kind, triangle_mesh):
-    vertices, triangles, colors = triangle_mesh
-    data = encode_mesh(vertices, triangles, colors, kind, "ras")
-    assert b"SPACE=RAS" in data[:200] and b"SPACE" not in encode_mesh(vertices, triangles, colors, kind, "opengl")[:200]
+    data = encode_mesh(triangle_mesh, kind, "ras")
+    assert b"SPACE=RAS" in data[:200] and b"SPACE" not in encode_mesh(triangle_mesh, kind, "opengl")[:200]
     found = trimesh.load(io.BytesIO(data), file_type=kind, process=False)
-    assert found.triangles == pytest.approx(vertices[triangles], abs=1e-5)
+    corners = points_in_axes(triangle_mesh.vertices, "ras")[triangle_mesh.triangles]
+    assert found.triangles == pytest.approx(corners, abs=1e-5)
     if kind == "stl":
         assert len(data) == 84 + 50 * 2 and not data.startswith(b"solid")
         stored = np.frombuffer(data, np.dtype([("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")]), offset=84)["n"]
         assert stored == pytest.approx(found.face_normals, abs=1e-6)
     else:
-        assert (found.visual.vertex_colors[:, :3] == colors).all() and (found.faces == triangles).all()
+        assert (found.visual.vertex_colors[:, :3] == triangle_mesh.colors).all()
+        assert (found.faces == triangle_mesh.triangles).all()
 
 
 def test_ply_mesh_by_a_second_reader(triangle_mesh):
-    vertices, triangles, colors = triangle_mesh
-    data = PlyData.read(io.BytesIO(encode_mesh(vertices, triangles, colors, "ply", "opencv")))
-    assert np.array_equal(np.stack(data["face"]["vertex_indices"]), triangles)
-    assert np.array_equal(np.column_stack([data["vertex"][c] for c in ("red", "green", "blue")]), colors)
+    data = PlyData.read(io.BytesIO(encode_mesh(triangle_mesh, "ply", "opencv")))
+    assert np.array_equal(np.stack(data["face"]["vertex_indices"]), triangle_mesh.triangles)
+    assert np.array_equal(np.column_stack([data["vertex"][c] for c in ("red", "green", "blue")]), triangle_mesh.colors)
 
 
 def fans(triangles, vertex):

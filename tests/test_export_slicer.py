@@ -161,22 +161,3 @@ def test_every_frame_at_the_rate_of_the_sequence_and_equal_bytes(run, tmp_path):
     opened = Bundle(data)
     assert list(sequence_index(opened.only("Sequence"))) == pytest.approx([i / 25 for i in range(10)])
     assert float(opened.only("SequenceBrowser").attributes["playbackRateFps"]) == 25
-
-
-@pytest.mark.parametrize(
-    ("out", "options", "said"),
-    [
-        ("a.seq.mrb", (), "a.mrb"),
-        ("a.zip", (), ".mrb"),
-        ("a.mrb", ("--times", "0.5"), "two or more"),
-        ("a.mrb", ("--times", "0.5", "0.2"), "in order"),
-        ("a.mrb", ("--frame", "ras"), "--frame"),
-        ("a.mrb", ("--points", "missing.csv"), "missing.csv"),
-        ("a.mrb", ("--max-slope", "0.01", "--mesh-step", "20", "--min-alpha", "1"), "--min-alpha"),
-    ],
-)
-def test_a_mistake_is_one_line_and_leaves_nothing(run, tmp_path, capsys, out, options, said):
-    assert main(["export", str(run), str(tmp_path / out), "--format", "slicer", *options]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
-    assert not list(tmp_path.iterdir())

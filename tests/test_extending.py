@@ -68,7 +68,7 @@ main(["export", "--help"])
 def extend(tmp_path):
     """Copies the package, and adds a file and a line to the copy."""
 
-    def add(page: str, module: str, registry: str, variable: str) -> None:
+    def add(page: str, module: str, registry: str, variable: str, entry: str = '"{}"', opening: str = "(") -> None:
         shutil.copytree(SOURCES, tmp_path / "src", ignore=shutil.ignore_patterns("*.nb?", "*.ready", "*.egg-info"))
         write_package(tmp_path / "src", "endoprior", entry_points(SOURCES.parent))
         example = (DOCS / page).read_text(encoding="utf-8").split("\n## Add a ")[1]
@@ -78,9 +78,9 @@ def extend(tmp_path):
         assert shown or f"[{file.name}](" in example
         file.write_text(shown[1] if shown else linked.read_text(encoding="utf-8"))
         lines = (tmp_path / "src" / "endoprior" / registry).read_text()
-        start = f"{variable} = (\n"
+        start = f"{variable} = {opening}\n"
         assert start in lines
-        added = lines.replace(start, f'{start}    "{file.stem}",\n')
+        added = lines.replace(start, f"{start}    {entry.format(file.stem)},\n")
         (tmp_path / "src" / "endoprior" / registry).write_text(added)
 
     return add
@@ -125,7 +125,7 @@ def test_a_new_layout_is_recognized_and_opened(extend, tmp_path, tiny_sequence):
 
 
 def test_a_new_export_format_is_offered_and_written(extend, tmp_path, tiny_sequence):
-    extend("export.md", "export/xyz.py", "export/formats.py", "FORMATS")
+    extend("export.md", "export/xyz.py", "export/formats.py", "FORMATS", '"{0}": "{0}:FORMAT"', "{")
     scene = tiny_scene(tiny_sequence)
     scene.save(tmp_path / "scene.safetensors")
     said = run(tmp_path, "-c", EXPORT, tmp_path / "scene.safetensors", tmp_path / "a.xyz")

@@ -20,7 +20,7 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.export import export
-from endoprior.export.options import ExportOptions
+from endoprior.export.formats import ExportOptions
 from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.work_folder import work_folder
 from endoprior.runs.train import train

@@ -10,7 +10,7 @@ from conftest import REAL_DATA
 from endoprior.data.images import read_color
 from endoprior.footage.border import Circle, Strips, find_circle, find_strips
 from endoprior.footage.camera_motion import camera_motion
-from endoprior.footage.combing import are_combed
+from endoprior.footage.changes import are_combed
 from endoprior.prepare.source import open_source
 
 

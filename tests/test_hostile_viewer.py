@@ -18,9 +18,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from endoprior.core.checks import InputError
 from endoprior.view import panel as panels
-from endoprior.view.access_control import MAX_BROWSERS, MAX_MESSAGE_BYTES
+from endoprior.view.access_control import MAX_BROWSERS, MAX_MESSAGE_BYTES, is_valid_message
 from endoprior.view.job_queue import MAX_WAITING, JobQueue
-from endoprior.view.messages import is_valid_message
 from endoprior.view.panel import ORBIT, control_id
 from endoprior.view.saving import keep
 from endoprior.view.server import MAX_KEPT, Viewer

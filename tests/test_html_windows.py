@@ -13,8 +13,7 @@ from player_page import HEIGHT, RATE, WIDTH, open_player, picture, random_scene,
 
 from endoprior.core.checks import InputError
 from endoprior.core.types import Camera
-from endoprior.export.html import PageTooLarge, write_html
-from endoprior.export.html_data import quantized_blocks
+from endoprior.export.html import PageTooLarge, quantized_blocks, write_html
 from endoprior.model.single_scene import SingleScene
 from endoprior.model.windowed_scene import Span, WindowedScene
 

@@ -13,7 +13,7 @@ from sequence_edits import change_poses, write
 
 from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
-from endoprior.footage.black_margin import black_margin
+from endoprior.footage.border import black_margin
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
 CROP = 4

@@ -7,7 +7,7 @@ import pytest
 from painted_borders import HEIGHT, NOT_ROUND, ROUND, WIDTH, finish, judge, round_image, tissue
 
 from endoprior.footage.border import Circle, find_circle, find_outline, find_strips
-from endoprior.footage.circle import fit_circle
+from endoprior.footage.dark_outline import fit_circle
 from endoprior.prepare.first_pass import border_notes
 from endoprior.prepare.frame_geometry import make_geometry
 

@@ -18,7 +18,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config, DataConfig
 from endoprior.data import load_sequence
 from endoprior.export import export
-from endoprior.export.options import ExportOptions
+from endoprior.export.formats import ExportOptions
 from endoprior.model.presets import preset
 from endoprior.model.scene_file import load_scene
 from endoprior.runs.train import train

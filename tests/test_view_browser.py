@@ -154,8 +154,9 @@ def test_two_clicks_measure_the_true_distance(viewer, page, phantom):
             page.click_at(left + x * width, top + y * height)
             wait_until(lambda before=before: viewer.measured is not before)
         true = float(np.linalg.norm(points[1] - points[0]))
-        assert viewer.measured.distances[FRAME] == pytest.approx(true, abs=1.0)
-        page.wait_for(f"document.body.innerText.includes('{viewer.measured.distances[FRAME]:.2f} mm')")
+        assert viewer.measured.curve("Distance")[FRAME] == pytest.approx(true, abs=1.0)
+        distance = viewer.measured.curve("Distance")[FRAME]
+        page.wait_for(f"document.body.innerText.includes('{distance:.2f} mm')")
     settled(page, "measured")
 
 

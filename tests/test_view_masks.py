@@ -20,7 +20,7 @@ from endoprior.view.job_queue import JobQueue
 from endoprior.view.mask_editor import MaskEditor
 from endoprior.view.mask_edits import MaskEdits, stroke
 from endoprior.view.server import Viewer
-from endoprior.view.view_settings import ViewSettings
+from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_sequence import ViewableSequence
 
 SHAPE = (48, 64)

@@ -11,12 +11,11 @@ from endoprior.core.geometry import project
 from endoprior.core.types import Camera
 from endoprior.data.images import encode_png
 from endoprior.view.browsers import Browsers
-from endoprior.view.line_overlay import concatenated, draw_lines, no_lines, ruler, track_lines
-from endoprior.view.measure import POINTS_OF, Measurement, measurement_text, pick
-from endoprior.view.point_rendering import render_points
-from endoprior.view.saving import keep, mp4_bytes
-from endoprior.view.video_path import PathPoint, follow_frames, interpolate
-from endoprior.view.view_settings import frame_due, shrink_factor
+from endoprior.view.layers import concatenated, draw_lines, no_lines, render_points, ruler, track_lines
+from endoprior.view.measure import Measurement, measurement_text, pick
+from endoprior.view.panel import POINTS_OF
+from endoprior.view.saving import PathPoint, follow_frames, interpolate, keep, mp4_bytes
+from endoprior.view.viewable import frame_due, shrink_factor
 from endoprior.view.viewport import bounded_aspect, endoscope_viewport, free_viewport
 
 CAMERA = Camera(64, 48, 80.0, 80.0, 32.0, 24.0, np.eye(4))
@@ -122,7 +121,7 @@ def test_a_measurement_reports_distance_and_change():
     paths = np.zeros((3, 2, 3))
     paths[:, 1, 0] = 4, 5, 7
     measured = Measurement(1, paths)
-    assert measured.distances.tolist() == [4, 5, 7]
+    assert measured.curve("Distance").tolist() == [4, 5, 7]
     text = measurement_text(measured, 2, relative=False)
     assert "7.00 mm" in text and "+2.00 since frame 1" in text and "4.00 to 7.00" in text
     text = measurement_text(measured, 2, relative=True)

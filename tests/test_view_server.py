@@ -24,11 +24,10 @@ from endoprior.model.scene import Scene
 from endoprior.model.single_scene import SingleScene
 from endoprior.runs.train import train
 from endoprior.view import live
-from endoprior.view.measure import AREA, DISPLACEMENT, STRETCH
-from endoprior.view.panel import BROWSER, LAYER_NAMES, ORBIT, POINTS
+from endoprior.view.measure import DrawnTracks
+from endoprior.view.panel import AREA, BROWSER, DISPLACEMENT, LAYER_NAMES, ORBIT, POINTS, STRETCH
 from endoprior.view.server import Viewer
-from endoprior.view.tracks import DrawnTracks
-from endoprior.view.view_settings import ViewSettings
+from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.view.viewable_sequence import ViewableSequence
 from endoprior.visualization.image_tools import to_u8
@@ -129,7 +128,7 @@ def test_two_clicks_measure_and_the_distance_follows_the_tissue(viewer, client, 
     for x in (0.25, 0.75):
         client.click(x, 0.5)
     client.image()
-    assert viewer.measured.distances == pytest.approx(np.full(NUM_FRAMES, 32 / 80 * 50), abs=0.05)
+    assert viewer.measured.curve("Distance") == pytest.approx(np.full(NUM_FRAMES, 32 / 80 * 50), abs=0.05)
     assert "mm" in viewer.panel.distance.content
     shift = viewer.measured.paths[-1, 0, 0] - viewer.measured.paths[0, 0, 0]
     moved = scene.at((NUM_FRAMES - 1) / NUM_FRAMES).means - scene.at(0).means
@@ -220,6 +219,15 @@ def test_displacement_and_stretch_are_since_the_reference_frame(scene):
     assert alpha[24, 23].min() > 200 and not stretch[24, 23].any()
 
 
+def test_each_gaussian_has_a_color_also_behind_the_camera(scene):
+    turned = np.eye(4)
+    turned[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # looks along the wall, from its middle
+    turned[:3, 3] = -turned[:3, :3] @ [0, 0, 50]
+    cameras = tuple(replace(camera, world_to_camera=turned) for camera in scene.cameras)
+    cloud = ViewableScene(replace(scene, cameras=cameras), "wall").cloud(ViewSettings(layer="prior"))
+    assert len(cloud.colors) == len(cloud.points) == len(scene)
+
+
 def test_play_advances_and_pauses(viewer, client):
     client.set(viewer.panel.speed, "0.5x")
     client.set(viewer.panel.play, True)
@@ -293,7 +301,7 @@ def test_a_raw_sequence_is_shown_before_training(tiny_sequence):
         for x in (0.45, 0.55):
             client.click(x, 0.7)
         time.sleep(0.5)
-        assert np.isfinite(viewer.measured.distances).sum() == 1  # the motion of the points is unknown
+        assert np.isfinite(viewer.measured.curve("Distance")).sum() == 1  # the motion of the points is unknown
         client.socket.close()
 
 

@@ -31,7 +31,7 @@ from endoprior.model.single_scene import SingleScene
 from endoprior.model.surface import Support
 from endoprior.model.windowed_scene import Span, WindowedScene, save_index, window_file
 from endoprior.runs.train import start_run, train
-from endoprior.view.view_settings import ViewSettings
+from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_scene import ViewableScene
 
 RULES = WindowConfig(enabled=True, shortest=10, longest=40, overlap=4)

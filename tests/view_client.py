@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from websockets.protocol import State
 from websockets.sync.client import connect
 
-from endoprior.view.messages import BRUSH_NODE
+from endoprior.view.access_control import BRUSH_NODE
 from endoprior.view.panel import control_id
 
 VISER = "viser-v1.1.1"

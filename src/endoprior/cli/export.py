@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ..export.options import ExportOptions
+from ..export.formats import ExportOptions
 from ..system.console import say
 from .help_page import Help
 from .parsing import parse

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..core.config import DataConfig
 from ..core.spread import spread
 from ..core.types import Camera
-from ..footage.black_margin import black_margin
+from ..footage.border import black_margin
 from .assemble import Pixels, assemble, kept_frames
 from .endonerf import focal_at, read_poses_bounds
 from .files import IMAGE_SUFFIXES, list_files

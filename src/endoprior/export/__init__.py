@@ -1,6 +1,6 @@
 """Export: a trained scene in formats that other programs read. Each format is a module; `formats` lists them all."""
 
 from .exporting import export
-from .options import ExportOptions
+from .formats import ExportOptions
 
 __all__ = ["ExportOptions", "export"]

@@ -46,15 +46,15 @@ def rotated(splats: Splats, rotation: NDArray[np.float64]) -> Splats:
     matrix = torch.from_numpy(rotation)
     return Splats(
         means=(splats.means.double() @ matrix.T).to(splats.means.dtype),
-        quats=quaternion_product(torch.tensor([w, x, y, z]), splats.quats.double()).to(splats.quats.dtype),
+        quats=_quaternion_product(torch.tensor([w, x, y, z]), splats.quats.double()).to(splats.quats.dtype),
         scales=splats.scales,
         opacities=splats.opacities,
-        sh=rotated_sh(splats.sh, rotation),
+        sh=_rotated_sh(splats.sh, rotation),
         color_slopes=splats.color_slopes,
     )
 
 
-def quaternion_product(left: Tensor, right: Tensor) -> Tensor:
+def _quaternion_product(left: Tensor, right: Tensor) -> Tensor:
     """Hamilton product of quaternions (w, x, y, z), shapes (..., 4): the rotation `right`, then `left`."""
     a, b, c, d = left.unbind(-1)
     w, x, y, z = right.unbind(-1)
@@ -69,14 +69,14 @@ def quaternion_product(left: Tensor, right: Tensor) -> Tensor:
     )
 
 
-def rotated_sh(sh: Tensor, rotation: NDArray[np.float64]) -> Tensor:
+def _rotated_sh(sh: Tensor, rotation: NDArray[np.float64]) -> Tensor:
     """Coefficients (N, K, 3) rotated with their Gaussians: the color from direction d becomes that from R d."""
-    matrix = torch.from_numpy(sh_rotation(harmonics.degree_of(sh.shape[1]), rotation.tobytes()))
+    matrix = torch.from_numpy(_sh_rotation(harmonics.degree_of(sh.shape[1]), rotation.tobytes()))
     return torch.einsum("kj,njc->nkc", matrix, sh.double()).to(sh.dtype)
 
 
 @cache
-def sh_rotation(degree: int, rotation: bytes) -> NDArray[np.float64]:
+def _sh_rotation(degree: int, rotation: bytes) -> NDArray[np.float64]:
     """(K, K) matrix that rotates spherical-harmonic coefficients up to `degree`.
 
     Degrees do not mix. The block of each solves Y(R d) block = Y(d) by least squares over directions d on a spiral,

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..core.checks import input_error
 from ..core.geometry import length_unit
 from ..system.atomic import whole_file, whole_folder, write_json
-from .formats import REGISTRY, Format, Progress, formats_of, known_suffixes, load_format
-from .options import DEFAULTS, ExportOptions
+from .formats import REGISTRY, ExportOptions, Format, Progress, formats_of, load_format, usable_formats
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
@@ -53,7 +52,8 @@ def format_name(out: Path, options: ExportOptions) -> str:
     name = options.format or next(iter(formats_of(out.suffix)), None)
     if name is None:
         got = f"the suffix {out.suffix}" if out.suffix else "a name without a suffix"
-        fix = f"Choose a suffix of {' '.join(known_suffixes())}, or add --format with one of "
+        known = dict.fromkeys(suffix for each in usable_formats().values() for suffix in each.suffixes)
+        fix = f"Choose a suffix of {' '.join(known)}, or add --format with one of "
         fix += f"{', '.join(REGISTRY.names())}."
         raise input_error(out, "a file whose suffix says the format, or --format", got, fix)
     return name
@@ -74,7 +74,7 @@ def _by_suffix(out: Path, options: ExportOptions, chosen: Format) -> str:
 
 def _reject_unused_options(options: ExportOptions, chosen: Format) -> None:
     for field in fields(options):
-        given = getattr(options, field.name) != getattr(DEFAULTS, field.name)
+        given = getattr(options, field.name) != field.default
         if given and field.name not in ("format", *chosen.options):
             known = ", ".join(f"--{name.replace('_', '-')}" for name in chosen.options) or "no options"
             want, fix = f"an option of --format {options.format}", f"Leave it out. The format takes {known}."

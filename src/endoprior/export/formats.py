@@ -1,6 +1,6 @@
-"""Every export format. To add one, write a module with a `FORMAT` in this folder and name it in `FORMATS`.
+"""Every export format, and the options of `endoprior export`. To add a format, see docs/export.md.
 
-docs/export.md shows how; docs/format.md says what the files of each format hold.
+docs/format.md says what the files of each format hold.
 """
 
 from __future__ import annotations
@@ -11,38 +11,37 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ..core.checks import check_range
 from ..system.plugins import Registry
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
-    from .options import ExportOptions
-    from .time_steps import TimeStep
 
 Axes = Literal["opencv", "opengl", "ras", "lps"]
 """Axes that exported coordinates refer to; docs/format.md defines them."""
 Progress = Callable[[int, int], None]
 """Takes how much is done and how much there is."""
 
-FORMATS = (
-    "ply",
-    "compressed_ply",
-    "sog",
-    "splat",
-    "spz",
-    "gltf",
-    "points",
-    "mesh",
-    "animation",
-    "slicer",
-    "cameras",
-    "depth",
-    "tracks",
-    "measures",
-    "video",
-    "scene",
-    "html",
-)
-"""Modules of this package by the name that --format takes, in the order of `endoprior export --help`."""
+FORMATS = {
+    "ply": "ply:PLY",
+    "compressed_ply": "packed_splats:COMPRESSED_PLY",
+    "sog": "packed_splats:SOG",
+    "splat": "packed_splats:SPLAT",
+    "spz": "packed_splats:SPZ",
+    "gltf": "gltf:GAUSSIANS",
+    "points": "ply:POINTS",
+    "mesh": "mesh:FORMAT",
+    "animation": "gltf:ANIMATION",
+    "slicer": "slicer:FORMAT",
+    "cameras": "frames:CAMERAS",
+    "depth": "frames:DEPTH",
+    "tracks": "tracks:FORMAT",
+    "measures": "measures:FORMAT",
+    "video": "frames:VIDEO",
+    "scene": "frames:SCENE",
+    "html": "html:FORMAT",
+}
+"""Module of this package and object in it by the name that --format takes, in the order of the command's help."""
 TIME_STEP_OPTIONS = ("times", "split", "frame")
 """Options of most formats that have a file for each time step."""
 
@@ -55,8 +54,8 @@ class Format:
     """Suffixes of its files; empty for a `write` that makes a folder."""
     options: tuple[str, ...]
     """Fields of `ExportOptions` that the format uses; others are rejected."""
-    files: Callable[[Scene, TimeStep, ExportOptions], dict[str, bytes]] | None = None
-    """The contents of the files of one time step, by suffix."""
+    files: Callable[[Scene, Any, ExportOptions], dict[str, bytes]] | None = None
+    """The contents of the files of one `time_steps.TimeStep`, by suffix."""
     write: Callable[[Scene, Path, ExportOptions, Progress], None] | None = None
     """Writes one output for the whole sequence."""
     suffix_option: str = ""
@@ -80,14 +79,74 @@ def _problem(found: Any) -> str:
     return "" if has_one else "a Format with both or none of files and write"
 
 
+def _built_in(name: str) -> Format:
+    module, _, variable = FORMATS[name].partition(":")
+    return getattr(import_module(f".{module}", __package__), variable)
+
+
 REGISTRY: Registry[Format] = Registry(
-    "exporters",
-    "a Format of endoprior.export.formats",
-    _problem,
-    modules=FORMATS,
-    load_module=lambda name: import_module(f".{name}", __package__).FORMAT,
+    "exporters", "a Format of endoprior.export.formats", _problem, modules=tuple(FORMATS), load_module=_built_in
 )
 """The formats above, and those of plugins."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Options of an export. Each format takes some of them and rejects the others."""
+
+    format: Literal[REGISTRY.names()] | None = None
+    """Format; by default the one of OUT's suffix: .ply and .glb are Gaussians, .obj is a mesh.
+    Blender opens `animation` (a moving mesh, .glb) and `mesh`. A folder has no default."""
+    times: tuple[float, ...] = ()
+    """Times in [0, 1] to export instead of frames. Frame i of T is at i / T."""
+    split: Literal["video", "test", "train"] = "video"
+    """Frames to export; `video` is all of them."""
+    canonical: bool = False
+    """Export the Gaussians as they are stored, before any motion."""
+    frame: Axes | None = None
+    """Axes of the coordinates. opencv: x right, y down, z forward; opengl: y up, z back; ras, lps: for 3D Slicer.
+    Default: opengl for spz, gltf and animation, whose specifications require it; else opencv."""
+    min_alpha: float = 0.5
+    """Accumulated opacity from which a pixel shows a surface (depth, meshes, tracks)."""
+    min_opacity: float = 0.5
+    """Least opacity of a Gaussian that becomes a point (points)."""
+    mesh_format: Literal["ply", "obj", "stl"] | None = None
+    """Files of a mesh; by default OUT's suffix. In a folder ply; STL has no colors."""
+    mesh_method: Literal["grid", "tsdf"] = "grid"
+    """`grid`: a grid mesh of the depth that the frame's camera sees; `tsdf`: the depths of all cameras fused."""
+    mesh_step: int = 2
+    """Pixels between the vertices of a grid mesh."""
+    max_slope: float = 5.0
+    """Depth change per mm sideways above which a grid mesh is cut."""
+    voxel_mm: float = 1.0
+    """Edge of a voxel of the fusion, mm."""
+    points: Path | None = None
+    """CSV with columns x, y, frame: pixels to track; default: a grid on the first frame (tracks).
+    For measures the rows are the corners of a polygon, and the first two the ends of a distance; default: none.
+    For slicer they become a list of points; default: none."""
+    grid_px: int = 32
+    """Pixels between the points of that grid."""
+    data: Path | None = None
+    """Sequence folder whose masks tell where tools hide a point (tracks). Default: the one of the run."""
+    from_frame: int = 0
+    """Frame that displacement and stretch refer to (measures)."""
+    to_frame: int | None = None
+    """Frame whose displacement and stretch the surface shows; default: the last (measures)."""
+    title: str = ""
+    """Title above the player (html)."""
+    max_mb: float = 20.0
+    """Largest player to write, MB (html)."""
+
+    def __post_init__(self) -> None:
+        for time in self.times:
+            check_range("times", time, 0, 1)
+        check_range("min_alpha", self.min_alpha, 0.01, 1)
+        check_range("min_opacity", self.min_opacity, 0, 1)
+        check_range("mesh_step", self.mesh_step, 1, 1000)
+        check_range("max_slope", self.max_slope, 0.01, 1000)
+        check_range("voxel_mm", self.voxel_mm, 0.01, 1000)
+        check_range("grid_px", self.grid_px, 1, 100_000)
+        check_range("max_mb", self.max_mb, 0.1, 1000)
 
 
 def load_format(name: str) -> Format:
@@ -102,16 +161,11 @@ def load_format(name: str) -> Format:
     return REGISTRY.load(name)
 
 
+def usable_formats() -> dict[str, Format]:
+    """Every format that can be used, by name, plugins last."""
+    return {name: REGISTRY.load(name) for name in FORMATS} | dict(REGISTRY.usable())
+
+
 def formats_of(suffix: str) -> list[str]:
     """Names of the formats that write files of this suffix: the one that it stands for first, plugins last."""
-    return [name for name, format_ in _loaded() if suffix in format_.suffixes]
-
-
-def known_suffixes() -> list[str]:
-    """Every suffix that says a format, without repetition."""
-    return list(dict.fromkeys(suffix for _, format_ in _loaded() for suffix in format_.suffixes))
-
-
-def _loaded() -> list[tuple[str, Format]]:
-    """Name and format of all that can be used, plugins last."""
-    return [*((name, REGISTRY.load(name)) for name in FORMATS), *REGISTRY.usable()]
+    return [name for name, each in usable_formats().items() if suffix in each.suffixes]

@@ -1,11 +1,16 @@
-"""Binary glTF 2.0 with KHR_gaussian_splatting; programs without the extension show a colored point cloud.
+"""Binary glTF 2.0: Gaussians with KHR_gaussian_splatting, and the moving tissue surface as one animated mesh.
 
-Source: extensions/2.0/Khronos/KHR_gaussian_splatting in github.com/KhronosGroup/glTF as ratified in 2026 (linear
-scales, linear opacities, quaternions x, y, z, w). glTF counts meters: a node scales the mm of the data by 0.001.
+Sources: the glTF 2.0 specification, and extensions/2.0/Khronos/KHR_gaussian_splatting in github.com/KhronosGroup/glTF
+as ratified in 2026 (linear scales, linear opacities, quaternions x, y, z, w); programs without the extension show a
+colored point cloud. glTF counts meters: a node scales the mm of the data by 0.001.
 """
 
 from __future__ import annotations
 
+import json
+import math
+import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,38 +18,99 @@ from numpy.typing import NDArray
 
 from ..core.geometry import length_unit
 from ..core.types import Splats
+from ..model.carry import carry_points
 from ..model.gaussians import SH_C0
 from ..model.scene import Scene
-from .formats import TIME_STEP_OPTIONS, Format
-from .glb import MM_TO_METERS, VERTEX_BUFFER, Buffer, decoded_srgb
-from .options import ExportOptions
-from .time_steps import TimeStep
+from ..system.atomic import whole_file
+from .axes import points_in_axes
+from .formats import TIME_STEP_OPTIONS, ExportOptions, Format, Progress
+from .mesh import SURFACE_OPTIONS, surface_mesh
+from .ply import unit_quaternions
+from .time_steps import TimeStep, seconds_of_motion, selected_time_steps
 
-EXTENSION = "KHR_gaussian_splatting"
+MM_TO_METERS = [0.001] * 3
+SPLATTING = "KHR_gaussian_splatting"
+UNLIT = "KHR_materials_unlit"
+"""Vertex colors are those of the video, the endoscope's light included; viewers must not light them again."""
+VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
+_COMPONENTS = {"<f4": 5126, "<u4": 5125}
+_KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _POINTS = 0
 
 
-def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+class Buffer:
+    """The arrays of a file, one after the other; others refer to them by the number of their accessor."""
+
+    def __init__(self) -> None:
+        self._accessors: list[dict[str, Any]] = []
+        self._views: list[dict[str, int]] = []
+        self._contents = bytearray()
+
+    def add(self, values: NDArray, target: int | None = None, *, bounds: bool = False) -> int:
+        """Append float32 or uint32 `values`, (count,) or (count, 3 or 4), and return the number of their accessor.
+
+        Args:
+            target: VERTEX_BUFFER or INDEX_BUFFER; None for what is neither.
+            bounds: also store minimum and maximum, as positions and times of keyframes must.
+        """
+        columns = values.reshape(len(values), -1)
+        accessor = {"bufferView": len(self._views), "componentType": _COMPONENTS[values.dtype.str]}
+        accessor |= {"count": len(columns), "type": _KINDS[columns.shape[1]]}
+        if bounds:
+            accessor |= {"min": columns.min(0).tolist(), "max": columns.max(0).tolist()}
+        view = {"buffer": 0, "byteOffset": len(self._contents), "byteLength": values.nbytes}
+        self._views.append(view | ({} if target is None else {"target": target}))
+        self._accessors.append(accessor)
+        self._contents += values.tobytes()
+        return len(self._accessors) - 1
+
+    def file(self, document: dict[str, Any], extras: dict[str, Any]) -> bytes:
+        """The bytes of a .glb file: a header, a JSON chunk and a binary chunk, both padded to 4 bytes.
+
+        Args:
+            document: its scene of one node, without `asset`, `accessors`, `bufferViews` and `buffers`.
+            extras: `extras` of its `asset`.
+        """
+        document = {
+            "asset": {"version": "2.0", "generator": "endoprior", "extras": extras},
+            **document,
+            "accessors": self._accessors,
+            "bufferViews": self._views,
+            "buffers": [{"byteLength": len(self._contents)}],
+        }
+        text = json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
+        chunks = b""
+        for kind, content, filler in ((b"JSON", text, b" "), (b"BIN\0", self._contents, b"\0")):
+            padding = filler * (-len(content) % 4)
+            chunks += struct.pack("<I4s", len(content) + len(padding), kind) + content + padding
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def decoded_srgb(encoded: NDArray) -> NDArray:
+    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+# Gaussians of one time step.
+
+
+def gaussians(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The .glb file of one time step."""
     extras = {"unit": length_unit(scene.lengths_are_relative), "axes": options.frame, "time": step.time}
     return {".glb": encode_glb(step.plain_splats(scene, options.frame), extras)}
 
 
 def encode_glb(splats: Splats, extras: dict[str, Any] | None = None) -> bytes:
-    """One scene, one node, one primitive of POINTS.
-
-    Args:
-        extras: `extras` of the file's `asset`.
-    """
+    """One scene, one node, one primitive of POINTS. Args: extras: `extras` of the file's `asset`."""
     buffer = Buffer()
     numbers = {
-        name: buffer.add(values, VERTEX_BUFFER, bounds=name == "POSITION")
-        for name, values in splat_attributes(splats).items()
+        name: buffer.add(np.ascontiguousarray(values, "<f4"), VERTEX_BUFFER, bounds=name == "POSITION")
+        for name, values in _attributes(splats).items()
     }
     kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {"attributes": numbers, "mode": _POINTS, "extensions": {EXTENSION: kernel}}
+    primitive = {"attributes": numbers, "mode": _POINTS, "extensions": {SPLATTING: kernel}}
     document = {
-        "extensionsUsed": [EXTENSION],
+        "extensionsUsed": [SPLATTING],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "scale": MM_TO_METERS}],
@@ -53,25 +119,92 @@ def encode_glb(splats: Splats, extras: dict[str, Any] | None = None) -> bytes:
     return buffer.file(document, extras or {})
 
 
-def splat_attributes(splats: Splats) -> dict[str, NDArray[np.float32]]:
+def _attributes(splats: Splats) -> dict[str, NDArray]:
     """Vertex attributes by semantic: positions and scales in mm, the color of the fallback in linear light."""
-    quats = splats.quats.numpy().astype(np.float64)
-    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     sh, opacities = splats.sh.numpy(), splats.opacities.numpy()
-    linear = decoded_srgb(np.clip(sh[:, 0] * SH_C0 + 0.5, 0, 1))
     attributes = {
         "POSITION": splats.means.numpy(),
-        "COLOR_0": np.column_stack([linear, opacities]),
-        f"{EXTENSION}:ROTATION": unit[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": splats.scales.numpy(),
-        f"{EXTENSION}:OPACITY": opacities,
+        "COLOR_0": np.column_stack([decoded_srgb(np.clip(sh[:, 0] * SH_C0 + 0.5, 0, 1)), opacities]),
+        f"{SPLATTING}:ROTATION": unit_quaternions(splats.quats.numpy().astype(np.float64))[:, [1, 2, 3, 0]],
+        f"{SPLATTING}:SCALE": splats.scales.numpy(),
+        f"{SPLATTING}:OPACITY": opacities,
     }
     for k in range(sh.shape[1]):
         band = int(np.sqrt(k))
-        attributes[f"{EXTENSION}:SH_DEGREE_{band}_COEF_{k - band * band}"] = sh[:, k]
-    return {name: np.ascontiguousarray(values, "<f4") for name, values in attributes.items()}
+        attributes[f"{SPLATTING}:SH_DEGREE_{band}_COEF_{k - band * band}"] = sh[:, k]
+    return attributes
 
 
-FORMAT = Format(
-    suffixes=(".glb",), options=(*TIME_STEP_OPTIONS, "canonical"), files=files, default_axes="opengl", holds="Gaussians"
+# The moving mesh. Carried by the Gaussians, each vertex is one material point. Morph target i displaces every vertex to
+# where it is at time step i + 1; the animation fades from each target to the next.
+
+
+def write_animation(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
+    """Write the .glb file.
+
+    Raises:
+        InputError: there are fewer than two time steps, they do not increase, or the first shows no surface.
+    """
+    steps = selected_time_steps(scene, options)
+    seconds = seconds_of_motion(scene, steps)
+    mesh = surface_mesh(scene, steps[0], options)
+    at_first = np.zeros(len(mesh.vertices), np.intp)
+    carried = carry_points(scene, mesh.vertices, at_first, [step.time for step in steps])
+    positions = points_in_axes(carried, options.frame)
+    buffer = Buffer()
+    attributes = {
+        "POSITION": buffer.add(positions[0], VERTEX_BUFFER, bounds=True),
+        "COLOR_0": buffer.add(decoded_srgb(mesh.colors / 255).astype(np.float32), VERTEX_BUFFER),
+    }
+    indices = buffer.add(mesh.triangles.astype(np.uint32).ravel(), INDEX_BUFFER)
+    targets = [{"POSITION": buffer.add(there - positions[0], VERTEX_BUFFER, bounds=True)} for there in positions[1:]]
+    weights = np.eye(len(seconds), dtype=np.float32)[:, 1:]  # of every target at every time; the first is the mesh
+    sampler = {
+        "input": buffer.add(np.array(seconds, np.float32), bounds=True),
+        "output": buffer.add(weights.ravel()),
+        "interpolation": "LINEAR",
+    }
+    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+    primitive = {"attributes": attributes, "indices": indices, "targets": targets, "material": 0}
+    names = {"targetNames": [step.name for step in steps[1:]]}
+    document = {
+        "extensionsUsed": [UNLIT],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "tissue", "mesh": 0, "scale": MM_TO_METERS}],
+        "meshes": [{"name": "tissue", "primitives": [primitive], "extras": names}],
+        "materials": [{"name": "tissue", "doubleSided": True, "extensions": {UNLIT: {}}}],
+        "animations": [{"name": "motion", "samplers": [sampler], "channels": [channel]}],
+    }
+    relative = scene.lengths_are_relative
+    extras = {"unit": length_unit(relative), "axes": options.frame, "lengths_are_relative": relative}
+    with whole_file(out) as temporary:
+        temporary.write_bytes(buffer.file(document, extras))
+    progress(1, 1)
+
+
+def blender_note(scene: Scene, out: Path, options: ExportOptions) -> str:
+    """How to open `out` in Blender: glTF cannot tell it the rate and the range of the frames to play."""
+    seconds = seconds_of_motion(scene, selected_time_steps(scene, options))
+    rate = max(round(scene.frames_per_second), 1)
+    first, last = math.floor(seconds[0] * rate + 1e-6), math.ceil(seconds[-1] * rate - 1e-6)
+    code = f"s = bpy.context.scene; s.render.fps = {rate}; s.frame_start = {first}; s.frame_end = {last}; "
+    code += f"bpy.ops.import_scene.gltf(filepath={str(out.absolute())!r})"
+    return f"a .glb file does not say which frames to play. In Blender's Python console, type: {code}"
+
+
+GAUSSIANS = Format(
+    suffixes=(".glb",),
+    options=(*TIME_STEP_OPTIONS, "canonical"),
+    files=gaussians,
+    default_axes="opengl",
+    holds="Gaussians",
+)
+ANIMATION = Format(
+    suffixes=(".glb",),
+    options=(*TIME_STEP_OPTIONS, *SURFACE_OPTIONS),
+    write=write_animation,
+    default_axes="opengl",
+    holds="a moving mesh",
+    note=blender_note,
 )

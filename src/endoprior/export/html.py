@@ -1,8 +1,18 @@
 """One HTML file that plays a scene in a browser: no server, no network, nothing to install.
 
-The page holds the Gaussians of every time step as deflated integers (`html_data`), window by window, unpacks a window
-when it is needed, and renders them with WebGL 2 by the
-formulas of our renderer (`player/`). Its content security policy forbids it to load or send anything.
+The page holds the Gaussians of every time step as deflated integers, window by window, unpacks a window when it is
+needed, and renders them with WebGL 2 by the formulas of our renderer (`player/`). Its content security policy forbids
+it to load or send anything.
+
+The data are blocks: one for each window of the scene, with the time steps that show it. Where two windows overlap, a
+time step shows two blocks, and the opacities of each contain how far it is faded.
+
+Every Gaussian of a block has 20 channels, each `low + step * q` with q a 16-bit integer: center x, y, z (mm),
+quaternion w, x, y, z, the logarithms of the three scales (mm), opacity, red, green, blue, and the change of these three
+per standard deviation along the first and the second local axis. A channel that never changes is stored once. The
+others store time step 0 and then the residual of a prediction from one step before (q[t-1]) or two (2 q[t-1] - q[t-2]),
+whichever leaves less. Arithmetic is modulo 2**16, so that unpacking is exact. Shared letters: `T` time steps of a
+block, `N` Gaussians, `C = 20` channels.
 """
 
 from __future__ import annotations
@@ -12,29 +22,27 @@ import html
 import json
 import math
 import re
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 from ..core.geometry import length_unit
-from ..model.scene import Scene
+from ..core.types import Camera, Splats
+from ..model.playback import faded
+from ..model.scene import Scene, Shown
+from ..render.constants import ALPHA_MIN, NEAR_Z
+from ..render.projection import color_slopes
+from ..render.sh import colors
 from ..system.atomic import whole_file
-from .formats import Format, Progress
-from .html_data import CHANNELS, Block, pack, quantized_blocks
-from .options import ExportOptions
-
-
-class PageTooLarge(InputError):
-    """The page would exceed the limit."""
-
-    def __init__(self, message: str, num_bytes: int) -> None:
-        super().__init__(message)
-        self.num_bytes = num_bytes
-        """Size of the page; where packing stopped before its end, what it would be if all went on like that."""
-
+from .formats import ExportOptions, Format, Progress
 
 DATA_FORMAT = "endoprior-player-2"
 """Name and version of the data in the page."""
@@ -44,6 +52,15 @@ DEFLATE_LEVEL = 6
 """zlib level: 9 saves 2 % and takes three times as long."""
 PLAYER = Path(__file__).parent / "player"
 SCRIPTS = ("aside.js", "unpack.js", "blocks.js", "sort.js", "camera.js", "shaders.js", "draw.js", "player.js")
+
+
+class PageTooLarge(InputError):
+    """The page would exceed the limit."""
+
+    def __init__(self, message: str, num_bytes: int) -> None:
+        super().__init__(message)
+        self.num_bytes = num_bytes
+        """Size of the page; where packing stopped before its end, what it would be if all went on like that."""
 
 
 def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
@@ -58,11 +75,10 @@ def write_html(
 ) -> Path:
     """Write a single-file player of `scene`: a web page that opens from disk and needs nothing else.
 
-    It renders the Gaussians at `times`, from the cameras of the sequence or from a free view. Rounding (`html_data`)
-    moves centers by at most 0.05 mm and an eighth of a pixel per axis at the working distance of a window, rotations by
-    half a degree, scales by 1 %, opacities by 0.0005, colors by half of an 8-bit level. Colors are always those seen
-    from the sequence's camera at that time. A page that would be too large is an error: nothing is left out or rounded
-    further.
+    It renders the Gaussians at `times`, from the cameras of the sequence or from a free view. Rounding moves centers by
+    at most 0.05 mm and an eighth of a pixel per axis at the working distance of a window, rotations by half a degree,
+    scales by 1 %, opacities by 0.0005, colors by half of an 8-bit level. Colors are always those seen from the
+    sequence's camera at that time. A page that would be too large is an error: nothing is left out or rounded further.
 
     Args:
         out: file to write; an existing one is replaced, and missing folders are created.
@@ -86,13 +102,16 @@ def write_html(
     blocks, streams, num_shown, focus = [], [], np.zeros(len(times), int), {}
     near, far = math.inf, 0.0
     for block in quantized_blocks(scene, times):
-        data, channels = pack(block.values, DEFLATE_LEVEL)
-        blocks.append(_about_block(block, channels))
+        data, coded = pack(block.values)
+        scaled = zip(block.low.tolist(), block.step.tolist(), coded, strict=True)
+        channels = [{"low": low, "step": step, **stream} for low, step, stream in scaled]
+        _, num_steps, num_gaussians = block.values.shape
+        blocks.append({"first": block.first, "steps": num_steps, "gaussians": num_gaussians, "channels": channels})
         streams.append(data)
-        num_shown[block.steps] += block.values.shape[2]
+        num_shown[block.steps] += num_gaussians
         focus[(block.steps.start + block.steps.stop - 1) / 2] = block.focus
         near, far = min(near, block.depth_range[0]), max(far, block.depth_range[1])
-        size = _base64_length(sum(map(len, streams)))
+        size = 4 * math.ceil(sum(map(len, streams)) / 3)  # in Base64
         if size > max_bytes:
             raise _too_large(out, max_bytes, size * len(times) / block.steps.stop, len(times), num_shown.max())
     if not blocks:
@@ -113,26 +132,11 @@ def write_html(
     return out
 
 
-def _base64_length(num_bytes: int) -> int:
-    return 4 * math.ceil(num_bytes / 3)
-
-
 def _too_large(out: Path, max_bytes: int, num_bytes: float, num_times: int, num_gaussians: int) -> PageTooLarge:
     got = f"about {num_bytes / 1e6:.1f} MB for {num_times} time steps of {num_gaussians} Gaussians"
     fix = "choose fewer with --times (the size grows with their number), or raise --max-mb."
     error = input_error(out, f"at most {max_bytes / 1e6:.1f} MB", got, fix)
     return PageTooLarge(str(error), math.ceil(num_bytes))
-
-
-def _about_block(block: Block, coded: list[dict[str, int]]) -> dict[str, Any]:
-    """The description of a block; `channels` in the order of their streams."""
-    scaled = zip(block.low.tolist(), block.step.tolist(), coded, strict=True)
-    return {
-        "first": block.first,
-        "steps": len(block.steps),
-        "gaussians": block.values.shape[2],
-        "channels": [{"low": low, "step": step, **stream} for low, step, stream in scaled],
-    }
 
 
 def _about(scene: Scene, times: list[float]) -> dict[str, Any]:
@@ -152,17 +156,201 @@ def _about(scene: Scene, times: list[float]) -> dict[str, Any]:
 
 
 def _page(title: str, unit: str, about: dict[str, Any], data: bytes) -> str:
-    script = "\n".join((PLAYER / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    def read(name: str) -> str:
+        return (PLAYER / name).read_text(encoding="utf-8")
+
     parts = {
         "TITLE": html.escape(title),
-        "STYLE": (PLAYER / "player.css").read_text(encoding="utf-8"),
+        "STYLE": read("player.css"),
         "UNIT": unit,
         "ABOUT": json.dumps(about, allow_nan=False).replace("<", "\\u003c"),
         "DATA": base64.b64encode(data).decode(),
-        "SCRIPT": script,
+        "SCRIPT": "\n".join(map(read, SCRIPTS)),
     }
-    template = (PLAYER / "player.html").read_text(encoding="utf-8")
-    return re.sub(r"@@([A-Z]+)@@", lambda match: parts[match[1]], template)
+    return re.sub(r"@@([A-Z]+)@@", lambda match: parts[match[1]], read("player.html"))
+
+
+# The data.
+
+CHANNELS = (
+    *("x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz", "opacity"),
+    *("r", "g", "b", "r1", "g1", "b1", "r2", "g2", "b2"),
+)
+OPACITY = CHANNELS.index("opacity")
+LARGEST = 65535
+"""Largest stored integer."""
+MAX_STEP_MM = 0.1
+"""Centers are off by half a step: never by more than 0.05 mm ..."""
+STEP_PX = 0.25
+"""... nor, at the working distance, by more than an eighth of a pixel on each axis."""
+QUAT_STEP = 1 / 255
+"""Of a component of the unit quaternion; turns a Gaussian by less than half a degree."""
+LOG_SCALE_STEP = 0.02
+"""A scale is off by at most 1 %."""
+SMALLEST_SCALE_PX = 0.02
+"""Scales below this at the working distance are stored as this: the renderer's blur is 27 times wider."""
+OPACITY_STEP = 1 / 1020
+COLOR_STEP = 1 / 255
+SLOPE_STEP = 1 / 510
+LARGEST_SLOPE = 8
+"""A color would change by its whole range within an eighth of a standard deviation."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """The Gaussians of one window at successive time steps, as integers."""
+
+    first: int
+    """The first of its time steps."""
+    values: NDArray[np.uint16]
+    """(C, T, N)."""
+    low: NDArray[np.float64]
+    """(C,) what q = 0 stands for."""
+    step: NDArray[np.float64]
+    """(C,)."""
+    depth_range: tuple[float, float]
+    """1st and 99th percentile of z of the visible Gaussians, at least 1 % apart, mm."""
+    focus: float
+    """Median z, mm: a free view turns around a point at this depth."""
+
+    @property
+    def steps(self) -> range:
+        """The time steps that show it."""
+        return range(self.first, self.first + self.values.shape[1])
+
+
+def quantized_blocks(scene: Scene, times: list[float]) -> Iterator[Block]:
+    """The Gaussians of `scene` at `times`, window by window, without those that are never visible.
+
+    Colors are those seen from the sequence's camera at each time, with all degrees of the harmonics. A Gaussian counts
+    as invisible at a time, and its opacity is stored as 0, if its opacity is below 1/255, if a value of it is not
+    finite, or if it is too far away for 16 bits. A window in which nothing is visible is left out.
+
+    Args:
+        times: increasing times in [0, 1].
+    Raises:
+        ValueError: a time is not in [0, 1].
+    """
+    cameras = [scene.camera_at(time) for time in times]
+    focal = max(max(camera.fx, camera.fy) for camera in cameras)
+    shown: dict[int, list[tuple[int, Shown]]] = {}
+    for t, time in enumerate(times):
+        for part in scene.shown_at(time):
+            shown.setdefault(part.window.start, []).append((t, part))
+    for steps in shown.values():
+        first, last = steps[0][0], steps[-1][0]
+        raw, depths = _sample([part for _, part in steps], cameras[first : last + 1])
+        block = _quantize(raw, depths, first, focal)
+        if block is not None:
+            yield block
+
+
+def _quantize(raw: NDArray[np.float32], depths: NDArray[np.float32], first: int, focal: float) -> Block | None:
+    """Args: as `_sample` returns them; `raw` is changed. None: nothing is visible."""
+    opacity = raw[OPACITY]
+    finite = np.isfinite(raw).all(0)
+    visible_depths = depths[finite & (depths > NEAR_Z) & (opacity >= ALPHA_MIN)]
+    if not len(visible_depths):
+        return None
+    near, focus, far = (float(v) for v in np.percentile(visible_depths, [1, 50, 99]))
+    steps = min(MAX_STEP_MM, STEP_PX * near / focal), QUAT_STEP, LOG_SCALE_STEP, OPACITY_STEP, COLOR_STEP, SLOPE_STEP
+    step = np.repeat(steps, (3, 4, 3, 1, 3, 6))
+    raw[:, ~finite] = 0
+    centers = raw[:3].reshape(3, -1)
+    middle = np.median(centers[:, finite.ravel()], axis=1)
+    within = (np.abs(centers - middle[:, None]) < step[:3, None] * (LARGEST // 2)).all(0).reshape(finite.shape)
+    visible = finite & within & (opacity >= ALPHA_MIN)
+    kept = visible.any(0)
+    if not kept.any():
+        return None
+    raw, visible = raw[:, :, kept], visible[:, kept]
+
+    low = np.zeros(len(CHANNELS))
+    low[:3] = np.where(visible, raw[:3], np.inf).min((1, 2))
+    low[3:7] = -1
+    low[7:10] = np.log(SMALLEST_SCALE_PX * near / focal)
+    low[14:] = -LARGEST_SLOPE
+    raw[OPACITY] *= visible
+    values = np.empty(raw.shape, np.uint16)
+    for c in range(len(CHANNELS)):
+        values[c] = np.rint((raw[c] - float(low[c])) / float(step[c])).clip(0, LARGEST)
+    _repeat_hidden(values, visible)
+    return Block(first, values, low, step, (near, max(far, near * 1.01)), focus)
+
+
+def pack(values: NDArray[np.uint16]) -> tuple[bytes, list[dict[str, int]]]:
+    """Code (C, T, N) integers over time and deflate them, one zlib stream per channel.
+
+    A stream unpacks to a plane of low bytes and one of high bytes, Gaussian by Gaussian: the first frame, then T - 1
+    residuals r, each as the unsigned 2 r (r >= 0) or -2 r - 1.
+
+    Returns:
+        the streams one after the other, and for each channel its number of `bytes` and its `order`: 0 for a channel
+        that never changes (N values), 1 and 2 for the two predictions (N * T values).
+    """
+    streams, table = [], []
+    for plane in values:
+        order, coded = _predict(plane)
+        by_gaussian = np.ascontiguousarray(coded.T)
+        low, high = (by_gaussian & 255).astype(np.uint8), (by_gaussian >> 8).astype(np.uint8)
+        streams.append(zlib.compress(low.tobytes() + high.tobytes(), DEFLATE_LEVEL))
+        table.append({"order": order, "bytes": len(streams[-1])})
+    return b"".join(streams), table
+
+
+def _predict(plane: NDArray[np.uint16]) -> tuple[int, NDArray[np.uint16]]:
+    """Order of the prediction, and (T, N) first frame and residuals; (1, N) where nothing changes."""
+    if (plane == plane[:1]).all():
+        return 0, plane[:1]
+    velocity = np.diff(plane, axis=0)
+    first, second = _zigzag(velocity), _zigzag(np.diff(velocity, axis=0))
+    # Bits follow the logarithm. The first step has no velocity before it to be predicted from.
+    bits = [np.log2(1 + left.astype(np.float32)).sum() for left in (first[1:], second)]
+    if len(plane) > 2 and bits[1] < bits[0]:
+        return 2, np.concatenate([plane[:1], first[:1], second])
+    return 1, np.concatenate([plane[:1], first])
+
+
+def _sample(shown: list[Shown], cameras: list[Camera]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(C, T, N) channels of one window before rounding, and (T, N) z in the camera at each time, mm."""
+    scene = shown[0].window.scene
+    raw = np.empty((len(CHANNELS), len(shown), len(scene)), np.float32)
+    depths = np.empty((len(shown), len(scene)), np.float32)
+    for t, (part, camera) in enumerate(zip(shown, cameras, strict=True)):
+        raw[:, t], depths[t] = _channels(faded(scene.at(part.time), part.weight), camera)
+        if t:  # q and -q are one rotation: take the one nearer to the time step before
+            raw[3:7, t] *= np.where((raw[3:7, t] * raw[3:7, t - 1]).sum(0) < 0, -1, 1)
+    return raw, depths
+
+
+def _channels(splats: Splats, camera: Camera) -> tuple[NDArray, NDArray]:
+    pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float32)
+    towards = splats.means - torch.as_tensor(camera.center, dtype=torch.float32)
+    towards = towards / towards.norm(dim=-1, keepdim=True)
+    quats = splats.quats / splats.quats.norm(dim=-1, keepdim=True)
+    quats = torch.where(quats[:, :1] < 0, -quats, quats)
+    parts = [
+        splats.means,
+        quats,
+        splats.scales.clamp(min=1e-30).log(),
+        splats.opacities[:, None],
+        colors(splats.sh, towards),
+        color_slopes(splats).flatten(1),
+    ]
+    return torch.cat(parts, 1).T.numpy(), (splats.means @ pose[2, :3] + pose[2, 3]).numpy()
+
+
+def _repeat_hidden(values: NDArray[np.uint16], visible: NDArray[np.bool_]) -> None:
+    """Where a Gaussian is invisible, repeat its numbers of the time step before: they compress to nothing."""
+    for channels in (values[:OPACITY], values[OPACITY + 1 :]):
+        for t in range(1, values.shape[1]):
+            channels[:, t, ~visible[t]] = channels[:, t - 1, ~visible[t]]
+
+
+def _zigzag(residual: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Residuals modulo 2**16 as small unsigned numbers: 0, -1, 1, -2 ... become 0, 1, 2, 3 ..."""
+    signed = residual.view(np.int16)
+    return ((signed << 1) ^ (signed >> 15)).view(np.uint16)
 
 
 FORMAT = Format(suffixes=(".html",), options=("times", "title", "max_mb"), write=write, holds="a player")

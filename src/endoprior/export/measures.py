@@ -1,8 +1,13 @@
-"""Measures over time of chosen points, and maps of displacement and stretch of the surface between two frames."""
+"""Measures over time of chosen points, and maps of displacement and stretch of the surface between two frames.
+
+ParaView plays the surface over time: `.vtp` for one time, `.pvd` for the times together. Source: VTK's documentation of
+its XML file formats. An array is the Base64 of its length in bytes, 64 bits, and itself. `T` frames, `V` vertices.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import base64
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +22,15 @@ from ..model.surface import render_surface
 from ..system.atomic import whole_folder
 from ..visualization.measures import MeasuresFigure, displacement_span, measures_csv, stretch_span, value_colors
 from .axes import points_in_axes
-from .formats import Axes, Format, Progress
-from .mesh import Mesh, depth_grid
-from .options import ExportOptions
-from .ply import ply_bytes, vertex_table
+from .formats import ExportOptions, Format, Progress
+from .mesh import depth_grid
+from .ply import colored, ply_bytes
 from .tracks import back_projected, read_query_points
-from .vtk_files import pvd_bytes, vtp_bytes
 
 SURFACES = "surface"
 """Name of the series for ParaView, and of the folder of its files."""
+VTK_KINDS = {"<f4": "Float32", "<i4": "Int32"}
+VTK_HEAD = '<?xml version="1.0"?>\n<VTKFile type="{}" version="1.0" byte_order="LittleEndian" header_type="UInt64">'
 
 
 def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -> None:
@@ -35,42 +40,43 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         InputError: a frame is not in the sequence, the file of points cannot be read, or a point or the whole frame
             shows no surface.
     """
-    last = len(scene.cameras) - 1
-    since, until = options.from_frame, last if options.to_frame is None else options.to_frame
+    num_frames, rate, unit = len(scene.cameras), scene.frames_per_second, length_unit(scene.lengths_are_relative)
+    since, until = options.from_frame, num_frames - 1 if options.to_frame is None else options.to_frame
     for name, frame in (("--from-frame", since), ("--to-frame", until)):
-        if not 0 <= frame <= last:
-            raise input_error(name, f"a frame in 0..{last}", f"{frame}", "choose another.")
+        if not 0 <= frame < num_frames:
+            raise input_error(name, f"a frame in 0..{num_frames - 1}", f"{frame}", "choose another.")
     if since == until:
         raise input_error("--to-frame", f"another frame than --from-frame {since}", f"{until}", "choose another.")
-    times, rate, unit = (
-        [i / (last + 1) for i in range(last + 1)],
-        scene.frames_per_second,
-        length_unit(scene.lengths_are_relative),
-    )
-    camera = scene.cameras[since]
+    times, camera = [i / num_frames for i in range(num_frames)], scene.cameras[since]
     surface = render_surface(scene, times[since], camera, options.min_alpha)
     mesh = depth_grid(surface, options.mesh_step, options.max_slope)
     if not len(mesh.triangles):
-        raise input_error(
-            "--from-frame", "a frame that shows tissue", f"{since}", "choose another, or lower --min-alpha."
-        )
+        fix = "choose another, or lower --min-alpha."
+        raise input_error("--from-frame", "a frame that shows tissue", f"{since}", fix)
     motion = SurfaceMotion(scene, since, options.min_alpha)
     frames = list(range(min(since, until), max(since, until) + 1))
-    surfaces = _carried(scene, mesh, motion, frames)
-    shown = surfaces.values(frames.index(until))
-    spans = (displacement_span, stretch_span)
-    maps = {name: _Map(one, span(one)) for (name, one), span in zip(shown.items(), spans, strict=True)}
+    at_since = np.zeros(len(mesh.vertices), np.intp)
+    moved = carry_points(scene, mesh.vertices, at_since, [times[since], *(times[frame] for frame in frames)])[1:]
+    values = {  # (T, V) each: straight distance, mm, and largest principal stretch, NaN where unknown
+        "displacement": np.stack([distance(there, mesh.vertices) for there in moved]),
+        "stretch": motion.stretch(mesh.vertices.astype(np.float64), frames),
+    }
+    maps = {name: each[frames.index(until)] for name, each in values.items()}
+    spans = displacement_span(maps["displacement"]), stretch_span(maps["stretch"])
     with whole_folder(out) as folder:
         (folder / SURFACES).mkdir()
+        about = f"axes {options.frame}, unit {unit}"
         for k, frame in enumerate(frames):
-            place, about = points_in_axes(surfaces.positions[k], options.frame), f"axes {options.frame}, unit {unit}"
-            content = vtp_bytes(place, mesh.triangles, surfaces.values(k), about)
-            (folder / SURFACES / f"{frame:06d}.vtp").write_bytes(content)
+            place, now = points_in_axes(moved[k], options.frame), {name: each[k] for name, each in values.items()}
+            (folder / SURFACES / f"{frame:06d}.vtp").write_bytes(vtp_bytes(place, mesh.triangles, now, about))
             progress(k, len(frames))
         files = [f"{SURFACES}/{frame:06d}.vtp" for frame in frames]
         (folder / f"{SURFACES}.pvd").write_bytes(pvd_bytes(files, [frame / rate for frame in frames]))
-        for name, one in maps.items():
-            (folder / f"{name}.ply").write_bytes(_colored_mesh(mesh, maps, one, options.frame, unit))
+        positions = points_in_axes(mesh.vertices, options.frame)
+        # In the colors of one map, with the values of both.
+        for (name, shown), span in zip(maps.items(), spans, strict=True):
+            columns = colored(positions, value_colors(shown, span)) | maps
+            (folder / f"{name}.ply").write_bytes(ply_bytes(columns, options.frame, unit, mesh.triangles))
         figure = MeasuresFigure(f"frame {since} to frame {until}", with_curves=options.points is not None)
         pixels = np.zeros((0, 2))
         if options.points:
@@ -78,7 +84,7 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             starts = back_projected(scene, queries, options.min_alpha)
             carried = carry(scene, starts, queries.frames, times)
             paths = carried.positions
-            around = motion.stretch(paths[since].astype(np.float64), list(range(len(times))))
+            around = motion.stretch(paths[since].astype(np.float64), list(range(num_frames)))
             found = measures_of(paths, around, since, drawn=int(queries.frames[-1]))
             table = measures_csv(found, rate, unit, carried.confidence)
             (folder / "measures.csv").write_text(table, encoding="utf-8", newline="\n")
@@ -87,50 +93,51 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         figure.show_points(surface.color, pixels)
         on_image = project(mesh.vertices.astype(np.float64), camera)[0]
         titles = f"displacement, {unit}", "largest principal stretch; 1: unchanged"
-        for place, (title, one) in enumerate(zip(titles, maps.values(), strict=True), 1):
-            figure.show_map(place, title, on_image, mesh.triangles, one.values, one.span)
+        for place, (title, shown, span) in enumerate(zip(titles, maps.values(), spans, strict=True), 1):
+            figure.show_map(place, title, on_image, mesh.triangles, shown, span)
         figure.save(folder / "measures.png")
     progress(len(frames), len(frames))
 
 
-@dataclass(frozen=True)
-class _Surfaces:
-    """The vertices of a mesh at `T` frames."""
+def vtp_bytes(
+    vertices: NDArray[np.float32], triangles: NDArray[np.int32], values: Mapping[str, NDArray], about: str
+) -> bytes:
+    """A surface as VTK's PolyData.
 
-    positions: NDArray[np.float32]
-    """(T, V, 3) world axes, mm."""
-    displacement: NDArray
-    """(T, V) straight distance from where they were in the first one, mm."""
-    stretch: NDArray
-    """(T, V) largest principal stretch since then; NaN where unknown."""
-
-    def values(self, k: int) -> dict[str, NDArray]:
-        """(V,) values at frame k, by name."""
-        return {"displacement": self.displacement[k], "stretch": self.stretch[k]}
-
-
-@dataclass(frozen=True)
-class _Map:
-    """A value for each vertex, and the ends of its color scale."""
-
-    values: NDArray
-    span: tuple[float, float]
-
-
-def _carried(scene: Scene, mesh: Mesh, motion: SurfaceMotion, frames: list[int]) -> _Surfaces:
-    """The vertices of the mesh of the frame of `motion`, carried to other frames."""
-    times = [frame / len(scene.cameras) for frame in (motion.since, *frames)]
-    moved = carry_points(scene, mesh.vertices, np.zeros(len(mesh.vertices), np.intp), times)[1:]
-    displacement = np.stack([distance(there, mesh.vertices) for there in moved])
-    return _Surfaces(moved, displacement, motion.stretch(mesh.vertices.astype(np.float64), frames))
+    Args:
+        vertices: (V, 3), in the axes of the file. triangles: (F, 3) vertex numbers.
+        values: (V,) each, by the name under which programs list them; the first is shown. NaN where unknown.
+        about: a comment on axes and unit.
+    """
+    ends = 3 * np.arange(1, len(triangles) + 1, dtype="<i4")
+    lines = [
+        VTK_HEAD.format("PolyData"),
+        f"<!-- {about} -->",
+        f'<PolyData><Piece NumberOfPoints="{len(vertices)}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" '
+        f'NumberOfPolys="{len(triangles)}">',
+        f'<PointData Scalars="{next(iter(values))}">',
+        *(_array(name, column.astype("<f4")) for name, column in values.items()),
+        "</PointData>",
+        f"<Points>{_array('Points', vertices.astype('<f4'))}</Points>",
+        f"<Polys>{_array('connectivity', triangles.astype('<i4').ravel())}{_array('offsets', ends)}</Polys>",
+        "</Piece></PolyData>\n</VTKFile>\n",
+    ]
+    return "\n".join(lines).encode()
 
 
-def _colored_mesh(mesh: Mesh, maps: dict[str, _Map], shown: _Map, axes: Axes, unit: str) -> bytes:
-    """A PLY file in the colors of one map, with the values of all."""
-    columns = dict(zip("xyz", points_in_axes(mesh.vertices, axes).T, strict=True))
-    columns |= dict(zip(("red", "green", "blue"), value_colors(shown.values, shown.span).T, strict=True))
-    columns |= {name: one.values for name, one in maps.items()}
-    return ply_bytes(vertex_table(columns), axes, unit, mesh.triangles)
+def pvd_bytes(files: Sequence[str], seconds: Sequence[float]) -> bytes:
+    """The list of the files of a series, relative to it, and the time of each, s."""
+    sets = [
+        f'<DataSet timestep="{time:.9g}" part="0" file="{file}"/>' for file, time in zip(files, seconds, strict=True)
+    ]
+    return "\n".join([VTK_HEAD.format("Collection"), "<Collection>", *sets, "</Collection>\n</VTKFile>\n"]).encode()
+
+
+def _array(name: str, array: NDArray) -> str:
+    """One array, of rows of 1 or 3 numbers."""
+    body = base64.b64encode(np.uint64(array.nbytes).tobytes() + array.tobytes()).decode()
+    rows = f' NumberOfComponents="{array.shape[1]}"' if array.ndim == 2 else ""
+    return f'<DataArray type="{VTK_KINDS[array.dtype.str]}" Name="{name}"{rows} format="binary">{body}</DataArray>'
 
 
 FORMAT = Format(

@@ -1,10 +1,16 @@
-"""Surface meshes of one time step: a grid mesh of the rendered depth, or the depths of all cameras fused.
+"""Surface meshes: a grid mesh of the depth at one time, or the depths of all cameras fused; as PLY, OBJ and STL.
 
 Triangles turn counterclockwise as seen from the camera, so normals point at it. `V` vertices, `F` triangles.
+
+Sources: Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996; Doi and
+Koide, 1991, for tetrahedra, which leave no ambiguous case. Wavefront, "Object Files (.obj)", with colors after the
+coordinates as is customary; 3D Systems, "StereoLithography Interface Specification", 1989.
 """
 
 from __future__ import annotations
 
+import io
+import struct
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,15 +19,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..core.checks import input_error
-from ..core.geometry import back_project, length_unit, pixel_centers
+from ..core.geometry import back_project, length_unit, pixel_centers, project
+from ..core.spread import spread
+from ..core.types import Camera
 from ..model.scene import Scene
 from ..model.surface import Surface, render_surface
 from .axes import points_in_axes
-from .formats import TIME_STEP_OPTIONS, Format
-from .mesh_files import encode_mesh
-from .options import ExportOptions
+from .formats import TIME_STEP_OPTIONS, Axes, ExportOptions, Format
+from .ply import colored, ply_bytes
 from .time_steps import TimeStep
-from .tsdf import fused_mesh, viewpoints
 
 SURFACE_OPTIONS = ("mesh_method", "mesh_step", "max_slope", "voxel_mm", "min_alpha")
 """What `surface_mesh` uses."""
@@ -41,11 +47,8 @@ class Mesh:
 
 def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
     """The mesh of one time step in the file format of the options; errors as in `surface_mesh`."""
-    mesh = surface_mesh(scene, step, options)
-    vertices = points_in_axes(mesh.vertices, options.frame)
-    unit = length_unit(scene.lengths_are_relative)
-    content = encode_mesh(vertices, mesh.triangles, mesh.colors, options.mesh_format, options.frame, unit)
-    return {f".{options.mesh_format}": content}
+    mesh, unit = surface_mesh(scene, step, options), length_unit(scene.lengths_are_relative)
+    return {f".{options.mesh_format}": encode_mesh(mesh, options.mesh_format, options.frame, unit)}
 
 
 def surface_mesh(scene: Scene, step: TimeStep, options: ExportOptions) -> Mesh:
@@ -58,7 +61,7 @@ def surface_mesh(scene: Scene, step: TimeStep, options: ExportOptions) -> Mesh:
         shown = scene.shown_at(step.time)  # cameras of other windows look elsewhere
         cameras = scene.cameras[shown[0].window.start : shown[-1].window.stop]
         views = [render_surface(scene, step.time, c, options.min_alpha) for c in viewpoints(cameras)]
-        mesh = Mesh(*fused_mesh(views, options.voxel_mm))
+        mesh = fused_mesh(views, options.voxel_mm)
     else:
         surface = render_surface(scene, step.time, step.camera(scene), options.min_alpha)
         mesh = depth_grid(surface, options.mesh_step, options.max_slope)
@@ -66,6 +69,40 @@ def surface_mesh(scene: Scene, step: TimeStep, options: ExportOptions) -> Mesh:
         want = f"a value that leaves a surface at time {step.time:.3f}"
         raise input_error("--min-alpha", want, f"{options.min_alpha}", "lower it, or raise --max-slope.")
     return mesh
+
+
+# Files.
+
+
+def encode_mesh(mesh: Mesh, suffix: str, axes: Axes, unit: str = "mm") -> bytes:
+    """A mesh in OpenCV axes as the bytes of a file in `axes`, a `suffix` ply, obj or stl; the file names the unit."""
+    vertices = points_in_axes(mesh.vertices, axes)
+    if suffix == "ply":
+        return ply_bytes(colored(vertices, mesh.colors), axes, unit, mesh.triangles)
+    # `SPACE=LPS` or `SPACE=RAS` is what 3D Slicer looks for.
+    about = f"endoprior, axes {axes}, unit {unit}" + (f", SPACE={axes.upper()}" if axes in ("lps", "ras") else "")
+    return _obj(vertices, mesh, about) if suffix == "obj" else _stl(vertices[mesh.triangles], about)
+
+
+def _obj(vertices: NDArray, mesh: Mesh, about: str) -> bytes:
+    text = io.StringIO()
+    text.write(f"# {about}\n")
+    np.savetxt(text, np.column_stack([vertices, mesh.colors / 255]), "v %.6g %.6g %.6g %.4f %.4f %.4f")
+    np.savetxt(text, mesh.triangles + 1, "f %d %d %d")
+    return text.getvalue().encode()
+
+
+def _stl(corners: NDArray, about: str) -> bytes:
+    """Args: corners: (F, 3, 3)."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    facets = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    facets["normal"], facets["corners"] = normals / np.where(length > 0, length, 1), corners
+    # The header must not begin with "solid": readers would take the file for STL in text form.
+    return about.encode().ljust(80) + struct.pack("<I", len(corners)) + facets.tobytes()
+
+
+# A grid mesh of one depth.
 
 
 def depth_grid(surface: Surface, step: int, max_slope: float) -> Mesh:
@@ -83,11 +120,7 @@ def depth_grid(surface: Surface, step: int, max_slope: float) -> Mesh:
     used, triangles = split_at_touching_corners(triangles)
     vertices = back_project(pixels.reshape(-1, 2)[used].astype(np.float64), depth.ravel()[used], surface.camera)
     colors = surface.color[::step, ::step].reshape(-1, 3)[used]
-    return Mesh(
-        vertices.astype(np.float32),
-        triangles,
-        np.rint(colors * 255).astype(np.uint8),
-    )
+    return Mesh(vertices.astype(np.float32), triangles, np.rint(colors * 255).astype(np.uint8))
 
 
 def split_at_touching_corners(triangles: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
@@ -127,6 +160,143 @@ def _is_continuous(
         sideways = near / focal * np.linalg.norm(pixels[one] - pixels[other], axis=1)
         continuous &= (near > 0) & (np.abs(depth[one] - depth[other]) <= max_slope * sideways)
     return continuous
+
+
+# The depths of several cameras fused.
+
+TRUNCATION_VOXELS = 3.0
+"""Distances to a surface are truncated at so many voxels, before and behind it."""
+MAX_VIEWS = 24
+MAX_VOXELS = 20_000_000
+# Six tetrahedra around the diagonal from corner 0 to corner 7; bits of a corner's number are its steps along x, y, z.
+_TETRAHEDRA = ((0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7))
+_CORNERS = np.array([[n & 1, n >> 1 & 1, n >> 2 & 1] for n in range(8)])
+
+
+def viewpoints(cameras: tuple[Camera, ...]) -> list[Camera]:
+    """Cameras at different places, evenly chosen, `MAX_VIEWS` at most.
+
+    Raises:
+        InputError: the camera never moves.
+    """
+    kept: dict[bytes, Camera] = {}
+    for camera in cameras:
+        kept.setdefault(np.round(camera.world_to_camera, 4).tobytes(), camera)
+    different = list(kept.values())
+    if len(different) < 2:
+        raise input_error("--mesh-method tsdf", "several camera positions", "one", "use --mesh-method grid.")
+    return [different[i] for i in spread(len(different), MAX_VIEWS)]
+
+
+def fused_mesh(views: list[Surface], voxel_mm: float) -> Mesh:
+    """The surface of several views in world axes, mm: a truncated signed distance on a grid is zero there.
+
+    Args:
+        voxel_mm: edge of a voxel, mm.
+    Raises:
+        InputError: the grid would be larger than `MAX_VOXELS`, or no view shows a surface.
+    """
+    low, shape = _grid(views, voxel_mm)
+    distance, weight = np.zeros((2, *shape), np.float32)
+    color = np.zeros((*shape, 3), np.float32)
+    plane = np.stack(np.meshgrid(*(np.arange(n) for n in shape[1:]), indexing="ij"), -1)
+    for x in range(shape[0]):  # a slice at a time, so that memory stays small
+        points = low + voxel_mm * np.concatenate([np.full((*shape[1:], 1), x), plane], -1)
+        for surface in views:
+            _add(surface, points, TRUNCATION_VOXELS * voxel_mm, distance[x], weight[x], color[x])
+    share = np.maximum(weight, 1)
+    vertices, triangles, colors = _zero_surface(distance / share, weight > 0, color / share[..., None])
+    colors = np.rint(colors.clip(0, 1) * 255).astype(np.uint8)
+    return Mesh((low + voxel_mm * vertices).astype(np.float32), triangles.astype(np.int32), colors)
+
+
+def _grid(views: list[Surface], voxel_mm: float) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
+    """First corner (3,), mm, and number of voxels of a grid with a margin around every visible point."""
+    points = [
+        back_project(pixel_centers(surface.camera.width, surface.camera.height)[surface.depth > 0], z, surface.camera)
+        for surface in views
+        if len(z := surface.depth[surface.depth > 0])
+    ]
+    if not points:
+        raise input_error("--min-alpha", "a value that leaves a surface", "one too high", "lower it.")
+    visible = np.concatenate(points)
+    margin = (TRUNCATION_VOXELS + 1) * voxel_mm
+    low = visible.min(0) - margin
+    shape = tuple(int(n) for n in np.ceil((visible.max(0) + margin - low) / voxel_mm) + 1)
+    if np.prod(shape, dtype=np.float64) > MAX_VOXELS:
+        least = voxel_mm * (np.prod(shape, dtype=np.float64) / MAX_VOXELS) ** (1 / 3)
+        raise input_error("--voxel-mm", f"at least {least:.2f} for a scene of this size", f"{voxel_mm}", "raise it.")
+    return low, shape
+
+
+def _add(
+    surface: Surface, points: NDArray, truncation: float, distance: NDArray, weight: NDArray, color: NDArray
+) -> None:
+    """Add the distance, weight and color of points (..., 3) in one view to their sums."""
+    pixels, z = project(points, surface.camera)
+    column, row = np.floor(pixels[..., 0]), np.floor(pixels[..., 1])
+    inside = (z > 0) & (column >= 0) & (row >= 0) & (column < surface.camera.width) & (row < surface.camera.height)
+    row, column = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
+    depth = surface.depth[row, column]
+    before = depth - z  # positive in front of the surface
+    known = inside & (depth > 0) & (before > -truncation)
+    distance += np.where(known, np.minimum(before, truncation), 0)
+    weight += known
+    color += np.where(known[..., None], surface.color[row, column], 0)
+
+
+def _zero_surface(
+    field: NDArray[np.float32], known: NDArray[np.bool_], color: NDArray[np.float32]
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Vertices (V, 3) in voxels, triangles (F, 3) and colors of the zero level within cubes known at every corner."""
+    offsets = _CORNERS @ np.array([field.shape[1] * field.shape[2], field.shape[2], 1])
+    inside = np.stack([field[_shifted(field.shape, c)] < 0 for c in _CORNERS])
+    whole = np.logical_and.reduce([known[_shifted(known.shape, c)] for c in _CORNERS])
+    crossed = whole & inside.any(0) & ~inside.all(0)
+    numbers = np.arange(field.size).reshape(field.shape)[:-1, :-1, :-1][crossed]
+    values = field.ravel()
+    cut = [_triangles_of(numbers[:, None] + offsets[list(corners)], values) for corners in _TETRAHEDRA]
+    edges = np.concatenate(cut)  # (F, 3, 2): each vertex lies between two grid points
+    keys, renumbered = np.unique(np.sort(edges, -1).reshape(-1, 2) @ [field.size, 1], return_inverse=True)
+    lower, upper = keys // field.size, keys % field.size
+    share = (values[lower] / (values[lower] - values[upper])).astype(np.float64)[:, None]
+    vertices = _places(lower, field.shape) * (1 - share) + _places(upper, field.shape) * share
+    triangles = renumbered.reshape(-1, 3)
+    # Normals must point to where the field is positive, outside: from the inner to the outer ends of the edges.
+    outwards = (_places(edges, field.shape) * np.where(values[edges] < 0, -1, 1)[..., None]).sum((1, 2))
+    corners = vertices[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    wrong = (normal * outwards).sum(1) < 0
+    triangles[wrong] = triangles[wrong][:, ::-1]
+    flat = color.reshape(-1, 3)
+    return vertices, triangles, flat[lower] * (1 - share) + flat[upper] * share
+
+
+def _places(numbers: NDArray[np.intp], shape: tuple[int, ...]) -> NDArray[np.intp]:
+    """(..., 3) grid coordinates of numbered grid points."""
+    return np.stack(np.unravel_index(numbers, shape), -1)
+
+
+def _shifted(shape: tuple[int, ...], corner: NDArray) -> tuple[slice, ...]:
+    """Of all cubes of a grid, the grid points at one corner."""
+    return tuple(slice(int(step), size - 1 + int(step)) for step, size in zip(corner, shape, strict=True))
+
+
+def _triangles_of(corners: NDArray[np.intp], values: NDArray[np.float32]) -> NDArray[np.intp]:
+    """(F, 3, 2) edges, as pairs of grid points, that the surface's triangles cut in tetrahedra with corners (M, 4)."""
+    order = np.argsort(values[corners] >= 0, axis=1, kind="stable")  # those inside come first
+    corners = np.take_along_axis(corners, order, 1)
+    num_inside = (values[corners] < 0).sum(1)
+    a, b, c, d = corners.T
+    cut = []
+    for count, triangles in {
+        1: [((a, b), (a, c), (a, d))],
+        2: [((a, c), (a, d), (b, d)), ((a, c), (b, d), (b, c))],
+        3: [((d, a), (d, b), (d, c))],
+    }.items():
+        rows = num_inside == count
+        cut += [np.stack([np.stack([p[rows], q[rows]], -1) for p, q in edges], 1) for edges in triangles]
+    return np.concatenate(cut)
 
 
 FORMAT = Format(

@@ -1,4 +1,4 @@
-"""PLY in the layout of 3D Gaussian splatting, and the PLY file that point clouds and meshes share.
+"""PLY files: Gaussians in the layout of 3D Gaussian splatting, colored points, and what every PLY file shares.
 
 Source of the layout: the files that 3DGS writes (Kerbl et al. 2023); of the file format: Turk, "The PLY Polygon File
 Format", 1994. `K` spherical-harmonic coefficients per channel.
@@ -7,22 +7,24 @@ Format", 1994. `K` spherical-harmonic coefficients per channel.
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from ..core.checks import input_error
 from ..core.geometry import length_unit
 from ..core.types import Splats
 from ..model.scene import Scene
-from .formats import TIME_STEP_OPTIONS, Axes, Format
-from .options import ExportOptions
+from ..render import sh as harmonics
+from .axes import points_in_axes
+from .formats import TIME_STEP_OPTIONS, Axes, ExportOptions, Format
 from .time_steps import TimeStep
 
 LEAST_OPACITY = 1e-7
 """Opacities are clipped to this distance from 0 and 1, because their logits would be infinite."""
-_TYPES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
 
-def files(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
-    """The PLY file of one time step."""
+def gaussians(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+    """The Gaussians of one time step."""
     unit = length_unit(scene.lengths_are_relative)
     return {".ply": encode_ply(step.plain_splats(scene, options.frame), options.frame, unit, when(scene, step))}
 
@@ -41,46 +43,76 @@ def encode_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", comment:
     docs/format.md), opacity (logit), scale_0..2 (log of mm), rot_0..3 (w, x, y, z, of length 1).
     """
     sh = splats.sh.numpy()
-    quats = splats.quats.numpy().astype(np.float64)
     opacities = splats.opacities.numpy().astype(np.float64).clip(LEAST_OPACITY, 1 - LEAST_OPACITY)
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1)
-    columns = {name: splats.means.numpy()[:, i] for i, name in enumerate("xyz")}
+    columns = numbered("xyz", splats.means.numpy())
     columns |= {name: np.zeros(len(sh)) for name in ("nx", "ny", "nz")}
-    columns |= {f"f_dc_{i}": sh[:, 0, i] for i in range(3)}
-    columns |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
+    columns |= numbered("f_dc_", sh[:, 0]) | numbered("f_rest_", sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1))
     columns["opacity"] = np.log(opacities / (1 - opacities))
-    columns |= {f"scale_{i}": np.log(splats.scales.numpy()[:, i].clip(1e-30)) for i in range(3)}
-    rotations = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    columns |= {f"rot_{i}": rotations[:, i] for i in range(4)}
-    return ply_bytes(vertex_table(columns), axes, unit, comment=comment)
+    columns |= numbered("scale_", np.log(splats.scales.numpy().clip(1e-30)))
+    columns |= numbered("rot_", unit_quaternions(splats.quats.numpy().astype(np.float64)))
+    return ply_bytes(columns, axes, unit, comment=comment)
 
 
-def vertex_table(columns: dict[str, NDArray]) -> NDArray:
-    """Structured array of equally long columns; 8-bit stays 8-bit, everything else becomes float32."""
-    kinds = [(name, "u1" if column.dtype == np.uint8 else "<f4") for name, column in columns.items()]
-    table = np.empty(len(next(iter(columns.values()))), kinds)
-    for name, column in columns.items():
-        table[name] = column
-    return table
+def unit_quaternions(quats: NDArray) -> NDArray:
+    """(N, 4) quaternions scaled to length 1."""
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+def points(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+    """The centers of the Gaussians that are opaque enough, in the colors that the frame's camera sees.
+
+    Raises:
+        InputError: no Gaussian is that opaque.
+    """
+    splats = step.splats(scene, "opencv")
+    opaque = splats.opacities >= options.min_opacity
+    if not opaque.any():
+        want = f"at most {float(splats.opacities.max()):.3f}, the largest opacity"
+        raise input_error("--min-opacity", want, f"{options.min_opacity}", "lower it.")
+    means = splats.means[opaque]
+    towards = torch.nn.functional.normalize(means - torch.from_numpy(step.camera(scene).center).to(means.dtype))
+    colors = np.rint(harmonics.colors(splats.sh[opaque], towards).numpy().clip(0, 1) * 255).astype(np.uint8)
+    columns = colored(points_in_axes(means.numpy(), options.frame), colors)
+    return {".ply": ply_bytes(columns, options.frame, length_unit(scene.lengths_are_relative))}
+
+
+def colored(positions: NDArray, colors: NDArray[np.uint8]) -> dict[str, NDArray]:
+    """The properties of points (P, 3) with colors (P, 3), 0..255."""
+    return numbered("xyz", positions) | numbered(("red", "green", "blue"), colors)
+
+
+def numbered(names: str | tuple[str, ...], values: NDArray) -> dict[str, NDArray]:
+    """The columns of an array by `names`, or by a name that ends in `_` and their number."""
+    if isinstance(names, str) and names.endswith("_"):
+        names = tuple(f"{names}{i}" for i in range(values.shape[1]))
+    return dict(zip(names, values.T, strict=True))
 
 
 def ply_bytes(
-    vertices: NDArray, axes: Axes, unit: str, triangles: NDArray[np.int32] | None = None, comment: str = ""
+    columns: dict[str, NDArray],
+    axes: Axes,
+    unit: str,
+    triangles: NDArray[np.int32] | None = None,
+    comment: str = "",
 ) -> bytes:
     """A little-endian binary PLY file.
 
     Args:
-        vertices: structured array, one field per property.
+        columns: equally long properties of the vertices; 8-bit stays 8-bit, everything else becomes float32.
         axes: named in a comment; `SPACE=LPS` or `SPACE=RAS` is what 3D Slicer looks for.
         unit: of lengths, named in the same comment.
         triangles: (F, 3) vertex numbers.
         comment: one more line of text.
     """
+    kinds = [(name, "u1" if column.dtype == np.uint8 else "<f4") for name, column in columns.items()]
+    vertices = np.empty(len(next(iter(columns.values()))), kinds)
+    for name, column in columns.items():
+        vertices[name] = column
     lines = ["ply", "format binary_little_endian 1.0", f"comment axes {axes}, unit {unit}"]
     lines += [f"comment {comment}"] if comment else []
     lines += [f"comment SPACE={axes.upper()}"] if axes in ("lps", "ras") else []
     lines += [f"element vertex {len(vertices)}"]
-    lines += [f"property {_TYPES[vertices.dtype[name].str.lstrip('|')]} {name}" for name in vertices.dtype.names]
+    lines += [f"property {'uchar' if kind == 'u1' else 'float'} {name}" for name, kind in kinds]
     body = vertices.tobytes()
     if triangles is not None:
         lines += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
@@ -90,10 +122,13 @@ def ply_bytes(
     return ("\n".join([*lines, "end_header"]) + "\n").encode() + body
 
 
-FORMAT = Format(
+PLY = Format(
     suffixes=(".ply",),
     options=(*TIME_STEP_OPTIONS, "canonical"),
-    files=files,
+    files=gaussians,
     holds="Gaussians",
     has_index=False,  # SuperSplat plays a folder as a sequence only if it holds nothing else
+)
+POINTS = Format(
+    suffixes=(".ply",), options=(*TIME_STEP_OPTIONS, "canonical", "min_opacity"), files=points, holds="colored points"
 )

@@ -2,6 +2,8 @@
 
 A .mrb file is a zip archive of a scene and its data. This scene holds a sequence of meshes and one of point lists,
 each an archive of the same kind with one file per time step, a browser that plays them, and the nodes that it shows.
+Source of the scene files (MRML): what the node classes of github.com/Slicer/Slicer read (`ReadXMLAttributes` in
+Libs/MRML/Core, and vtkMRMLSequenceBrowserNode).
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from xml.etree import ElementTree
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import numpy as np
@@ -25,11 +28,8 @@ from ..model.carry import CarriedPoints, carry
 from ..model.scene import Scene
 from ..system.atomic import whole_file
 from .axes import points_in_axes
-from .formats import Format, Progress
-from .mesh import SURFACE_OPTIONS, Mesh, surface_mesh
-from .mesh_files import encode_mesh
-from .mrml import SlicerScene
-from .options import ExportOptions
+from .formats import ExportOptions, Format, Progress
+from .mesh import SURFACE_OPTIONS, Mesh, encode_mesh, surface_mesh
 from .time_steps import TimeStep, seconds_of_motion, selected_time_steps
 from .tracks import back_projected, read_query_points
 
@@ -42,6 +42,8 @@ MARKUPS_SCHEMA = (
 """Name of the format of point lists; Slicer takes files with this name."""
 IN_MEMORY_BYTES = 2**28
 """A larger sequence waits in a temporary file."""
+SCENE_VERSION = "Slicer4.4.0"
+"""Version of the scene format, as in the scenes of Slicer's own tests."""
 VIEW_ANGLE = 30.0
 """Vertical angle of Slicer's 3D view, degrees."""
 
@@ -99,7 +101,7 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
     played: dict[Played, Iterable[bytes]] = {}
     meshes = (surface_mesh(scene, step, options) for step in steps)
     first, unit = next(meshes), length_unit(scene.lengths_are_relative)
-    played[TISSUE] = (_ply(mesh, unit) for mesh in chain([first], meshes))
+    played[TISSUE] = (encode_mesh(mesh, "ply", "lps", unit) for mesh in chain([first], meshes))
     if options.points:
         found = _carried(scene, options, steps)
         played[POINTS] = (markups(*there) for there in zip(found.positions, found.confidence, strict=True))
@@ -203,10 +205,6 @@ def _view(mesh: Mesh, camera: Camera) -> dict[str, str]:
     return {name: " ".join(f"{x:.6g}" for x in points_in_axes(place, "ras")) for name, place in places.items()}
 
 
-def _ply(mesh: Mesh, unit: str) -> bytes:
-    return encode_mesh(points_in_axes(mesh.vertices, "lps"), mesh.triangles, mesh.colors, "ply", "lps", unit)
-
-
 def _put(archive: ZipFile, name: str, content: bytes) -> None:
     archive.writestr(_entry(name), content, ZIP_DEFLATED)
 
@@ -214,6 +212,49 @@ def _put(archive: ZipFile, name: str, content: bytes) -> None:
 def _entry(name: str) -> ZipInfo:
     """A file of an archive; `ZipInfo` dates all of them 1980, so equal scenes give equal bytes."""
     return ZipInfo(f"{FOLDER}/{name}")
+
+
+class SlicerScene:
+    """A scene to write: nodes with attributes that refer to one another by id."""
+
+    def __init__(self) -> None:
+        self._root = ElementTree.Element("MRML", version=SCENE_VERSION, userTags="")
+
+    def add(
+        self, tag: str, name: str, references: dict[str, str] | None = None, singleton: str = "", **attributes: str
+    ) -> str:
+        """Append a node and return its id.
+
+        Args:
+            tag: the node's class `vtkMRML...Node` without prefix and suffix.
+            references: ids of other nodes, by role.
+            singleton: tag of a node that replaces the one of the same class and tag in Slicer; its id ends in it.
+        """
+        number = singleton or str(len(self._root.findall(tag)) + 1)
+        identity = f"vtkMRML{tag}Node{number}"
+        if singleton:
+            attributes["singletonTag"] = singleton
+        if references:
+            attributes["references"] = "".join(f"{role}:{other};" for role, other in references.items())
+        ElementTree.SubElement(self._root, tag, {"id": identity, "name": name, **attributes})
+        return identity
+
+    def add_stored(
+        self, kind: tuple[str, str], name: str, file: str, references: dict[str, str] | None = None, **attributes: str
+    ) -> str:
+        """Append a node whose data is in `file`, relative to the scene's own, in LPS axes; return its id.
+
+        Args:
+            kind: tags of the node and of its storage node.
+        """
+        tag, storage_tag = kind
+        storage = self.add(storage_tag, "storage", fileName=file, coordinateSystem="LPS")
+        return self.add(tag, name, {"storage": storage, **(references or {})}, **attributes)
+
+    def file(self) -> bytes:
+        """The .mrml file."""
+        ElementTree.indent(self._root)
+        return ElementTree.tostring(self._root, encoding="UTF-8", xml_declaration=True)
 
 
 FORMAT = Format(

@@ -13,8 +13,7 @@ from ..data.sequence import Split, is_test_frame
 from ..model.colors import one_color
 from ..model.scene import Scene
 from .axes import splats_in_axes
-from .formats import Axes
-from .options import ExportOptions
+from .formats import Axes, ExportOptions
 
 
 @dataclass(frozen=True)

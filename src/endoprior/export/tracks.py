@@ -20,8 +20,7 @@ from ..model.scene import Scene
 from ..model.surface import Surface, depth_at, project_visible, render_surface
 from ..system.atomic import whole_folder
 from .axes import points_in_axes
-from .formats import Format, Progress
-from .options import ExportOptions
+from .formats import ExportOptions, Format, Progress
 
 COLUMNS = ("frame", "time", "point", "x", "y", "z", "u", "v", "visible", "confidence")
 

@@ -1,6 +1,6 @@
-"""Where the endoscope image ends: straight and round borders of one clip together.
+"""Where the endoscope image ends: straight and round borders of one clip together, and black parts.
 
-Shared letters: `K` sample images of one clip, (H, W, 3) uint8 each.
+Shared letters: `K` sample images of one clip, (H, W, 3) uint8 each, at different times.
 """
 
 from __future__ import annotations
@@ -8,15 +8,54 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .black_arcs import black_arcs
-from .circle import Circle
+from .dark_outline import Circle, Darkness, brightness, find_darkness, reduced
 from .round_border import find_circle
-from .strips import BLACK_LEVEL, Strips, find_strips
 
-__all__ = ["Circle", "Outline", "Strips", "find_circle", "find_outline", "find_strips", "masked_border"]
+__all__ = ["Circle", "Outline", "Strips", "black_margin", "find_circle", "find_outline", "find_strips", "masked_border"]
+
+BLACK_LEVEL = 28
+"""Levels 0..255 below this are black, including limited-range video with coding noise."""
+MIN_STRIP_PX = 3
+"""Thinner strips are ignored; they can be coding noise."""
+MAX_STRIP_FRACTION = 0.25
+"""Largest share of the image for one strip."""
+STATIC_RATIO = 0.3
+"""The change over time of a strip is below this share of the change in the image center ..."""
+STRIP_CHROMA = 40
+"""... and a strip is gray: the channels of half of its pixels differ by less than this."""
+EDGE_SHARE, EDGE_STEP = 0.55, 12
+"""Share of a strip's edge with a brightness step, and its least levels: unlike that of a shadow, it is straight."""
+FADING, MOST_FADING_PX = 0.8, 3
+"""So many rows next to a strip belong to it if they have less than this share of the level two rows further inside."""
+MARGIN_LEVEL, MARGIN_AREA = 20, 0.001
+"""The margin of a rectification is darker than this level, and covers at least this share of the image."""
+SHARP_PX = 4
+"""Beside a black part the image begins within this length, px; dark tissue becomes brighter gradually."""
+MARGIN_SHARP, ARC_SHARP = 0.3, 0.6
+"""Share of the outline on which it does: of a margin, and of a black part of a circle."""
+MARGIN_GROW_PX, ARC_GROW_PX = 2, 3
+"""So much more is left out: interpolation and coding darken or blur the outline."""
+ARC_LENGTH = 3
+"""A black part of a circle is so many times longer along the border than deep; a dark tool is not."""
+FRAME_PX = 3
+"""Width of the black frame around the image while a margin is searched."""
+
+
+@dataclass(frozen=True)
+class Strips:
+    """Rows and columns at each side that are outside of the endoscope image, px."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    def __bool__(self) -> bool:
+        return any((self.top, self.bottom, self.left, self.right))
 
 
 @dataclass(frozen=True)
@@ -40,7 +79,7 @@ def find_outline(images: Sequence[NDArray[np.uint8]]) -> Outline:
     in_strip[strips.top : height - strips.bottom, strips.left : width - strips.right] = False
     outside = np.zeros((height, width), bool)
     if circle:
-        outside = ~circle.mask(width, height, circle.margin_px) | black_arcs(images, circle)
+        outside = ~circle.mask(width, height, circle.margin_px) | _black_arcs(images, circle)
     return Outline(strips, circle, in_strip, outside)
 
 
@@ -57,3 +96,127 @@ def masked_border(
     for tissue in tissue_masks:
         masked &= ~tissue
     return masked
+
+
+def find_strips(images: Sequence[NDArray[np.uint8]], circle: Circle | None = None) -> Strips:
+    """Detect black bars and static gray console strips at the sides.
+
+    Args:
+        images: K of one size; from a single image only black bars are detected.
+        circle: round border; what lies outside of it is no strip and hides none.
+    """
+    grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in images]
+    mean = sum(grays) / len(grays)
+    change = np.sqrt(sum((gray - mean) ** 2 for gray in grays) / len(grays))
+    chroma = sum((brightness(image) - ~brightness(~image)).astype(np.float32) for image in images) / len(images)
+    brightest = np.maximum.reduce([brightness(image) for image in images])
+    height, width = brightest.shape
+    central_change = float(np.median(change[height // 4 : height - height // 4, width // 4 : width - width // 4]))
+    inside = circle.mask(width, height, circle.margin_px) if circle else np.ones((height, width), bool)
+    top, bottom, right, left = (  # turned so that the side in question is on top
+        _strip_on_top(*(np.rot90(m, turns) for m in (brightest, chroma, change, mean, inside)), central_change)
+        for turns in (0, 2, 1, 3)
+    )
+    return Strips(top, bottom, left, right)
+
+
+def _strip_on_top(
+    brightest: NDArray[np.uint8],
+    chroma: NDArray,
+    change: NDArray,
+    mean: NDArray,
+    inside: NDArray[np.bool_],
+    central_change: float,
+) -> int:
+    """Number of rows of a strip at the top of these (H, W) maps, 0 for none."""
+    limit = int(MAX_STRIP_FRACTION * len(brightest))
+    first = int(inside.any(1).argmax())  # rows above show nothing of the circle
+    rows = first
+    while rows <= limit:
+        at = inside[rows]
+        black = np.quantile(brightest[rows][at], 0.98) < BLACK_LEVEL
+        static = np.quantile(change[rows][at], 0.8) < STATIC_RATIO * central_change  # False for one image
+        if not (black or (static and np.median(chroma[rows][at]) < STRIP_CHROMA)):
+            break
+        rows += 1
+    if rows < MIN_STRIP_PX or rows == first or rows > limit:
+        return 0
+    # A row of coding noise can lie between strip and image.
+    jumps = [
+        np.abs(mean[rows + d] - mean[rows - 1])[inside[rows - 1] & inside[rows + d]] > EDGE_STEP
+        for d in (0, 1)
+        if rows + d < len(mean)
+    ]
+    if max((jump.mean() for jump in jumps if jump.size), default=0.0) <= EDGE_SHARE:
+        return 0
+    level = [
+        float(np.median(row[at])) if at.any() else 0.0
+        for row, at in zip(mean[rows : rows + 6], inside[rows : rows + 6], strict=True)
+    ]
+    fading = 0
+    while fading < min(MOST_FADING_PX, len(level) - 3) and level[fading] < FADING * level[fading + 2]:
+        fading += 1
+    return rows + fading
+
+
+def black_margin(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.bool_]:
+    """(H, W) True on the black margin that rectification leaves around an image.
+
+    It has no color at all, in all of the K images, touches the image's edge, and ends sharply.
+    """
+    # A black frame around the image joins the regions of its sides, and keeps narrow ones.
+    grays = [cv2.copyMakeBorder(brightness(image), *4 * (FRAME_PX,), cv2.BORDER_CONSTANT) for image in images]
+    grays = [cv2.blur(gray, (3, 3)) for gray in grays]
+    inner = (slice(FRAME_PX, -FRAME_PX),) * 2
+    none = np.zeros(images[0].shape[:2], bool)
+    darkness = find_darkness([gray[inner] for gray in grays])
+    if darkness is None or darkness.level >= MARGIN_LEVEL:
+        return none
+    black, lit = _black_and_lit(np.maximum.reduce(grays), darkness)
+    _, regions = cv2.connectedComponents(black, connectivity=4)
+    margin = (regions == regions[0, 0]).astype(np.uint8)
+    if margin[inner].mean() < MARGIN_AREA:
+        return none
+    outline = (cv2.dilate(margin, _square(1)) > margin)[inner]
+    if not outline.any() or lit[inner][outline].mean() < MARGIN_SHARP:
+        return none
+    return cv2.dilate(margin[inner], _square(MARGIN_GROW_PX)) > 0
+
+
+def _black_arcs(images: Sequence[NDArray[np.uint8]], circle: Circle) -> NDArray[np.bool_]:
+    """(H, W) True on black parts of the circle, where the picture ends before it does.
+
+    They are black in all of the K images, begin at the border or the image's edge, and end sharply.
+    """
+    grays = [cv2.blur(brightness(image), (3, 3)) for image in images]
+    height, width = grays[0].shape
+    darkness = find_darkness(reduced(grays)[0])
+    if darkness is None:
+        return np.zeros((height, width), bool)
+    inside = circle.mask(width, height, circle.margin_px)
+    black, lit = _black_and_lit(np.maximum.reduce(grays), darkness, inside)
+    count, regions = cv2.connectedComponents(black, connectivity=4)
+    framed = np.pad(inside.astype(np.uint8), 1)  # the edge of the image cuts the circle
+    distance = cv2.distanceTransform(framed, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    inner = (cv2.erode(black, _square(1)) == 0) & (black > 0) & (distance > SHARP_PX)
+    depth = np.zeros(count, np.float32)
+    np.maximum.at(depth, regions[black > 0], distance[black > 0])
+    contact = np.bincount(regions[(black > 0) & (distance < 1.5)], minlength=count)
+    outline = np.bincount(regions[inner], minlength=count)
+    sharp = np.bincount(regions[inner & lit], minlength=count)
+    chosen = (contact > ARC_LENGTH * depth) & (outline > 0) & (sharp >= ARC_SHARP * outline)
+    chosen[0] = False
+    return (cv2.dilate(chosen[regions].astype(np.uint8), _square(ARC_GROW_PX)) > 0) & inside
+
+
+def _black_and_lit(
+    brightest: NDArray[np.uint8], darkness: Darkness, inside: NDArray[np.bool_] | bool = True
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """(H, W) 1 on black pixels `inside`, without specks; (H, W) True within `SHARP_PX` of lit ones."""
+    black = ((brightest <= darkness.level + darkness.step) & inside).astype(np.uint8)
+    lit = cv2.dilate(brightest, _square(SHARP_PX)) > darkness.level + 4 * darkness.step
+    return cv2.morphologyEx(black, cv2.MORPH_OPEN, _square(1)), lit
+
+
+def _square(reach: int) -> NDArray[np.uint8]:
+    return np.ones((2 * reach + 1,) * 2, np.uint8)

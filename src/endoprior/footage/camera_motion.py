@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .corner_flow import follow_both_ways
+from .optical_flow import follow_both_ways
 
 WORK_WIDTH = 320
 """Images are resized to this width, px: enough for hundreds of corners, and fast."""
@@ -62,16 +62,12 @@ def camera_motion(
         size = gray.shape[::-1]
         if before is not None:
             step = _step(*before, gray)
-            grid = _grid(*size)
-            if step is None:
-                shifts.append(np.nan)
-            else:
-                shifts.append(float(np.hypot(*(_apply(step, grid) - grid).T).mean()) / factor)
-                chain = step @ chain
-            path.append(float(np.hypot(*(_apply(chain, grid) - grid).T).mean()) / factor)
+            shifts.append(np.nan if step is None else _mean_shift(step, *size) / factor)
+            chain = chain if step is None else step @ chain
+            path.append(_mean_shift(chain, *size) / factor)
         before = (gray, allowed)
     steps, distances = np.array(shifts), np.array(path)
-    farthest = distances.max() if len(distances) else 0.0
+    farthest = distances.max()
     moving = bool(farthest > MOVING_FRACTION * size[0] / factor)
     explained = float(np.isfinite(steps).mean()) if len(steps) else 1.0
     reason = (
@@ -97,11 +93,8 @@ def _step(before: NDArray[np.uint8], allowed: NDArray[np.uint8] | None, now: NDA
     return np.vstack([matrix, [0, 0, 1]])
 
 
-def _grid(width: int, height: int) -> NDArray[np.float64]:
-    """(9, 2) points spread over the image; also a zoom about the center moves most of them."""
+def _mean_shift(matrix: NDArray, width: int, height: int) -> float:
+    """Mean shift by a (3, 3) transform of 9 points spread over the image, px; also a zoom moves most of them."""
     x, y = np.meshgrid(np.array([1, 3, 5]) * width / 6, np.array([1, 3, 5]) * height / 6)
-    return np.stack([x.ravel(), y.ravel()], 1)
-
-
-def _apply(matrix: NDArray, points: NDArray) -> NDArray[np.float64]:
-    return points @ matrix[:2, :2].T + matrix[:2, 2]
+    grid = np.stack([x.ravel(), y.ravel()], 1)
+    return float(np.hypot(*(grid @ matrix[:2, :2].T + matrix[:2, 2] - grid).T).mean())

@@ -7,7 +7,7 @@ do not blur from frame to frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -55,32 +55,33 @@ class CarriedEdit:
 
 
 def carry_mask_edit(
-    frames: Sequence[NDArray[np.uint8]],
-    masks: Sequence[NDArray[np.bool_]],
+    frame_at: Callable[[int], NDArray[np.uint8]],
+    mask_at: Callable[[int], NDArray[np.bool_]],
+    num_frames: int,
     frame_index: int,
     edited_mask: NDArray[np.bool_],
 ) -> CarriedEdit:
     """Apply the correction of one mask to the frames before and after it, until the flow is no longer reliable.
 
     Args:
-        frames: T frames (H, W, 3), 0..255; decoded one at a time, in the order of carrying.
-        masks: T masks (H, W) before the correction.
+        frame_at: reads a frame (H, W, 3), 0..255; one at a time, in the order of carrying.
+        mask_at: reads its mask (H, W) before the correction.
         frame_index: the corrected frame, 0-based.
         edited_mask: (H, W) its mask after the correction.
     Raises:
         IndexError: no such frame.
         ValueError: unequal shapes, or frames smaller than `MIN_SIZE_PX`.
     """
-    if not 0 <= frame_index < len(frames):
-        raise IndexError(f"frame_index must be in 0..{len(frames) - 1}; got {frame_index}")
-    start, before = frames[frame_index], masks[frame_index]
+    if not 0 <= frame_index < num_frames:
+        raise IndexError(f"frame_index must be in 0..{num_frames - 1}; got {frame_index}")
+    start, before = frame_at(frame_index), mask_at(frame_index)
     check_shape("frame:H,W,3 mask:H,W edited:H,W", frame=start, mask=before, edited=edited_mask)
     if min(before.shape) < MIN_SIZE_PX:
         raise ValueError(f"frames must be at least {MIN_SIZE_PX} px wide and high; got {before.shape[::-1]}")
     added, removed = edited_mask & ~before, before & ~edited_mask
     changed: dict[int, NDArray[np.bool_]] = {}
-    to_first = _carry(frames, masks, range(frame_index, -1, -1), added, removed, changed)
-    to_last = _carry(frames, masks, range(frame_index, len(frames)), added, removed, changed)
+    to_first = _carry(frame_at, mask_at, range(frame_index, -1, -1), added, removed, changed)
+    to_last = _carry(frame_at, mask_at, range(frame_index, num_frames), added, removed, changed)
     return CarriedEdit(dict(sorted(changed.items())), to_first, to_last)
 
 
@@ -122,8 +123,8 @@ def _moved(region: NDArray[np.bool_], positions: Positions) -> NDArray[np.bool_]
 
 
 def _carry(
-    frames: Sequence[NDArray[np.uint8]],
-    masks: Sequence[NDArray[np.bool_]],
+    frame_at: Callable[[int], NDArray[np.uint8]],
+    mask_at: Callable[[int], NDArray[np.bool_]],
     order: range,
     added: NDArray[np.bool_],
     removed: NDArray[np.bool_],
@@ -134,10 +135,10 @@ def _carry(
     size = int(region.sum())
     if not size:
         return "nothing was corrected"
-    start = now = _Small.of(frames[order[0]])
+    start = now = _Small.of(frame_at(order[0]))
     positions = _grid(*now.gray.shape)
     for number in order[1:]:
-        before, now = now, _Small.of(frames[number])
+        before, now = now, _Small.of(frame_at(number))
         share, near = _follow(before.gray, now.gray, region)
         if share < LEAST_RETURNING:
             return f"frame {number}: the motion is uncertain; {share:.0%} of the region returns along the flow"
@@ -155,7 +156,7 @@ def _carry(
         difference = cv2.absdiff(now.color, sampled(start.color, positions))[inside].mean(-1)
         if (change := float(np.median(difference))) > MOST_COLOR_CHANGE:
             return f"frame {number}: the color of the region changed by {change:.0f} of 255 levels"
-        mask = masks[number]
+        mask = mask_at(number)
         agrees = (painted & mask) | (erased & ~mask)
         if agrees.sum() < AGREES * region.sum():
             changed[number] = (mask | painted) & ~erased

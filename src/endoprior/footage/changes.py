@@ -1,11 +1,12 @@
 """Detect changes that tissue motion does not cause: duplicates, exposure jumps, cuts, blur, views outside the body.
 
-Shared letters: `T` successive images of one clip. All measurements use thumbnails, which suppresses noise.
+Also combed images, of an interlaced video that its file does not flag as such. Shared letters: `T` successive images of
+one clip. Changes are measured on thumbnails, which suppresses noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -83,8 +84,8 @@ def find_changes(images: Iterable[NDArray[np.uint8]]) -> Changes:
         duplicates=find_duplicates(difference),
         exposure_jumps=tuple(i for i in _exposure_jumps(pairs) if i not in cuts),
         cuts=cuts,
-        blurred=_blurred(sharp),
-        off_color=_off_color(np.array(shares)),
+        blurred=_places(sharp < BLUR_RATIO * np.array([np.median(window) for window in _windows(sharp)])),
+        off_color=_places(np.abs(shares - np.median(shares, axis=0)).max(1) > COLOR_DISTANCE),
     )
 
 
@@ -95,10 +96,9 @@ def find_duplicates(difference: NDArray[np.floating]) -> tuple[int, ...]:
         difference: (T - 1,) mean absolute difference of successive images, levels of 255.
     """
     # A high percentile, not the median: half of the images are duplicates if the frame rate was doubled.
-    windows = (difference[max(0, i - NEIGHBORS) : i + NEIGHBORS + 1] for i in range(len(difference)))
-    usual = np.array([np.percentile(window, 80) for window in windows])
+    usual = np.array([np.percentile(window, 80) for window in _windows(difference)])
     limit = np.maximum(SAME_LEVELS, np.minimum(COPY_LEVELS, COPY_SHARE * usual))
-    return tuple(int(i) + 1 for i in np.flatnonzero(difference < limit))
+    return tuple(i + 1 for i in _places(difference < limit))
 
 
 def _exposure_jumps(pairs: list[tuple[NDArray, NDArray]]) -> list[int]:
@@ -131,10 +131,9 @@ def _reduced(image: NDArray, share: float) -> NDArray:
     return cv2.resize(image, None, fx=fx, fy=fy, interpolation=cv2.INTER_AREA)
 
 
-def _blurred(sharpness: NDArray[np.float64]) -> tuple[int, ...]:
-    windows = (sharpness[max(0, i - NEIGHBORS) : i + NEIGHBORS + 1] for i in range(len(sharpness)))
-    usual = np.array([np.median(window) for window in windows])
-    return tuple(int(i) for i in np.flatnonzero(sharpness < BLUR_RATIO * usual))
+def _windows(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
+    """Each value with its neighbors."""
+    return [values[max(0, i - NEIGHBORS) : i + NEIGHBORS + 1] for i in range(len(values))]
 
 
 def color_share(image: NDArray) -> NDArray[np.float64]:
@@ -143,9 +142,8 @@ def color_share(image: NDArray) -> NDArray[np.float64]:
     return mean[:2] / max(mean.sum(), 1.0)
 
 
-def _off_color(shares: NDArray[np.float64]) -> tuple[int, ...]:
-    distance = np.abs(shares - np.median(shares, axis=0)).max(1)
-    return tuple(int(i) for i in np.flatnonzero(distance > COLOR_DISTANCE))
+def _places(found: NDArray[np.bool_]) -> tuple[int, ...]:
+    return tuple(np.flatnonzero(found).tolist())
 
 
 def _correlation(a: NDArray, b: NDArray) -> float:
@@ -154,3 +152,37 @@ def _correlation(a: NDArray, b: NDArray) -> float:
     a, b = a - a.mean(), b - b.mean()
     energy = float(np.sqrt((a * a).mean() * (b * b).mean()))
     return 1.0 if energy < 1e-3 else float((a * b).mean()) / energy
+
+
+BLOCK_PX = 16
+LEAST_DIFFERENCE = 3.0
+"""Mean difference of neighboring rows, of 255, above which a block has structure."""
+RATIO = 1.3
+"""A block is combed if its neighboring rows differ more than rows two apart, by this factor; usually it is 0.55."""
+SHARE = 0.1
+"""Least share of combed blocks, of those with structure. Progressive clips have up to 0.03, woven ones 0.07 to 1."""
+LEAST_BLOCKS = 8
+LEAST_IMAGES = 0.1
+"""Share of images that must be combed: without motion there is nothing to see."""
+
+
+def is_combed(rgb_u8: NDArray[np.uint8]) -> bool:
+    """Whether moving parts of an image (H, W, 3) alternate from row to row."""
+    gray = cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    height, width = ((side - 2) // BLOCK_PX * BLOCK_PX for side in gray.shape)
+    if min(height, width) < BLOCK_PX:
+        return False
+    next_row, next_but_one = (
+        np.abs(gray[by : height + by, :width] - gray[:height, :width])
+        .reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)
+        .mean((1, 3))
+        for by in (1, 2)
+    )
+    structured = next_row > LEAST_DIFFERENCE
+    combed = structured & (next_row > RATIO * next_but_one)
+    return bool(combed.sum() >= max(LEAST_BLOCKS, SHARE * structured.sum()))
+
+
+def are_combed(images: Sequence[NDArray[np.uint8]]) -> bool:
+    """Whether images (H, W, 3) of a clip are those of an interlaced video."""
+    return sum(map(is_combed, images)) > LEAST_IMAGES * len(images)

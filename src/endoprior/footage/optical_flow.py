@@ -1,6 +1,11 @@
-"""Dense optical flow between two frames, both ways, by dense inverse search (Kroeger et al. 2016, OpenCV)."""
+"""Optical flow between two images: dense by inverse search (Kroeger et al. 2016), of corners by Lucas and Kanade.
+
+Both are those of OpenCV; corners are followed by its pyramidal method (Bouguet 2001).
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,9 +19,6 @@ HALVED_FROM_PX = 256
 """Flow of frames with at least this shorter side is computed at half size: four times faster, almost as accurate."""
 FINE_SIDE_PX = 256
 """Fine flow is computed on images shrunk by a whole number to at least this shorter side."""
-
-FlowPair = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Flow (h, w, 2) from a frame to the next and back, in px of the image it was computed on."""
 
 
 def flow_shrink(height: int, width: int) -> int:
@@ -37,22 +39,17 @@ def gray_for_flow(rgb_u8: NDArray[np.uint8], shrink: int | None = None) -> NDArr
     return cv2.resize(gray, (width // shrink, height // shrink), interpolation=cv2.INTER_AREA)
 
 
-def flow_pair(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> FlowPair:
-    """Flow from the first (h, w) gray image to the second, and back; both sides at least `MIN_SIZE_PX`."""
+def flow_pair(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Flow (h, w, 2) from the first (h, w) gray image to the second, and back, px; sides at least `MIN_SIZE_PX`."""
     estimator = _estimator()
     forward = estimator.calc(first, second, None)
     return forward, estimator.calc(second, first, None)
 
 
-def flow_between(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Flow (h, w, 2) from the first (h, w) gray image to the second; both sides at least `MIN_SIZE_PX`."""
-    return _estimator().calc(first, second, None)
-
-
 def fine_flow(
     first: NDArray[np.uint8], second: NDArray[np.uint8], start: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """Flow as by `flow_between`, but refined on the full image: twice as slow, less than half the error.
+    """Flow to the second image as by `flow_pair`, but refined on the full image: twice as slow, half the error.
 
     Larger steps between patches and fewer iterations than OpenCV's preset: half the time, the same error.
 
@@ -70,3 +67,40 @@ def fine_flow(
 def _estimator() -> cv2.DISOpticalFlow:
     """A new one for each pair: it keeps buffers, and a result must not depend on the previous pair."""
     return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+
+def follow_both_ways(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    pixels: NDArray[np.float32],
+    return_px: float,
+    *,
+    side_px: int = 21,
+    halvings: int = 3,
+    guess: NDArray[np.float32] | None = None,
+    criteria: tuple[int, int, float] | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Where the second image shows pixels of the first, and which of them the way back leads home.
+
+    Args:
+        first, second: (H, W) gray images.
+        pixels: (N, 2) px, N > 0; pixel centers count from 0.
+        return_px: followed back, x and y of a pixel come back within this distance, or it counts as lost.
+        side_px: side of the window that is compared.
+        halvings: how often the images are halved; it bounds the motion that is found.
+        guess: (N, 2) where to start in the second image; without it at `pixels`.
+        criteria: when the iteration ends, as OpenCV has it; None for its default.
+    Returns:
+        (N, 2) pixels of the second image, meaningless where lost, and (N,) False where lost.
+    """
+    options: dict[str, Any] = {"winSize": (side_px, side_px), "maxLevel": halvings}
+    if criteria is not None:
+        options["criteria"] = criteria
+    if guess is not None:
+        options["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
+    start = None if guess is None else guess.copy()  # OpenCV overwrites it
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, pixels, start, **options)
+    home = None if guess is None else pixels + there - guess
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, home, **options)
+    kept = (found & found_back).ravel().astype(bool) & (np.abs(back - pixels).max(1) < return_px)
+    return there, kept

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.pose_conventions import CONVENTIONS, Convention, to_ours
 from ..core.spread import spread
-from .corner_flow import follow_both_ways
+from .optical_flow import follow_both_ways
 
 View = tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]]
 """Of a frame: (H, W, 3) image, (H, W) True on tissue, (H, W) depth in mm, 0 where missing."""
@@ -155,26 +156,28 @@ def measure_poses(
 
     fits: list[tuple[float, Convention, float]] = []
     for convention in (given, *(each for each in CONVENTIONS if each != given)):
-        fits.append(_best_unit(lambda unit, name=convention: error(name, unit), convention))
+        unit = _best_unit(partial(error, convention))
+        fits.append((error(convention, unit), convention, unit))
     as_given = fits[0][0] if relative else error(given, 1.0)
     least, best, unit = min(fits, key=lambda fit: fit[0])
     others = tuple(name for at, name, of in fits if name != best and of == unit and at < AS_GOOD * least)
-    still = px * float(np.median(np.concatenate([np.linalg.norm(t.after - t.before, axis=1) for t in tracks])))
-    rigid = px * float(np.median(np.concatenate([_rigid_errors(each, matrix) for each in tracks])))
     ours = read(given, 1.0)
-    moved = px * float(np.median(np.concatenate([_errors(each, matrix, ours, each.before) for each in tracks])))
+    still, rigid, moved = (
+        px * float(np.median(np.concatenate(errors)))
+        for errors in (
+            [np.linalg.norm(each.after - each.before, axis=1) for each in tracks],
+            [_rigid_errors(each, matrix) for each in tracks],
+            [_errors(each, matrix, ours, each.before) for each in tracks],
+        )
+    )
     return PoseFit(as_given, still, rigid, moved, best, 1.0 if relative else unit, least, others)
 
 
-def _best_unit(error: Callable[[float], float], convention: Convention) -> tuple[float, Convention, float]:
-    """Least error of a convention over lengths of its unit: (error, convention, unit)."""
-    unit = float(SCALES[int(np.argmin([error(each) for each in SCALES]))])
+def _best_unit(error: Callable[[float], float]) -> float:
+    """The length of a unit with the least error."""
+    unit = min(SCALES.tolist(), key=error)
     plain = next((each for each in PLAIN_UNITS if 1 / SAME_UNIT < unit / each < SAME_UNIT), None)
-    if plain is None:
-        finer = unit * FINER
-        unit = float(finer[int(np.argmin([error(each) for each in finer]))])
-    unit = plain or unit
-    return error(unit), convention, unit
+    return plain or min((unit * FINER).tolist(), key=error)
 
 
 def _rigid_errors(tracks: _Tracks, matrix: NDArray) -> NDArray[np.float64]:

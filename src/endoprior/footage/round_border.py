@@ -2,20 +2,21 @@
 
 Outline points of all sample images vote for one circle. It is then measured along radial lines in every image, and
 rejected unless the images agree: the edge is sharp, on the circle, bent as the circle is, and its outside is dark.
+
+Shared letters: `K` sample images, `A` angles, `D` depths inside of the circle, px (negative outside).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .circle import Circle, likely_circle
-from .dark_outline import Darkness, brightness, find_darkness, outline_points, reduced
-from .radial import Edges, measure_edges, profiles
-from .rim import measure_rim
+from .dark_outline import Circle, Darkness, brightness, find_darkness, likely_circle, outline_points, reduced
 
 LEAST_AGREEMENT = 0.35
 """Share of the visible circle on which the images show a border, if anything is lit there."""
@@ -65,14 +66,14 @@ def find_circle(images: Sequence[NDArray[np.uint8]]) -> Circle | None:
     if start is None:
         return None
     start = Circle(start.center_x * factor, start.center_y * factor, start.radius * factor)
-    edges = measure_edges(grays, start, darkness)
+    edges = _measure_edges(grays, start, darkness)
     agreement = _agreement(edges, grays, small, factor, darkness)
     if agreement is None or agreement < LEAST_AGREEMENT:
         return None
     if agreement < CERTAIN and np.median(edges.contrast[edges.hits]) < SHARP:
         return None
     center, drift = _rest(edges)
-    rim = min(measure_rim(grays, edges, darkness) + drift, MOST_MARGIN * edges.radius)
+    rim = min(_measure_rim(grays, edges, darkness) + drift, MOST_MARGIN * edges.radius)
     return Circle(float(center[0]), float(center[1]), edges.radius, rim, agreement)
 
 
@@ -94,7 +95,7 @@ def _agreement(
     partial = supported.sum() < 0.8 * edges.visible.sum()  # an outline that stays near the circle everywhere is one
     if partial and np.quantile(uneven, 0.8) > MOST_UNEVEN * edges.tolerance_px:
         return None
-    bend, error = measured_bend(edges, supported)
+    bend, error = _bend_of(edges, supported)
     if not (BEND[0] < bend < BEND[1] and error < BEND_ERROR):
         return None
     wide = Circle(center[0] / factor, center[1] / factor, 1.02 * edges.radius / factor)
@@ -111,7 +112,7 @@ def _agreement(
 def _support(edges: Edges, grays: Sequence[NDArray], darkness: Darkness) -> tuple[NDArray, NDArray]:
     """(A,) True where enough images show the border; (A,) True where it is dark inside in all images."""
     depths = np.linspace(0.01, 0.04, 7) * edges.radius
-    inner = profiles(grays, [edges.circle(k) for k in range(len(grays))], edges.angles, depths)
+    inner = _profiles(grays, edges.centers, edges.radius, edges.angles, depths)
     with np.errstate(invalid="ignore"):
         lit = np.nan_to_num(inner).mean(2) > darkness.level + 2 * darkness.step
     lit |= edges.hits
@@ -132,7 +133,7 @@ def _contradicted(edges: Edges) -> NDArray[np.bool_]:
     return found
 
 
-def measured_bend(edges: Edges, supported: NDArray[np.bool_]) -> tuple[float, float]:
+def _bend_of(edges: Edges, supported: NDArray[np.bool_]) -> tuple[float, float]:
     """Curvature of the border in units of the circle's, and its standard error.
 
     Each connected arc may have its own position and direction; only how it bends counts: 1 for the circle, 0 for the
@@ -141,12 +142,11 @@ def measured_bend(edges: Edges, supported: NDArray[np.bool_]) -> tuple[float, fl
     error = np.where(edges.hits, edges.error, np.nan)
     seen = np.flatnonzero(supported)
     values = np.array([np.nanmedian(error[:, a]) for a in seen])
-    along = edges.radius * edges.angles[seen]
     top = bottom = squares = 0.0
     freedom = 0
     for arc in _arcs(seen, len(supported)):
         # A circle's outline lies on the circle. A straight line through it lies s^2 / 2R outside of it at s.
-        s = np.unwrap(along[arc] / edges.radius) * edges.radius
+        s = np.unwrap(edges.radius * edges.angles[seen[arc]] / edges.radius) * edges.radius
         s = s - s.mean()
         basis = np.stack([np.ones_like(s), s], 1)
         bent = s * s / (2 * edges.radius)
@@ -185,3 +185,176 @@ def _rest(edges: Edges) -> tuple[NDArray[np.float64], float]:
     low, high = np.quantile(centers, [0.02, 0.98], axis=0)
     center = (low + high) / 2
     return center, float(np.quantile(np.hypot(*(centers - center).T), 0.98))
+
+
+ANGLES = 360
+SEARCH = (0.02, 0.01, 0.005)
+"""Standard deviation of the search around the circle, in radii: one round each, which reaches three times as far."""
+EDGE_WIDTH = 0.006
+"""Length over which levels are averaged on both sides of an edge, in radii."""
+LEAST_EDGE_PX = 1.5
+LEAST_CONTRAST = 0.4
+"""The level outside of an edge is lower by at least this share of the level inside."""
+DRIFT = 0.005
+"""Typical movement of the border in the image, in radii."""
+ANGLE_WEIGHT = 0.125
+"""Weight of one angle: neighbors have the same error."""
+
+
+@dataclass(frozen=True)
+class Edges:
+    """The round border in every image."""
+
+    radius: float
+    centers: NDArray[np.float64]
+    """(K, 2) px."""
+    angles: NDArray[np.float64]
+    """(A,) radians; 0 points right, pi/2 down."""
+    error: NDArray[np.float64]
+    """(K, A) distance of the edge from the image's circle, px, positive outside; NaN without an edge."""
+    contrast: NDArray[np.float64]
+    """(K, A) share 0..1 of the level inside that is lost across the edge; NaN without one."""
+    visible: NDArray[np.bool_]
+    """(A,) True where the circle lies in the image."""
+
+    @property
+    def tolerance_px(self) -> float:
+        """Largest error of an edge that lies on the circle."""
+        return max(0.005 * self.radius, 1.5)
+
+    @property
+    def hits(self) -> NDArray[np.bool_]:
+        """(K, A) True where the edge lies on the circle."""
+        return np.abs(np.nan_to_num(self.error, nan=np.inf)) < self.tolerance_px
+
+
+def _profiles(
+    grays: Sequence[NDArray[np.uint8]], centers: NDArray, radius: float, angles: NDArray, depths: NDArray
+) -> NDArray[np.float32]:
+    """(K, A, D) levels along radial lines of circles with (K, 2) centers; NaN outside of the image."""
+    height, width = grays[0].shape
+    found = np.empty((len(grays), len(angles), len(depths)), np.float32)
+    across, down = np.cos(angles)[:, None] * (radius - depths), np.sin(angles)[:, None] * (radius - depths)
+    for k, gray in enumerate(grays):
+        x, y = (centers[k, 0] + across - 0.5).astype(np.float32), (centers[k, 1] + down - 0.5).astype(np.float32)
+        found[k] = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        found[k][(x < 0) | (y < 0) | (x > width - 1) | (y > height - 1)] = np.nan
+    return found
+
+
+def _measure_edges(grays: Sequence[NDArray[np.uint8]], start: Circle, darkness: Darkness) -> Edges:
+    """Measure the circle in every full image (H, W), beginning with an approximate one.
+
+    The radius is that of all images. The center may move a little: lens and camera are not one piece.
+    """
+    angles = np.arange(ANGLES) * (2 * np.pi / ANGLES)
+    radius = start.radius
+    centers = np.repeat([[start.center_x, start.center_y]], len(grays), 0)
+    for search in SEARCH:
+        step = max(radius / 1000, 0.5)
+        reach = 3 * search * radius + 2 * max(EDGE_WIDTH * radius, LEAST_EDGE_PX)
+        depths = np.arange(-reach, reach, step)
+        levels = _profiles(grays, centers, radius, angles, depths)
+        error, contrast = _edges(levels, depths, search * radius, radius, darkness)
+        shift, grow = _moves(error, angles, radius)
+        centers, radius = centers + shift, radius + grow
+        error -= shift[:, :1] * np.cos(angles) + shift[:, 1:] * np.sin(angles) + grow
+        if not 0.1 * start.radius < radius < 2 * start.radius:
+            break
+    middle = np.argmin(np.abs(depths))
+    return Edges(radius, centers, angles, error, contrast, np.isfinite(levels[:, :, middle]).mean(0) > 0.5)
+
+
+def _edges(levels: NDArray, depths: NDArray, search_px: float, radius: float, darkness: Darkness) -> tuple:
+    """(K, A) distance of the edges outside of the circle, px, and their contrast; NaN where there is none."""
+    step = depths[1] - depths[0]
+    count = max(round(max(EDGE_WIDTH * radius, LEAST_EDGE_PX) / step), 1)
+    above = np.maximum(levels - darkness.level, 0)
+    sums = np.cumsum(np.nan_to_num(above), axis=2, dtype=np.float64)
+    sums[np.isnan(levels)] = np.nan  # lines that leave the image have no edge there
+    mean = (sums[:, :, count:] - sums[:, :, :-count]) / count
+    outer, inner = mean[:, :, :-count], mean[:, :, count:]
+    at = depths[count : count + outer.shape[2]] + step / 2
+    rise = inner - outer
+    contrast = rise / np.maximum(inner, 1e-6)
+    score = rise / (inner + 2 * darkness.step) * np.exp(-0.5 * (at / search_px) ** 2)
+    score[~((rise > darkness.step) & (contrast > LEAST_CONTRAST))] = 0  # also where there is no number
+    best = score.argmax(2)[:, :, None]
+    found = np.take_along_axis(score, best, 2)[:, :, 0] > 0
+    contrast = np.take_along_axis(contrast, best, 2)[:, :, 0]
+    # The score prefers the outer side of an edge. The edge itself lies where the level rises most.
+    near = np.clip(best + np.arange(-count, count + 1), 0, len(at) - 1)
+    rises = np.nan_to_num(np.take_along_axis(rise, near, 2))
+    peak = np.maximum(rises - 0.8 * rises.max(2, keepdims=True), 1e-12)
+    place = (at[near] * peak).sum(2) / peak.sum(2)
+    return np.where(found, -place, np.nan), np.where(found, contrast, np.nan)
+
+
+def _moves(error: NDArray, angles: NDArray, radius: float) -> tuple[NDArray[np.float64], float]:
+    """(K, 2) movement of each center and growth of the radius, px, that explain (K, A) errors; robust.
+
+    Least squares with Tukey's weights. Images that show little of the border stay near the mean center.
+    """
+    count = len(error)
+    columns = np.stack([np.cos(angles), np.sin(angles)], 1)
+    shift, grow = np.zeros((count, 2)), 0.0
+    known = np.isfinite(error)
+    prior = (1.0 / max(DRIFT * radius, 0.5)) ** 2
+    for _ in range(8):
+        left = np.where(known, error - shift @ columns.T - grow, np.nan)
+        scale = max(3 * 1.48 * float(np.nanmedian(np.abs(left))) if known.any() else 0.0, 1.5)
+        weights = ANGLE_WEIGHT * np.where(known, np.maximum(1 - (left / scale) ** 2, 0) ** 2, 0.0)
+        # Unknowns: 2 for each image, the radius, and the mean center.
+        matrix, right = np.zeros((2 * count + 3, 2 * count + 3)), np.zeros(2 * count + 3)
+        values = np.where(known, error, 0.0)
+        for k in range(count):
+            own = slice(2 * k, 2 * k + 2)
+            weighted = weights[k][:, None] * columns
+            matrix[own, own] = weighted.T @ columns + prior * np.eye(2)
+            matrix[own, -3] = matrix[-3, own] = weighted.sum(0)
+            matrix[own, -2:] = matrix[-2:, own] = -prior * np.eye(2)
+            right[own] = weighted.T @ values[k]
+        matrix[-3, -3], right[-3] = weights.sum() + 1e-9, (weights * values).sum()
+        matrix[-2:, -2:] = (count * prior + 1e-9) * np.eye(2)
+        solution = np.linalg.solve(matrix, right)
+        shift, grow = solution[: 2 * count].reshape(-1, 2), float(solution[-3])
+    return shift, grow
+
+
+LEAST_RIM, LEAST_RIM_PX = 0.005, 1.0
+"""Smallest rim, in radii and px."""
+MOST_RIM = 0.06
+"""Largest rim, in radii."""
+TISSUE = (0.06, 0.12)
+"""Depths, in radii, that show tissue in all endoscopes."""
+RADIAL = 1.6
+"""In a rim the level changes this many times more across the border than deeper in the image."""
+FADED = 0.7
+"""A rim is darker than this share of the level that tissue's own fall-off leads to."""
+
+
+def _measure_rim(grays: Sequence[NDArray[np.uint8]], edges: Edges, darkness: Darkness) -> float:
+    """Width of the rim, px inside of the radius.
+
+    Tissue moves and its structures have any direction. A rim stays, is lit or faded, and changes across the border:
+    the rim ends at the last depth where levels change much more across the border than along it, or are faded.
+    """
+    depths = np.arange(0.0, TISSUE[1] * edges.radius, 0.5)
+    levels = _profiles(grays, edges.centers, edges.radius, edges.angles, depths) - darkness.level
+    rows = levels[edges.hits]
+    rows = rows[np.isfinite(rows).all(1)]
+    least = max(LEAST_RIM * edges.radius, LEAST_RIM_PX)
+    tissue = depths >= TISSUE[0] * edges.radius
+    normal = rows[:, tissue].mean(1)
+    lit = normal > 2 * darkness.step
+    if lit.sum() < 20:
+        return least
+    share = rows[lit] / normal[lit, None]
+    change = np.median(np.abs(share[:, 2:] - share[:, :-2]), axis=0)
+    usual = np.median(change[tissue[1:-1]]) + 0.02
+    level = np.median(share, axis=0)
+    is_rim = (level < FADED) | (level > 1 / FADED)
+    is_rim[1:-1] |= change > RADIAL * usual
+    is_rim &= depths < MOST_RIM * edges.radius
+    last = float(depths[np.flatnonzero(is_rim)[-1]] + 1) if is_rim.any() else 0.0
+    return float(np.clip(last, least, MOST_RIM * edges.radius))

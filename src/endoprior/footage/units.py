@@ -75,33 +75,20 @@ def guess_unit(
     median = float(np.median(medians))
     shading = float(np.mean(shadings)) if shadings else 0.0
     tool = float(np.median(ratios)) if ratios else float("nan")
-    return UnitGuess(*_decide(median, shading, tool), median, shading, tool, _reason(median, shading, tool))
-
-
-def _decide(median: float, shading: float, tool: float) -> tuple[Unit, float | None]:
-    if _larger_is_nearer(shading, tool):
-        return "disparity", None
+    if shading > SHADING_LIMIT:  # clear, unless tools contradict it; if shading is weak, tools decide
+        larger_is_nearer = not tool < 1 / TOOL_LIMIT
+    else:
+        larger_is_nearer = shading > -SHADING_LIMIT / 2 and tool > TOOL_LIMIT
+    if larger_is_nearer:
+        tools = "" if np.isnan(tool) else f", tools have {tool:.2f} times the values around them"
+        reason = f"larger values are nearer: brightness and value correlate by {shading:+.2f}{tools}"
+        return UnitGuess("disparity", None, median, shading, tool, reason)
     for unit, low, high, factor in RANGES:
         if low <= median < high:
-            return unit, factor
-    return "ambiguous", None
-
-
-def _larger_is_nearer(shading: float, tool: float) -> bool:
-    """Use shading if it is clear and tools do not contradict it; if it is weak, use tools."""
-    if shading > SHADING_LIMIT:
-        return not tool < 1 / TOOL_LIMIT
-    return shading > -SHADING_LIMIT / 2 and tool > TOOL_LIMIT
-
-
-def _reason(median: float, shading: float, tool: float) -> str:
-    unit, factor = _decide(median, shading, tool)
-    if unit == "disparity":
-        tools = "" if np.isnan(tool) else f", tools have {tool:.2f} times the values around them"
-        return f"larger values are nearer: brightness and value correlate by {shading:+.2f}{tools}"
-    if factor is None:
-        return f"the median is {median:.4g}, which no usual unit brings to {NEAR_MM:.0f}-{FAR_MM:.0f} mm"
-    return f"the median is {median:.4g}, which in {unit} is {median * factor:.0f} mm away"
+            reason = f"the median is {median:.4g}, which in {unit} is {median * factor:.0f} mm away"
+            return UnitGuess(unit, factor, median, shading, tool, reason)
+    reason = f"the median is {median:.4g}, which no usual unit brings to {NEAR_MM:.0f}-{FAR_MM:.0f} mm"
+    return UnitGuess("ambiguous", None, median, shading, tool, reason)
 
 
 def _shading(values: NDArray, image: NDArray[np.uint8], where: NDArray[np.bool_]) -> list[float]:

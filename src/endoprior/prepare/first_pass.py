@@ -16,7 +16,7 @@ from ..core.checks import InputError, input_error
 from ..core.shell import quoted
 from ..data.reading import kind_of
 from ..footage.border import Circle, Strips, find_outline
-from ..footage.combing import are_combed
+from ..footage.changes import are_combed
 from ..footage.overlays import find_static_overlays
 from ..footage.round_border import CERTAIN
 from .calibration import fitted

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Camera
-from .line_overlay import Lines, draw_lines
-from .view_settings import IDLE_SECONDS, ViewSettings, shrink_factor
-from .viewable import Viewable
+from .layers import Lines, draw_lines
+from .viewable import IDLE_SECONDS, Viewable, ViewSettings, shrink_factor
 from .viewport import Viewport, bounded_aspect, endoscope_viewport, free_viewport
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 from ..core.checks import number_ranges
 from ..tool_masks.clicked_tools import SearchStep, ToolClick
+from .access_control import BRUSH_NODE
 from .job_queue import JobQueue
 from .mask_edits import MaskEdits, Masks, carried_text
-from .messages import BRUSH_NODE
 
 if TYPE_CHECKING:
     import viser

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar, overload
 
 import cv2
 import numpy as np
@@ -23,7 +22,6 @@ Mask = NDArray[np.bool_]
 """(H, W) True on tools."""
 Masks = dict[int, Mask]
 """By frame. A mask is never changed, only replaced."""
-Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -68,10 +66,15 @@ class MaskEdits:
 
     def carry(self, frame: int) -> CarriedEdit:
         """Carry what was corrected in a frame since the last time to the frames around it."""
-        total = len(self._sequence)
-        frames = _Lazy(total, lambda i: self._sequence.frame(i).rgb_u8)
-        masks = _Lazy(total, lambda i: self._state.uncarried.get(i, self.tool(i)) if i == frame else self.tool(i))
-        done = carry_mask_edit(frames, masks, frame, self.tool(frame))
+        edited = self.tool(frame)
+        before = self._state.uncarried.get(frame, edited)
+        done = carry_mask_edit(
+            lambda i: self._sequence.frame(i).rgb_u8,
+            lambda i: before if i == frame else self.tool(i),
+            len(self._sequence),
+            frame,
+            edited,
+        )
         if done.masks:
             self.begin()
             uncarried = {i: mask for i, mask in self._state.uncarried.items() if i != frame}
@@ -142,22 +145,3 @@ def carried_text(done: CarriedEdit) -> str:
     """What carrying changed and why it stopped, in a few lines."""
     changed = f"Changed frames: {number_ranges(done.masks)}." if done.masks else "No frame changed."
     return f"{changed}  \nBackward until {done.before}.  \nForward until {done.after}."
-
-
-class _Lazy(Sequence[Value]):
-    """A sequence whose items are made when they are used."""
-
-    def __init__(self, length: int, item: Callable[[int], Value]) -> None:
-        self._length, self._item = length, item
-
-    def __len__(self) -> int:
-        return self._length
-
-    @overload
-    def __getitem__(self, index: int) -> Value: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Value]: ...
-    def __getitem__(self, index: int | slice) -> Value | Sequence[Value]:
-        if isinstance(index, slice):
-            return [self._item(i) for i in range(self._length)[index]]
-        return self._item(index)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.geometry import length_unit
-from .measure import DISTANCE, POINTS_OF
-from .messages import are_numbers
-from .view_settings import Layer, ViewSettings
-from .viewable import Viewable
+from .access_control import are_numbers
+from .viewable import Layer, Viewable, ViewSettings
 
 if TYPE_CHECKING:
     import viser
@@ -34,7 +31,15 @@ ENDOSCOPE, ORBIT = "Endoscope", "Orbit"
 SERVER, BROWSER = "Server (exact)", "Browser (smooth)"
 SPLATS, POINTS = "Splats", "Points"
 ORIGINALS = ("frame", "difference")
+DISTANCE, AREA, PATH, DISPLACEMENT, STRETCH = "Distance", "Area", "Path length", "Displacement", "Stretch"
+POINTS_OF = {DISTANCE: 2, AREA: 64, PATH: 1, DISPLACEMENT: 1, STRETCH: 1}
+"""Quantities to measure, and the most points of each: the next click after that begins a new measurement."""
 SPEEDS = ("0.1x", "0.25x", "0.5x", "1x", "2x", "4x")
+CHOICES = ("speed", "layer", "camera", "rendered_by", "rendered_as", "quantity")
+SWITCHES = ("tool", "riding", "tracks", "follow", "measure", "correct", "erase", "find")
+SWITCHES += ("play", "clear", "table", "screenshot", "keep", "forget", "video", "undo", "carry", "save_masks")
+SWITCHES += ("clear_tracks",)
+"""Names of the controls of a `Panel` that a browser sets to one of several texts, and to True or False."""
 CLIP_MARGIN = 1.5
 """The clipping slider ends at this multiple of the far depth; at its end nothing is clipped."""
 
@@ -103,32 +108,21 @@ class Panel:
             self.keep = gui.add_button("Save this view", hint="The video interpolates between saved views, in order.")
             self.forget = gui.add_button("Delete saved views")
             self.video = gui.add_button("Video (MP4)", hint="All frames from this view, or through the saved views.")
-        self._rules = self._value_rules()
-
-    def _value_rules(self) -> dict[str, Callable[[Any], bool]]:
-        """For the id of each control, a function that tells whether a value is valid."""
-        found: dict[str, Callable[[Any], bool]] = {}
-
-        def allow(rule: Callable[[Any], bool], *handles: Any) -> None:
-            found.update({control_id(handle): rule for handle in handles})
-
-        end = self.clip_end
-        allow(lambda value: are_numbers([value], 1, self.frame.max) and value >= 0, self.since, self.frame)
-        allow(lambda value: are_numbers(value, 2, end) and min(value) >= 0, self.clip)
-        allow(lambda value: are_numbers([value], 1, self.radius.max) and value >= self.radius.min, self.radius)
-        buttons = self.play, self.clear, self.table, self.screenshot, self.keep, self.forget, self.video
-        buttons += self.undo, self.carry, self.save_masks, self.clear_tracks
-        switches = self.tool, self.riding, self.tracks, self.follow, self.measure, self.correct, self.erase
-        switches += (self.find,)
-        allow(lambda value: isinstance(value, bool), *switches, *buttons)
-        for handle in (self.speed, self.layer, self.camera, self.rendered_by, self.rendered_as, self.quantity):
-            allow(lambda value, names=handle.options: isinstance(value, str) and value in names, handle)
-        return found
+        names = "frame", "since", "clip", "radius", *CHOICES, *SWITCHES
+        self._names = {control_id(getattr(self, name)): name for name in names}
 
     def accepts(self, uuid: str, value: Any) -> bool:
         """Whether the control with this id can have this value; False if there is no such control."""
-        rule = self._rules.get(uuid)
-        return rule is not None and rule(value)
+        name = self._names.get(uuid)
+        if name in ("frame", "since"):
+            return are_numbers([value], 1, self.frame.max) and value >= 0
+        if name == "clip":
+            return are_numbers(value, 2, self.clip_end) and min(value) >= 0
+        if name == "radius":
+            return are_numbers([value], 1, self.radius.max) and value >= self.radius.min
+        if name in CHOICES:
+            return isinstance(value, str) and value in getattr(self, name).options
+        return name in SWITCHES and isinstance(value, bool)
 
     def set_length(self, total: int, settings: ViewSettings) -> None:
         """Offer this number of frames, and show the two of `settings`."""

@@ -19,23 +19,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from ..core.checks import InputError
+from ..core.types import Camera
 from ..data.images import encode_png
 from ..system.console import complain
-from . import panel, saving
+from . import panel
 from .access_control import RateLimit, access_control, check_address
 from .browsers import Browsers, camera_pose, picture_with_lines
 from .job_queue import JobQueue
-from .line_overlay import Lines, concatenated
+from .layers import Lines, concatenated
 from .mask_editor import MaskEditor, Spot
-from .measure import Measurement, pick
-from .measuring import Measuring
-from .tracks import DrawnTracks
-from .video_path import PathPoint, follow_frames, interpolate
-from .view_settings import IDLE_SECONDS, ViewSettings, frame_due
-from .viewable import Viewable
+from .measure import DrawnTracks, Measurement, Measuring, pick
+from .saving import PathPoint, follow_frames, interpolate, keep, mp4_bytes
+from .viewable import IDLE_SECONDS, Viewable, ViewSettings, frame_due
 from .viewport import endoscope_viewport
 
 MAX_KEPT = 100
@@ -166,12 +166,10 @@ class Viewer:
         """Run a job. Report a failure on stderr and in the browsers; it stops neither the viewer nor a training."""
         try:
             job()
-        except InputError as error:
-            complain(f"view: {error}")
-            self._browsers.notify("That did not work", str(error))
         except Exception as error:
-            traceback.print_exc(file=sys.stderr)
-            self._browsers.notify("That did not work", f"{type(error).__name__}: {error}")
+            known = isinstance(error, InputError)
+            complain(f"view: {error}") if known else traceback.print_exc(file=sys.stderr)
+            self._browsers.notify("That did not work", str(error) if known else f"{type(error).__name__}: {error}")
 
     def _accepts(self, uuid: str, value: Any) -> bool:
         """Whether a control can have this value; there is no panel while the viewer starts."""
@@ -285,6 +283,9 @@ class Viewer:
     def _lines(self, settings: ViewSettings) -> Lines:
         return concatenated(self.tracks.lines(settings.frame, settings.tracks), self._measuring.lines(settings.frame))
 
+    def _picture(self, settings: ViewSettings, camera: Camera) -> NDArray[np.uint8]:
+        return picture_with_lines(self.viewable, settings, camera, self._lines(settings))
+
     # Tracking and measuring.
 
     def read_clicking(self) -> None:
@@ -351,39 +352,32 @@ class Viewer:
         viewport = self._browsers.viewport(client, self.viewable, self.settings)
         if viewport is None:
             return
-        picture = picture_with_lines(self.viewable, self.settings, viewport.camera, self._lines(self.settings))
-        self._offer(client, f"{self.settings.layer}_{self.settings.frame:06d}.png", encode_png(picture))
+        picture = encode_png(self._picture(self.settings, viewport.camera))
+        self._offer(client, f"{self.settings.layer}_{self.settings.frame:06d}.png", picture)
 
     def _save_video(self, client: viser.ClientHandle) -> None:
         viewport = self._browsers.viewport(client, self.viewable, self.settings)
         if viewport is None:
             return
-        settings, places = (
-            self.settings,
-            follow_frames(
-                self.viewable.cameras,
-                None if self.settings.endoscope else viewport.camera,
-                self.settings.frame if self.settings.riding else None,
-            ),
-        )
+        settings = self.settings
         if len(self.kept_views) > 1:
             settings, places = replace(settings, endoscope=False), interpolate(self.kept_views)
+        else:
+            free, rides_from = viewport.camera, settings.frame if settings.riding else None
+            places = follow_frames(self.viewable.cameras, None if settings.endoscope else free, rides_from)
         if len(places) > MAX_PICTURES:
             self._browsers.notify("No video", f"Expected at most {MAX_PICTURES} images, got {len(places)}.")
             return
         self._browsers.notify("Rendering the video", f"{len(places)} images")
-        steps = [replace(settings, frame=place.frame) for place in places]
-        pictures = (  # one at a time: all together may not fit into memory
-            picture_with_lines(self.viewable, settings, place.camera, self._lines(settings))
-            for settings, place in zip(steps, places, strict=True)
-        )
-        self._offer(client, f"{settings.layer}.mp4", saving.mp4_bytes(pictures, self.viewable.frames_per_second))
+        # One at a time: all together may not fit into memory.
+        pictures = (self._picture(replace(settings, frame=place.frame), place.camera) for place in places)
+        self._offer(client, f"{settings.layer}.mp4", mp4_bytes(pictures, self.viewable.frames_per_second))
 
     def _offer(self, client: viser.ClientHandle, name: str, content: bytes) -> None:
         """Send a file to the browser, and store it in `out`."""
         client.send_file_download(name, content)
         if self.out is not None:
-            self._browsers.notify("Saved", str(saving.keep(self.out, name, content)))
+            self._browsers.notify("Saved", str(keep(self.out, name, content)))
 
     def _save_table(self, client: viser.ClientHandle) -> None:
         table = self._measuring.table(self.viewable, self.settings)

@@ -1,9 +1,9 @@
-"""The interface between the viewer and its content: a trained scene or a raw sequence."""
+"""What the viewer shows, a trained scene or a raw sequence, and the settings of the view."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,60 @@ from numpy.typing import NDArray
 from ..core.types import Camera
 from ..model.carry import CarriedPoints
 from .mask_edits import MaskEdits
-from .view_settings import Layer, ViewSettings
+
+Layer = Literal["color", "depth", "alpha", "displacement", "stretch", "prior", "support", "frame", "difference"]
+"""`color`, `depth` and `alpha` as rendered; `displacement` and `stretch` since a reference frame; `prior` the
+texture-prior score; `support` the share of the training frames that show the tissue; `frame` the original;
+`difference` rendered minus original."""
+
+SLOW_MS = 60.0
+"""If rendering at full size takes longer, images are rendered at half size while something moves."""
+IDLE_SECONDS = 0.25
+"""After this time without motion, the image is rendered again at full size."""
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """All settings of the panel. The viewports of the browsers are not part of it."""
+
+    frame: int = 0
+    """0-based frame of the sequence."""
+    layer: Layer = "color"
+    endoscope: bool = True
+    """Use the camera of the sequence in this frame; False: the camera of the browser."""
+    riding: bool = True
+    """A camera of the browser moves with the endoscope from frame to frame; False: it stands still."""
+    in_browser: bool = False
+    """Send the Gaussians to the browser and render there (smooth); False: render on the server (exact)."""
+    points: bool = False
+    """Small opaque dots in place of splats."""
+    tool: bool = False
+    """Show the tool of the input frame on top, with an outline."""
+    correcting: bool = False
+    """Show the tool mask in color, to correct it; only with the endoscope camera of a sequence."""
+    near: float = 0.0
+    """Smallest depth to render, mm."""
+    far: float = float("inf")
+    """Largest depth to render, mm."""
+    since: int = 0
+    """Reference frame of displacement and stretch."""
+    tracks: bool = False
+    """Show tracks of material points over the previous frames."""
+
+
+def frame_due(start: int, seconds: float, frames_per_second: float, total: int) -> int:
+    """The frame to show `seconds` after `start` was shown; playback repeats."""
+    return (start + int(seconds * frames_per_second)) % total
+
+
+def shrink_factor(idle_seconds: float, full_ms: float) -> int:
+    """Divisor of the image size: 2 while something moves and rendering at full size is slow, else 1.
+
+    Args:
+        idle_seconds: time since the last motion.
+        full_ms: rendering time of the last image of full size.
+    """
+    return 2 if idle_seconds < IDLE_SECONDS and full_ms > SLOW_MS else 1
 
 
 @dataclass(frozen=True)
@@ -50,40 +103,27 @@ class Viewable(Protocol):
 
     def picture(self, settings: ViewSettings, camera: Camera) -> NDArray[np.uint8]:
         """(H, W, 3) image of the selected layer and frame from `camera`."""
-        ...
 
     def surface(self, settings: ViewSettings, camera: Camera) -> NDArray[np.float32]:
         """(H, W) z of the visible surface, mm; 0 where there is none."""
-        ...
 
     def renders_in_browser(self, settings: ViewSettings) -> bool:
         """Whether the browser renders this view itself, from a `cloud`."""
-        ...
 
     def cloud(self, settings: ViewSettings) -> Cloud:
         """The content for the browser to render."""
-        ...
-
-    def carry(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
-        """(T, K, 3) positions in every frame of points (K, 3), each picked in its frame of `frames`; NaN if unknown."""
-        ...
 
     def stretch(self, points: NDArray, since: int) -> NDArray[np.float64]:
         """(T, K) largest principal stretch since a frame, around points (K, 3) of that frame; NaN where unknown."""
-        ...
 
     def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
-        """The points of `carry` with their confidence."""
-        ...
+        """Points (K, 3), each picked in its frame of `frames`, in every frame; NaN where unknown."""
 
     def tracks(self) -> CarriedPoints:
         """Tracks of material points, world axes, mm; NaN where unknown; there may be none."""
-        ...
 
     def shows(self, points: NDArray, frame: int) -> NDArray[np.bool_]:
         """(P,) whether the endoscope's image of a frame shows points (P, 3): neither tissue nor tool hides them."""
-        ...
 
     def legend(self, settings: ViewSettings) -> str:
         """Meaning of the colors in one line; empty for plain color."""
-        ...

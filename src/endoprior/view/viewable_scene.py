@@ -25,8 +25,7 @@ from ..visualization.image_tools import gray, to_u8
 from ..visualization.measures import displacement_span, stretch_span, value_colors
 from ..visualization.rendered_views import depth_span
 from . import layers
-from .view_settings import Layer, ViewSettings
-from .viewable import Cloud
+from .viewable import Cloud, Layer, ViewSettings
 from .viewport import shrunk_camera
 
 VALUE_LAYERS = ("displacement", "stretch", "prior", "support")
@@ -80,7 +79,7 @@ class ViewableScene:
         return depth_span(self.scene)
 
     def picture(self, settings: ViewSettings, camera: Camera) -> NDArray[np.uint8]:
-        """See `Viewable.picture`. From another camera the input frames do not fit; shows rendered color instead."""
+        """From another camera the input frames do not fit; shows rendered color instead."""
         kind = settings.layer if settings.endoscope or settings.layer not in ("frame", "difference") else "color"
         picture = self._layer(kind, settings, camera)
         if settings.tool and settings.endoscope and self.sequence is not None:
@@ -107,7 +106,6 @@ class ViewableScene:
         return color
 
     def surface(self, settings: ViewSettings, camera: Camera) -> NDArray[np.float32]:
-        """See `Viewable.surface`."""
         out = self._draw(settings, camera)
         return expected_depth(out.depth.cpu().numpy(), out.alpha.cpu().numpy())
 
@@ -172,12 +170,12 @@ class ViewableScene:
         return max((stretch_span(each) for each in motion.stretch(motion.samples, frames)), key=lambda ends: ends[1])
 
     def renders_in_browser(self, settings: ViewSettings) -> bool:
-        """See `Viewable.renders_in_browser`: layers that are not a color per Gaussian are rendered on the server."""
+        """Layers that are not a color per Gaussian are rendered on the server."""
         return settings.in_browser and settings.layer in BROWSER_LAYERS
 
     @torch.no_grad()
     def cloud(self, settings: ViewSettings) -> Cloud:
-        """See `Viewable.cloud`: one color each, without what depends on the view."""
+        """One color each, without what depends on the view."""
         in_color = settings.layer == "color"
         drawn = self._plain(settings.frame) if in_color and not settings.points else self._splats(settings)
         within = (self.cameras[settings.frame], settings.near, settings.far)
@@ -195,21 +193,15 @@ class ViewableScene:
     def _one_color(self, frame: int) -> Splats:
         return one_color(self._playback.splats(frame), self.cameras[frame], FEW_ITERATIONS, self.scene.backend)
 
-    def carry(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
-        """See `Viewable.carry`: a point moves with the Gaussians around it."""
-        return self.follow(points, frames).positions.astype(np.float64)
-
     def stretch(self, points: NDArray, since: int) -> NDArray[np.float64]:
-        """See `Viewable.stretch`."""
         return self._surface_motion(since).stretch(points, list(range(len(self.cameras))))
 
     def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
-        """See `Viewable.follow`."""
         times = [i / len(self.cameras) for i in range(len(self.cameras))]
         return carry(self.scene, np.asarray(points), np.array(frames), times)
 
     def shows(self, points: NDArray, frame: int) -> NDArray[np.bool_]:
-        """See `Viewable.shows`: by a small rendered depth and the tool mask."""
+        """By a small rendered depth and the tool mask."""
         surface, mask = self._seen(frame)
         shown = project_visible(points, surface)[1]
         return shown if mask is None else shown & shown_pixels(project(points, self.cameras[frame])[0], mask)
@@ -222,7 +214,7 @@ class ViewableScene:
         return surface, None if self.sequence is None else layers.fitted(self.sequence.frame(frame).tissue_mask, camera)
 
     def tracks(self) -> CarriedPoints:
-        """See `Viewable.tracks`: a grid on the surface of the first frame, off the tool."""
+        """A grid on the surface of the first frame, off the tool."""
         camera, settings = self.cameras[0], ViewSettings()
         depth = self.surface(settings, camera)
         if self.sequence is not None:
@@ -236,7 +228,6 @@ class ViewableScene:
         return self.follow(points, [0] * len(points))
 
     def legend(self, settings: ViewSettings) -> str:
-        """See `Viewable.legend`."""
         unit = length_unit(self.relative)
         if settings.layer in ("displacement", "stretch"):
             low, high = self._value_span(settings.layer, settings.since)
@@ -260,13 +251,14 @@ def _value_colors(values: Tensor) -> Tensor:
 
 
 def _clipped(splats: Splats, camera: Camera, near: float, far: float) -> Splats:
-    """The Gaussians whose centers lie between two depths of `camera`, mm."""
-    if near <= 0 and far == float("inf"):
-        return splats
+    """The Gaussians whose centers lie between two depths of `camera`, mm; all of them without limits."""
     return Splats(**{name: _rows(value, splats, camera, near, far) for name, value in splats.tensors.items()})
 
 
 def _rows(values: Tensor, splats: Splats, camera: Camera, near: float, far: float) -> Tensor:
+    """The rows of `values` (N, ...) of these Gaussians."""
+    if near <= 0 and far == float("inf"):
+        return values
     pose = torch.from_numpy(camera.world_to_camera[2]).to(splats.means)
     z = splats.means @ pose[:3] + pose[3]
     return values[(z >= near) & (z <= far)]

@@ -15,9 +15,7 @@ from ..model.carry import CarriedPoints
 from ..priors import joint_texture_prior
 from . import layers
 from .mask_edits import MaskEdits
-from .point_rendering import render_points
-from .view_settings import Layer, ViewSettings
-from .viewable import Cloud
+from .viewable import Cloud, Layer, ViewSettings
 
 MAX_POINTS = 100_000
 """Largest number of points sent to a browser per frame; larger images are subsampled."""
@@ -50,7 +48,7 @@ class ViewableSequence:
         return 0.0, 1.0
 
     def picture(self, settings: ViewSettings, camera: Camera) -> NDArray[np.uint8]:
-        """See `Viewable.picture`: from another camera, the measured points."""
+        """From another camera, the measured points."""
         if not settings.endoscope:
             return self._dots(settings, camera)[0]
         frame = self.sequence.frame(settings.frame)
@@ -69,14 +67,14 @@ class ViewableSequence:
 
     def _dots(self, settings: ViewSettings, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         cloud = self.cloud(settings)
-        return render_points(cloud.points, cloud.colors, cloud.size, camera)
+        return layers.render_points(cloud.points, cloud.colors, cloud.size, camera)
 
     def _prior(self, index: int, camera: Camera) -> NDArray[np.float32]:
         frame = self.sequence.frame(index)
         return layers.fitted(joint_texture_prior(frame.rgb, ~self._masks.tool(index)), camera)
 
     def surface(self, settings: ViewSettings, camera: Camera) -> NDArray[np.float32]:
-        """See `Viewable.surface`: the measured depth."""
+        """The measured depth."""
         if not settings.endoscope:
             return self._dots(settings, camera)[1]
         frame = self.sequence.frame(settings.frame)
@@ -84,11 +82,11 @@ class ViewableSequence:
         return layers.fitted(depth.astype(np.float32), camera)
 
     def renders_in_browser(self, settings: ViewSettings) -> bool:
-        """See `Viewable.renders_in_browser`: from another camera there are only the points."""
+        """From another camera there are only the points."""
         return not settings.endoscope
 
     def cloud(self, settings: ViewSettings) -> Cloud:
-        """See `Viewable.cloud`: measured points; those of the tool only with the tool overlay."""
+        """Measured points; those of the tool only with the tool overlay."""
         camera = self.cameras[settings.frame]
         settings = replace(settings, endoscope=True, correcting=False)
         depth = self.surface(settings, camera)
@@ -100,27 +98,22 @@ class ViewableSequence:
         colors = self.picture(settings, camera)[rows, columns]
         return Cloud(points.astype(np.float32), colors, None, None, step * sum(self.span) / 2 / camera.fy)
 
-    def carry(self, points: NDArray, frames: list[int]) -> NDArray[np.float64]:
-        """See `Viewable.carry`: a point is known only in the frame in which it was picked."""
-        paths = np.full((len(self.cameras), *np.shape(points)), np.nan)
-        for k, frame in enumerate(frames):
-            paths[frame, k] = points[k]
-        return paths
-
     def stretch(self, points: NDArray, since: int) -> NDArray[np.float64]:
-        """See `Viewable.stretch`: unknown before training."""
+        """Unknown before training."""
         return np.full((len(self.cameras), len(points)), np.nan)
 
     def follow(self, points: NDArray, frames: list[int]) -> CarriedPoints:
-        """See `Viewable.follow`: certain where known."""
-        return _certain(self.carry(points, frames))
+        """A point is known only in the frame in which it was picked."""
+        paths = np.full((len(self.cameras), *np.shape(points)), np.nan)
+        paths[frames, range(len(frames))] = points
+        return _certain(paths)
 
     def shows(self, points: NDArray, frame: int) -> NDArray[np.bool_]:
-        """See `Viewable.shows`: where points are known, they are seen."""
+        """Where points are known, they are seen."""
         return np.isfinite(points).all(-1)
 
     def tracks(self) -> CarriedPoints:
-        """See `Viewable.tracks`: the tracks of the ground truth, if there are any."""
+        """The tracks of the ground truth, if there are any."""
         tracks = self.sequence.truth.tracks if self.sequence.truth else None
         if tracks is None or not tracks.paired:
             return _certain(np.zeros((len(self.cameras), 0, 3)))
@@ -129,7 +122,6 @@ class ViewableSequence:
         return _certain(np.where(tracks.visible[..., None], world, np.nan))
 
     def legend(self, settings: ViewSettings) -> str:
-        """See `Viewable.legend`."""
         unit = length_unit(self.relative)
         return {
             "depth": f"blue {self.span[0]:.1f} to red {self.span[1]:.1f} {unit}",

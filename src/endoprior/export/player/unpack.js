@@ -1,4 +1,4 @@
-// From the text in the page to 16-bit integers. The coding is described in export/html_data.py.
+// From the text in the page to 16-bit integers. The coding is described in export/html.py.
 
 function bytesOfBase64(text) {
   const characters = atob(text);

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...footage.corner_flow import follow_both_ways
+from ...footage.optical_flow import follow_both_ways
 from ...priors.specular import specular_likelihood
 from .adjust import back_projected, coarse_pose
 from .tracks import Lens, PoseInput

@@ -1,0 +1,296 @@
+"""Gaussians in few bytes: compressed PLY and SOG of PlayCanvas, SPZ of Niantic, .splat of antimatter15's viewer.
+
+Sources: https://developer.playcanvas.com (compressed PLY; The SOG Format), https://github.com/nianticlabs/spz,
+https://github.com/antimatter15/splat. SuperSplat and splat-transform read all. Equal Gaussians give equal bytes. `N`
+Gaussians, `C` chunks.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import math
+import struct
+from collections.abc import Callable
+from typing import Any
+from zipfile import ZipFile, ZipInfo
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL.Image import fromarray
+
+from ..core.checks import input_error
+from ..core.geometry import length_unit
+from ..core.types import Splats
+from ..model.gaussians import SH_C0
+from ..model.scene import Scene
+from ..render.sh import degree_of
+from .formats import TIME_STEP_OPTIONS, Axes, ExportOptions, Format
+from .ply import unit_quaternions, when
+from .time_steps import TimeStep
+
+# Compressed PLY: 16 bytes a Gaussian, and 18 floats for each chunk of 256 of them.
+
+CHUNK = 256
+LOG_SCALES = (-20.0, 20.0)
+"""Readers take no log scale beyond."""
+RANGES = [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
+RANGES += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
+RANGES += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
+
+def compressed_ply(scene: Scene, step: TimeStep, options: ExportOptions) -> dict[str, bytes]:
+    """The compressed PLY file of one time step."""
+    unit, splats = length_unit(scene.lengths_are_relative), step.plain_splats(scene, options.frame)
+    return {".ply": encode_compressed_ply(splats, options.frame, unit, when(scene, step))}
+
+
+def encode_compressed_ply(splats: Splats, axes: Axes = "opencv", unit: str = "mm", comment: str = "") -> bytes:
+    """All Gaussians along a curve that keeps neighbors together.
+
+    Position and log scale: 11, 10 and 11 bits within the range of their chunk. Color 0.5 + C0 dc: 8 bits a channel
+    within that of the chunk; opacity 8 bits. Rotation: the place of the largest of w, x, y, z in 2 bits, the three
+    others in 10 bits each, times 1 / sqrt(2). Higher harmonics: 8 bits, steps of 8 / 255 from -4.
+
+    Raises:
+        InputError: a position is not finite.
+    """
+    means, log_scales, quats, opacities, sh = _ordered(splats, "compressed_ply")
+    colors = 0.5 + SH_C0 * sh[:, 0]
+    of_mean, of_scale, of_color = (_ranges(values) for values in (means, log_scales, colors))
+    red, green, blue = _in_bits(_within(colors, of_color), 8).T
+    largest, (a, b, c) = (part.T for part in _smallest_three(quats, 10))
+    vertices = [
+        _packed(_within(means, of_mean)),
+        largest << 30 | a << 20 | b << 10 | c,
+        _packed(_within(log_scales, of_scale)),
+        red << 24 | green << 16 | blue << 8 | _in_bits(opacities, 8),
+    ]
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * sh.shape[1] - 3)
+    ranges = np.concatenate([of_mean, of_scale, of_color], 1).astype("<f4")
+    lines = ["ply", "format binary_little_endian 1.0", f"comment axes {axes}, unit {unit}"]
+    lines += [f"comment {comment}"] if comment else []
+    lines += [f"element chunk {len(ranges)}", *(f"property float {name}" for name in RANGES)]
+    lines += [f"element vertex {len(sh)}", *(f"property uint {name}" for name in PACKED)]
+    if rest.shape[1]:
+        lines += [f"element sh {len(sh)}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
+    header = "\n".join([*lines, "end_header"]) + "\n"
+    body = np.stack(vertices, 1).astype("<u4").tobytes() + _bytes((rest + 4) * (255 / 8)).tobytes()
+    return header.encode() + ranges.tobytes() + body
+
+
+def _ranges(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(C, 6) the least and the largest of (N, 3) values in each chunk, rounded outward to float32."""
+    starts = np.arange(0, len(values), CHUNK)
+    if not len(starts):
+        return np.zeros((0, 6), np.float32)
+    low = np.minimum.reduceat(values, starts).astype(np.float32)
+    high = np.maximum.reduceat(values, starts).astype(np.float32)
+    return np.concatenate([np.nextafter(low, -np.inf), np.nextafter(high, np.inf)], 1, dtype=np.float32)
+
+
+def _within(values: NDArray[np.float64], ranges: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(N, 3) where each value lies between the ends of its chunk, 0..1."""
+    own = np.repeat(ranges.astype(np.float64), CHUNK, axis=0)[: len(values)]
+    return (values - own[:, :3]) / (own[:, 3:] - own[:, :3])
+
+
+def _packed(shares: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(N,) three shares in 11, 10 and 11 bits."""
+    x, y, z = (_in_bits(shares[:, i], bits) for i, bits in enumerate((11, 10, 11)))
+    return x << 21 | y << 11 | z
+
+
+# SOG version 2: a zip archive of images with one pixel per Gaussian, in the axes of a PLY file.
+
+FIRST_ALPHA = 252
+"""Alpha of a rotation whose largest part is w; one more for x, y, z."""
+
+
+def encode_sog(splats: Splats) -> bytes:
+    """All Gaussians along a curve that keeps neighbors together; no direction-dependent color.
+
+    Position: 16 bits for sign(x) ln(|x| + 1) between the ends of each axis. Log scale and mean color: one of 256 equal
+    steps. Opacity: 8 bits. Rotation: as in `_smallest_three`, 8 bits.
+
+    Raises:
+        InputError: a position is not finite.
+    """
+    means, log_scales, quats, opacities, sh = _ordered(splats, "sog")
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = logs.min(0), logs.max(0)
+    steps = _in_bits((logs - low) / np.maximum(high - low, 1e-9), 16)
+    (scales, of_scale), (colors, of_color) = _by_codebook(log_scales), _by_codebook(sh[:, 0])
+    largest, others = _smallest_three(quats, 8)
+    images = {
+        "means_l": steps & 255,
+        "means_u": steps >> 8,
+        "scales": scales,
+        "quats": np.column_stack([others, FIRST_ALPHA + largest]),
+        "sh0": np.column_stack([colors, _in_bits(opacities, 8)]),
+    }
+    about: dict[str, Any] = {"version": 2, "asset": {"generator": "endoprior"}, "count": len(means), "antialias": False}
+    about["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]}
+    about["scales"] = {"codebook": of_scale.tolist(), "files": ["scales.webp"]}
+    about["quats"] = {"files": ["quats.webp"]}
+    about["sh0"] = {"codebook": of_color.tolist(), "files": ["sh0.webp"]}
+    file = io.BytesIO()
+    with ZipFile(file, "w") as archive:  # `ZipInfo` dates all files 1980; images are compressed as they are
+        archive.writestr(ZipInfo("meta.json"), json.dumps(about, allow_nan=False))
+        for name, values in images.items():
+            archive.writestr(ZipInfo(f"{name}.webp"), _webp(values))
+    return file.getvalue()
+
+
+def _by_codebook(values: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The 8-bit place of each value in 256 equal steps, and these."""
+    low, high = values.min(), values.max()
+    return _in_bits((values - low) / max(high - low, 1e-9), 8), np.linspace(low, high, 256).round(6)
+
+
+def _webp(values: NDArray[np.int64]) -> bytes:
+    """(N, 3 or 4) bytes as the pixels of a lossless image about as high as wide, row by row."""
+    width = 4 * math.ceil(math.sqrt(len(values)) / 4)
+    pixels = np.zeros((math.ceil(len(values) / width), width, values.shape[1]), np.uint8)
+    pixels.reshape(-1, values.shape[1])[: len(values)] = values
+    file = io.BytesIO()
+    fromarray(pixels).save(file, "WEBP", lossless=True, exact=True)
+    return file.getvalue()
+
+
+# SPZ version 2: a gzipped header and one block per attribute. Coordinates are right, up, back (OpenGL).
+
+MAGIC, VERSION = 0x5053474E, 2
+FRACTIONAL_BITS = 12
+"""Of a coordinate, as in the format's own writer: steps of 1/4096 mm, range 2 m; fewer for a larger scene."""
+COLOR_SCALE = 0.15
+"""Stored color = 255 (0.15 dc + 0.5)."""
+
+
+def encode_spz(splats: Splats) -> bytes:
+    """Gaussians in their own order.
+
+    Positions: 24-bit fixed point. Opacity, color, log scale (16 steps per unit from -10): 8 bits. Rotation: x, y, z of
+    a unit quaternion with w >= 0, 8 bits each. Higher harmonics: 8 bits, 128 steps per unit, -1 to 1.
+
+    Raises:
+        InputError: a position is not finite.
+    """
+    means, sh = _finite_means(splats, "spz"), splats.sh.numpy()
+    largest = np.abs(means).max(initial=0.0)
+    bits = next((n for n in range(FRACTIONAL_BITS, 0, -1) if largest * 2**n <= 2**23 - 1), 0)
+    header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(means), degree_of(sh.shape[1]), bits, 0, 0)
+    blocks = [
+        np.rint(means * 2.0**bits).astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3],  # the low three bytes
+        _bytes(splats.opacities.numpy() * 255),
+        _bytes(sh[:, 0] * (COLOR_SCALE * 255) + 0.5 * 255),
+        _bytes((np.log(splats.scales.numpy().clip(1e-30)) + 10) * 16),
+        _bytes(_well_conditioned(splats.quats.numpy().astype(np.float64))[:, 1:] * 127.5 + 127.5),
+        _bytes(sh[:, 1:] * 128 + 128),
+    ]
+    return gzip.compress(header + b"".join(block.tobytes() for block in blocks), mtime=0)
+
+
+def _well_conditioned(quats: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternions (w, x, y, z) of the same ellipsoids with w at least 1/2.
+
+    Readers compute w as sqrt(1 - x^2 - y^2 - z^2), which 8 bits cannot carry near w = 0. Half a turn about one of its
+    own axes leaves an ellipsoid unchanged, and multiplies the quaternion by i, j or k: one of the four has a large w.
+    """
+    w, x, y, z = unit_quaternions(quats).T
+    same = np.stack([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])  # q, q i, q j, q k
+    best = np.abs(same[:, 0]).argmax(0)
+    chosen = same[best, :, np.arange(len(quats))]
+    return chosen * np.where(chosen[:, :1] < 0, -1, 1)
+
+
+# .splat: 32 bytes per Gaussian, no header.
+
+RECORD = np.dtype([("center", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+"""Center (mm), standard deviations (mm), color and opacity (0..255), quaternion w, x, y, z (128 + 128 q)."""
+
+
+def encode_splat(splats: Splats) -> bytes:
+    """Records sorted by opacity times volume, largest first, so that a viewer can show a file while it loads.
+
+    No direction-dependent color.
+    """
+    scales, opacities = splats.scales.numpy(), splats.opacities.numpy()
+    order = np.argsort(-scales.prod(1) * opacities, kind="stable")
+    records = np.empty(len(scales), RECORD)
+    records["center"], records["scale"] = splats.means.numpy(), scales
+    records["rgba"] = _bytes(np.column_stack([splats.sh.numpy()[:, 0] * SH_C0 + 0.5, opacities]) * 255)
+    records["rotation"] = _bytes(unit_quaternions(splats.quats.numpy()) * 128 + 128)
+    return records[order].tobytes()
+
+
+# What they share.
+
+
+def _finite_means(splats: Splats, name: str) -> NDArray[np.float64]:
+    means = splats.means.numpy().astype(np.float64)
+    if not np.isfinite(means).all():
+        raise input_error(name, "finite positions", "NaN or infinity", "train the scene again.")
+    return means
+
+
+def _ordered(splats: Splats, name: str) -> tuple[NDArray[np.float64], ...]:
+    """Positions, log scales, quaternions, opacities and coefficients along a curve that keeps neighbors together.
+
+    The curve is a Z-order curve of 2^10 cells along each axis. `name` is the format's, for the error.
+    """
+    means = _finite_means(splats, name)
+    low = means.min(0, initial=np.inf)
+    size = max(float((means.max(0, initial=-np.inf) - low).max()), 1e-9)
+    cells = np.floor((means - low) / size * 1023).astype(np.int64)
+    places = np.zeros(len(means), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            places |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    order = np.argsort(places, kind="stable")
+    scales, *others = (
+        tensor.numpy().astype(np.float64)[order]
+        for tensor in (splats.scales, splats.quats, splats.opacities, splats.sh)
+    )
+    return means[order], np.log(scales.clip(1e-30)).clip(*LOG_SCALES), *others
+
+
+def _smallest_three(quats: NDArray[np.float64], bits: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(N,) the place of the largest of w, x, y, z, and (N, 3) the others, times 1 / sqrt(2), in so many bits."""
+    unit = unit_quaternions(quats)
+    largest = np.abs(unit).argmax(1)
+    unit = unit * np.where(unit[np.arange(len(unit)), largest] < 0, -1, 1)[:, None]
+    others = unit[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    return largest, _in_bits(others / np.sqrt(2) + 0.5, bits)
+
+
+def _in_bits(shares: NDArray[np.float64], bits: int) -> NDArray[np.int64]:
+    """The integers of so many bits for values in 0..1."""
+    return np.rint(shares * (2**bits - 1)).clip(0, 2**bits - 1).astype(np.int64)
+
+
+def _bytes(values: NDArray) -> NDArray[np.uint8]:
+    return np.rint(values).clip(0, 255).astype(np.uint8)
+
+
+def _format(suffix: str, encode: Callable[[Splats], bytes], axes: Axes = "opencv") -> Format:
+    """A format of one file for each time step that says nothing of axes and time."""
+    return Format(
+        suffixes=(suffix,),
+        options=(*TIME_STEP_OPTIONS, "canonical"),
+        files=lambda scene, step, options: {suffix: encode(step.plain_splats(scene, options.frame))},
+        default_axes=axes,
+        holds="Gaussians",
+    )
+
+
+SOG, SPZ, SPLAT = _format(".sog", encode_sog), _format(".spz", encode_spz, "opengl"), _format(".splat", encode_splat)
+COMPRESSED_PLY = Format(
+    suffixes=(".ply",),
+    options=(*TIME_STEP_OPTIONS, "canonical"),
+    files=compressed_ply,
+    holds="compressed Gaussians",
+    has_index=False,  # as in a folder of `ply`
+)
