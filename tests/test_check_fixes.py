@@ -20,8 +20,8 @@ from video_files import write_video
 
 from endoprior.check import Facts, Finding, find, measure
 from endoprior.cli import main
+from endoprior.cli.arguments import parse
 from endoprior.cli.check import Check
-from endoprior.cli.parsing import parse
 from endoprior.data import load_sequence
 from endoprior.phantom import PhantomConfig, write_phantom
 

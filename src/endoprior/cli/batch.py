@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from typing import TYPE_CHECKING
 
 from ..core.checks import input_error
 from ..system.console import say
-from .help_page import Help
-from .parsing import parse
+from .arguments import Help, parse
 from .step_display import StepDisplay
 
 if TYPE_CHECKING:
@@ -32,9 +29,9 @@ class Batch:
     not stop the others. To resume, or to try again what failed, run the same command again.
     """
 
-    list: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="LIST")]]
+    list: Path = field(metadata={"place": "LIST"})
     """Text file."""
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: Path = field(metadata={"place": "OUT"})
     """Folder for the results."""
     ray: str | None = None
     """Train on a Ray cluster that shares this file system: its address, `auto`, or `local`, which starts one."""

@@ -14,9 +14,8 @@ from ..core.options import Options
 from ..data.reading import kind_of, read_text
 from ..data.recognize import is_sequence
 from ..pipeline import Entry, SequenceJob
+from .arguments import option_name, parse
 from .devices import with_device
-from .options import option_name
-from .parsing import parse
 from .run import HELP, Run, job_of, require_gaussians
 from .train import arguments
 

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-import tyro
+from typing import TYPE_CHECKING, Literal
 
 from ..core.checks import input_error
 from ..core.shell import command
 from ..system.console import say
 from ..system.installation import page
+from .arguments import Help, parse
 from .devices import Wanted, on_device
-from .help_page import Help
-from .parsing import parse
 from .score_table import score_table
 from .trained_scene import folder_of, open_scene
 
@@ -37,7 +34,7 @@ class Eval:
     Splits other than test have files of their own: metrics_train.json, per_frame_train.json.
     """
 
-    run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
+    run: Path = field(metadata={"place": "RUN"})
     """Run folder; with --pictures or --masks the sequence folder."""
     data: Path | None = None
     """Sequence folder. Default: the one the run was trained on."""

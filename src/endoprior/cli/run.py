@@ -6,9 +6,7 @@ import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from typing import TYPE_CHECKING
 
 from ..core.checks import input_error
 from ..core.config import Config
@@ -17,9 +15,8 @@ from ..core.shell import command
 from ..model.presets import PresetName, preset
 from ..prepare.config import PrepareConfig
 from ..system.console import say
+from .arguments import Help, parse
 from .devices import Wanted, with_device
-from .help_page import Help
-from .parsing import parse
 from .step_display import StepDisplay, duration
 
 if TYPE_CHECKING:
@@ -34,9 +31,9 @@ class Run:
     interruption, run the same command again. Your video never leaves this computer.
     """
 
-    video: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIDEO")]]
+    video: Path = field(metadata={"place": "VIDEO"})
     """Video file, or folder of images."""
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: Path = field(metadata={"place": "OUT"})
     """Folder for the results: new, empty, or resumed."""
     preview: bool = False
     """A first look in about a minute: at most 60 frames, 320 px wide. Not for scores."""
@@ -46,7 +43,7 @@ class Run:
     """Seed of the training."""
     device: Wanted = "auto"
     """Device that trains; auto uses CUDA only if all of it works (`endoprior doctor`)."""
-    config: Annotated[PrepareConfig, tyro.conf.arg(name="")] = field(default_factory=PrepareConfig)
+    config: PrepareConfig = field(default_factory=PrepareConfig, metadata={"name": ""})
 
 
 HELP = Help(

@@ -27,32 +27,11 @@ def input_error(subject: Path | str, expected: str, got: str, fix: str) -> Input
     return InputError(f"{found}. Fix: {fix[:1].upper()}{fix[1:]}")
 
 
-SIMILAR = 0.75
-"""Least similarity, difflib's ratio, of a name and what may be meant by it; at 0.6 `port` would mean `preset`."""
-
-
 def similar_name(name: str, names: Sequence[str]) -> str | None:
-    """The name with the same last part, such as `temporal.weight` for `weight`, else the most similar one.
-
-    Args:
-        name: what was typed: a dotted name, or an option with its dashes.
-        names: those that there are; of equally good ones the first is taken.
-    """
-    by_last_part = {last_part(each): each for each in reversed(names)}
-    if last_part(name) in by_last_part:
-        return by_last_part[last_part(name)]
-    by_name = {each.removeprefix("--"): each for each in names}  # equal dashes would make any two names similar
-    for known, word in ((by_name, name.removeprefix("--")), (by_last_part, last_part(name))):
-        if close := difflib.get_close_matches(word, known, 1, SIMILAR):
-            return known[close[0]]
-    words = set(last_part(name).split("-"))
-    one_more = [part for part in by_last_part if len(words ^ set(part.split("-"))) == 1]  # `max-width` for `width`
-    return by_last_part[one_more[0]] if len(one_more) == 1 else None
-
-
-def last_part(name: str) -> str:
-    """What stands behind the last dot of a dotted name or option, without dashes in front."""
-    return name.rpartition(".")[2].removeprefix("--")
+    """The name with the same last part, such as `temporal.weight` for `weight`, else the most similar one, or None."""
+    last = [re.split(r"\.|--", each)[-1] for each in (name, *names)]
+    same = [each for each, part in zip(names, last[1:], strict=True) if part == last[0]]
+    return next(iter(same or difflib.get_close_matches(name, names, 1, 0.75)), None)
 
 
 def number_ranges(numbers: Iterable[int], most: int = 8) -> str:

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-from endoprior.cli.help_page import Help
-from endoprior.cli.parsing import parse
+from endoprior.cli.arguments import Help, parse
 from endoprior.core.checks import input_error
 from endoprior.system.console import say
 
@@ -23,7 +19,7 @@ class BenchMasks:
     the folder that the environment variable ENDOPRIOR_DATA names.
     """
 
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: Path = field(metadata={"place": "OUT"})
     """Folder for networks, phantoms and the report."""
     steps: int = 8000
     """Training steps of each network, of 16 images each."""
