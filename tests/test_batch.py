@@ -10,13 +10,13 @@ from ray_runs import silent
 from tiny_training import tiny_config
 
 from endoprior.cli import main
-from endoprior.cli.batch_list import entries_of, read_list
+from endoprior.cli.batch import entries_of, read_list
 from endoprior.core.checks import InputError
 from endoprior.pipeline import Entry, SequenceJob, run_here, run_on, write_summary
 from endoprior.pipeline.steps import Step
 from endoprior.runs.remote import Trained, Training
+from endoprior.system.devices import Threads
 from endoprior.system.ray_cluster import Ended
-from endoprior.system.threads import Threads
 
 
 def entry(name: str, out: Path) -> Entry:
@@ -41,7 +41,7 @@ def fake_steps(monkeypatch):
     steps = (Step("first", lambda job: job.run, first), Step("train", lambda job: job.run / "metrics.json", act))
     for module in ("batch.steps_of", "batch.open_folder"):
         monkeypatch.setattr(f"endoprior.pipeline.{module}", lambda job: steps)
-    monkeypatch.setattr("endoprior.pipeline.summary.load_sequence", lambda *_: SimpleNamespace(depth_is_relative=False))
+    monkeypatch.setattr("endoprior.pipeline.batch.load_sequence", lambda *_: SimpleNamespace(depth_is_relative=False))
     return fails
 
 

@@ -24,6 +24,7 @@ VALUES = {
     Path: "x",
     str: "x",
     "--config": "FILE",
+    "--times": 0.5,
     "--data.skip-frames": "0-9",
     "--data.window": "0-9",
 }

@@ -9,7 +9,7 @@ import pytest
 from endoprior.check.remake import find_remakes
 from endoprior.core.checks import InputError, read_ranges
 from endoprior.core.config import DataConfig
-from endoprior.core.options import changed_options, command_of
+from endoprior.core.shell import changed_options, command_of
 from endoprior.data import load_sequence
 from endoprior.data.prepare_record import PrepareRecord, read_record
 from endoprior.prepare import PrepareConfig

@@ -55,7 +55,7 @@ def run(argv: list[str]) -> int:
     if argv[:1] == ["masks"]:
         return bench_masks.run(argv[1:])
     args = parse(Bench, argv, "bench", HELP)
-    from endoprior.cli.output_paths import require_writable_folder
+    from endoprior.cli.paths import require_writable_folder
     from endoprior.system.file_lock import locked
 
     from .execute import local_executor, ray_executor

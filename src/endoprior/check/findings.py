@@ -11,10 +11,9 @@ from typing import Literal
 
 import numpy as np
 
-from ..core.checks import number_ranges
+from ..core.checks import number_ranges, quotation
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
-from ..core.text import quotation
 from ..core.types import Camera
 from ..data.description import SIZE_NOT_STATED
 from ..footage.camera_motion import MOVING_FRACTION

@@ -7,8 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 from ..core.checks import number_ranges, read_ranges
-from ..core.options import changed_options, command_of
-from ..core.shell import command
+from ..core.shell import changed_options, command, command_of
 from .facts import Facts
 
 FEWEST_FRAMES = 2

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..core.config import DataConfig
-from ..core.options import Options, command_of
+from ..core.shell import Options, command_of
 from ..core.types import Camera
 from ..data import FrameSequence
 from ..data.camera_matrix import MATRIX_FILE

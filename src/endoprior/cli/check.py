@@ -42,7 +42,7 @@ def run(argv: list[str]) -> None:
     if args.out.suffix.lower() != ".png":
         fix = f"`--out {quoted(args.out.with_suffix('.png'))}`."
         raise input_error("--out", "a .png file", str(args.out), fix)
-    from .output_paths import require_writable_file
+    from .paths import require_writable_file
 
     for option, file in (("--out", args.out), ("--json", args.json)):
         if file is not None:

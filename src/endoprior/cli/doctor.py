@@ -7,7 +7,7 @@ import platform
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 
-from ..core.extras import install_command, packages_of
+from ..core.shell import install_command, packages_of
 from ..system.console import say
 from ..system.installation import docs_folder, page, source_commit
 from ..system.memory import available_bytes

@@ -13,8 +13,8 @@ from ..system.console import say
 from ..system.installation import page
 from .arguments import Help, parse
 from .devices import Wanted, on_device
+from .paths import folder_of, open_scene
 from .score_table import score_table
-from .trained_scene import folder_of, open_scene
 
 if TYPE_CHECKING:
     from ..data import FrameSequence
@@ -72,7 +72,7 @@ def run(argv: list[str]) -> None:
     args = parse(Eval, argv, "eval", HELP)
     from ..evaluation.protocols.table import chosen_protocols
     from ..runs.stored_run import sequence_of_run
-    from .output_paths import require_writable_folder
+    from .paths import require_writable_folder
 
     if args.masks:
         evaluate_masks(args, args.masks)
@@ -128,7 +128,7 @@ def evaluate_pictures(args: Eval, folder: Path, protocols: Sequence[str]) -> Non
     from ..data import load_sequence
     from ..evaluation.pictures import Pictures
     from ..evaluation.scoring import evaluate
-    from .output_paths import require_writable_folder
+    from .paths import require_writable_folder
 
     if args.data:
         raise input_error("--data", "--pictures FOLDER DATA", "--data as well", "Remove --data.")
@@ -151,7 +151,7 @@ def evaluate_masks(args: Eval, folder: Path) -> None:
     """Score the masks of the sequence that takes the place of the run against the true masks in `folder`."""
     from ..data import load_sequence
     from ..evaluation.true_masks import TrueMasks, score_masks
-    from .output_paths import require_writable_folder
+    from .paths import require_writable_folder
 
     plain = Eval(args.run, out=args.out, masks=folder)
     if other := next((f.name for f in fields(Eval) if getattr(args, f.name) != getattr(plain, f.name)), None):
@@ -184,7 +184,7 @@ def save_and_print(
     run: Path | None = None,
 ) -> None:
     """Write the two files into `out`, and print a table; name frames to look at in the `run`, if there is one."""
-    from .protocol_table import protocol_table
+    from .score_table import protocol_table
 
     file = result.save(out)
     held_out = f"; {sequence.split_rule}" if sequence.test_phase else ""

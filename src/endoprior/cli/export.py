@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from ..export.options import ExportOptions
 from ..system.console import say
 from .arguments import Help, parse
+from .paths import folder_of, open_gaussians, sequence_of
 from .progress import Counting
-from .trained_scene import folder_of, open_gaussians, sequence_of
 
 if TYPE_CHECKING:
     from ..export.formats import Format
@@ -50,7 +50,7 @@ def run(argv: list[str]) -> None:
     """Export."""
     args = parse(Export, argv, "export", HELP)
     from ..export import export
-    from .output_paths import require_new_file
+    from .paths import require_new_file
 
     options = ExportOptions(**{field.name: getattr(args, field.name) for field in fields(ExportOptions)})
     scene = open_gaussians(args.run)

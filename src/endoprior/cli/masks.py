@@ -9,8 +9,8 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from ..core.checks import input_error, number_ranges
+from ..core.ranges import spread
 from ..core.shell import command
-from ..core.spread import spread
 from ..system.console import say
 from .arguments import Help, parse
 from .progress import Counting

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.checks import check_range, number_ranges
-from ..core.pose_conventions import Convention
+from ..core.geometry import Convention
 from ..core.shell import command
 from ..system.console import say
 from .arguments import Help, parse

@@ -10,7 +10,7 @@ from ..core.checks import input_error
 from ..system.console import say
 from .arguments import Help, parse
 from .devices import Wanted, on_device
-from .trained_scene import folder_of, open_scene, reject_without_gaussians
+from .paths import folder_of, open_scene, reject_without_gaussians
 
 if TYPE_CHECKING:
     from ..model.scene import RenderedScene
@@ -86,7 +86,7 @@ def reject_two_choices(args: Render) -> None:
 
 def render(scene: RenderedScene, args: Render) -> None:
     """Render the views selected by `args` and print the output paths."""
-    from .output_paths import require_writable_folder
+    from .paths import require_writable_folder
 
     run = folder_of(args.run)
     require_writable_folder("OUT" if args.out else "RUN", args.out or run)

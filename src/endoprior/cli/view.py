@@ -14,7 +14,7 @@ from ..core.shell import command
 from ..system.console import say
 from .arguments import Help, parse
 from .devices import Wanted, on_device
-from .trained_scene import open_gaussians, sequence_of
+from .paths import open_gaussians, sequence_of
 
 if TYPE_CHECKING:
     from ..training.stage import StepReport

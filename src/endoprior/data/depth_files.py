@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.extras import install_command
+from ..core.shell import install_command
 from .depth_fill import is_measured
 from .images import decode_image, single_channel
 from .numpy_files import read_only_array

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..system.atomic import whole_file, whole_folder, write_json
-from ..system.leftovers import remove_leftovers, temporary_sibling
+from ..system.atomic import remove_leftovers, temporary_sibling, whole_file, whole_folder, write_json
 from .images import save_png
 
 POSES, BACKUP = "poses_bounds.npy", "poses_bounds_before.npy"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..data.depth_files import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
 from ..data.depth_fill import is_measured
 from ..data.description import TOOLS_FOUND

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import check_shape, input_error
-from ..core.extras import install_command
+from ..core.shell import install_command
 from .hub_model import FILES, find_model, first_line, import_transformers
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..core.checks import input_error
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..footage.stereo_order import row_offsets_px
 from .frame_geometry import FrameGeometry, with_rows_moved
 from .video_clip import StereoFrame

@@ -9,8 +9,7 @@ from typing import Any
 from ..core.checks import InputError, input_error
 from ..core.shell import command
 from ..data.reading import kind_of, read_bytes
-from ..system.atomic import reject_occupied
-from ..system.leftovers import is_leftover
+from ..system.atomic import is_leftover, reject_occupied
 
 LOCK = ".lock"
 """File that a process holds while it trains in a folder."""

@@ -21,7 +21,7 @@ from ..core.config_io import to_dict
 from ..model.method import method_of
 from ..render import ON_GPU
 from ..system.file_lock import exclusive
-from ..system.own_python import python_command
+from ..system.surroundings import python_command
 
 PACKAGE = Path(__file__).parents[1]
 LIMIT_S = 900.0

@@ -11,10 +11,9 @@ from ..core.config import Config
 from ..data import FrameSequence
 from ..model.method import method_of
 from ..model.scene import RenderedScene
-from ..system.atomic import write_json, writing
+from ..system.atomic import remove_leftovers, write_json, writing
 from ..system.file_lock import locked
-from ..system.heap import freed_memory_kept
-from ..system.leftovers import remove_leftovers
+from ..system.memory import freed_memory_kept
 from ..tool_masks.margin import with_tool_margin
 from ..training.divergence import Diverged
 from ..training.memory_check import reject_too_large

@@ -15,9 +15,8 @@ from ..data import FrameSequence
 from ..model.scene_file import load_scene
 from ..model.single_scene import SingleScene
 from ..model.windowed_scene import Span, WindowedScene, save_index, window_file
-from ..system.atomic import write_json, write_text
+from ..system.atomic import remove_leftovers, write_json, write_text
 from ..system.file_lock import locked
-from ..system.leftovers import remove_leftovers
 from ..training.trainer import DEFAULT_FRAMES_PER_SECOND, Observer
 from .folder import CONFIG, LOCK, LOG, SCENE, prepare_run_folder, read_log, reject_unusable_folder
 from .identity import reject_other_start

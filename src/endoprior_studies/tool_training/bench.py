@@ -43,7 +43,7 @@ def run(argv: list[str]) -> int:
     if not (root / "vocalfolds").is_dir():
         fix = "ENDOPRIOR_DATA=FOLDER with bowel_lift/, vocalfolds/, mono_endo.mp4 and wild/ (docs/tool_network.md)."
         raise input_error("ENDOPRIOR_DATA", "the folder of the clips", repr(str(root)), f"Set {fix}")
-    from endoprior.cli.output_paths import require_writable_folder
+    from endoprior.cli.paths import require_writable_folder
     from endoprior.system.file_lock import locked
     from endoprior.tool_masks.weights import network_from_file
 

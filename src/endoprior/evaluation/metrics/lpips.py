@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.checks import check_shape
-from ...core.extras import missing_package
+from ...core.shell import missing_package
 from .torchvision_compat import import_torchvision
 from .weights import (
     ALEXNET,

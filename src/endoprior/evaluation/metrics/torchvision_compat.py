@@ -11,7 +11,7 @@ import importlib
 from types import ModuleType
 from typing import Any
 
-from ...core.extras import install_command, missing_package
+from ...core.shell import install_command, missing_package
 from .weights import ScoreUnavailable
 
 MISSING_OPERATORS = (

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Literal
 
 from ...core.checks import input_error
-from ...core.extras import install_command
+from ...core.shell import install_command
 from .colmap import LONGEST, SECONDS_AN_IMAGE, colmap_path, is_installed, stride_of
 from .explained import explained_share
 from .own import own_path

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.spread import spread
+from ...core.ranges import spread
 from .adjust import adjust
 from .corners import MAX_CORNERS, REFRESH, Gray, followed, gray_of, new_corners, sampled, usable_tissue
 from .keyframes import Keyframe, Link, keyframe, link
