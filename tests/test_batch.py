@@ -20,7 +20,7 @@ from endoprior.system.ray_cluster import Ended
 
 
 def entry(name: str, out: Path) -> Entry:
-    return Entry(name, SequenceJob(Path(name), out / name, tiny_config("basis"), {}))
+    return Entry(name, SequenceJob(Path(name), out / name, tiny_config("basis")))
 
 
 @pytest.fixture
@@ -119,7 +119,7 @@ def test_lines_of_a_list(tmp_path, make_tiny_sequence):
     ]
     first, second = entries_of(file, tmp_path / "out", silent)
     assert first.job.out == tmp_path / "out/a b" and second.job.cfg.seed == 3 and second.job.cfg.optim.means_lr == 1e-3
-    assert second.job.options == {"--seed": ("3",), "--optim.means-lr": ("1e-3",)}
+    assert (second.job.cfg.seed, second.job.cfg.optim.means_lr) == (3, 1e-3)
     assert not (tmp_path / "out").exists()
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.checks import InputError, input_error
-from ..core.shell import Options
 from ..data.reading import kind_of, read_text
 from ..data.recognize import is_sequence
 from ..system.console import say
@@ -206,17 +205,4 @@ def _job(line: Line, out: Path, tell: Callable[[str], None]) -> SequenceJob:
 
     args = arguments(argv)
     require_gaussians(args.config, "`train`, `eval` and `render` one after the other.")
-    return SequenceJob(line.path, out, with_device(args.config, args.device, tell), _typed(line.options))
-
-
-def _typed(words: tuple[str, ...]) -> Options:
-    """Options and the words after them."""
-    options: Options = {}
-    name = ""
-    for word in words:
-        if word.startswith("--"):
-            name, equals, value = option_name(word), *word.partition("=")[1:]
-            options[name] = (value,) if equals else ()
-        else:
-            options[name] = (*options.get(name, ()), word)
-    return options
+    return SequenceJob(line.path, out, with_device(args.config, args.device, tell))

@@ -105,13 +105,11 @@ class SequenceJob:
     """What the user gave: the sequence folder."""
     out: Path
     cfg: Config
-    options: Options
-    """What the user chose, as it is typed; all else follows from it: `{"--preview": (), "--end": ("2.5",)}`."""
 
     @property
     def is_preview(self) -> bool:
         """Whether it is a first look: few and small frames, a short training."""
-        return "--preview" in self.options
+        return False
 
     @property
     def data(self) -> Path:
@@ -158,9 +156,16 @@ class SequenceJob:
 class Job(SequenceJob):
     """A video on its way to a scene; it is prepared first."""
 
+    options: Options
+    """What the user chose, as it is typed; all else follows from it: `{"--preview": (), "--end": ("2.5",)}`."""
     prepare: PrepareConfig
     """Options of `prepare`, for `part` only."""
     part: Part
+
+    @property
+    def is_preview(self) -> bool:
+        """See `SequenceJob`."""
+        return "--preview" in self.options
 
     @property
     def data(self) -> Path:
@@ -241,7 +246,7 @@ def _settings(job: SequenceJob) -> dict[str, Any]:
     """Everything that decides the results of a job."""
     if not isinstance(job, Job):
         facts = {"name": job.source.name, "fingerprint": load_sequence(job.source, job.cfg.data).fingerprint()}
-        return {"video": facts, "inputs": {}, "options": job.options, "derived": {"config": to_dict(job.cfg)}}
+        return {"video": facts, "inputs": {}, "options": {}, "derived": {"config": to_dict(job.cfg)}}
     prepare = {name: repr(value) for name, value in vars(job.prepare).items()}
     derived = {"prepare": prepare, "config": to_dict(job.cfg)}
     inputs = input_facts(job.prepare)
