@@ -9,8 +9,7 @@ from dataclasses import replace
 import pytest
 from tiny_training import tiny_config
 
-from endoprior.core.config import Config
-from endoprior.core.config_windows import WindowConfig
+from endoprior.core.config import Config, WindowConfig
 
 needs_ray = pytest.mark.skipif(
     importlib.util.find_spec("ray") is None or sys.platform != "linux", reason="no Ray, or not Linux"

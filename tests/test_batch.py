@@ -10,17 +10,17 @@ from ray_runs import silent
 from tiny_training import tiny_config
 
 from endoprior.cli import main
-from endoprior.cli.batch_list import entries_of, read_list
+from endoprior.cli.batch import entries_of, read_list
 from endoprior.core.checks import InputError
 from endoprior.pipeline import Entry, SequenceJob, run_here, run_on, write_summary
 from endoprior.pipeline.steps import Step
 from endoprior.runs.remote import Trained, Training
+from endoprior.system.devices import Threads
 from endoprior.system.ray_cluster import Ended
-from endoprior.system.threads import Threads
 
 
 def entry(name: str, out: Path) -> Entry:
-    return Entry(name, SequenceJob(Path(name), out / name, tiny_config("basis"), {}))
+    return Entry(name, SequenceJob(Path(name), out / name, tiny_config("basis")))
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def fake_steps(monkeypatch):
     steps = (Step("first", lambda job: job.run, first), Step("train", lambda job: job.run / "metrics.json", act))
     for module in ("batch.steps_of", "batch.open_folder"):
         monkeypatch.setattr(f"endoprior.pipeline.{module}", lambda job: steps)
-    monkeypatch.setattr("endoprior.pipeline.summary.load_sequence", lambda *_: SimpleNamespace(depth_is_relative=False))
+    monkeypatch.setattr("endoprior.pipeline.batch.load_sequence", lambda *_: SimpleNamespace(depth_is_relative=False))
     return fails
 
 
@@ -119,7 +119,7 @@ def test_lines_of_a_list(tmp_path, make_tiny_sequence):
     ]
     first, second = entries_of(file, tmp_path / "out", silent)
     assert first.job.out == tmp_path / "out/a b" and second.job.cfg.seed == 3 and second.job.cfg.optim.means_lr == 1e-3
-    assert second.job.options == {"--seed": ("3",), "--optim.means-lr": ("1e-3",)}
+    assert (second.job.cfg.seed, second.job.cfg.optim.means_lr) == (3, 1e-3)
     assert not (tmp_path / "out").exists()
 
 

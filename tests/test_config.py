@@ -5,9 +5,8 @@ import json
 from pathlib import Path
 
 import pytest
-import tyro
 
-from endoprior.cli.parsing import parse
+from endoprior.cli.arguments import parse
 from endoprior.cli.train import HELP, Train
 from endoprior.core import config_io
 from endoprior.core.checks import InputError
@@ -106,8 +105,8 @@ def test_short_names_are_those_of_the_command_line():
     cfg = preset("default").replace({"iterations": 7, "gaussians": "x0.5"})
     assert (cfg.schedule.fine_iterations, cfg.init.budget) == (7, 15_000)
     assert preset("default", iterations=7, gaussians=15_000) == cfg
-    start = Train(tyro.MISSING, config=preset("default"))
-    assert parse(Train, ["--iterations", "7", "--gaussians", "15000", "d"], "train", HELP, start).config == cfg
+    words = ["--iterations", "7", "--gaussians", "15000", "d"]
+    assert parse(Train, words, "train", HELP, config=preset("default")).config == cfg
     assert all(f"--{name}".replace("_", "-") in HELP.short for name in config_io.SHORT_NAMES)
 
 

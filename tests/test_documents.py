@@ -17,7 +17,7 @@ from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
 from endoprior.cli import descriptions
-from endoprior.cli.parsing import parse
+from endoprior.cli.arguments import parse
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")})

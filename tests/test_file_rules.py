@@ -25,9 +25,15 @@ from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.work_folder import work_folder
 from endoprior.runs.train import train
 from endoprior.system.arrays_file import ArraySpec, load_arrays, save_arrays
-from endoprior.system.atomic import CannotWrite, whole_file, whole_folder, write_json, write_text
-from endoprior.system.leftovers import remove_leftovers
-from endoprior.system.paths import lies_in
+from endoprior.system.atomic import (
+    CannotWrite,
+    lies_in,
+    remove_leftovers,
+    whole_file,
+    whole_folder,
+    write_json,
+    write_text,
+)
 
 
 @pytest.fixture
@@ -131,7 +137,7 @@ def test_a_scanner_that_holds_a_new_file_for_a_moment_is_waited_for(windows, tmp
 
 
 def test_leftovers_are_found_without_ending_their_owner(windows, tmp_path):
-    code = "import sys, pathlib; from endoprior.system.leftovers import temporary_sibling as name\n"
+    code = "import sys, pathlib; from endoprior.system.atomic import temporary_sibling as name\n"
     code += "name(pathlib.Path(sys.argv[1])).touch(); print(flush=True); input()"
     words = [sys.executable, "-P", "-c", code, str(tmp_path / "a.png")]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as living:

@@ -4,28 +4,31 @@ from __future__ import annotations
 
 import re
 import shlex
+from dataclasses import MISSING
 from importlib import import_module
+from pathlib import Path
+from typing import get_args
 
 import pytest
 from command_modules import module_of
 
 from endoprior.cli import descriptions, main
-from endoprior.cli.options import options
-from endoprior.cli.parsing import parse
+from endoprior.cli.arguments import options, parse
+from endoprior.cli.prepare import HELP, Prepare
 from endoprior.core.checks import InputError
 
 MOST_LINES = 45
 VALUES = {
-    "INT": "1",
-    "FLOAT": "300",
-    "PATH": "x",
-    "STR": "x",
-    "FLOAT ...": "0.5",
-    "STR ...": "x",
+    int: 1,
+    float: 300,
+    Path: "x",
+    str: "x",
+    "--config": "FILE",
+    "--times": 0.5,
     "--data.skip-frames": "0-9",
     "--data.window": "0-9",
 }
-"""Values of options without a default, by their name or by what the page calls them."""
+"""Values of options without a default, by name or type."""
 
 
 class Parsed(BaseException):
@@ -36,8 +39,8 @@ class Parsed(BaseException):
 def parsed(monkeypatch):
     """Runs a command until its arguments are parsed; returns (args, class, page, default)."""
 
-    def stop(cls, argv, command, page, default=None):
-        raise Parsed(parse(cls, argv, command, page, default), cls, page, default)
+    def stop(cls, argv, command, page, **defaults):
+        raise Parsed(parse(cls, argv, command, page, **defaults), cls, page, defaults)
 
     def run(*words):
         monkeypatch.setattr(f"{module_of(words[0])}.parse", stop)
@@ -85,22 +88,22 @@ def test_every_option_of_help_all_can_be_typed(command, printed, parsed, tmp_pat
     monkeypatch.chdir(tmp_path)
     (tmp_path / "FILE").write_text("seed: 1")  # --config FILE is read before the options
     page = printed(command, "--help-all")
-    args, cls, help_, default = parsed(*examples(page)[0])
-    words, named = [command], [each for each in options(cls, default) if not each.is_positional]
-    for each in options(cls, default):
+    args, cls, help_, defaults = parsed(*examples(page)[0])
+    arguments = list(options(cls, defaults))
+    words, named = [command], [each for each in arguments if not each.is_positional]
+    for each in arguments:
+        words += [] if each.is_positional else [each.usual_name]
         value = each.default
-        if value in (None, "", ()) or each.is_positional:
-            value = VALUES.get(each.name) or VALUES.get(each.metavar) or re.findall(r"[\w-]+", each.metavar)[0]
-        if each.is_flag:
-            words.append(each.off if value else each.name)
-        else:
-            words += [] if each.is_positional else [each.name]
+        if value in (None, "", (), MISSING) or each.is_positional:
+            kinds = [kind for kind in (each.kind, *get_args(each.kind)) if kind in VALUES or isinstance(kind, str)]
+            value = VALUES.get(each.name) or VALUES.get(kinds[0], kinds[0])
+        if each.kind is not bool:
             words += map(str, value) if isinstance(value, tuple) else [str(value)]
-        assert each.is_flag or re.search(rf"^  {re.escape(each.name)}\b", page, re.MULTILINE), each.name
+        assert re.search(rf"^  {re.escape(each.usual_name)}\b", page, re.MULTILINE), each.name
     again = parsed(*words)[0]
     assert type(again) is type(args)
     shown = set(re.findall(r"^  (--[\w.-]+)", page, re.MULTILINE))
-    assert shown <= {name for each in named for name in each.names} and len(shown) == len(named)
+    assert shown == {each.usual_name for each in named}
     short = printed(command, "--help")
     assert (f"--help-all lists all {len(named)} options." in short) == bool(help_.basics)
     assert help_.basics or short == page
@@ -134,45 +137,22 @@ def test_short_names_stand_for_config_fields(parsed):
         (["--iteration=5"], "got --iteration. Fix: Did you mean --iterations? "),
         (["--weight"], "got --weight. Fix: Did you mean --temporal.weight? "),
         (["--zzz"], "got --zzz. Fix: `endoprior train --help-all` lists all options."),
+        (["--lr", "1"], "got --lr. Fix: `endoprior train --help-all` lists all options."),
         (["c"], "endoprior train: expected DATA OUT, got c."),
-        (["--iterations", "x"], "--iterations: expected an integer, got 'x'."),
-        (["--device=gpu"], "--device: expected one of auto, cpu, cuda, got 'gpu'."),
-        (["--view", "--view-port", "x"], "--view-port: expected an integer, got 'x'."),
-        (["--min-valid", "3"], "got --min-valid. Fix: Did you mean --temporal.min-valid? "),
-        (["--seed"], "--seed: expected an integer, got nothing."),
+        (["--iterations", "x"], "--iterations: invalid int value: 'x'."),
+        (["--device=gpu"], "--device: invalid choice: 'gpu' (choose from 'auto', 'cpu', 'cuda')."),
+        (["--view", "--view-port", "x"], "--view-port: invalid int value: 'x'."),
+        (["--seed"], "--seed: expected one argument."),
         (["--gaussians", "0"], "endoprior: --gaussians: budget must be in [1, 1e+07], got 0. Fix: "),
     ],
 )
-def test_a_wrong_option_is_named_with_what_was_meant(words, said, capsys):
+def test_a_wrong_option_is_named(words, said, capsys):
     assert main(["train", "a", "b", *words]) == 2
     error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("command", "option", "meant"),
-    [
-        ("run", "--fps", "--frames-per-second"),
-        ("prepare", "--fps", "--frames-per-second"),
-        ("train", "--epochs", "--iterations"),
-        ("train", "--gpu", "--device"),
-        ("export", "--force", "--overwrite"),
-        ("export", "--fps", None),
-        ("run", "--pose", "--poses"),
-        ("run", "--depht", "--depth"),
-        ("run", "--width", "--max-width"),
-        ("train", "--lr", None),
-    ],
-)
-def test_only_a_plausible_option_is_suggested(command, option, meant, capsys):
-    assert main([command, "a", "b", option, "1"]) == 2
-    said = f"Did you mean {meant}? `" if meant else "`"
-    assert f"got {option}. Fix: {said}endoprior {command} --help-all`" in capsys.readouterr().err
+    assert said in error and error.count("\n") == 1 and error.count("Fix: ") == 1
 
 
 def test_missing_arguments_are_named():
-    from endoprior.cli.prepare import HELP, Prepare
-
-    for words, missing in ((["a"], "no OUT"), ([], "no VIDEO and no OUT")):
-        with pytest.raises(InputError, match=rf"^endoprior prepare: expected VIDEO OUT, got {missing}\. Fix: "):
+    for words, missing in ((["a"], "OUT"), ([], "VIDEO, OUT")):
+        with pytest.raises(InputError, match=rf"^the following arguments are required: {missing}\. Fix: "):
             parse(Prepare, words, "prepare", HELP)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from endoprior.core.checks import InputError
-from endoprior.core.config_windows import WindowConfig
+from endoprior.core.config import WindowConfig
 from endoprior.data import load_sequence
 from endoprior.model.method import METHODS, method_named
 from endoprior.model.presets import preset, preset_names

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from endoprior.core.extras import install_command, missing_package
+from endoprior.core.shell import install_command, missing_package
 from endoprior.system import installation
 
 ROOT = Path(__file__).parents[1]
@@ -24,7 +24,7 @@ def test_the_packages_of_an_optional_part_are_those_of_pyproject(extra):
 
 def test_packages_that_only_some_systems_need_are_no_optional_part(monkeypatch):
     lines = ['b>=1; sys_platform != "none"', 'c>=2; sys_platform != "none" and extra == "x"', 'd; extra == "y"', "a"]
-    monkeypatch.setattr("endoprior.core.extras.requires", lambda name: lines)
+    monkeypatch.setattr("endoprior.core.shell.requires", lambda name: lines)
     install_command.cache_clear()
     assert install_command("x") == "pip install -c constraints.txt c"
     install_command.cache_clear()

@@ -13,7 +13,7 @@ from endoprior.cli import main
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.runs.train import train
-from endoprior.system.leftovers import remove_leftovers, temporary_sibling
+from endoprior.system.atomic import remove_leftovers, temporary_sibling
 
 ENDED = 2**22 - 3
 """Beyond what Linux gives to processes."""

@@ -1,8 +1,10 @@
-"""Memory: what is free, and a cache that keeps to its size."""
+"""Memory: what is free, a cache that keeps to its size, and memory that training frees."""
 
 from __future__ import annotations
 
+import json
 import os
+import platform
 import resource
 import subprocess
 import sys
@@ -12,7 +14,8 @@ import pytest
 
 from endoprior.data import load_sequence
 from endoprior.runs.train import train
-from endoprior.system.memory import LEAST_CACHE, BoundedCache, available_bytes, cache_bytes
+from endoprior.system import memory
+from endoprior.system.memory import LEAST_CACHE, BoundedCache, available_bytes, cache_bytes, freed_memory_kept
 
 
 def test_free_memory_is_between_zero_and_total():
@@ -78,3 +81,50 @@ def test_a_small_cache_changes_speed_and_nothing_else(tiny_sequence, tmp_path, m
         files.append((tmp_path / size / "scene.safetensors").read_bytes())
         assert np.isfinite(sequence.frame(3).depth).all()
     assert files[0] == files[1]
+
+
+FAULTS = """
+import json, resource
+from endoprior.system.memory import freed_memory_kept
+
+def faults_of_an_array():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    bytearray(b'x') * 2**26  # 64 MB: 16,384 pages
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+def megabytes_held():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * resource.getpagesize() / 2**20
+
+found = {"before": [faults_of_an_array(), faults_of_an_array()], "held before": megabytes_held()}
+with freed_memory_kept():
+    found["kept"] = [faults_of_an_array(), faults_of_an_array()]
+    found["held inside"] = megabytes_held()
+found["held after"] = megabytes_held()
+found["after"] = [faults_of_an_array(), faults_of_an_array()]
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are those of the GNU C library")
+def test_freed_memory_is_used_again_and_goes_back():
+    done = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout)
+    first, second = found["kept"]
+    assert second < first / 10, "the second array should lie where the first one was"
+    assert found["held inside"] - found["held before"] > 50
+    assert found["held after"] - found["held before"] < 10
+    assert min(found["after"]) > first / 2, "arrays are mapped anew, as before"
+
+
+@pytest.mark.parametrize(("system", "library"), [("win32", None), ("linux", object())], ids=["windows", "musl"])
+def test_elsewhere_nothing_happens(monkeypatch, system, library):
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: library or pytest.fail("no library is asked"))
+    with freed_memory_kept():
+        pass
+
+
+def test_an_error_inside_comes_out():
+    with pytest.raises(ValueError, match="inside"), freed_memory_kept():
+        raise ValueError("inside")

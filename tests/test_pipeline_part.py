@@ -1,19 +1,13 @@
-"""Which part of a video becomes a scene, how long that takes, and what fits into a player: pure functions."""
+"""Which part of a video becomes a scene, and what fits into a player: pure functions."""
 
 import math
-from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from endoprior.cli.step_display import duration
-from endoprior.model.presets import preset
-from endoprior.pipeline import Job, seconds_if_moving
-from endoprior.pipeline.estimate import FRAMES, Trial, scaled, seconds_of_colmap, shortened
-from endoprior.pipeline.part import Part, choose_part, every_kth_time, usable_frames
-from endoprior.prepare.camera_path import choose
-from endoprior.prepare.config import PrepareConfig
+from endoprior.cli.progress import Counting, duration
+from endoprior.pipeline.job import Part, choose_part
+from endoprior.pipeline.steps import every_kth_time, usable_frames
 from endoprior.prepare.frame_selection import FrameSelection
 from endoprior.prepare.video import SourceFrame
 
@@ -97,44 +91,20 @@ def test_frames_end_where_the_camera_is_lost():
     assert usable_frames(100, list(range(7, 100)), []) == 100, "too few frames would be left"
 
 
-def test_the_estimate_of_the_trial_itself_is_what_the_trial_took():
-    trial = Trial(
-        decode=0.01, look=1.0, learn=2.0, write=0.2, follow=0.5, check=3.0, start=1.0, half_iteration=0.02,
-        iteration=0.05, render=0.01, score=2.5, rendered_video=0.06, player=0.7,
-    )  # fmt: skip
-    cfg = replace(preset(), schedule=replace(preset().schedule, fine_iterations=1500, half_resolution_iterations=500))
-    seconds = scaled(trial, cfg, FRAMES, FRAMES)
-    assert seconds["prepare"] == pytest.approx(1.0 + 2.0 + FRAMES * 0.2 + 0.5 + FRAMES * 0.01 - FRAMES * 0.01)
-    assert seconds["train"] == pytest.approx(1.0 + 500 * 0.02 + 1000 * 0.05)
-    assert (seconds["check"], seconds["score"]) == (pytest.approx(3.0), pytest.approx(2.5))
-    assert scaled(trial, cfg, 100, 100)["video"] == pytest.approx(100 * 0.06)
-
-
-@pytest.mark.parametrize(
-    ("poses", "depth", "forced", "if_moving"),
-    [
-        ("auto", "auto", 60, 60), ("estimate", "auto", 60, 0), ("colmap", "auto", 60, 0), ("auto", "none", 0, 0),
-        ("auto-own", "auto", 0, 0), ("own", "auto", 0, 0), ("still", "auto", 0, 0), ("poses.npy", "auto", 0, 0),
-    ],
-)  # fmt: skip
-def test_the_estimate_knows_what_colmap_takes(poses, depth, forced, if_moving, monkeypatch):
-    monkeypatch.setattr(choose, "is_installed", lambda: True)
-    monkeypatch.setattr(choose, "SECONDS_AN_IMAGE", 1.0)
-    prepare, part = PrepareConfig(poses=poses, depth=depth), Part(25.0, 0.0, 2.4, 60, True)
-    job = Job(Path("video.mp4"), Path("out"), preset(), {}, prepare, part)
-    assert seconds_of_colmap(job) == forced and seconds_if_moving(job) == if_moving
-    trial = Trial(*[0.0] * len(fields(Trial)))
-    assert scaled(trial, preset(), 60, 60, forced)["prepare"] == forced
-    monkeypatch.setattr(choose, "is_installed", lambda: False)
-    assert seconds_of_colmap(job) == seconds_if_moving(job) == 0
-
-
-def test_iterations_of_the_trial_cost_what_those_of_the_job_cost():
-    cfg = shortened(preset(), 250)
-    assert cfg.deformation.basis.num_bases == preset().fitted(250).deformation.basis.num_bases
-    assert cfg.schedule.half_resolution_iterations * 2 == cfg.schedule.fine_iterations
-    assert cfg.temporal.start_iteration == cfg.schedule.half_resolution_iterations + 1
-
-
 def test_durations_are_readable():
     assert [duration(s) for s in (0.4, 42, 100, 120, 3900)] == ["0 s", "42 s", "1 min 40 s", "2 min", "1 h 5 min"]
+
+
+def test_progress_says_how_long_the_rest_takes(capsys, monkeypatch):
+    now = iter((0.0, 5.0, 20.0, 21.0))
+    monkeypatch.setattr("endoprior.cli.progress.clock.monotonic", lambda: next(now))
+    with Counting("3/6  train: ") as progress:
+        for what, done, total in (
+            ("training", 0, 300),
+            ("training", 50, 300),
+            ("training", 100, 300),
+            ("packing", 0, 0),
+        ):
+            progress(what, done, total)
+    lines = ["training 0/300", "training 100/300  5.0/s  40 s left", "packing"]
+    assert capsys.readouterr().out.splitlines() == [f"3/6  train: {line}" for line in lines]

@@ -8,7 +8,7 @@ from relief import HEIGHT, MATRIX, WIDTH, path, view
 
 from endoprior.check import find, measure
 from endoprior.cli import main
-from endoprior.core.pose_conventions import CONVENTIONS, to_ours
+from endoprior.core.geometry import CONVENTIONS, to_ours
 from endoprior.data import load_sequence
 from endoprior.data.writer import SequenceMeta, new_sequence
 from endoprior.footage.pose_fit import measure_poses

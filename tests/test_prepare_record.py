@@ -7,7 +7,7 @@ import pytest
 
 from endoprior.core.checks import InputError, read_ranges
 from endoprior.core.config import DataConfig
-from endoprior.core.options import changed_options, command_of
+from endoprior.core.shell import changed_options, command_of
 from endoprior.data import load_sequence
 from endoprior.data.description import PrepareRecord, read_record
 from endoprior.prepare import PrepareConfig

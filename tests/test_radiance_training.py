@@ -11,7 +11,7 @@ import pytest
 import torch
 from state_files import StateFile
 
-from endoprior.cli.trained_scene import open_gaussians
+from endoprior.cli.paths import open_gaussians
 from endoprior.core.checks import InputError
 from endoprior.core.config import Config
 from endoprior.core.types import Frame

@@ -11,7 +11,7 @@ import pytest
 
 import endoprior
 from endoprior.cli import main
-from endoprior.cli.start_config import resume_command, start_config, typed
+from endoprior.cli.train import arguments, resume_command, typed
 from endoprior.core.checks import InputError
 from endoprior.model.presets import preset
 from endoprior.runs.folder import config_of_run, read_config
@@ -112,11 +112,14 @@ def test_a_run_of_an_earlier_version_has_defaults_for_later_fields(interrupted, 
 
 
 def test_a_config_file_overrides_the_preset_and_options_override_it(interrupted, tmp_path):
-    assert start_config(["--config", str(interrupted[1] / "config.json")])[1] == config_of_run(interrupted[1])
+    assert arguments(["a", "b", "--config", str(interrupted[1] / "config.json")]).config == config_of_run(
+        interrupted[1]
+    )
     some = tmp_path / "some.yaml"
     some.write_text("seed: 7\ninit: {budget: 123}\n")
     expected = replace(preset("paper"), seed=7, init=replace(preset("paper").init, budget=123))
-    assert start_config(["--preset=paper", f"--config={some}"]) == ("paper", expected)
+    args = arguments(["a", "b", "--preset=paper", f"--config={some}"])
+    assert (args.preset, args.config) == ("paper", expected)
     words = ["train", str(interrupted[0]), str(tmp_path / "run"), *QUICK, "--config", str(some)]
     assert main(words) == 0
     stored = config_of_run(tmp_path / "run")

@@ -37,7 +37,7 @@ PRIVATE_WORDS = (
 PRIVATE_NAMES_ALLOWED = {"_C", "_hub_dir", "_asdict", "_fields", "_replace"}
 """What tests may use of gsplat, of torch.hub and of named tuples."""
 PRINTS = {
-    "system/console.py", "core/config_io.py", "cli/step_display.py", "cli/progress.py", "runs/progress.py",
+    "system/console.py", "core/config_io.py", "cli/progress.py", "runs/progress.py",
     "render/trial.py",
 }  # fmt: skip
 """The console; a module below it; lines that are replaced on a terminal; a trial, which prints its answer."""
@@ -159,7 +159,7 @@ def test_one_module_starts_python_and_one_prints():
     """`sys.executable` elsewhere would be a Python without `-P`; `print` would show control characters."""
     for path in ALL_FILES:
         text, name = path.read_text(), path.relative_to(ROOT / "src").as_posix().removeprefix("endoprior/")
-        if name != "system/own_python.py":
+        if name != "system/surroundings.py":
             assert "sys.executable" not in text and "executable_path" not in text, path
         assert not re.search(r"os\.(system|popen|exec\w+|spawn\w+|posix_spawn)\(|shell=True|ProcessPool", text), path
         if name not in PRINTS:

@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 
 from endoprior.cli import main
-from endoprior.core.checks import input_error
-from endoprior.core.text import printable, quotation
+from endoprior.core.checks import input_error, printable, quotation
 from endoprior.system import console
 from endoprior.system.atomic import write_json, write_text
-from endoprior.system.own_python import python_command, without_current_folder
+from endoprior.system.surroundings import python_command, without_current_folder
 
 SHORT = "--init.budget 100 --schedule.coarse-iterations 1 --schedule.fine-iterations 1 --no-networks".split()
 LEAVES_A_MARK = """import importlib, os, sys

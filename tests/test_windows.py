@@ -14,8 +14,7 @@ import torch
 from tiny_training import tiny_config
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import Config, DataConfig
-from endoprior.core.config_windows import WindowConfig
+from endoprior.core.config import Config, DataConfig, WindowConfig
 from endoprior.core.types import Camera, Splats
 from endoprior.data import load_sequence
 from endoprior.data.window_plan import Looks, look_through, plan_windows, windows_by_length

@@ -7,7 +7,7 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .system.settings_files import ignore_settings_of_current_folder
+from .system.surroundings import ignore_settings_of_current_folder
 
 if TYPE_CHECKING:
     from .core.checks import InputError

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import os
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-from endoprior.cli.help_page import Help
-from endoprior.cli.parsing import parse
+from endoprior.cli.arguments import Help, parse
 from endoprior.core.checks import input_error
 from endoprior.system.console import say
 
@@ -26,14 +22,14 @@ MOST_CORES = 4096
 class Bench:
     """Compare methods on sequences over seeds, under one protocol. Finished cells in OUT are kept."""
 
-    spec: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="SPEC")]]
+    spec: str = field(metadata={"place": "SPEC"})
     """A .yaml or .toml file, a folder of them, or a name. quick: minutes. masks: the network that finds tools, on
     frames that it has not seen (`endoprior bench masks --help`). found_masks: given and found tool masks. poses: given
     and estimated camera path. sized: the paper's tables, for two cores. full: the same at full size.
     radiance: the two radiance fields, a day. One table: sized/NAME or full/NAME with budgets, compared, depth_flags,
     growth, instability, ladder, matched, methods, primitives, regime, temporal; sized/whole_phantom; sized/whole_clip;
     full/radiance; full/scared."""
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: Path = field(metadata={"place": "OUT"})
     """Folder for cells and reports; equal cells of several specs are run once."""
     cores: int = 0
     """Cores to use in total; 0 uses all of this machine."""
@@ -59,7 +55,7 @@ def run(argv: list[str]) -> int:
     if argv[:1] == ["masks"]:
         return bench_masks.run(argv[1:])
     args = parse(Bench, argv, "bench", HELP)
-    from endoprior.cli.output_paths import require_writable_folder
+    from endoprior.cli.paths import require_writable_folder
     from endoprior.system.file_lock import locked
 
     from .execute import local_executor, ray_executor

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Protocol
 
 from endoprior.system.console import say
-from endoprior.system.own_python import python_command
 from endoprior.system.ray_cluster import connected
+from endoprior.system.surroundings import python_command
 
 from .worker import Job
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError
 from ..core.config import DataConfig
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..core.types import Camera, Frame
 from ..data import FrameSequence
 from ..data.description import PrepareRecord, read_description, read_record

@@ -17,7 +17,7 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
 from ..core.geometry import length_unit, project
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..core.types import Frame
 from ..data import FrameSequence
 from ..footage.units import FAR_MM, NEAR_MM

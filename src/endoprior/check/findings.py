@@ -12,11 +12,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..core.checks import number_ranges, read_ranges
+from ..core.checks import number_ranges, quotation, read_ranges
 from ..core.config import DataConfig
 from ..core.geometry import length_unit
 from ..core.shell import command
-from ..core.text import quotation
 from ..data.description import SIZE_NOT_STATED
 from ..footage.camera_motion import MOVING_FRACTION
 from ..footage.units import FAR_MM

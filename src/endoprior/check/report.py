@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ..core.checks import quotation
 from ..core.geometry import length_unit
-from ..core.text import quotation
 from .facts import Facts
 from .findings import Finding
 

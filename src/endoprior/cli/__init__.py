@@ -11,7 +11,7 @@ import os
 import sys
 from importlib import import_module
 
-from ..core.checks import InputError
+from ..core.checks import InputError, input_error
 from ..system.atomic import DISK_ERRORS
 from ..system.console import complain, complete_streams, say
 from ..system.installation import docs_folder
@@ -19,7 +19,6 @@ from ..system.memory import reject_small_limits
 from ..system.plugins import Registry
 from ..system.signals import all_interrupt
 from ..system.surroundings import reject_surroundings, set_library_variables
-from .usage_errors import unknown_command
 
 COMMANDS = {
     "run": "from a video to a model to look at: prepare, check, train, score, video, player",
@@ -77,9 +76,9 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     name, rest = argv[0], argv[1:]
     try:
-        if name not in REGISTRY.names():
-            words = REGISTRY.names()
-            raise unknown_command(name, {word: word for word in words} | {MODULES[word]: word for word in MODULES})
+        if name not in (names := REGISTRY.names()):
+            fix = "`endoprior --help` explains each."
+            raise input_error(name, f"one of {', '.join(names)}", "no such command", fix)
         reject_small_limits()
         reject_surroundings()
         with all_interrupt():

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig
 from ..core.shell import quoted
 from ..system.console import say
-from .help_page import Help
-from .parsing import parse
+from .arguments import Help, parse
 
 
 @dataclass
 class Check:
     """Check a sequence before training: print its properties and problems, and draw a figure."""
 
-    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    folder: Path = field(metadata={"place": "DATA"})
     """Sequence folder."""
     out: Path = Path("check.png")
     """PNG file of the figure."""
@@ -46,7 +42,7 @@ def run(argv: list[str]) -> None:
     if args.out.suffix.lower() != ".png":
         fix = f"`--out {quoted(args.out.with_suffix('.png'))}`."
         raise input_error("--out", "a .png file", str(args.out), fix)
-    from .output_paths import require_writable_file
+    from .paths import require_writable_file
 
     for option, file in (("--out", args.out), ("--json", args.json)):
         if file is not None:

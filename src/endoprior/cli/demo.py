@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import time as clock
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from ..model.presets import PresetName, preset
 from ..system.console import say
-from .help_page import Help
-from .parsing import parse
+from .arguments import Help, parse
 
 
 @dataclass
 class Demo:
     """Everything once, on synthetic data: phantom sequence -> train -> eval -> render, with a report."""
 
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]] = Path("demo")
+    out: Path = field(default=Path("demo"), metadata={"place": "OUT"})
     """Folder for sequence/, run/, report.png; must be new or empty."""
     preset: PresetName = "default"
     """Config to train with."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 from ..core.checks import input_error
 from ..core.config import Backend, Config
 from ..system.console import say
-from ..system.own_python import python_command
+from ..system.surroundings import python_command
 
 if TYPE_CHECKING:
     from ..model.scene import RenderedScene

@@ -7,13 +7,12 @@ import platform
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 
-from ..core.extras import install_command, packages_of
+from ..core.shell import install_command, packages_of
 from ..system.console import say
 from ..system.installation import docs_folder, page, source_commit
 from ..system.memory import available_bytes
+from .arguments import Help, parse
 from .devices import choose, try_backend, why_no_gpu
-from .help_page import Help
-from .parsing import parse
 
 NEEDED = ("torch", "numba", "numpy")
 OPTIONAL = {

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-import tyro
+from typing import TYPE_CHECKING, Literal
 
 from ..core.checks import input_error
 from ..core.shell import command
 from ..system.console import say
 from ..system.installation import page
+from .arguments import Help, parse
 from .devices import Wanted, on_device
-from .help_page import Help
-from .parsing import parse
+from .paths import folder_of, open_scene
 from .score_table import score_table
-from .trained_scene import folder_of, open_scene
 
 if TYPE_CHECKING:
     from ..data import FrameSequence
@@ -37,7 +34,7 @@ class Eval:
     Splits other than test have files of their own: metrics_train.json, per_frame_train.json.
     """
 
-    run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
+    run: Path = field(metadata={"place": "RUN"})
     """Run folder; with --pictures or --masks the sequence folder."""
     data: Path | None = None
     """Sequence folder. Default: the one the run was trained on."""
@@ -75,7 +72,7 @@ def run(argv: list[str]) -> None:
     args = parse(Eval, argv, "eval", HELP)
     from ..evaluation.protocols.table import chosen_protocols
     from ..runs.folder import sequence_of_run
-    from .output_paths import require_writable_folder
+    from .paths import require_writable_folder
 
     if args.masks:
         evaluate_masks(args, args.masks)
@@ -130,7 +127,7 @@ def evaluate_pictures(args: Eval, folder: Path, protocols: Sequence[str]) -> Non
     from ..data import load_sequence
     from ..evaluation.pictures import Pictures
     from ..evaluation.scoring import evaluate
-    from .output_paths import require_writable_folder
+    from .paths import require_writable_folder
 
     if args.data:
         raise input_error("--data", "--pictures FOLDER DATA", "--data as well", "Remove --data.")
@@ -153,7 +150,7 @@ def evaluate_masks(args: Eval, folder: Path) -> None:
     """Score the masks of the sequence that takes the place of the run against the true masks in `folder`."""
     from ..data import load_sequence
     from ..evaluation.true_masks import TrueMasks, score_masks
-    from .output_paths import require_writable_folder
+    from .paths import require_writable_folder
 
     plain = Eval(args.run, out=args.out, masks=folder)
     if other := next((f.name for f in fields(Eval) if getattr(args, f.name) != getattr(plain, f.name)), None):
@@ -186,7 +183,7 @@ def save_and_print(
     run: Path | None = None,
 ) -> None:
     """Write the two files into `out`, and print a table; name frames to look at in the `run`, if there is one."""
-    from .protocol_table import protocol_table
+    from .score_table import protocol_table
 
     file = result.save(out)
     held_out = f"; {sequence.split_rule}" if sequence.test_phase else ""

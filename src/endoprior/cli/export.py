@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from typing import TYPE_CHECKING
 
 from ..export.formats import ExportOptions
 from ..system.console import say
-from .help_page import Help
-from .parsing import parse
+from .arguments import Help, parse
+from .paths import folder_of, open_gaussians, sequence_of
 from .progress import Counting
-from .trained_scene import folder_of, open_gaussians, sequence_of
 
 if TYPE_CHECKING:
     from ..export.formats import Format
@@ -25,9 +22,9 @@ if TYPE_CHECKING:
 class Export(ExportOptions):
     """Write a trained scene in a format that other programs read (docs/export.md)."""
 
-    run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
+    run: Path = field(metadata={"place": "RUN"})
     """Run folder, or a scene.safetensors."""
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: Path = field(metadata={"place": "OUT"})
     """A new file, or a new folder with one file for each time step. Its suffix says the format."""
     overwrite: bool = False
     """Replace OUT if it is a file that exists."""
@@ -53,7 +50,7 @@ def run(argv: list[str]) -> None:
     """Export."""
     args = parse(Export, argv, "export", HELP)
     from ..export import export
-    from .output_paths import require_new_file
+    from .paths import require_new_file
 
     options = ExportOptions(**{field.name: getattr(args, field.name) for field in fields(ExportOptions)})
     scene = open_gaussians(args.run)

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from typing import TYPE_CHECKING
 
 from ..core.checks import input_error, number_ranges
+from ..core.ranges import spread
 from ..core.shell import command
-from ..core.spread import spread
 from ..system.console import say
-from .help_page import Help
-from .parsing import parse
+from .arguments import Help, parse
 from .progress import Counting
 
 if TYPE_CHECKING:
@@ -42,14 +39,14 @@ class Masks:
     DATA/tool_masks.json holds the share and the confidence of each frame.
     """
 
-    data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    data: Path = field(metadata={"place": "DATA"})
     """Sequence folder."""
     refine: bool = False
     """The masks of DATA are right but miss parts, such as jaws: learn from them, and only add pixels."""
-    segmenter: Annotated[str | None, tyro.conf.arg(name="with", metavar="SEGMENTER")] = None
+    segmenter: str | None = field(default=None, metadata={"name": "with", "metavar": "SEGMENTER"})
     """`sam2`: SAM 2 follows the tools that are found first through the video. A folder of its weights, or the name of a
     model, may follow after a colon."""
-    tool: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FRAME,X,Y ...")] = ()
+    tool: tuple[str, ...] = field(default=(), metadata={"metavar": "FRAME,X,Y ..."})
     """Points on tools that the masks of DATA miss: the frame, from 0, and px of the image. Such tools are found in all
     frames; pixels are only added."""
 

@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from ..core.shell import command
 from ..phantom import PhantomConfig
 from ..system.console import say
-from .help_page import Help
-from .parsing import parse
+from .arguments import Help, parse
 
 
 @dataclass
 class Phantom:
     """Write a synthetic surgical sequence with full ground truth."""
 
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: Path = field(metadata={"place": "OUT"})
     """Sequence folder to write; must be new or empty."""
-    config: Annotated[PhantomConfig, tyro.conf.arg(name="")] = field(default_factory=PhantomConfig)
+    config: PhantomConfig = field(default_factory=PhantomConfig, metadata={"name": ""})
 
 
 HELP = Help(

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from ..core.checks import InputError
 from ..system.console import say
-from .help_page import Help
-from .parsing import parse
+from .arguments import Help, parse
 
 LINE = "{:<11}{:<20}{:<28}{}"
 

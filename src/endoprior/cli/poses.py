@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from typing import TYPE_CHECKING
 
 from ..core.checks import check_range, number_ranges
-from ..core.pose_conventions import Convention
+from ..core.geometry import Convention
 from ..core.shell import command
 from ..system.console import say
-from .help_page import Help
-from .parsing import parse
+from .arguments import Help, parse
 from .progress import Counting
 
 if TYPE_CHECKING:
@@ -30,7 +27,7 @@ class Poses:
     scale of the path. DATA/camera_path.json holds the method and the uncertainty of each pose.
     """
 
-    data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    data: Path = field(metadata={"place": "DATA"})
     """Sequence folder."""
     poses: str = "auto"
     """`auto` (static, or estimated if the camera moves), `estimate` (by our own tracks, or by COLMAP if it is installed

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from ..core.shell import command
 from ..prepare.config import PrepareConfig
 from ..system.console import say
-from .help_page import Help
-from .parsing import parse
+from .arguments import Help, parse
 from .progress import Counting
 
 
@@ -24,11 +20,11 @@ class Prepare:
     only its path is kept, in OUT/prepare.json. `depth-anything` and `sam2` are downloaded.
     """
 
-    video: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIDEO")]]
+    video: Path = field(metadata={"place": "VIDEO"})
     """Video file, or folder of images."""
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: Path = field(metadata={"place": "OUT"})
     """Sequence folder to write; must be new or empty."""
-    config: Annotated[PrepareConfig, tyro.conf.arg(name="")] = field(default_factory=PrepareConfig)
+    config: PrepareConfig = field(default_factory=PrepareConfig, metadata={"name": ""})
 
 
 HELP = Help(

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
+from typing import Literal
 
 from ..core.config import PriorConfig
 from ..system.console import say
-from .help_page import Help
-from .parsing import parse
+from .arguments import Help, parse
 
 
 @dataclass
 class Prior:
     """Write the cue maps and the joint texture prior of each frame: one PNG per map, and a contact sheet."""
 
-    data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    data: Path = field(metadata={"place": "DATA"})
     """Sequence folder."""
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: Path = field(metadata={"place": "OUT"})
     """Folder for specular/, salience/, prior/ and contact_sheet.png."""
     split: Literal["train", "test", "video"] = "video"
     """Frames to write."""
-    config: Annotated[PriorConfig, tyro.conf.arg(name="")] = field(default_factory=PriorConfig)
+    config: PriorConfig = field(default_factory=PriorConfig, metadata={"name": ""})
 
 
 HELP = Help(

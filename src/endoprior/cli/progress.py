@@ -1,39 +1,46 @@
-"""Progress of countable steps: one updated line on a terminal, plain lines elsewhere."""
+"""Progress: one line that is replaced on a terminal, lines now and then elsewhere."""
 
 from __future__ import annotations
 
 import sys
 import time as clock
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
-from ..core.text import printable
+from ..core.checks import printable
 from ..runs.progress import PLAIN_EVERY_SECONDS
 from ..system.console import say
 
+UPDATE_SECONDS = 0.2
+"""Time between two updates of the line on a terminal."""
+
 
 class Counting:
-    """Progress of countable steps: a line every few seconds, or one updated line on a terminal."""
+    """Shows what is being done, how much of it is done, and the time that is left of it at this rate."""
+
+    def __init__(self, head: str = "") -> None:
+        """Args: head: stands in front of each line."""
+        self._head, self._what, self._width, self._terminal = head, "", 0, sys.stderr.isatty()
 
     def __enter__(self) -> Counting:
-        self._terminal, self._what, self._first, self._width = sys.stderr.isatty(), "", 0, 0
-        self._began = self._last = clock.monotonic()
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if self._terminal and self._what:
+        if self._width:
             self._replace_line("")
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Report progress of the step `what`; a `total` of 0 is unknown."""
+        """Report progress of the part `what`; a `total` of 0 is unknown."""
         now = clock.monotonic()
         if what != self._what:
             self._what, self._began, self._first = what, now, done
-        elif not self._terminal and now - self._last < PLAIN_EVERY_SECONDS:
+        elif now - self._last < (UPDATE_SECONDS if self._terminal else PLAIN_EVERY_SECONDS):
             return
         self._last = now
-        rate = (done - self._first) / max(now - self._began, 1e-9)
-        line = f"{what} {done}/{total or '?'}"
-        if rate > 0 and total:
-            line += f"  {rate:.1f}/s  {(total - done) / rate:.0f} s left"
+        line = f"{self._head}{what}{f' {done}/{total}' if total else f' {done}' if done else ''}"
+        if total and done > self._first:
+            seconds = (now - self._began) / (done - self._first)
+            line += f"  {1 / max(seconds, 1e-9):.1f}/s  {duration((total - done) * seconds)} left"
         if self._terminal:
             self._replace_line(line)
         else:
@@ -44,3 +51,28 @@ class Counting:
         line = printable(line)
         print(f"\r{line:<{self._width}}", end="\r", file=sys.stderr, flush=True)
         self._width = len(line)
+
+
+@contextmanager
+def step_progress(names: Sequence[str], name: str) -> Iterator[Counting]:
+    """Show the progress of one of several steps, then how long it took."""
+    head, began = step_head(names, name), clock.monotonic()
+    with Counting(f"{head}: ") as progress:
+        yield progress
+    say(f"{head:<13} {duration(clock.monotonic() - began)}")
+
+
+def step_head(names: Sequence[str], name: str) -> str:
+    """What stands in front of the lines of a step: `3/6  train`."""
+    return f"{names.index(name) + 1}/{len(names)}  {name}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds as text: `42 s`, `3 min 20 s`, `1 h 5 min`."""
+    whole = round(seconds)
+    if whole < 100:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s" if rest else f"{minutes} min"
+    return f"{minutes // 60} h {minutes % 60} min"

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-import tyro
+from typing import TYPE_CHECKING, Literal
 
 from ..core.checks import input_error
 from ..system.console import say
+from .arguments import Help, parse
 from .devices import Wanted, on_device
-from .help_page import Help
-from .parsing import parse
-from .trained_scene import folder_of, open_scene, reject_without_gaussians
+from .paths import folder_of, open_scene, reject_without_gaussians
 
 if TYPE_CHECKING:
     from ..model.scene import RenderedScene
@@ -30,9 +27,9 @@ class Render:
     another time is blue; support/*.npy says how many frames saw it and how many seconds away the nearest is.
     """
 
-    run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
+    run: Path = field(metadata={"place": "RUN"})
     """Run folder."""
-    out: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="OUT")]] = None
+    out: Path | None = field(default=None, metadata={"place": "OUT"})
     """Output folder. Default: RUN/renders for the frames and RUN/video.mp4 for the video."""
     split: Literal["video", "test", "train"] = "video"
     """Frames of the sequence to render."""
@@ -89,7 +86,7 @@ def reject_two_choices(args: Render) -> None:
 
 def render(scene: RenderedScene, args: Render) -> None:
     """Render the views selected by `args` and print the output paths."""
-    from .output_paths import require_writable_folder
+    from .paths import require_writable_folder
 
     run = folder_of(args.run)
     require_writable_folder("OUT" if args.out else "RUN", args.out or run)

@@ -6,21 +6,17 @@ import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from typing import TYPE_CHECKING
 
 from ..core.checks import input_error
 from ..core.config import Config
-from ..core.options import command_of
-from ..core.shell import command
+from ..core.shell import command, command_of
 from ..model.presets import PresetName, preset
 from ..prepare.config import PrepareConfig
 from ..system.console import say
+from .arguments import Help, parse
 from .devices import Wanted, with_device
-from .help_page import Help
-from .parsing import parse
-from .step_display import StepDisplay, duration
+from .progress import duration, step_head, step_progress
 
 if TYPE_CHECKING:
     from ..pipeline import Job
@@ -34,9 +30,9 @@ class Run:
     interruption, run the same command again. Your video never leaves this computer.
     """
 
-    video: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIDEO")]]
+    video: Path = field(metadata={"place": "VIDEO"})
     """Video file, or folder of images."""
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: Path = field(metadata={"place": "OUT"})
     """Folder for the results: new, empty, or resumed."""
     preview: bool = False
     """A first look in about a minute: at most 60 frames, 320 px wide. Not for scores."""
@@ -46,7 +42,7 @@ class Run:
     """Seed of the training."""
     device: Wanted = "auto"
     """Device that trains; auto uses CUDA only if all of it works (`endoprior doctor`)."""
-    config: Annotated[PrepareConfig, tyro.conf.arg(name="")] = field(default_factory=PrepareConfig)
+    config: PrepareConfig = field(default_factory=PrepareConfig, metadata={"name": ""})
 
 
 HELP = Help(
@@ -67,8 +63,7 @@ HELP = Help(
 def run(argv: list[str]) -> None:
     """Do every step, with one progress display."""
     args = parse(Run, argv, "run", HELP)
-    from ..pipeline import STEPS, estimate, notes_of, open_folder, problems, run_step, seconds_if_moving
-    from ..prepare.sam2 import is_sam2
+    from ..pipeline import STEPS, notes_of, open_folder, problems, run_step
     from ..runs import kernel_cache
     from ..runs.log import missed_tools_line
 
@@ -77,26 +72,17 @@ def run(argv: list[str]) -> None:
     resumes = open_folder(job)
     say(_part_words(job))
     waiting = [step for step in STEPS if not step.result(job).exists()]
+    names = [step.name for step in STEPS]
     if resumes:
-        say(resume_words([step.name for step in STEPS], [step.name for step in waiting]))
+        say(resume_words(names, [step.name for step in waiting]))
     kernel_cache.fill(job.cfg, say)
-    seconds: dict[str, float] = {}
-    if waiting == list(STEPS) and not job.is_preview and job.part.num_frames:
-        say("Estimating the time ...")
-        seconds = estimate(job)
-        say(f"This takes about {duration(sum(seconds.values()))}: {_seconds_words(seconds)}.")
-        if is_sam2(job.prepare.masks):
-            say("SAM 2 is not part of this estimate: without a GPU it may take much longer than all the rest.")
-        if more := seconds_if_moving(job):
-            say(f"If the camera moves, COLMAP takes up to about {duration(more)} more; `--poses auto-own` skips it.")
-    display = StepDisplay([step.name for step in STEPS], seconds)
     try:
         for step in STEPS:
             if step in waiting:
-                with display.step(step.name) as progress:
+                with step_progress(names, step.name) as progress:
                     lines = run_step(step, job, progress)
             else:
-                display.skip(step.name)
+                say(f"{step_head(names, step.name):<13} done before")
                 lines = notes_of(step, job)
             for line in lines or []:
                 say(f"     {line}")
@@ -166,7 +152,3 @@ def resume_words(names: list[str], waiting: list[str]) -> str:
     """Where a job goes on, and what is there already."""
     done = ", ".join(name for name in names if name not in waiting) or "nothing"
     return f"Resuming at {waiting[0]}; done before: {done}." if waiting else f"All done before: {done}."
-
-
-def _seconds_words(seconds: dict[str, float]) -> str:
-    return ", ".join(f"{name} {duration(value)}" for name, value in seconds.items())

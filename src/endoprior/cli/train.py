@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated
-
-import tyro
+from typing import get_args
 
 from ..core.checks import input_error
 from ..core.config import Config
 from ..core.config_io import SHORT_NAMES
 from ..core.shell import command
-from ..model.presets import PresetName
+from ..model.presets import PresetName, preset
+from ..runs.folder import config_of_run, read_config, sequence_of_run
 from ..runs.progress import training_progress
 from ..system.console import say
+from .arguments import Help, parse
 from .devices import Wanted, with_device
-from .help_page import Help
-from .parsing import parse
-from .start_config import device_to_resume, resume_command, run_to_resume, start_config
 from .view import live_view
 
 
@@ -27,13 +26,13 @@ from .view import live_view
 class Train:
     """Train one scene and score it. The preset sets every number of the method; options change single ones."""
 
-    data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    data: Path = field(metadata={"place": "DATA"})
     """Sequence folder: of `endoprior prepare` or a dataset. To resume a run, `--resume RUN` alone is enough."""
-    out: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="OUT")]] = None
+    out: Path | None = field(default=None, metadata={"place": "OUT"})
     """Run folder to write."""
     preset: PresetName = "default"
     """Method: a preset of the config."""
-    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
+    config_file: Path | None = field(default=None, metadata={"name": "config", "metavar": "FILE"})
     """Config of another run (config.json), or YAML with some fields. It overrides the preset; options override it."""
     device: Wanted = "auto"
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
@@ -52,7 +51,7 @@ class Train:
     """Show the scene in a web browser during training. At 127.0.0.1 and --view-port; it slows down training."""
     view_port: int = 8080
     """Port of --view; 0 uses any free port."""
-    config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    config: Config = field(default_factory=Config, metadata={"name": ""})
 
 
 HELP = Help(
@@ -75,8 +74,12 @@ HELP = Help(
 
 def run(argv: list[str]) -> None:
     """Train, score, and print the results."""
+    from ..render import ON_GPU
+
     args = arguments(argv)
-    wanted = device_to_resume(args.config) if args.resume and args.device == "auto" else args.device
+    wanted = args.device
+    if args.resume and wanted == "auto":  # the device that the run was started on
+        wanted = "cuda" if args.config.render.backend in ON_GPU else "cpu"
     cfg = with_device(args.config, wanted)
     if args.weights_dir and not args.weights_dir.is_dir():
         raise input_error(args.weights_dir, "a folder with weights", "none", "Correct --weights-dir.")
@@ -156,20 +159,48 @@ def _logged_seconds(log: Path) -> float:
 
 
 def arguments(argv: list[str]) -> Train:
-    """The parsed arguments. A resumed run takes its config from its folder, and its data too if only RUN is given.
+    """The parsed arguments. The config starts from a preset, then a file; a resumed run has that of its folder.
 
     Raises:
-        InputError: as `parse`; OUT is missing; or the run to resume cannot be read.
+        InputError: as `parse`; no such preset; OUT is missing; or a config or the run to resume cannot be read.
     """
-    name, cfg = start_config(argv)
-    start = Train(data=tyro.MISSING, preset=name, config=cfg)
-    args = parse(Train, argv, "train", HELP, default=start)
+    named, file = typed(argv, "--preset"), typed(argv, "--config")  # now, so that --help shows their values
+    name = named or "default"
+    if name not in get_args(PresetName):
+        raise input_error("--preset", f"one of {', '.join(get_args(PresetName))}", repr(name), "`--preset default`.")
+    cfg = preset(name) if file is None else read_config(Path(file), preset(name))
+    args = parse(Train, argv, "train", HELP, preset=name, config=cfg)
     if not args.resume:
         if args.out is None:
             fix = f"`{command('train', args.data, 'RUN')}`."
             raise input_error("endoprior train", "the run folder to write after DATA", "nothing", fix)
         return args
-    data, out, stored = run_to_resume(args.data, args.out, argv)
-    if stored is not None:
-        args = parse(Train, argv, "train", HELP, default=replace(start, config=stored))
-    return replace(args, data=data, out=out)
+    data, run = args.data, args.out or args.data
+    if named is None and file is None and (args.out is None or (run / "config.json").is_file()):
+        args = parse(Train, argv, "train", HELP, preset=name, config=config_of_run(run))
+    if args.out is None:
+        moved = f"`{command('train', 'DATA', run, '--resume')}` with the folder of the sequence."
+        data = sequence_of_run(run, moved)
+    return replace(args, data=data, out=run)
+
+
+def typed(argv: Sequence[str], option: str) -> str | None:
+    """The value of an option in the arguments, the last one if there are several; None without it."""
+    value = None
+    for word, following in zip_longest(argv, argv[1:]):
+        if word == option and following is not None:
+            value = following
+        elif word.startswith(f"{option}="):
+            value = word.partition("=")[2]
+    return value
+
+
+def resume_command(
+    run: Path, networks: bool, weights_dir: Path | None, checkpoint_seconds: float, ray: str | None = None
+) -> str:
+    """The command that resumes an interrupted training; config and data are those of the run folder."""
+    words: list[str | Path] = [] if networks else ["--no-networks"]
+    words += ["--weights-dir", weights_dir] if weights_dir else []
+    words += ["--checkpoint-seconds", f"{checkpoint_seconds:g}"] if checkpoint_seconds != 60 else []
+    words += ["--ray", ray] if ray else []
+    return command("train", "--resume", run, *words)

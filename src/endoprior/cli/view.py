@@ -5,19 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from typing import TYPE_CHECKING
 
 from ..core.checks import input_error
 from ..core.shell import command
 from ..system.console import say
+from .arguments import Help, parse
 from .devices import Wanted, on_device
-from .help_page import Help
-from .parsing import parse
-from .trained_scene import open_gaussians, sequence_of
+from .paths import open_gaussians, sequence_of
 
 if TYPE_CHECKING:
     from ..training.stage import StepReport
@@ -32,7 +29,7 @@ DEFAULT_PORT = 8080
 class View:
     """Show a trained scene, or a sequence before training, in a web browser."""
 
-    path: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN|DATA")]]
+    path: Path = field(metadata={"place": "RUN|DATA"})
     """Run folder, or sequence folder."""
     data: Path | None = None
     """Sequence folder with the input frames of a run. Default: the one it was trained on."""

@@ -1,14 +1,32 @@
-"""Input checks and their error messages: `FILE: expected X, got Y. Fix: COMMAND.`"""
+"""Input checks, their error messages `FILE: expected X, got Y. Fix: COMMAND.`, and text that is safe to show."""
 
 from __future__ import annotations
 
 import difflib
 import re
+import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from .text import quotation
+
+def printable(text: str) -> str:
+    r"""The text with `\x1b` and the like in place of characters that a terminal obeys or that turn the text around.
+
+    Newlines, tabs and spaces of any width stay.
+    """
+    return text if text.isprintable() else "".join(map(_shown, text))
+
+
+def quotation(text: str) -> str:
+    """Text from a file or a name, without what would pass for advice of this program: backticks and `Fix:`."""
+    return re.sub(r"\bfix\s*:", "fix", text.replace("`", "'"), flags=re.IGNORECASE)
+
+
+def _shown(character: str) -> str:
+    if character.isprintable() or character in "\n\t" or unicodedata.category(character) == "Zs":
+        return character
+    return character.encode("unicode_escape").decode("ascii")
 
 
 class InputError(ValueError):
@@ -27,32 +45,11 @@ def input_error(subject: Path | str, expected: str, got: str, fix: str) -> Input
     return InputError(f"{found}. Fix: {fix[:1].upper()}{fix[1:]}")
 
 
-SIMILAR = 0.75
-"""Least similarity, difflib's ratio, of a name and what may be meant by it; at 0.6 `port` would mean `preset`."""
-
-
 def similar_name(name: str, names: Sequence[str]) -> str | None:
-    """The name with the same last part, such as `temporal.weight` for `weight`, else the most similar one.
-
-    Args:
-        name: what was typed: a dotted name, or an option with its dashes.
-        names: those that there are; of equally good ones the first is taken.
-    """
-    by_last_part = {last_part(each): each for each in reversed(names)}
-    if last_part(name) in by_last_part:
-        return by_last_part[last_part(name)]
-    by_name = {each.removeprefix("--"): each for each in names}  # equal dashes would make any two names similar
-    for known, word in ((by_name, name.removeprefix("--")), (by_last_part, last_part(name))):
-        if close := difflib.get_close_matches(word, known, 1, SIMILAR):
-            return known[close[0]]
-    words = set(last_part(name).split("-"))
-    one_more = [part for part in by_last_part if len(words ^ set(part.split("-"))) == 1]  # `max-width` for `width`
-    return by_last_part[one_more[0]] if len(one_more) == 1 else None
-
-
-def last_part(name: str) -> str:
-    """What stands behind the last dot of a dotted name or option, without dashes in front."""
-    return name.rpartition(".")[2].removeprefix("--")
+    """The name with the same last part, such as `temporal.weight` for `weight`, else the most similar one, or None."""
+    last = [re.split(r"\.|--", each)[-1] for each in (name, *names)]
+    same = [each for each, part in zip(names, last[1:], strict=True) if part == last[0]]
+    return next(iter(same or difflib.get_close_matches(name, names, 1, 0.75)), None)
 
 
 def number_ranges(numbers: Iterable[int], most: int = 8) -> str:

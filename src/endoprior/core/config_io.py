@@ -12,8 +12,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from .checks import InputError, input_error, similar_name
-from .text import printable
+from .checks import InputError, input_error, printable, similar_name
 
 C = TypeVar("C")
 _hints = functools.cache(typing.get_type_hints)

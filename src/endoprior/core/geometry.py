@@ -6,6 +6,7 @@ Pixel (0, 0) is centered at (0.5, 0.5); `x = fx X / Z + cx`. Everything is in mm
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,3 +118,30 @@ def quaternion_to_matrix(quats: NDArray) -> NDArray:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+Convention = Literal["opencv", "opengl", "llff", "world-to-camera", "world-to-camera-opengl"]
+"""In which files hold camera poses. Ours is `opencv` (x right, y down, z forward); it and `opengl` (x right, y up, z
+backward; Blender, NeRF) are camera-to-world. `llff` has columns down, right, back. The others are inverses of the
+first two."""
+CONVENTIONS: tuple[Convention, ...] = get_args(Convention)
+
+
+def to_ours(poses: NDArray[np.float64], convention: Convention, unit_mm: float = 1.0) -> NDArray[np.float64]:
+    """(T, 4, 4) camera-to-world in mm, OpenCV axes, of rigid transforms (T, 4, 4) in another convention.
+
+    Args:
+        unit_mm: length of a unit of their translations.
+    """
+    ours = poses.copy()
+    ours[:, :3, 3] *= unit_mm
+    if convention.startswith("world-to-camera"):
+        rotation = ours[:, :3, :3].transpose(0, 2, 1)
+        ours[:, :3, 3] = -(rotation @ ours[:, :3, 3:])[..., 0]
+        ours[:, :3, :3] = rotation
+    if convention.endswith("opengl"):
+        ours[:, :3, 1:3] *= -1
+    if convention == "llff":
+        down, right, back = (ours[:, :3, i].copy() for i in range(3))
+        ours[:, :3, 0], ours[:, :3, 1], ours[:, :3, 2] = right, down, -back
+    return ours

@@ -1,4 +1,4 @@
-"""Ranges of the numbers in a config: part of a field's type, checked when the config is made."""
+"""Ranges of the numbers in a config: part of a field's type, checked when it is made. And evenly spaced numbers."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import functools
 import typing
 from collections import namedtuple
 from typing import Annotated
+
+import numpy as np
 
 from .checks import check_range
 
@@ -36,3 +38,8 @@ class Checked:
             value = getattr(self, name)
             for part in value if isinstance(value, tuple | list) else (value,):
                 check_range(name, part, *allowed)
+
+
+def spread(count: int, wanted: int) -> list[int]:
+    """At most `wanted` different positions of 0..count-1, ascending and evenly spaced, both ends included."""
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, wanted)).round()})

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 from ..core.config_io import from_dict
-from ..core.options import Options
+from ..core.shell import Options
 from ..system.atomic import write_json
 from .files import read_json
 

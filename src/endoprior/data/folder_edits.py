@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..system.atomic import whole_file, whole_folder, write_json
-from ..system.leftovers import remove_leftovers, temporary_sibling
+from ..system.atomic import remove_leftovers, temporary_sibling, whole_file, whole_folder, write_json
 from .description import TOOLS_FOUND, read_description
 from .images import read_tool_mask, save_png
 from .sequence import FrameSequence

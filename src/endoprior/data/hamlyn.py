@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.config import DataConfig
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..core.types import Camera
 from ..footage.border import black_margin
 from .assemble import Pixels, assemble, kept_frames

@@ -23,7 +23,7 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 from PIL.WebPImagePlugin import WebPImageFile
 
 from ..core.checks import input_error
-from ..core.extras import install_command
+from ..core.shell import install_command
 from .pixels import is_measured
 from .reading import MOST_PIXELS, demand_file, read_bytes, read_only_array
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config_windows import WindowConfig
+from ..core.config import WindowConfig
 from ..core.types import Camera
 from .sequence import FrameSequence
 

@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from ..core.checks import input_error
-from ..core.extras import install_command, missing_package
+from ..core.shell import install_command, missing_package
 from .score import ScoreUnavailable
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..data import FrameSequence
 from ..data.description import read_description
 from ..data.files import IMAGE_SUFFIXES, files_with

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..core.checks import input_error
 from ..core.geometry import back_project, length_unit, pixel_centers, project
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..core.types import Camera
 from ..model.scene import Scene
 from ..model.surface import Surface, render_surface

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.spread import spread
+from ..core.ranges import spread
 
 WORKING_SIDE_PX = 640
 """Larger images are reduced to this: the outline needs no more, and the circle is measured in full images later."""

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.pose_conventions import CONVENTIONS, Convention, to_ours
-from ..core.spread import spread
+from ..core.geometry import CONVENTIONS, Convention, to_ours
+from ..core.ranges import spread
 from .optical_flow import follow_both_ways
 
 View = tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32]]

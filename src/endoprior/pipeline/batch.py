@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 
 from ..core.checks import InputError
+from ..data import load_sequence
+from ..data.files import read_json
+from ..evaluation.registry import all_scores
 from ..prepare.pipeline import Progress
 from ..render import ON_GPU
 from ..runs.remote import RESTARTS, Training, start_training_on, trainings
 from ..runs.training_run import WindowedRun
 from ..system.atomic import write_text
+from ..system.devices import Threads
 from ..system.ray_cluster import Cluster
-from ..system.threads import Threads
-from .job import SequenceJob
-from .settings import open_folder
-from .steps import run_step, start_training, steps_of
+from .job import SequenceJob, open_folder
+from .steps import SHOWN_SCORES, run_step, start_training, steps_of
 
 FAILURE = "failure.txt"
 """In the folder of a job: the traceback, if it failed by an error of the program."""
+SUMMARY, TABLE = "summary.md", "scores.csv"
+"""Files in the folder of a batch: the main scores to read, and all scores as numbers."""
 BEGIN, FINISH = "before training", "after training"
 """Calls of a job on a cluster; between them are those that train."""
 
@@ -166,3 +173,32 @@ def _reason(entry: Entry, error: Exception) -> str:
     file = entry.job.out / FAILURE
     write_text(file, "".join(traceback.format_exception(error)))
     return f"{type(error).__name__}: {line[:200]} ({file})"
+
+
+def write_summary(outcomes: Sequence[Outcome], out: Path) -> list[str]:
+    """Write the table of a batch to `SUMMARY` and `TABLE` in `out`.
+
+    Returns:
+        The lines of `SUMMARY`.
+    """
+    done = [outcome.entry for outcome in outcomes if not outcome.failure]
+    scores = {entry.name: read_json(entry.job.run / "metrics.json")["scores"] for entry in done}
+    known = [all_scores()[name] for name in SHOWN_SCORES if any(name in found for found in scores.values())]
+    lines = []
+    if done:
+        lines = [f"| | {' | '.join(score.label for score in known)} |", f"|---|{'---|' * len(known)}"]
+    for entry in done:
+        relative, found = load_sequence(entry.job.data, entry.job.cfg.data).depth_is_relative, scores[entry.name]
+        cells = [score.text(found[score.name], relative) if score.name in found else "" for score in known]
+        lines.append(f"| {entry.name} | {' | '.join(cells)} |")
+    if failed := [outcome for outcome in outcomes if outcome.failure]:
+        lines += ([""] if done else []) + ["Failed:", ""]
+        lines += [f"- {outcome.entry.name}: {outcome.failure}" for outcome in failed]
+    write_text(out / SUMMARY, "\n".join(lines) + "\n")
+    columns = list(dict.fromkeys(name for found in scores.values() for name in found))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, ["name", *columns], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({"name": name} | found for name, found in scores.items())
+    write_text(out / TABLE, text.getvalue())
+    return lines

@@ -2,22 +2,99 @@
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
+from ..core.checks import input_error
 from ..core.config import Config
-from ..core.options import Options, changed_options
+from ..core.config_io import to_dict
+from ..core.shell import Options, changed_options
+from ..data import load_sequence
+from ..data.files import read_json
 from ..prepare.camera_path.sequence_path import WITHOUT_COLMAP
 from ..prepare.config import PrepareConfig
+from ..prepare.first_pass import input_facts, source_facts
+from ..prepare.frame_selection import FrameSelection
 from ..prepare.source import open_source
-from .part import Part, choose_part
+from ..system.atomic import reject_occupied, write_json
 
+LEAST_RATE = 10.0
+"""Frame rate, 1/s, below which tissue and camera move too far between two frames to be followed."""
 MOST_FRAMES = 10_000
 USUAL_FRAMES = 300
 """A video with more frames loses some in between, as long as tissue can be followed."""
 PREVIEW_FRAMES = 60
 PREVIEW_WIDTH = 320
 """Width of the frames of a preview, px."""
+SETTINGS = "settings.json"
+"""File in the output folder with everything that decides the results: a job that is resumed must have the same."""
+MOST_NAMED = 4
+"""Differences that a message names; more are counted."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Part of a video."""
+
+    frames_per_second: float
+    """Rate of the frames that are used."""
+    start: float
+    """First time, seconds."""
+    end: float
+    """End time, seconds, not included; infinite for the end of the video."""
+    num_frames: int
+    """Number of frames."""
+    is_whole: bool
+    """Whether it reaches the end that was asked for."""
+
+
+def choose_part(
+    times: Sequence[float],
+    rate: float,
+    wanted_rate: float,
+    start: float,
+    end: float,
+    most: int,
+    usual: int | None = None,
+) -> Part:
+    """The first part of a video that has at most `most` frames.
+
+    A long video loses frames in between, down to `LEAST_RATE`, until it has at most `usual`, then its end.
+
+    Args:
+        usual: None: `most`.
+        times: when each image of the video is shown, s, ascending.
+        rate: usual one of the video, 1/s.
+        wanted_rate: rate that the user chose, 1/s; 0 for none.
+        start, end: times that the user chose; the end may be infinite.
+    """
+
+    def chosen(used: float, most: int) -> list[float]:
+        """Times of the frames, up to `most`, that `prepare` selects."""
+        picked = FrameSelection(used, start, end, rate).pick(map(_Image, times))
+        return [image.seconds for image in islice(picked, most)]
+
+    every = 1
+    if not wanted_rate:
+        most_skipped, usual = max(math.floor(rate / LEAST_RATE), 1), usual or most
+        every = max(math.ceil(len(chosen(rate, most_skipped * usual)) / usual), 1)
+    used = wanted_rate or rate / every
+    frames = chosen(used, most + 1)
+    if len(frames) <= most:
+        return Part(used, start, end, len(frames), True)
+    # Half a step after the last one, on the grid start, start + 1 / rate, ..., keeps rounding from adding one.
+    end = start + (round((frames[most - 1] - start) * used) + 0.5) / used
+    return Part(used, start, end, sum(time < end - 1e-9 for time in frames), False)
+
+
+@dataclass(frozen=True)
+class _Image:
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -28,8 +105,6 @@ class SequenceJob:
     """What the user gave: the sequence folder."""
     out: Path
     cfg: Config
-    options: Options
-    """What the user chose, as it is typed; all else follows from it: `{"--preview": (), "--end": ("2.5",)}`."""
 
     @property
     def is_preview(self) -> bool:
@@ -81,6 +156,8 @@ class SequenceJob:
 class Job(SequenceJob):
     """A video on its way to a scene; it is prepared first."""
 
+    options: Options
+    """What the user chose, as it is typed; all else follows from it: `{"--preview": (), "--end": ("2.5",)}`."""
     prepare: PrepareConfig
     """Options of `prepare`, for `part` only."""
     part: Part
@@ -118,3 +195,74 @@ def make_job(
     options: Options = {"--preview": ()} if preview else {"--preset": (preset,)} if preset != "default" else {}
     options |= {"--seed": (str(cfg.seed),)} if cfg.seed else {}
     return Job(video, out, cfg, options | changed_options(prepare), chosen, part)
+
+
+def open_folder(job: SequenceJob) -> bool:
+    """Create the output folder, or accept that of an interrupted job with the same settings.
+
+    Returns:
+        Whether the folder was there before.
+    Raises:
+        InputError: the folder holds something else, or a job with other settings; it names them.
+    """
+    file, given = job.out / SETTINGS, json.loads(json.dumps(_settings(job)))
+    if not file.is_file():
+        reject_occupied(job.out)
+        job.out.mkdir(parents=True, exist_ok=True)
+        write_json(file, given)
+        return False
+    if found := differences(read_json(file), given):
+        got = "; ".join(found[:MOST_NAMED]) + (f"; and {len(found) - MOST_NAMED} more" if found[MOST_NAMED:] else "")
+        fix = "give the stored settings to resume, or choose another folder."
+        raise input_error(job.out, "results of the same video and options", got, fix)
+    return True
+
+
+def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:
+    """What differs between two settings, one text for each: `--end: stored 2.5, given 3`.
+
+    Numbers that follow from the video and the options are named only if these are equal: after an update, for instance.
+    """
+    if stored.keys() != given.keys() or not all(isinstance(stored[part], dict) for part in given):
+        return ["settings of another version"]
+    named = []
+    if stored["video"] != given["video"]:
+        names = [facts.get("name") for facts in (stored["video"], given["video"])]
+        changed = ", which has changed" if names[0] == names[1] else ""
+        named.append(f"VIDEO: stored {names[0]}, given {names[1]}{changed}")
+    before, now = stored["options"], given["options"]
+    for name in {**before, **now}:
+        if before.get(name) != now.get(name):
+            texts = [_text(before.get(name), now.get(name)), _text(now.get(name), before.get(name))]
+            named.append(f"{name}: stored {texts[0]}, given {texts[1]}")
+        elif (facts := given["inputs"].get(name)) and facts != stored["inputs"].get(name):
+            named.append(f"{name}: {facts['name']}, which has changed")
+    before, now = _flat(stored["derived"]), _flat(given["derived"])
+    changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    return named or [f"{name}: stored {before.get(name)}, given {now.get(name)}" for name in changed]
+
+
+def _settings(job: SequenceJob) -> dict[str, Any]:
+    """Everything that decides the results of a job."""
+    if not isinstance(job, Job):
+        facts = {"name": job.source.name, "fingerprint": load_sequence(job.source, job.cfg.data).fingerprint()}
+        return {"video": facts, "inputs": {}, "options": {}, "derived": {"config": to_dict(job.cfg)}}
+    prepare = {name: repr(value) for name, value in vars(job.prepare).items()}
+    derived = {"prepare": prepare, "config": to_dict(job.cfg)}
+    inputs = input_facts(job.prepare)
+    return {"video": source_facts(job.source), "inputs": inputs, "options": job.options, "derived": derived}
+
+
+def _text(words: Any, others: Any) -> str:
+    """The words after an option; None if it was not given."""
+    if words is None:
+        return "no" if others == [] else "the default"
+    return " ".join(map(str, words)) or "yes" if isinstance(words, list) else str(words)
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The entries of a nested dict by their dotted names."""
+    flat = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat

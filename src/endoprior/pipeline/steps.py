@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -13,9 +14,9 @@ from numpy.typing import NDArray
 
 from ..check import draw_check, find, measure
 from ..check.report import as_json
+from ..core.checks import quotation
 from ..core.config import Config
 from ..core.shell import command
-from ..core.text import quotation
 from ..data import FrameSequence, load_sequence
 from ..data.description import read_description
 from ..data.files import read_json
@@ -35,7 +36,6 @@ from ..visualization.image_tools import colorize, label, tile, to_u8
 from ..visualization.rendered_views import depth_span
 from ..visualization.video import write_video
 from .job import Job, SequenceJob
-from .part import every_kth_time, usable_frames
 
 PLAYER_BYTES = 40_000_000
 """Largest player."""
@@ -44,6 +44,10 @@ LEAST_BYTES = 7
 PREVIEW_TITLE = "Preview: small frames, short training. Not for scores."
 CODE = re.compile("[a-z]+(-[a-z]+)*")
 """Names of findings."""
+LOST_FRAMES = 5
+"""So many frames in a row without a pose: the camera is lost. Fewer are blurred or covered."""
+FEWEST_FRAMES = 20
+"""Fewer frames are not worth a scene."""
 SHOWN_SCORES = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis")
 
 
@@ -205,3 +209,21 @@ def _usable(job: SequenceJob, num_frames: int) -> int:
 
 def _frames_of(job: SequenceJob, cfg: Config) -> FrameSequence:
     return load_sequence(job.data, scored_data(cfg.data))
+
+
+def every_kth_time(num_frames: int, most: float) -> list[float]:
+    """Times in [0, 1) of every k-th frame, with the smallest k that gives at most `most` of them, or one."""
+    return [i / num_frames for i in range(0, num_frames, math.ceil(num_frames / max(int(most), 1)))]
+
+
+def usable_frames(num_frames: int, unexplained: list[int], cuts: list[int]) -> int:
+    """Number of frames before the camera is lost or another scene begins; all of them if too few would be left.
+
+    Args:
+        unexplained: frames without a camera pose, or of another color than the clip.
+        cuts: first frames after a scene cut.
+    """
+    missing = set(unexplained)
+    lost = [i for i in missing if all(i + k in missing for k in range(LOST_FRAMES))]
+    first = min([num_frames, *lost, *cuts])
+    return first if first >= FEWEST_FRAMES else num_frames

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..core.checks import check_range, input_error
-from ..core.pose_conventions import Convention
+from ..core.geometry import Convention
 from .calibration_files import Unit
 from .stereo import StereoConfig
 

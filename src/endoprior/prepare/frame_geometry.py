@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..footage.border import Circle, Strips
 from ..footage.stereo_order import row_offsets_px
 from .calibration import Calibration, Intrinsics, check_pair

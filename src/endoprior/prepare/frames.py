@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..data.found_tools import FoundTools
 from ..data.frame_files import match_files
 from ..data.images import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values

@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from ..core.checks import input_error
-from ..core.extras import install_command
+from ..core.shell import install_command
 from ..system.console import say
 
 FILES = ("config.json", "model.safetensors")

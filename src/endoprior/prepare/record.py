@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.options import changed_options
+from ..core.shell import changed_options
 from ..data.description import PrepareRecord
 from .config import PrepareConfig
 from .frame_geometry import FrameGeometry

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
 from ..tool_masks.regions import disk, entering_regions
 

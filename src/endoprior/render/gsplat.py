@@ -37,7 +37,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import InputError
-from ..core.extras import install_command
+from ..core.shell import install_command
 from ..core.types import Camera, RenderOutput, Splats
 from .constants import ALPHA_MIN, BLUR_PX2, MIN_QUAT, NEAR_Z, OVERFLOW
 from .projection import FIELDS, check, check_device, color_slopes, jacobian_limits, project

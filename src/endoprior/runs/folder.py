@@ -21,11 +21,10 @@ from ..data.files import read_json
 from ..data.reading import kind_of, load_yaml, read_text
 from ..model.method import config_from
 from ..render import ON_GPU
-from ..system.atomic import reject_occupied
+from ..system.atomic import is_leftover, reject_occupied
 from ..system.devices import name_of
 from ..system.file_lock import locked
 from ..system.installation import source_commit
-from ..system.leftovers import is_leftover
 from ..training.trainer import device_for
 
 LOCK = ".lock"

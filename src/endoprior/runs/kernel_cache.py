@@ -28,7 +28,7 @@ from ..data import FrameSequence
 from ..model.method import config_from, method_of
 from ..render import ON_GPU
 from ..system.file_lock import exclusive
-from ..system.own_python import python_command
+from ..system.surroundings import python_command
 
 PACKAGE = Path(__file__).parents[1]
 LIMIT_S = 900.0

@@ -13,8 +13,8 @@ from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
 from ..model.windowed_scene import window_file
 from ..render import ON_GPU
+from ..system.devices import Threads
 from ..system.ray_cluster import Cluster
-from ..system.threads import Threads
 from .checkpoint import CHECKPOINT_SECONDS
 from .folder import CONFIG, SCENE
 from .training_run import TrainingRun, WindowedRun, window_config

@@ -19,9 +19,8 @@ from ..model.scene import RenderedScene
 from ..model.scene_file import load_scene
 from ..model.single_scene import SingleScene
 from ..model.windowed_scene import Span, WindowedScene, save_index, window_file
-from ..system.atomic import write_json, write_text, writing
-from ..system.heap import freed_memory_kept
-from ..system.leftovers import remove_leftovers
+from ..system.atomic import remove_leftovers, write_json, write_text, writing
+from ..system.memory import freed_memory_kept
 from ..tool_masks.margin import with_tool_margin
 from ..training.divergence import Diverged
 from ..training.preflight import reject_too_large

@@ -6,8 +6,7 @@ import os
 import sys
 from contextlib import suppress
 
-from ..core.checks import input_error
-from ..core.text import printable
+from ..core.checks import input_error, printable
 
 
 def say(text: str) -> None:

@@ -1,11 +1,14 @@
-"""Available memory, and a cache of bounded size."""
+"""Memory: what is left, caches of bounded size, and what training frees."""
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -19,6 +22,12 @@ LEAST_DATA, LEAST_SPACE = 600 * 2**20, 1500 * 2**20
 """Writable memory and address space that the libraries alone need, bytes (docs/reliability.md)."""
 VARIABLE = "ENDOPRIOR_CACHE_GB"
 """Environment variable that overrides the size of each cache, GB."""
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_MMAP_MAX = -1, -3, -4
+"""Names of the settings, from malloc.h."""
+KEPT = {M_MMAP_MAX: 0, M_TRIM_THRESHOLD: -1}
+"""Nothing is mapped on its own, nothing goes back."""
+USUAL = {M_MMAP_MAX: 65_536, M_MMAP_THRESHOLD: 2**25, M_TRIM_THRESHOLD: 2**26}
+"""What the library arrives at by itself in a process that frees large arrays."""
 
 Value = TypeVar("Value")
 
@@ -131,3 +140,34 @@ def workers(bytes_each: int) -> int:
     free = available_bytes()
     affordable = free // 4 // max(bytes_each, 1) if free is not None else 1
     return max(1, min(os.cpu_count() or 1, affordable))
+
+
+@contextmanager
+def freed_memory_kept() -> Iterator[None]:
+    """Inside, this process keeps what it frees; at the end that goes back. Without effect where malloc is another.
+
+    Every iteration of a training allocates the same large arrays. By default the GNU C library maps those above 32 MB
+    anew each time, and the system clears every page at its first use: a quarter to half of the time of an iteration of
+    radiance fields (docs/log.md). Its setting for the limit does not go higher, so mapping is switched off.
+    """
+    library = _library()
+    if library is None:
+        yield
+        return
+    _set(library, KEPT)
+    try:
+        yield
+    finally:
+        _set(library, USUAL)
+        library.malloc_trim(0)
+
+
+def _library() -> ctypes.CDLL | None:
+    """The C library, if it has these settings."""
+    library = ctypes.CDLL(None) if sys.platform == "linux" else None
+    return library if hasattr(library, "mallopt") and hasattr(library, "malloc_trim") else None
+
+
+def _set(library: ctypes.CDLL, settings: dict[int, int]) -> None:
+    for name, value in settings.items():
+        library.mallopt(name, value)

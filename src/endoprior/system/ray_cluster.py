@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ..core.checks import input_error
-from ..core.extras import install_command
+from ..core.shell import install_command
 from .signals import handled_by
 
 CONNECT_SECONDS = 5.0

@@ -1,8 +1,15 @@
-"""What surrounds the command line: variables and folders with which libraries fail, or read what is not ours."""
+"""What surrounds this program: variables, folders and files with which libraries fail, or read what is not ours."""
 
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from types import CodeType, ModuleType
+from typing import Any
 
 from ..core.checks import input_error
 
@@ -36,3 +43,66 @@ def reject_surroundings() -> None:
     if layer not in THREADING_LAYERS:
         what = f"one of {', '.join(THREADING_LAYERS)}"
         raise input_error("NUMBA_THREADING_LAYER", what, repr(layer), "`unset NUMBA_THREADING_LAYER`.")
+
+
+NAMES = {"numba.core.config": b"'.numba_config.yaml'", "matplotlib": b"yield 'matplotlibrc'"}
+"""Module -> the code in it that names the file in the current folder. An empty name in its place is never found."""
+
+
+class _WithoutFile(SourceFileLoader):
+    def get_code(self, fullname: str) -> CodeType:
+        name = NAMES[fullname]
+        source = self.get_data(self.path).replace(name, name.split(b"'")[0] + b"''")
+        return self.source_to_code(source, self.path)
+
+
+class _Finder(MetaPathFinder):
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if fullname not in NAMES or not (spec := PathFinder.find_spec(fullname, path)):
+            return None
+        if isinstance(spec.loader, SourceFileLoader):
+            spec.loader = _WithoutFile(fullname, spec.loader.path)
+        return spec
+
+
+def ignore_settings_of_current_folder() -> None:
+    """Keep libraries from reading settings in the current folder, which may have come with the data.
+
+    Numba loads pickles from the `cache_dir` of `.numba_config.yaml`, and Matplotlib's `matplotlibrc` can start LaTeX.
+    Both look in the current folder first, and neither has an option against it. This holds for what is imported from
+    now on, and for Numba if it is imported already. Call it as often as needed.
+
+    What Matplotlib has read before stays: then it is the settings of the program that imported it.
+    """
+    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Finder())
+    config: Any = sys.modules.get("numba.core.config")
+    if config and getattr(config, "_config_fname", ""):
+        config._config_fname, config.CACHE_DIR = "", os.environ.get("NUMBA_CACHE_DIR", "")
+
+
+SAFE_PATH = "PYTHONSAFEPATH"
+"""As `-P`, for all Python processes."""
+
+
+def python_command(module: str, *arguments: str) -> list[str]:
+    """The command that runs a module of this program.
+
+    With `-P`, a file in the current folder, which may have come with the data, is not imported in place of a package.
+    """
+    return [sys.executable, "-P", "-m", module, *arguments]
+
+
+@contextmanager
+def without_current_folder() -> Iterator[None]:
+    """Python processes that libraries start in this block do not import files of the current folder either."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        os.environ.pop(SAFE_PATH)
+        if before is not None:
+            os.environ[SAFE_PATH] = before

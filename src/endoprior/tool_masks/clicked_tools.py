@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..data import FrameSequence
 from .examples import Classifier, Examples, clicked_region, examples_of, fit
 from .feature_maps import feature_map

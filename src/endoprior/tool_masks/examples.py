@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.spread import spread
+from ..core.ranges import spread
 from .feature_maps import LOOK
 from .logistic import fit_logistic, probability
 from .regions import disk

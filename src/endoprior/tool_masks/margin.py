@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..data import FrameSequence
 from .color_reach import ColorReach, color_reach
 from .regions import LEAST_SHARE, disk

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..core.types import Frame
 from ..data import FrameSequence
 from ..data.found_tools import FoundTools

@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..core.spread import spread
+from ..core.ranges import spread
 from ..data import FrameSequence
 from ..system.memory import BoundedCache, cache_bytes
 from ..tool_masks import ToolFinder

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-from endoprior.cli.help_page import Help
-from endoprior.cli.parsing import parse
+from endoprior.cli.arguments import Help, parse
 from endoprior.core.checks import input_error
 from endoprior.system.console import say
 
@@ -23,7 +19,7 @@ class BenchMasks:
     the folder that the environment variable ENDOPRIOR_DATA names.
     """
 
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: Path = field(metadata={"place": "OUT"})
     """Folder for networks, phantoms and the report."""
     steps: int = 8000
     """Training steps of each network, of 16 images each."""
@@ -47,7 +43,7 @@ def run(argv: list[str]) -> int:
     if not (root / "vocalfolds").is_dir():
         fix = "ENDOPRIOR_DATA=FOLDER with bowel_lift/, vocalfolds/, mono_endo.mp4 and wild/ (docs/tool_network.md)."
         raise input_error("ENDOPRIOR_DATA", "the folder of the clips", repr(str(root)), f"Set {fix}")
-    from endoprior.cli.output_paths import require_writable_folder
+    from endoprior.cli.paths import require_writable_folder
     from endoprior.system.file_lock import locked
     from endoprior.tool_masks.weights import network_from_file
 

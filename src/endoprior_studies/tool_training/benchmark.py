@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from endoprior.core.spread import spread
+from endoprior.core.ranges import spread
 from endoprior.tool_masks import ToolFinder
 from endoprior.tool_masks.regions import disk
 

@@ -17,7 +17,7 @@ from torch.nn import functional
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from endoprior.system.atomic import whole_file
-from endoprior.system.own_python import without_current_folder
+from endoprior.system.surroundings import without_current_folder
 from endoprior.tool_masks.network import MULTIPLE, ToolNetwork, network_input
 
 from .composites import IGNORED, LabeledFrame, examples

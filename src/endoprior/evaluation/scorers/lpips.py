@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.extras import missing_package
+from ...core.shell import missing_package
 from ..context import NETWORKS_OFF, EvaluationContext
 from ..networks import (
     ALEXNET,

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ...core.checks import input_error
-from ...core.extras import install_command
+from ...core.shell import install_command
 from .adjust import Observations, adjust, back_projected, residuals
 from .colmap import LONGEST, SECONDS_AN_IMAGE, colmap_path, is_installed, stride_of
 from .own import own_path

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.spread import spread
+from ...core.ranges import spread
 from .adjust import INLIER_PX, adjust, back_projected, coarse_pose
 from .features import Keyframe, Link, View, followed, keyframe, link, new_corners, sampled, view_of
 from .tracks import Lens, PoseInput, Tracks

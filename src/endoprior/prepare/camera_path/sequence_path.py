@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...core.checks import input_error, number_ranges
-from ...core.geometry import length_unit
-from ...core.pose_conventions import Convention, to_ours
+from ...core.geometry import Convention, length_unit, to_ours
 from ...data.writer import FARTHEST_UNIT
 from ...footage.camera_motion import camera_motion
 from ...footage.pose_fit import View, measure_poses
