@@ -12,8 +12,8 @@ import torch
 
 from endoprior.core.config import Config
 from endoprior.core.types import Camera, RenderOutput, Splats
-from endoprior.model import motion
-from endoprior.model.hexplane_field import HexPlaneField
+from endoprior.model.hexplane_field import HexPlaneField, HexPlaneMotion
+from endoprior.model.motion import BasisMotion
 from endoprior.model.playback import Playback
 from endoprior.model.presets import preset
 from endoprior.model.scene import Scene
@@ -25,7 +25,7 @@ TIME = 0.4
 TORCH_MOST = 20_000
 """Gaussians; with more, torch takes many seconds."""
 PARTS = {
-    "deformation": [(motion.HexPlaneMotion, "offsets"), (motion.BasisMotion, "offsets")],
+    "deformation": [(HexPlaneMotion, "offsets"), (BasisMotion, "offsets")],
     "projection + SH": [(numba_backend, "project_forward")],
     "binning + sort": [(numba_backend.tiles, "build")],
     "compositing": [(numba_backend, "composite_forward")],

@@ -42,7 +42,7 @@ USUAL_FOCAL = 0.9
 """Focal length of a usual endoscope, image widths: 58 degrees."""
 ITERATION_S, USUAL_PIXELS, FIXED_SHARE = 0.09, 640 * 512, 0.3
 """Seconds of a training iteration with `default` on two cores, start included, at this size of the image, and the share
-that does not depend on it (docs/measurements.md)."""
+that does not depend on it (docs/results.md)."""
 DARK = 0.05
 """Images with a smaller mean, of 1, are nearly black."""
 FAR_SHARE = 1e-3
