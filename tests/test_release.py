@@ -90,7 +90,9 @@ def names(wheel: Path) -> list[str]:
 
 def test_the_wheel_holds_the_whole_package_and_its_documentation(checkout, built, commit):
     found = {name for name in names(next(built.glob("*.whl"))) if ".dist-info/" not in name}
-    package = {path.relative_to(ROOT / "src") for path in (ROOT / "src" / "endoprior").rglob("*") if path.is_file()}
+    sources = ("endoprior", "endoprior_baselines", "endoprior_studies")
+    files = (path for name in sources for path in (ROOT / "src" / name).rglob("*") if path.is_file())
+    package = {path.relative_to(ROOT / "src") for path in files}
     pages = {Path("endoprior") / path.relative_to(ROOT) for path in (ROOT / "docs").rglob("*") if path.is_file()}
     wanted = {path.as_posix() for path in package | pages if not {"__pycache__", "log.md"} & {*path.parts}}
     assert found == wanted | {"endoprior/commit.txt"}

@@ -249,7 +249,7 @@ def is_leftover(file: Path) -> bool:
     """
     import psutil  # os.kill(process, 0), the usual test of POSIX, ends the process on Windows
 
-    owner = re.fullmatch(rf"\..+\.endoprior-{_machine()}-([0-9]+)\.partial(\.[^.]+)?", file.name)
+    owner = re.fullmatch(rf"\..+\.endoprior-{_machine()}-([0-9]+)\.partial(\.[^.]+)?(\.staging)?", file.name)
     return bool(owner) and not file.is_symlink() and not psutil.pid_exists(int(owner[1]))
 
 
