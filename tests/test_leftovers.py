@@ -42,6 +42,8 @@ def test_only_what_a_dead_process_of_this_machine_left_is_removed(tmp_path):
     kept = foreign_files(tmp_path)
     for name in ("checkpoint.safetensors", "v1.2", "config"):
         of_process(tmp_path / name).touch()
+    partial = of_process(tmp_path / "checkpoint.safetensors")
+    partial.with_name(f"{partial.name}.staging").touch()  # of the library that writes tensors
     of_process(tmp_path / "frames").mkdir()
     (of_process(tmp_path / "frames") / "link").symlink_to(tmp_path / ".backup.2023.partial")
     remove_leftovers(tmp_path)
