@@ -17,7 +17,7 @@ from endoprior.core.checks import InputError
 from endoprior.core.config import Config, DataConfig, WindowConfig
 from endoprior.core.types import Camera, Splats
 from endoprior.data import load_sequence
-from endoprior.data.window_plan import Looks, look_through, plan_windows, windows_by_length
+from endoprior.data.window_plan import Looks, look_through, plan_windows
 from endoprior.model.carry import carry, carry_points, centers_then
 from endoprior.model.colors import with_fixed_color
 from endoprior.model.gaussians import create_gaussians
@@ -127,12 +127,6 @@ def test_where_a_sequence_is_cut(cameras, seen, starts):
     assert all(stop == following + RULES.overlap for (_, stop), (following, _) in pairwise(plan))
     assert all(RULES.shortest <= stop - start <= RULES.longest for start, stop in plan)
     assert plan_windows(cameras, seen, replace(RULES, enabled=False)) == [(0, len(cameras))]
-
-
-@pytest.mark.parametrize("num", [4, 39, 40, 41, 76, 100, 400])
-def test_the_number_of_windows_of_a_static_camera_is_known_before(num):
-    plan = plan_windows([camera_at()] * num, looks(num), RULES)
-    assert abs(windows_by_length(num, RULES) - len(plan)) <= 1
 
 
 def test_without_depth_only_turns_pictures_and_length_cut():

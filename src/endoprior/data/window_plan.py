@@ -83,8 +83,3 @@ def plan_windows(cameras: Sequence[Camera], looks: Looks, cfg: WindowConfig) -> 
             starts.append(first)
     stops = [min(start + cfg.overlap, num) for start in starts[1:]] + [num]
     return list(zip(starts, stops, strict=True))
-
-
-def windows_by_length(num_frames: int, cfg: WindowConfig) -> int:
-    """Number of windows where nothing but the length cuts: what a static camera needs."""
-    return max(-(-(num_frames - cfg.overlap) // (cfg.longest - cfg.overlap)), 1)

@@ -11,20 +11,13 @@ import numpy as np
 from ...core.checks import input_error
 from ...core.shell import install_command
 from .adjust import Observations, adjust, back_projected, residuals
-from .colmap import LONGEST, SECONDS_AN_IMAGE, colmap_path, is_installed, stride_of
+from .colmap import LONGEST, colmap_path, is_installed
 from .own import own_path
 from .tracks import DEPTH_STD, CameraPath, Lens, PoseInput, Tracks
 
 How = Literal["best", "own", "colmap"]
 USUAL_PX = 1.0
 """An error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)."""
-
-
-def colmap_seconds(how: How, count: int) -> float:
-    """About how long COLMAP takes to find the path of a clip of `count` frames, s; 0 where it takes no part."""
-    if how == "own" or not is_installed() or (how == "best" and count > LONGEST):
-        return 0.0
-    return SECONDS_AN_IMAGE * len(range(0, count, stride_of(count)))
 
 
 def find_path(
