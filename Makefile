@@ -8,15 +8,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHON TORCH_INDEX
 
-.PHONY: demo test test-all test-faults lint browser bench figures docs clean
+.PHONY: demo test test-all test-faults style lint browser bench figures docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/endoprior demo demo
 	@echo "To type endoprior without its folder: source $(BIN)/activate"
 
 # Two processes, because most of a first run is compiling kernels, which takes one core. Files stay together.
-test: $(VENV)/.test-installed lint browser
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+test: $(VENV)/.test-installed style browser
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --cov --cov-report=
+	@echo "Lines run by the quick tests: $$($(BIN)/python -m coverage report --format=total) % (compiled kernels count as not run)"
 
 # One process: slow tests start processes of their own and watch the clock.
 test-all: test
@@ -26,9 +27,14 @@ test-all: test
 test-faults: $(VENV)/.test-installed
 	$(BIN)/python faults/run.py $(FAULTS)
 
-lint: $(VENV)/.test-installed
-	$(BIN)/ruff check setup.py src tests bench faults docs examples
-	$(BIN)/ruff format --check setup.py src tests bench faults docs examples
+PYTHON_CODE := setup.py src tests bench faults docs examples tools
+
+style: $(VENV)/.test-installed
+	$(BIN)/ruff check $(PYTHON_CODE)
+	$(BIN)/ruff format --check $(PYTHON_CODE)
+
+lint: style
+	$(BIN)/pyright
 
 # The viewer and the player are tested in headless Chromium. Where there is none, Debian's package is installed if that is
 # possible without asking; otherwise those tests are skipped, and say so.

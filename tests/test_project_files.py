@@ -6,6 +6,7 @@ import tomllib
 from importlib import metadata
 from pathlib import Path
 
+import pytest
 import yaml
 from packaging.requirements import Requirement
 
@@ -59,6 +60,27 @@ def test_least_versions_are_safe_ones_and_the_pinned_ones_are_newer():
     for name, specifier in least.items():
         if pin := TOOL["pinned"]().get(name.lower()):
             assert pin[1] in specifier, name
+
+
+def test_the_changelog_has_a_section_for_the_release():
+    notes = runpy.run_path(str(ROOT / "tools" / "release_notes.py"))["notes"]
+    assert notes(f"v{PROJECT['version']}").startswith("### ")
+    with pytest.raises(SystemExit, match="expected the tag v"):
+        notes("v0.0.1")
+
+
+def test_workflows_run_actions_of_one_commit_only():
+    """A tag of an action can be moved to other code, a commit cannot."""
+    files = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+    used = [line for file in files for line in file.read_text().splitlines() if "uses:" in line]
+    assert len(files) == 2 and used
+    for line in used:
+        assert re.search(r"uses: [\w./-]+@[0-9a-f]{40} # v[0-9.]+$", line), line
+
+
+def test_every_yaml_file_of_the_project_can_be_read():
+    hidden = [ROOT / ".pre-commit-config.yaml", *(ROOT / ".github").rglob("*.yml")]
+    assert all(yaml.safe_load(file.read_text()) for file in hidden)
 
 
 def test_opencv_reads_and_writes_no_video():
