@@ -93,13 +93,13 @@ def start_run(
     if note := note_on_budget(cfg):
         say(f"note: {note}")
     _check_reading(sequence, cfg)
-    if cfg.windows.enabled:
+    if cfg.windows.longest:
         cameras = [sequence.camera(i) for i in range(len(sequence))]
         whole = sequence.part(0, len(sequence))  # with a cache of its own, which is freed
-        plan = plan_windows(cameras, look_through(whole), cfg.windows)
+        plan = plan_windows(cameras, look_through(whole), cfg.windows.longest)
         if len(plan) > 1 and not method_of(cfg).has_gaussians:
-            want, got = f"False with method {cfg.method}, which trains one window", f"a plan of {len(plan)} windows"
-            raise input_error("windows.enabled", want, got, "Add --windows.no-enabled.")
+            want, got = f"0 with method {cfg.method}, which trains one window", f"a plan of {len(plan)} windows"
+            raise input_error("windows.longest", want, got, "Add --windows.longest 0.")
         if len(plan) > 1:
             return WindowedRun(sequence, cfg, plan, out, resume=resume, say=say)
     return TrainingRun(sequence, cfg, out, resume=resume, say=say)

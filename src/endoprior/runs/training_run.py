@@ -141,7 +141,7 @@ def window_config(cfg: Config, start: int, stop: int) -> Config:
     return replace(
         cfg,
         data=replace(cfg.data, window=f"{first + start}-{first + stop - 1}"),
-        windows=replace(cfg.windows, enabled=False),
+        windows=replace(cfg.windows, longest=0),
     )
 
 
