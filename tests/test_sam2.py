@@ -20,7 +20,7 @@ from endoprior.prepare.hub_model import FILES
 from endoprior.prepare.masks import WORK
 from endoprior.prepare.record import names_path
 from endoprior.prepare.sam2 import DEFAULT_MODEL, is_sam2, open_sam2
-from endoprior.tool_masks.carry import carry
+from endoprior.tool_masks.video_segmenter import carry
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 # The library's own warnings are not ours to fix.

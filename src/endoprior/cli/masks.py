@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from ..data import FrameSequence
     from ..data.found_tools import FoundTools
-    from ..tool_masks.carry import VideoSegmenter
     from ..tool_masks.sequence import Progress
+    from ..tool_masks.video_segmenter import VideoSegmenter
 
 SHEET = "tool_masks.png"
 SHOWN, COLUMNS = 24, 6

@@ -27,8 +27,8 @@ from .first_pass import Depth, FirstPass, Mask, MeasuredFrame
 from .sam2 import is_sam2
 
 if TYPE_CHECKING:
-    from ..tool_masks.carry import VideoSegmenter
     from ..tool_masks.sequence import Progress
+    from ..tool_masks.video_segmenter import VideoSegmenter
 
 COVERED = 0.5
 """Masks that extend over a smaller share of the frames are those of another clip, or not complete."""

@@ -45,7 +45,7 @@ def run(argv: list[str]) -> int:
         raise input_error("ENDOPRIOR_DATA", "the folder of the clips", repr(str(root)), f"Set {fix}")
     from endoprior.cli.paths import require_writable_folder
     from endoprior.system.file_lock import locked
-    from endoprior.tool_masks.weights import network_from_file
+    from endoprior.tool_masks.network import network_from_file
 
     from .leave_one_out import ALL, Training, rows, weights_file
     from .report import write_report

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from endoprior.system.atomic import whole_file
 from endoprior.tool_masks import ToolFinder
-from endoprior.tool_masks.network import ToolNetwork
-from endoprior.tool_masks.weights import network_from, weights_of
+from endoprior.tool_masks.network import ToolNetwork, network_from, weights_of
 
 from .benchmark import SetScore, TestFrame, score_set
 from .fit import fit
