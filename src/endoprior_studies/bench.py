@@ -45,9 +45,7 @@ class Bench:
     """Train nothing; write the report of the finished cells."""
 
 
-HELP = Help(
-    examples=(("quick", "OUT"), ("sized", "OUT", "--report-only")),
-)
+HELP = Help(("quick OUT", "sized OUT --report-only"))
 
 
 def run(argv: list[str]) -> int:

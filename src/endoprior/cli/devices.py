@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
@@ -69,14 +70,14 @@ def try_backend(backend: Backend, *, compiles: bool = False) -> Trial:
     """
     limit_s = COMPILE_LIMIT_S if compiles else TRIAL_LIMIT_S
     words = python_command("endoprior.render.trial", backend, *["compile"] * compiles)
+    status = None
     with tempfile.TemporaryFile() as output:  # no pipe: what the process starts could keep one open
         process = subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
         )
         try:
-            status = process.wait(limit_s)
-        except subprocess.TimeoutExpired:
-            status = None
+            with suppress(subprocess.TimeoutExpired):
+                status = process.wait(limit_s)
         finally:  # also after Ctrl-C
             _end(process)
         output.seek(0)
@@ -89,17 +90,13 @@ def try_backend(backend: Backend, *, compiles: bool = False) -> Trial:
 
 def _end(process: subprocess.Popen) -> None:
     """End the process and, where that is possible, all that it started; a driver that hangs may keep it."""
-    try:
+    with suppress(OSError):  # all gone
         if os.name == "posix":
             os.killpg(process.pid, signal.SIGKILL)
         else:
             process.kill()
-    except OSError:  # all gone
-        pass
-    try:
+    with suppress(subprocess.TimeoutExpired):
         process.wait(1.0)
-    except subprocess.TimeoutExpired:
-        pass
 
 
 @cache
@@ -122,9 +119,8 @@ def choose(wanted: Wanted) -> Choice:
             failed.append(f"{backend}: {trial.found}")
         problem = "; ".join(failed)
     if wanted == "cuda":
-        raise input_error(
-            "--device cuda", "a GPU that renders", problem, "`endoprior doctor` and docs/gpu.md tell more."
-        )
+        fix = "`endoprior doctor` and docs/gpu.md tell more."
+        raise input_error("--device cuda", "a GPU that renders", problem, fix)
     return Choice("cpu", "numba", f"CPU: {problem}")
 
 
@@ -153,14 +149,13 @@ def with_device(cfg: Config, wanted: Wanted, tell: Callable[[str], None] = say) 
     """
     from ..render import ON_GPU
 
-    named = cfg.render.backend if cfg.render.backend in ON_GPU else None
-    if named:
-        option = f"--render.backend {named}"
+    if cfg.render.backend in ON_GPU:
+        option = f"--render.backend {cfg.render.backend}"
         if wanted == "cpu":
             raise input_error(option, "--device cuda or auto", "cpu", f"Remove --device cpu or {option}.")
         if problem := why_no_gpu():
             raise input_error(option, "a GPU that torch can use", problem, "leave it out for the CPU.")
-        tell(f"CUDA: {named}, as requested")  # which may compile itself first
+        tell(f"CUDA: {cfg.render.backend}, as requested")  # which may compile itself first
         return cfg
     choice = choose(wanted)
     tell(choice.why)

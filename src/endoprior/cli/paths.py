@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.checks import InputError, input_error
-from ..core.shell import command
-from ..data.reading import kind_of
+from ..data.reading import Kind, kind_of
 from ..system.atomic import lies_in, temporary_sibling
 from ..system.console import say
 
@@ -40,53 +39,48 @@ def open_scene(run: Path) -> RenderedScene:
 
 
 def open_gaussians(run: Path) -> Scene:
-    """`open_scene` for what needs Gaussians.
-
-    Raises:
-        InputError: as `open_scene`, or the scene has none.
-    """
-    scene = open_scene(run)
-    reject_without_gaussians(scene, run)
-    return scene
+    """`open_scene` for what needs Gaussians; InputError for a scene without."""
+    return with_gaussians(open_scene(run), run)
 
 
-def reject_without_gaussians(scene: RenderedScene, run: Path) -> None:
-    """Reject a radiance field.
-
-    Raises:
-        InputError: the scene has no Gaussians.
-    """
+def with_gaussians(scene: RenderedScene, run: Path) -> Scene:
+    """The scene of a run; InputError if it is a radiance field."""
     from ..model.scene import Scene
 
     if not isinstance(scene, Scene):
-        fix = f"`{command('render', run)}` makes images and a video of it."
+        fix = "`endoprior render RUN` makes images and a video of it."
         raise input_error(run, "a scene of Gaussians", f"a radiance field ({scene.config.method})", fix)
+    return scene
 
 
-def sequence_of(scene: RenderedScene, run: Path, data: Path | None, without: str) -> FrameSequence | None:
-    """The sequence of a run's scene, with the scene's poses; None, with a note, if it does not exist any more.
+def sequence_of(scene: RenderedScene, run: Path, data: Path | None) -> FrameSequence:
+    """The sequence of a run's scene, with the scene's poses.
 
     Args:
         run: run folder. data: sequence folder that the user names, if any.
-        without: what the note says is missing.
     Raises:
-        InputError: `data` does not fit the run.
+        InputError: it does not exist any more, or does not fit the run.
     """
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
     from ..runs.folder import sequence_of_run
 
+    sequence = load_sequence(data or sequence_of_run(run), scored_data(scene.config.data))
+    if len(sequence) != len(scene.cameras):
+        fix = "`--data FOLDER` with the sequence of the run."
+        raise input_error(sequence.path, f"{len(scene.cameras)} frames", str(len(sequence)), fix)
+    return sequence.with_poses(scene.cameras)
+
+
+def sequence_if_there(scene: RenderedScene, run: Path, data: Path | None, without: str) -> FrameSequence | None:
+    """`sequence_of`; None, with a note of what is missing without it, if the user names none and it cannot be read."""
     try:
-        sequence = load_sequence(data or sequence_of_run(run), scored_data(scene.config.data))
+        return sequence_of(scene, run, data)
     except InputError as error:
         if data:
             raise
         say(f"note: without input frames {without}. {error}")
         return None
-    if len(sequence) != len(scene.cameras):
-        fix = "`--data FOLDER` with the sequence of the run."
-        raise input_error(sequence.path, f"{len(scene.cameras)} frames", str(len(sequence)), fix)
-    return sequence.with_poses(scene.cameras)
 
 
 def require_writable_file(option: str, path: Path, keep: Path) -> None:
@@ -99,10 +93,7 @@ def require_writable_file(option: str, path: Path, keep: Path) -> None:
     Raises:
         InputError: names option and path.
     """
-    kind = kind_of(path)
-    if kind not in ("a file", "nothing"):
-        raise input_error(f"{option} {path}", "the path of a file", kind, "Choose another name.")
-    if kind == "a file" and lies_in(path, keep):
+    if _require(option, path, "a file") == "a file" and lies_in(path, keep):
         raise input_error(f"{option} {path}", f"a path outside of {keep}", "a file in it", "Choose another name.")
     _require_writable(option, path, path.absolute().parent)
 
@@ -115,10 +106,16 @@ def require_new_file(path: Path) -> None:
 
 def require_writable_folder(option: str, path: Path) -> None:
     """Reject a path where no folder can be created or written; see `require_writable_file`."""
-    kind = kind_of(path)
-    if kind not in ("a folder", "nothing"):
-        raise input_error(f"{option} {path}", "the path of a folder", kind, "Choose another name.")
+    _require(option, path, "a folder")
     _require_writable(option, path, path.absolute())
+
+
+def _require(option: str, path: Path, wanted: Kind) -> Kind:
+    """What is at `path`: a `wanted` one or nothing."""
+    kind = kind_of(path)
+    if kind not in (wanted, "nothing"):
+        raise input_error(f"{option} {path}", f"the path of {wanted}", kind, "Choose another name.")
+    return kind
 
 
 def _require_writable(option: str, path: Path, folder: Path) -> None:

@@ -7,7 +7,6 @@ asks for it by name ends with an error.
 from __future__ import annotations
 
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -63,6 +62,7 @@ def installed(kind: str) -> tuple[Plugin, ...]:
     found = [
         Plugin(kind, entry.name, entry.value, entry.dist.name, entry.dist.version)
         for entry in entry_points(group=f"endoprior.{kind}")
+        if entry.dist
     ]
     return tuple(sorted(found, key=lambda plugin: (plugin.name, plugin.package)))
 
@@ -89,7 +89,6 @@ class Registry(Generic[T]):
         """Describe a kind; nothing is imported yet.
 
         Args:
-            kind: see `Plugin.kind`.
             expected: what an entry point must stand for, for messages.
             problem: what is wrong with the object that an entry point stands for; empty if nothing is.
             modules: built-in names that need no entry point.
@@ -109,12 +108,7 @@ class Registry(Generic[T]):
         return (*self.builtin, *(name for name in self._plugins() if name not in self.builtin))
 
     def load(self, name: str) -> T:
-        """The one of that name in `names()`.
-
-        Raises:
-            InputError: it is a plugin that cannot be used; the message names package and object.
-            KeyError: there is none.
-        """
+        """The one of that name in `names()`; InputError for a plugin that cannot be used, KeyError if there is none."""
         if name in self._modules and self._load_module:
             return self._load_module(name)
         return self.loaded(self._plugins()[name])
@@ -133,14 +127,11 @@ class Registry(Generic[T]):
 
     def failure(self, name: str, error: Exception) -> str:
         """What to say of an error inside a plugin: `mae of endoprior-example 0.1 failed: KeyError: 'x' (mae.py:9)`."""
-        return f"{name} of {self.origin(name)} failed: {self._plugins()[name].words_for(error)}"
+        plugin = self._plugins()[name]
+        return f"{name} of {plugin.origin} failed: {plugin.words_for(error)}"
 
     def loaded(self, plugin: Plugin) -> T:
-        """Import a plugin of this kind and check that it is what it promises.
-
-        Raises:
-            InputError: its name is taken, importing it fails, or it is something else.
-        """
+        """Import a plugin; InputError if its name is taken, importing it fails, or it is not what it should be."""
         self._demand_free_name(plugin)
         fix = f"update or uninstall {plugin.package}."
         try:
@@ -169,6 +160,7 @@ class Registry(Generic[T]):
             return
         if plugin.name in (*self.builtin, *self.reserved):
             raise plugin.rejected("a name of its own", "that of a built-in one", f"uninstall {plugin.package}.")
-        if Counter(other.name for other in installed(self.kind))[plugin.name] > 1:
-            packages = ", ".join(other.package for other in installed(self.kind) if other.name == plugin.name)
-            raise plugin.rejected("a name of its own", f"one name in {packages}", "uninstall all but one.")
+        packages = [other.package for other in installed(self.kind) if other.name == plugin.name]
+        if len(packages) > 1:
+            got = f"one name in {', '.join(packages)}"
+            raise plugin.rejected("a name of its own", got, "uninstall all but one.")

@@ -160,7 +160,8 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
     job = ray.job_config.JobConfig()
     job._client_job = True
     try:
-        _reject_silent(address)
+        if named := HOST_AND_PORT.fullmatch(address):  # Ray would wait for minutes, then end the process
+            socket.create_connection((named[1], int(named[2])), CONNECT_SECONDS).close()
         ray.init(
             address=address,
             log_to_driver=False,
@@ -174,8 +175,13 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
         got = "none" if is_silent else " ".join(str(error).split()).rstrip(".") or type(error).__name__
         raise input_error(f"--ray {address}", "a running cluster", got[:200], fix) from error
     cluster = Cluster(ray, say)
+
+    def interrupt(_signum: int, _frame: Any) -> None:
+        cluster.interrupted = True  # what is raised here can be lost inside of Ray
+        raise KeyboardInterrupt
+
     try:
-        with _interrupted_by_signals(cluster):
+        with handled_by(interrupt):  # Ray ends the process on the first signal of a scheduler or closing terminal
             try:
                 yield cluster
             except BaseException:
@@ -183,24 +189,3 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
                 raise
     finally:
         ray.shutdown()
-
-
-def _reject_silent(address: str) -> None:
-    """Raise OSError if the machine of an address does not answer: Ray would wait for minutes, then end the process."""
-    if named := HOST_AND_PORT.fullmatch(address):
-        socket.create_connection((named[1], int(named[2])), CONNECT_SECONDS).close()
-
-
-@contextmanager
-def _interrupted_by_signals(cluster: Cluster) -> Iterator[None]:
-    """Treat the signals of schedulers and closing terminals as Ctrl-C: Ray ends the process on the first.
-
-    What a handler raises can be lost inside of Ray, so `Cluster.interrupted` remembers it.
-    """
-
-    def interrupt(signum: int, frame: Any) -> None:
-        cluster.interrupted = True
-        raise KeyboardInterrupt
-
-    with handled_by(interrupt):
-        yield

@@ -31,7 +31,7 @@ class BenchMasks:
     """Also write the weights of the network that was trained with all sets to this file."""
 
 
-HELP = Help(examples=(("OUT",), ("OUT", "--steps", "500")))
+HELP = Help(("OUT", "OUT --steps 500"))
 
 
 def run(argv: list[str]) -> int:
