@@ -62,9 +62,6 @@ class Option:
     """As it is typed: `--init.budget`; of a positional argument what the usage line calls it: `OUT`."""
     kind: Any
     """Type of a value, without the None that stands for "not given"."""
-    metavar: str
-    """What stands for the value on the help page; empty takes the type."""
-    choices: Sequence[str] | None
     default: Any
     """Its value if it is not given; MISSING if it must be."""
     text: str
@@ -72,6 +69,9 @@ class Option:
     """Dotted name of the part of the config that it belongs to: `init`; empty for the command's own."""
     about: str | None
     """What that part is."""
+    metavar: str | None = None
+    """What stands for the value on the help page; None takes the type."""
+    choices: Sequence[str] | None = None
 
     @property
     def is_positional(self) -> bool:
@@ -155,16 +155,14 @@ def options(cls: type, defaults: Mapping[str, Any], path: str = "", section: str
     kinds, texts = get_type_hints(cls), _texts(cls)
     about = (inspect.getdoc(cls) or "").partition("\n")[0] if section else None
     for each in fields(cls):
-        kind, default, facts = kinds[each.name], _default(each, defaults), each.metadata
-        name = facts.get("name", each.name.replace("_", "-"))
-        dotted = ".".join(filter(None, (section, name)))
+        kind, default, facts = kinds[each.name], _default(each, defaults), dict(each.metadata)
+        dotted = ".".join(filter(None, (section, facts.pop("name", each.name.replace("_", "-")))))
         if is_dataclass(default):
             yield from options(type(default), vars(default), f"{path}{each.name}.", dotted)
             continue
         kind = get_args(kind)[0] if NoneType in get_args(kind) else kind
-        choices = get_args(kind) if get_origin(kind) is Literal else facts.get("choices")
-        typed, metavar, text = facts.get("place", f"--{dotted}"), facts.get("metavar", ""), texts.get(each.name, "")
-        yield Option(path + each.name, typed, kind, metavar, choices, default, text, section, about)
+        name, text = facts.pop("place", f"--{dotted}"), texts.get(each.name, "")
+        yield Option(path + each.name, name, kind, default, text, section, about, **facts)
 
 
 class _Parser(ArgumentParser):
@@ -207,8 +205,8 @@ def _taken(option: Option, name: str) -> dict[str, Any]:
     """The words after a name of an option, for argparse."""
     if option.kind is bool:
         return {"action": "store_false" if name == option.off else "store_true"}
-    if option.choices:
-        return {"choices": option.choices}
+    if option.choices or get_origin(option.kind) is Literal:
+        return {"choices": option.choices or get_args(option.kind)}
     kind, count = option.kind, None
     if get_origin(kind) is tuple:
         kind, *others = get_args(kind)

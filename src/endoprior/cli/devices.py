@@ -63,11 +63,7 @@ def why_no_gpu() -> str:
 
 @cache
 def try_backend(backend: Backend, *, compiles: bool = False) -> Trial:
-    """Render with a backend in a process of its own: it may crash, hang or print anything.
-
-    Args:
-        compiles: let gsplat compile itself first, which takes minutes.
-    """
+    """Render with a backend in a process of its own: it may crash, hang, print anything, and compile gsplat first."""
     limit_s = COMPILE_LIMIT_S if compiles else TRIAL_LIMIT_S
     words = python_command("endoprior.render.trial", backend, *["compile"] * compiles)
     status = None
@@ -103,8 +99,7 @@ def _end(process: subprocess.Popen) -> None:
 def choose(wanted: Wanted) -> Choice:
     """The device and the backend: gsplat where it works and is compiled, else Triton where that works, else the CPU.
 
-    Raises:
-        InputError: "cuda" is wanted and no backend works on it.
+    Raises InputError if "cuda" is wanted and no backend works on it.
     """
     if wanted == "cpu":
         return Choice("cpu", "numba", "CPU: as requested")
@@ -129,8 +124,6 @@ def on_device(scene: RenderedScene, wanted: Wanted, *, fp16_planes: bool = False
 
     Args:
         fp16_planes: on a GPU, store a HexPlane as fp16 (`Scene.to`): for viewing, not for scores.
-    Raises:
-        InputError: CUDA was requested and is not usable.
     """
     choice = choose(wanted)
     if wanted != "cpu":

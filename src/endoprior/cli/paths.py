@@ -22,11 +22,7 @@ def folder_of(run: Path) -> Path:
 
 
 def open_scene(run: Path) -> RenderedScene:
-    """`load_scene` with an error that says what to type if the path is a sequence folder or a video.
-
-    Raises:
-        InputError: there is no scene that can be read.
-    """
+    """`load_scene` with an error that says what to type if the path is a sequence folder or a video."""
     from ..data.load import not_a_run
     from ..model.scene_file import load_scene
 
@@ -54,12 +50,10 @@ def with_gaussians(scene: RenderedScene, run: Path) -> Scene:
 
 
 def sequence_of(scene: RenderedScene, run: Path, data: Path | None) -> FrameSequence:
-    """The sequence of a run's scene, with the scene's poses.
+    """The sequence of a run's scene, with the scene's poses; InputError if it is gone or does not fit the run.
 
     Args:
-        run: run folder. data: sequence folder that the user names, if any.
-    Raises:
-        InputError: it does not exist any more, or does not fit the run.
+        data: sequence folder that the user names, if any.
     """
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
@@ -84,18 +78,10 @@ def sequence_if_there(scene: RenderedScene, run: Path, data: Path | None, withou
 
 
 def require_writable_file(option: str, path: Path, keep: Path) -> None:
-    """Reject a path that cannot be written, and files of the input folder.
-
-    Args:
-        option: the option that names the path.
-        path: the file to write; an existing file is replaced.
-        keep: the input folder, whose files must not change.
-    Raises:
-        InputError: names option and path.
-    """
-    if _require(option, path, "a file") == "a file" and lies_in(path, keep):
+    """Reject the path of an option that cannot be written, and existing files of the input folder `keep`."""
+    _require_writable(option, path, "a file", path.absolute().parent)
+    if path.exists() and lies_in(path, keep):
         raise input_error(f"{option} {path}", f"a path outside of {keep}", "a file in it", "Choose another name.")
-    _require_writable(option, path, path.absolute().parent)
 
 
 def require_new_file(path: Path) -> None:
@@ -105,21 +91,14 @@ def require_new_file(path: Path) -> None:
 
 
 def require_writable_folder(option: str, path: Path) -> None:
-    """Reject a path where no folder can be created or written; see `require_writable_file`."""
-    _require(option, path, "a folder")
-    _require_writable(option, path, path.absolute())
+    """Reject the path of an option where no folder can be created or written."""
+    _require_writable(option, path, "a folder", path.absolute())
 
 
-def _require(option: str, path: Path, wanted: Kind) -> Kind:
-    """What is at `path`: a `wanted` one or nothing."""
-    kind = kind_of(path)
-    if kind not in (wanted, "nothing"):
+def _require_writable(option: str, path: Path, wanted: Kind, folder: Path) -> None:
+    """Reject what is no `wanted` one, and try to write a file in the nearest existing parent of `folder`."""
+    if (kind := kind_of(path)) not in (wanted, "nothing"):
         raise input_error(f"{option} {path}", f"the path of {wanted}", kind, "Choose another name.")
-    return kind
-
-
-def _require_writable(option: str, path: Path, folder: Path) -> None:
-    """Try to write a file in the nearest existing parent folder."""
     while kind_of(folder) == "nothing" and folder != folder.parent:
         folder = folder.parent
     try:

@@ -67,23 +67,11 @@ class Render(Command):
 
     def _reject_two_choices(self) -> None:
         """One option alone says which times are rendered, and one from where: a second one would have no effect."""
-        given = [
-            option
-            for option, value, usual in (
-                ("--camera-path", self.camera_path, None),
-                ("--times", self.times, ()),
-                ("--split", self.split, Render.split),
-                ("--camera", self.camera, Render.camera),
-            )
-            if value != usual
-        ]
-        for first, second in (
-            ("--camera-path", "--times"),
-            ("--camera-path", "--split"),
-            ("--camera-path", "--camera"),
-            ("--times", "--split"),
-        ):
-            if first in given and second in given:
+        names = ("times", "split", "camera") if self.camera_path else ("split",) if self.times else ()
+        first = "--camera-path" if self.camera_path else "--times"
+        for name in names:
+            if getattr(self, name) != getattr(Render, name):
+                second = f"--{name}"
                 raise input_error(second, f"one of {first} and {second}", "both", f"Remove {first} or {second}.")
         if bad := [t for t in self.times if not 0 <= t <= 1]:
             raise input_error("--times", "times in [0, 1]", str(bad[0]), "Correct it; frame i of T is at i / T.")

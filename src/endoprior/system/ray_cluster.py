@@ -11,7 +11,8 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from ..core.checks import input_error
@@ -40,19 +41,13 @@ class Ended:
     """What it raised; or why its process died, too often."""
 
 
-@dataclass(frozen=True)
-class _Call:
-    key: Any
-    remote: Callable[..., Any]
-    arguments: tuple[Any, ...]
-    restarts: int
-
-
 class Cluster:
     """Calls that run on a cluster, as many at a time as it has cores for. See `connected`."""
 
     def __init__(self, ray: Any, say: Callable[[str], None]) -> None:
-        self._ray, self._say, self._running = ray, say, dict[Any, _Call]()
+        self._ray, self._say = ray, say
+        self._running = dict[Any, tuple[Any, Callable[[], Any], int]]()
+        """Key, how to call it again, and how often, by Ray's reference."""
         self.interrupted = False
         """Whether a signal asked to stop."""
 
@@ -90,7 +85,8 @@ class Cluster:
         if on_gpu and not self._ray.cluster_resources().get("GPU"):
             raise input_error("--ray", "a cluster with a GPU", "none", "add `--device cpu`.")
         options = {"num_cpus": cores, "max_retries": 0} | ({"num_gpus": 1} if on_gpu else {})
-        self._submit(_Call(key, self._ray.remote(**options)(function).remote, arguments, restarts))
+        submit = partial(self._ray.remote(**options)(function).remote, *arguments)
+        self._running[submit()] = key, submit, restarts
 
     def next(self) -> Ended:
         """Wait for a call to end. One whose process dies is called again, as often as it may be."""
@@ -101,23 +97,22 @@ class Cluster:
                 if self.interrupted:
                     raise KeyboardInterrupt
                 ended, _ = self._ray.wait(list(self._running), num_returns=1, timeout=SIGNAL_SECONDS)
-            (reference,) = ended
-            call = self._running.pop(reference)
+            key, submit, restarts = self._running.pop(ended[0])
             try:
-                return Ended(call.key, self._ray.get(reference))
+                return Ended(key, self._ray.get(ended[0]))
             except errors.RayTaskError as error:
                 cause = getattr(error, "cause", None)
                 if not isinstance(cause, Exception):
-                    return Ended(call.key, error=error)
+                    return Ended(key, error=error)
                 cause.__cause__ = error  # which tells where it was raised
-                return Ended(call.key, error=cause)
+                return Ended(key, error=cause)
             except errors.RayError as error:
                 lines = [line for line in str(error).splitlines() if line.strip()]
                 reason = lines[0].partition(". ")[0].rstrip(".")[:160] if lines else type(error).__name__
-                if not call.restarts:
-                    return Ended(call.key, error=RuntimeError(f"Ray: {reason}"))
-                self._say(f"{call.key}: its process died and is started again ({reason})")
-                self._submit(replace(call, restarts=call.restarts - 1))
+                if not restarts:
+                    return Ended(key, error=RuntimeError(f"Ray: {reason}"))
+                self._say(f"{key}: its process died and is started again ({reason})")
+                self._running[submit()] = key, submit, restarts - 1
 
     def interrupt(self) -> None:
         """Interrupt every call, like Ctrl-C, and wait until all have saved their state and ended."""
@@ -125,9 +120,6 @@ class Cluster:
             for reference in self._running:
                 self._ray.cancel(reference)
             self._ray.wait(list(self._running), num_returns=len(self._running), timeout=SAVE_SECONDS)
-
-    def _submit(self, call: _Call) -> None:
-        self._running[call.remote(*call.arguments)] = call
 
     def _cores(self) -> list[int]:
         """Cores of each machine that has any."""
