@@ -165,7 +165,9 @@ def options(cls: type, defaults: Mapping[str, Any], path: str = "", section: str
         yield Option(path + each.name, name, kind, default, text, section, about, **facts)
 
 
-class _Parser(ArgumentParser):
+class Parser(ArgumentParser):
+    """A parser whose errors are those of this program."""
+
     def error(self, message: str) -> NoReturn:
         fix = f"`{self.prog} --help-all` lists all options"
         raise InputError(f"{self.prog}: {quotation(message.removeprefix('argument '))}. Fix: {fix}.")
@@ -175,7 +177,7 @@ def _parser(cls: type, command: str, arguments: Sequence[Option], page: Help, ev
     """A parser that takes all arguments, and whose help shows all or the basic ones."""
     places = [each.name if each.default is MISSING else f"[{each.name}]" for each in arguments if each.is_positional]
     rest = ["[options]"] if len(arguments) > len(places) else []
-    parser = _Parser(
+    parser = Parser(
         prog=f"endoprior {command}",
         usage=" ".join([f"endoprior {command}", *places, *rest]),
         description=(inspect.getdoc(cls) or "").replace("%", "%%"),

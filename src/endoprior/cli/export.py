@@ -7,10 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.checks import input_error
+from ..data.reading import kind_of
 from ..export.formats import ExportOptions
 from ..system.console import say
 from .arguments import Command, Help
-from .paths import folder_of, open_gaussians, require_new_file, sequence_if_there
+from .paths import folder_of, open_gaussians, sequence_if_there
 from .progress import Counting
 
 if TYPE_CHECKING:
@@ -52,8 +54,8 @@ class Export(ExportOptions, Command):
 
         given = {each.name: getattr(self, each.name) for each in fields(ExportOptions)}
         scene = open_gaussians(self.run)
-        if not self.overwrite:
-            require_new_file(self.out)
+        if not self.overwrite and kind_of(self.out) == "a file":
+            raise input_error(self.out, "a new file", "one that exists", "Choose another name, or add --overwrite.")
         name = format_name(self.out, ExportOptions(**given))
         chosen = load_format(name)
         if "data" in chosen.options:

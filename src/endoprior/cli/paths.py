@@ -84,12 +84,6 @@ def require_writable_file(option: str, path: Path, keep: Path) -> None:
         raise input_error(f"{option} {path}", f"a path outside of {keep}", "a file in it", "Choose another name.")
 
 
-def require_new_file(path: Path) -> None:
-    """Reject an existing file; the caller has an option --overwrite that permits it."""
-    if kind_of(path) == "a file":
-        raise input_error(path, "a new file", "one that exists", "Choose another name, or add --overwrite.")
-
-
 def require_writable_folder(option: str, path: Path) -> None:
     """Reject the path of an option where no folder can be created or written."""
     _require_writable(option, path, "a folder", path.absolute())

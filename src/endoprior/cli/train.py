@@ -5,7 +5,6 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
@@ -16,7 +15,7 @@ from ..model.presets import preset, preset_names
 from ..runs.folder import config_of_run, read_config, sequence_of_run
 from ..runs.progress import training_progress
 from ..system.console import say
-from .arguments import Command, Help, parse
+from .arguments import Command, Help, Parser, parse
 from .devices import Wanted, with_device
 from .evaluate import Eval, reject_missing_weights
 from .view import live_view
@@ -73,11 +72,12 @@ class Train(Command):
         Raises:
             InputError: as `parse`; no such preset; OUT is missing; or a config or the run to resume cannot be read.
         """
-        named, file = _typed(argv, "--preset"), _typed(argv, "--config")  # now, so that --help shows their values
-        name = named or "default"
-        if name not in preset_names():
-            raise input_error("--preset", f"one of {', '.join(preset_names())}", repr(name), "`--preset default`.")
-        cfg = preset(name) if file is None else read_config(Path(file), preset(name))
+        first = Parser(prog="endoprior train", add_help=False, allow_abbrev=False)  # so that --help shows their values
+        first.add_argument("--preset", choices=preset_names())
+        first.add_argument("--config", type=Path)
+        typed, _ = first.parse_known_args(argv)
+        name, file = typed.preset or "default", typed.config
+        cfg = preset(name) if file is None else read_config(file, preset(name))
         args = parse(cls, argv, "train", cls.page, preset=name, config=cfg)
         if not args.resume:
             if args.out is None:
@@ -85,7 +85,7 @@ class Train(Command):
                 raise input_error("endoprior train", "the run folder to write after DATA", "nothing", fix)
             return args
         data, run = args.data, args.out or args.data
-        if named is None and file is None and (args.out is None or (run / "config.json").is_file()):
+        if typed.preset is None and file is None and (args.out is None or (run / "config.json").is_file()):
             args = parse(cls, argv, "train", cls.page, preset=name, config=config_of_run(run))
         if args.out is None:
             data = sequence_of_run(run, "`endoprior train DATA RUN --resume` with the folder of the sequence.")
@@ -155,11 +155,3 @@ def require_gaussians(cfg: Config, fix: str) -> None:
 
     if not method_of(cfg).has_gaussians:
         raise input_error("--preset", "a method with Gaussians, which all steps need", cfg.method, fix)
-
-
-def _typed(argv: Sequence[str], option: str) -> str | None:
-    """The value of an option in the arguments, the last one if there are several; None without it."""
-    typed = (
-        word.partition("=")[::2] if "=" in word else (word, following) for word, following in pairwise([*argv, ""])
-    )
-    return next((value for name, value in reversed([*typed]) if name == option and value), None)

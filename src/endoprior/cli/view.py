@@ -17,7 +17,6 @@ from .paths import open_gaussians, sequence_if_there, with_gaussians
 
 if TYPE_CHECKING:
     from ..training.trainer import Observer
-    from ..view.server import Viewer
     from ..view.viewable import Viewable
 
 
@@ -42,12 +41,12 @@ class View(Command):
 
     def execute(self) -> None:
         """Serve until interrupted."""
-        viewer_class = import_viewer()
         from ..view.access_control import check_address, is_open
+        from ..view.server import Viewer
 
         check_address(self.host, self.port)
         viewable, out = open_viewable(self.path, self.data, self.device, highlights=self.highlights)
-        viewer = viewer_class(viewable, host=self.host, port=self.port, out=out)
+        viewer = Viewer(viewable, host=self.host, port=self.port, out=out)
         if is_open(self.host):
             say("--host: whoever learns the address below can see and change everything here; nothing is encrypted.")
         say(f"{viewable.title}: {viewer.url}  (Ctrl-C stops)")
@@ -57,27 +56,15 @@ class View(Command):
             say("viewer closed")
 
 
-def import_viewer() -> type[Viewer]:
-    """Import the viewer class; InputError if viser is not installed."""
-    try:
-        from ..view.server import Viewer
-    except ModuleNotFoundError as error:
-        fix = "`pip install -c constraints.txt viser`."
-        raise input_error("the viewer", f"the package {error.name}", "none", fix) from None
-    return Viewer
-
-
 @contextmanager
 def live_view(port: int | None) -> Iterator[Observer]:
-    """Yield an `on_step` callback that shows the scene at 127.0.0.1. It does nothing if `port` is None.
+    """Yield an `on_step` callback that shows the scene at 127.0.0.1; InputError if the port is in use.
 
-    Raises:
-        InputError: viser is not installed, or the port is in use.
+    It does nothing if `port` is None.
     """
     if port is None:
         yield lambda _report, _trainer: None
         return
-    import_viewer()
     from ..view.access_control import check_address
     from ..view.live import LiveView
 

@@ -101,9 +101,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 def whole_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling folder of `path`; rename it to `path` on success, remove it on failure.
 
-    Raises:
-        InputError: `path` is not empty, or the folder cannot be created.
-        CannotWrite: the disk rejects a file.
+    Raises InputError if `path` is not empty or cannot be created, CannotWrite if the disk rejects a file.
     """
     reject_current_folder(path)
     reject_occupied(path)

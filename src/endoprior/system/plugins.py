@@ -25,14 +25,14 @@ OWN_PACKAGE = "endoprior"
 class Plugin:
     """An entry point of an installed package."""
 
-    kind: str
-    """What it is, such as `methods`; the group of its entry point is `endoprior.KIND`."""
-    name: str
-    """What options and specs call it."""
-    target: str
-    """What it stands for, `module` or `module:object`."""
+    entry: EntryPoint
     package: str
     version: str
+
+    @property
+    def name(self) -> str:
+        """What options and specs call it."""
+        return self.entry.name
 
     @property
     def origin(self) -> str:
@@ -41,12 +41,12 @@ class Plugin:
 
     def rejected(self, expected: str, got: str, fix: str) -> InputError:
         """The error for this plugin, on one line."""
-        subject = f"plugin {self.name} of {self.origin} ({self.target})"
+        subject = f"plugin {self.name} of {self.origin} ({self.entry.value})"
         return input_error(subject, expected, " ".join(got.split()), fix)
 
     def words_for(self, error: BaseException) -> str:
         """An error inside this plugin on one line: `KeyError: 'x' (FILE:LINE)`, the last place in its own package."""
-        package = self.target.partition(":")[0].partition(".")[0]
+        package = self.entry.module.partition(".")[0]
         frames = traceback.walk_tb(error.__traceback__)
         own = [(f, line) for f, line in frames if f.f_globals.get("__name__", "").partition(".")[0] == package]
         if isinstance(error, SyntaxError) and error.filename:  # raised before a frame of the file exists
@@ -58,9 +58,9 @@ class Plugin:
 
 @cache
 def installed(kind: str) -> tuple[Plugin, ...]:
-    """The plugins of a kind, by name and package; none is imported."""
+    """The plugins of a kind, such as `methods`: entry points of the group `endoprior.KIND`, none of them imported."""
     found = [
-        Plugin(kind, entry.name, entry.value, entry.dist.name, entry.dist.version)
+        Plugin(entry, entry.dist.name, entry.dist.version)
         for entry in entry_points(group=f"endoprior.{kind}")
         if entry.dist
     ]
@@ -135,7 +135,7 @@ class Registry(Generic[T]):
         self._demand_free_name(plugin)
         fix = f"update or uninstall {plugin.package}."
         try:
-            found = EntryPoint(plugin.name, plugin.target, f"endoprior.{self.kind}").load()
+            found = plugin.entry.load()
             problem = self._problem(found)
         except (Exception, SystemExit) as error:  # code of others: anything can happen
             raise plugin.rejected(self._expected, plugin.words_for(error), fix) from error
