@@ -31,8 +31,8 @@ class Help:
 
     examples: tuple[str, ...] = ()
     """Arguments of example commands."""
-    basics: Mapping[str, str] = field(default_factory=dict)
-    """What options are for -> their names, as they are typed. `--help` shows these; empty shows all options."""
+    basics: str = ""
+    """Names of options, as they are typed. `--help` shows these; empty shows all options."""
     short: Mapping[str, str] = field(default_factory=dict)
     """Short name -> the option it stands for: `--iterations` -> `--schedule.fine-iterations`."""
 
@@ -116,8 +116,6 @@ def parse(cls: type[A], argv: Sequence[str], command: str, page: Help | None = N
     Args:
         page: short names of options, and what `--help` shows.
         defaults: values of fields in place of those of the class.
-    Raises:
-        InputError: an unknown option, a missing argument, or a value of the wrong kind or range.
     """
     page, arguments = page or Help(), list(options(cls, defaults))
     everything = "--help-all" in argv or not page.basics
@@ -146,12 +144,7 @@ def parse(cls: type[A], argv: Sequence[str], command: str, page: Help | None = N
 
 
 def options(cls: type, defaults: Mapping[str, Any], path: str = "", section: str = "") -> Iterator[Option]:
-    """Every argument of the command `cls`, in the order of its fields.
-
-    Args:
-        defaults: values of fields in place of those of the class.
-        path, section: in front of the names of fields and of options.
-    """
+    """Every argument of the command `cls`; `path` and `section` stand in front of the names of fields and options."""
     kinds, texts = get_type_hints(cls), _texts(cls)
     about = (inspect.getdoc(cls) or "").partition("\n")[0] if section else None
     for each in fields(cls):
@@ -186,8 +179,7 @@ def _parser(cls: type, command: str, arguments: Sequence[Option], page: Help, ev
         argument_default=SUPPRESS,
         formatter_class=partial(HelpFormatter, max_help_position=28),
     )
-    basics = {name: title for title, names in page.basics.items() for name in names.split()}
-    groups = {} if everything else {title: parser.add_argument_group(title) for title in page.basics}
+    basics, groups = page.basics.split(), {}
     for each in arguments:
         text = each.help(brief=not (everything or each.is_positional))
         if each.is_positional:
@@ -196,9 +188,9 @@ def _parser(cls: type, command: str, arguments: Sequence[Option], page: Help, ev
             continue
         if everything and each.section not in groups:
             groups[each.section] = parser.add_argument_group(f"{each.section} options".strip(), each.about)
+        group = groups.get(each.section, parser)
         for name in each.names(page):
             shown = name == each.usual_name if everything else name in basics
-            group = groups[each.section if everything else basics[name]] if shown else parser
             group.add_argument(name, dest=each.path, help=text if shown else SUPPRESS, **_taken(each, name))
     return parser
 

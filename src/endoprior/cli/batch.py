@@ -122,11 +122,7 @@ class Line:
 
 
 def read_list(file: Path) -> list[Line]:
-    """The jobs in a list; empty lines and what follows a `#` are skipped.
-
-    Raises:
-        InputError: the file cannot be read, has no job, or two with one name.
-    """
+    """The jobs in a list, at least one, no two with one name; empty lines and what follows a `#` are skipped."""
     fix = "write a line `PATH [OPTIONS]` for each video or sequence folder."
     text, lines = read_text(file, "a list of videos and sequence folders", fix), dict[str, Line]()
     for number, written in enumerate(text.splitlines(), 1):
@@ -150,8 +146,6 @@ def entries_of(file: Path, out: Path, tell: Callable[[str], None]) -> list[Entry
 
     Args:
         tell: takes the device that trains, and the reason.
-    Raises:
-        InputError: the list, or what a line of it names, cannot be used.
     """
     from ..pipeline import Entry
 

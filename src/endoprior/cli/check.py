@@ -28,10 +28,7 @@ class Check(Command):
 
     page = Help(
         examples=("DATA", "DATA --out DATA.png --strict"),
-        basics={
-            "results": "--out --json --strict",
-            "which frames": "--data.first-frames --data.stride --data.shrink --data.format",
-        },
+        basics="--out --json --strict --data.first-frames --data.stride --data.shrink --data.format",
     )
 
     def execute(self) -> None:
@@ -77,7 +74,7 @@ class Prior(Command):
     """Frames to write."""
     config: PriorConfig = field(default_factory=PriorConfig, metadata={"name": ""})
 
-    page = Help(("DATA OUT", "DATA OUT --split test"), {"which frames": "--split"})
+    page = Help(("DATA OUT", "DATA OUT --split test"), "--split")
 
     def execute(self) -> None:
         """Write the maps."""

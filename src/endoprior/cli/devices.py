@@ -99,7 +99,7 @@ def _end(process: subprocess.Popen) -> None:
 def choose(wanted: Wanted) -> Choice:
     """The device and the backend: gsplat where it works and is compiled, else Triton where that works, else the CPU.
 
-    Raises InputError if "cuda" is wanted and no backend works on it.
+    InputError if "cuda" is wanted and no backend works on it.
     """
     if wanted == "cpu":
         return Choice("cpu", "numba", "CPU: as requested")
@@ -133,13 +133,7 @@ def on_device(scene: RenderedScene, wanted: Wanted, *, fp16_planes: bool = False
 
 
 def with_device(cfg: Config, wanted: Wanted, tell: Callable[[str], None] = say) -> Config:
-    """The config with the rendering backend of the chosen device.
-
-    Args:
-        tell: takes the device and the reason, as a line for the user.
-    Raises:
-        InputError: CUDA was requested and is not usable, or the config names a GPU backend and the user the CPU.
-    """
+    """The config with the rendering backend of the chosen device; `tell` takes the device and the reason."""
     from ..render import ON_GPU
 
     if cfg.render.backend in ON_GPU:

@@ -83,15 +83,13 @@ class Eval(Command):
         self.score_run(on_device(scene, self.device), run)
 
     def score_run(self, scene: RenderedScene, run: Path, extra: Mapping[str, float] | None = None) -> None:
-        """Score the `scene` of a run folder, write the two files with these `extra` scores, print a table.
-
-        Depth is scored against measured depth, even where the run's preset trained on filled-in depth.
-        """
+        """Score the `scene` of a run folder, write the two files with these `extra` scores, print a table."""
         from ..data import load_sequence
         from ..evaluation.scoring import evaluate, scored_data
         from ..runs.folder import sequence_of_run
         from ..runs.log import growth_of, mask_facts
 
+        # Depth is scored against measured depth, even where the run's preset trained on filled-in depth.
         sequence = load_sequence(self.data or sequence_of_run(run), scored_data(scene.config.data))
         result = evaluate(scene, sequence, self.split, **self._how())
         growth = growth_of(run)
@@ -178,7 +176,6 @@ def score_table(scores: Mapping[str, float], skipped: Mapping[str, str], relativ
     """The lines of the table, at most 29 and as many as there are reasons for skipped scores.
 
     Args:
-        scores: value by name.
         skipped: reason by name, of scores that could not be computed.
         relative: whether the scale of the depth is unknown, so that lengths are not in mm.
     """
@@ -213,12 +210,7 @@ def _references(score: Score, scores: Mapping[str, float]) -> str:
 
 
 def protocol_table(result: Evaluation, relative: bool = False) -> list[str]:
-    """The lines of the blocks: scores and tags, then what differs and why scores have no value; else nothing.
-
-    Args:
-        result: an evaluation with or without protocols.
-        relative: whether the scale of the depth is unknown, so that lengths are not in mm.
-    """
+    """The lines of the blocks: scores and tags, then what differs and why scores have no value; else nothing."""
     lines: list[str] = []
     ours = {"scores": result.scores, "tags": result.protocol["tags"]}
     scored = [name for name, about in result.protocols.items() if about["tags"]]

@@ -39,11 +39,8 @@ class Export(ExportOptions, Command):
             "RUN for_blender.glb --format animation",
             "RUN player.html",
         ),
-        basics={
-            "what to write": "--format --mesh-format --frame --overwrite",
-            "which times": "--times --split --canonical",
-            "details": "--mesh-method --min-alpha --points",
-        },
+        basics="--format --mesh-format --frame --overwrite --times --split --canonical --mesh-method"
+        " --min-alpha --points",
     )
 
     def execute(self) -> None:

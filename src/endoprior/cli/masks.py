@@ -118,11 +118,7 @@ class Masks(Command):
 def _replacing(
     sequence: FrameSequence, also_shown: Set[int] = frozenset()
 ) -> Iterator[tuple[Callable[..., None], Path, Counting]]:
-    """Yield what takes the mask of a frame, a folder to work in, and the progress; then write masks and sheet.
-
-    Args:
-        also_shown: frames for the sheet besides the usual ones.
-    """
+    """Yield what takes the mask of a frame, a folder to work in, and the progress; then write masks and sheet."""
     from ..data.folder_edits import replace_masks
     from ..tool_masks.mask_store import MaskStore
     from ..visualization.image_tools import mask_sheet, write_png

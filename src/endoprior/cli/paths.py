@@ -50,11 +50,7 @@ def with_gaussians(scene: RenderedScene, run: Path) -> Scene:
 
 
 def sequence_of(scene: RenderedScene, run: Path, data: Path | None) -> FrameSequence:
-    """The sequence of a run's scene, with the scene's poses; InputError if it is gone or does not fit the run.
-
-    Args:
-        data: sequence folder that the user names, if any.
-    """
+    """The sequence of a run's scene, the one that the user names if any, with the scene's poses."""
     from ..data import load_sequence
     from ..evaluation.scoring import scored_data
     from ..runs.folder import sequence_of_run

@@ -22,11 +22,8 @@ class Phantom(Command):
 
     page = Help(
         examples=("DATA", "DATA --frames 16 --width 320 --height 256 --stereo"),
-        basics={
-            "size": "--frames --width --height --stereo",
-            "scene": "--seed --instruments --tissue --camera --breathing-mm --pull-mm --slide-mm --smooth-share "
-            "--noise",
-        },
+        basics="--frames --width --height --stereo --seed --instruments --tissue --camera --breathing-mm"
+        " --pull-mm --slide-mm --smooth-share --noise",
     )
 
     def execute(self) -> None:

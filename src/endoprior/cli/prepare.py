@@ -40,11 +40,7 @@ class Prepare(Command):
             "stereo.mp4 DATA --calibration calib.yaml",
             "video.mp4 DATA --start 10 --end 20 --frames-per-second 10",
         ),
-        basics={
-            "cameras": "--calibration --right",
-            "frames": "--start --end --frames-per-second --max-width",
-            "depth, tools and camera path": "--depth --masks --poses",
-        },
+        basics="--calibration --right --start --end --frames-per-second --max-width --depth --masks --poses",
     )
 
     def execute(self) -> None:

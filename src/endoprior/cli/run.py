@@ -44,12 +44,7 @@ class Run(Command):
 
     page = Help(
         examples=("video.mp4 OUT --preview", "video.mp4 OUT", "stereo.mp4 OUT --calibration calib.yaml"),
-        basics={
-            "how much": "--preview --start --end",
-            "cameras": "--calibration --right",
-            "depth and tools": "--depth --masks",
-            "training": "--preset --device",
-        },
+        basics="--preview --start --end --calibration --right --depth --masks --preset --device",
     )
 
     def execute(self) -> None:
@@ -90,13 +85,7 @@ class Run(Command):
             say("For the whole model, run the same command without --preview and with another OUT.")
 
     def job(self, tell: Callable[[str], None]) -> Job:
-        """The job that the arguments ask for.
-
-        Args:
-            tell: takes the device that trains, and the reason.
-        Raises:
-            InputError: the video cannot be read, or the device not be used.
-        """
+        """The job that the arguments ask for; `tell` takes the device that trains, and the reason."""
         from ..pipeline import make_job
 
         cfg = replace(preset("preview" if self.preview else self.preset), seed=self.seed)

@@ -54,24 +54,14 @@ class Train(Command):
 
     page = Help(
         examples=("DATA RUN", "DATA RUN --iterations 3000 --gaussians 50000", "--resume RUN"),
-        basics={
-            "method": "--preset --config --seed",
-            "what to train on": "--data.first-frames --data.shrink",
-            "how long": "--iterations --resume",
-            "how large": "--gaussians",
-            "where it runs": "--device",
-            "during and after training": "--view --no-networks --weights-dir",
-        },
+        basics="--preset --config --seed --data.first-frames --data.shrink --iterations --resume"
+        " --gaussians --device --view --no-networks --weights-dir",
         short={f"--{short}".replace("_", "-"): f"--{full}".replace("_", "-") for short, full in SHORT_NAMES.items()},
     )
 
     @classmethod
     def from_words(cls, argv: Sequence[str]) -> Self:
-        """The parsed arguments. The config starts from a preset, then a file; a resumed run has that of its folder.
-
-        Raises:
-            InputError: as `parse`; no such preset; OUT is missing; or a config or the run to resume cannot be read.
-        """
+        """The parsed arguments. The config starts from a preset, then a file; a resumed run has that of its folder."""
         first = Parser(prog="endoprior train", add_help=False, allow_abbrev=False)  # so that --help shows their values
         first.add_argument("--preset", choices=preset_names())
         first.add_argument("--config", type=Path)

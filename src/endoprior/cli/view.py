@@ -58,10 +58,7 @@ class View(Command):
 
 @contextmanager
 def live_view(port: int | None) -> Iterator[Observer]:
-    """Yield an `on_step` callback that shows the scene at 127.0.0.1; InputError if the port is in use.
-
-    It does nothing if `port` is None.
-    """
+    """Yield an `on_step` callback that shows the scene at 127.0.0.1; it does nothing if `port` is None."""
     if port is None:
         yield lambda _report, _trainer: None
         return
@@ -82,11 +79,7 @@ def open_viewable(
     """Open the run or sequence at `path`. Also returns the folder for its screenshots: None for a sequence.
 
     Args:
-        data: sequence folder of a run.
-        device: device that renders a run.
-        highlights: False shows a run without them.
-    Raises:
-        InputError: neither a run nor a sequence; or highlights cannot be taken out of it.
+        data, device, highlights: of a run; see `View`.
     """
     from ..data import load_sequence
     from ..view.viewable_sequence import ViewableSequence

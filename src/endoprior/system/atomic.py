@@ -183,12 +183,7 @@ def reject_current_folder(path: Path) -> None:
 
 
 def reject_occupied(path: Path, alternative: str = "", *, ignore: Callable[[Path], bool] = lambda _: False) -> None:
-    """Raise InputError unless `path` does not exist yet or is an empty folder.
-
-    Args:
-        alternative: another possible fix, appended to the message.
-        ignore: says which files may exist.
-    """
+    """Raise InputError, with `alternative` behind its fix, unless `path` is new or a folder of what to `ignore`."""
     try:
         if path.is_dir() and not all(map(ignore, path.iterdir())):
             found = "one with files in it"

@@ -31,14 +31,12 @@ HOST_AND_PORT = re.compile(r"(?:ray://)?\[?([^/\]]+)\]?:(\d+)")
 
 @dataclass(frozen=True)
 class Ended:
-    """How a call ended."""
+    """How a call ended: what the function returned or raised, or why its process died, too often."""
 
     key: Any
     """What `Cluster.start` was given."""
     value: Any = None
-    """What the function returned."""
     error: Exception | None = None
-    """What it raised; or why its process died, too often."""
 
 
 class Cluster:
@@ -77,8 +75,6 @@ class Cluster:
             function: of a module of this program, which every machine has.
             on_gpu: it also needs a GPU of its own.
             restarts: how often it is called again if its process dies.
-        Raises:
-            InputError: no machine has so many cores, or none has a GPU.
         """
         if cores > (most := max(self._cores())):
             raise input_error("--ray", f"a machine with {cores} cores", f"at most {most}", "ask for fewer cores.")
@@ -132,11 +128,6 @@ def connected(address: str, say: Callable[[str], None]) -> Iterator[Cluster]:
     """Connect to a Ray cluster; `local` starts one on this machine, `auto` finds one that runs here.
 
     If the body raises, all calls are interrupted. SIGTERM and SIGHUP count as Ctrl-C.
-
-    Args:
-        say: takes lines for the user.
-    Raises:
-        InputError: Ray is not installed, or the cluster cannot be reached.
     """
     if address == "local" and "ray" not in sys.modules and "RAY_AUTH_MODE" not in os.environ:
         # It listens on all addresses of this machine, and runs what it is sent by whoever has the token.
