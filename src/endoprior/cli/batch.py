@@ -111,50 +111,30 @@ def _tell(outcome: Outcome) -> None:
             say(f"     {line}")
 
 
-@dataclass(frozen=True)
-class Line:
-    """A line of a list: `[NAME =] PATH [OPTIONS]`."""
-
-    number: int
-    name: str
-    path: Path
-    options: tuple[str, ...]
-
-
-def read_list(file: Path) -> list[Line]:
-    """The jobs in a list, at least one, no two with one name; empty lines and what follows a `#` are skipped."""
-    fix = "write a line `PATH [OPTIONS]` for each video or sequence folder."
-    text, lines = read_text(file, "a list of videos and sequence folders", fix), dict[str, Line]()
-    for number, written in enumerate(text.splitlines(), 1):
-        where = f"{file}, line {number}"
-        try:
-            words = _words(written)
-        except ValueError as error:
-            raise input_error(where, "words as in a shell", f"{error}", "correct it.") from None
-        if words:
-            line = _line(where, number, words)
-            if (other := lines.setdefault(line.name, line)) is not line:
-                got = f"{line.name!r} in line {other.number}, too"
-                raise input_error(where, "another name", got, f"`NAME = {line.path}`.")
-    if not lines:
-        raise input_error(file, "a list of videos and sequence folders", "an empty file", fix)
-    return list(lines.values())
-
-
 def entries_of(file: Path, out: Path, tell: Callable[[str], None]) -> list[Entry]:
-    """The jobs in a list, with results in folders of `out`. Nothing is written.
+    """The jobs in a list, with results in folders of `out`; empty lines and what follows a `#` are skipped.
 
     Args:
         tell: takes the device that trains, and the reason.
     """
     from ..pipeline import Entry
 
-    entries = []
-    for line in read_list(file):
+    fix = "write a line `PATH [OPTIONS]` for each video or sequence folder."
+    text, entries, lines = read_text(file, "a list of videos and sequence folders", fix), [], dict[str, int]()
+    for number, written in enumerate(text.splitlines(), 1):
         try:
-            entries.append(Entry(line.name, _job(line, out / line.name, tell)))
-        except InputError as error:
-            raise InputError(f"{file}, line {line.number}: {error}") from None
+            if not (words := _words(written)):
+                continue
+            name, path, options = _parts(words)
+            if other := lines.setdefault(name, number) - number:
+                got = f"{name!r} in line {number + other}, too"
+                raise input_error("NAME", "another one", got, f"`NAME = {path}`.")
+            entries.append(Entry(name, _job(path, out / name, options, tell)))
+        except ValueError as error:
+            problem = f"{error}" if isinstance(error, InputError) else f"expected words as in a shell, got {error}"
+            raise InputError(f"{file}, line {number}: {problem}") from None
+    if not entries:
+        raise input_error(file, "a list of videos and sequence folders", "an empty file", fix)
     return entries
 
 
@@ -165,30 +145,30 @@ def _words(line: str) -> list[str]:
     return [word.strip('"') for word in shlex.split(line, comments=True, posix=False)]
 
 
-def _line(where: str, number: int, words: list[str]) -> Line:
+def _parts(words: list[str]) -> tuple[str, Path, list[str]]:
+    """Name, path and options of a line `[NAME =] PATH [OPTIONS]`."""
     name, rest = (words[0], words[2:]) if words[1:2] == ["="] else (None, words)
     if not rest or rest[0].startswith("-"):
         fix = "write `PATH [OPTIONS]` or `NAME = PATH [OPTIONS]`."
-        raise input_error(where, "a path", rest[0] if rest else "none", fix)
+        raise input_error("PATH", "a video or a folder", rest[0] if rest else "none", fix)
     path = Path(rest[0]).expanduser()
     name = name or (path.name if kind_of(path) == "a folder" else path.stem)
     if not NAME.fullmatch(name):
         want = "a name for a folder: letters, digits, and spaces, dots or dashes"
-        raise input_error(where, want, repr(name), "write `NAME = PATH [OPTIONS]`.")
-    return Line(number, name, path, tuple(rest[1:]))
+        raise input_error("NAME", want, repr(name), "write `NAME = PATH [OPTIONS]`.")
+    return name, path, rest[1:]
 
 
-def _job(line: Line, out: Path, tell: Callable[[str], None]) -> SequenceJob:
-    if kind_of(line.path) == "nothing":
-        raise input_error(line.path, "a video or a sequence folder", "nothing", "correct the path.")
-    for word in line.options:
-        if option_name(word) in NOT_IN_A_LIST:
-            raise input_error(word, "options of what to train", "one of a single training", "remove it.")
-    argv = [str(line.path), str(out), *line.options]
-    if not is_sequence(line.path):
+def _job(path: Path, out: Path, options: list[str], tell: Callable[[str], None]) -> SequenceJob:
+    if kind_of(path) == "nothing":
+        raise input_error(path, "a video or a sequence folder", "nothing", "correct the path.")
+    if single := [word for word in options if option_name(word) in NOT_IN_A_LIST]:
+        raise input_error(single[0], "options of what to train", "one of a single training", "remove it.")
+    argv = [str(path), str(out), *options]
+    if not is_sequence(path):
         return Run.from_words(argv).job(tell)
     from ..pipeline import SequenceJob
 
     train = Train.from_words(argv)
     require_gaussians(train.config, "`train`, `eval` and `render` one after the other.")
-    return SequenceJob(line.path, out, with_device(train.config, train.device, tell))
+    return SequenceJob(path, out, with_device(train.config, train.device, tell))

@@ -44,15 +44,24 @@ class Doctor(Command):
         say(
             f"endoprior {version('endoprior')}, commit {source_commit() or 'unknown'}; documentation: {docs_folder()}\n"
         )
-        for name, found in (*_machine().items(), *_optional_parts().items()):
-            say(f"{name:<10}{found}")
+        free = available_bytes()
+        memory = "unknown memory" if free is None else f"{free / 1e9:.1f} GB free"
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        _row("computer", f"{platform.platform(terse=True)}, {platform.machine()}, {cores} cores, {memory}")
+        _row("Python", platform.python_version())
+        for name in NEEDED:
+            _row(name, _version(name) or "not installed")
+        for part, purpose in OPTIONAL.items():
+            versions = {name: _version(name) for name in packages_of(part)}
+            there = ", ".join(f"{name} {found}" for name, found in versions.items())
+            _row(part, f"{purpose}: {there if all(versions.values()) else install_command(part)}")
         say("")
         works = {"numba": _try("numba")}
         if self.compile:
             say("compiling gsplat; this takes minutes")
             works["gsplat"] = _try("gsplat", compiles=True)
         if problem := why_no_gpu():
-            say(f"GPU       {problem}; everything runs on the CPU")
+            _row("GPU", f"{problem}; everything runs on the CPU")
         else:
             for backend in ("triton", "gsplat"):
                 if backend not in works:
@@ -65,26 +74,8 @@ class Doctor(Command):
         return 0 if all(works.values()) else 1
 
 
-def _machine() -> dict[str, str]:
-    """The computer and what every installation needs."""
-    free = available_bytes()
-    memory = "unknown memory" if free is None else f"{free / 1e9:.1f} GB free"
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "computer": f"{platform.platform(terse=True)}, {platform.machine()}, {cores} cores, {memory}",
-        "Python": platform.python_version(),
-        **{name: _version(name) or "not installed" for name in NEEDED},
-    }
-
-
-def _optional_parts() -> dict[str, str]:
-    """What each optional part is for, and its versions or how to install it."""
-    parts = {}
-    for part, purpose in OPTIONAL.items():
-        versions = {name: _version(name) for name in packages_of(part)}
-        there = ", ".join(f"{name} {found}" for name, found in versions.items())
-        parts[part] = f"{purpose}: {there if all(versions.values()) else install_command(part)}"
-    return parts
+def _row(name: str, found: str) -> None:
+    say(f"{name:<10}{found}")
 
 
 def _version(package: str) -> str:
@@ -97,10 +88,10 @@ def _version(package: str) -> str:
 def _try(backend: Backend, *, compiles: bool = False) -> bool:
     """Try a backend and print what came of it; whether it works."""
     trial = try_backend(backend, compiles=compiles)
-    say(f"{backend:<10}{'works' if trial.works else 'fails'}: {trial.found}")
+    _row(backend, f"{'works' if trial.works else 'fails'}: {trial.found}")
     if not trial.works:
         for line in trial.printed.splitlines()[-12:-1]:
-            say(f"{'':<10}| {line}")
+            _row("", f"| {line}")
     return trial.works
 
 

@@ -73,35 +73,27 @@ def report(error: str) -> None:
     complain(f"endoprior: {error}")
 
 
+@dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Everything of one kind by name: what is built in, and what plugins add."""
+    """Everything of one kind by name: what is built in, and what plugins add. Nothing is imported before it is used."""
 
-    def __init__(
-        self,
-        kind: str,
-        expected: str,
-        problem: Callable[[Any], str],
-        *,
-        modules: tuple[str, ...] = (),
-        load_module: Callable[[str], T] | None = None,
-        reserved: tuple[str, ...] = (),
-    ) -> None:
-        """Describe a kind; nothing is imported yet.
-
-        Args:
-            expected: what an entry point must stand for, for messages.
-            problem: what is wrong with the object that an entry point stands for; empty if nothing is.
-            modules: built-in names that need no entry point.
-            load_module: gives the one of such a name.
-            reserved: names with a meaning of their own, which no plugin can have.
-        """
-        self.kind, self.reserved = kind, reserved
-        self._modules, self._load_module, self._expected, self._problem = modules, load_module, expected, problem
+    kind: str
+    """See `installed`."""
+    expected: str
+    """What an entry point must stand for, for messages."""
+    problem: Callable[[Any], str]
+    """What is wrong with the object that an entry point stands for; empty if nothing is."""
+    modules: tuple[str, ...] = ()
+    """Built-in names that need no entry point."""
+    load_module: Callable[[str], T] | None = None
+    """Gives the one of such a name."""
+    reserved: tuple[str, ...] = ()
+    """Names with a meaning of their own, which no plugin can have."""
 
     @property
     def builtin(self) -> tuple[str, ...]:
         """The names that come with this package."""
-        return (*self._modules, *(plugin.name for plugin in installed(self.kind) if plugin.package == OWN_PACKAGE))
+        return (*self.modules, *(plugin.name for plugin in installed(self.kind) if plugin.package == OWN_PACKAGE))
 
     def names(self) -> tuple[str, ...]:
         """The built-in names, then those of plugins. Plugins whose name is taken are reported and left out."""
@@ -109,8 +101,8 @@ class Registry(Generic[T]):
 
     def load(self, name: str) -> T:
         """The one of that name in `names()`; InputError for a plugin that cannot be used, KeyError if there is none."""
-        if name in self._modules and self._load_module:
-            return self._load_module(name)
+        if name in self.modules and self.load_module:
+            return self.load_module(name)
         return self.loaded(self._plugins()[name])
 
     def usable(self) -> Iterator[tuple[str, T]]:
@@ -136,11 +128,11 @@ class Registry(Generic[T]):
         fix = f"update or uninstall {plugin.package}."
         try:
             found = plugin.entry.load()
-            problem = self._problem(found)
+            problem = self.problem(found)
         except (Exception, SystemExit) as error:  # code of others: anything can happen
-            raise plugin.rejected(self._expected, plugin.words_for(error), fix) from error
+            raise plugin.rejected(self.expected, plugin.words_for(error), fix) from error
         if problem:
-            raise plugin.rejected(self._expected, problem, fix)
+            raise plugin.rejected(self.expected, problem, fix)
         return found
 
     def _plugins(self) -> dict[str, Plugin]:
