@@ -119,9 +119,8 @@ def test_names_are_unique_and_there_are_many():
 
 
 def test_a_sample_of_bad_inputs_is_rejected_in_one_line(samples, tmp_path, monkeypatch, capfd):
-    assert not (wrong := wrong_cases([BY_NAME[name] for name in SAMPLE], samples, tmp_path, monkeypatch, capfd)), (
-        "\n".join(wrong)
-    )
+    wrong = wrong_cases([BY_NAME[name] for name in SAMPLE], samples, tmp_path, monkeypatch, capfd)
+    assert not wrong, "\n".join(wrong)
 
 
 @pytest.mark.slow
