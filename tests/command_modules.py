@@ -7,10 +7,10 @@ from endoprior.cli.arguments import parse
 def parsed(name: str, *words: str) -> object:
     """The arguments of a command, or of `bench masks`; no file that they name is read."""
     if name != "bench":
-        return parse(REGISTRY.load(name), words, name, REGISTRY.load(name).page)
+        return parse(REGISTRY.load(name), words, name)
     from endoprior_studies import bench
     from endoprior_studies.tool_training import bench as masks
 
     if words[:1] == ("masks",):
-        return parse(masks.BenchMasks, words[1:], "bench masks", masks.HELP)
-    return parse(bench.Bench, words, "bench", bench.HELP)
+        return parse(masks.BenchMasks, words[1:], "bench masks")
+    return parse(bench.Bench, words, "bench")

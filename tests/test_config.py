@@ -105,7 +105,7 @@ def test_short_names_are_those_of_the_command_line():
     assert (cfg.schedule.fine_iterations, cfg.init.budget) == (7, 15_000)
     assert preset("default", iterations=7, gaussians=15_000) == cfg
     assert Train.from_words(["--iterations", "7", "--gaussians", "15000", "d", "o"]).config == cfg
-    assert all(f"--{name}".replace("_", "-") in Train.page.short for name in config_io.SHORT_NAMES)
+    assert all(f"--{name}".replace("_", "-") in Train.short for name in config_io.SHORT_NAMES)
 
 
 def test_a_field_goes_before_a_short_name_of_another():

@@ -13,7 +13,7 @@ import re
 import textwrap
 from argparse import SUPPRESS, ArgumentParser, HelpFormatter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from functools import cache, partial
 from itertools import pairwise
 from types import NoneType
@@ -23,29 +23,23 @@ from ..core.checks import InputError, input_error, quotation
 from ..system.console import say
 
 A = TypeVar("A")
-
-
-@dataclass(frozen=True)
-class Help:
-    """What the help page of a command shows besides its options."""
-
-    examples: tuple[str, ...] = ()
-    """Arguments of example commands."""
-    basics: str = ""
-    """Names of options, as they are typed. `--help` shows these; empty shows all options."""
-    short: Mapping[str, str] = field(default_factory=dict)
-    """Short name -> the option it stands for: `--iterations` -> `--schedule.fine-iterations`."""
+C = TypeVar("C", bound="Command")
 
 
 class Command:
-    """A command of this program: a dataclass with its arguments."""
+    """A command: a dataclass whose fields are its arguments, and what its help page shows besides them."""
 
-    page: ClassVar[Help] = Help()
+    examples: ClassVar[tuple[str, ...]] = ()
+    """Arguments of example commands."""
+    basics: ClassVar[str] = ""
+    """Names of options, as they are typed. `--help` shows these; empty shows all options."""
+    short: ClassVar[Mapping[str, str]] = {}
+    """Short name -> the option it stands for: `--iterations` -> `--schedule.fine-iterations`."""
 
     @classmethod
     def from_words(cls, argv: Sequence[str]) -> Self:
         """The command with the arguments that were typed; see `parse`."""
-        return parse(cls, argv, cls.__name__.lower(), cls.page)
+        return parse(cls, argv, cls.__name__.lower())
 
     def execute(self) -> int | None:
         """Do it; returns the exit status, or None for 0."""
@@ -89,9 +83,9 @@ class Option:
         """The name to show: of a flag that is on, the one that switches it off."""
         return self.off if self.default is True else self.name
 
-    def names(self, page: Help) -> list[str]:
+    def names(self, command: type[Command]) -> list[str]:
         """Every name that can be typed."""
-        short = [short for short, name in page.short.items() if name == self.name]
+        short = [short for short, name in command.short.items() if name == self.name]
         return [self.name, *short, *([self.off] if self.kind is bool else [])]
 
     def help(self, brief: bool) -> str:
@@ -110,18 +104,12 @@ def option_name(word: str) -> str:
     return word.partition("=")[0].replace("_", "-")
 
 
-def parse(cls: type[A], argv: Sequence[str], command: str, page: Help | None = None, **defaults: Any) -> A:
-    """Fill the dataclass `cls` from `argv`; `--help` and `--help-all` print a page and exit with status 0.
-
-    Args:
-        page: short names of options, and what `--help` shows.
-        defaults: values of fields in place of those of the class.
-    """
-    page, arguments = page or Help(), list(options(cls, defaults))
-    everything = "--help-all" in argv or not page.basics
-    parser = _parser(cls, command, arguments, page, everything)
+def parse(cls: type[C], argv: Sequence[str], command: str, **defaults: Any) -> C:
+    """Fill `cls` from `argv`, with `defaults`; `--help` and `--help-all` print a page and exit with status 0."""
+    arguments, everything = list(options(cls, defaults)), "--help-all" in argv or not cls.basics
+    parser = _parser(cls, command, arguments, everything)
     if {"-h", "--help", "--help-all"} & set(argv):
-        examples = "".join(f"\n  endoprior {command} {words}".rstrip() for words in page.examples)
+        examples = "".join(f"\n  endoprior {command} {words}".rstrip() for words in cls.examples)
         count = sum(not each.is_positional for each in arguments)
         listed = "" if everything else f"\n\n--help-all lists all {count} options."
         say(parser.format_help().rstrip() + (f"\n\nexamples:{examples}" if examples else "") + listed)
@@ -136,7 +124,7 @@ def parse(cls: type[A], argv: Sequence[str], command: str, page: Help | None = N
     except InputError:
         raise
     except ValueError as error:  # a range check of the config; its message starts with the name of the field
-        paths = {name: f".{each.path}" for each in arguments for name in each.names(page)}
+        paths = {name: f".{each.path}" for each in arguments for name in each.names(cls)}
         at_fault = f".{str(error).partition(' ')[0]}"
         named = [name for name in map(option_name, words) if paths.get(name, "").endswith(at_fault)]
         message = ": ".join([*named[:1], str(error).removesuffix(".")])
@@ -166,7 +154,7 @@ class Parser(ArgumentParser):
         raise InputError(f"{self.prog}: {quotation(message.removeprefix('argument '))}. Fix: {fix}.")
 
 
-def _parser(cls: type, command: str, arguments: Sequence[Option], page: Help, everything: bool) -> ArgumentParser:
+def _parser(cls: type[Command], command: str, arguments: Sequence[Option], everything: bool) -> ArgumentParser:
     """A parser that takes all arguments, and whose help shows all or the basic ones."""
     places = [each.name if each.default is MISSING else f"[{each.name}]" for each in arguments if each.is_positional]
     rest = ["[options]"] if len(arguments) > len(places) else []
@@ -179,7 +167,7 @@ def _parser(cls: type, command: str, arguments: Sequence[Option], page: Help, ev
         argument_default=SUPPRESS,
         formatter_class=partial(HelpFormatter, max_help_position=28),
     )
-    basics, groups = page.basics.split(), {}
+    basics, groups = cls.basics.split(), {}
     for each in arguments:
         text = each.help(brief=not (everything or each.is_positional))
         if each.is_positional:
@@ -189,7 +177,7 @@ def _parser(cls: type, command: str, arguments: Sequence[Option], page: Help, ev
         if everything and each.section not in groups:
             groups[each.section] = parser.add_argument_group(f"{each.section} options".strip(), each.about)
         group = groups.get(each.section, parser)
-        for name in each.names(page):
+        for name in each.names(cls):
             shown = name == each.usual_name if everything else name in basics
             group.add_argument(name, dest=each.path, help=text if shown else SUPPRESS, **_taken(each, name))
     return parser

@@ -16,7 +16,7 @@ from ..core.checks import InputError, input_error
 from ..data.load import is_sequence
 from ..data.reading import kind_of, read_text
 from ..system.console import say
-from .arguments import Command, Help, option_name
+from .arguments import Command, option_name
 from .devices import with_device
 from .paths import require_writable_folder
 from .progress import Counting, step_progress
@@ -51,7 +51,7 @@ class Batch(Command):
     ray: str | None = None
     """Train on a Ray cluster that shares this file system: its address, `auto`, or `local`, which starts one."""
 
-    page = Help(("LIST OUT", "LIST OUT --ray auto"))
+    examples = ("LIST OUT", "LIST OUT --ray auto")
 
     def execute(self) -> int:
         """Do every job of the list and write the table; 1 if one failed."""

@@ -9,7 +9,7 @@ from typing import Literal
 from ..core.checks import InputError, input_error
 from ..core.config import DataConfig, PriorConfig
 from ..system.console import say
-from .arguments import Command, Help
+from .arguments import Command
 
 
 @dataclass
@@ -26,10 +26,8 @@ class Check(Command):
     """Exit with status 2 if there is a problem of severity `error`."""
     data: DataConfig = field(default_factory=DataConfig)
 
-    page = Help(
-        examples=("DATA", "DATA --out DATA.png --strict"),
-        basics="--out --json --strict --data.first-frames --data.stride --data.shrink --data.format",
-    )
+    examples = ("DATA", "DATA --out DATA.png --strict")
+    basics = "--out --json --strict --data.first-frames --data.stride --data.shrink --data.format"
 
     def execute(self) -> None:
         """Measure the sequence, print the report, write the figure."""
@@ -74,7 +72,8 @@ class Prior(Command):
     """Frames to write."""
     config: PriorConfig = field(default_factory=PriorConfig, metadata={"name": ""})
 
-    page = Help(("DATA OUT", "DATA OUT --split test"), "--split")
+    examples = ("DATA OUT", "DATA OUT --split test")
+    basics = "--split"
 
     def execute(self) -> None:
         """Write the maps."""

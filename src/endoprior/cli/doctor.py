@@ -14,7 +14,7 @@ from ..system.console import say
 from ..system.installation import docs_folder, page, source_commit
 from ..system.memory import available_bytes
 from ..system.plugins import OWN_PACKAGE, installed
-from .arguments import Command, Help
+from .arguments import Command
 from .devices import choose, try_backend, why_no_gpu
 
 NEEDED = ("torch", "numba", "numpy")
@@ -37,7 +37,7 @@ class Doctor(Command):
     """Compile gsplat now, which takes minutes, and render with it. Without a GPU, as in a container build, it compiles
     for the architectures in TORCH_CUDA_ARCH_LIST. Exit status 1 if that fails."""
 
-    page = Help(("", "--compile"))
+    examples = ("", "--compile")
 
     def execute(self) -> int:
         """Print the report. Exit status 1 if the CPU cannot render or --compile fails, whatever else is missing."""
@@ -99,7 +99,7 @@ def _try(backend: Backend, *, compiles: bool = False) -> bool:
 class Plugins(Command):
     """List datasets, methods, scores, ...: what is built in, and what other packages add (docs/plugins.md)."""
 
-    page = Help(("",))
+    examples = ("",)
 
     def execute(self) -> None:
         """Import every plugin and print one line for each."""

@@ -13,7 +13,7 @@ from ..evaluation.registry import all_scores
 from ..evaluation.score import GROUPS, Score
 from ..system.console import say
 from ..system.installation import page
-from .arguments import Command, Help
+from .arguments import Command
 from .devices import Wanted, on_device
 from .paths import folder_of, open_scene, require_writable_folder
 
@@ -64,7 +64,7 @@ class Eval(Command):
     device: Wanted = "auto"
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
-    page = Help(("RUN", "RUN --split train", "--pictures FOLDER DATA", "--masks TRUTH DATA"))
+    examples = ("RUN", "RUN --split train", "--pictures FOLDER DATA", "--masks TRUTH DATA")
 
     def execute(self) -> None:
         """Score and print."""

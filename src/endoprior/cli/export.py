@@ -11,7 +11,7 @@ from ..core.checks import input_error
 from ..data.reading import kind_of
 from ..export.formats import ExportOptions
 from ..system.console import say
-from .arguments import Command, Help
+from .arguments import Command
 from .paths import folder_of, open_gaussians, sequence_if_there
 from .progress import Counting
 
@@ -31,17 +31,14 @@ class Export(ExportOptions, Command):
     overwrite: bool = False
     """Replace OUT if it is a file that exists."""
 
-    page = Help(
-        examples=(
-            "RUN tissue.ply --times 0.5",
-            "RUN tissue.obj --times 0.5",
-            "RUN OUT --format mesh --split test",
-            "RUN for_blender.glb --format animation",
-            "RUN player.html",
-        ),
-        basics="--format --mesh-format --frame --overwrite --times --split --canonical --mesh-method"
-        " --min-alpha --points",
+    examples = (
+        "RUN tissue.ply --times 0.5",
+        "RUN tissue.obj --times 0.5",
+        "RUN OUT --format mesh --split test",
+        "RUN for_blender.glb --format animation",
+        "RUN player.html",
     )
+    basics = "--format --mesh-format --frame --overwrite --times --split --canonical --mesh-method --min-alpha --points"
 
     def execute(self) -> None:
         """Export."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from ..core.checks import input_error, number_ranges
 from ..core.ranges import spread
 from ..system.console import say
-from .arguments import Command, Help
+from .arguments import Command
 from .progress import Counting
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Masks(Command):
     """Points on tools that the masks of DATA miss: the frame, from 0, and px of the image. Such tools are found in all
     frames; pixels are only added."""
 
-    page = Help(("DATA", "DATA --refine", "DATA --with sam2", "DATA --tool 12,310,205"))
+    examples = ("DATA", "DATA --refine", "DATA --with sam2", "DATA --tool 12,310,205")
 
     def execute(self) -> None:
         """Find tools and write their masks."""

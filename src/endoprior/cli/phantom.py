@@ -9,7 +9,7 @@ from pathlib import Path
 from ..model.presets import preset, preset_names
 from ..phantom import PhantomConfig
 from ..system.console import say
-from .arguments import Command, Help
+from .arguments import Command
 
 
 @dataclass
@@ -20,10 +20,10 @@ class Phantom(Command):
     """Sequence folder to write; must be new or empty."""
     config: PhantomConfig = field(default_factory=PhantomConfig, metadata={"name": ""})
 
-    page = Help(
-        examples=("DATA", "DATA --frames 16 --width 320 --height 256 --stereo"),
-        basics="--frames --width --height --stereo --seed --instruments --tissue --camera --breathing-mm"
-        " --pull-mm --slide-mm --smooth-share --noise",
+    examples = ("DATA", "DATA --frames 16 --width 320 --height 256 --stereo")
+    basics = (
+        "--frames --width --height --stereo --seed --instruments --tissue --camera --breathing-mm"
+        " --pull-mm --slide-mm --smooth-share --noise"
     )
 
     def execute(self) -> None:
@@ -48,7 +48,7 @@ class Demo(Command):
     seed: int = 0
     """Seed of the phantom and of the training."""
 
-    page = Help(("", "OUT --frames 16"))
+    examples = ("", "OUT --frames 16")
 
     def execute(self) -> None:
         """Write the phantom, train, score, render, and print the results' paths."""

@@ -11,7 +11,7 @@ from ..core.checks import check_range, number_ranges
 from ..core.geometry import Convention
 from ..prepare.config import PrepareConfig
 from ..system.console import say
-from .arguments import Command, Help
+from .arguments import Command
 from .progress import Counting
 
 if TYPE_CHECKING:
@@ -34,14 +34,12 @@ class Prepare(Command):
     """Sequence folder to write; must be new or empty."""
     config: PrepareConfig = field(default_factory=PrepareConfig, metadata={"name": ""})
 
-    page = Help(
-        examples=(
-            "video.mp4 DATA",
-            "stereo.mp4 DATA --calibration calib.yaml",
-            "video.mp4 DATA --start 10 --end 20 --frames-per-second 10",
-        ),
-        basics="--calibration --right --start --end --frames-per-second --max-width --depth --masks --poses",
+    examples = (
+        "video.mp4 DATA",
+        "stereo.mp4 DATA --calibration calib.yaml",
+        "video.mp4 DATA --start 10 --end 20 --frames-per-second 10",
     )
+    basics = "--calibration --right --start --end --frames-per-second --max-width --depth --masks --poses"
 
     def execute(self) -> None:
         """Prepare the sequence."""
@@ -75,7 +73,7 @@ class Poses(Command):
     poses_unit_mm: float = 1.0
     """mm per unit of the positions in the file of --poses: 1000 for m."""
 
-    page = Help(("DATA", "DATA --poses estimate"))
+    examples = ("DATA", "DATA --poses estimate")
 
     def __post_init__(self) -> None:
         check_range("poses_unit_mm", self.poses_unit_mm, 1e-6, 1e6)

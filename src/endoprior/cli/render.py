@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ..core.checks import input_error
 from ..system.console import say
-from .arguments import Command, Help
+from .arguments import Command
 from .devices import Wanted, on_device
 from .paths import folder_of, open_scene, require_writable_folder, sequence_of, with_gaussians
 
@@ -49,15 +49,13 @@ class Render(Command):
     device: Wanted = "auto"
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
-    page = Help(
-        (
-            "RUN",
-            "RUN OUT --split test",
-            "RUN OUT --camera sway",
-            "RUN OUT --layer texture",
-            "RUN OUT --layer support",
-            "RUN OUT --no-highlights",
-        )
+    examples = (
+        "RUN",
+        "RUN OUT --split test",
+        "RUN OUT --camera sway",
+        "RUN OUT --layer texture",
+        "RUN OUT --layer support",
+        "RUN OUT --no-highlights",
     )
 
     def execute(self) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from ..model.presets import preset, preset_names
 from ..prepare.config import PrepareConfig
 from ..system.console import say
-from .arguments import Command, Help
+from .arguments import Command
 from .devices import Wanted, with_device
 from .progress import duration, step_head, step_progress
 from .train import require_gaussians
@@ -42,10 +42,8 @@ class Run(Command):
     """Device that trains; auto uses CUDA only if all of it works (`endoprior doctor`)."""
     config: PrepareConfig = field(default_factory=PrepareConfig, metadata={"name": ""})
 
-    page = Help(
-        examples=("video.mp4 OUT --preview", "video.mp4 OUT", "stereo.mp4 OUT --calibration calib.yaml"),
-        basics="--preview --start --end --calibration --right --depth --masks --preset --device",
-    )
+    examples = ("video.mp4 OUT --preview", "video.mp4 OUT", "stereo.mp4 OUT --calibration calib.yaml")
+    basics = "--preview --start --end --calibration --right --depth --masks --preset --device"
 
     def execute(self) -> None:
         """Do every step, with one progress display."""

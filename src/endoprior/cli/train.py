@@ -6,7 +6,7 @@ import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 from ..core.checks import input_error
 from ..core.config import Config
@@ -15,7 +15,7 @@ from ..model.presets import preset, preset_names
 from ..runs.folder import config_of_run, read_config, sequence_of_run
 from ..runs.progress import training_progress
 from ..system.console import say
-from .arguments import Command, Help, Parser, parse
+from .arguments import Command, Parser, parse
 from .devices import Wanted, with_device
 from .evaluate import Eval, reject_missing_weights
 from .view import live_view
@@ -52,12 +52,14 @@ class Train(Command):
     """Port of --view; 0 uses any free port."""
     config: Config = field(default_factory=Config, metadata={"name": ""})
 
-    page = Help(
-        examples=("DATA RUN", "DATA RUN --iterations 3000 --gaussians 50000", "--resume RUN"),
-        basics="--preset --config --seed --data.first-frames --data.shrink --iterations --resume"
-        " --gaussians --device --view --no-networks --weights-dir",
-        short={f"--{short}".replace("_", "-"): f"--{full}".replace("_", "-") for short, full in SHORT_NAMES.items()},
+    examples = ("DATA RUN", "DATA RUN --iterations 3000 --gaussians 50000", "--resume RUN")
+    basics = (
+        "--preset --config --seed --data.first-frames --data.shrink --iterations --resume"
+        " --gaussians --device --view --no-networks --weights-dir"
     )
+    short: ClassVar = {
+        f"--{short}".replace("_", "-"): f"--{full}".replace("_", "-") for short, full in SHORT_NAMES.items()
+    }
 
     @classmethod
     def from_words(cls, argv: Sequence[str]) -> Self:
@@ -68,7 +70,7 @@ class Train(Command):
         typed, _ = first.parse_known_args(argv)
         name, file = typed.preset or "default", typed.config
         cfg = preset(name) if file is None else read_config(file, preset(name))
-        args = parse(cls, argv, "train", cls.page, preset=name, config=cfg)
+        args = parse(cls, argv, "train", preset=name, config=cfg)
         if not args.resume:
             if args.out is None:
                 fix = "`endoprior train DATA RUN`."
@@ -76,7 +78,7 @@ class Train(Command):
             return args
         data, run = args.data, args.out or args.data
         if typed.preset is None and file is None and (args.out is None or (run / "config.json").is_file()):
-            args = parse(cls, argv, "train", cls.page, preset=name, config=config_of_run(run))
+            args = parse(cls, argv, "train", preset=name, config=config_of_run(run))
         if args.out is None:
             data = sequence_of_run(run, "`endoprior train DATA RUN --resume` with the folder of the sequence.")
         return replace(args, data=data, out=run)

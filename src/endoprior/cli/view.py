@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from ..core.checks import input_error
 from ..system.console import say
-from .arguments import Command, Help
+from .arguments import Command
 from .devices import Wanted, on_device
 from .paths import open_gaussians, sequence_if_there, with_gaussians
 
@@ -37,7 +37,7 @@ class View(Command):
     device: Wanted = "auto"
     """Where to compute. `auto` uses CUDA only if all of it works (`endoprior doctor`)."""
 
-    page = Help(("RUN", "DATA --port 9000"))
+    examples = ("RUN", "DATA --port 9000")
 
     def execute(self) -> None:
         """Serve until interrupted."""
