@@ -77,14 +77,14 @@ def test_a_drive_that_is_gone_is_one_line(tiny_sequence, monkeypatch, capsys, na
     def refuse(path, *words, **options):
         raise OSError(getattr(errno, name), os.strerror(getattr(errno, name)), *([str(path)] if is_named else []))
 
-    monkeypatch.setattr(Path, "iterdir", refuse)
-    assert main(["check", str(tiny_sequence)]) == 2
-    monkeypatch.undo()
-    monkeypatch.setattr(np, "fromfile", refuse)
-    assert main(["check", str(tiny_sequence)]) == 2
-    monkeypatch.undo()
-    monkeypatch.setattr("endoprior.cli.check.Check.execute", lambda check: refuse(check.folder))
-    assert main(["check", str(tiny_sequence)]) == 2
+    for place, change in (
+        ("pathlib.Path.iterdir", refuse),
+        ("numpy.fromfile", refuse),
+        ("endoprior.cli.check.Check.execute", lambda check: refuse(check.folder)),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(place, change)
+            assert main(["check", str(tiny_sequence)]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 3 and all(os.strerror(getattr(errno, name)) in line for line in lines)
 
