@@ -69,11 +69,7 @@ class Batch(Command):
             kernel_cache.fill(entry.job.cfg, say)
         outcomes = []
         with connected(self.ray, say) if self.ray and waiting else nullcontext() as cluster:
-            try:
-                self.out.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                got = error.strerror or str(error)
-                raise input_error(self.out, "a place for a folder", got, "choose another folder.") from None
+            self.out.mkdir(parents=True, exist_ok=True)
             with locked(self.out, self.out / LOCK):
                 try:
                     for outcome in run_on(cluster, entries, say) if cluster else run_here(entries, _shown):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..core.checks import input_error
+from ..data import FrameSequence, load_sequence
 from ..evaluation.protocols.table import KEYS, SCORES, chosen_protocols
 from ..evaluation.registry import all_scores
 from ..evaluation.score import GROUPS, Score
@@ -18,7 +19,6 @@ from .devices import Wanted, on_device
 from .paths import folder_of, open_scene, require_writable_folder
 
 if TYPE_CHECKING:
-    from ..data import FrameSequence
     from ..evaluation.context import Evaluation
     from ..model.scene import RenderedScene
 
@@ -84,7 +84,6 @@ class Eval(Command):
 
     def score_run(self, scene: RenderedScene, run: Path, extra: Mapping[str, float] | None = None) -> None:
         """Score the `scene` of a run folder, write the two files with these `extra` scores, print a table."""
-        from ..data import load_sequence
         from ..evaluation.scoring import evaluate, scored_data
         from ..runs.folder import sequence_of_run
         from ..runs.log import growth_of, mask_facts
@@ -99,7 +98,6 @@ class Eval(Command):
 
     def _score_pictures(self, folder: Path) -> None:
         """Score the rendered frames in `folder` on the sequence that takes the place of the run."""
-        from ..data import load_sequence
         from ..evaluation.pictures import Pictures
         from ..evaluation.scoring import evaluate
 
@@ -119,7 +117,6 @@ class Eval(Command):
 
     def _score_masks(self, folder: Path) -> None:
         """Score the masks of the sequence that takes the place of the run against the true masks in `folder`."""
-        from ..data import load_sequence
         from ..evaluation.true_masks import TrueMasks, score_masks
 
         others = [each.name for each in fields(self) if each.name not in ("run", "out", "masks")]

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.checks import InputError, input_error
+from ..data import FrameSequence, load_sequence
+from ..data.load import not_a_run
 from ..data.reading import Kind, kind_of
 from ..system.atomic import lies_in, temporary_sibling
 from ..system.console import say
 
 if TYPE_CHECKING:
-    from ..data import FrameSequence
     from ..model.scene import RenderedScene, Scene
 
 
@@ -23,7 +24,6 @@ def folder_of(run: Path) -> Path:
 
 def open_scene(run: Path) -> RenderedScene:
     """`load_scene` with an error that says what to type if the path is a sequence folder or a video."""
-    from ..data.load import not_a_run
     from ..model.scene_file import load_scene
 
     try:
@@ -51,7 +51,6 @@ def with_gaussians(scene: RenderedScene, run: Path) -> Scene:
 
 def sequence_of(scene: RenderedScene, run: Path, data: Path | None) -> FrameSequence:
     """The sequence of a run's scene, the one that the user names if any, with the scene's poses."""
-    from ..data import load_sequence
     from ..evaluation.scoring import scored_data
     from ..runs.folder import sequence_of_run
 

@@ -6,6 +6,7 @@ import time as clock
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from ..data import load_sequence
 from ..model.presets import preset, preset_names
 from ..phantom import PhantomConfig
 from ..system.console import say
@@ -52,7 +53,6 @@ class Demo(Command):
 
     def execute(self) -> None:
         """Write the phantom, train, score, render, and print the results' paths."""
-        from ..data import load_sequence
         from ..phantom import write_phantom
         from ..runs.folder import prepare_run_folder
         from ..runs.report import write_report

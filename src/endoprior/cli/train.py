@@ -11,6 +11,8 @@ from typing import ClassVar, Self
 from ..core.checks import input_error
 from ..core.config import Config
 from ..core.config_io import SHORT_NAMES
+from ..data import load_sequence
+from ..model.method import method_of
 from ..model.presets import preset, preset_names
 from ..runs.folder import config_of_run, read_config, sequence_of_run
 from ..runs.progress import training_progress
@@ -85,7 +87,6 @@ class Train(Command):
 
     def execute(self) -> None:
         """Train, score, and print the results."""
-        from ..model.method import method_of
         from ..render import ON_GPU
 
         wanted = self.device
@@ -103,7 +104,6 @@ class Train(Command):
 
     def train_and_score(self, cfg: Config) -> None:
         """Train with this config, write the run folder, score the test split, print the scores."""
-        from ..data import load_sequence
         from ..runs.log import missed_tools_line, read_log
         from ..runs.remote import complete_on
         from ..runs.train import start_run
@@ -143,7 +143,5 @@ class Train(Command):
 
 def require_gaussians(cfg: Config, fix: str) -> None:
     """Reject a method without Gaussians, with this `fix`: the report and the player need them."""
-    from ..model.method import method_of
-
     if not method_of(cfg).has_gaussians:
         raise input_error("--preset", "a method with Gaussians, which all steps need", cfg.method, fix)

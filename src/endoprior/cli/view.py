@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.checks import input_error
+from ..data import load_sequence
 from ..system.console import say
 from .arguments import Command
 from .devices import Wanted, on_device
@@ -81,7 +82,6 @@ def open_viewable(
     Args:
         data, device, highlights: of a run; see `View`.
     """
-    from ..data import load_sequence
     from ..view.viewable_sequence import ViewableSequence
 
     file = path if path.suffix == ".safetensors" else path / "scene.safetensors"
