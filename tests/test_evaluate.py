@@ -126,7 +126,7 @@ def test_demo_leaves_what_it_promises(tmp_path, monkeypatch):
         schedule=replace(quick.schedule, coarse_iterations=0, fine_iterations=10, half_resolution_iterations=0),
     )
     monkeypatch.setattr(package, "write_phantom", small)
-    monkeypatch.setattr("endoprior.cli.demo.preset", lambda name: quick)
+    monkeypatch.setattr("endoprior.cli.phantom.preset", lambda name: quick)
     assert main(["demo", str(tmp_path / "demo"), "--frames", "10"]) == 0
     for part in (
         "report.png",
