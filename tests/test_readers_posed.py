@@ -146,9 +146,9 @@ def test_colmap_with_distortion(tmp_path):
 def test_the_lens_of_larger_images_is_scaled(nerfstudio):
     edit_json(nerfstudio / "transforms.json", w=192, h=160, fl_x=200, fl_y=208, cx=91, cy=84.5)
     assert_lands(nerfstudio)
-    assert remark_with(nerfstudio, "fx 200 px is scaled to 100 px for 96x80")
+    assert remark_with(nerfstudio, "200 px, is for 192x160 px; scaled to 100 px for 96x80")
     edit_json(nerfstudio / "transforms.json", w=192, h=150)
-    assert_rejected(nerfstudio, "transforms.json", "images of 192x150 px, or of that shape, got 96x80")
+    assert_rejected(nerfstudio, "transforms.json", "the size of the images, 96x80 px, or that shape, got 192x150")
 
 
 def test_the_angle_of_blender_is_a_focal_length(nerfstudio):

@@ -21,10 +21,8 @@ CONTAINERS = (
     "yuv4mpegpipe,mjpeg,apng,vvc,cine,h263,dnxhd"
 )
 """FFmpeg formats that hold images themselves. Playlists are excluded: they name other files and addresses."""
-STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-"""Images that `prepare` reads from a folder."""
-PLAYLISTS = (b"#EXTM3U", b"ffconcat", b"<MPD", b"<smil", b"[playlist]")
-"""What stands in the first bytes of playlists."""
+STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # of images that `prepare` reads from a folder
+PLAYLISTS = (b"#EXTM3U", b"ffconcat", b"<MPD", b"<smil", b"[playlist]")  # in the first bytes of playlists
 HEADS = {
     "flv": rb"FLV\x01[\x01\x04\x05]\x00\x00\x00\x09",
     "asf": rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11\xa6\xd9\x00\xaa\x00\x62\xce\x6c",
@@ -53,12 +51,12 @@ def is_video(path: Path) -> bool:
     """Whether an existing file has the suffix of a video, or FFmpeg finds images in it."""
     if path.suffix.lower() in VIDEO_SUFFIXES or is_animated_webp(path):
         return True
-    import av
+    from av.error import FFmpegError
 
     try:
         with open_container(path) as container:
             return bool(container.streams.video)
-    except (av.error.FFmpegError, OSError, UnicodeError):
+    except (FFmpegError, OSError, UnicodeError):
         return False
 
 
@@ -66,6 +64,23 @@ def is_animated_webp(path: Path) -> bool:
     """Whether a file is a WebP animation, which FFmpeg does not read."""
     head = _head(path)
     return head[:4] == b"RIFF" and head[8:16] == b"WEBPVP8X" and bool(head[20] & 2)
+
+
+def what_it_is(path: Path) -> str:
+    """What a file is that FFmpeg takes for no video of `CONTAINERS`, in words; empty if unknown."""
+    head = _head(path)
+    if any(mark in head for mark in PLAYLISTS):
+        return "a playlist, which only names other files"
+    return "one image" if head.startswith(STILLS) else ""
+
+
+def _head(path: Path) -> bytes:
+    """The first bytes of a file, at least 32 of them; zeros for what is not there."""
+    try:
+        with path.open("rb") as file:
+            return file.read(512).ljust(32, b"\0")
+    except OSError:
+        return bytes(32)
 
 
 def starts_of_parts(path: Path, name: str) -> list[int]:
@@ -96,20 +111,3 @@ def _starts_of_mp4(path: Path) -> list[int]:
                 break
             at += length
     return starts
-
-
-def what_it_is(path: Path) -> str:
-    """What a file is that FFmpeg takes for no video of `CONTAINERS`, in words; empty if unknown."""
-    head = _head(path)
-    if any(mark in head for mark in PLAYLISTS):
-        return "a playlist, which only names other files"
-    return "one image" if head.startswith(STILLS) else ""
-
-
-def _head(path: Path) -> bytes:
-    """The first bytes of a file, at least 32 of them; zeros for what is not there."""
-    try:
-        with path.open("rb") as file:
-            return file.read(512).ljust(32, b"\0")
-    except OSError:
-        return bytes(32)
