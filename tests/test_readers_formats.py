@@ -86,12 +86,6 @@ def test_missing_folder_and_file(tmp_path):
     assert_rejected(touch(tmp_path, "a.mp4") / "a.mp4", "a.mp4", "got a video. Fix: `endoprior prepare")
 
 
-def test_ranges_of_the_options():
-    for wrong in ({"stride": -1}, {"depth_unit_mm": -0.1}, {"depth_unit_mm": float("nan")}):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            DataConfig(**wrong)
-
-
 def test_pose_axes_belong_to_the_endonerf_layout(tmp_path):
     touch(tmp_path, *LOOKS["c3vd"])
     with pytest.raises(ValueError, match="pose_axes must be opencv for the c3vd layout"):
@@ -105,12 +99,6 @@ def test_endonerf_stride_and_unit(tiny_sequence):
     np.testing.assert_array_equal(part.frame(2).rgb_u8, whole.frame(10).rgb_u8)
     np.testing.assert_allclose(part.frame(2).depth, 2 * whole.frame(10).depth, rtol=1e-6)
     assert part.frame(2).time == 0.5 and part.fingerprint() != whole.fingerprint()
-
-
-def test_stride_leaves_truth_out(tiny_sequence):
-    (tiny_sequence / "truth").mkdir()
-    assert load_sequence(tiny_sequence).truth is not None
-    assert load_sequence(tiny_sequence, DataConfig(stride=2)).truth is None
 
 
 def test_origins_of_an_endonerf_folder(tiny_sequence):
