@@ -25,9 +25,7 @@ LEAST_FOCAL_PX, MOST_PX = 1e-2, 1e6  # of focal lengths; the upper one also of p
 def kept_frames(count: int, cfg: DataConfig, own_stride: int = 1, having: Sequence[Container[int]] = ()) -> list[int]:
     """Positions of the frames to read in a folder of `count`, by stride, then first frames, then skipped frames.
 
-    Args:
-        own_stride: the dataset's published stride, used where `cfg.stride` is 0.
-        having: frames that are not in all of these, such as those with a mask, are left out.
+    Without a stride the dataset's published one counts. Frames that are not in all of `having` are left out.
     """
     kept = range(0, count, cfg.stride or own_stride)
     kept = kept[: cfg.first_frames] if cfg.first_frames else kept

@@ -29,22 +29,6 @@ SIZE_NOT_STATED = "calibration, the size of its images not stated"
 """Source of a lens whose calibration file has no image size: the principal point decided."""
 FORMAT_VERSION = 1  # newest `format_version` this program can read; a file without one is of version 1
 CORRECT = "correct it or remove it."
-POSITIVE = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")
-KEYS: dict[str, tuple[str, Callable[[Any], bool], str]] = {
-    "depth_unit": ("mm", lambda unit: unit == "mm", "give mm, and mm per stored unit as depth_scale."),
-    "mask_tool_value": ("255 or 0", lambda value: value in (0, 255), "give the one that marks tools."),
-    "depth_relative": ("true or false", lambda value: isinstance(value, bool), CORRECT),
-    "sources": ("to map names to texts", lambda value: _is_all(value, dict, str), CORRECT),
-    "unexplained_frames": ("to be a list of frame numbers", lambda value: _is_all(value, list, int), CORRECT),
-    "format_version": (
-        f"1 to {FORMAT_VERSION}",
-        lambda value: type(value) is int and 1 <= value <= FORMAT_VERSION,
-        "update endoprior, or prepare the folder again.",
-    ),
-}
-"""Other keys: what is expected, whether a value is that, and the fix."""
-RECORD = "prepare.json"
-STEPS, NEAR_PX = 40, 0.5  # to find a source point in the frame, and how near they end, px, unless it lies outside
 
 
 def is_number(value: Any) -> bool:
@@ -57,17 +41,33 @@ def _is_all(value: Any, kind: type, of: type) -> bool:
     return type(value) is kind and all(type(each) is of for each in (value.values() if kind is dict else value))
 
 
+NUMBERS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", "frames_per_second")
+KEYS: dict[str, tuple[str, Callable[[Any], bool], str]] = {
+    **dict.fromkeys(NUMBERS, (f"to be a number in [{LEAST:g}, {MOST:g}]", is_number, CORRECT)),
+    "depth_unit": ("mm", lambda unit: unit == "mm", "give mm, and mm per stored unit as depth_scale."),
+    "mask_tool_value": ("255 or 0", lambda value: value in (0, 255), "give the one that marks tools."),
+    "depth_relative": ("true or false", lambda value: isinstance(value, bool), CORRECT),
+    "sources": ("to map names to texts", lambda value: _is_all(value, dict, str), CORRECT),
+    "unexplained_frames": ("to be a list of frame numbers", lambda value: _is_all(value, list, int), CORRECT),
+    "format_version": (
+        f"1 to {FORMAT_VERSION}",
+        lambda value: type(value) is int and 1 <= value <= FORMAT_VERSION,
+        "update endoprior, or prepare the folder again.",
+    ),
+}
+"""What is expected of each key, whether a value is that, and the fix."""
+RECORD = "prepare.json"
+STEPS, NEAR_PX = 40, 0.5  # to find a source point in the frame, and how near they end, px, unless it lies outside
+
+
 def read_description(path: Path) -> dict[str, Any]:
     """The checked contents of `sequence.json`, or an empty dict when there is none. Unknown keys are kept."""
     if not path.exists():
         return {}
     described = {key: value for key, value in read_json(path).items() if value is not None}
-    for key in POSITIVE:
-        if not is_number(value := described.get(key, 1)):
-            raise input_error(path, f"{key} to be a number in [{LEAST:g}, {MOST:g}]", repr(value)[:60], CORRECT)
     for key, (want, is_right, hint) in KEYS.items():
         if key in described and not is_right(described[key]):
-            raise input_error(path, f"{key} {want}", repr(described[key]), hint)
+            raise input_error(path, f"{key} {want}", repr(described[key])[:60], hint)
     return described
 
 

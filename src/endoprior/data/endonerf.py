@@ -66,7 +66,7 @@ def load_endonerf(
     def column(name: str, kind: Kind, suffixes: tuple[str, ...], required: bool, missing: str) -> dict[int, Path]:
         """The file of each image in a folder."""
         if required or (path / name).is_dir():
-            return files_of_images(path / name, list_files(path / name, suffixes, layout), kind, images, remarks)
+            return files_of_images(path / name, suffixes, layout, kind, images, remarks)
         remarks.append(f"{path / name}: missing{missing}")
         return {}
 

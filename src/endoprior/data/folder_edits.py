@@ -52,10 +52,7 @@ def _keep_first(file: Path, original: Path) -> bool:
 
 
 def writable_masks(sequence: FrameSequence) -> list[Path]:
-    """The PNG of each frame's mask; they need not exist yet. Called before long work, too.
-
-    InputError if the layout does not read masks from files of the frames' size, or the folder is read-only.
-    """
+    """The PNG of each frame's mask; they need not exist yet. InputError if none would be read, or it is read-only."""
     files = sequence.mask_files or sequence.new_mask_files
     if not files:
         fix = "Convert it to a sequence folder, or make a video of it for `endoprior prepare`."
@@ -81,12 +78,7 @@ def note_found_masks(folder: Path, with_tools: float, followed_by: str = "") -> 
 
 
 def found_source(with_tools: float, followed_by: str = "") -> str:
-    """The source of masks that a program found.
-
-    Args:
-        with_tools: share of the frames in which it found tools, 0..1.
-        followed_by: the segmenter that followed them through the video, if any.
-    """
+    """The source of masks that a program found in a share of the frames, 0..1, and another followed, if any."""
     found = f"{TOOLS_FOUND} in {with_tools:.0%} of the frames" if with_tools else f"no {TOOLS_FOUND}"
     return f"{found}, followed by {followed_by}" if followed_by else found
 
@@ -96,10 +88,7 @@ def pose_table(
 ) -> NDArray[np.float64]:
     """(T, 17) rows of `poses_bounds.npy`: 3x5 [R | t | (height, width, focal)], row-major, then near and far.
 
-    Args:
-        camera_to_world: (T, 4, 4) mm, OpenCV axes.
-        focal: px.
-        bounds: (T, 2) nearest and farthest depth, mm.
+    `camera_to_world` is (T, 4, 4) in mm, with OpenCV axes; `bounds` (T, 2) the nearest and farthest depth, mm.
     """
     count = len(camera_to_world)
     size = np.broadcast_to([[height], [width], [focal]], (count, 3, 1))
@@ -120,14 +109,9 @@ def demand_writable(folder: Path) -> None:
 
 
 def replace_poses(folder: Path, table: NDArray[np.float64], described: dict[str, Any], *, ours: bool) -> Path | None:
-    """Write poses and the description of a sequence folder, each atomically.
+    """Write poses, as `pose_table` has them, and the description of a sequence folder, each atomically.
 
-    Args:
-        table: (T, 17), as `pose_table` has it.
-        described: contents of `sequence.json`.
-        ours: the poses there were estimated by this program; others are kept in `poses_bounds_before.npy`.
-    Returns:
-        The file of the old poses, if it was kept.
+    Old poses are kept in `poses_bounds_before.npy`, which is returned, unless they are `ours`: of this program.
     """
     poses, kept = folder / POSES, folder / BACKUP
     was_kept = not ours and _keep_first(poses, kept)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..core.checks import input_error
-from .files import DEPTH_WORDS, MASK_WORDS, OTHER_WORDS, bare, files_with, numbers_of, pattern_of, words_of
+from .files import DEPTH_WORDS, MASK_WORDS, OTHER_WORDS, bare, files_with, list_files, numbers_of, pattern_of, words_of
 
 Kind = Literal["images", "masks", "depth"]
 HINT = "Add the missing files, or name each file by its frame number."
@@ -48,11 +48,7 @@ class Series:
 
 
 def one_per_frame(folder: Path, files: Sequence[Path], kind: Kind) -> tuple[list[Path], str]:
-    """The files of one kind, in the same order, where a folder has several files of a frame; all others stay.
-
-    Returns:
-        The files, and a note on those left out, empty if there are none.
-    """
+    """The files of one kind where a folder has several of a frame, else all; and a note on those left out, or none."""
     found: dict[str, list[Path]] = {}
     for file in files:
         found.setdefault(pattern_of(file.stem) + file.suffix.lower(), []).append(file)
@@ -107,16 +103,13 @@ def match_files(
 
 
 def files_of_images(
-    folder: Path, files: Sequence[Path], kind: Kind, images: Sequence[Path], remarks: list[str]
+    folder: Path, suffixes: tuple[str, ...], layout: str, kind: Kind, images: Sequence[Path], remarks: list[str]
 ) -> dict[int, Path]:
-    """The file of each image that has one, by position of the image.
+    """The file of each image that has one in the folder, by position of the image; arguments as `list_files`.
 
-    Args:
-        folder: of the files, for messages.
-        files: in natural order; those of another kind are left out.
-        remarks: gets where order decides, and the numbers of images without a file and of files without an image.
+    `remarks` gets where order decides, and the numbers of images without a file and of files without an image.
     """
-    files, note = one_per_frame(folder, files, kind)
+    files, note = one_per_frame(folder, list_files(folder, suffixes, layout), kind)
     names = [image.stem for image in images]
     matched = match_names(folder, [file.name for file in files], range(len(images)), names, required=())
     remarks += [note] if note else []

@@ -49,9 +49,7 @@ def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
     images = list_files(path / image_folder, kinds, layout)
     kinds_of: list[tuple[str, Kind]] = [(depth_folder, "depth"), (mask_folder, "masks")]
     columns = [
-        files_of_images(path / folder, list_files(path / folder, (".png",), layout), kind, images, remarks)
-        for folder, kind in kinds_of
-        if folder
+        files_of_images(path / folder, (".png",), layout, kind, images, remarks) for folder, kind in kinds_of if folder
     ]
     height, width = read_color(images[0]).shape[:2]
     size, crop = (width, height), 0

@@ -138,11 +138,7 @@ def read_color(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
 
 
 def read_tool_mask(path: Path, tool_value: int = 255, size: Size | None = None) -> NDArray[np.bool_]:
-    """(H, W) True on tools, of an 8-bit image with values 0 and 255 only, gray or with equal channels.
-
-    Args:
-        tool_value: 255, or 0 where the file marks tissue instead of tools.
-    """
+    """(H, W) True on tools, of an 8-bit image with values 0 and 255 only, one of which is that of tools."""
     pixels = single_channel(path, decode_image(path, size))
     if pixels.dtype != np.uint8:
         raise input_error(path, "an 8-bit mask", describe_pixels(pixels), "save it with values 0 and 255.")
@@ -264,13 +260,9 @@ def save_png(path: Path, pixels: NDArray, compression: int = 1) -> None:
 
 
 def encode_png(pixels: NDArray, compression: int = 1) -> bytes:
-    """The bytes of a PNG file.
+    """The bytes of a PNG file of (H, W) 8- or 16-bit pixels, or (H, W, 3) 8-bit red, green, blue.
 
-    Args:
-        pixels: (H, W) 8- or 16-bit, or (H, W, 3) 8-bit red, green, blue.
-        compression: 0 to 9.
-    Raises:
-        MemoryError: the encoder stopped; libpng has no other reason with pixels of these types.
+    MemoryError if the encoder stopped: libpng has no other reason with pixels of these types.
     """
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below replaces its messages
     stored = np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels

@@ -66,14 +66,13 @@ class Tally:
     """How often a pixel of that number has both a smaller and a larger neighbor, as on a smoothed outline."""
     fractions: bool = False  # whether other numbers occur
     lowest: float = np.inf
-    highest: float = -np.inf
     lossy: bool = False  # whether a file is compressed with errors
 
     def add(self, values: NDArray, lossy: bool) -> None:
         """Count the numbers (H, W) of a file, bool or finite."""
         self.lossy |= lossy
         if values.size:
-            self.lowest, self.highest = min(self.lowest, values.min()), max(self.highest, values.max())
+            self.lowest = min(self.lowest, float(values.min()))
         if values.dtype.kind == "f":
             if (values != np.round(values)).any():
                 self.fractions = True
@@ -141,9 +140,7 @@ def names(numbers: Iterable[int], most: int = 12) -> str:
 def asked_labels(subject: Path, asked: str, labels: Mapping[str, Label], known: str, example: str) -> list[Label]:
     """The labels that the user names, separated by commas, without regard to case and leading zeros: 001 is 1.
 
-    Args:
-        subject, known, example: file or folder of the labels, what they are, and one of them, for messages.
-        labels: by name.
+    `subject`, `known` and `example` are the place of the labels, all of them, and one of them, for messages.
     """
 
     def plain(text: str) -> str:
@@ -200,11 +197,9 @@ def demand_size(subject: Path | str, got: Size, size: Size) -> None:
 
 
 def rule_of_files(files: Sequence[Path], asked: str = "") -> HighValues:
-    """Which values are high in the masks of a folder. All files are decoded.
+    """Which values are high in the masks of a clip. All are decoded: a label that occurs in a single frame counts.
 
-    Args:
-        files: of one clip; a label that occurs in a single frame counts.
-        asked: labels that are high, separated by commas: numbers, or colors such as `#ff5500`; empty for all above 0.
+    `asked` names labels that are high, separated by commas: numbers, or colors such as `#ff5500`; empty: all above 0.
     """
     tally, odd = Tally(), None
     for file in files:
@@ -236,12 +231,7 @@ def tool_polarity(
 ) -> Polarity:
     """Which value marks tools: the given one, else the detected one, else high values by convention.
 
-    Args:
-        tool_value: `high`, `low`, or `auto` to detect it.
-        highs: (H, W) each, from `read_user_mask`.
-        images: (H, W, 3) each, 0..255, the frames of these masks; a dozen are enough.
-    Returns:
-        The polarity; its `reason` is a line to show to the user.
+    `highs` are of `read_user_mask`, `images` the frames of these masks; a dozen are enough. The `reason` is for users.
     """
     if tool_value != "auto":
         return Polarity(tool_value == "high", 1.0, f"{tool_value} values mark tools (--mask-tool-value)")

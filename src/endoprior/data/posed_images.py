@@ -14,8 +14,8 @@ from ..core.config import DataConfig
 from ..core.shell import command
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .files import in_order, list_files
-from .frame_files import Kind, files_of_images
+from .files import in_order
+from .frame_files import files_of_images
 from .images import DEPTH_SUFFIXES, read_color, read_depth_file, read_tool_mask
 from .lens import Lens, Undistorter
 from .poses import demand_rotations, scale_of
@@ -134,7 +134,7 @@ def _masks(path: Path, posed: Sequence[PosedImage], remarks: list[str]) -> tuple
     # COLMAP's own masks are called like the image, with .png behind its suffix, and 0 is not used.
     if all((folder / f"{each.file.name}.png").is_file() for each in posed):
         return {i: folder / f"{each.file.name}.png" for i, each in enumerate(posed)}, 0
-    return _beside(folder, posed, "masks", (".png",), remarks), 255
+    return files_of_images(folder, (".png",), "nerfstudio", "masks", [each.file for each in posed], remarks), 255
 
 
 def _depths(
@@ -149,17 +149,10 @@ def _depths(
     found: dict[int, Path] = {}
     if (path / "depth").is_dir():
         remarks.append(f"{path / 'depth'}: taken to be in the units of the poses")
-        found = _beside(path / "depth", posed, "depth", DEPTH_SUFFIXES, remarks)
+        images = [each.file for each in posed]
+        found = files_of_images(path / "depth", DEPTH_SUFFIXES, "nerfstudio", "depth", images, remarks)
     else:
         prepare = command("prepare", posed[0].file.parent, "OUT", "--calibration", calibration, "--poses", poses)
         remarks.append(f"{path / 'depth'}: missing; `{prepare}` makes depth")
     remarks.append(f"{poses}: the scale of its poses is unknown; lengths are not millimeters")
     return found, None
-
-
-def _beside(
-    folder: Path, posed: Sequence[PosedImage], kind: Kind, suffixes: tuple[str, ...], remarks: list[str]
-) -> dict[int, Path]:
-    """The file of each image in a folder."""
-    files = list_files(folder, suffixes, "nerfstudio")
-    return files_of_images(folder, files, kind, [each.file for each in posed], remarks)

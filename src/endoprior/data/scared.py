@@ -98,13 +98,9 @@ def load_scared(path: Path, cfg: DataConfig) -> FrameSequence:
 
 
 def disparity_to_depth(disparity: NDArray[np.float32], reprojection: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Depth z = Q[2,3] / (Q[3,2] d + Q[3,3]) of disparity d.
+    """(H, W) depth z = Q[2,3] / (Q[3,2] d + Q[3,3]) of disparity d, px, and (4, 4) Q, in mm.
 
-    Args:
-        disparity: (H, W) px; missing where 0, negative or not finite.
-        reprojection: (4, 4) Q, for mm.
-    Returns:
-        (H, W) mm; 0 where missing or outside [NEAR_MM, FAR_MM].
+    It is 0 outside [NEAR_MM, FAR_MM], and where disparity is missing: 0, negative or not finite.
     """
     known = np.isfinite(disparity) & (disparity > 0)
     below = np.where(known, reprojection[3, 2] * disparity + reprojection[3, 3], 0)

@@ -62,11 +62,9 @@ def _video(clip: Path) -> Path:
 
 
 def tattoo_centers(path: Path) -> NDArray[np.float64]:
-    """Centers of the marked spots of a segmentation image, which has 0 where there is no tattoo.
+    """(P, 2) x, y of the marked spots of a segmentation image, px; the top-left pixel is centered at (0.5, 0.5).
 
-    Returns:
-        (P, 2) x, y of the middle of each connected region's bounding box, as in STIR's benchmark, px of the image.
-        The top-left pixel is centered at (0.5, 0.5).
+    As in STIR's benchmark, they are the middles of the bounding boxes of connected regions that are not 0.
     """
     marked = (single_channel(path, decode_image(path, None)) > 0).astype(np.uint8)
     boxes = np.asarray(cv2.connectedComponentsWithStats(marked, None, None, None, 8)[2], np.float64)
@@ -79,13 +77,8 @@ def stir_tracks(
 ) -> Tracks:
     """Unpaired material points: those of the start are visible in the first frame only, those of the end in the last.
 
-    Args:
-        start_px: (P, 2) x, y in the first frame, px of the frame.
-        end_px: (Q, 2) in the last frame.
-        start, end: the first and the last frame, with depth.
-        num_frames: T of the sequence.
-    Returns:
-        Points (T, P' + Q', 3) in camera axes, mm, 0 where they are not visible; spots without depth are left out.
+    `start_px`, (P, 2) x, y, and `end_px`, (Q, 2), are in px of these frames. Spots without depth are left out; points
+    are 0 where they are not visible.
     """
     first, last = _lift(start_px, start), _lift(end_px, end)
     points = np.zeros((num_frames, len(first) + len(last), 3), np.float32)
@@ -108,12 +101,7 @@ def _lift(spots: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
 
 
 def nearest_end_errors(predicted: NDArray[np.floating], true_ends: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(P,) distance of each predicted end point to the nearest true one: the error of STIR's benchmark.
-
-    Args:
-        predicted: (P, K) predicted end of each start point; mm for K = 3, px for K = 2.
-        true_ends: (Q, K) Q > 0.
-    """
+    """(P,) distance of predicted end points (P, K) to the nearest true one (Q, K): the error of STIR's benchmark."""
     return np.linalg.norm(predicted[:, None] - true_ends[None], axis=-1).min(1)
 
 

@@ -160,13 +160,9 @@ def open_right_eye(
     """The right eye of a sequence folder, if it has one that can be used; else a remark says why not.
 
     Args:
-        path: the folder; nothing is said of one without `right/`.
-        images: the left picture of every frame in the folder.
+        images, size: the left picture of every frame in the folder, and their (width, height), px.
         kept: positions in `images` of the frames to read.
-        size: (width, height) of the left pictures, px.
         described: contents of `sequence.json`, of which `baseline_mm` is used.
-        shrink: see `RightEye`.
-        remarks: gets the reason, or that the files are matched in order.
         relative: whether the scale of depth is unknown: then a baseline in mm does not fit the scene.
     """
     folder = path / "right"

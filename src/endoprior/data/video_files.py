@@ -34,11 +34,7 @@ STILLS = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"RIFF")
 
 
 def open_container(path: Path) -> InputContainer:
-    """Open a video file with FFmpeg.
-
-    Raises:
-        av.error.FFmpegError, OSError, UnicodeError: it is no video that can be read.
-    """
+    """Open a video file with FFmpeg; av.error.FFmpegError, OSError or UnicodeError if it cannot be read."""
     import av
 
     # The scheme keeps FFmpeg from reading a colon in the name as an address; the lists restrict it to this file. FFmpeg
@@ -84,10 +80,9 @@ def _head(path: Path) -> bytes:
 
 
 def starts_of_parts(path: Path, name: str) -> list[int]:
-    """Where files begin, in bytes, that were written one after the other into this one; FFmpeg may not read them all.
+    """Where files begin, in bytes, that were written one after the other into this one, of a format of FFmpeg's name.
 
-    Args:
-        name: FFmpeg's name of the format.
+    FFmpeg may not read them all.
     """
     if "mp4" in name:
         return _starts_of_mp4(path)

@@ -59,13 +59,9 @@ class FrameFiles:
         depth: NDArray[np.float32] | None = None,
         right: NDArray[np.uint8] | None = None,
     ) -> None:
-        """Append one frame.
+        """Append one frame: image, mask that is True on tools, and z in mm, 0 or not finite where it is missing.
 
-        Args:
-            rgb: (H, W, 3) image, 0..255.
-            tool_mask: (H, W) True where a tool is.
-            depth: (H, W) z in mm, 0 or not finite where missing; None in every frame for a sequence without depth.
-            right: (H, W, 3) image of the right camera, 0..255; None in every frame of a monocular sequence.
+        Depth and the image of the right camera are there in every frame of a sequence, or in none.
         """
         size = (self.meta.height, self.meta.width)
         for name, array in (("rgb", rgb), ("tool_mask", tool_mask), ("depth", depth), ("right", right)):
@@ -85,12 +81,7 @@ class FrameFiles:
         return np.where(units <= FARTHEST_UNIT, units, 0).astype(np.uint16)
 
     def write_image(self, folder: str, pixels: NDArray) -> None:
-        """Write an image as `folder`/NNNNNN.png, numbered like the frame that the next `add` appends.
-
-        Args:
-            folder: relative to the sequence, for example `truth/tissue`.
-            pixels: (H, W, 3) RGB 8-bit, or (H, W) 8- or 16-bit.
-        """
+        """Write an image (`encode_png`) as `folder`/NNNNNN.png, numbered like the frame that the next `add` appends."""
         save_png(self._file(f"{folder}/{self.count:06d}.png"), pixels, 2)  # noise does not compress well anyway
 
     def write_array(self, name: str, array: NDArray) -> None:

@@ -100,11 +100,7 @@ def _is_tool(label: str) -> bool | None:
 
 
 def mask_of_runs(runs: Sequence[int], num_pixels: int) -> Mask:
-    """(num_pixels,) from lengths of runs that are outside, inside, outside, ... of an object.
-
-    Raises:
-        ValueError: a negative length, or lengths that do not fill the mask.
-    """
+    """(num_pixels,) from lengths of runs outside, inside, ... of an object; ValueError if they do not fill the mask."""
     lengths = np.asarray(runs, np.int64)
     if num_pixels > MOST_PIXELS or lengths.ndim != 1:
         raise ValueError(f"run lengths of {num_pixels} px")
@@ -115,11 +111,7 @@ def mask_of_runs(runs: Sequence[int], num_pixels: int) -> Mask:
 
 
 def mask_of_coco(counts: str | Sequence[int], size: Sequence[int]) -> NDArray[np.bool_]:
-    """(H, W) from COCO's run lengths, numbers or the text that holds them; `size` is height, width.
-
-    Raises:
-        ValueError: as `mask_of_runs`, or the text is cut off.
-    """
+    """(H, W) from COCO's run lengths, numbers or their text, and height, width; ValueError as `mask_of_runs`."""
     height, width = (int(side) for side in size)
     runs = _unpacked(counts) if isinstance(counts, str) else list(counts)
     return mask_of_runs(runs, height * width).reshape(width, height).T
