@@ -11,7 +11,6 @@ from reader_checks import assert_damage_is_rejected
 from sequence_edits import change_poses, describe, write
 
 from endoprior.core.checks import InputError
-from endoprior.core.config import DataConfig
 from endoprior.data import load_sequence
 
 # Damage to the folder, file named in the message, words in it.
@@ -27,6 +26,10 @@ def empty(name):
 
 def delete(name):
     return lambda folder: (folder / name).unlink()
+
+
+def a_folder(name):
+    return lambda folder: ((folder / name).unlink(), (folder / name).mkdir())
 
 
 def replaced(name, pixels):
@@ -106,11 +109,7 @@ AT_LOAD = {
 }
 ON_VALIDATE = {
     "image unreadable": (cut_short, "images/000004.png", "cannot be decoded"),
-    "image is a folder": (
-        lambda f: ((f / "images/000004.png").unlink(), (f / "images/000004.png").mkdir()),
-        "images/000004.png",
-        "expected a readable file",
-    ),
+    "image is a folder": (a_folder("images/000004.png"), "images/000004.png", "expected a readable file"),
     "image of other size": (replaced("images/000003.png", np.zeros((41, 48, 3), np.uint8)), "000003.png", "48x41"),
     "image 16 bit": (replaced("images/000003.png", np.zeros((*SIZE, 3), np.uint16)), "images/000003.png", "16-bit"),
     "image gray": (replaced("images/000003.png", np.zeros(SIZE, np.uint8)), "images/000003.png", "1 channel"),
@@ -155,11 +154,6 @@ def test_damage_is_one_line(tiny_sequence, case, capfd):
         with pytest.raises(InputError):
             load_sequence(tiny_sequence)
     assert capfd.readouterr().err == ""  # the message is all that the user sees
-
-
-def test_missing_gt_masks_are_named(tiny_sequence):
-    with pytest.raises(InputError, match="gt_masks: expected"):
-        load_sequence(tiny_sequence, DataConfig(use_gt_masks=True))
 
 
 def test_float_tiff_depth_under_png_name_is_rejected(tiny_sequence):

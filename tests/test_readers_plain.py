@@ -134,7 +134,7 @@ BAD = {
     "sources list": (describe(sources=["a"]), "sequence.json", "sources to map names to texts"),
     "frames": (describe(unexplained_frames=[1.5]), "sequence.json", "a list of frame numbers"),
     "frames outside": (describe(unexplained_frames=[12]), "sequence.json", "in 0..11, got 12"),
-    "version": (describe(format_version=2), "sequence.json", "format_version 1 to 1, got 2"),
+    "version": (describe(format_version=2), "sequence.json", "1 to 1, got 2. Fix: Update endoprior"),
     "version text": (describe(format_version="1"), "sequence.json", "format_version 1 to 1, got '1'"),
 }
 

@@ -73,8 +73,16 @@ def assemble(
     if count < 2 or min(width, height) // cfg.shrink < 1:
         hint = "lower data.shrink or data.stride, raise data.first_frames, or shorten data.skip_frames."
         raise input_error(path, "at least 2 frames of 1x1 px", f"{count} of {width}x{height} / {cfg.shrink}", hint)
-    for index, camera in enumerate(cameras):
-        _demand_usable(path, camera, index)
+    for index, camera in enumerate(cameras):  # finite numbers may still overflow in the renderer
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        if not (all(abs(value) <= MOST_PX for value in lens) and min(camera.fx, camera.fy) >= LEAST_FOCAL_PX):
+            want = f"fx, fy, cx, cy up to {MOST_PX:g} px, fx and fy at least {LEAST_FOCAL_PX:g}"
+            got = ", ".join(f"{value:g}" for value in lens)
+            raise input_error(path, want, f"{got} in frame {index}", "correct the intrinsics.")
+        far = np.abs(camera.world_to_camera[:3, 3]).max()
+        if not far <= FARTHEST_MM:
+            want, got = f"cameras within {FARTHEST_MM:g} mm of the origin", f"{far:g} mm in frame {index}"
+            raise input_error(path, want, got, "correct the poses.")
 
     def read_frame(index: int) -> Frame:
         rgb_u8, tissue_mask, measured = decode(index)
@@ -94,16 +102,3 @@ def assemble(
         new_mask_files=list(new_mask_files) if cfg.shrink == 1 else [],
         **about,
     )
-
-
-def _demand_usable(path: Path, camera: Camera, index: int) -> None:
-    """Raise InputError for a camera whose finite numbers would still overflow in the renderer."""
-    lens = (camera.fx, camera.fy, camera.cx, camera.cy)
-    if not (all(abs(value) <= MOST_PX for value in lens) and min(camera.fx, camera.fy) >= LEAST_FOCAL_PX):
-        want = f"fx, fy, cx, cy up to {MOST_PX:g} px, fx and fy at least {LEAST_FOCAL_PX:g}"
-        got = ", ".join(f"{value:g}" for value in lens)
-        raise input_error(path, want, f"{got} in frame {index}", "correct the intrinsics.")
-    far = np.abs(camera.world_to_camera[:3, 3]).max()
-    if not far <= FARTHEST_MM:
-        want, got = f"cameras within {FARTHEST_MM:g} mm of the origin", f"{far:g} mm in frame {index}"
-        raise input_error(path, want, got, "correct the poses.")

@@ -23,7 +23,7 @@ from .files import IMAGE_SUFFIXES, list_files, read_json
 from .formats import Format
 from .frame_files import Kind, files_of_images, one_per_frame
 from .images import DEPTH_SUFFIXES, decode_image, read_color, read_depth, read_depth_file, read_tool_mask, read_values
-from .poses import MATRIX_FILE, demand_rotations, read_camera_matrix, scale_of, world_to_camera
+from .poses import MATRIX_FILE, demand_rotations, identity_poses, read_camera_matrix, scale_of, world_to_camera
 from .reading import read_numpy
 from .sequence import FrameSequence, is_test_frame
 from .truth import Truth, open_right_eye
@@ -66,7 +66,7 @@ def load_endonerf(
     def column(name: str, kind: Kind, suffixes: tuple[str, ...], required: bool, missing: str) -> dict[int, Path]:
         """The file of each image in a folder."""
         if required or (path / name).is_dir():
-            return files_of_images(path / name, suffixes, layout, kind, images, remarks)
+            return files_of_images(path / name, list_files(path / name, suffixes, layout), kind, images, remarks)
         remarks.append(f"{path / name}: missing{missing}")
         return {}
 
@@ -150,7 +150,7 @@ def _cameras(
     if not complete and "fx" not in described and (path / MATRIX_FILE).is_file():
         matrix = read_camera_matrix(path / MATRIX_FILE)
         described |= {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
-    focal, poses = ASSUMED_FOCAL * width, [np.eye(4) for _ in range(count)]
+    focal, poses = ASSUMED_FOCAL * width, identity_poses(count)
     if complete or (path / POSES).exists():
         stored = read_poses_bounds(path / POSES, count)
         flip = np.array([1.0, 1.0, 1.0] if pose_axes == "opencv" else [1.0, -1.0, -1.0])

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..core.checks import input_error
-from .files import DEPTH_WORDS, MASK_WORDS, OTHER_WORDS, bare, files_with, list_files, numbers_of, pattern_of, words_of
+from .files import DEPTH_WORDS, MASK_WORDS, OTHER_WORDS, bare, files_with, numbers_of, pattern_of, words_of
 
 Kind = Literal["images", "masks", "depth"]
 HINT = "Add the missing files, or name each file by its frame number."
@@ -103,13 +103,13 @@ def match_files(
 
 
 def files_of_images(
-    folder: Path, suffixes: tuple[str, ...], layout: str, kind: Kind, images: Sequence[Path], remarks: list[str]
+    folder: Path, files: Sequence[Path], kind: Kind, images: Sequence[Path], remarks: list[str]
 ) -> dict[int, Path]:
-    """The file of each image that has one in the folder, by position of the image; arguments as `list_files`.
+    """The file of each image that has one, by position of the image; files, in order, of another kind are left out.
 
     `remarks` gets where order decides, and the numbers of images without a file and of files without an image.
     """
-    files, note = one_per_frame(folder, list_files(folder, suffixes, layout), kind)
+    files, note = one_per_frame(folder, files, kind)
     names = [image.stem for image in images]
     matched = match_names(folder, [file.name for file in files], range(len(images)), names, required=())
     remarks += [note] if note else []

@@ -22,7 +22,7 @@ from .files import IMAGE_SUFFIXES, list_files
 from .formats import Format
 from .frame_files import Kind, files_of_images
 from .images import read_color, read_depth_file, read_tool_mask
-from .poses import MATRIX_FILE, matrix_of_images, read_camera_matrix
+from .poses import MATRIX_FILE, identity_poses, matrix_of_images, read_camera_matrix
 from .sequence import FrameSequence
 
 FULL_SIZE = (640, 480)
@@ -49,7 +49,9 @@ def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
     images = list_files(path / image_folder, kinds, layout)
     kinds_of: list[tuple[str, Kind]] = [(depth_folder, "depth"), (mask_folder, "masks")]
     columns = [
-        files_of_images(path / folder, (".png",), layout, kind, images, remarks) for folder, kind in kinds_of if folder
+        files_of_images(path / folder, list_files(path / folder, (".png",), layout), kind, images, remarks)
+        for folder, kind in kinds_of
+        if folder
     ]
     height, width = read_color(images[0]).shape[:2]
     size, crop = (width, height), 0
@@ -90,7 +92,7 @@ def load_hamlyn(path: Path, cfg: DataConfig) -> FrameSequence:
     return assemble(
         path,
         cfg,
-        [Camera(*shape, np.eye(4)) for _ in kept],
+        [Camera(*shape, pose) for pose in identity_poses(len(kept))],
         decode,
         images=images,
         # A calibration outside the folder has no name below it, which the fingerprint needs.

@@ -14,7 +14,7 @@ from ..core.config import DataConfig
 from ..core.shell import command
 from ..core.types import Camera
 from .assemble import Pixels, assemble, kept_frames
-from .files import in_order
+from .files import in_order, list_files
 from .frame_files import files_of_images
 from .images import DEPTH_SUFFIXES, read_color, read_depth_file, read_tool_mask
 from .lens import Lens, Undistorter
@@ -54,8 +54,11 @@ def load_posed(
     demand_rotations(source, rotations, "the poses", "export them again.")
     height, width = read_color(posed[0].file).shape[:2]
     size = (width, height)
-    own = {id(each.lens): each.lens for each in posed}  # images share lenses
-    lenses = {key: Undistorter(_fitted(source, lens, size, remarks)) for key, lens in own.items()}
+    lenses: dict[int, Undistorter] = {}
+    for lens in {id(each.lens): each.lens for each in posed}.values():  # images share lenses
+        focal, fix = float(lens.matrix[0, 0]), "pass the images that it was made of."
+        scale_of(source, (lens.width, lens.height), size, focal, fix, remarks)
+        lenses[id(lens)] = Undistorter(lens.scaled(*size))
     if any(each.lens.is_bent for each in lenses.values()):
         remarks.append(f"{source}: the lens is distorted; frames are undistorted, without part of the periphery")
     masks, tool_value = _masks(path, posed, remarks)
@@ -113,13 +116,6 @@ def _sorted(posed: list[PosedImage]) -> list[PosedImage]:
     return sorted(posed, key=lambda each: rank[each.file])
 
 
-def _fitted(source: Path, lens: Lens, size: tuple[int, int], remarks: list[str]) -> Lens:
-    """The lens in px of images of that size."""
-    focal = float(lens.matrix[0, 0])
-    scale_of(source, (lens.width, lens.height), size, focal, "pass the images that it was made of.", remarks)
-    return lens if (lens.width, lens.height) == size else lens.scaled(*size)
-
-
 def _masks(path: Path, posed: Sequence[PosedImage], remarks: list[str]) -> tuple[Mapping[int, Path | None], int]:
     """The mask of each image, None where all of it is tissue, and the value of tools; nothing without any masks."""
     named = {i: each.mask for i, each in enumerate(posed)}
@@ -134,7 +130,8 @@ def _masks(path: Path, posed: Sequence[PosedImage], remarks: list[str]) -> tuple
     # COLMAP's own masks are called like the image, with .png behind its suffix, and 0 is not used.
     if all((folder / f"{each.file.name}.png").is_file() for each in posed):
         return {i: folder / f"{each.file.name}.png" for i, each in enumerate(posed)}, 0
-    return files_of_images(folder, (".png",), "nerfstudio", "masks", [each.file for each in posed], remarks), 255
+    files, images = list_files(folder, (".png",), "nerfstudio"), [each.file for each in posed]
+    return files_of_images(folder, files, "masks", images, remarks), 255
 
 
 def _depths(
@@ -149,8 +146,8 @@ def _depths(
     found: dict[int, Path] = {}
     if (path / "depth").is_dir():
         remarks.append(f"{path / 'depth'}: taken to be in the units of the poses")
-        images = [each.file for each in posed]
-        found = files_of_images(path / "depth", DEPTH_SUFFIXES, "nerfstudio", "depth", images, remarks)
+        files, images = list_files(path / "depth", DEPTH_SUFFIXES, "nerfstudio"), [each.file for each in posed]
+        found = files_of_images(path / "depth", files, "depth", images, remarks)
     else:
         prepare = command("prepare", posed[0].file.parent, "OUT", "--calibration", calibration, "--poses", poses)
         remarks.append(f"{path / 'depth'}: missing; `{prepare}` makes depth")

@@ -35,6 +35,11 @@ def world_to_camera(rotation: NDArray[np.float64], center: NDArray[np.float64]) 
     return transform
 
 
+def identity_poses(count: int) -> list[NDArray[np.float64]]:
+    """`world_to_camera` of a static camera at the origin, once per frame."""
+    return [np.eye(4) for _ in range(count)]
+
+
 def scale_of(path: Path, stated: tuple[float, float], size: Size, focal: float, fix: str, remarks: list[str]) -> float:
     """Factor by which numbers in a file for images of the `stated` size fit those of `size`, both (width, height), px.
 
