@@ -25,20 +25,17 @@ from ..system.ray_cluster import Cluster
 from .job import SequenceJob, open_folder
 from .steps import SHOWN_SCORES, run_step, start_training, steps_of
 
-FAILURE = "failure.txt"
-"""In the folder of a job: the traceback, if it failed by an error of the program."""
+FAILURE = "failure.txt"  # in the folder of a job: the traceback, if it failed by an error of the program
 SUMMARY, TABLE = "summary.md", "scores.csv"
 """Files in the folder of a batch: the main scores to read, and all scores as numbers."""
-BEGIN, FINISH = "before training", "after training"
-"""Calls of a job on a cluster; between them are those that train."""
+BEGIN, FINISH = "before training", "after training"  # calls of a job on a cluster; between them are those that train
 
 
 @dataclass(frozen=True)
 class Entry:
     """A job of a list."""
 
-    name: str
-    """Of its folder."""
+    name: str  # of its folder
     job: SequenceJob
 
     @property
@@ -52,8 +49,7 @@ class Outcome:
     """How a job ended."""
 
     entry: Entry
-    failure: str = ""
-    """Why it failed, one line; empty if it is done."""
+    failure: str = ""  # why it failed, one line; empty if it is done
 
 
 @dataclass(frozen=True)

@@ -23,34 +23,25 @@ from ..prepare.frame_selection import FrameSelection
 from ..prepare.source import open_source
 from ..system.atomic import reject_occupied, write_json
 
-LEAST_RATE = 10.0
-"""Frame rate, 1/s, below which tissue and camera move too far between two frames to be followed."""
+LEAST_RATE = 10.0  # frame rate, 1/s, below which tissue and camera move too far between two frames to be followed
 MOST_FRAMES = 10_000
-USUAL_FRAMES = 300
-"""A video with more frames loses some in between, as long as tissue can be followed."""
+USUAL_FRAMES = 300  # a video with more frames loses some in between, as long as tissue can be followed
 PREVIEW_FRAMES = 60
-PREVIEW_WIDTH = 320
-"""Width of the frames of a preview, px."""
+PREVIEW_WIDTH = 320  # width of the frames of a preview, px
 SETTINGS = "settings.json"
 """File in the output folder with everything that decides the results: a job that is resumed must have the same."""
-MOST_NAMED = 4
-"""Differences that a message names; more are counted."""
+MOST_NAMED = 4  # differences that a message names; more are counted
 
 
 @dataclass(frozen=True)
 class Part:
     """Part of a video."""
 
-    frames_per_second: float
-    """Rate of the frames that are used."""
-    start: float
-    """First time, seconds."""
-    end: float
-    """End time, seconds, not included; infinite for the end of the video."""
-    num_frames: int
-    """Number of frames."""
-    is_whole: bool
-    """Whether it reaches the end that was asked for."""
+    frames_per_second: float  # rate of the frames that are used
+    start: float  # first time, seconds
+    end: float  # end time, seconds, not included; infinite for the end of the video
+    num_frames: int  # number of frames
+    is_whole: bool  # whether it reaches the end that was asked for
 
 
 def choose_part(
@@ -101,8 +92,7 @@ class _Image:
 class SequenceJob:
     """A sequence folder on its way to a scene. Results are in `out`."""
 
-    source: Path
-    """What the user gave: the sequence folder."""
+    source: Path  # what the user gave: the sequence folder
     out: Path
     cfg: Config
 
@@ -158,8 +148,7 @@ class Job(SequenceJob):
 
     options: Options
     """What the user chose, as it is typed; all else follows from it: `{"--preview": (), "--end": ("2.5",)}`."""
-    prepare: PrepareConfig
-    """Options of `prepare`, for `part` only."""
+    prepare: PrepareConfig  # options of `prepare`, for `part` only
     part: Part
 
     @property

@@ -37,17 +37,12 @@ from ..visualization.rendered_views import depth_span
 from ..visualization.video import write_video
 from .job import Job, SequenceJob
 
-PLAYER_BYTES = 40_000_000
-"""Largest player."""
-LEAST_BYTES = 7
-"""Size of one Gaussian at one time step in the player; at least this (docs/export.md)."""
+PLAYER_BYTES = 40_000_000  # largest player
+LEAST_BYTES = 7  # size of one Gaussian at one time step in the player; at least this (docs/export.md)
 PREVIEW_TITLE = "Preview: small frames, short training. Not for scores."
-CODE = re.compile("[a-z]+(-[a-z]+)*")
-"""Names of findings."""
-LOST_FRAMES = 5
-"""So many frames in a row without a pose: the camera is lost. Fewer are blurred or covered."""
-FEWEST_FRAMES = 20
-"""Fewer frames are not worth a scene."""
+CODE = re.compile("[a-z]+(-[a-z]+)*")  # names of findings
+LOST_FRAMES = 5  # so many frames in a row without a pose: the camera is lost. Fewer are blurred or covered.
+FEWEST_FRAMES = 20  # fewer frames are not worth a scene
 SHOWN_SCORES = ("psnr_tissue", "ssim", "depth_rmse_mm", "flow_error_dis")
 
 
@@ -56,10 +51,8 @@ class Step:
     """One step of a job."""
 
     name: str
-    result: Callable[[SequenceJob], Path]
-    """File or folder that is there when the step is done."""
-    act: Callable[[SequenceJob, Progress], list[str]]
-    """Does it; returns lines for the user."""
+    result: Callable[[SequenceJob], Path]  # file or folder that is there when the step is done
+    act: Callable[[SequenceJob, Progress], list[str]]  # does it; returns lines for the user
 
 
 def run_step(step: Step, job: SequenceJob, progress: Progress) -> list[str] | None:
@@ -190,8 +183,7 @@ STEPS = (
     Step("score", lambda job: job.report, _score),
     Step("video", lambda job: job.rendered_video, _render_video),
     Step("player", lambda job: job.player, _player),
-)
-"""In order. Every result is written completely or not at all."""
+)  # in order. Every result is written completely or not at all.
 
 
 def steps_of(job: SequenceJob) -> tuple[Step, ...]:

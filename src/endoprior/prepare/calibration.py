@@ -16,32 +16,24 @@ from numpy.typing import NDArray
 
 from ..core.checks import InputError, input_error
 
-MIN_BASELINE_MM, MAX_BASELINE_MM = 1.0, 30.0
-"""The baseline of stereo endoscopes is 3 to 6 mm; bench setups reach 30 mm."""
-NEGLIGIBLE = 1e-6
-"""Rotation, or vertical offset in mm, below which a pair without distortion counts as rectified."""
+MIN_BASELINE_MM, MAX_BASELINE_MM = 1.0, 30.0  # the baseline of stereo endoscopes is 3 to 6 mm; bench setups reach 30 mm
+NEGLIGIBLE = 1e-6  # rotation, or vertical offset in mm, below which a pair without distortion counts as rectified
 CENTERED = 0.1
 """Mean principal points of endoscopes are off the image center by less than this share of half the image ..."""
-FAR_OFF = 0.5
-"""... and if it is further off than this, the images were cropped or have another size."""
+FAR_OFF = 0.5  # ... and if it is further off than this, the images were cropped or have another size
 SAME_ASPECT = 0.01
-SQUEEZED = 0.12
-"""A factor from 2 that counts as 2, as a share: an image at half its width or height."""
+SQUEEZED = 0.12  # a factor from 2 that counts as 2, as a share: an image at half its width or height
 USUAL_RATIOS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4)
-NEAR_RATIO = 0.06
-"""An estimated ratio this near to a usual one is that one, as a share."""
-Size = tuple[int, int]
-"""(width, height) of one camera's image, px."""
+NEAR_RATIO = 0.06  # an estimated ratio this near to a usual one is that one, as a share
+Size = tuple[int, int]  # (width, height) of one camera's image, px
 
 
 @dataclass(frozen=True)
 class Intrinsics:
     """Camera matrix and lens distortion of one camera."""
 
-    matrix: NDArray[np.float64]
-    """(3, 3) K, px."""
-    distortion: NDArray[np.float64]
-    """(k,) OpenCV distortion coefficients, k in 0, 4, 5, 8, 12, 14; of a fisheye k1..k4."""
+    matrix: NDArray[np.float64]  # (3, 3) K, px
+    distortion: NDArray[np.float64]  # (k,) OpenCV distortion coefficients, k in 0, 4, 5, 8, 12, 14; of a fisheye k1..k4
     fisheye: bool = False
     """OpenCV's fisheye model (equidistant, Kannala-Brandt): bent even where all coefficients are 0."""
 
@@ -57,18 +49,13 @@ class Calibration:
 
     left: Intrinsics
     right: Intrinsics | None = None
-    rotation: NDArray[np.float64] | None = None
-    """(3, 3) R of x_right = R x_left + t."""
-    translation_mm: NDArray[np.float64] | None = None
-    """(3,) t, mm: about (-baseline, 0, 0)."""
-    size: Size | None = None
-    """Of the images that it was made for; None if the file does not state it."""
-    layout: str | None = None
-    """Text in the file that describes the stereo layout."""
+    rotation: NDArray[np.float64] | None = None  # (3, 3) R of x_right = R x_left + t
+    translation_mm: NDArray[np.float64] | None = None  # (3,) t, mm: about (-baseline, 0, 0)
+    size: Size | None = None  # of the images that it was made for; None if the file does not state it
+    layout: str | None = None  # text in the file that describes the stereo layout
     size_is_sure: bool = False
     """The user states the size, or this program wrote it: a principal point far from the center is a crop."""
-    notes: tuple[str, ...] = ()
-    """What the reader decided, one line each."""
+    notes: tuple[str, ...] = ()  # what the reader decided, one line each
 
     @property
     def cameras(self) -> list[Intrinsics]:

@@ -22,12 +22,9 @@ from .calibration_tables import HINT, Table, plain, read_table
 
 Unit = Literal["auto", "mm", "cm", "m"]
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-MOST_PX = 1e6
-"""Largest plausible image size, focal length or principal point, px."""
-METERS_BELOW = 0.05
-"""A T shorter than this is in meters: no stereo endoscope has a baseline of 0.05 mm."""
-LEAST_SKEW = 1e-3
-"""Share of the focal length above which the skew of K would move pixels: OpenCV ignores it."""
+MOST_PX = 1e6  # largest plausible image size, focal length or principal point, px
+METERS_BELOW = 0.05  # A T shorter than this is in meters: no stereo endoscope has a baseline of 0.05 mm
+LEAST_SKEW = 1e-3  # share of the focal length above which the skew of K would move pixels: OpenCV ignores it
 
 MATRIX = (
     "k", "m", "cameramatrix", "mtx", "intrinsics", "intrinsic", "intrinsicmatrix", "cammatrix", "cameramat", "matrix",
@@ -39,12 +36,10 @@ SIDES = (
     ("l", "r"), ("1", "2"), ("0", "1"),
 )  # fmt: skip
 """How files name the left and the right camera."""
-PREFIXES = ("", "camera", "cam", "intrinsics", "calibration")
-"""What files put before the values of an only camera."""
+PREFIXES = ("", "camera", "cam", "intrinsics", "calibration")  # what files put before the values of an only camera
 ROTATION = ("r", "rotation", "rot", "rotationmatrix", "rstereo", "om")
 TRANSLATION = ("t", "translation", "trans", "translationvector", "tvec", "tstereo")
-LEFT_TO_RIGHT, RIGHT_TO_LEFT = "tcncnm1", "stereotc1c2"
-"""4x4 poses of Kalibr and ORB-SLAM, in m."""
+LEFT_TO_RIGHT, RIGHT_TO_LEFT = "tcncnm1", "stereotc1c2"  # 4x4 poses of Kalibr and ORB-SLAM, in m
 SIZE_PAIRS = (("width", "height"), ("imagewidth", "imageheight"), ("resx", "resy"), ("w", "h"))
 SIZES = ("imagesize", "resolution", "size", "imgsize", "imageshape", "imgshape", "shape", "dimensions")
 VECTORS = (
@@ -54,8 +49,7 @@ VECTORS = (
 """Names of all coefficients together."""
 RADIAL, TANGENTIAL = ("radialdistortion", "radial"), ("tangentialdistortion", "tangential")
 """MATLAB's names of the two parts."""
-BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""Names of single coefficients, in OpenCV's order."""
+BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # names of single coefficients, in OpenCV's order
 FISHEYE = ("k1", "k2", "k3", "k4")
 MODEL_NAMES = ("distortionmodel", "distortiontype", "projection")
 """Names of the model of the distortion: every value must be known."""

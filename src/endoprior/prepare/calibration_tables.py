@@ -22,8 +22,7 @@ from ..data.colmap import StoredCamera, read_cameras
 from ..data.lens import MODELS, UNSUPPORTED
 from ..data.reading import BoundedLoader, load_yaml, read_bytes, read_numpy, read_text
 
-Table = dict[str, Any]
-"""Numbers, arrays and texts, by name in lower case without punctuation."""
+Table = dict[str, Any]  # numbers, arrays and texts, by name in lower case without punctuation
 FORMATS = "a calibration of OpenCV, ROS, Kalibr, ORB-SLAM, COLMAP or the da Vinci, or rows of numbers"
 HINT = "Use the names K_left, distortion_left, K_right, distortion_right, R, T_mm, width, height (docs/prepare.md)."
 FOREIGN = {
@@ -31,8 +30,7 @@ FOREIGN = {
     b"\x89HDF": ("a .mat or .h5 file (HDF5)", "Write K and the distortion to a .json file."),
     b"\x80": ("a pickle, which could run programs", "Save it with numpy.savez, or as .json."),
     b"\xd0\xcf\x11\xe0": ("a document of an office program", "Export it as text."),
-}
-"""First bytes of formats that are not read: what they are, and what to do."""
+}  # first bytes of formats that are not read: what they are, and what to do
 COLMAP_LINE = re.compile(r"\d+\s+([A-Z_]{3,})\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)\s*")
 INI_SECTION = re.compile(r"^\s*\[[A-Za-z][^\]=:]*\]\s*$", re.MULTILINE)
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"

@@ -13,8 +13,7 @@ from .calibration_files import Unit
 from .stereo import StereoConfig
 
 Layout = Literal["auto", "mono", "side-by-side", "top-bottom", "interlaced", "two-files"]
-Rectangle = tuple[int, int, int, int]
-"""x, y, width, height in px, in one camera's image of the source video."""
+Rectangle = tuple[int, int, int, int]  # x, y, width, height in px, in one camera's image of the source video
 
 
 def parse_rectangle(text: str, option: str) -> Rectangle:

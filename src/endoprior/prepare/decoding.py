@@ -15,20 +15,14 @@ import numpy as np
 from av.container import InputContainer
 from av.video.stream import VideoStream
 
-AVI = "avi"
-"""FFmpeg's name of the format that counts time in images and does not hold when they are shown."""
-DEFAULT, ATTACHED_PICTURE, TIMED_THUMBNAILS = 0x1, 0x400, 0x800
-"""FFmpeg's bits of what a track is for."""
-SHORT = 0.5
-"""A track that lasts a smaller share of the longest one is a preview."""
-RATES = (0.01, 100_000.0)
-"""Plausible frame rates, 1/s."""
-USUAL_RATE = 25.0
-"""Frame rate of a file without times, 1/s."""
+AVI = "avi"  # FFmpeg's name of the format that counts time in images and does not hold when they are shown
+DEFAULT, ATTACHED_PICTURE, TIMED_THUMBNAILS = 0x1, 0x400, 0x800  # FFmpeg's bits of what a track is for
+SHORT = 0.5  # a track that lasts a smaller share of the longest one is a preview
+RATES = (0.01, 100_000.0)  # plausible frame rates, 1/s
+USUAL_RATE = 25.0  # frame rate of a file without times, 1/s
 NEAR = 0.25
 """Time steps that differ from the median by less than this share are the usual step, up to rounding of the file."""
-SAME_RATE = 0.01
-"""A stated rate that differs from the measured one by less than this share is its exact value."""
+SAME_RATE = 0.01  # a stated rate that differs from the measured one by less than this share is its exact value
 Item = TypeVar("Item")
 
 
@@ -37,26 +31,19 @@ class DecodedImage:
     """One image as the decoder gives it."""
 
     frame: av.VideoFrame
-    seconds: float | None
-    """Time in the file; None if it has no times."""
-    damaged: bool
-    """Bytes of it, or of an image that it was predicted from, are missing or wrong."""
-    interlaced: bool
-    """Whether the file says that its even and odd rows were taken at different times."""
-    turns: int
-    """Quarter turns, counterclockwise, that bring it upright."""
+    seconds: float | None  # time in the file; None if it has no times
+    damaged: bool  # bytes of it, or of an image that it was predicted from, are missing or wrong
+    interlaced: bool  # whether the file says that its even and odd rows were taken at different times
+    turns: int  # quarter turns, counterclockwise, that bring it upright
 
 
 @dataclass
 class Timeline:
     """Times that only increase, and counts of where those of the file do not."""
 
-    step: float
-    """Usual time between two images, s."""
-    restarts: int = 0
-    """How often time starts again, as where two recordings were joined."""
-    misplaced: int = 0
-    """Images whose time is not after that of the image before, while the next one is in order again."""
+    step: float  # usual time between two images, s
+    restarts: int = 0  # how often time starts again, as where two recordings were joined
+    misplaced: int = 0  # images whose time is not after that of the image before, while the next one is in order again
 
     def along(self, images: Iterable[tuple[Item, float | None]]) -> Iterator[tuple[Item, float]]:
         """The images and their times, s. A misplaced image keeps its time; all others are later than those before.

@@ -26,10 +26,8 @@ from .frame_selection import FrameSelection
 from .source import ImageFolder
 from .video_clip import Clip, EvenSample, StereoFrame
 
-SAMPLES = 24
-"""Number of frames used to detect borders, labels, tools and lighting."""
-DARK = 40.0
-"""Images whose brightest percent of values is below this are nearly black."""
+SAMPLES = 24  # number of frames used to detect borders, labels, tools and lighting
+DARK = 40.0  # images whose brightest percent of values is below this are nearly black
 Mask = NDArray[np.bool_]
 Depth = NDArray[np.float32]
 
@@ -38,16 +36,11 @@ Depth = NDArray[np.float32]
 class MeasuredFrame:
     """A rectified frame and its depth."""
 
-    position: int
-    """Position in the sequence, from 0."""
-    index: int
-    """Position in the source."""
-    rgb_u8: NDArray[np.uint8]
-    """(H, W, 3)."""
-    right_u8: NDArray[np.uint8] | None
-    """(H, W, 3) image of the right camera, rectified; None if monocular."""
-    depth: Depth | None = None
-    """(H, W) mm, 0 where missing; None before it is measured."""
+    position: int  # position in the sequence, from 0
+    index: int  # position in the source
+    rgb_u8: NDArray[np.uint8]  # (H, W, 3)
+    right_u8: NDArray[np.uint8] | None  # (H, W, 3) image of the right camera, rectified; None if monocular
+    depth: Depth | None = None  # (H, W) mm, 0 where missing; None before it is measured
 
     @classmethod
     def of(cls, seen: StereoFrame, geometry: FrameGeometry, position: int = 0) -> MeasuredFrame:
@@ -60,17 +53,13 @@ class MeasuredFrame:
 class FirstPass:
     """Result of the first pass."""
 
-    indices: list[int]
-    """Positions of the selected frames in the source."""
-    samples: list[StereoFrame]
-    """At most `SAMPLES` of them, evenly spaced."""
+    indices: list[int]  # positions of the selected frames in the source
+    samples: list[StereoFrame]  # at most `SAMPLES` of them, evenly spaced
     geometry: FrameGeometry
-    notes: list[str] = field(default_factory=list)
-    """Notes for the user on borders and the lens, one line each."""
+    notes: list[str] = field(default_factory=list)  # notes for the user on borders and the lens, one line each
     video_notes: list[str] = field(default_factory=list)
     """What is particular about the video and which of its images are not used, one line each."""
-    damaged: frozenset[int] = frozenset()
-    """Those of `indices` whose images are damaged."""
+    damaged: frozenset[int] = frozenset()  # those of `indices` whose images are damaged
     stored_size: tuple[int, int] | None = None
     """(width, height) of one camera's image before its pixels became square, px; None if they were."""
     image_names: list[str] = field(default_factory=list)

@@ -36,16 +36,11 @@ STATIC = "static camera"
 class FolderPath:
     """What was found and written."""
 
-    camera_to_world: NDArray[np.float64]
-    """(T, 4, 4) mm."""
-    relative: bool
-    """Lengths have no unit."""
-    unexplained: list[int]
-    """Frames without a pose, or of another scene."""
-    kept: Path | None
-    """The file of the poses that were there, if it was kept."""
-    notes: list[str]
-    """Notes for the user, one line each."""
+    camera_to_world: NDArray[np.float64]  # (T, 4, 4) mm
+    relative: bool  # lengths have no unit
+    unexplained: list[int]  # frames without a pose, or of another scene
+    kept: Path | None  # the file of the poses that were there, if it was kept
+    notes: list[str]  # notes for the user, one line each
 
 
 def write_folder_path(

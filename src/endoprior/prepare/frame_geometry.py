@@ -24,12 +24,9 @@ from .config import Rectangle
 MIN_SIDE_PX = 32
 LEAST_FOCAL_SHARE, MOST_FOCAL_SHARE = 0.2, 5.0
 """A rectified focal length outside of this range, as a share of the calibrated one, comes from wrong coefficients."""
-MOST_LOST = 0.2
-"""So much of an image may be lost: corners outside of a round image, where nothing was measured."""
-COMPARED = 8
-"""Number of frames in which the offset between the rows of both cameras is measured ..."""
-FEWEST = 40
-"""... and of matching features, over all of them, that it needs."""
+MOST_LOST = 0.2  # so much of an image may be lost: corners outside of a round image, where nothing was measured
+COMPARED = 8  # number of frames in which the offset between the rows of both cameras is measured ...
+FEWEST = 40  # ... and of matching features, over all of them, that it needs
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -37,24 +34,16 @@ Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 class FrameGeometry:
     """How every source image becomes a frame."""
 
-    source_size: tuple[int, int]
-    """(width, height) of one camera's source image, px."""
+    source_size: tuple[int, int]  # (width, height) of one camera's source image, px
     maps: tuple[Maps | None, Maps | None]
     """Where each pixel of the rectified left and right image lies in the source; None if the images are rectified."""
-    cut: Rectangle
-    """Part of the rectified image to keep."""
-    size: tuple[int, int]
-    """(width, height) of a frame, px."""
-    matrix: NDArray[np.float64]
-    """(3, 3) camera matrix K of the frames, px; the left-most pixel is centered at 0.5."""
-    turn: NDArray[np.float64]
-    """(3, 3) rotation from the axes of the source's left camera to those of the frames."""
-    baseline_mm: float | None
-    """None if monocular."""
-    blank: NDArray[np.bool_]
-    """(h, w) of the source: True where images are painted black."""
-    inside: NDArray[np.bool_]
-    """(H, W) of a frame: True inside the endoscope's field of view."""
+    cut: Rectangle  # part of the rectified image to keep
+    size: tuple[int, int]  # (width, height) of a frame, px
+    matrix: NDArray[np.float64]  # (3, 3) camera matrix K of the frames, px; the left-most pixel is centered at 0.5
+    turn: NDArray[np.float64]  # (3, 3) rotation from the axes of the source's left camera to those of the frames
+    baseline_mm: float | None  # None if monocular
+    blank: NDArray[np.bool_]  # (h, w) of the source: True where images are painted black
+    inside: NDArray[np.bool_]  # (H, W) of a frame: True inside the endoscope's field of view
 
     def image(self, rgb_u8: NDArray[np.uint8], right: bool = False) -> NDArray[np.uint8]:
         """The frame (H, W, 3) of a source image (h, w, 3)."""
@@ -126,7 +115,7 @@ def make_geometry(
         painted[y : y + h, x : x + w] = True
     full, baseline = (width * stretch[0], height * stretch[1]), None
     if calibration is None:
-        # A round border of a squeezed image is no circle.
+        # a round border of a squeezed image is no circle.
         matrix = _assumed(*full, circle if full == size else None, field_of_view_degrees)
         turn, maps = np.eye(3), (None, None)
     else:

@@ -16,8 +16,7 @@ from ..data.frame_files import match_names
 from .source import ImageFolder, Source
 from .video import SourceFrame
 
-EVEN = 0.25
-"""A time step that differs from the nominal one by more than this share is uneven."""
+EVEN = 0.25  # a time step that differs from the nominal one by more than this share is uneven
 SAME_CLOCK_S = 1.0
 """Recordings whose clocks do not count from their starts have one clock if they start closer together than this."""
 
@@ -43,23 +42,16 @@ Image = TypeVar("Image", bound=Timed)
 class FrameSelection:
     """A time grid, and counts of gaps and uneven steps. Iterating over `pick` fills the counts."""
 
-    frames_per_second: float
-    """Rate of the grid."""
-    start: float = 0.0
-    """Seconds."""
-    end: float = math.inf
-    """Seconds; images at or after it are not used."""
-    source_rate: float = 0.0
-    """Nominal rate of the source, 1/s; half of its time step is the tolerance. 0 if unknown."""
+    frames_per_second: float  # rate of the grid
+    start: float = 0.0  # seconds
+    end: float = math.inf  # seconds; images at or after it are not used
+    source_rate: float = 0.0  # nominal rate of the source, 1/s; half of its time step is the tolerance. 0 if unknown.
     only: frozenset[int] | None = None
     """Positions in the source of the images to use, of those on the grid; None for all."""
     taken: int = field(default=0, init=False)
-    gaps: int = field(default=0, init=False)
-    """Grid steps without an image."""
-    uneven_steps: int = field(default=0, init=False)
-    """Time steps of the source that differ from the nominal one."""
-    between: int = field(default=0, init=False)
-    """Images within the time range that are not used."""
+    gaps: int = field(default=0, init=False)  # grid steps without an image
+    uneven_steps: int = field(default=0, init=False)  # time steps of the source that differ from the nominal one
+    between: int = field(default=0, init=False)  # images within the time range that are not used
 
     def pick(self, images: Iterable[Image]) -> Iterator[Image]:
         """The images on the grid, in order; stops at `end`."""
@@ -89,14 +81,10 @@ class FrameSelection:
 class Pairing:
     """How the images of two sources are paired."""
 
-    offset: float
-    """Time of the first image of the second source, s since that of the first source."""
-    rate: float
-    """Usual rate of the pairs, 1/s."""
-    by_name: dict[int, int] | None
-    """Position in the second folder for a position in the first one; None: by time."""
-    note: str
-    """What is particular, one line; else empty."""
+    offset: float  # time of the first image of the second source, s since that of the first source
+    rate: float  # usual rate of the pairs, 1/s
+    by_name: dict[int, int] | None  # position in the second folder for a position in the first one; None: by time
+    note: str  # what is particular, one line; else empty
 
     def pairs(self, first: Source, second: Source) -> Iterator[tuple[SourceFrame, SourceFrame | None]]:
         """Each image of the first source, with that of the second source at the same time, if there is one."""

@@ -29,12 +29,9 @@ from .relative_depth import DEFAULT_MODEL, DepthNetwork, Kind, fit_reference, fi
 from .stereo import stereo_depth, temporal_median
 from .video_clip import Clip, StereoFrame
 
-REACH = 2
-"""Number of frames on each side in the temporal depth filter."""
-FITTED_SAMPLES = 16
-"""Number of frames to which the tool and shading models are fitted."""
-MAX_ROW_OFFSET_PX = 1.5
-"""If the rows of the two cameras are further apart, stereo matching is poor."""
+REACH = 2  # number of frames on each side in the temporal depth filter
+FITTED_SAMPLES = 16  # number of frames to which the tool and shading models are fitted
+MAX_ROW_OFFSET_PX = 1.5  # if the rows of the two cameras are further apart, stereo matching is poor
 NETWORK = "depth-anything"
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
@@ -44,21 +41,14 @@ Measure = Callable[[MeasuredFrame], Depth]
 class FrameMethods:
     """How depth and masks of one clip are made."""
 
-    measure: Measure | None
-    """Depth that needs no mask: stereo, files, a network."""
-    shade: Callable[[NDArray[np.uint8], Mask], Depth] | None
-    """Depth from the shading of an image inside a mask."""
+    measure: Measure | None  # depth that needs no mask: stereo, files, a network
+    shade: Callable[[NDArray[np.uint8], Mask], Depth] | None  # depth from the shading of an image inside a mask
     tools: Tools
-    filter_in_time: bool
-    """Whether to filter depth over neighboring frames."""
-    wanted: Callable[[NDArray[np.uint8]], bool]
-    """Whether an image (H, W, 3) belongs in the sequence."""
-    sources: dict[str, str]
-    """Where images, depth and masks come from."""
-    relative: bool
-    """Whether the scale of the depth is assumed."""
-    notes: list[str]
-    """Notes for the user, one line each."""
+    filter_in_time: bool  # whether to filter depth over neighboring frames
+    wanted: Callable[[NDArray[np.uint8]], bool]  # whether an image (H, W, 3) belongs in the sequence
+    sources: dict[str, str]  # where images, depth and masks come from
+    relative: bool  # whether the scale of the depth is assumed
+    notes: list[str]  # notes for the user, one line each
 
 
 def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> FrameMethods:

@@ -15,10 +15,8 @@ from ..core.checks import input_error
 from ..core.shell import install_command
 from ..system.console import say
 
-FILES = ("config.json", "model.safetensors")
-"""Files of a model. Pickled weights are not read."""
-ANSWER_S = 10.0
-"""Longest time to wait for the size and the license of a model."""
+FILES = ("config.json", "model.safetensors")  # files of a model. Pickled weights are not read.
+ANSWER_S = 10.0  # longest time to wait for the size and the license of a model
 
 
 def load_network(name: str, default: str, class_name: str, what: str, *, option: str, extra: str) -> Any:

@@ -30,13 +30,11 @@ if TYPE_CHECKING:
     from ..tool_masks.carry import VideoSegmenter
     from ..tool_masks.sequence import Progress
 
-COVERED = 0.5
-"""Masks that extend over a smaller share of the frames are those of another clip, or not complete."""
+COVERED = 0.5  # masks that extend over a smaller share of the frames are those of another clip, or not complete
 HINT = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
 WORK = "carried"
 """Folder of the segmenter's masks until the sequence is complete, so that an interrupted run need not repeat them."""
-Tools = Callable[[MeasuredFrame], FoundTools]
-"""The tools of a frame; those that the user gives have confidence 1."""
+Tools = Callable[[MeasuredFrame], FoundTools]  # the tools of a frame; those that the user gives have confidence 1
 
 
 def names_folder(masks: str) -> bool:

@@ -33,8 +33,7 @@ from .sam2 import is_sam2, open_sam2
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
-DEPTH_SCALE = 0.01
-"""mm per unit of the 16-bit depth files: up to 655 mm."""
+DEPTH_SCALE = 0.01  # mm per unit of the 16-bit depth files: up to 655 mm
 Progress = Callable[[str, int, int], None]
 """Called with the name of the step, the number of items done, and their total (0: unknown)."""
 

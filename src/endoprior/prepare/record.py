@@ -17,12 +17,10 @@ from .frame_geometry import FrameGeometry
 from .frames import NETWORK
 from .sam2 import SAM2
 
-GRID_POINTS = 9
-"""Points a side of the grid over a rectified frame; between them the rectification is nearly linear."""
+GRID_POINTS = 9  # points a side of the grid over a rectified frame; between them the rectification is nearly linear
 METHODS = ("auto", "none", "sgbm", "shading", "still", "auto-own", "estimate", "own", "colmap", NETWORK, SAM2)
 """Values of --depth, --masks and --poses that are no paths."""
-NETWORKS = (NETWORK, SAM2)
-"""Methods that a folder of weights, or the name of a model, may follow after a colon."""
+NETWORKS = (NETWORK, SAM2)  # methods that a folder of weights, or the name of a model, may follow after a colon
 
 
 def record_of(

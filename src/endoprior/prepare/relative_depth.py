@@ -27,52 +27,37 @@ from ..core.checks import input_error
 from ..priors.specular import specular_likelihood
 from .hub_model import load_network
 
-Kind = Literal["depth", "disparity"]
-"""Meaning of the values: in `depth` near is small, in `disparity` near is large."""
-DEFAULT_MODEL = "depth-anything/Depth-Anything-V2-Small-hf"
-"""Name on the hub; about 100 MB, Apache-2.0."""
-SHORT_SIDE_PX = 518
-"""The image is resized so that its shorter side has this length, as in the training of the network."""
+Kind = Literal["depth", "disparity"]  # meaning of the values: in `depth` near is small, in `disparity` near is large
+DEFAULT_MODEL = "depth-anything/Depth-Anything-V2-Small-hf"  # name on the hub; about 100 MB, Apache-2.0
+SHORT_SIDE_PX = 518  # the image is resized so that its shorter side has this length, as in the training of the network
 MEAN, STD = np.array([0.485, 0.456, 0.406], np.float32), np.array([0.229, 0.224, 0.225], np.float32)
 """ImageNet statistics that normalize the input, colors in [0, 1]."""
-NEAR_PERCENT = 98.0
-"""Percentile of disparity that represents the nearest tissue ..."""
+NEAR_PERCENT = 98.0  # percentile of disparity that represents the nearest tissue ...
 NEAR_RATIO = 1.5
 """... assumed this many times nearer than the median. A disparity with unknown shift does not determine it."""
-MAX_RATIO = 4.0
-"""Depth is clipped to this ratio of the working distance."""
-SMALL_WIDTH = 160
-"""w: finer detail is texture, not shading."""
-GAMMA = 2.2
-"""Exponent of the display gamma, which is inverted."""
-DARKEST = 1e-3
-"""Smallest linear brightness; darker pixels are clamped to it."""
-RELIEF = 0.25
-"""Share of the formula's log depth to use; least squares gave 0.2 to 0.4 on the phantom and a real clip."""
+MAX_RATIO = 4.0  # depth is clipped to this ratio of the working distance
+SMALL_WIDTH = 160  # w: finer detail is texture, not shading
+GAMMA = 2.2  # exponent of the display gamma, which is inverted
+DARKEST = 1e-3  # smallest linear brightness; darker pixels are clamped to it
+RELIEF = 0.25  # share of the formula's log depth to use; least squares gave 0.2 to 0.4 on the phantom and a real clip
 VIGNETTING_SHARE = 0.5
 """Share of the darkening towards the corners attributed to lens and light; the rest may be the shape of the scene."""
-MAX_VIGNETTING = 3.0
-"""Largest vignetting in the corners, log units."""
+MAX_VIGNETTING = 3.0  # largest vignetting in the corners, log units
 SMOOTH_SIGMA_PX, SMOOTH_LOG = 8.0, 1.0
 """Bilateral smoothing of log brightness: standard deviations in small px and in log units."""
-MAX_SHADING_RATIO = 2.0
-"""Depth is clipped to this ratio of the working distance."""
+MAX_SHADING_RATIO = 2.0  # depth is clipped to this ratio of the working distance
 
 
 @dataclass(frozen=True)
 class ShadingModel:
     """Mapping from brightness to depth, the same for all frames of a clip."""
 
-    size: tuple[int, int]
-    """(W, H) of the images, px."""
+    size: tuple[int, int]  # (W, H) of the images, px
     reference: NDArray[np.float32]
     """(h, w) median log brightness, used to estimate the exposure of a frame; NaN where never usable."""
-    level: float
-    """Log brightness of tissue at the working distance, corrected for vignetting."""
-    vignetting: float
-    """Log units by which the corners are darker; proportional to the squared distance from the center."""
-    working_distance_mm: float
-    """Median depth over the samples, mm."""
+    level: float  # log brightness of tissue at the working distance, corrected for vignetting
+    vignetting: float  # log units by which the corners are darker; proportional to the squared distance from the center
+    working_distance_mm: float  # median depth over the samples, mm
 
     def depth(self, rgb_u8: NDArray[np.uint8], usable: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Depth of one image. Its exposure is the median change of brightness against the reference.
@@ -178,12 +163,9 @@ def _square_radius(shape: tuple[int, ...]) -> NDArray[np.float32]:
 class Reference:
     """How relative values of one clip map to mm."""
 
-    middle: float
-    """Median over the samples; maps to the working distance."""
-    near: float
-    """Percentile `NEAR_PERCENT` over the samples; used for disparity."""
-    working_distance_mm: float
-    """mm."""
+    middle: float  # median over the samples; maps to the working distance
+    near: float  # percentile `NEAR_PERCENT` over the samples; used for disparity
+    working_distance_mm: float  # mm
 
 
 def fit_reference(

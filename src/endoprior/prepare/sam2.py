@@ -20,10 +20,8 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.nn import Module
 
-SAM2 = "sam2"
-"""Value of `--masks` and of `--with`."""
-DEFAULT_MODEL = "facebook/sam2.1-hiera-tiny"
-"""Name on the hub; 156 MB, Apache-2.0."""
+SAM2 = "sam2"  # value of `--masks` and of `--with`
+DEFAULT_MODEL = "facebook/sam2.1-hiera-tiny"  # name on the hub; 156 MB, Apache-2.0
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """ImageNet statistics that normalize the input, colors in [0, 1]; the same for every SAM 2."""
 
@@ -60,8 +58,7 @@ class Sam2:
         """Args: name: for the user. network: a `Sam2VideoModel` in evaluation mode."""
         self.name, self.network = name, network
         size = network.config.image_size
-        self.side_px = int(size if isinstance(size, int) else size[0])
-        """The network sees square images of this side."""
+        self.side_px = int(size if isinstance(size, int) else size[0])  # the network sees square images of this side
 
     def begin(self) -> Sam2Chunk:
         """A new chunk that remembers nothing."""

@@ -25,8 +25,7 @@ from ..data.video_files import STILL_SUFFIXES, is_animated_webp
 from .decoding import usual_rate
 from .video import SourceFrame, Video, too_many_pixels
 
-OTHER_IMAGES = (".webp", ".jp2", ".gif", ".avif", ".exr")
-"""Suffixes of images that are counted, but not read."""
+OTHER_IMAGES = (".webp", ".jp2", ".gif", ".avif", ".exr")  # suffixes of images that are counted, but not read
 
 
 class ImageFolder:

@@ -18,28 +18,18 @@ from ..priors.specular import specular_likelihood
 
 MATCHING_WIDTH = 960
 """Wider images are matched at a whole fraction of their size, px. The refinement uses the full size."""
-TOLERANCE = 0.02
-"""Relative difference up to which depths agree: about half a pixel of disparity at the usual distance."""
-SURROUNDINGS_PX = 15
-"""Side of the square around a pixel that counts as its surroundings."""
-ROUNDS = 3
-"""Gauss-Newton steps of the refinement."""
-WINDOW_SIGMA_PX = 5.0
-"""Standard deviation of the Gaussian window over which one shift is estimated."""
-NOISE_VARIANCE = 4.0
-"""Sensor noise of the gray images, levels^2: weaker gradients do not change the disparity."""
-OUTLIER_LEVELS = 6.0
-"""Brightness difference between the cameras at which a pixel has half weight."""
+TOLERANCE = 0.02  # relative difference up to which depths agree: about half a pixel of disparity at the usual distance
+SURROUNDINGS_PX = 15  # side of the square around a pixel that counts as its surroundings
+ROUNDS = 3  # Gauss-Newton steps of the refinement
+WINDOW_SIGMA_PX = 5.0  # standard deviation of the Gaussian window over which one shift is estimated
+NOISE_VARIANCE = 4.0  # sensor noise of the gray images, levels^2: weaker gradients do not change the disparity
+OUTLIER_LEVELS = 6.0  # brightness difference between the cameras at which a pixel has half weight
 MAX_CHANGE_PX = 0.5
 """Largest change by a step, and by the whole refinement; limits the damage of windows across a depth edge."""
-SMOOTHING_PX, SMOOTHING_SIGMA_PX = 15, 5.0
-"""Size and standard deviation of the smoothing window ..."""
-SMOOTHING_STEP_PX = 0.5
-"""... and the difference of disparity between neighbors on different surfaces, px."""
-SPECKLE_STEP_PX = 1.0
-"""Neighbors whose disparities differ by more belong to different regions."""
-PLANE_RESIDUAL_PX = 0.35
-"""A hole is filled if 90 % of its rim lies on a plane to within this, px of disparity."""
+SMOOTHING_PX, SMOOTHING_SIGMA_PX = 15, 5.0  # size and standard deviation of the smoothing window ...
+SMOOTHING_STEP_PX = 0.5  # ... and the difference of disparity between neighbors on different surfaces, px
+SPECKLE_STEP_PX = 1.0  # neighbors whose disparities differ by more belong to different regions
+PLANE_RESIDUAL_PX = 0.35  # a hole is filled if 90 % of its rim lies on a plane to within this, px of disparity
 
 
 @dataclass(frozen=True)
@@ -79,10 +69,8 @@ class StereoConfig:
 class StereoDepth:
     """Depth and confidence of the left image."""
 
-    depth: NDArray[np.float32]
-    """(H, W) z, mm; 0 where not measured."""
-    confidence: NDArray[np.float32]
-    """(H, W) in [0, 1]; 0 where not measured."""
+    depth: NDArray[np.float32]  # (H, W) z, mm; 0 where not measured
+    confidence: NDArray[np.float32]  # (H, W) in [0, 1]; 0 where not measured
 
 
 def stereo_depth(
@@ -155,7 +143,7 @@ def temporal_median(window: Sequence[NDArray[np.float32]]) -> NDArray[np.float32
     for away in range(1, half + 1):
         before, after = window[half - away], window[half + away]
         agree = np.maximum(np.abs(before - middle), np.abs(after - middle)) <= np.float32(TOLERANCE) * middle
-        # A pair of opposite infinities does not change the median.
+        # a pair of opposite infinities does not change the median.
         votes += [np.where(agree, before, -np.inf), np.where(agree, after, np.inf)]
     median = np.partition(np.stack(votes), half, axis=0)[half] if half else middle
     result = np.where(measured, median, 0).astype(np.float32)

@@ -20,8 +20,7 @@ from ..core.ranges import spread
 from ..footage.optical_flow import MIN_SIZE_PX, MOTION_S, flow_pair, gray_for_flow
 from ..tool_masks.regions import disk, entering_regions
 
-COMPARED = 24
-"""Number of frames that are compared with a later one."""
+COMPARED = 24  # number of frames that are compared with a later one
 SIDE_PX = 160
 RETURN_PX, RETURN_SHARE = 0.7, 0.1
 """Forward and backward flow agree if they differ by at most this, px, plus this share of the step."""
@@ -30,13 +29,10 @@ LEAST_AGREEING = 0.8
 LEAST_PX, TIMES_MEDIAN = 2.0, 8.0
 """Least difference from the background motion, px, and as a multiple of that of the median pixel. At 1.5 and 5, frames
 without tools are named in fetoscopy and colonoscopy."""
-NEAR_TOOL_PX = 8
-"""Motion this near to a mask is that of its tool, or of tissue that it pulls."""
-LEAST_SHARE = 0.01
-"""Smaller regions, as a share of the view, are not reported."""
+NEAR_TOOL_PX = 8  # motion this near to a mask is that of its tool, or of tissue that it pulls
+LEAST_SHARE = 0.01  # smaller regions, as a share of the view, are not reported
 SMOOTH_PX = 2.0
-ROUNDS, EVERY = 8, 7
-"""Rounds of the robust fit; every so many pixels take part in it."""
+ROUNDS, EVERY = 8, 7  # rounds of the robust fit; every so many pixels take part in it
 Mask = NDArray[np.bool_]
 
 

@@ -26,14 +26,11 @@ from .decoding import AVI, DecodedImage, Timeline, choose_track, decode, is_cove
 class SourceFrame:
     """One image of a source."""
 
-    index: int
-    """Position in the source, from 0."""
+    index: int  # position in the source, from 0
     seconds: float
     """Time since the first image. It may be before that of the image before, if the file has its times in disorder."""
-    rgb_u8: NDArray[np.uint8]
-    """(H, W, 3) of square pixels."""
-    damaged: bool = False
-    """Bytes of it, or of an image that it was predicted from, are missing or wrong."""
+    rgb_u8: NDArray[np.uint8]  # (H, W, 3) of square pixels
+    damaged: bool = False  # bytes of it, or of an image that it was predicted from, are missing or wrong
 
 
 LOST_SHARE, LOST_IMAGES = 0.02, 2
@@ -42,17 +39,14 @@ STATES_END = ("matroska,webm", "nut")
 """FFmpeg's names of the formats whose duration is the time of the end, however late the first image is shown."""
 ARBITRARY_CLOCKS = ("mpegts", "mpeg")
 """FFmpeg's names of the formats whose times do not count from the start of the recording."""
-PIXEL_ASPECTS = (0.25, 4.0)
-"""Plausible width of a pixel, in heights."""
-LOOKED_AT = 300
-"""Most images that are decoded to reach the time of a glimpse: as many as between two key frames."""
+PIXEL_ASPECTS = (0.25, 4.0)  # plausible width of a pixel, in heights
+LOOKED_AT = 300  # most images that are decoded to reach the time of a glimpse: as many as between two key frames
 
 
 class Video:
     """A video file. Metadata (names, dates, places) is not read."""
 
-    weave: bool = False
-    """Keep the rows of interlaced images as they are: they are those of two cameras."""
+    weave: bool = False  # keep the rows of interlaced images as they are: they are those of two cameras
     was_damaged: bool = False
     """Whether an iteration has met damage. From then on, one thread decodes: it reports all damage."""
 

@@ -18,12 +18,9 @@ from .frame_selection import FrameSelection, Pairing, find_pairing
 from .source import Source, open_source
 from .video import SourceFrame, Video
 
-KINDS: tuple[Layout, ...] = ("side-by-side", "top-bottom", "interlaced")
-"""How one frame can hold two images."""
-LOOK_ALIKE = 0.8
-"""Correlation above which the halves of a frame are two views of the same scene."""
-GLIMPSES = 9
-"""Number of images that tell the stereo layout."""
+KINDS: tuple[Layout, ...] = ("side-by-side", "top-bottom", "interlaced")  # how one frame can hold two images
+LOOK_ALIKE = 0.8  # correlation above which the halves of a frame are two views of the same scene
+GLIMPSES = 9  # number of images that tell the stereo layout
 CONTENT = 3.0
 """Least standard deviation, levels of 255, of a frame that shows something, in each of its rows and columns."""
 
@@ -131,14 +128,10 @@ def _alike(frame: NDArray[np.uint8], layout: Layout) -> bool:
 class StereoFrame:
     """The images of both cameras at one time, as stored in the source."""
 
-    index: int
-    """Position of the frame in the source, from 0."""
-    left: NDArray[np.uint8]
-    """(h, w, 3)."""
-    right: NDArray[np.uint8] | None
-    """(h, w, 3); None if the video is monocular."""
-    damaged: bool = False
-    """Bytes of one of them, or of what it was predicted from, are missing or wrong."""
+    index: int  # position of the frame in the source, from 0
+    left: NDArray[np.uint8]  # (h, w, 3)
+    right: NDArray[np.uint8] | None  # (h, w, 3); None if the video is monocular
+    damaged: bool = False  # bytes of one of them, or of what it was predicted from, are missing or wrong
 
 
 class Clip:

@@ -13,8 +13,7 @@ from ..core.checks import InputError, input_error
 from ..system.atomic import CannotWrite, complete_folder, reject_current_folder, reject_occupied, write_json, writing
 from ..system.file_lock import locked
 
-PLAN = "plan.json"
-"""Inputs and options of the folder. If they changed, the work starts from the beginning."""
+PLAN = "plan.json"  # inputs and options of the folder. If they changed, the work starts from the beginning.
 
 
 @contextmanager

@@ -21,16 +21,11 @@ NEAREST_MM = 1e-3
 """Points nearer than this, or behind the camera, are held at it: finite residuals, far from any inlier."""
 TRACK_WIDTH = (1.5, 6.0)
 """Range of the width of a track's weight, standard deviations; between them twice the median over the tracks."""
-SINGLE_WIDTH = 4.0
-"""Width of the weight of one observation, standard deviations."""
-DEPTH_WIDTH = 3.0
-"""Width of the weight of one depth, standard deviations."""
-DENSE_LIMIT = 900
-"""Up to this many unknowns of the cameras, their system is solved as a dense matrix."""
-INLIER_PX = 2.5
-"""Largest reprojection error of an inlier of RANSAC, px of an image 640 px wide."""
-FEWEST = 12
-"""With fewer points there is no pose."""
+SINGLE_WIDTH = 4.0  # width of the weight of one observation, standard deviations
+DEPTH_WIDTH = 3.0  # width of the weight of one depth, standard deviations
+DENSE_LIMIT = 900  # up to this many unknowns of the cameras, their system is solved as a dense matrix
+INLIER_PX = 2.5  # largest reprojection error of an inlier of RANSAC, px of an image 640 px wide
+FEWEST = 12  # with fewer points there is no pose
 
 
 def residuals(
@@ -95,32 +90,22 @@ def _in_camera(poses: NDArray, points: NDArray) -> NDArray[np.float64]:
 class Observations:
     """Which camera saw which point where."""
 
-    camera: NDArray[np.intp]
-    """(N,) 0..K-1."""
-    point: NDArray[np.intp]
-    """(N,) 0..P-1."""
-    pixels: NDArray[np.float64]
-    """(N, 2) px."""
-    inverse_depth: NDArray[np.float64]
-    """(N,) 1 / measured depth, 1/mm; anything finite where its sigma is inf."""
-    sigma: NDArray[np.float64]
-    """(N, 2) standard deviations: px, 1/mm."""
+    camera: NDArray[np.intp]  # (N,) 0..K-1
+    point: NDArray[np.intp]  # (N,) 0..P-1
+    pixels: NDArray[np.float64]  # (N, 2) px
+    inverse_depth: NDArray[np.float64]  # (N,) 1 / measured depth, 1/mm; anything finite where its sigma is inf
+    sigma: NDArray[np.float64]  # (N, 2) standard deviations: px, 1/mm
 
 
 @dataclass(frozen=True)
 class Adjusted:
     """Result of the adjustment."""
 
-    poses: NDArray[np.float64]
-    """(K, 4, 4) world-to-camera."""
-    points: NDArray[np.float64]
-    """(P, 3) mm."""
-    track_weight: NDArray[np.float64]
-    """(P,) 0..1: how well the track follows the rigid scene over time."""
-    focal_factor: float
-    """Of the focal length; 1 where it is fixed."""
-    focal_std: float
-    """Standard deviation of its logarithm; 0 where it is fixed."""
+    poses: NDArray[np.float64]  # (K, 4, 4) world-to-camera
+    points: NDArray[np.float64]  # (P, 3) mm
+    track_weight: NDArray[np.float64]  # (P,) 0..1: how well the track follows the rigid scene over time
+    focal_factor: float  # of the focal length; 1 where it is fixed
+    focal_std: float  # standard deviation of its logarithm; 0 where it is fixed
 
 
 def adjust(
@@ -290,14 +275,10 @@ def _rows(values: NDArray, columns: NDArray, width: int) -> sparse.csr_matrix:
 class Resected:
     """A pose and how sure it is."""
 
-    pose: NDArray[np.float64]
-    """(4, 4) world-to-camera."""
-    inlier: NDArray[np.bool_]
-    """(N,) points that it explains."""
-    translation_std: float
-    """Of the camera center, mm; the points count as known."""
-    rotation_std: float
-    """rad."""
+    pose: NDArray[np.float64]  # (4, 4) world-to-camera
+    inlier: NDArray[np.bool_]  # (N,) points that it explains
+    translation_std: float  # of the camera center, mm; the points count as known
+    rotation_std: float  # rad
 
 
 def coarse_pose(

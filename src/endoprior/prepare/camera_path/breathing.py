@@ -20,38 +20,25 @@ from .adjust import Observations, derivatives, moved, residuals, summed_by, weig
 from .follow import Follower
 
 HARMONICS = 2
-CYCLES = 3.0
-"""Fewer breaths are not told from the camera."""
-SHORTEST = 8
-"""Frames of the fastest breath."""
-SAMPLE = 4000
-"""Observations from which the period is found."""
-SPACING = 12
-"""Frames of a breath that are adjusted, and ..."""
-MOST_CAMERAS = 220
-"""... at most in all: a longer clip is left to the camera."""
-SIGNIFICANT = 0.03
-"""Share of the residuals that one period must explain ..."""
-PEAK = 10.0
-"""... and how many times more than the median period."""
-SMOOTH = 20.0
-"""Weight of the acceleration of the camera, 1/mm; rotation counts at the distance of the tissue."""
-STILL_MM = 0.01
-"""Changes of speed far below this count quadratically, mm per step."""
-COEFFICIENT_MM = 5.0
-"""Prior standard deviation of A and B, mm."""
+CYCLES = 3.0  # fewer breaths are not told from the camera
+SHORTEST = 8  # frames of the fastest breath
+SAMPLE = 4000  # observations from which the period is found
+SPACING = 12  # frames of a breath that are adjusted, and ...
+MOST_CAMERAS = 220  # ... at most in all: a longer clip is left to the camera
+SIGNIFICANT = 0.03  # share of the residuals that one period must explain ...
+PEAK = 10.0  # ... and how many times more than the median period
+SMOOTH = 20.0  # weight of the acceleration of the camera, 1/mm; rotation counts at the distance of the tissue
+STILL_MM = 0.01  # changes of speed far below this count quadratically, mm per step
+COEFFICIENT_MM = 5.0  # prior standard deviation of A and B, mm
 
 
 @dataclass(frozen=True)
 class Breathing:
     """Displacement of every point in every frame."""
 
-    period: float
-    """Frames."""
-    basis: NDArray[np.float64]
-    """(P, 6) phi of each point."""
-    coefficients: NDArray[np.float64]
-    """(6, 2 * HARMONICS, 3) mm."""
+    period: float  # frames
+    basis: NDArray[np.float64]  # (P, 6) phi of each point
+    coefficients: NDArray[np.float64]  # (6, 2 * HARMONICS, 3) mm
 
     def at(self, frame: int, ids: NDArray) -> NDArray[np.float64]:
         """(N, 3) displacement of points, mm."""

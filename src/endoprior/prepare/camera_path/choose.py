@@ -16,8 +16,7 @@ from .own import own_path
 from .tracks import DEPTH_STD, CameraPath, Lens, PoseInput, Tracks
 
 How = Literal["best", "own", "colmap"]
-USUAL_PX = 1.0
-"""An error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)."""
+USUAL_PX = 1.0  # an error of this many px, at a width of 640, scores one half: 1 / (1 + e^2)
 
 
 def find_path(

@@ -29,24 +29,16 @@ from .tracks import CameraPath, PoseInput, Tracks
 
 ENOUGH_IMAGES, LARGEST_STRIDE = 150, 4
 """A longer clip is mapped by every second to fourth frame; our tracks place those between."""
-LONGEST = 1000
-"""Longer clips are mapped only if COLMAP is asked for: it takes seconds a frame."""
-DEFORMING = 0.1
-"""Tracks below this weight deform; the tissue around them is masked ..."""
-AROUND = 40
-"""... within the image width divided by this."""
+LONGEST = 1000  # longer clips are mapped only if COLMAP is asked for: it takes seconds a frame
+DEFORMING = 0.1  # tracks below this weight deform; the tissue around them is masked ...
+AROUND = 40  # ... within the image width divided by this
 SECONDS_AN_IMAGE = 1.0
 """About the time for each image, on two cores. Mapping that alone takes longer is stopped: see `time_note`."""
-LEAST_SECONDS = 60
-"""Mapping may always take this long."""
-LEAST_SHARE = 0.3
-"""A model with a smaller share of the frames is no path of the clip."""
-PARALLAX = 0.02
-"""Least spread of the rays to a point, rad, whose position counts for the scale."""
-FEWEST = 10
-"""With fewer such points in a frame, its scale is that of the frames around."""
-STRIDE = 3
-"""Points are placed by every third frame and all keyframes: neighbors add nothing."""
+LEAST_SECONDS = 60  # mapping may always take this long
+LEAST_SHARE = 0.3  # a model with a smaller share of the frames is no path of the clip
+PARALLAX = 0.02  # least spread of the rays to a point, rad, whose position counts for the scale
+FEWEST = 10  # with fewer such points in a frame, its scale is that of the frames around
+STRIDE = 3  # points are placed by every third frame and all keyframes: neighbors add nothing
 
 
 def time_note(seconds: float, limit: float) -> list[str]:

@@ -17,42 +17,31 @@ from .adjust import back_projected, coarse_pose
 from .tracks import Lens, PoseInput
 
 MAX_CORNERS = 500
-REFRESH = 0.8
-"""New corners are detected when fewer than this share of `MAX_CORNERS` is left."""
-EDGE_STEP = 0.05
-"""No corners where depth changes by more than this share between neighbors: those are depth edges."""
+REFRESH = 0.8  # new corners are detected when fewer than this share of `MAX_CORNERS` is left
+EDGE_STEP = 0.05  # no corners where depth changes by more than this share between neighbors: those are depth edges
 CELLS = (8, 6)
 """The image is divided into these columns and rows; no cell holds more than twice its share of the corners."""
 FLAT_WIDTHS, FLAT_CONTRAST = 64, 300.0
 """Shading is what is left after a blur by the image width divided by this; contrast of the rest, gray levels."""
-COARSE_HALVINGS, FINE_HALVINGS = 4, 1
-"""How often images are halved to follow corners: plain images, then flat ones."""
+COARSE_HALVINGS, FINE_HALVINGS = 4, 1  # how often images are halved to follow corners: plain images, then flat ones
 FINE_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 0.01)
-FINE_PX = 2.0
-"""The two results differ by less than this."""
-RETURN_PX = 1.0
-"""Followed to the next frame and back, a corner returns within this distance."""
+FINE_PX = 2.0  # the two results differ by less than this
+RETURN_PX = 1.0  # followed to the next frame and back, a corner returns within this distance
 KEYPOINTS = 600
-RATIO = 0.8
-"""The best match is nearer than the second best by this factor (Lowe's ratio test)."""
-FEWEST_INLIERS = 20
-"""Fewer matches that one pose explains may be chance."""
-INLIER_PX = 4.0
-"""Reprojection error of a match, px of an image 640 px wide: the tissue may have moved in between."""
+RATIO = 0.8  # the best match is nearer than the second best by this factor (Lowe's ratio test)
+FEWEST_INLIERS = 20  # fewer matches that one pose explains may be chance
+INLIER_PX = 4.0  # reprojection error of a match, px of an image 640 px wide: the tissue may have moved in between
 
 
 @dataclass(frozen=True)
 class View:
     """A frame as points are recognized in it."""
 
-    plain: NDArray[np.uint8]
-    """(H, W) brightness: finds large motion."""
+    plain: NDArray[np.uint8]  # (H, W) brightness: finds large motion
     flat: NDArray[np.uint8]
     """(H, W) without shading: the light moves with the camera, and what it paints must not count as tissue."""
-    usable: NDArray[np.bool_]
-    """(H, W) see `usable_tissue`."""
-    depth: NDArray[np.float32]
-    """(H, W) 0 where missing."""
+    usable: NDArray[np.bool_]  # (H, W) see `usable_tissue`
+    depth: NDArray[np.float32]  # (H, W) 0 where missing
 
 
 def view_of(seen: PoseInput) -> View:
@@ -131,28 +120,20 @@ class Keyframe:
     """What is kept of a keyframe."""
 
     frame: int
-    pixels: NDArray[np.float32]
-    """(M, 2) px."""
-    depths: NDArray[np.float32]
-    """(M,) mm before any scale, > 0."""
-    descriptors: NDArray[np.uint8]
-    """(M, 128)."""
-    track: NDArray[np.int32]
-    """(M,) id of the track of the keypoint, -1 without one."""
+    pixels: NDArray[np.float32]  # (M, 2) px
+    depths: NDArray[np.float32]  # (M,) mm before any scale, > 0
+    descriptors: NDArray[np.uint8]  # (M, 128)
+    track: NDArray[np.int32]  # (M,) id of the track of the keypoint, -1 without one
 
 
 @dataclass(frozen=True)
 class Link:
     """A keyframe recognized in another one."""
 
-    pose: NDArray[np.float64]
-    """(4, 4) world-to-camera of the new one, in the world of the old one."""
-    old: NDArray[np.intp]
-    """(N,) keypoints of the old one ..."""
-    new: NDArray[np.intp]
-    """... that are these of the new one."""
-    scale: float
-    """Depth in the world of the old one, as a multiple of the new one's own depth."""
+    pose: NDArray[np.float64]  # (4, 4) world-to-camera of the new one, in the world of the old one
+    old: NDArray[np.intp]  # (N,) keypoints of the old one ...
+    new: NDArray[np.intp]  # ... that are these of the new one
+    scale: float  # depth in the world of the old one, as a multiple of the new one's own depth
 
 
 def keyframe(index: int, view: View) -> Keyframe:

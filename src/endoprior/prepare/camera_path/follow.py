@@ -16,20 +16,14 @@ from .adjust import INLIER_PX, adjust, back_projected, coarse_pose
 from .features import Keyframe, Link, View, followed, keyframe, link, new_corners, sampled, view_of
 from .tracks import Lens, PoseInput, Tracks
 
-MIN_TRACKS = 30
-"""With fewer tracks a frame gets no pose from the frame before."""
+MIN_TRACKS = 30  # with fewer tracks a frame gets no pose from the frame before
 MIN_INLIERS = 0.4
 """Share of the tracks that one pose must explain; below, the frame shows another place or another scene."""
-KEYFRAME_GAP = 10
-"""Frames from one keyframe to the next at most: the weights need the history of a breath ..."""
-KEYFRAME_LEFT = 0.7
-"""... and earlier when less than this share of its tracks is left ..."""
-KEYFRAME_SHIFT = 0.08
-"""... or when they have moved by this share of the image width."""
-WINDOW = 8
-"""Keyframes that are adjusted together with each new one."""
-RECENT, OLDER = 6, 14
-"""Keyframes that a lost frame is compared with: the last ones, and others spread over the clip."""
+KEYFRAME_GAP = 10  # frames from one keyframe to the next at most: the weights need the history of a breath ...
+KEYFRAME_LEFT = 0.7  # ... and earlier when less than this share of its tracks is left ...
+KEYFRAME_SHIFT = 0.08  # ... or when they have moved by this share of the image width
+WINDOW = 8  # keyframes that are adjusted together with each new one
+RECENT, OLDER = 6, 14  # keyframes that a lost frame is compared with: the last ones, and others spread over the clip
 
 
 class Follower:
@@ -38,8 +32,7 @@ class Follower:
     def __init__(self, lens: Lens, count: int) -> None:
         """Args: lens: the camera. count: frames of the clip."""
         self.lens, self.tracks = lens, Tracks(lens)
-        self.poses = np.tile(np.eye(4), (count, 1, 1))
-        """(T, 4, 4) world-to-camera, in the world of the frame's segment."""
+        self.poses = np.tile(np.eye(4), (count, 1, 1))  # (T, 4, 4) world-to-camera, in the world of the frame's segment
         self.scales = np.ones(count)
         self.segment = np.full(count, -1)
         self.keyframes: list[Keyframe] = []

@@ -19,26 +19,18 @@ from .features import Keyframe, link
 from .follow import Follower, follow_camera
 from .tracks import CameraPath, Lens, PoseInput, Tracks
 
-FOCAL_PRIOR = 0.2
-"""Standard deviation of log f where the focal length is assumed."""
-FOCAL_STD = 0.03
-"""A refined focal length is kept if the standard deviation of its logarithm is below this."""
+FOCAL_PRIOR = 0.2  # standard deviation of log f where the focal length is assumed
+FOCAL_STD = 0.03  # a refined focal length is kept if the standard deviation of its logarithm is below this
 BREATHES, NOT_CAMERA = "the tissue breathes", "what the view does in this rhythm is not counted as camera motion"
-MIN_POINTS = 20
-"""With fewer adjusted points a frame keeps its pose relative to its keyframe."""
-OVERLAP = 0.3
-"""Least share of an old keyframe's points that lies in the new image."""
-SHARED = 0.3
-"""Keyframes that share more of their tracks than this need no loop."""
-PARTNERS = 3
-"""Old keyframes that each new one is matched with at most."""
+MIN_POINTS = 20  # with fewer adjusted points a frame keeps its pose relative to its keyframe
+OVERLAP = 0.3  # least share of an old keyframe's points that lies in the new image
+SHARED = 0.3  # keyframes that share more of their tracks than this need no loop
+PARTNERS = 3  # old keyframes that each new one is matched with at most
 LOW_PX, HIGH_PX = 0.25, 0.5
 """The camera rests while rigid tissue stays this near to where it was, px of an image 640 px wide; once at rest, it
 moves when it is beyond the second value (hysteresis)."""
-FEWEST_FRAMES = 8
-"""A shorter rest is none: slow motion looks the same."""
-RIGID = 0.5
-"""Weight of a track that counts as rigid tissue."""
+FEWEST_FRAMES = 8  # a shorter rest is none: slow motion looks the same
+RIGID = 0.5  # weight of a track that counts as rigid tissue
 FEWEST_TRACKS = 20
 
 

@@ -21,10 +21,8 @@ HINT = "Write (T, 4, 4) camera-to-world matrices in mm, OpenCV axes."
 TEXT_SUFFIXES = (".txt", ".tum", ".freiburg", ".csv")
 TEXT_HINT = "Write `frame x y z qx qy qz qw` in each row: camera to world, m."
 MM_PER_M = 1000.0
-FARTHEST_M = 2.0
-"""An endoscope does not move further; larger numbers are mm."""
-UNIT_TOLERANCE = 0.01
-"""Largest difference of a quaternion's length from 1 that rounding explains."""
+FARTHEST_M = 2.0  # an endoscope does not move further; larger numbers are mm
+UNIT_TOLERANCE = 0.01  # largest difference of a quaternion's length from 1 that rounding explains
 
 
 def read_poses(path: Path, count: int, sources: Sequence[int] | None = None) -> NDArray[np.float64]:

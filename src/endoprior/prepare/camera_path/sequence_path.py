@@ -22,14 +22,12 @@ from .pose_file import is_model, read_model_poses, read_poses
 from .tracks import CameraPath, Lens, PoseInput
 
 NEGLIGIBLE_DEGREES = 1e-3
-PATH_RECORD = "camera_path.json"
-"""In a sequence folder: how each pose was found, and how sure it is."""
+PATH_RECORD = "camera_path.json"  # in a sequence folder: how each pose was found, and how sure it is
 ASSUMED, CALIBRATED = "assumed field of view", "calibration"
 """Where the focal length comes from: `sources.lens` of `sequence.json`."""
 METHODS: dict[str, How] = {"auto": "best", "auto-own": "own", "estimate": "best", "own": "own", "colmap": "colmap"}
 """Values of --poses that estimate a path; `still` and files do not."""
-ONLY_IF_MOVING = ("auto", "auto-own")
-"""Those that do so only where the camera moves."""
+ONLY_IF_MOVING = ("auto", "auto-own")  # those that do so only where the camera moves
 WITHOUT_COLMAP = {"auto": "auto-own", "estimate": "own", "colmap": "own"}
 """The same by our own tracks alone, which is ten times faster."""
 
@@ -39,8 +37,7 @@ class Reading:
     """How the matrices of a file of poses are to be read."""
 
     convention: Convention = "opencv"
-    unit_mm: float = 1.0
-    """mm per unit of the positions."""
+    unit_mm: float = 1.0  # mm per unit of the positions
     turn: NDArray[np.float64] | None = None
     """(3, 3) rotation from the camera that the poses belong to, to that of the frames; None if they are the same."""
     sources: Sequence[int] | None = None

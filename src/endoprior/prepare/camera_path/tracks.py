@@ -11,44 +11,31 @@ from numpy.typing import NDArray
 
 from .adjust import Observations, Resected, refined_pose
 
-REFINED = "refined with the camera path"
-"""Where the focal length may come from: `sources.lens` of `sequence.json`."""
-HELD_OUT = 8
-"""One in this many tracks takes no part in any estimate: it measures how well a path explains the frames."""
-PIXEL_STD = 0.5
-"""Error of a followed corner, px of an image 640 px wide."""
-KEYPOINT_STD = 1.0
-"""Error of a matched keypoint, px of an image 640 px wide."""
-DISPARITY_STD = 0.2
-"""Error of stereo, px."""
-DEPTH_STD = {False: 0.02, True: 0.15}
-"""Error of other depth as a share of it, by whether it is relative."""
+REFINED = "refined with the camera path"  # where the focal length may come from: `sources.lens` of `sequence.json`
+HELD_OUT = 8  # one in this many tracks takes no part in any estimate: it measures how well a path explains the frames
+PIXEL_STD = 0.5  # error of a followed corner, px of an image 640 px wide
+KEYPOINT_STD = 1.0  # error of a matched keypoint, px of an image 640 px wide
+DISPARITY_STD = 0.2  # error of stereo, px
+DEPTH_STD = {False: 0.02, True: 0.15}  # error of other depth as a share of it, by whether it is relative
 
 
 @dataclass(frozen=True)
 class PoseInput:
     """One frame for camera tracking."""
 
-    rgb_u8: NDArray[np.uint8]
-    """(H, W, 3)."""
-    tissue_mask: NDArray[np.bool_]
-    """(H, W) True outside tools."""
-    depth: NDArray[np.float32]
-    """(H, W) mm, 0 where missing."""
+    rgb_u8: NDArray[np.uint8]  # (H, W, 3)
+    tissue_mask: NDArray[np.bool_]  # (H, W) True outside tools
+    depth: NDArray[np.float32]  # (H, W) mm, 0 where missing
 
 
 @dataclass(frozen=True)
 class Lens:
     """A pinhole camera whose depth was measured; pixel centers are counted from 0, as in OpenCV."""
 
-    matrix: NDArray[np.float64]
-    """(3, 3) K, px."""
-    width: int
-    """Of the image, px."""
-    depth_is_relative: bool
-    """Each frame's depth has a scale of its own."""
-    baseline_mm: float | None = None
-    """Distance between the cameras that measured the depth, mm."""
+    matrix: NDArray[np.float64]  # (3, 3) K, px
+    width: int  # of the image, px
+    depth_is_relative: bool  # each frame's depth has a scale of its own
+    baseline_mm: float | None = None  # distance between the cameras that measured the depth, mm
 
     @classmethod
     def centered_at_half(
@@ -77,24 +64,17 @@ class CameraPath:
 
     camera_to_world: NDArray[np.float64]
     """(T, 4, 4), translation in mm; an unexplained frame has the pose of the frame before it."""
-    explained: NDArray[np.bool_]
-    """(T,) whether the pose is linked to those of the other frames."""
+    explained: NDArray[np.bool_]  # (T,) whether the pose is linked to those of the other frames
     depth_scale: NDArray[np.float64]
     """(T,) factor that makes the depth of the frame agree with the path; 1 for depth in mm."""
-    method: str = "file"
-    """Where the poses come from."""
-    focal_factor: float = 1.0
-    """Refined focal length, as a multiple of the given one."""
+    method: str = "file"  # where the poses come from
+    focal_factor: float = 1.0  # refined focal length, as a multiple of the given one
     translation_std: NDArray[np.float64] | None = None
     """(T,) standard deviation of the camera center, mm; NaN where unexplained."""
-    rotation_std: NDArray[np.float64] | None = None
-    """(T,) standard deviation of the rotation, degrees."""
-    still: NDArray[np.bool_] | None = None
-    """(T,) whether the pose is a copy, because the camera rests."""
-    breathes: bool = False
-    """Whether periodic motion of the tissue was told apart from the camera's."""
-    notes: list[str] = field(default_factory=list)
-    """Notes for the user, one line each."""
+    rotation_std: NDArray[np.float64] | None = None  # (T,) standard deviation of the rotation, degrees
+    still: NDArray[np.bool_] | None = None  # (T,) whether the pose is a copy, because the camera rests
+    breathes: bool = False  # whether periodic motion of the tissue was told apart from the camera's
+    notes: list[str] = field(default_factory=list)  # notes for the user, one line each
 
     @property
     def lost(self) -> list[int]:
