@@ -9,9 +9,8 @@ import pytest
 
 from endoprior.core.checks import InputError
 from endoprior.evaluation.networks import import_torchvision
-from endoprior.prepare import relative_depth
-from endoprior.prepare.hub_model import FILES
-from endoprior.prepare.relative_depth import DepthNetwork
+from endoprior.prepare import networks
+from endoprior.prepare.networks import FILES, DepthNetwork
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 # The library's own warnings are not ours to fix.
@@ -56,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @needs_transformers
 def test_a_model_folder_runs_on_any_image_size(folder, monkeypatch):
-    monkeypatch.setattr(relative_depth, "SHORT_SIDE_PX", 56)
+    monkeypatch.setattr(networks, "SHORT_SIDE_PX", 56)
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the net"))
     network = DepthNetwork(folder)
     image = np.random.default_rng(0).integers(0, 256, (45, 71, 3), np.uint8)
@@ -129,7 +128,7 @@ def test_importing_the_module_loads_neither_torch_nor_transformers():
     import subprocess
 
     code = (
-        "import sys, endoprior.prepare.relative_depth, endoprior.prepare.sam2, endoprior.prepare.pipeline; "
+        "import sys, endoprior.prepare.pipeline; "
         "assert not {'torch', 'transformers', 'huggingface_hub'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -15,11 +15,10 @@ from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
 from endoprior.data.images import read_tool_mask
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.prepare import PrepareConfig, hub_model, pipeline, prepare
-from endoprior.prepare.hub_model import FILES
+from endoprior.prepare import PrepareConfig, networks, prepare
+from endoprior.prepare.config import is_sam2, names_path
 from endoprior.prepare.masks import WORK
-from endoprior.prepare.record import names_path
-from endoprior.prepare.sam2 import DEFAULT_MODEL, is_sam2, open_sam2
+from endoprior.prepare.networks import DEFAULT_SAM2, FILES, open_sam2
 from endoprior.tool_masks.carry import carry
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
@@ -138,7 +137,7 @@ SQUARE[60:80, 30:60] = True
 def segmenter(monkeypatch):
     """In place of SAM 2."""
     stand_in = Repainting()
-    monkeypatch.setattr(pipeline, "open_sam2", lambda value, option: stand_in)
+    monkeypatch.setattr(networks, "open_sam2", lambda value, option: stand_in)
     return stand_in
 
 
@@ -209,7 +208,7 @@ def test_a_missing_model_stops_prepare_before_it_starts(phantom, tmp_path, monke
     source = video(phantom, tmp_path)
     assert main(["prepare", str(source), str(tmp_path / "out"), "--masks", "sam2"]) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and f"{DEFAULT_MODEL}: expected a model in the cache or a download" in error
+    assert error.count("\n") == 1 and f"{DEFAULT_SAM2}: expected a model in the cache or a download" in error
     assert "no network" in error and "`--masks sam2:FOLDER`" in error
     assert [path.name for path in tmp_path.iterdir()] == ["v.mkv"]
 
@@ -257,7 +256,7 @@ def test_other_files_are_an_error(model, tmp_path):
 
 @pytest.mark.parametrize("option", ["--masks", "--with"])
 def test_without_the_package_its_name_is_said(monkeypatch, option):
-    monkeypatch.setattr(hub_model, "find_spec", lambda name: None)
+    monkeypatch.setattr(networks, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=rf"{option} sam2: expected the transformers package, got none. Fix: `pip"):
         open_sam2("sam2", option)
 

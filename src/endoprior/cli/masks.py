@@ -70,7 +70,7 @@ def _find_all(args: Masks) -> None:
     from ..data import load_sequence
     from ..data.folder_edits import note_found_masks, replace_masks, writable_masks
     from ..data.found_tools import FrameRow, uncertain_frames, write_rows
-    from ..prepare.sam2 import open_sam2
+    from ..prepare.networks import open_sam2
     from ..tool_masks.mask_store import MaskStore
     from ..visualization.image_tools import mask_sheet, write_png
 

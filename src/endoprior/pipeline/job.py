@@ -19,7 +19,7 @@ from ..data.files import read_json
 from ..prepare.camera_path.sequence_path import WITHOUT_COLMAP
 from ..prepare.config import PrepareConfig
 from ..prepare.first_pass import input_facts, source_facts
-from ..prepare.frame_selection import FrameSelection
+from ..prepare.frame_selection import FrameSelection, Moment
 from ..prepare.source import open_source
 from ..system.atomic import reject_occupied, write_json
 

@@ -10,29 +10,30 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 from ..data.frame_files import match_names
 from .source import ImageFolder, Source
 from .video import SourceFrame
 
 EVEN = 0.25  # a time step that differs from the nominal one by more than this share is uneven
-SAME_CLOCK_S = 1.0
-"""Recordings whose clocks do not count from their starts have one clock if they start closer together than this."""
+SAME_CLOCK_S = 1.0  # arbitrary clocks are one clock if they start closer together than this
 
 
 class Timed(Protocol):
-    """An image of a source, or only its place there and its time."""
+    """An image of a source: its position there, from 0, and its time since the first image."""
 
     @property
-    def index(self) -> int:
-        """Position in the source, from 0."""
-        ...
-
+    def index(self) -> int: ...
     @property
-    def seconds(self) -> float:
-        """Time since the first image."""
-        ...
+    def seconds(self) -> float: ...
+
+
+class Moment(NamedTuple):
+    """Place and time of an image."""
+
+    index: int
+    seconds: float
 
 
 Image = TypeVar("Image", bound=Timed)
@@ -46,8 +47,7 @@ class FrameSelection:
     start: float = 0.0  # seconds
     end: float = math.inf  # seconds; images at or after it are not used
     source_rate: float = 0.0  # nominal rate of the source, 1/s; half of its time step is the tolerance. 0 if unknown.
-    only: frozenset[int] | None = None
-    """Positions in the source of the images to use, of those on the grid; None for all."""
+    only: frozenset[int] | None = None  # positions in the source of the images to use, of those on the grid; None: all
     taken: int = field(default=0, init=False)
     gaps: int = field(default=0, init=False)  # grid steps without an image
     uneven_steps: int = field(default=0, init=False)  # time steps of the source that differ from the nominal one
@@ -63,8 +63,7 @@ class FrameSelection:
         for image in images:
             if image.seconds >= self.end - 1e-9:
                 return
-            if before is not None and abs(image.seconds - before - nominal) > EVEN * nominal:
-                self.uneven_steps += 1
+            self.uneven_steps += before is not None and abs(image.seconds - before - nominal) > EVEN * nominal
             before = image.seconds
             if image.seconds < self.start + slot * step - tolerance:
                 self.between += image.seconds >= self.start - tolerance
@@ -77,70 +76,66 @@ class FrameSelection:
                 yield image
 
 
-@dataclass(frozen=True)
 class Pairing:
-    """How the images of two sources are paired."""
+    """How the images of two sources are paired: those of folders by name, others by time."""
 
-    offset: float  # time of the first image of the second source, s since that of the first source
-    rate: float  # usual rate of the pairs, 1/s
-    by_name: dict[int, int] | None  # position in the second folder for a position in the first one; None: by time
-    note: str  # what is particular, one line; else empty
+    def __init__(self, first: Source, second: Source) -> None:
+        self._first, self._second = first, second
+        self._offset = 0.0  # time of the first image of the second source, s since that of the first source
+        self._by_name: dict[int, int] = {}  # position in the second folder for a position in the first one
+        self.rate = min(first.frames_per_second, second.frames_per_second)
+        if isinstance(first, ImageFolder) and isinstance(second, ImageFolder):
+            names = [file.name for file in second.files], [file.stem for file in first.files]
+            matched = match_names(second.path, names[0], range(len(names[1])), names[1], required=())
+            self._by_name, unused = matched.files, len(names[0]) - len(matched.files)
+            notes = [matched.rule] if "in order" in matched.rule else []
+            notes += [f"{unused} images have none of the first camera and are left out"] if unused else []
+        else:
+            self._offset, notes = _offset(first, second)
+        self.note = f"{second.path.name}: {'; '.join(notes)}" if notes else ""  # what is particular, or empty
 
-    def pairs(self, first: Source, second: Source) -> Iterator[tuple[SourceFrame, SourceFrame | None]]:
+    def __iter__(self) -> Iterator[tuple[SourceFrame, SourceFrame | None]]:
         """Each image of the first source, with that of the second source at the same time, if there is one."""
-        if self.by_name is None:
+        first, second = self._first, self._second
+        if isinstance(first, ImageFolder) and isinstance(second, ImageFolder):
+            for image in first:
+                other = self._by_name.get(image.index)
+                yield image, None if other is None else second.image(other)
+        else:
             tolerance = 0.5 * min(1 / first.frames_per_second, 1 / second.frames_per_second)
-            yield from pair_by_time(first, second, self.offset, tolerance)
-            return
-        assert isinstance(second, ImageFolder)
-        for image in first:
-            other = self.by_name.get(image.index)
-            yield image, None if other is None else second.image(other)
-
-
-def find_pairing(first: Source, second: Source) -> Pairing:
-    """How to pair the images of two opened sources."""
-    offset, by_name, notes = 0.0, None, []
-    if isinstance(first, ImageFolder) and isinstance(second, ImageFolder):
-        names = [file.name for file in second.files], [file.stem for file in first.files]
-        matched = match_names(second.path, names[0], range(len(names[1])), names[1], required=())
-        by_name, unused = matched.files, len(names[0]) - len(matched.files)
-        notes += [matched.rule] if "in order" in matched.rule else []
-        notes += [f"{unused} images have none of the first camera and are left out"] if unused else []
-    else:
-        offset, notes = _offset(first, second)
-    note = f"{second.path.name}: {'; '.join(notes)}" if notes else ""
-    return Pairing(offset, min(first.frames_per_second, second.frames_per_second), by_name, note)
+            yield from pair_by_time(first, second, self._offset, tolerance)
 
 
 def _offset(first: Source, second: Source) -> tuple[float, list[str]]:
     """Time of the first image of the second source, s since that of the first source; and what is particular."""
     offset, notes = second.start - first.start, []
-    arbitrary = any(getattr(each, "clock_is_arbitrary", False) for each in (first, second))
-    if arbitrary and abs(offset) > SAME_CLOCK_S:
+    if (first.clock_is_arbitrary or second.clock_is_arbitrary) and abs(offset) > SAME_CLOCK_S:
         offset = 0.0
         notes.append("its clock differs from that of the first video; their first images are taken as simultaneous")
     step = 1 / max(first.frames_per_second, second.frames_per_second)
+
+    def beside(seconds: float) -> str:
+        return f"{abs(seconds):.3g} s {'after' if seconds > 0 else 'before'} the first video"
+
     if abs(offset) > step / 2:
-        when = "after" if offset > 0 else "before"
-        notes.append(f"by its time stamps it starts {abs(offset):.3g} s {when} the first video")
+        notes.append(f"by its time stamps it starts {beside(offset)}")
     if abs(second.frames_per_second / first.frames_per_second - 1) > 0.01:
         rates = f"{second.frames_per_second:.4g} images per second, the first video {first.frames_per_second:.4g}"
         notes.append(f"it has {rates}; images are paired by time")
     ends_apart = second.seconds + offset - first.seconds
     if abs(ends_apart) > 1.5 * step and second.seconds:
-        notes.append(f"it ends {abs(ends_apart):.3g} s {'after' if ends_apart > 0 else 'before'} the first video")
+        notes.append(f"it ends {beside(ends_apart)}")
     return offset, notes
 
 
 def pair_by_time(
     firsts: Iterable[SourceFrame], seconds: Iterable[SourceFrame], offset: float, tolerance: float
 ) -> Iterator[tuple[SourceFrame, SourceFrame | None]]:
-    """Each first image with the second image nearest in time, or None.
+    """Each first image with the second image nearest in time, or None; none is used twice.
 
     Args:
         offset: added to the times of the second images, s.
-        tolerance: largest difference in time, s. No second image is used twice.
+        tolerance: largest difference in time, s.
     """
     others = _in_order(seconds)
     now, following = next(others, None), next(others, None)

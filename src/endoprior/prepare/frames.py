@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain, islice, repeat
 from pathlib import Path
 from typing import Literal
 
@@ -21,18 +22,17 @@ from ..data.writer import FrameFiles
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit
-from .config import PrepareConfig
-from .first_pass import Depth, FirstPass, Mask, MeasuredFrame
+from .config import NETWORK, PrepareConfig
+from .first_pass import Depth, FirstPass, Image, Mask, MeasuredFrame
 from .frame_geometry import FrameGeometry
 from .masks import Tools, choose_tools
-from .relative_depth import DEFAULT_MODEL, DepthNetwork, Kind, fit_reference, fit_shading, relative_to_mm
+from .relative_depth import RelativeScale, fit_shading
 from .stereo import stereo_depth, temporal_median
 from .video_clip import Clip, StereoFrame
 
 REACH = 2  # number of frames on each side in the temporal depth filter
 FITTED_SAMPLES = 16  # number of frames to which the tool and shading models are fitted
 MAX_ROW_OFFSET_PX = 1.5  # if the rows of the two cameras are further apart, stereo matching is poor
-NETWORK = "depth-anything"
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
 
@@ -42,10 +42,10 @@ class FrameMethods:
     """How depth and masks of one clip are made."""
 
     measure: Measure | None  # depth that needs no mask: stereo, files, a network
-    shade: Callable[[NDArray[np.uint8], Mask], Depth] | None  # depth from the shading of an image inside a mask
+    shade: Callable[[Image, Mask], Depth] | None  # depth from the shading of an image inside a mask
     tools: Tools
     filter_in_time: bool  # whether to filter depth over neighboring frames
-    wanted: Callable[[NDArray[np.uint8]], bool]  # whether an image (H, W, 3) belongs in the sequence
+    wanted: Callable[[Image], bool]  # whether an image (H, W, 3) belongs in the sequence
     sources: dict[str, str]  # where images, depth and masks come from
     relative: bool  # whether the scale of the depth is assumed
     notes: list[str]  # notes for the user, one line each
@@ -62,12 +62,9 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
     notes = _check_stereo(samples, clip) if clip.stereo else []
     kind = _depth_kind(cfg, clip)
     relative = kind in ("shading", "network") or cfg.depth_relative != "no"
-    measure, source = None, kind
-    if kind not in ("none", "shading"):
-        measure, source, depth_notes = _measured_depth(kind, cfg, clip, first_pass)
-        notes += depth_notes
+    measure, source, depth_notes = _measured_depth(kind, cfg, first_pass)
     tools, mask_source, mask_notes = choose_tools(cfg, first_pass, samples)
-    notes += mask_notes
+    notes += depth_notes + mask_notes
     shade = None
     if relative:
         images, usable = [f.rgb_u8 for f in samples], [geometry.inside & ~tools(f).mask for f in samples]
@@ -79,16 +76,17 @@ def choose_methods(cfg: PrepareConfig, clip: Clip, first_pass: FirstPass) -> Fra
             f"depth is relative ({source}), with its median set to {cfg.working_distance_mm:g}: lengths have no unit "
             "(rel.). For mm use a stereo video or measured depth."
         )
-    elif kind == "folder":
+    elif kind == "folder" and measure is not None:
         notes += _check_unit(samples, [measure(frame) for frame in samples], geometry, cfg.depth)
-    wanted = _inside_body([frame.rgb_u8 for frame in samples]) if cfg.drop_out_of_body else lambda rgb_u8: True
+    wanted = _inside_body([frame.rgb_u8 for frame in samples] if cfg.drop_out_of_body else [])
     sources = {"images": f"video, {clip.layout}", "depth": source, "masks": mask_source}
     return FrameMethods(measure, shade, tools, kind == "sgbm", wanted, sources, relative, notes)
 
 
 def _check_stereo(samples: list[MeasuredFrame], clip: Clip) -> list[str]:
     """Reject swapped cameras; return a note if the rows do not match."""
-    pairs = [(frame.rgb_u8, frame.right_u8) for frame in samples][:: max(len(samples) // 3, 1)]
+    pairs = [(frame.rgb_u8, frame.right_u8) for frame in samples if frame.right_u8 is not None]
+    pairs = pairs[:: max(len(samples) // 3, 1)]
     orders = [stereo_order(*pair) for pair in pairs]
     if sum(order.swapped for order in orders) > len(orders) / 2:
         fix = "Remove --swap-eyes." if clip.swap else "Add --swap-eyes."
@@ -103,11 +101,7 @@ def _check_stereo(samples: list[MeasuredFrame], clip: Clip) -> list[str]:
 
 
 def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
-    """The depth method that --depth selects.
-
-    Raises:
-        InputError: --depth-relative without a depth folder.
-    """
+    """The depth method that --depth selects; InputError for --depth-relative without a depth folder."""
     if cfg.depth == "auto":
         kind: DepthKind = "sgbm" if clip.stereo else "shading"
     elif cfg.depth in ("none", "sgbm", "shading"):
@@ -120,23 +114,17 @@ def _depth_kind(cfg: PrepareConfig, clip: Clip) -> DepthKind:
 
 
 def _measured_depth(
-    kind: DepthKind, cfg: PrepareConfig, clip: Clip, first_pass: FirstPass
-) -> tuple[Measure, str, list[str]]:
+    kind: DepthKind, cfg: PrepareConfig, first_pass: FirstPass
+) -> tuple[Measure | None, str, list[str]]:
     """A function that measures depth without a mask (mm, or relative values of a network), its name, and notes."""
-    geometry = first_pass.geometry
+    if kind in ("none", "shading"):
+        return None, kind, []
     if kind == "sgbm":
-        if not clip.stereo or geometry.baseline_mm is None:
-            fix = "`--calibration FILE` with both cameras, or `--depth shading`."
-            raise input_error("--depth sgbm", "two cameras and their calibration", "one camera", fix)
-        focal, baseline = float(geometry.matrix[0, 0]), geometry.baseline_mm
-
-        def match(frame: MeasuredFrame) -> Depth:
-            assert frame.right_u8 is not None
-            return stereo_depth(frame.rgb_u8, frame.right_u8, focal, baseline, cfg.stereo).depth
-
-        return match, "stereo: semi-global matching", []
+        return _matched_depth(cfg, first_pass.geometry), "stereo: semi-global matching", []
     if kind == "network":
-        network = DepthNetwork(cfg.depth.partition(":")[2] or DEFAULT_MODEL)
+        from .networks import DepthNetwork  # imports torch
+
+        network = DepthNetwork(cfg.depth.partition(":")[2])
         return lambda frame: network.inverse_depth(frame.rgb_u8), "Depth Anything V2", []
     files, notes = match_files(Path(cfg.depth), DEPTH_SUFFIXES, "depth", first_pass.indices, first_pass.image_names)
     if cfg.depth_relative == "no":
@@ -155,11 +143,24 @@ def _measured_depth(
     return lambda frame: first_pass.frame_of(lambda size: read(files[frame.index], size)), "user's files", notes
 
 
+def _matched_depth(cfg: PrepareConfig, geometry: FrameGeometry) -> Measure:
+    baseline, focal = geometry.baseline_mm, float(geometry.matrix[0, 0])
+    if baseline is None:
+        fix = "`--calibration FILE` with both cameras, or `--depth shading`."
+        raise input_error("--depth sgbm", "two cameras and their calibration", "one camera", fix)
+
+    def match(frame: MeasuredFrame) -> Depth:
+        assert frame.right_u8 is not None
+        return stereo_depth(frame.rgb_u8, frame.right_u8, focal, baseline, cfg.stereo).depth
+
+    return match
+
+
 def _scaled(measure: Measure, samples: list[MeasuredFrame], usable: list[Mask], cfg: PrepareConfig) -> Measure:
     """Relative values scaled to the working distance by constants of the clip."""
-    kind: Kind = "depth" if cfg.depth_relative == "depth" else "disparity"
-    reference = fit_reference([measure(frame) for frame in samples], usable, kind, cfg.working_distance_mm)
-    return lambda frame: relative_to_mm(measure(frame), kind, reference)
+    kind = "depth" if cfg.depth_relative == "depth" else "disparity"
+    scale = RelativeScale.fit(kind, [measure(frame) for frame in samples], usable, cfg.working_distance_mm)
+    return lambda frame: scale.mm(measure(frame))
 
 
 def _check_unit(samples: list[MeasuredFrame], depths: list[Depth], geometry: FrameGeometry, folder: str) -> list[str]:
@@ -184,10 +185,10 @@ def _check_stored(images: list[NDArray]) -> list[str]:
     return notes
 
 
-def _inside_body(images: list[NDArray[np.uint8]]) -> Callable[[NDArray[np.uint8]], bool]:
-    """A function that tells whether an image has the usual color of the samples."""
-    usual = np.median([color_share(image) for image in images], 0)
-    return lambda rgb_u8: bool(np.abs(color_share(rgb_u8) - usual).max() < COLOR_DISTANCE)
+def _inside_body(images: list[Image]) -> Callable[[Image], bool]:
+    """A function that tells whether an image has the usual color of these; any image has if there are none."""
+    usual = np.median([color_share(image) for image in images], 0) if images else None
+    return lambda rgb_u8: usual is None or bool(np.abs(color_share(rgb_u8) - usual).max() < COLOR_DISTANCE)
 
 
 def measure_frames(
@@ -209,22 +210,13 @@ def measure_frames(
 
 def with_neighbors(frames: Iterable[MeasuredFrame]) -> Iterator[list[MeasuredFrame]]:
     """For each frame, the window centered on it: `REACH` frames on each side, fewer at both ends."""
-    window: deque[MeasuredFrame] = deque(maxlen=2 * REACH + 1)
-    at = -1  # position of the center frame in the window
-
-    def around() -> list[MeasuredFrame]:
-        reach = min(at, len(window) - 1 - at)
-        return list(window)[at - reach : at + reach + 1]
-
-    for frame in frames:
-        at -= len(window) == window.maxlen
-        window.append(frame)
-        if len(window) > REACH:
-            at += 1
-            yield around()
-    while at < len(window) - 1:
-        at += 1
-        yield around()
+    padded = chain(repeat(None, REACH), frames, repeat(None, REACH))
+    window = deque(islice(padded, 2 * REACH), 2 * REACH + 1)
+    for last in padded:
+        window.append(last)
+        sides = list(window)[:REACH], list(window)[REACH + 1 :]
+        reach = min(REACH - side.count(None) for side in sides)
+        yield [frame for frame in list(window)[REACH - reach : REACH + reach + 1] if frame is not None]
 
 
 def write_frames(
@@ -253,7 +245,7 @@ def write_frames(
             continue
         depth = frame.depth
         if methods.filter_in_time:
-            depth = temporal_median([other.depth for other in window])
+            depth = temporal_median([other.depth for other in window if other.depth is not None])
         found = methods.tools(frame)
         on_tools(frame.position, found)
         tools = found.mask | ~geometry.inside

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.checks import input_error
 from ..core.config import DataConfig
@@ -22,9 +20,8 @@ from ..data.images import read_color, save_png
 from ..data.mask_files import tool_polarity
 from ..data.mask_folders import open_mask_folder
 from ..data.writer import TOOL_VALUE, FrameFiles
-from .config import PrepareConfig
-from .first_pass import Depth, FirstPass, Mask, MeasuredFrame
-from .sam2 import is_sam2
+from .config import PrepareConfig, is_sam2
+from .first_pass import Depth, FirstPass, Image, Mask, MeasuredFrame
 
 if TYPE_CHECKING:
     from ..tool_masks.carry import VideoSegmenter
@@ -32,8 +29,7 @@ if TYPE_CHECKING:
 
 COVERED = 0.5  # masks that extend over a smaller share of the frames are those of another clip, or not complete
 HINT = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
-WORK = "carried"
-"""Folder of the segmenter's masks until the sequence is complete, so that an interrupted run need not repeat them."""
+WORK = "carried"  # folder of the segmenter's masks until the sequence is complete, for an interrupted run
 Tools = Callable[[MeasuredFrame], FoundTools]  # the tools of a frame; those that the user gives have confidence 1
 
 
@@ -47,8 +43,6 @@ def masked_frames(cfg: PrepareConfig, first_pass: FirstPass) -> tuple[frozenset[
 
     Returns:
         Their positions in the source, the usual distance between them in selected frames, and a note for the user.
-    Raises:
-        InputError: the folder of masks cannot be used, or its names do not tell the frames.
     """
     if not names_folder(cfg.masks):
         return None
@@ -70,18 +64,14 @@ def masked_frames(cfg: PrepareConfig, first_pass: FirstPass) -> tuple[frozenset[
 def choose_tools(
     cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
 ) -> tuple[Tools, str, list[str]]:
-    """A function that returns the tools of a frame, the name of its source, and notes.
-
-    Raises:
-        InputError: the folder of masks cannot be used.
-    """
+    """A function that returns the tools of a frame, the name of its source, and notes."""
     inside = first_pass.geometry.inside
     if names_folder(cfg.masks):
         return _given_tools(cfg, first_pass, samples)
     if cfg.mask_labels:
         raise input_error("--mask-labels", "a folder with --masks", cfg.masks, "Remove --mask-labels.")
     if cfg.masks == "none":
-        return lambda frame: FoundTools(np.zeros_like(inside), 1.0), "none", []
+        return lambda _frame: FoundTools(np.zeros_like(inside), 1.0), "none", []
     from ..tool_masks import ToolFinder  # imports torch
 
     finder = ToolFinder()
@@ -117,7 +107,7 @@ def replace_by_carried(
     files: FrameFiles,
     segmenter: VideoSegmenter,
     inside: Mask,
-    shade: Callable[[NDArray[np.uint8], Mask], Depth] | None,
+    shade: Callable[[Image, Mask], Depth] | None,
     progress: Progress,
 ) -> list[str]:
     """Replace the masks of all written frames, their depth from shading, and the source of the masks in `files.meta`.
@@ -136,29 +126,21 @@ def replace_by_carried(
 
     work = files.folder / WORK
     store = MaskStore(work / "masks", (files.meta.width, files.meta.height))
-    state = read_state(work)
-    if "rows" not in state:
+    if "rows" not in read_state(work):
         files.finish()  # a reader needs the description; it is written again at the end
-        sequence = load_sequence(files.folder, DataConfig(format="plain"))
-        found_rows = []
+        sequence, found_rows = load_sequence(files.folder, DataConfig(format="plain")), []
         for i, (mask, found) in enumerate(segment_sequence(sequence, segmenter, work / "work", progress=progress)):
             store.put(i, mask)
             found_rows.append(asdict(FrameRow.of(i, found)))
         write_state(work, {"rows": found_rows})
-        state = read_state(work)
     for i in range(files.count):
         mask = store.mask(i) | ~inside
         write_mask(files.file("masks", i), mask, TOOL_VALUE)
         if shade is not None:
             depth = np.where(inside, shade(read_color(files.file("images", i)), ~mask), np.float32(0))
             save_png(files.file("depth", i), files.depth_units(depth))
-    rows = [FrameRow(**row) for row in state["rows"]]
+    rows = [FrameRow(**row) for row in read_state(work)["rows"]]
     write_rows(files.folder, rows)
     source = found_source(sum(row.share > 0 for row in rows) / files.count, segmenter.name)
     files.meta = replace(files.meta, sources=files.meta.sources | {"masks": source})
     return [f"masks: {source}. {HINT}"]
-
-
-def remove_carried(files: FrameFiles) -> None:
-    """Remove the folder that lets an interrupted run resume; the sequence is complete without it."""
-    shutil.rmtree(files.folder / WORK, ignore_errors=True)

@@ -67,5 +67,4 @@ def _plan_of(folder: Path) -> Any:
 
 def frames_done(folder: Path, parts: list[str]) -> int:
     """Number of complete frames of an interrupted run; the last frame may be incomplete and does not count."""
-    counts = [len(list((folder / part).glob("*.png"))) for part in parts]
-    return max(min(counts) - 1, 0)
+    return max(min(len(list((folder / part).glob("*.png"))) for part in parts) - 1, 0)
