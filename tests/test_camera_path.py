@@ -8,18 +8,18 @@ import pytest
 from relief import HEIGHT, MATRIX, WIDTH, lens, path, pose, smooth, view
 
 from endoprior.core.checks import InputError
-from endoprior.prepare.camera_path import choose, colmap
+from endoprior.prepare.camera_path import colmap
+from endoprior.prepare.camera_path import sequence_path as paths
 from endoprior.prepare.camera_path.adjust import (
     back_projected,
 )
 from endoprior.prepare.camera_path.breathing import breathing_period
-from endoprior.prepare.camera_path.choose import explained_share, find_path
 from endoprior.prepare.camera_path.colmap import with_poses
 from endoprior.prepare.camera_path.features import new_corners, sampled, view_of
 from endoprior.prepare.camera_path.follow import follow_camera
 from endoprior.prepare.camera_path.own import own_path
 from endoprior.prepare.camera_path.pose_file import read_poses
-from endoprior.prepare.camera_path.sequence_path import sequence_path
+from endoprior.prepare.camera_path.sequence_path import explained_share, find_path, sequence_path
 from endoprior.prepare.camera_path.tracks import Lens, PoseInput
 
 SIZE = (WIDTH, HEIGHT)
@@ -175,18 +175,18 @@ def test_back_projection_inverts_projection():
 def test_the_better_path_is_taken(relief, monkeypatch):
     frames, _ = relief
     args = frames.__getitem__, 24, lens(), SIZE
-    monkeypatch.setattr(choose, "is_installed", lambda: False)
+    monkeypatch.setattr(paths, "is_installed", lambda: False)
     own = find_path(*args)
     assert own.method == "our own tracks" and not own.notes
     with pytest.raises(InputError, match="expected the package pycolmap"):
-        monkeypatch.setattr(choose, "install_command", lambda extra: f"pip install {extra}")
+        monkeypatch.setattr(paths, "install_command", lambda extra: f"pip install {extra}")
         find_path(*args, "colmap")
     worse = replace(own, method="COLMAP", camera_to_world=np.tile(np.eye(4), (24, 1, 1)))
-    monkeypatch.setattr(choose, "is_installed", lambda: True)
-    monkeypatch.setattr(choose, "colmap_path", lambda *args, **options: worse)
+    monkeypatch.setattr(paths, "is_installed", lambda: True)
+    monkeypatch.setattr(paths, "colmap_path", lambda *args, **options: worse)
     assert find_path(*args).method == "our own tracks" and "COLMAP explains" in find_path(*args).notes[0]
     assert find_path(*args, "colmap").method == "COLMAP"
-    monkeypatch.setattr(choose, "colmap_path", lambda *args, **options: None)
+    monkeypatch.setattr(paths, "colmap_path", lambda *args, **options: None)
     assert "too few frames" in find_path(*args).notes[0]
     with pytest.raises(InputError, match="COLMAP can register"):
         find_path(*args, "colmap")
@@ -287,20 +287,20 @@ def test_a_mapping_that_was_stopped_is_told_whichever_path_is_taken(monkeypatch)
     assert not colmap.time_note(59.9, 60.0) and "stopped after 60 s" in colmap.time_note(60.2, 60.0)[0]
     frames = [view(pose) for pose in path(10, 2.0)]
     args = frames.__getitem__, len(frames), lens(), (WIDTH, HEIGHT)
-    monkeypatch.setattr(choose, "is_installed", lambda: True)
+    monkeypatch.setattr(paths, "is_installed", lambda: True)
     own, _ = own_path(*args)
     at_rest = np.tile(np.eye(4), (len(frames), 1, 1))
     for poses, how, taken in ((at_rest, "best", own.method), (own.camera_to_world, "colmap", "COLMAP")):
         stopped = replace(own, method="COLMAP", camera_to_world=poses, notes=colmap.time_note(60.0, 60.0))
-        monkeypatch.setattr(choose, "colmap_path", lambda *args, found=stopped, **options: found)
-        found = choose.find_path(*args, how)
+        monkeypatch.setattr(paths, "colmap_path", lambda *args, found=stopped, **options: found)
+        found = paths.find_path(*args, how)
         assert found.method == taken and sum("stopped after 60 s" in note for note in found.notes) == 1
 
 
 @pytest.mark.parametrize("moves", [True, False])
 def test_auto_own_decides_as_auto_and_leaves_colmap_out(moves, monkeypatch):
-    monkeypatch.setattr(choose, "is_installed", lambda: True)
-    monkeypatch.setattr(choose, "colmap_path", lambda *args, **options: pytest.fail("COLMAP was asked"))
+    monkeypatch.setattr(paths, "is_installed", lambda: True)
+    monkeypatch.setattr(paths, "colmap_path", lambda *args, **options: pytest.fail("COLMAP was asked"))
     frames = [view(pose) for pose in path(10, 2.0)] if moves else [view(path(1)[0])] * 10
     found, notes = sequence_path(
         "auto-own", frames.__getitem__, lambda: ([f.rgb_u8 for f in frames], [f.tissue_mask for f in frames]),

@@ -23,6 +23,7 @@ from ..data.files import read_json
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
 from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
+from ..model.scene import Scene
 from ..model.scene_file import load_scene
 from ..prepare import prepare
 from ..prepare.pipeline import Progress
@@ -56,11 +57,7 @@ class Step:
 
 
 def run_step(step: Step, job: SequenceJob, progress: Progress) -> list[str] | None:
-    """Do a step, and keep what it returns for a resumed job; None if it was done before.
-
-    Raises:
-        InputError: the input cannot be used.
-    """
+    """Do a step, and keep what it returns for a resumed job; None if it was done before."""
     if step.result(job).exists():
         return None
     lines = step.act(job, progress)
@@ -115,18 +112,24 @@ def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[st
         sequence = load_sequence(job.data, cfg.data)
         notes = [f"note: the camera is lost, or the scene changes, at frame {usable}: training uses the frames before"]
     begun = (job.run / CHECKPOINT).is_file() or (job.run / CONFIG).is_file()
-    return start_run(sequence, cfg, job.run, resume=begun, say=lambda text: None), notes
+    return start_run(sequence, cfg, job.run, resume=begun, say=lambda _text: None), notes
 
 
 def _train(job: SequenceJob, progress: Progress) -> list[str]:
     run, notes = start_training(job)
-    scene = run.complete(lambda report, trainer: progress("training", *trainer.progress()))
-    return [*notes, f"{len(scene):,} Gaussians"]
+    run.complete(lambda _report, trainer: progress("training", *trainer.progress()))
+    return [*notes, f"{len(_scene(job)):,} Gaussians"]
+
+
+def _scene(job: SequenceJob) -> Scene:
+    scene = load_scene(job.run)
+    assert isinstance(scene, Scene), "a job trains Gaussians"
+    return scene
 
 
 def _score(job: SequenceJob, progress: Progress) -> list[str]:
     progress("rendering held-out frames", 0, 0)
-    scene = load_scene(job.run)
+    scene = _scene(job)
     sequence = _frames_of(job, scene.config)
     result = evaluate(scene, sequence, networks=False)
     result.protocol |= mask_facts(job.run)
@@ -138,7 +141,7 @@ def _score(job: SequenceJob, progress: Progress) -> list[str]:
 
 
 def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
-    scene = load_scene(job.run)
+    scene = _scene(job)
     frames = _frames_of(job, scene.config).with_poses(scene.cameras).frames("video")
     span = depth_span(scene)
 
@@ -160,7 +163,7 @@ def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
 
 def _player(job: SequenceJob, progress: Progress) -> list[str]:
     progress("packing", 0, 0)
-    scene = load_scene(job.run)
+    scene = _scene(job)
     at_a_time = len(scene) / len(scene.windows)
     times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (at_a_time * LEAST_BYTES))
     title = f"{DEFAULT_TITLE} (preview)" if job.is_preview else DEFAULT_TITLE  # never the name of the video

@@ -108,8 +108,9 @@ def written_in_order(size: Size, cameras: Sequence[Intrinsics]) -> Size:
     """A stated pair as (width, height): NumPy's shapes are (height, width), and the principal point tells."""
     if not cameras or not all((camera.matrix[:2, 2] > 0).all() for camera in cameras):
         return size
-    as_stated, turned = (np.abs(np.log(_ratios(cameras, pair))).sum() for pair in (size, size[::-1]))
-    return size[::-1] if turned < as_stated / 2 else size
+    other = size[1], size[0]
+    as_stated, turned = (np.abs(np.log(_ratios(cameras, pair))).sum() for pair in (size, other))
+    return other if turned < as_stated / 2 else size
 
 
 def fitted(calibration: Calibration, size: Size, name: str, *, squeezed: bool) -> tuple[Calibration, list[str]]:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import chain, islice, pairwise, tee, zip_longest
+from itertools import chain, islice, tee, zip_longest
 from typing import TypeVar
 
 import av
@@ -51,7 +51,9 @@ class Timeline:
         A misplaced image keeps its time; all others are later than those before.
         """
         shift, last = 0.0, None
-        for (image, time), (_, following) in pairwise(chain(images, [(None, None)])):
+        images, ahead = tee(images)
+        for (image, time), after in zip(images, chain(islice(ahead, 1, None), [None]), strict=True):
+            following = after and after[1]
             now = (0.0 if last is None else last + self.step) if time is None else time + shift
             if time is not None and last is not None and now <= last:
                 if following is not None and following + shift > last:

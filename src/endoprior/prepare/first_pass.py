@@ -108,7 +108,7 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
     if cfg.border == "auto":
         outline = find_outline(lefts)
         circle, strips, outside = outline.circle, outline.strips or None, outline.outside
-        labels = [tuple(box) for box in find_static_overlays([_without(image, strips) for image in lefts])]
+        labels = find_static_overlays([_without(image, strips) for image in lefts])
     blank = [parse_rectangle(text, "--blank") for text in cfg.blank]
     for rectangle in blank:
         demand_within(rectangle, size, "--blank")

@@ -84,7 +84,8 @@ def write_folder_path(
         reading=replace(reading, image_names=names),
         progress=lambda done: progress(done, count),
     )
-    unexplained = sorted({*(path.lost if path else []), *find_changes(map(color, range(count))).off_color})
+    lost = path.lost if path else list[int]()
+    unexplained = sorted({*lost, *find_changes(map(color, range(count))).off_color})
     new = path or CameraPath(np.tile(np.eye(4), (count, 1, 1)), np.ones(count, bool), np.ones(count))
     if relative and path is not None:
         scaled = zip(depths, path.depth_scale, strict=True)

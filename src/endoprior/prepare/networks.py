@@ -204,7 +204,7 @@ class Sam2Chunk:
         device = sam2.network.device
         self._sam2, self._count = sam2, 0
         self.scores = torch.zeros(0)  # (objects, 1, h, w) of the last frame, above 0 inside an object
-        self._session = Sam2VideoInferenceSession(
+        self._session: Any = Sam2VideoInferenceSession(
             inference_device=device,
             inference_state_device=device,
             video_storage_device=device,

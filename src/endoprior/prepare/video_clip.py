@@ -71,15 +71,16 @@ def find_layout(frames: Sequence[Image], calibration: Calibration | None, has_se
     if has_second_source:
         return "two-files"
     telling = [frame for frame in frames if _shows_something(frame)]
-    alike = [kind for kind in KINDS if sum(_alike(frame, kind) for frame in telling) > len(telling) / 2]
+    alike: list[Layout] = [kind for kind in KINDS if sum(_alike(frame, kind) for frame in telling) > len(telling) / 2]
     if calibration is None or calibration.right is None:
         if alike and alike[0] != "interlaced":
             fix = f"`--calibration FILE --layout {alike[0]}`, or `--layout mono` if there is one camera."
             raise input_error(name, "a calibration for a stereo video", f"none, and a {alike[0]} frame", fix)
         return "mono"
     height, width = frames[0].shape[:2]
-    stated = [kind for kind in KINDS if kind in (calibration.layout or "").lower()]
-    if found := [*stated, *_by_size(width, height, calibration, alike), *alike]:
+    stated: list[Layout] = [kind for kind in KINDS if kind in (calibration.layout or "").lower()]
+    found: list[Layout] = [*stated, *_by_size(width, height, calibration, alike), *alike]
+    if found:
         return found[0]
     fix = "`--layout side-by-side`, `top-bottom` or `interlaced`, or `--right VIDEO` for a second video."
     raise input_error(name, "two cameras in each frame", f"{width}x{height} px without a known layout", fix)

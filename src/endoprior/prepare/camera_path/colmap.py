@@ -32,8 +32,7 @@ ENOUGH_IMAGES, LARGEST_STRIDE = 150, 4
 LONGEST = 1000  # longer clips are mapped only if COLMAP is asked for: it takes seconds a frame
 DEFORMING = 0.1  # tracks below this weight deform; the tissue around them is masked ...
 AROUND = 40  # ... within the image width divided by this
-SECONDS_AN_IMAGE = 1.0
-"""About the time for each image, on two cores. Mapping that alone takes longer is stopped: see `time_note`."""
+SECONDS_AN_IMAGE = 1.0  # about the time on two cores. Mapping that alone takes longer is stopped: see `time_note`.
 LEAST_SECONDS = 60  # mapping may always take this long
 LEAST_SHARE = 0.3  # a model with a smaller share of the frames is no path of the clip
 PARALLAX = 0.02  # least spread of the rays to a point, rad, whose position counts for the scale
@@ -42,12 +41,7 @@ STRIDE = 3  # points are placed by every third frame and all keyframes: neighbor
 
 
 def time_note(seconds: float, limit: float) -> list[str]:
-    """A note for the user if mapping was stopped, because the path then depends on the speed of the machine.
-
-    Args:
-        seconds: that it took.
-        limit: after which COLMAP stops it, s.
-    """
+    """A note for the user if mapping was stopped, because the path then depends on the speed of the machine."""
     if seconds < limit:
         return []
     return [f"COLMAP was stopped after {limit:.0f} s: a faster machine may find another path; `--poses own` does not"]
@@ -58,21 +52,16 @@ def is_installed() -> bool:
     return find_spec("pycolmap") is not None
 
 
-def stride_of(count: int) -> int:
-    """Every how many frames of a clip one is mapped."""
-    return min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
-
-
 def colmap_poses(
     frame: Callable[[int], PoseInput], count: int, follower: Follower, *, refine_focal: bool
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], float, list[str]] | None:
+) -> tuple[NDArray, NDArray, float, list[str]] | None:
     """World-to-camera poses (T, 4, 4) in units of its own, (T,) which frames are registered, focal factor, notes.
 
     None if no model holds enough frames.
     """
     import pycolmap
 
-    stride = stride_of(count)
+    stride = min(-(-count // ENOUGH_IMAGES), LARGEST_STRIDE)
     pycolmap.logging.minloglevel = 2
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -126,9 +115,7 @@ def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: boo
     database = folder / "database.db"
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model, reader.mask_path = "PINHOLE", folder / "masks"
-    reader.camera_params = ",".join(
-        str(v) for v in (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)
-    )
+    reader.camera_params = ",".join(map(str, (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)))
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = 2000
     extraction.sift.peak_threshold = 0.003
@@ -141,13 +128,10 @@ def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: boo
     limit = int(max(LEAST_SECONDS, SECONDS_AN_IMAGE * len(list((folder / "images").iterdir()))))
     mapping.max_runtime_seconds = limit
     (folder / "models").mkdir()
-    device = pycolmap.Device.cpu
-    single = pycolmap.CameraMode.SINGLE
+    device, single = pycolmap.Device.cpu, pycolmap.CameraMode.SINGLE
+    options = {"reader_options": reader, "extraction_options": extraction, "device": device}
     pycolmap.set_random_seed(0)
-    pycolmap.extract_features(
-        database, folder / "images", camera_mode=single, reader_options=reader, extraction_options=extraction,
-        device=device,
-    )  # fmt: skip
+    pycolmap.extract_features(database, folder / "images", camera_mode=single, **options)
     pycolmap.match_sequential(database, device=device)
     began = clock.perf_counter()
     models = pycolmap.incremental_mapping(database, folder / "images", folder / "models", mapping)
@@ -169,14 +153,11 @@ def _file(folder: Path, part: str, index: int, more: str = "") -> Path:
     return path
 
 
-def with_poses(
-    follower: Follower, poses: NDArray[np.float64], known: NDArray[np.bool_], focal_factor: float = 1.0
-) -> Follower:
-    """A copy of the tracks whose points lie where these poses see them, with the depth scale of each frame.
+def with_poses(follower: Follower, poses: NDArray, known: NDArray[np.bool_], focal_factor: float = 1.0) -> Follower:
+    """A copy of the tracks whose points lie where poses (T, 4, 4) see them, with the depth scale of each frame.
 
     Args:
-        poses: (T, 4, 4) world-to-camera.
-        known: (T,) frames that have one.
+        known: (T,) frames that have a pose.
     """
     out = copy.copy(follower)
     tracks = out.tracks = follower.tracks.copy()
@@ -208,9 +189,7 @@ def with_poses(
     return out
 
 
-def ray_points(
-    tracks: Tracks, poses: NDArray[np.float64], known: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ray_points(tracks: Tracks, poses: NDArray, known: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
     """(P, 3) point nearest to all rays of each track, and (P,) the spread of the rays, rad; 0 with less than two rays.
 
     The point minimizes sum |(I - d d^T) (X - c)|^2 over rays with center c and direction d.
