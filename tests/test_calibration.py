@@ -85,12 +85,7 @@ def test_one_camera(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "bent",
-    [
-        {"distortion_coefficients": D1},
-        {"dist": D1},
-        dict(zip(("k1", "k2", "p1", "p2", "k3"), D1, strict=True)),
-    ],
+    "bent", [{"distortion_coefficients": D1}, {"dist": D1}, dict(zip(("k1", "k2", "p1", "p2", "k3"), D1, strict=True))]
 )
 def test_distortion_next_to_single_numbers(tmp_path, bent):
     path, numbers = tmp_path / "c.yaml", {"fx": 580, "fy": 582, "cx": 318.2, "cy": 255.1}

@@ -10,9 +10,7 @@ from relief import HEIGHT, MATRIX, WIDTH, lens, path, pose, smooth, view
 from endoprior.core.checks import InputError
 from endoprior.prepare.camera_path import colmap
 from endoprior.prepare.camera_path import sequence_path as paths
-from endoprior.prepare.camera_path.adjust import (
-    back_projected,
-)
+from endoprior.prepare.camera_path.adjust import back_projected
 from endoprior.prepare.camera_path.breathing import breathing_period
 from endoprior.prepare.camera_path.colmap import with_poses
 from endoprior.prepare.camera_path.features import new_corners, sampled, view_of

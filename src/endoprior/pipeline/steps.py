@@ -23,7 +23,7 @@ from ..data.files import read_json
 from ..evaluation.registry import all_scores
 from ..evaluation.scoring import evaluate, scored_data
 from ..export.html import DEFAULT_TITLE, PageTooLarge, write_html
-from ..model.scene import Scene
+from ..model.scene import RenderedScene, Scene
 from ..model.scene_file import load_scene
 from ..prepare import prepare
 from ..prepare.pipeline import Progress
@@ -105,8 +105,12 @@ def problems(job: SequenceJob) -> str:
 def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[str]]:
     """The run of a job, new or resumed, and lines for the user."""
     sequence = load_sequence(job.data, job.cfg.data)
-    cfg, notes = job.cfg, list[str]()
-    usable = _usable(job, len(sequence)) if isinstance(job, Job) else len(sequence)
+    cfg, notes, usable = job.cfg, list[str](), len(sequence)
+    if isinstance(job, Job):
+        unexplained = read_description(job.data / "sequence.json").get("unexplained_frames", [])
+        findings = read_json(job.findings)["findings"]
+        cuts = [frame for finding in findings if finding["code"] == "scene-cut" for frame in finding["frames"]]
+        usable = usable_frames(len(sequence), unexplained, cuts)
     if usable < len(sequence):
         cfg = replace(cfg, data=replace(cfg.data, first_frames=usable))
         sequence = load_sequence(job.data, cfg.data)
@@ -117,19 +121,18 @@ def start_training(job: SequenceJob) -> tuple[TrainingRun | WindowedRun, list[st
 
 def _train(job: SequenceJob, progress: Progress) -> list[str]:
     run, notes = start_training(job)
-    run.complete(lambda _report, trainer: progress("training", *trainer.progress()))
-    return [*notes, f"{len(_scene(job)):,} Gaussians"]
+    scene = run.complete(lambda _report, trainer: progress("training", *trainer.progress()))
+    return [*notes, f"{len(_of_gaussians(scene)):,} Gaussians"]
 
 
-def _scene(job: SequenceJob) -> Scene:
-    scene = load_scene(job.run)
+def _of_gaussians(scene: RenderedScene) -> Scene:
     assert isinstance(scene, Scene), "a job trains Gaussians"
     return scene
 
 
 def _score(job: SequenceJob, progress: Progress) -> list[str]:
     progress("rendering held-out frames", 0, 0)
-    scene = _scene(job)
+    scene = _of_gaussians(load_scene(job.run))
     sequence = _frames_of(job, scene.config)
     result = evaluate(scene, sequence, networks=False)
     result.protocol |= mask_facts(job.run)
@@ -141,7 +144,7 @@ def _score(job: SequenceJob, progress: Progress) -> list[str]:
 
 
 def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
-    scene = _scene(job)
+    scene = _of_gaussians(load_scene(job.run))
     frames = _frames_of(job, scene.config).with_poses(scene.cameras).frames("video")
     span = depth_span(scene)
 
@@ -163,7 +166,7 @@ def _render_video(job: SequenceJob, progress: Progress) -> list[str]:
 
 def _player(job: SequenceJob, progress: Progress) -> list[str]:
     progress("packing", 0, 0)
-    scene = _scene(job)
+    scene = _of_gaussians(load_scene(job.run))
     at_a_time = len(scene) / len(scene.windows)
     times = every_kth_time(len(scene.cameras), PLAYER_BYTES / (at_a_time * LEAST_BYTES))
     title = f"{DEFAULT_TITLE} (preview)" if job.is_preview else DEFAULT_TITLE  # never the name of the video
@@ -192,14 +195,6 @@ STEPS = (
 def steps_of(job: SequenceJob) -> tuple[Step, ...]:
     """The steps that a job needs: a sequence folder is not prepared."""
     return STEPS if isinstance(job, Job) else STEPS[1:]
-
-
-def _usable(job: SequenceJob, num_frames: int) -> int:
-    """Number of frames that one scene can explain: see `usable_frames`."""
-    unexplained = read_description(job.data / "sequence.json").get("unexplained_frames", [])
-    findings = read_json(job.findings)["findings"]
-    cuts = [frame for finding in findings if finding["code"] == "scene-cut" for frame in finding["frames"]]
-    return usable_frames(num_frames, unexplained, cuts)
 
 
 def _frames_of(job: SequenceJob, cfg: Config) -> FrameSequence:

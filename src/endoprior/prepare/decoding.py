@@ -112,13 +112,10 @@ def is_cover(track: VideoStream) -> bool:
 
 
 def packet_times(container: InputContainer, track: VideoStream) -> tuple[list[float | None], int]:
-    """The time of every image that is shown, in their order, s, None where there is none. Decodes nothing.
+    """The time of every image that is shown, in their order, s or None; and at which byte the last one lies.
 
     A file has its images in the order of decoding. Where the times of decoding start again, another part begins; within
-    a part, the images are shown in the order of their times.
-
-    Returns:
-        The times, and where in the file, in bytes, the last image lies.
+    a part, the images are shown in the order of their times. Nothing is decoded.
     """
     parts: list[list[int | None]] = [[]]
     last, end = None, 0
@@ -157,14 +154,12 @@ def _packets(container: InputContainer, track: VideoStream) -> Iterator[av.Packe
 def decode(
     container: InputContainer, track: VideoStream, lost: list, *, one_thread: bool = False, weave: bool = False
 ) -> Iterator[DecodedImage]:
-    """The images in the order in which they are shown.
+    """The images in the order in which they are shown; FFmpegError if the file cannot be read on.
 
     Args:
         lost: gets the place, in ticks, of each image that is in the file and cannot be decoded.
         one_thread: slower; with threads, FFmpeg does not report all damage, and not always the same.
         weave: keep the rows of interlaced images as they are.
-    Raises:
-        FFmpegError: the file cannot be read on.
     """
     if not track.codec_context.is_open:
         track.thread_type = "NONE" if one_thread else "AUTO"

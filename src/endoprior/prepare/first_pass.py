@@ -96,7 +96,13 @@ def run_first_pass(clip: Clip, cfg: PrepareConfig) -> FirstPass:
         fix = "Check --start, --end and --frames-per-second."
         raise input_error(str(path), "at least 2 frames in the selection", str(len(indices)), fix)
     lefts = [frame.left for frame in samples]
-    video_notes = [*clip.notes, *_timing_notes(selection, cfg), *_brightness_notes(lefts), *_comb_notes(clip, lefts)]
+    video_notes = [*clip.notes, *_timing_notes(selection, cfg)]
+    brightest = float(np.median([np.percentile(image, 99) for image in lefts]))
+    if brightest < DARK:
+        words = f"their brightest parts have {brightest:.0f} of 255. Export them brighter"
+        video_notes.append(f"the images are nearly black: {words}")
+    if clip.layout != "interlaced" and are_combed(lefts):
+        video_notes.append(_comb_note(clip))
     calibration, name, notes = clip.calibration, str(cfg.calibration), list[str]()
     across, down = _stretch(clip.layout) if cfg.squeezed_eyes else (1, 1)
     if calibration is not None:
@@ -180,24 +186,14 @@ def _timing_notes(selection: FrameSelection, cfg: PrepareConfig) -> list[str]:
     return notes
 
 
-def _brightness_notes(images: list[Image]) -> list[str]:
-    brightest = float(np.median([np.percentile(image, 99) for image in images]))
-    if brightest >= DARK:
-        return []
-    return [f"the images are nearly black: their brightest parts have {brightest:.0f} of 255. Export them brighter"]
-
-
-def _comb_notes(clip: Clip, images: list[Image]) -> list[str]:
-    """A note, with the command that helps, if images of a progressive video have rows of two times."""
-    if clip.layout == "interlaced" or not are_combed(images):
-        return []
-    path = clip.source.path
-    fix = "deinterlace the video before its images are exported"
+def _comb_note(clip: Clip) -> str:
+    """That images of a progressive video have rows of two times, and the command that helps."""
+    path, fix = clip.source.path, "deinterlace the video before its images are exported"
     if not isinstance(clip.source, ImageFolder):
         even = path.with_name(f"{path.stem}_progressive.mp4")
         words = ["ffmpeg", "-i", path, "-vf", "bwdif=deint=all", "-crf", "10", even]
         fix = f"`{' '.join(map(quoted, words))}`"
-    return [f"{path.name}: rows alternate where something moves, as in interlaced video. Fix: {fix}"]
+    return f"{path.name}: rows alternate where something moves, as in interlaced video. Fix: {fix}"
 
 
 def border_notes(strips: Strips | None, circle: Circle | None, labels: list[Rectangle], outside: float) -> list[str]:

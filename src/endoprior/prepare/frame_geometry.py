@@ -22,8 +22,7 @@ from .calibration import Calibration, Intrinsics, Size, check_pair
 from .config import Rectangle
 
 MIN_SIDE_PX = 32
-LEAST_FOCAL_SHARE, MOST_FOCAL_SHARE = 0.2, 5.0
-"""A rectified focal length outside of this range, as a share of the calibrated one, comes from wrong coefficients."""
+LEAST_FOCAL_SHARE, MOST_FOCAL_SHARE = 0.2, 5.0  # wrong coefficients give a focal length outside of these shares
 MOST_LOST = 0.2  # so much of an image may be lost: corners outside of a round image, where nothing was measured
 COMPARED = 8  # number of frames in which the offset between the rows of both cameras is measured ...
 FEWEST = 40  # ... and of matching features, over all of them, that it needs
@@ -166,14 +165,14 @@ def _bounding_box(keep: Mask) -> Rectangle:
 
 
 def rectify(calibration: Calibration, size: Size, name: str, *, stereo: bool) -> tuple[NDArray, NDArray, Pair]:
-    """Rectify images of this (width, height), px. Every pixel of the result shows something.
+    """Rectify images of this (width, height), px, so that every pixel of the result shows something.
 
     Args:
         calibration: in px of these images; with both cameras if `stereo`.
         name: of its file, for error messages.
     Returns:
-        (3, 3) K of both rectified cameras, with the left-most pixel centered at 0.5; (3, 3) rotation from the axes of
-        the left camera to those of the rectified one; and the maps of the left and the right image.
+        (3, 3) K of both rectified cameras; (3, 3) rotation from the axes of the left camera to those of the rectified
+        one; and the maps.
     Raises:
         InputError: the distortion cannot be undone, or only one lens is a fisheye.
     """

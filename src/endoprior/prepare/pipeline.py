@@ -81,7 +81,11 @@ def prepare(
     if cfg.stir is not None:
         demand_stir_clip(cfg.stir)
         _demand_all_frames(cfg)
-    segmenter = _segmenter(cfg.masks)
+    segmenter = None
+    if is_sam2(cfg.masks):
+        from .networks import open_sam2  # imports torch
+
+        segmenter = open_sam2(cfg.masks, "--masks")
     plan = {"config": repr(cfg), "sources": [source_facts(video), *input_facts(cfg).values()]}
     with work_folder(out, plan) as folder:
         clip, first_pass, step = _look(video, cfg, progress)
@@ -109,9 +113,7 @@ def prepare(
         shutil.rmtree(folder / WORK, ignore_errors=True)  # the sequence is complete without it
         RowLog(folder).remove()
         files.finish(None if path is None else path.camera_to_world, unexplained)
-        video_notes = [*first_pass.video_notes, *_damage_notes(damaged)]
-        if outside := len(first_pass.indices) - len(used):
-            video_notes.append(f"{outside} frames without the color of the inside of a body are left out")
+        video_notes = [*first_pass.video_notes, *_usage_notes(damaged, len(first_pass.indices) - len(used))]
         _record(video, cfg, first_pass.geometry, video_notes).save(folder)
         if cfg.stir is not None:
             write_stir_tracks(cfg.stir, folder)
@@ -119,14 +121,6 @@ def prepare(
         notes = [*video_notes, *first_pass.notes, *methods.notes, *carried_notes, *motion_notes]
         notes += _advice(out, uncertain_frames(read_rows(folder)), moving, others, files.count - len(unexplained))
     return Prepared(out, files.count, first_pass.geometry.size, notes)
-
-
-def _segmenter(masks: str):
-    if not is_sam2(masks):
-        return None
-    from .networks import open_sam2  # imports torch
-
-    return open_sam2(masks, "--masks")
 
 
 def _look(video: Path, cfg: PrepareConfig, progress: Progress) -> tuple[Clip, FirstPass, int]:
@@ -234,12 +228,15 @@ def _unexplained(path: CameraPath | None, files: _Written, damaged: list[int]) -
     return sorted({*damaged, *(path.lost if path else []), *other_scene})
 
 
-def _damage_notes(damaged: list[int]) -> list[str]:
-    if not damaged:
-        return []
-    what = "damaged in the video, or predicted from damaged images before the next key frame"
-    fix = "leave them out with --start and --end, or copy the video again"
-    return [f"{what}: frames {number_ranges(damaged)}. They are unexplained_frames of sequence.json; {fix}"]
+def _usage_notes(damaged: list[int], outside: int) -> list[str]:
+    notes = []
+    if damaged:
+        what = "damaged in the video, or predicted from damaged images before the next key frame"
+        fix = "leave them out with --start and --end, or copy the video again"
+        notes.append(f"{what}: frames {number_ranges(damaged)}. They are unexplained_frames of sequence.json; {fix}")
+    if outside:
+        notes.append(f"{outside} frames without the color of the inside of a body are left out")
+    return notes
 
 
 def _advice(out: Path, uncertain: list[int], moving: list[int], others: list[int], usable: int) -> list[str]:

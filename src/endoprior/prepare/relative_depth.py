@@ -49,17 +49,14 @@ class ShadingModel:
     working_distance_mm: float  # median depth over the samples, mm
 
     def depth(self, rgb_u8: Image, usable: Mask) -> NDArray:
-        """Depth of one image. Its exposure is the median change of brightness against the reference.
+        """(H, W) depth, mm, of one image (H, W, 3), within `MAX_SHADING_RATIO` times the working distance.
 
-        Exposure changes therefore do not change depth, nor do changes of less than half of the image. A camera that
-        moves closer to everything looks like an exposure change and is not detected.
+        Its exposure is the median change of brightness against the reference. Exposure changes therefore do not change
+        depth, nor do changes of less than half of the image. A camera that moves closer to everything looks like an
+        exposure change and is not detected.
 
         Args:
-            rgb_u8: (H, W, 3) of the size the model was fitted to, 0..255.
             usable: (H, W) False on tools and outside the field of view; like highlights, these are filled in.
-        Returns:
-            (H, W) depth, mm, within a factor of `MAX_SHADING_RATIO` of the working distance, which is everywhere if no
-            pixel is usable.
         """
         brightness, weight = _log_brightness(rgb_u8, usable)
         seen = weight > 0.5
@@ -78,15 +75,7 @@ class ShadingModel:
 
 
 def fit_shading(images: Sequence[Image], usable: Sequence[Mask], working_distance_mm: float = 70.0) -> ShadingModel:
-    """Fit the constants of a clip to a few images spread over it.
-
-    Args:
-        images: (H, W, 3) each, 0..255.
-        usable: (H, W) each, True on tissue.
-        working_distance_mm: median depth to scale to, mm.
-    Raises:
-        InputError: no image has a usable pixel.
-    """
+    """Fit the constants of a clip to a few images (H, W, 3) spread over it; InputError if no pixel is usable (H, W)."""
     height, width = images[0].shape[:2]
     small = [_log_brightness(rgb_u8, mask) for rgb_u8, mask in zip(images, usable, strict=True)]
     values = np.stack([np.where(weight > 0.5, brightness, np.nan) for brightness, weight in small])
@@ -155,12 +144,8 @@ class RelativeScale:
         cls, kind: Literal["depth", "disparity"], samples: Sequence[NDArray], usable: Sequence[Mask],
         working_distance_mm: float = 70.0,
     ) -> RelativeScale:  # fmt: skip
-        """Fit the mapping to a few frames spread over the clip.
+        """Fit the mapping to a few frames (H, W) spread over the clip, where they are usable, (H, W), and valid.
 
-        Args:
-            samples: (H, W) each; values that are not finite, and depth <= 0, are ignored.
-            usable: (H, W) each, True on tissue.
-            working_distance_mm: median depth to scale to, mm.
         Raises:
             InputError: no usable value, or constant disparity.
         """
