@@ -193,10 +193,8 @@ def test_the_better_path_is_taken(relief, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.skipif(not colmap.is_installed(), reason="needs pycolmap: pip install pycolmap")
 def test_colmap_finds_the_path():
-    import relief as module
-
     true = path(24)
-    found = find_path([view(p) for p in true].__getitem__, 24, lens(), (module.WIDTH, module.HEIGHT), "colmap")
+    found = find_path([view(p) for p in true].__getitem__, 24, lens(), SIZE, "colmap")
     assert found.method == "COLMAP" and found.explained.mean() > 0.9
     assert drift(found.camera_to_world, true) < 2.0
 
@@ -242,8 +240,6 @@ def still_views(frames):
 def test_a_static_camera_has_no_path(relief):
     frames = [relief[0][0]] * 6
     args = frames.__getitem__, still_views(frames), 6, lens(), SIZE
-    found, notes = sequence_path("auto", *args, has_depth=True, refine_focal=False)
-    assert found is None and "static" in notes[0]
     assert sequence_path("still", *args, has_depth=True, refine_focal=False) == (None, [])
     found, _ = sequence_path("own", *args, has_depth=True, refine_focal=False)
     assert np.array_equal(found.camera_to_world, np.tile(np.eye(4), (6, 1, 1))) or not found.still.any()
@@ -284,7 +280,7 @@ def test_the_principal_point_may_lie_at_the_edge_of_the_image():
 def test_a_mapping_that_was_stopped_is_told_whichever_path_is_taken(monkeypatch):
     assert not colmap.time_note(59.9, 60.0) and "stopped after 60 s" in colmap.time_note(60.2, 60.0)[0]
     frames = [view(pose) for pose in path(10, 2.0)]
-    args = frames.__getitem__, len(frames), lens(), (WIDTH, HEIGHT)
+    args = frames.__getitem__, len(frames), lens(), SIZE
     monkeypatch.setattr(paths, "is_installed", lambda: True)
     own, _ = own_path(*args)
     at_rest = np.tile(np.eye(4), (len(frames), 1, 1))
@@ -300,9 +296,7 @@ def test_auto_own_decides_as_auto_and_leaves_colmap_out(moves, monkeypatch):
     monkeypatch.setattr(paths, "is_installed", lambda: True)
     monkeypatch.setattr(paths, "colmap_path", lambda *args, **options: pytest.fail("COLMAP was asked"))
     frames = [view(pose) for pose in path(10, 2.0)] if moves else [view(path(1)[0])] * 10
-    found, notes = sequence_path(
-        "auto-own", frames.__getitem__, lambda: ([f.rgb_u8 for f in frames], [f.tissue_mask for f in frames]),
-        len(frames), lens(), (WIDTH, HEIGHT), has_depth=True, refine_focal=False,
-    )  # fmt: skip
+    args = frames.__getitem__, still_views(frames), len(frames), lens(), SIZE
+    found, notes = sequence_path("auto-own", *args, has_depth=True, refine_focal=False)
     assert (found is not None) == moves and ("the camera moves" in notes[0]) == moves
     assert not moves or found.method == "our own tracks"

@@ -1,5 +1,6 @@
 """The depth network: a tiny one with random weights stands for the real one; nothing is downloaded."""
 
+import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,22 +28,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
     backbone = Dinov2Config(
-        hidden_size=16,
-        num_hidden_layers=4,
-        num_attention_heads=2,
-        image_size=56,
-        patch_size=14,
-        out_indices=[1, 2, 3, 4],
-        reshape_hidden_states=False,
-    )
-    config = DepthAnythingConfig(
-        backbone_config=backbone,
-        patch_size=14,
-        reassemble_hidden_size=16,
-        neck_hidden_sizes=[8, 8, 8, 8],
-        fusion_hidden_size=8,
-        head_hidden_size=8,
-    )
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, image_size=56, patch_size=14,
+        out_indices=[1, 2, 3, 4], reshape_hidden_states=False,
+    )  # fmt: skip
+    sizes = {"neck_hidden_sizes": [8, 8, 8, 8], "fusion_hidden_size": 8, "head_hidden_size": 8}
+    config = DepthAnythingConfig(backbone_config=backbone, patch_size=14, reassemble_hidden_size=16, **sizes)
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = DepthAnythingForDepthEstimation(config)
@@ -125,8 +115,6 @@ def test_a_package_that_transformers_lacks_is_one_line(folder, monkeypatch):
 
 
 def test_importing_the_module_loads_neither_torch_nor_transformers():
-    import subprocess
-
     code = (
         "import sys, endoprior.prepare.pipeline; "
         "assert not {'torch', 'transformers', 'huggingface_hub'} & set(sys.modules)"

@@ -1,6 +1,8 @@
 """SAM 2: a tiny one with random weights stands for the real one; nothing is downloaded."""
 
 import json
+import shutil
+from dataclasses import replace
 from importlib.util import find_spec
 from types import SimpleNamespace
 
@@ -101,8 +103,6 @@ def test_images_and_prompts_are_prepared_as_by_the_library(model):
 
 @needs_transformers
 def test_the_command_replaces_masks(model, phantom, tmp_path, capsys):
-    import shutil
-
     folder = shutil.copytree(phantom, tmp_path / "DATA")
     before = masks_of(folder)
     assert main(["masks", str(folder), "--with", f"sam2:{model}"]) == 0
@@ -160,17 +160,13 @@ def test_prepare_writes_the_segmenters_masks_and_depth_made_with_them(phantom, t
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "v.mkv"]
     assert not (done.out / WORK).exists()
     # The same masks, given by a user, give the same depth.
-    given = prepare(tmp_path / "v.mkv", tmp_path / "given", OPTIONS.__class__(**given_options(done.out)))
-    own = prepare(tmp_path / "v.mkv", tmp_path / "own", OPTIONS.__class__(**given_options("auto")))
+    from_folder = replace(OPTIONS, masks=str(done.out / "masks"), mask_tool_value="high")
+    given = prepare(tmp_path / "v.mkv", tmp_path / "given", from_folder)
+    own = prepare(tmp_path / "v.mkv", tmp_path / "own", replace(OPTIONS, masks="auto"))
     depths = [[cv2.imread(str(f), -1) for f in sorted((d.out / "depth").glob("*.png"))] for d in (done, given, own)]
     near = [np.abs(a.astype(float) - b).mean() for a, b in zip(depths[0], depths[1], strict=True)]
     far = [np.abs(a.astype(float) - b).mean() for a, b in zip(depths[0], depths[2], strict=True)]
     assert max(near) < max(far), "nearer to depth made with these masks than with our own"
-
-
-def given_options(masks):
-    masks = masks if masks == "auto" else str(masks / "masks")
-    return {"masks": masks, "depth": "shading", "poses": "still", "border": "keep", "mask_tool_value": "high"}
 
 
 @pytest.mark.parametrize("stop_at", ["following tools, round 1", "following the camera", "writing frames"])
