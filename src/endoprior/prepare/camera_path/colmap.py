@@ -27,8 +27,7 @@ from .follow import Follower
 from .own import finished_path, place_frames
 from .tracks import CameraPath, PoseInput, Tracks
 
-ENOUGH_IMAGES, LARGEST_STRIDE = 150, 4
-"""A longer clip is mapped by every second to fourth frame; our tracks place those between."""
+ENOUGH_IMAGES, LARGEST_STRIDE = 150, 4  # a longer clip is mapped by every second to fourth frame
 LONGEST = 1000  # longer clips are mapped only if COLMAP is asked for: it takes seconds a frame
 DEFORMING = 0.1  # tracks below this weight deform; the tissue around them is masked ...
 AROUND = 40  # ... within the image width divided by this
@@ -65,10 +64,12 @@ def colmap_poses(
     pycolmap.logging.minloglevel = 2
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        for part in ("images", "masks", "models"):
+            (folder / part).mkdir()
         for i in range(0, count, stride):
             seen = frame(i)
-            save_png(_file(folder, "images", i), seen.rgb_u8)
-            save_png(_file(folder, "masks", i, ".png"), _allowed(seen, follower, i).astype(np.uint8) * 255)
+            save_png(folder / f"images/{i:06d}.png", seen.rgb_u8)
+            save_png(folder / f"masks/{i:06d}.png.png", _allowed(seen, follower, i).astype(np.uint8) * 255)
         models, notes = _reconstruct(pycolmap, folder, follower.lens.matrix, refine_focal)
     if not models:
         return None
@@ -127,7 +128,6 @@ def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: boo
     mapping.max_num_models = 2
     limit = int(max(LEAST_SECONDS, SECONDS_AN_IMAGE * len(list((folder / "images").iterdir()))))
     mapping.max_runtime_seconds = limit
-    (folder / "models").mkdir()
     device, single = pycolmap.Device.cpu, pycolmap.CameraMode.SINGLE
     options = {"reader_options": reader, "extraction_options": extraction, "device": device}
     pycolmap.set_random_seed(0)
@@ -145,12 +145,6 @@ def _allowed(seen: PoseInput, follower: Follower, index: int) -> NDArray[np.bool
     for x, y in tracks.pixels[index][tracks.adjusted[ids] & (tracks.weight[ids] < DEFORMING)]:
         cv2.circle(mask, (round(float(x)), round(float(y))), mask.shape[1] // AROUND, 0, -1)
     return mask.astype(bool)
-
-
-def _file(folder: Path, part: str, index: int, more: str = "") -> Path:
-    path = folder / part / f"{index:06d}.png{more}"
-    path.parent.mkdir(exist_ok=True)
-    return path
 
 
 def with_poses(follower: Follower, poses: NDArray, known: NDArray[np.bool_], focal_factor: float = 1.0) -> Follower:

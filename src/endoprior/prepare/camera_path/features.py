@@ -149,7 +149,7 @@ def keyframe(index: int, view: View) -> Keyframe:
 
 def link(lens: Lens, old: Keyframe, old_pose: NDArray, old_scale: float, new: Keyframe) -> Link | None:
     """Find the pose of `new` from what it shares with `old`; None if that is too little."""
-    first, second = _matches(old.descriptors, new.descriptors)
+    first, second = _matches(old.descriptors.astype(np.float32), new.descriptors.astype(np.float32))
     if len(first) < FEWEST_INLIERS:
         return None
     points = back_projected(lens.matrix, old_pose, old.pixels[first], old.depths[first] * old_scale)
@@ -164,11 +164,10 @@ def link(lens: Lens, old: Keyframe, old_pose: NDArray, old_scale: float, new: Ke
     return Link(pose, first[inlier], second[inlier], scale)
 
 
-def _matches(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _matches(a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     """Mutual nearest neighbors that pass the ratio test."""
-    if len(first) < 2 or len(second) < 2:
+    if min(len(a), len(b)) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    a, b = first.astype(np.float32), second.astype(np.float32)
     distance = (a**2).sum(1)[:, None] + (b**2).sum(1)[None] - 2 * a @ b.T
     best = np.argmin(distance, 1)
     two = np.partition(distance, 1, 1)[:, :2]

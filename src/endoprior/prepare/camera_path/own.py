@@ -167,14 +167,10 @@ def close_loops(follower: Follower, keyframes: list[Keyframe], size: tuple[int, 
                 continue
             fresh = old.track[match.old] < 0
             old.track[match.old[fresh]] = tracks.add_points(points[a][match.old[fresh]], keypoint=True)
-            _see(follower, old, match.old[fresh])
             unseen = new.track[match.new] < 0
             new.track[match.new[unseen]] = old.track[match.old[unseen]]
-            _see(follower, new, match.new[unseen])
-
-
-def _see(follower: Follower, key: Keyframe, which: NDArray) -> None:
-    follower.tracks.see(key.frame, key.track[which], key.pixels[which], key.depths[which])
+            for key, which in ((old, match.old[fresh]), (new, match.new[unseen])):
+                tracks.see(key.frame, key.track[which], key.pixels[which], key.depths[which])
 
 
 def _share_inside(matrix: NDArray, pose: NDArray, points: NDArray, size: tuple[int, int]) -> float:

@@ -38,7 +38,21 @@ def read_poses(path: Path, count: int, sources: Sequence[int] | None = None) -> 
             fix = "pass it to `endoprior prepare VIDEO OUT --poses`, which knows their frames and rectifies them."
             raise input_error(path, "poses of these frames, .npy", "poses of the images of a video", fix)
         return _of_images(path, sources)
-    return _of_frames(path, count)
+    stored = read_numpy(path, "camera poses", HINT)
+    shape = "an archive" if isinstance(stored, dict) else stored.shape or "an archive"
+    if isinstance(stored, dict) or shape not in ((count, 4, 4), (count, 3, 4), (count, 17)):
+        raise input_error(path, f"shape ({count}, 4, 4), one pose per frame", str(shape), HINT)
+    if stored.dtype.kind not in "iuf":
+        raise input_error(path, "numbers", str(stored.dtype), HINT)
+    values = stored.astype(np.float64)
+    if shape == (count, 17):
+        values = values[:, :15].reshape(count, 3, 5)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3] = values[:, :3, :4]
+    if not np.isfinite(poses).all():
+        raise input_error(path, "finite numbers", "NaN or infinity", HINT)
+    demand_rotations(path, poses[:, :3, :3], "the upper left 3x3", HINT)
+    return poses
 
 
 def is_model(path: Path) -> bool:
@@ -79,24 +93,6 @@ def read_model_poses(
     poses = np.array([by_name[files[i]] for i in np.array(places)[before]], np.float64)
     demand_rotations(path, poses[:, :3, :3], "the poses", "Export them again.")
     return poses, known, matched.rule
-
-
-def _of_frames(path: Path, count: int) -> NDArray:
-    stored = read_numpy(path, "camera poses", HINT)
-    shape = "an archive" if isinstance(stored, dict) else stored.shape or "an archive"
-    if isinstance(stored, dict) or shape not in ((count, 4, 4), (count, 3, 4), (count, 17)):
-        raise input_error(path, f"shape ({count}, 4, 4), one pose per frame", str(shape), HINT)
-    if stored.dtype.kind not in "iuf":
-        raise input_error(path, "numbers", str(stored.dtype), HINT)
-    values = stored.astype(np.float64)
-    if shape == (count, 17):
-        values = values[:, :15].reshape(count, 3, 5)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3] = values[:, :3, :4]
-    if not np.isfinite(poses).all():
-        raise input_error(path, "finite numbers", "NaN or infinity", HINT)
-    demand_rotations(path, poses[:, :3, :3], "the upper left 3x3", HINT)
-    return poses
 
 
 def _of_images(path: Path, sources: Sequence[int]) -> NDArray:
