@@ -8,8 +8,8 @@ import pytest
 from endoprior.cli.progress import Counting, duration
 from endoprior.pipeline.job import Part, choose_part
 from endoprior.pipeline.steps import every_kth_time, usable_frames
-from endoprior.prepare.frame_selection import FrameSelection
 from endoprior.prepare.video import SourceFrame
+from endoprior.prepare.video_clip import FrameSelection
 
 WHOLE = (0.0, math.inf)
 

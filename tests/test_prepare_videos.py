@@ -18,8 +18,8 @@ from endoprior.data import load_sequence
 from endoprior.data.description import read_record
 from endoprior.data.images import read_color
 from endoprior.prepare import PrepareConfig, prepare
-from endoprior.prepare.frame_selection import pair_by_time
 from endoprior.prepare.video import SourceFrame
+from endoprior.prepare.video_clip import pair_by_time
 
 
 def prepared(video, tmp_path, **options):

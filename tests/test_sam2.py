@@ -19,7 +19,7 @@ from endoprior.data.images import read_tool_mask
 from endoprior.phantom import PhantomConfig, write_phantom
 from endoprior.prepare import PrepareConfig, networks, prepare
 from endoprior.prepare.config import is_sam2, names_path
-from endoprior.prepare.masks import WORK
+from endoprior.prepare.frames import WORK
 from endoprior.prepare.networks import DEFAULT_SAM2, FILES, open_sam2
 from endoprior.tool_masks.carry import carry
 

@@ -21,8 +21,8 @@ from ..data.files import read_json
 from ..prepare.camera_path.sequence_path import WITHOUT_COLMAP
 from ..prepare.config import PrepareConfig
 from ..prepare.first_pass import input_facts, source_facts
-from ..prepare.frame_selection import FrameSelection, Moment
 from ..prepare.source import open_source
+from ..prepare.video_clip import FrameSelection, Moment
 from ..system.atomic import reject_occupied, write_json
 
 LEAST_RATE = 10.0  # frame rate, 1/s, below which tissue and camera move too far between two frames to be followed

@@ -22,9 +22,8 @@ from ..footage.round_border import CERTAIN
 from .calibration import fitted
 from .config import Layout, PrepareConfig, Rectangle, parse_rectangle
 from .frame_geometry import FrameGeometry, demand_within, make_geometry
-from .frame_selection import FrameSelection
 from .source import ImageFolder
-from .video_clip import Clip, StereoFrame
+from .video_clip import Clip, FrameSelection, StereoFrame
 
 SAMPLES = 24  # number of frames used to detect borders, labels, tools and lighting
 DARK = 40.0  # images whose brightest percent of values is below this are nearly black

@@ -1,40 +1,56 @@
-"""Second pass over a clip: choose how depth and masks are made, rectify and measure each frame, write the files."""
+"""Second pass over a clip: choose how depth and masks are made, rectify and measure each frame, write the files.
+
+Tools are found in the frames, read from the user's files, or followed by a video segmenter.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import chain, islice, repeat
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import input_error
+from ..core.config import DataConfig
 from ..core.ranges import spread
-from ..data.found_tools import FoundTools
-from ..data.frame_files import match_files
-from ..data.images import DEPTH_SUFFIXES, read_depth_file, read_stored, read_values
+from ..data import load_sequence
+from ..data.description import TOOLS_FOUND
+from ..data.folder_edits import found_source, write_mask
+from ..data.found_tools import FoundTools, FrameRow, write_rows
+from ..data.frame_files import match_files, match_names
+from ..data.images import DEPTH_SUFFIXES, read_color, read_depth_file, read_stored, read_values, save_png
+from ..data.mask_files import tool_polarity
+from ..data.mask_folders import open_mask_folder
 from ..data.pixels import is_measured
-from ..data.writer import FrameFiles
+from ..data.writer import TOOL_VALUE, FrameFiles
 from ..footage.changes import COLOR_DISTANCE, color_share
 from ..footage.stereo_order import stereo_order, vertical_offset_px
 from ..footage.units import guess_unit
-from .config import NETWORK, PrepareConfig
+from .config import NETWORK, PrepareConfig, is_sam2
 from .first_pass import Depth, FirstPass, Image, Mask, MeasuredFrame
 from .frame_geometry import FrameGeometry
-from .masks import Tools, choose_tools
 from .relative_depth import RelativeScale, fit_shading
 from .stereo import stereo_depth, temporal_median
 from .video_clip import Clip, StereoFrame
+
+if TYPE_CHECKING:
+    from ..tool_masks.carry import VideoSegmenter
+    from ..tool_masks.sequence import Progress
 
 REACH = 2  # number of frames on each side in the temporal depth filter
 FITTED_SAMPLES = 16  # number of frames to which the tool and shading models are fitted
 MAX_ROW_OFFSET_PX = 1.5  # if the rows of the two cameras are further apart, stereo matching is poor
 DepthKind = Literal["none", "sgbm", "shading", "network", "folder"]
 Measure = Callable[[MeasuredFrame], Depth]
+COVERED = 0.5  # masks that extend over a smaller share of the frames are those of another clip, or not complete
+HINT = "Check masks/, and correct them in `endoprior view` or any paint program (255 = tool)."
+WORK = "carried"  # folder of the segmenter's masks until the sequence is complete, for an interrupted run
+Tools = Callable[[MeasuredFrame], FoundTools]  # the tools of a frame; those that the user gives have confidence 1
 
 
 @dataclass(frozen=True)
@@ -191,6 +207,76 @@ def _inside_body(images: list[Image]) -> Callable[[Image], bool]:
     return lambda rgb_u8: usual is None or bool(np.abs(color_share(rgb_u8) - usual).max() < COLOR_DISTANCE)
 
 
+def names_folder(masks: str) -> bool:
+    """Whether a value of --masks is a folder of the user."""
+    return masks not in ("auto", "none") and not is_sam2(masks)
+
+
+def masked_frames(cfg: PrepareConfig, first_pass: FirstPass) -> tuple[frozenset[int], int, str] | None:
+    """The frames with a mask, if there are fewer masks than frames, as in StereoMIS; None if masks decide nothing.
+
+    Returns:
+        Their positions in the source, the usual distance between them in selected frames, and a note for the user.
+    """
+    if not names_folder(cfg.masks):
+        return None
+    indices, image_names = first_pass.indices, first_pass.image_names
+    given = open_mask_folder(Path(cfg.masks), cfg.mask_labels)
+    if given.in_order_only or len(given.frames) in (len(indices), len(image_names)):
+        return None
+    names = [frame.name for frame in given.frames]
+    found = match_names(Path(cfg.masks), names, indices, image_names, required=()).files
+    places = np.searchsorted(indices, sorted(found))
+    if len(found) in (1, len(indices)) or np.ptp(places) < COVERED * (len(indices) - 1):
+        return None
+    step = int(np.median(np.diff(places)))
+    every = f"one for every {step} frames; " if step > 1 else ""
+    left_out = f"{len(indices) - len(found)} of {len(indices)} frames have none and are left out"
+    return frozenset(found), step, f"masks: {every}{left_out}"
+
+
+def choose_tools(
+    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
+) -> tuple[Tools, str, list[str]]:
+    """A function that returns the tools of a frame, the name of its source, and notes."""
+    inside = first_pass.geometry.inside
+    if names_folder(cfg.masks):
+        return _given_tools(cfg, first_pass, samples)
+    if cfg.mask_labels:
+        raise input_error("--mask-labels", "a folder with --masks", cfg.masks, "Remove --mask-labels.")
+    if cfg.masks == "none":
+        return lambda _frame: FoundTools(np.zeros_like(inside), 1.0), "none", []
+    from ..tool_masks import ToolFinder  # imports torch
+
+    finder = ToolFinder()
+    share = np.mean([finder.find(sample.rgb_u8, inside).mask.any() for sample in samples])
+    source = f"{TOOLS_FOUND} in {share:.0%} of the samples" if share else f"no {TOOLS_FOUND}"
+    hint = HINT if share else "Tools in view become tissue: paint them in masks/ (255 = tool), or pass --masks FOLDER."
+    notes = [] if is_sam2(cfg.masks) else [f"masks: {source}. {hint}"]  # its own masks replace these
+    return lambda frame: finder.find(frame.rgb_u8, inside), source, notes
+
+
+def _given_tools(
+    cfg: PrepareConfig, first_pass: FirstPass, samples: list[MeasuredFrame]
+) -> tuple[Tools, str, list[str]]:
+    """As `choose_tools`, from the user's files."""
+    path = Path(cfg.masks)
+    given = open_mask_folder(path, cfg.mask_labels)
+    names = [each.name for each in given.frames]
+    matched = match_names(path, names, first_pass.indices, first_pass.image_names, in_order_only=given.in_order_only)
+
+    def high(frame: MeasuredFrame) -> Mask:
+        return first_pass.frame_of(given.frames[matched.files[frame.index]].read)
+
+    notes = [f"masks: {each}" for each in (given.note, matched.rule) if each]
+    tool_is_high = given.tool_is_high
+    if tool_is_high is None or cfg.mask_tool_value != "auto":
+        polarity = tool_polarity(cfg.mask_tool_value, [high(f) for f in samples], [f.rgb_u8 for f in samples])
+        tool_is_high = polarity.tool_is_high
+        notes.append(f"masks: {polarity.reason}")
+    return lambda frame: FoundTools(high(frame) == tool_is_high, 1.0), "user's files", notes
+
+
 def measure_frames(
     stereo_frames: Iterable[StereoFrame], geometry: FrameGeometry, methods: FrameMethods, first: int, used: list[int]
 ) -> Iterator[MeasuredFrame]:
@@ -257,3 +343,46 @@ def write_frames(
         files.add(rgb_u8, tools, depth, frame.right_u8 if keep_right else None)
         on_frame(files.count)
     return used
+
+
+def replace_by_carried(
+    files: FrameFiles,
+    segmenter: VideoSegmenter,
+    inside: Mask,
+    shade: Callable[[Image, Mask], Depth] | None,
+    progress: Progress,
+) -> list[str]:
+    """Replace the masks of all written frames, their depth from shading, and the source of the masks in `files.meta`.
+
+    The frames are written first, with the masks of our own finder, because the segmenter goes through them in both
+    directions. To call this again after an interruption gives the same files.
+
+    Args:
+        inside: (H, W) True inside the endoscope's image.
+        shade: depth from the shading of an image inside a mask; None if depth does not depend on masks.
+    Returns:
+        Notes for the user, one line each.
+    """
+    from ..tool_masks.mask_store import MaskStore, read_state, write_state  # imports torch
+    from ..tool_masks.video_segmenter import segment_sequence
+
+    work = files.folder / WORK
+    store = MaskStore(work / "masks", (files.meta.width, files.meta.height))
+    if "rows" not in read_state(work):
+        files.finish()  # a reader needs the description; it is written again at the end
+        sequence, found_rows = load_sequence(files.folder, DataConfig(format="plain")), []
+        for i, (mask, found) in enumerate(segment_sequence(sequence, segmenter, work / "work", progress=progress)):
+            store.put(i, mask)
+            found_rows.append(asdict(FrameRow.of(i, found)))
+        write_state(work, {"rows": found_rows})
+    for i in range(files.count):
+        mask = store.mask(i) | ~inside
+        write_mask(files.file("masks", i), mask, TOOL_VALUE)
+        if shade is not None:
+            depth = np.where(inside, shade(read_color(files.file("images", i)), ~mask), np.float32(0))
+            save_png(files.file("depth", i), files.depth_units(depth))
+    rows = [FrameRow(**row) for row in read_state(work)["rows"]]
+    write_rows(files.folder, rows)
+    source = found_source(sum(row.share > 0 for row in rows) / files.count, segmenter.name)
+    files.meta = replace(files.meta, sources=files.meta.sources | {"masks": source})
+    return [f"masks: {source}. {HINT}"]

@@ -29,8 +29,7 @@ from .camera_path.tracks import CameraPath, Lens, PoseInput
 from .config import PrepareConfig, is_sam2, names_path
 from .first_pass import FirstPass, input_facts, run_first_pass, source_facts
 from .frame_geometry import FrameGeometry, with_equal_rows
-from .frames import FrameMethods, choose_methods, write_frames
-from .masks import WORK, masked_frames, replace_by_carried
+from .frames import WORK, FrameMethods, choose_methods, masked_frames, replace_by_carried, write_frames
 from .video_clip import Clip
 from .work_folder import delete_plan, frames_done, work_folder
 
