@@ -294,13 +294,9 @@ def coarse_pose(
 
 def refined_pose(
     matrix: NDArray, pose: NDArray, points: NDArray, pixels: NDArray, inverse_depth: NDArray, sigma: NDArray,
-    track_weight: NDArray, *, steps: int = 8, widest: float = 4.0,
+    track_weight: NDArray,
 ) -> Resected:  # fmt: skip
-    """Refine a pose; residuals in standard deviations are weighted by their track, (N,), and by Geman-McClure.
-
-    Args:
-        widest: the weight's width starts at this multiple of its final one, and halves with each step.
-    """
+    """Refine a pose; residuals in standard deviations are weighted by their track, (N,), and by Geman-McClure."""
 
     def linearized(pose: NDArray, width: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Residuals, their weights, normal matrix and gradient."""
@@ -310,8 +306,8 @@ def refined_pose(
         weighted = by_pose * weight.reshape(-1, 1)
         return error, weight, weighted.T @ by_pose, weighted.T @ error.ravel()
 
-    for step in range(steps):
-        width = SINGLE_WIDTH * max(1.0, widest / 2**step)
+    for wider in (4.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0):
+        width = SINGLE_WIDTH * wider
         _, _, normal, gradient = linearized(pose, width)
         change = -np.linalg.solve(normal + np.diag(1e-6 * np.diag(normal) + 1e-9), gradient)
         pose = moved(pose[None], change[None])[0]

@@ -19,7 +19,7 @@ from scipy import sparse
 from .adjust import Observations, derivatives, moved, residuals, summed_by, weights
 from .follow import Follower
 
-HARMONICS = 2
+HARMONICS, ROUNDS = 2, 8
 CYCLES = 3.0  # fewer breaths are not told from the camera
 SHORTEST = 8  # frames of the fastest breath
 SAMPLE = 4000  # observations from which the period is found
@@ -143,9 +143,8 @@ def breathing_period(
 
 
 def separate(
-    matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, frames: NDArray, period: float, *,
-    rounds: int = 8,
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:  # fmt: skip
+    matrix: NDArray, poses: NDArray, points: NDArray, seen: Observations, frames: NDArray, period: float
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Adjust cameras (K, 4, 4), of frames (K,), points (P, 3) and motion of this period together.
 
     Returns:
@@ -156,7 +155,7 @@ def separate(
     coefficients = np.zeros((basis.shape[1], wave.shape[1], 3))
     distance = float(np.median(1 / seen.inverse_depth))
     track = np.ones(len(points))
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         swing = np.einsum("nb,nh->nbh", basis[seen.point], wave[seen.camera])
         here = points[seen.point] + np.einsum("nbh,bhj->nj", swing, coefficients)
         error = residuals(matrix, poses[seen.camera], here, seen.pixels, seen.inverse_depth, seen.sigma)

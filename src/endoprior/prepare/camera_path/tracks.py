@@ -161,18 +161,14 @@ class Tracks:
             sigma[:, 1] = np.inf
         return refined_pose(self.lens.matrix, start, points, pixels, inverse, sigma, self.weight[ids])
 
-    def of_frames(self, frames: list[int], scales: NDArray, least: int = 2) -> tuple[NDArray[np.int32], Observations]:
-        """Points seen in at least `least` of the frames, and their observations, for an adjustment.
-
-        Args:
-            scales: (T,) factor of the depth of every frame of the clip.
-        """
+    def of_frames(self, frames: list[int], scales: NDArray) -> tuple[NDArray[np.int32], Observations]:
+        """Points seen in two frames or more, and their observations. Args: scales: (T,) of the depth of all frames."""
         ids, numbers = np.concatenate([self.ids[f] for f in frames]), [len(self.ids[f]) for f in frames]
         camera, scale = np.repeat(np.arange(len(frames)), numbers), np.repeat(scales[frames], numbers)
         pixels = np.concatenate([self.pixels[f] for f in frames]).astype(np.float64)
         depths = np.concatenate([self.depths[f] for f in frames])
         number = np.bincount(ids, minlength=self.count)
-        keep = (number[ids] >= least) & ~self.held_out(ids)
+        keep = (number[ids] >= 2) & ~self.held_out(ids)
         ids, camera, pixels, depths, scale = ids[keep], camera[keep], pixels[keep], depths[keep], scale[keep]
         inverse, sigma = self.measured(ids, depths * scale.astype(np.float32))
         if self.lens.depth_is_relative:
