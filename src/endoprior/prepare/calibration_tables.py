@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from ..core.checks import InputError, input_error
-from ..data.colmap import StoredCamera, read_cameras
+from ..data.colmap import read_cameras
 from ..data.lens import MODELS, UNSUPPORTED
 from ..data.reading import BoundedLoader, load_yaml, read_bytes, read_numpy, read_text
 
@@ -70,7 +70,7 @@ def _content(path: Path) -> Any:
         if start.startswith(mark):
             raise input_error(path, FORMATS, what, fix)
     if path.name == "cameras.bin":
-        return _of_colmap(path, list(read_cameras(path).values()))
+        return _of_colmap(path)
     return _of_text(path, read_text(path, "a calibration file", "Check the path.", or_latin_1=True))
 
 
@@ -81,7 +81,7 @@ def _of_text(path: Path, text: str) -> Any:
         return json.loads(text)
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if lines and all(COLMAP_LINE.fullmatch(line.strip()) for line in lines):
-        return _of_colmap(path, list(read_cameras(path).values()))
+        return _of_colmap(path)
     if lines and ONLY_NUMBERS.fullmatch("\n".join(lines) + "\n"):
         numbers = [[float(word) for word in words] for words in map(NUMBER.findall, lines) if words]
         if len({len(row) for row in numbers}) == 1:
@@ -135,7 +135,8 @@ def _numbers(words: list[str]) -> list[float] | None:
         return None
 
 
-def _of_colmap(path: Path, cameras: list[StoredCamera]) -> Table:
+def _of_colmap(path: Path) -> Table:
+    cameras = list(read_cameras(path).values())
     if len(cameras) != 1:
         fix = "Keep this video's camera alone, in cameras.txt."
         raise input_error(path, "one camera of COLMAP, which writes no R and T", f"{len(cameras)} cameras", fix)
@@ -148,9 +149,9 @@ def _of_colmap(path: Path, cameras: list[StoredCamera]) -> Table:
     if len(names) != len(camera.values):
         raise input_error(path, f"{len(names)} numbers of {camera.model}", str(len(camera.values)), "Write it again.")
     found = dict(zip(names, camera.values, strict=True))
-    focal = {"fx": found["f"]} if "f" in found else {}
-    size = {"width": camera.width, "height": camera.height}
-    return {"camera_model": camera.model, "pixel_center": 0.5} | size | found | focal
+    found |= {"fx": found["f"]} if "f" in found else {}
+    facts = {"camera_model": camera.model, "pixel_center": 0.5, "width": camera.width, "height": camera.height}
+    return facts | found
 
 
 def _of_rows(path: Path, rows: np.ndarray) -> Table:

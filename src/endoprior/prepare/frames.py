@@ -167,7 +167,7 @@ def _matched_depth(cfg: PrepareConfig, geometry: FrameGeometry) -> Measure:
 
     def match(frame: MeasuredFrame) -> Depth:
         assert frame.right_u8 is not None
-        return stereo_depth(frame.rgb_u8, frame.right_u8, focal, baseline, cfg.stereo).depth
+        return stereo_depth(frame.rgb_u8, frame.right_u8, focal, baseline, cfg.stereo)
 
     return match
 

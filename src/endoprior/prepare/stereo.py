@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -68,24 +67,18 @@ class StereoConfig:
         check_range("min_confidence", self.min_confidence, 0, 1)
 
 
-class StereoDepth(NamedTuple):
-    """Depth and confidence of the left image."""
-
-    depth: NDArray  # (H, W) z, mm; 0 where not measured
-    confidence: NDArray  # (H, W) in [0, 1]; 0 where not measured
-
-
 def stereo_depth(
     left_u8: Image, right_u8: Image, focal_px: float, baseline_mm: float, cfg: StereoConfig | None = None
-) -> StereoDepth:
-    """Depth, within [near_mm, far_mm], of every pixel of the left image that passes the left-right consistency check.
+) -> NDArray:
+    """(H, W) depth, mm, of every pixel of the left image that passes the left-right consistency check, else 0.
 
     Confidence is the product of left-right consistency, texture and absence of highlights, which move with the camera
-    rather than with the tissue. That of filled holes is halved.
+    rather than with the tissue.
 
     Args:
         left_u8, right_u8: (H, W, 3) rectified images, 0..255.
         focal_px, baseline_mm: of the rectified cameras.
+        cfg: the depth is within its [near_mm, far_mm].
     Raises:
         ValueError: a depth range that is impossible for this image size.
     """
@@ -105,17 +98,10 @@ def stereo_depth(
     glint = specular_likelihood(left_u8 * np.float32(1 / 255))
     confidence = texture * np.exp(-((apart / np.float32(cfg.left_right_px)) ** 2)) * (1 - glint / 2)
     disparity[~(confidence >= cfg.min_confidence)] = np.nan
-    disparity = smooth_disparity(drop_speckles(disparity, cfg.speckle_px))
-    confidence[np.isnan(disparity)] = 0
-    disparity = fill_small_holes(disparity, cfg.fill_px)
-    filled = (confidence == 0) & np.isfinite(disparity)
-    if filled.any():
-        support = np.isfinite(disparity) & ~filled
-        confidence[filled] = _mean_around(confidence, support)[filled] / 2
+    disparity = fill_small_holes(smooth_disparity(drop_speckles(disparity, cfg.speckle_px)), cfg.fill_px)
     # This comparison also excludes NaN and disparities of the wrong sign.
     valid = (disparity >= lowest) & (disparity <= product / cfg.near_mm)
-    depth = np.divide(product, disparity, out=np.zeros_like(disparity), where=valid)
-    return StereoDepth(depth, np.where(valid, confidence, np.float32(0)))
+    return np.divide(product, disparity, out=np.zeros_like(disparity), where=valid)
 
 
 def temporal_median(window: Sequence[NDArray]) -> NDArray:
