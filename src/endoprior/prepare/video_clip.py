@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -126,15 +126,6 @@ def _small(gray: NDArray) -> NDArray:
     return cv2.resize(np.ascontiguousarray(gray), (96, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-class Timed(Protocol):
-    """An image of a source: its position there, from 0, and its time since the first image."""
-
-    @property
-    def index(self) -> int: ...
-    @property
-    def seconds(self) -> float: ...
-
-
 class Moment(NamedTuple):
     """Place and time of an image."""
 
@@ -142,7 +133,7 @@ class Moment(NamedTuple):
     seconds: float
 
 
-Item = TypeVar("Item", bound=Timed)
+Item = TypeVar("Item", Moment, "StereoFrame", SourceFrame)
 
 
 @dataclass

@@ -51,12 +51,15 @@ def is_installed() -> bool:
     return find_spec("pycolmap") is not None
 
 
-def colmap_poses(
+def colmap_path(
     frame: Callable[[int], PoseInput], count: int, follower: Follower, *, refine_focal: bool
-) -> tuple[NDArray, NDArray, float, list[str]] | None:
-    """World-to-camera poses (T, 4, 4) in units of its own, (T,) which frames are registered, focal factor, notes.
+) -> CameraPath | None:
+    """The path by COLMAP, in the unit of our depth; None if no model holds enough frames.
 
-    None if no model holds enough frames.
+    Args:
+        frame: reads frame i.
+        follower: our own tracks, their points adjusted: they show what deforms, and fill in frames.
+        refine_focal: the focal length is an assumption; the factor of the path is relative to that of `follower`.
     """
     import pycolmap
 
@@ -71,44 +74,25 @@ def colmap_poses(
             save_png(folder / f"images/{i:06d}.png", seen.rgb_u8)
             save_png(folder / f"masks/{i:06d}.png.png", _allowed(seen, follower, i).astype(np.uint8) * 255)
         models, notes = _reconstruct(pycolmap, folder, follower.lens.matrix, refine_focal)
-    if not models:
-        return None
-    best = max(models.values(), key=lambda model: model.num_reg_images())
-    if best.num_reg_images() < max(LEAST_SHARE * len(range(0, count, stride)), 3):
+    best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    if best is None or best.num_reg_images() < max(LEAST_SHARE * len(range(0, count, stride)), 3):
         return None
     poses, known = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
     for image in best.images.values():
         if image.has_pose:
             index = int(Path(image.name).stem)
             poses[index, :3], known[index] = image.cam_from_world().matrix(), True
-    focal = next(iter(best.cameras.values())).params[0]
-    return poses, known, float(focal / follower.lens.matrix[0, 0]), notes
-
-
-def colmap_path(
-    frame: Callable[[int], PoseInput], count: int, follower: Follower, *, refine_focal: bool
-) -> CameraPath | None:
-    """The path by COLMAP, in the unit of our depth; None if it finds none.
-
-    Args:
-        frame: reads frame i.
-        follower: our own tracks, their points adjusted: they show what deforms, and fill in frames.
-        refine_focal: the focal length is an assumption; the factor of the path is relative to that of `follower`.
-    """
-    found = colmap_poses(frame, count, follower, refine_focal=refine_focal)
-    if found is None:
-        return None
-    poses, known, focal_factor, notes = found
-    unit = float(np.exp(np.median(np.log(with_poses(follower, poses, known, focal_factor).scales[known]))))
+    factor = float(next(iter(best.cameras.values())).params[0] / follower.lens.matrix[0, 0])
+    unit = float(np.exp(np.median(np.log(with_poses(follower, poses, known, factor).scales[known]))))
     poses[:, :3, 3] /= unit
-    world = with_poses(follower, poses, known, focal_factor)
+    world = with_poses(follower, poses, known, factor)
     if not world.lens.depth_is_relative:
         world.scales[:] = 1.0
     explained = known | (follower.segment == follower.segment[np.argmax(known)])
     stds = place_frames(world, np.flatnonzero(known), follower.poses, explained)
     explained = known | (explained & np.isfinite(stds[0]))
     path = finished_path(world, explained, *stds)
-    return replace(path, method=COLMAP_POSES, focal_factor=focal_factor, notes=notes)
+    return replace(path, method=COLMAP_POSES, focal_factor=factor, notes=notes)
 
 
 def _reconstruct(pycolmap: Any, folder: Path, matrix: NDArray, refine_focal: bool) -> tuple[dict[int, Any], list[str]]:
