@@ -12,9 +12,7 @@ from endoprior.prepare.camera_path import colmap
 from endoprior.prepare.camera_path import sequence_path as paths
 from endoprior.prepare.camera_path.adjust import back_projected
 from endoprior.prepare.camera_path.breathing import breathing_period
-from endoprior.prepare.camera_path.colmap import with_poses
 from endoprior.prepare.camera_path.features import new_corners, sampled, view_of
-from endoprior.prepare.camera_path.follow import follow_camera
 from endoprior.prepare.camera_path.own import own_path
 from endoprior.prepare.camera_path.pose_file import read_poses
 from endoprior.prepare.camera_path.sequence_path import explained_share, find_path, sequence_path
@@ -62,14 +60,6 @@ def test_relative_depth_gets_one_scale_per_frame(relief):
     measured = found.camera_to_world.copy()
     measured[:, :3, 3] /= product.mean()
     assert drift(measured, true) < 1.5  # shape and scale of the depth are free
-
-
-def test_given_poses_scale_relative_depth(relief):
-    frames, true = relief
-    wrong = [replace(s, depth=s.depth * np.float32(0.5 + 0.02 * i)) for i, s in enumerate(frames)]
-    follower = follow_camera(wrong.__getitem__, 24, lens(relative=True))
-    scales = with_poses(follower, np.linalg.inv(true), np.ones(24, bool)).scales
-    assert np.allclose(scales * (0.5 + 0.02 * np.arange(24)), 1, atol=0.03)
 
 
 def test_a_lost_camera_is_found_again(relief):

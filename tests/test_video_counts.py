@@ -9,7 +9,6 @@ import pytest
 from video_files import ffmpeg, moving_pattern
 
 from endoprior.core.checks import InputError
-from endoprior.prepare import PrepareConfig, prepare
 from endoprior.prepare.source import open_source
 
 H264 = ["-c:v", "libx264", "-pix_fmt", "yuv420p"]
@@ -108,9 +107,3 @@ def test_the_loss_of_the_last_image_is_noted(clips, tmp_path, name):
     source = open_source(cut)
     assert len(list(source)) == 24
     assert source.notes == [f"{name} announces 25 images, 24 can be decoded; the last 0.04 s are missing"]
-
-
-def test_prepare_reports_both_numbers(clips, tmp_path):
-    cfg = PrepareConfig(border="keep", masks="none", depth="none", poses="still")
-    done = prepare(clips / "trimmed.mp4", tmp_path / "out", cfg)
-    assert done.num_frames == 39 and "trimmed.mp4 announces 92 images, 39 can be decoded" in done.notes
