@@ -52,7 +52,7 @@ class Timeline:
         """
         shift, last = 0.0, None
         images, ahead = tee(images)
-        for (image, time), after in zip(images, chain(islice(ahead, 1, None), [None]), strict=True):
+        for (image, time), after in zip(images, chain(islice(ahead, 1, None), [None]), strict=False):
             following = after and after[1]
             now = (0.0 if last is None else last + self.step) if time is None else time + shift
             if time is not None and last is not None and now <= last:
