@@ -69,7 +69,7 @@ class Masks(Command):
         """Find the tools of every frame, by our own means or by a segmenter that they prompt."""
         from ..data.folder_edits import note_found_masks
         from ..data.found_tools import FrameRow, uncertain_frames, write_rows
-        from ..prepare.sam2 import open_sam2
+        from ..prepare.networks import open_sam2
         from ..tool_masks.sequence import find_in_sequence
         from ..tool_masks.video_segmenter import segment_sequence
 
