@@ -18,11 +18,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from endoprior.core.checks import InputError
 from endoprior.view import panel as panels
-from endoprior.view.access_control import MAX_BROWSERS, MAX_MESSAGE_BYTES, is_valid_message
-from endoprior.view.job_queue import MAX_WAITING, JobQueue
+from endoprior.view.access_control import MAX_BROWSERS, MAX_MESSAGE_BYTES, MAX_WAITING, JobQueue, is_valid_message
 from endoprior.view.panel import ORBIT, control_id
-from endoprior.view.saving import keep
-from endoprior.view.server import MAX_KEPT, Viewer
+from endoprior.view.server import MAX_KEPT, Viewer, keep
 from endoprior.view.viewable_scene import ViewableScene
 from endoprior.view.viewport import bounded_aspect
 

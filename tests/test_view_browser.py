@@ -149,13 +149,13 @@ def test_two_clicks_measure_the_true_distance(viewer, page, phantom):
         for column, row in pair:
             assert truth[row, column] > 0
             points.append(back_project(np.array([column + 0.5, row + 0.5]), truth[row, column], frame.camera))
-            before = viewer.measured
+            before = viewer.measuring.measured
             x, y = viewport.screen((column + 0.5, row + 0.5))
             page.click_at(left + x * width, top + y * height)
-            wait_until(lambda before=before: viewer.measured is not before)
+            wait_until(lambda before=before: viewer.measuring.measured is not before)
         true = float(np.linalg.norm(points[1] - points[0]))
-        assert viewer.measured.curve("Distance")[FRAME] == pytest.approx(true, abs=1.0)
-        distance = viewer.measured.curve("Distance")[FRAME]
+        assert viewer.measuring.measured.curve("Distance")[FRAME] == pytest.approx(true, abs=1.0)
+        distance = viewer.measuring.measured.curve("Distance")[FRAME]
         page.wait_for(f"document.body.innerText.includes('{distance:.2f} mm')")
     settled(page, "measured")
 

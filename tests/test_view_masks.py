@@ -16,7 +16,7 @@ from endoprior.core.checks import InputError
 from endoprior.data import folder_edits, load_sequence
 from endoprior.tool_masks.clicked_tools import SearchStep, ToolClick, check_clicks
 from endoprior.view import layers
-from endoprior.view.job_queue import JobQueue
+from endoprior.view.access_control import JobQueue
 from endoprior.view.mask_editor import MaskEditor
 from endoprior.view.mask_edits import MaskEdits, stroke
 from endoprior.view.server import Viewer

@@ -7,14 +7,12 @@ beyond the farthest distance that browsers render, is such an object: always und
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from ..core.checks import number_ranges
 from ..tool_masks.clicked_tools import SearchStep, ToolClick
-from .access_control import BRUSH_NODE
-from .job_queue import JobQueue
-from .mask_edits import MaskEdits, Masks, carried_text
+from .access_control import BRUSH_NODE, JobQueue
+from .mask_edits import MaskEdits, Masks
 
 if TYPE_CHECKING:
     import viser
@@ -23,7 +21,7 @@ if TYPE_CHECKING:
 
 SPHERE_MM = 5000.0
 """Radius of the sphere; browsers render up to 1000."""
-ERASING_KEY = "shift"
+ERASING_KEY: Final = "shift"
 
 Spot = tuple[int, tuple[float, float]]
 """A frame, and a position in its mask, px."""
@@ -52,7 +50,7 @@ class MaskEditor:
         self._last: dict[int, Spot] = {}
         """Where each browser's stroke is."""
         self._listens = False
-        self._search: _Search | None = None
+        self._search: Iterator[SearchStep] | None = None
         self._say("")
 
     def listen(self, active: bool) -> None:
@@ -63,15 +61,14 @@ class MaskEditor:
         self._last.clear()
         if not active:
             self._scene.remove_click_callback(self._on_click)
-            self._scene.remove_click_callback(self._on_erasing_click)
             self._scene.remove_by_name(BRUSH_NODE)
             return
         sphere = self._scene.add_icosphere(
             BRUSH_NODE, SPHERE_MM, subdivisions=1, side="double", cast_shadow=False, receive_shadow=False
         )
-        for key, clicked in ((None, self._on_click), (ERASING_KEY, self._on_erasing_click)):
+        for key in (None, ERASING_KEY):
             sphere.on_drag("left", modifier=key)(self._on_drag)
-            self._scene.on_click(modifier=key)(clicked)
+            cast("Any", self._scene.on_click(modifier=key))(self._on_click)  # its types know no asynchronous ones
 
     # Callbacks in viser's threads. Asynchronous ones are called in order.
 
@@ -79,35 +76,32 @@ class MaskEditor:
         self._jobs.put(lambda: self._drag(event))
 
     async def _on_click(self, event: viser.SceneClickEvent) -> None:
-        self._jobs.put(lambda: self._dab(event, False))
-
-    async def _on_erasing_click(self, event: viser.SceneClickEvent) -> None:
-        self._jobs.put(lambda: self._dab(event, True))
+        self._jobs.put(lambda: self._dab(event))
 
     def _drag(self, event: viser.SceneNodeDragEvent) -> None:
         """Continue a stroke; begin it if it is new. It stays in the frame in which it began."""
-        here = self._spot(event.client, event.end_screen_pos)
+        browser, here = event.client_id, self._spot(event.client, event.end_screen_pos)
         if event.phase == "start":
-            self._last.pop(event.client_id, None)
+            self._last.pop(browser, None)
             if (began := self._spot(event.client, event.start_screen_pos)) is not None and self._listens:
                 self.edits.begin()
-                self._last[event.client_id] = began
-        if here is None or (last := self._last.get(event.client_id)) is None:
+                self._last[browser] = began
+        if here is None or (last := self._last.get(browser)) is None:
             return
         frame, before = last
         self._draw(frame, [before, here[1]], event.modifier == ERASING_KEY)
-        self._last[event.client_id] = frame, here[1]
+        self._last[browser] = frame, here[1]
         if event.phase == "end":
-            del self._last[event.client_id]
+            del self._last[browser]
 
-    def _dab(self, event: viser.SceneClickEvent, erasing_key: bool) -> None:
+    def _dab(self, event: viser.SceneClickEvent) -> None:
         """A stroke of one point, or a search for the tool there."""
         if self._listens and (here := self._spot(event.client, event.screen_pos)) is not None:
             if self._controls.find.value:
                 self.find(*here)
                 return
             self.edits.begin()
-            self._draw(here[0], [here[1]], erasing_key)
+            self._draw(here[0], [here[1]], event.modifier == ERASING_KEY)
 
     def _draw(self, frame: int, points: list[tuple[float, float]], erasing_key: bool) -> None:
         paint = self._controls.erase.value == erasing_key  # the key reverses the control
@@ -122,29 +116,29 @@ class MaskEditor:
         Raises:
             InputError: that place is masked already.
         """
-        self._search = _Search(self.edits.find(ToolClick(frame, *place)))
-        self._continue(self._search)
+        self._search = search = self.edits.find(ToolClick(frame, *place))
+        self._continue(search, {})
 
-    def _continue(self, search: _Search) -> None:
-        """Search one more frame, unless the search was stopped; when all are, add what was found."""
+    def _continue(self, search: Iterator[SearchStep], added: Masks) -> None:
+        """Search one more frame, unless the search was stopped; when all are, add what was found in them."""
         if search is not self._search:
             return
         try:
-            step = next(search.steps, None)
+            step = next(search, None)
         except Exception:  # shown by the viewer; the search is over
             self._search = None
             self._say("")
             raise
         if step is not None:
-            if step.added is not None and step.added.any():
-                search.added[step.frame] = step.added
+            if step.frame is not None and step.added is not None and step.added.any():
+                added[step.frame] = step.added
             self._controls.corrected.content = f"Finding the tool: {step.done} of {step.total}. *Undo* stops."
-            self._jobs.put(lambda: self._continue(search), surely=True)
+            self._jobs.put(lambda: self._continue(search, added), surely=True)
             return
         self._search = None
-        if search.added:
-            self.edits.add(search.added)
-        self._say(f"Found in {_frames(sorted(search.added))}." if search.added else "Nothing was found.")
+        if added:
+            self.edits.add(added)
+        self._say(f"Found in {_frames(sorted(added))}." if added else "Nothing was found.")
 
     # Buttons.
 
@@ -153,40 +147,27 @@ class MaskEditor:
         if self._search is not None:
             self._search = None
             self._say("Stopped.")
-            return
-        self._say("" if self.edits.undo() else "Nothing to undo.")
+        else:
+            self._say("" if self.edits.undo() else "Nothing to undo.")
 
     def carry(self, frame: int) -> None:
-        """Carry the correction of a frame to those around it."""
+        """Carry the correction of a frame to those around it, and say what changed and why it stopped."""
         self._controls.corrected.content = "Carrying the correction..."
-        self._say(carried_text(self.edits.carry(frame)))
+        done = self.edits.carry(frame)
+        changed = f"Changed frames: {number_ranges(done.masks)}." if done.masks else "No frame changed."
+        self._say(f"{changed}  \nBackward until {done.before}.  \nForward until {done.after}.")
 
     def save(self) -> None:
-        """Write the changed masks.
-
-        Raises:
-            InputError: they cannot be written.
-        """
+        """Write the changed masks; raises InputError if they cannot be written."""
         frames = self.edits.save()
         self._say(f"Saved: {_frames(frames)}." if frames else "Nothing to save.")
 
     def _say(self, text: str) -> None:
         """Show a text and which masks are not saved."""
         unsaved = self.edits.unsaved
-        lines = [text] if text else []
-        if unsaved:
-            lines.append(f"Not saved: {_frames(unsaved)}.")
-        self._controls.corrected.content = "  \n".join(lines)
+        lines = [text, f"Not saved: {_frames(unsaved)}." if unsaved else ""]
+        self._controls.corrected.content = "  \n".join(filter(None, lines))
         self._changed()
-
-
-@dataclass(frozen=True)
-class _Search:
-    """A search for a clicked tool."""
-
-    steps: Iterator[SearchStep]
-    added: Masks = field(default_factory=dict)
-    """(H, W) by frame, of what was found so far."""
 
 
 def _frames(numbers: list[int]) -> str:

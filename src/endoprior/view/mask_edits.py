@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import number_ranges
 from ..data import FrameSequence
 from ..data.folder_edits import replace_masks
 from ..data.found_tools import drop_rows
@@ -24,13 +23,10 @@ Masks = dict[int, Mask]
 """By frame. A mask is never changed, only replaced."""
 
 
-@dataclass(frozen=True)
-class _State:
-    """All corrections at one time."""
-
-    masks: Masks = field(default_factory=dict)
+class _State(NamedTuple):
+    masks: Masks
     """Masks that were corrected."""
-    uncarried: Masks = field(default_factory=dict)
+    uncarried: Masks
     """The masks before the strokes that were not carried yet."""
 
 
@@ -39,7 +35,7 @@ class MaskEdits:
 
     def __init__(self, sequence: FrameSequence) -> None:
         self._sequence = sequence
-        self._state, self._undo = _State(), list[_State]()
+        self._state, self._undo = _State({}, {}), list[_State]()
         self._saved: Masks = {}
         """Masks of files that differ from what `sequence` has read."""
 
@@ -59,7 +55,7 @@ class MaskEdits:
         self._undo = [*self._undo, self._state][-MOST_UNDO:]
 
     def draw(self, frame: int, points: Sequence[tuple[float, float]], radius: float, paint: bool) -> None:
-        """Continue the stroke through points (x, y), px of the mask. Args: as `stroke`."""
+        """Continue the stroke through points (x, y), px of the mask, as `stroke`."""
         before = self.tool(frame)
         masks = {**self._state.masks, frame: stroke(before, points, radius, paint)}
         self._state = _State(masks, {frame: before, **self._state.uncarried})
@@ -92,8 +88,8 @@ class MaskEdits:
     def add(self, added: Masks) -> None:
         """Add pixels to the masks of some frames, as one step. Strokes that were not carried yet stay so."""
         self.begin()
-        masks = {i: self.tool(i) | mask for i, mask in added.items()}
-        self._state = _State({**self._state.masks, **masks}, self._state.uncarried)
+        masks = self._state.masks | {i: self.tool(i) | mask for i, mask in added.items()}
+        self._state = self._state._replace(masks=masks)
 
     def undo(self) -> bool:
         """Go back by one stroke, one carrying or one search; False if there is none."""
@@ -110,15 +106,10 @@ class MaskEdits:
         Raises:
             InputError: the folder is read-only, or the disk rejects a file; masks written before it stay written.
         """
-        frames = self.unsaved
-        if not frames:
-            return []
-        replace_masks(self._sequence, {frame: self.tool(frame) for frame in frames})
-        drop_rows(self._sequence.path, frames)
-        for frame in frames:
-            self._saved.pop(frame, None)
-            if frame in self._state.masks:
-                self._saved[frame] = self._state.masks[frame]
+        if frames := self.unsaved:
+            replace_masks(self._sequence, {frame: self.tool(frame) for frame in frames})
+            drop_rows(self._sequence.path, frames)
+            self._saved = dict(self._state.masks)
         return frames
 
 
@@ -126,7 +117,6 @@ def stroke(mask: Mask, points: Sequence[tuple[float, float]], radius: float, pai
     """A copy of a mask with a brush stroke.
 
     Args:
-        mask: (H, W) bool.
         points: (x, y) through which the center of the brush moves, px; (0, 0) is the upper left corner of the image.
         radius: of the brush, px; at least one pixel is changed.
         paint: True adds pixels, False removes them.
@@ -134,14 +124,8 @@ def stroke(mask: Mask, points: Sequence[tuple[float, float]], radius: float, pai
     drawn = np.zeros(mask.shape, np.uint8)
     # Sixteenths of a pixel; OpenCV counts pixel centers from 0. Positions far outside would overflow.
     limit = 4 * max(mask.shape)
-    fixed = [[round(16 * (min(max(v, -limit), limit) - 0.5)) for v in point] for point in points]
-    cv2.polylines(drawn, [np.array(fixed, np.int32)], False, 1, max(round(2 * radius), 1), cv2.LINE_8, 4)
-    for point in fixed:
+    fixed = np.rint(16 * (np.clip(points, -limit, limit) - 0.5)).astype(np.int32)
+    cv2.polylines(drawn, [fixed], False, 1, max(round(2 * radius), 1), cv2.LINE_8, 4)
+    for point in fixed.tolist():
         cv2.circle(drawn, point, round(16 * radius), 1, -1, cv2.LINE_8, 4)
     return mask | (drawn > 0) if paint else mask & (drawn == 0)
-
-
-def carried_text(done: CarriedEdit) -> str:
-    """What carrying changed and why it stopped, in a few lines."""
-    changed = f"Changed frames: {number_ranges(done.masks)}." if done.masks else "No frame changed."
-    return f"{changed}  \nBackward until {done.before}.  \nForward until {done.after}."
