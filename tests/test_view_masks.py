@@ -17,8 +17,7 @@ from endoprior.data import folder_edits, load_sequence
 from endoprior.tool_masks.clicked_tools import SearchStep, ToolClick, check_clicks
 from endoprior.view import layers
 from endoprior.view.access_control import JobQueue
-from endoprior.view.mask_editor import MaskEditor
-from endoprior.view.mask_edits import MaskEdits, stroke
+from endoprior.view.mask_editor import MaskEditor, MaskEdits, stroke
 from endoprior.view.server import Viewer
 from endoprior.view.viewable import ViewSettings
 from endoprior.view.viewable_sequence import ViewableSequence
@@ -175,7 +174,7 @@ def found_in(monkeypatch, frames: dict[int, tuple[slice, slice]], clicks: list) 
                 added[frames[i]] = True
             yield SearchStep(i + 1, total, i, added)
 
-    monkeypatch.setattr("endoprior.view.mask_edits.find_clicked", steps)
+    monkeypatch.setattr("endoprior.view.mask_editor.find_clicked", steps)
 
 
 def test_a_search_is_one_edit_that_can_be_undone_and_saved(edits, monkeypatch, tiny_sequence):
@@ -256,7 +255,7 @@ def test_an_error_ends_a_search(edits, monkeypatch):
         yield SearchStep(1, 9)
         raise OSError("no such frame")
 
-    monkeypatch.setattr("endoprior.view.mask_edits.find_clicked", broken)
+    monkeypatch.setattr("endoprior.view.mask_editor.find_clicked", broken)
     editor.find(0, (3.0, 3.0))
     with pytest.raises(OSError, match="no such frame"):
         [job() for job in jobs.take(0)]

@@ -15,7 +15,7 @@ from ..model.carry import CarriedPoints
 from ..priors import joint_texture_prior
 from ..visualization.image_tools import colorize
 from . import layers
-from .mask_edits import MaskEdits
+from .mask_editor import MaskEdits
 from .viewable import Cloud, Layer, ViewSettings
 
 MAX_POINTS = 100_000
@@ -106,7 +106,7 @@ class ViewableSequence:
 
     def shows(self, points: NDArray, _frame: int) -> NDArray[np.bool_]:
         """Where points are known, they are seen."""
-        return np.isfinite(points).all(-1, keepdims=True)[..., 0]
+        return np.isfinite(points.sum(-1))
 
     def tracks(self) -> CarriedPoints:
         """The tracks of the ground truth, if there are any."""

@@ -69,5 +69,5 @@ def num_frames(path: Path) -> int:
     try:
         with open_container(path) as video:
             return sum(packet.size > 0 and not packet.is_corrupt for packet in video.demux(video=0))
-    except (av.FFmpegError, OSError, IndexError):
+    except (av.error.FFmpegError, OSError, IndexError):
         return 0
