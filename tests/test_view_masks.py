@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from view_client import Client, at_work
+from view_client import Client, at_work, wait_until
 
 from endoprior.cli.view import open_viewable
 from endoprior.core.checks import InputError
@@ -36,14 +36,6 @@ def tool(folder, name: str) -> np.ndarray:
     pixels = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
     assert set(np.unique(pixels)) <= {0, 255}
     return pixels == 255
-
-
-def wait_until(condition, seconds: float = 10) -> None:
-    """Until it is true."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.02)
 
 
 @pytest.mark.parametrize("points", [[(20.5, 30.5)], [(10.0, 12.0), (50.0, 30.0)], [(5, 5), (40, 9), (30, 44)]])

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from view_client import Client, at_work
+from view_client import Client, at_work, wait_until
 
 from endoprior.cli.view import live_view, open_viewable
 from endoprior.core.config import Config
@@ -193,9 +193,7 @@ def test_every_quantity_is_measured_and_saved_as_a_table(viewer, client):
     )  # the wall slides as a whole
     assert viewer.measuring.measured.curve(DISPLACEMENT)[2] == 0 < viewer.measuring.measured.curve(DISPLACEMENT)[4]
     client.set(viewer.panel.table, True)
-    end = time.monotonic() + 10
-    while not list(viewer.out.glob("measures*.csv")) and time.monotonic() < end:
-        time.sleep(0.05)
+    wait_until(lambda: list(viewer.out.glob("measures*.csv")))
     rows = list(csv.DictReader((viewer.out / "measures_1.csv").read_text().splitlines()))
     assert len(rows) == NUM_FRAMES and float(rows[1]["area_mm2"]) == pytest.approx(
         viewer.measuring.measured.curve(AREA)[1], abs=1e-3
@@ -235,11 +233,8 @@ def test_each_gaussian_has_a_color_also_behind_the_camera(scene):
 def test_play_advances_and_pauses(viewer, client):
     client.set(viewer.panel.speed, "0.5x")
     client.set(viewer.panel.play, True)
-    seen, end = set(), time.monotonic() + 3
-    while len(seen) < 4 and time.monotonic() < end:
-        seen.add(viewer.settings.frame)
-        time.sleep(0.01)
-    assert len(seen) >= 4
+    seen = set()
+    wait_until(lambda: seen.add(viewer.settings.frame) or len(seen) >= 4, 3)
     client.set(viewer.panel.play, True)
     client.image()
     at = viewer.settings.frame
@@ -270,9 +265,7 @@ def test_screenshot_and_video_are_stored_in_the_run(viewer, client):
     client.set(viewer.panel.frame, 3)
     client.set(viewer.panel.keep, True)
     client.set(viewer.panel.video, True)
-    end = time.monotonic() + 20
-    while not list(viewer.out.glob("color*.mp4")) and time.monotonic() < end:
-        time.sleep(0.05)
+    wait_until(lambda: list(viewer.out.glob("color*.mp4")), 20)
     assert sorted(path.name for path in viewer.out.iterdir()) == ["color_000000_1.png", "color_1.mp4"]
 
 

@@ -20,7 +20,7 @@ from ..model.measures import SurfaceMotion, distance, measures_of
 from ..model.scene import Scene
 from ..model.surface import render_surface
 from ..system.atomic import whole_folder
-from ..visualization.measures import MeasuresFigure, displacement_span, measures_csv, stretch_span, value_colors
+from ..visualization.measures import displacement_span, measures_csv, stretch_span, value_colors, write_figure
 from .axes import points_in_axes
 from .formats import ExportOptions, Format, Progress
 from .mesh import depth_grid
@@ -72,8 +72,7 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
         for (name, shown), span in zip(maps.items(), spans, strict=True):
             columns = colored(positions, value_colors(shown, span)) | maps
             (folder / f"{name}.ply").write_bytes(ply_bytes(columns, options.axes, unit, mesh.triangles))
-        figure = MeasuresFigure(f"frame {since} to frame {until}", with_curves=options.points is not None)
-        pixels = np.zeros((0, 2))
+        points, curves = np.zeros((0, 2)), None
         if options.points:
             queries = read_query_points(options.points, scene)
             carried = carry(scene, back_projected(scene, queries, options.min_alpha), queries.frames, times)
@@ -82,14 +81,12 @@ def write(scene: Scene, out: Path, options: ExportOptions, progress: Progress) -
             found = measures_of(paths, around, since, drawn=int(queries.frames[-1]))
             table = measures_csv(found, rate, unit, carried.confidence)
             (folder / "measures.csv").write_text(table, encoding="utf-8", newline="\n")
-            figure.show_curves(found, rate, unit)
-            pixels = project(paths[since].astype(np.float64), camera)[0]
-        figure.show_points(surface.color, pixels)
-        on_image = project(mesh.vertices.astype(np.float64), camera)[0]
+            points, curves = project(paths[since].astype(np.float64), camera)[0], (found, rate, unit)
+        on_image = project(mesh.vertices.astype(np.float64), camera)[0], mesh.triangles
         titles = f"displacement, {unit}", "largest principal stretch; 1: unchanged"
-        for place, (title, shown, span) in enumerate(zip(titles, maps.values(), spans, strict=True), 1):
-            figure.show_map(place, title, on_image, mesh.triangles, shown, span)
-        figure.save(folder / "measures.png")
+        shown = dict(zip(titles, zip(maps.values(), spans, strict=True), strict=True))
+        title = f"frame {since} to frame {until}"
+        write_figure(folder / "measures.png", title, surface.color, points, on_image, shown, curves)
     progress(len(frames), len(frames))
 
 

@@ -98,7 +98,7 @@ class RateLimit:
         self._most, self._since, self._count = most, float("-inf"), 0
 
     def exceeded(self, now: float) -> bool:
-        """Count an event at `now`, s; whether there are more than `most` in this second."""
+        """Count an event at `now`, s; whether there are more than allowed in this second."""
         if now - self._since >= 1:
             self._since, self._count = now, 0
         self._count += 1

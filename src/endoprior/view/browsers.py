@@ -43,11 +43,9 @@ class Browsers:
         self._full_ms = 0.0
 
     def join(self, client: viser.ClientHandle) -> None:
-        """Add a browser that connected."""
         self._browsers[client.client_id] = _Browser(client)
 
     def leave(self, client: viser.ClientHandle) -> None:
-        """Remove a browser that disconnected."""
         self._browsers.pop(client.client_id, None)
 
     def notify(self, title: str, body: str) -> None:
@@ -89,41 +87,31 @@ class Browsers:
         if self._sent != (content if sent else None):
             self._sent = content if sent else None
             self._send_nodes(viewable, settings, lines, sent)
+        shrink, preview = shrink_factor(idle_seconds, self._full_ms), idle_seconds < IDLE_SECONDS
         for browser in self._connected():
+            client = browser.client
             if settings.endoscope:
                 _follow_endoscope(browser, viewable, settings)
-            if not sent:
-                self._send_picture(browser, viewable, settings, lines, content, idle_seconds)
-            elif browser.shown is not None:
-                browser.client.scene.set_background_image(None)
-                browser.shown = None
-
-    def _send_picture(
-        self,
-        browser: _Browser,
-        viewable: Viewable,
-        settings: ViewSettings,
-        lines: Lines,
-        content: tuple,
-        idle_seconds: float,
-    ) -> None:
-        shrink = shrink_factor(idle_seconds, self._full_ms)
-        viewport = viewport_of(browser.client, viewable, settings, shrink)
-        if viewport is None:
-            return
-        camera, preview = viewport.camera, idle_seconds < IDLE_SECONDS
-        wanted = content, camera.width, camera.height, camera.fy, camera.world_to_camera.tobytes(), viewport.width
-        # After a preview, send the full image once nothing moves.
-        if browser.shown is not None and browser.shown[0] == wanted and (preview or not browser.shown[1]):
-            return
-        began = clock.perf_counter()
-        picture = picture_with_lines(viewable, settings, camera, lines)
-        if shrink == 1:
-            self._full_ms = 1e3 * (clock.perf_counter() - began)
-        kind, scene = "jpeg" if preview else "png", browser.client.scene
-        scene.set_background_image(viewport.paste(picture), kind, jpeg_quality=PREVIEW_QUALITY)
-        browser.client.flush()
-        browser.shown = wanted, preview
+            if sent:
+                if browser.shown is not None:
+                    client.scene.set_background_image(None)
+                    browser.shown = None
+                continue
+            viewport = viewport_of(client, viewable, settings, shrink)
+            if viewport is None:
+                continue
+            camera, shown = viewport.camera, browser.shown
+            wanted = content, camera.width, camera.height, camera.fy, camera.world_to_camera.tobytes(), viewport.width
+            # After a preview, send the full image once nothing moves.
+            if shown is not None and shown[0] == wanted and (preview or not shown[1]):
+                continue
+            began = clock.perf_counter()
+            picture = viewport.paste(picture_with_lines(viewable, settings, camera, lines))
+            if shrink == 1:
+                self._full_ms = 1e3 * (clock.perf_counter() - began)
+            client.scene.set_background_image(picture, "jpeg" if preview else "png", jpeg_quality=PREVIEW_QUALITY)
+            client.flush()
+            browser.shown = wanted, preview
 
     def _send_nodes(self, viewable: Viewable, settings: ViewSettings, lines: Lines, sent: bool) -> None:
         """Update the objects that browsers render themselves: nothing, or a cloud and the lines."""

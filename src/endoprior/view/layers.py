@@ -53,12 +53,10 @@ LARGEST_PX = 6
 def render_points(
     points: NDArray, colors: NDArray[np.uint8], size: float, camera: Camera
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Render a point cloud.
+    """(H, W, 3) image, black where there is no point, and (H, W) z of the visible points, mm, 0 where there is none.
 
     Args:
         points: (P, 3) world axes, mm. colors: (P, 3). size: width of a point, mm.
-    Returns:
-        (H, W, 3) image, black where there is no point, and (H, W) z of the visible points, mm, 0 where there is none.
     """
     picture = np.zeros((camera.height, camera.width, 3), np.uint8)
     depth = np.zeros((camera.height, camera.width), np.float32)

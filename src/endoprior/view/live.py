@@ -47,7 +47,6 @@ class LiveView:
             self._due = now + max(REFRESH_SECONDS, (now - began) / LARGEST_SHARE)
 
     def close(self) -> None:
-        """Stop listening."""
         if self.viewer is not None:
             self.viewer.close()
 

@@ -31,11 +31,7 @@ MOST_PICKED = 100
 
 
 def pick(depth: NDArray, camera: Camera, pixel: tuple[float, float]) -> NDArray[np.float64] | None:
-    """(3,) point of the surface behind a pixel (x, y), world axes, mm; None outside the image and where there is none.
-
-    Args:
-        depth: (H, W) z of the surface, mm; 0 where there is none.
-    """
+    """(3,) point of a surface of `depth` (H, W) behind a pixel (x, y), mm; None outside and where there is none."""
     x, y = (int(np.floor(v)) if np.isfinite(v) else -1 for v in pixel)
     if not (0 <= x < depth.shape[1] and 0 <= y < depth.shape[0]) or not depth[y, x] > 0:
         return None
@@ -64,7 +60,6 @@ class Measurement:
 
     @cached_property
     def measures(self) -> Measures:
-        """Everything that is measured of the points."""
         unknown = np.full(self.paths.shape[:2], np.nan)
         return measures_of(self.paths, unknown if self.stretch is None else self.stretch, self.since, self.frame)
 
@@ -113,7 +108,6 @@ class Measuring:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all points."""
         self.measured: Measurement | None = None
         self._picked: list[tuple[NDArray, int]] = []  # (3,) world axes, mm, and its frame
 
@@ -148,11 +142,9 @@ class Measuring:
         return measures_csv(self.measured.measures, viewable.frames_per_second, unit, confidence)
 
     def lines(self, frame: int) -> Lines:
-        """The line through the points."""
         return ruler(self.measured.ends(frame, self._panel.quantity.value)) if self.measured else NO_LINES
 
     def show(self, viewable: Viewable, frame: int) -> None:
-        """Update the text and the chart of the panel."""
         controls, quantity = self._panel, self._panel.quantity.value
         shown = self.measured or controls.measure.value
         text = measurement_text(self.measured, frame, viewable.relative, quantity) if shown else ""
@@ -177,7 +169,6 @@ class DrawnTracks:
         self.picked = [*self.picked, self._viewable.follow(point[None], [frame])][-MOST_PICKED:]
 
     def clear(self) -> None:
-        """Forget the clicked points."""
         self.picked = []
 
     def lines(self, frame: int, with_grid: bool) -> Lines:

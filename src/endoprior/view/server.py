@@ -100,7 +100,6 @@ class Viewer:
 
     @property
     def port(self) -> int:
-        """The port it listens on."""
         return self.server.get_port()
 
     @property
@@ -142,7 +141,6 @@ class Viewer:
             self.close()
 
     def close(self) -> None:
-        """Stop listening."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
@@ -162,9 +160,7 @@ class Viewer:
                 self._browsers.notify("That did not work", str(error) if known else f"{type(error).__name__}: {error}")
 
     def _accepts(self, uuid: str, value: Any) -> bool:
-        """Whether a control can have this value; there is no panel while the viewer starts."""
-        controls = getattr(self, "panel", None)
-        return controls is not None and controls.accepts(uuid, value)
+        return hasattr(self, "panel") and self.panel.accepts(uuid, value)  # there is no panel while the viewer starts
 
     # Callbacks of the controls.
 
@@ -236,7 +232,6 @@ class Viewer:
         self._update_panel()
 
     def _update_panel(self) -> None:
-        """Update the texts and the chart of the panel."""
         self.panel.status.content = panel.status(self.viewable, self.settings, len(self.kept_views))
         self.measuring.show(self.viewable, self.settings.frame)
 
@@ -247,7 +242,6 @@ class Viewer:
         self._restart_clock()
 
     def _set_frame(self, frame: int) -> None:
-        """Show a frame; the cameras of browsers ride along with the endoscope, if they are to."""
         self._moved_at = clock.monotonic()
         if self.settings.riding and not self.settings.endoscope:
             self._browsers.ride(self.viewable.cameras[self.settings.frame], self.viewable.cameras[frame])

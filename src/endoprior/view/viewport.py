@@ -49,11 +49,10 @@ class Viewport:
         return canvas
 
     def pixel(self, screen: tuple[float, float]) -> tuple[float, float]:
-        """Pixel of the image at a canvas position; `screen` is (0, 0) at the upper left, (1, 1) at the lower right."""
+        """Pixel of the image at a canvas position: (0, 0) at the upper left, (1, 1) at the lower right; and back."""
         return screen[0] * self.width - self.left, screen[1] * self.height - self.top
 
     def screen(self, pixel: tuple[float, float]) -> tuple[float, float]:
-        """The inverse of `pixel`."""
         return (pixel[0] + self.left) / self.width, (pixel[1] + self.top) / self.height
 
 
