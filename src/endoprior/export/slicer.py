@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, indent, tostring
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import numpy as np
@@ -136,18 +136,18 @@ def _put_sequence(
     archive: ZipFile, played: Played, contents: Iterable[bytes], seconds: list[float], progress: Progress
 ) -> None:
     """Add what is shown at the start, and the archive of a sequence: a node for each time step, and an index."""
-    scene = SlicerScene()
+    nodes: list[Element] = []
     with tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES) as sequence:
         with ZipFile(sequence, "w") as inner:
-            for k, content in enumerate(contents):
-                if not k:
+            for k, content in enumerate(contents, 1):
+                if k == 1:
                     _put(archive, played.first_file, content)
-                name = f"Data/{played.name}_{k}{played.suffix}"
+                name = f"Data/{played.name}_{k - 1}{played.suffix}"
                 _put(inner, name, content)
-                scene.add_stored(played, name)
-                progress(k + 1, len(seconds))
-            scene.add("Sequence", played.name, _index(played, seconds), singleton="SequenceIndex")
-            _put(inner, f"{FOLDER}.mrml", scene.file())
+                nodes += _stored(played, k, name)
+                progress(k, len(seconds))
+            nodes.append(_node("Sequence", "SequenceIndex", played.name, _index(played, seconds)))
+            _put(inner, f"{FOLDER}.mrml", _scene(nodes))
         entry = _entry(played.sequence_file)  # stored as it is: its files are compressed
         entry.file_size = sequence.tell()
         sequence.seek(0)
@@ -157,15 +157,15 @@ def _put_sequence(
 
 def _scene_text(first: Mesh, camera: Camera, seconds: list[float], played: list[Played]) -> bytes:
     """The scene that Slicer opens, with the first time step shown."""
-    scene = SlicerScene()
-    scene.add("Camera", "Camera", _view(first, camera), singleton="1")
-    roles: dict[str, str] = {}
+    nodes, roles = [_node("Camera", "1", "Camera", _view(first, camera))], {}
     for k, each in enumerate(played):
-        shown = scene.add_stored(each, each.first_file, display=scene.add(each.display, "display", each.look))
-        storage = scene.add("SequenceStorage", "storage", {"fileName": each.sequence_file})
+        display = _node(each.display, 1, "display", each.look)
+        stored = _stored(each, 1, each.first_file, display=display)
+        storage = _node("SequenceStorage", k + 1, "storage", {"fileName": each.sequence_file})
         attributes = {"attributes": f"DataNodeClassName:vtkMRML{each.tag}Node"} | _index(each, seconds)
-        sequence = scene.add("Sequence", each.name, attributes, {"storage": storage})
-        roles |= {f"sequenceNodeRef{k}": sequence, f"dataNodeRef{k}": shown}
+        sequence = _node("Sequence", k + 1, each.name, attributes, storage=storage)
+        nodes += [display, *stored, storage, sequence]
+        roles |= {f"sequenceNodeRef{k}": sequence, f"dataNodeRef{k}": stored[-1]}
     synchronization = "playback true recording false overwriteProxyName false saveChanges false"
     browser = {
         "virtualNodePostfixes": " ".join(str(k) for k in range(len(played))),
@@ -174,8 +174,7 @@ def _scene_text(first: Mesh, camera: Camera, seconds: list[float], played: list[
         "selectedItemNumber": "0",
     }
     browser |= {f"SynchronizationPropertiesMap{k}": synchronization for k in range(len(played))}
-    scene.add("SequenceBrowser", "tissue", browser, roles)
-    return scene.file()
+    return _scene([*nodes, _node("SequenceBrowser", 1, "tissue", browser, **roles)])
 
 
 def _index(played: Played, seconds: list[float]) -> dict[str, str]:
@@ -205,44 +204,32 @@ def _entry(name: str) -> ZipInfo:
     return ZipInfo(f"{FOLDER}/{name}")
 
 
-class SlicerScene:
-    """A scene to write: nodes with attributes that refer to one another by id."""
+def _scene(nodes: list[Element]) -> bytes:
+    """A .mrml file."""
+    root = Element("MRML", version=SCENE_VERSION, userTags="")
+    root.extend(nodes)
+    indent(root)
+    return tostring(root, encoding="UTF-8", xml_declaration=True)
 
-    def __init__(self) -> None:
-        self._root = ElementTree.Element("MRML", version=SCENE_VERSION, userTags="")
 
-    def add(
-        self,
-        tag: str,
-        name: str,
-        attributes: Mapping[str, str],
-        references: Mapping[str, str] = {},
-        singleton: str = "",
-    ) -> str:
-        """Append a node and return its id.
+def _node(tag: str, number: int | str, name: str, attributes: Mapping[str, str], **references: Element) -> Element:
+    """A node of a scene.
 
-        Args:
-            tag: the node's class `vtkMRML...Node` without prefix and suffix.
-            references: ids of other nodes, by role.
-            singleton: tag of a node that replaces the one of the same class and tag in Slicer; its id ends in it.
-        """
-        number = singleton or str(len(self._root.findall(tag)) + 1)
-        identity = f"vtkMRML{tag}Node{number}"
-        special = {"singletonTag": singleton} if singleton else {}
-        if references:
-            special["references"] = "".join(f"{role}:{other};" for role, other in references.items())
-        ElementTree.SubElement(self._root, tag, {"id": identity, "name": name, **attributes, **special})
-        return identity
+    Args:
+        tag: its class `vtkMRML...Node` without prefix and suffix.
+        number: among the nodes of its class; text: the tag of a node that replaces the one of that class and tag.
+        references: other nodes, by role.
+    """
+    special = {"singletonTag": number} if isinstance(number, str) else {}
+    if references:
+        special["references"] = "".join(f"{role}:{other.get('id')};" for role, other in references.items())
+    return Element(tag, {"id": f"vtkMRML{tag}Node{number}", "name": name, **attributes, **special})
 
-    def add_stored(self, played: Played, file: str, **references: str) -> str:
-        """Append a node whose data is in `file`, relative to the scene's own, in LPS axes; return its id."""
-        storage = self.add(played.storage, "storage", {"fileName": file, "coordinateSystem": "LPS"})
-        return self.add(played.tag, played.name, {}, {"storage": storage, **references})
 
-    def file(self) -> bytes:
-        """The .mrml file."""
-        ElementTree.indent(self._root)
-        return ElementTree.tostring(self._root, encoding="UTF-8", xml_declaration=True)
+def _stored(played: Played, number: int, file: str, **references: Element) -> list[Element]:
+    """A node whose data is in `file`, relative to the scene's own, in LPS axes, after the node for its storage."""
+    storage = _node(played.storage, number, "storage", {"fileName": file, "coordinateSystem": "LPS"})
+    return [storage, _node(played.tag, number, played.name, {}, storage=storage, **references)]
 
 
 FORMAT = Format((".mrb",), ("times", "split", "points", *SURFACE_OPTIONS), write=write, holds="a sequence of meshes")
