@@ -23,7 +23,7 @@ from endoprior.data.found_tools import FrameRow, write_rows
 from endoprior.footage.border import Circle
 from endoprior.footage.units import guess_unit
 from endoprior.phantom import PhantomConfig, write_phantom
-from endoprior.view.mask_edits import MaskEdits
+from endoprior.view.mask_editor import MaskEdits
 
 FRAMES, WIDTH, HEIGHT = 12, 256, 192
 
