@@ -16,8 +16,7 @@ from endoprior.phantom.scene import Moment, build_scene
 from endoprior.phantom.sensor import develop, exposure_gain, vignette
 from endoprior.phantom.smoke import Smoke
 from endoprior.phantom.surface import build_anatomy, organs_at
-from endoprior.phantom.texture import bled
-from endoprior.phantom.tissue_looks import LOOKS
+from endoprior.phantom.texture import LOOKS, bled
 from endoprior.phantom.views import render_view
 
 SMALL = PhantomConfig(frames=48, width=96, height=80, seed=3)

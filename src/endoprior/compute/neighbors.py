@@ -24,7 +24,7 @@ def nearest(points: NDArray, k: int) -> tuple[NDArray[np.intp], NDArray[np.float
     indices, distances = np.empty((num, k), np.intp), np.empty((num, k))
     rows, asked = np.arange(num), min(k + 2, num)
     while len(rows):
-        far, found = tree.query(places[rows], asked, workers=get_num_threads())
+        far, found = map(np.asarray, tree.query(places[rows], asked, workers=get_num_threads()))
         if not (far[:, 1:] > far[:, :-1]).all() or asked == num:  # the tree returns equally near ones in any order
             far[found == rows[:, None]] = np.inf  # a point itself comes last
             order = np.lexsort((found, far))

@@ -31,10 +31,7 @@ _PAD_MM = 6.0
 
 @dataclass(frozen=True)
 class Eye:
-    """A camera with the intrinsics of the endoscope, in outer axes.
-
-    Those are the world for the endoscope's left camera; for others, the axes of the left camera of the same frame.
-    """
+    """A camera in outer axes: of the world for the endoscope's left one, for others of the left one in that frame."""
 
     center: NDArray[np.float64]
     """(3,) mm."""
@@ -69,15 +66,13 @@ class Excursion:
     pan: NDArray[np.float64]
     """(3,) translation along the tissue, mm."""
     pan_turn: NDArray[np.float64]
-    """(2,) rotation vector (about x and y) of the view while it pans, rad."""
     turn: NDArray[np.float64]
-    """(2,) rotation vector of the look to another side, rad."""
+    """(2,) rotation vectors (about x and y) of the view while it pans, and of the look to another side, rad."""
     roll: float
     """Rotation about the optical axis, rad."""
     retreat: float
-    """mm back along the optical axis."""
     approach: float
-    """mm forward along the optical axis."""
+    """mm back and forward along the optical axis."""
 
     def camera_to_world(self, local: float) -> NDArray[np.float64]:
         """(4, 4) pose at time `local` in [0, 1] of the excursion; the identity at both ends."""

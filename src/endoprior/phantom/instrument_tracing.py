@@ -211,9 +211,7 @@ def render_instruments(
     """Render instruments in front of the tissue.
 
     Args:
-        poses: of each instrument, in world axes.
-        instruments: as many, all with parts or all without.
-        seed: of print, stains and wear.
+        poses: in world axes. instruments: as many, all with parts or all without. seed: of print, stains and wear.
         tissue: (SH, SW, 3) linear radiance of the tissue, which metals mirror. tissue_z: (SH, SW) its depth, mm.
         camera: (3,) camera center in the left camera's axes, mm.
         focal, center: of the sample grid, px.

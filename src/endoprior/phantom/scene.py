@@ -15,8 +15,7 @@ from .motion import Motion, ToolPose, build_motion
 from .raster import vertex_normals
 from .smoke import Smoke
 from .surface import MARGIN, Plane, build_anatomy, build_plane, organs_at, soften
-from .texture import build_texture
-from .tissue_looks import LOOKS, TissueLook
+from .texture import LOOKS, TissueLook, build_texture
 
 _TEXELS = 1.8
 """Texels per pixel of the first image."""
@@ -33,11 +32,9 @@ class Scene:
     plane: Plane
     motion: Motion
     a: NDArray[np.float64]
-    """(MH, MW) plane coordinates of the mesh vertices, mm."""
     b: NDArray[np.float64]
-    """(MH, MW) second plane coordinate, mm."""
     height: NDArray[np.float32]
-    """(MH, MW) rest height of the vertices, mm."""
+    """(MH, MW) each: plane coordinates and rest height of the mesh vertices, mm."""
     texture: NDArray[np.float32]
     """(TH, TW, 7) material maps."""
     path: CameraPath
@@ -65,15 +62,12 @@ class Moment:
     """What moves, at one time, in the axes of the endoscope's left camera of that time."""
 
     endoscope: Eye
-    """The left camera in the world."""
     vertices: NDArray[np.float64]
-    """(MH, MW, 3) mesh, mm."""
     normals: NDArray[np.float32]
-    """(MH, MW, 3) its unit normals."""
+    """(MH, MW, 3) mesh, mm, and its unit normals."""
     tools: tuple[ToolPose, ToolPose]
     """In world axes."""
     phase: float = 0.0
-    """Time in [0, 1]."""
 
     @staticmethod
     def of(scene: Scene, phase: float) -> Moment:

@@ -125,8 +125,7 @@ def shade(
         normals: (MH, MW, 3) unit vertex normals.
         texture: (TH, TW, 7) material maps.
         axes: (2, 3) e_a and e_b of the tissue's plane in the axes of the left camera.
-        eye: the camera; the lights stay with the left one.
-        viewer: (3,) mm, where the light goes to: the center of `eye`, or of another camera.
+        eye: the camera; the lights stay with the left one. viewer: (3,) mm, where the light goes to.
         focal, center: of the sample grid, px.
     """
     out = np.empty_like(hits)

@@ -57,7 +57,6 @@ class Smoke:
 
         Args:
             radiance: (SH, SW, 3) without smoke. z: (SH, SW) depth of what is seen, mm.
-            phase: time in [0, 1].
             eye: the camera, in the axes of the endoscope's left one, with which the smoke moves.
             focal, center: of the sample grid, px.
         """
@@ -71,8 +70,10 @@ class Smoke:
         # The light guides shine less away from the optical axis.
         axis = (1 / (1 + np.hypot(x, y) ** 2) ** 2).astype(np.float32)
         columns, rows = np.meshgrid(*(np.arange(size, dtype=np.float32) / _COARSE for size in (width, height)))
-        replicate = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
-        dense, lit = (cv2.remap(coarse, columns, rows, **replicate) for coarse in (clouds, axis))
+        dense, lit = (
+            cv2.remap(coarse, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for coarse in (clouds, axis)
+        )
         lost = 1 - np.exp(np.float32(np.log(1 - self.strongest) / _DEPTH_MM) * dense * z)
         return radiance + lost[..., None] * (_COLOR * lit[..., None] - radiance)
 

@@ -74,25 +74,21 @@ class Anatomy:
     paths: NDArray[np.float32]
     """(K, M, 2) axes of the loops as polylines in (a, b), mm; loop 0 is the one the grasper takes."""
     radii: NDArray[np.float32]
-    """(K, M) radius along each loop, mm."""
     bases: NDArray[np.float32]
-    """(K, M) height of each loop's axis, mm; both ends dive under the neighbors."""
+    """(K, M) radius along each loop, and height of its axis, mm; both ends dive under the neighbors."""
     liver_edge: NDArray[np.float64]
     """(4,) level, slope, bend amplitude and phase of the liver's edge b(a)."""
 
 
 @dataclass(frozen=True)
 class Organs:
-    """Height and organ at each queried plane point."""
+    """Height above the plane, mm, and organ (a loop's index, FLOOR or LIVER) at each queried plane point."""
 
     height: NDArray[np.float32]
-    """mm above the plane."""
     owner: NDArray[np.int32]
-    """Loop index, FLOOR or LIVER."""
     along: NDArray[np.float32]
-    """Arc length along the loop, mm; 0 elsewhere."""
     across: NDArray[np.float32]
-    """Signed distance from the loop's axis, mm; 0 elsewhere."""
+    """Arc length along a loop, and signed distance from its axis, mm; 0 elsewhere."""
 
 
 def build_plane(cfg: PhantomConfig) -> Plane:

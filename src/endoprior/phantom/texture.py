@@ -1,11 +1,13 @@
-"""Material maps of the tissue: color, fine relief, wetness and ambient occlusion.
+"""Kinds of tissue, and their material maps: color, fine relief, wetness and ambient occlusion.
 
-Letters: (TH, TW) texels; texel (i, j) is at g_u = (j + 0.5) / TW, g_v = (i + 0.5) / TH.
+The shapes of all kinds are those of `bowel`, but a liver has no narrow folds. Colors of kinds are display values in
+[0, 1]. Letters: (TH, TW) texels; texel (i, j) is at g_u = (j + 0.5) / TW, g_v = (i + 0.5) / TH.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -13,7 +15,6 @@ from numpy.typing import NDArray
 
 from .noise import cells, fractal
 from .surface import FLOOR, LIVER, Anatomy, Organs, Plane, organs_at, soften
-from .tissue_looks import LOOKS, TissueLook
 from .vessels import vessel_maps
 
 CHANNELS = 7
@@ -27,6 +28,84 @@ _INK = np.array([0.125, 0.0045, 0.0035], np.float32)
 """Linear color of deep blood."""
 _POOLED = 0.72
 """Share of the blood that lies in pools; the rest is in streaks."""
+
+
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class TissueLook:
+    """How one kind of tissue looks; the defaults are `bowel`."""
+
+    loops: tuple[Color, Color, Color] = ((0.74, 0.40, 0.38), (0.86, 0.60, 0.53), (0.56, 0.25, 0.31))
+    """A loop's color, and the pale and the dusky one between which it varies."""
+    ground: tuple[Color, Color, Color] = ((0.74, 0.46, 0.45), (0.88, 0.70, 0.46), (0.40, 0.16, 0.14))
+    """Colors of the mesentery between the loops, of fat and of the liver."""
+    vessels: tuple[Color, Color] = ((0.56, 0.13, 0.14), (0.38, 0.10, 0.16))
+    """Colors of thin and thick vessels."""
+    opacity: tuple[float, float] = (0.62, 0.80)
+    """Opacity of thin and thick vessels, 0..1."""
+    cover: Literal["serosa", "fat", "liver"] = "serosa"
+    """What the loops are covered with: their texture and relief."""
+    creases: float = 1.0
+    """Factor of the depth of fine creases, and of the contrast of the liver's lobules."""
+    wet: float = 1.0
+    """Factor of the highlights of the wet film."""
+    blurred_mm: float = 0.7
+    """Radius within which shapes are smoothed, mm; at least 0.7."""
+    blood: float = 0.0
+    """Share of the tissue under blood, 0..1."""
+    smoke: float = 0.0
+    """Share of the light that the densest smoke takes away at 80 mm, 0..1."""
+    light: Color = (1.0, 1.0, 1.0)
+    """Color of the light, linear."""
+    exposure: float = 1.0
+    """Brightness of the image beside that of `bowel`."""
+
+
+_BOWEL = TissueLook()
+LOOKS = {
+    "bowel": _BOWEL,
+    "pale": TissueLook(
+        loops=((0.86, 0.70, 0.63), (0.93, 0.84, 0.77), (0.80, 0.58, 0.55)),
+        ground=((0.88, 0.74, 0.66), (0.93, 0.84, 0.66), (0.52, 0.30, 0.25)),
+        vessels=((0.74, 0.40, 0.38), (0.55, 0.32, 0.40)),
+        opacity=(0.40, 0.55),
+        creases=0.7,
+        wet=0.8,
+        exposure=1.15,
+    ),
+    "fat": TissueLook(
+        loops=((0.90, 0.73, 0.40), (0.94, 0.83, 0.56), (0.84, 0.59, 0.32)),
+        ground=((0.86, 0.63, 0.40), (0.92, 0.78, 0.44), _BOWEL.ground[2]),
+        vessels=((0.72, 0.30, 0.16), (0.52, 0.15, 0.13)),
+        opacity=(0.50, 0.70),
+        cover="fat",
+        wet=1.25,
+    ),
+    "purple": TissueLook(
+        loops=((0.42, 0.23, 0.29), (0.55, 0.33, 0.36), (0.27, 0.14, 0.22)),
+        ground=((0.46, 0.27, 0.31), (0.62, 0.46, 0.36), (0.32, 0.14, 0.14)),
+        vessels=((0.27, 0.09, 0.14), (0.16, 0.07, 0.14)),
+        opacity=(0.70, 0.88),
+        creases=0.75,
+        wet=1.2,
+        exposure=0.50,
+    ),
+    "liver": TissueLook(
+        loops=((0.42, 0.22, 0.16), *_BOWEL.loops[1:]),
+        ground=((0.42, 0.23, 0.17), _BOWEL.ground[1], (0.42, 0.22, 0.16)),
+        cover="liver",
+        creases=0.5,
+        wet=1.1,
+        blurred_mm=4.0,
+        exposure=0.55,
+    ),
+    "warm": replace(_BOWEL, light=(1.12, 0.80, 0.46)),
+    "smoke": replace(_BOWEL, smoke=0.66),
+    "blood": replace(_BOWEL, blood=0.38, exposure=0.92),
+}
+"""By the values of `PhantomConfig.tissue`."""
 
 
 def _linear(display: tuple[float, float, float]) -> NDArray:
@@ -154,18 +233,19 @@ def _albedo(
     """(TH, TW, 3) linear color in [0, 1]."""
     mottle = fractal(a / 6, b / 6, 4, seed + 20)
     fine = fractal(a / 1.1, b / 1.1, 3, seed + 21)
-    loop, pale, dusky = _linear(look.loop), _linear(look.loop_pale), _linear(look.loop_dusky)
+    loop, pale, dusky = map(_linear, look.loops)
+    mesentery, fat, liver_color = map(_linear, look.ground)
     # Each loop has its own complexion between dusky and pale.
     complexion = np.concatenate([rng.uniform(-0.45, 0.35, max(64, loops)), [0, 0]]).astype(np.float32)[organs.owner]
     tone = np.clip(complexion - 0.12 + 0.95 * mottle, -1, 1)[..., None]
     color = loop + np.maximum(tone, 0) * (pale - loop) + np.maximum(-tone, 0) * (dusky - loop)
     fat_amount = _step(0.02, 0.34, fractal(a / 10, b / 10, 3, seed + 22)) * 0.85
-    floor = _linear(look.floor) + fat_amount[..., None] * (_linear(look.fat) - _linear(look.floor))
+    floor = mesentery + fat_amount[..., None] * (fat - mesentery)
     floor = floor * (1 + 0.25 * mottle[..., None])
     lobule = _step(0.0, 0.32, cells(a / 1.25, b / 1.25, seed + 9))
     if look.creases < 1:
         lobule = 1 - look.creases * (1 - lobule)
-    liver = _linear(look.liver) * (0.72 + 0.38 * lobule + 0.35 * mottle)[..., None]
+    liver = liver_color * (0.72 + 0.38 * lobule + 0.35 * mottle)[..., None]
     color = np.where((organs.owner == FLOOR)[..., None], floor, color)
     serosa = 1 + (1 - 0.75 * plain) * (0.26 * fine + 0.38 * wrinkles)
     color = color * serosa[..., None] + (0.25 * plain)[..., None] * (pale - color)
@@ -173,7 +253,7 @@ def _albedo(
     if look.cover == "fat":
         seams = 1 - _lumps(a, b, seed)
         color = color + (0.55 * seams)[..., None] * (dusky - color)
-    for map_, ink, opacity in ((twigs, look.twig, look.vessels[0]), (trunks, look.trunk, look.vessels[1])):
+    for map_, ink, opacity in zip((twigs, trunks), look.vessels, look.opacity, strict=True):
         color = color + (opacity * shown * map_)[..., None] * (_linear(ink) - color)
     color = np.where((organs.owner == LIVER)[..., None], liver, color)
     return np.clip(color, 0.004, 1).astype(np.float32)

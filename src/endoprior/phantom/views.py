@@ -34,9 +34,8 @@ class RenderedView:
     """The image of one camera at one time, float32."""
 
     tissue: NDArray
-    """(H, W, 3) linear radiance without tools."""
     image: NDArray
-    """(H, W, 3) linear radiance with tools."""
+    """(H, W, 3) linear radiance without and with tools."""
     tool_share: NDArray
     """(H, W) share of each pixel that is covered by a tool, 0..1."""
     tool_depth: NDArray

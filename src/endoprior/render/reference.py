@@ -21,6 +21,7 @@ def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_
     """
     check(splats, background)
     seen = project(splats, camera)
+    assert seen.det is not None
     order = seen.z.argsort(stable=True)
     order = order[seen.radii[order] > 0]
     alpha = _alpha(seen.means2d[order], seen.cov2d[order], seen.det[order], splats.opacities[order], camera)

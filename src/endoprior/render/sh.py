@@ -40,8 +40,8 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     values = [torch.full_like(x, C0)]
     if degree >= 1:
         values += [-C1 * y, C1 * z, -C1 * x]
+    xx, yy, zz = x * x, y * y, z * z
     if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
         values += [C2_XY * x * y, -C2_XY * y * z, C2_ZZ * (2 * zz - xx - yy), -C2_XY * x * z, C2_XX * (xx - yy)]
     if degree >= 3:
         values += [
