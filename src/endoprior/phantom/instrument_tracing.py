@@ -34,7 +34,6 @@ class Instrument:
     parts: tuple[Part, ...]
     """Rows of `instrument_shapes`; the first `shaft_parts` are those that reach beyond `clear_mm`. None: `graspers`."""
     materials: tuple[Material, ...]
-    """Parts name them by their index."""
     length_mm: float
     """From the wrist to the tip."""
     clear_mm: float

@@ -89,7 +89,7 @@ def rasterize(
 
     Args:
         vertices: (MH, MW, 3) camera-space mesh, mm; what is behind the camera is left out.
-        focal, center: focal length and principal point, px of the sample grid.
+        focal, center: px of the sample grid.
     """
     z = vertices[..., 2]
     inverse_z = np.divide(1, z, out=np.zeros_like(z), where=z > _NEAR_MM)

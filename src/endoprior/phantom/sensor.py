@@ -42,12 +42,7 @@ def develop(radiance: NDArray[np.float32], gain: float, shading: NDArray[np.floa
 
 
 def expose(display: NDArray[np.float32], noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) 8-bit image with sensor noise, which gamma amplifies in dark regions.
-
-    Args:
-        display: (H, W, 3) noise-free values in [0, 255].
-        noise: standard deviation at mid gray, in 8-bit levels.
-    """
+    """(H, W, 3) 8-bit image of `display` (H, W, 3), 0..255, with sensor noise: 8-bit levels at mid gray."""
     if noise > 0:
         grain = rng.standard_normal(display.shape, dtype=np.float32)
         # Partly correlated between channels, as after demosaicing; gamma amplifies the noise of dark pixels.

@@ -110,7 +110,6 @@ def build_anatomy(seed: int, wider: tuple[float, float, float, float] | None = N
     """Choose the organs of one patient.
 
     Args:
-        seed: of the layout.
         wider: range (a0, a1, b0, b1), mm, to fill with further loops; those in the middle are the same without it.
     """
     rng = np.random.default_rng([seed, 2])

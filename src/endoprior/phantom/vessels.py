@@ -32,10 +32,8 @@ def vessel_maps(
 ) -> tuple[NDArray, NDArray]:
     """Grow trees from random points; each stays on its own organ and splits into thinner branches.
 
-    Args:
-        plane, a, b, organs: the material grid (TH, TW) to draw on, and what lies there.
     Returns:
-        two (TH, TW) float32 maps in [0, 1]: trunks (caliber above 0.3 mm) and twigs.
+        two float32 maps in [0, 1] on the material grid a, b (TH, TW): trunks (caliber above 0.3 mm) and twigs.
     """
     shape = a.shape
     mm_per_texel = float(np.abs(np.diff(a[shape[0] // 2])).mean())

@@ -114,12 +114,7 @@ def visible_points(points: NDArray, z: NDArray, tool: NDArray[np.bool_], cfg: Ph
 
 
 def shown_elsewhere(hits: NDArray[np.float32], seen: NDArray[np.bool_], tool: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(H, W) True behind the `tool` (H, W) where the tissue was seen at another time.
-
-    Args:
-        hits: (H, W, 3) from `rasterize`.
-        seen: (MH, MW) mesh vertices that some training frame shows.
-    """
+    """(H, W) True behind the `tool` (H, W) where the tissue at `hits` (H, W, 3) is `seen` (MH, MW), at another time."""
     rows, columns = seen.shape
     row = np.round(hits[..., 1] * (rows - 1)).astype(int)
     column = np.round(hits[..., 0] * (columns - 1)).astype(int)
@@ -127,11 +122,7 @@ def shown_elsewhere(hits: NDArray[np.float32], seen: NDArray[np.bool_], tool: ND
 
 
 def side_eyes(pivot_mm: float) -> dict[str, Eye]:
-    """The side cameras by name.
-
-    Args:
-        pivot_mm: distance of the axis of turning from the endoscope, on its optical axis.
-    """
+    """The side cameras by name; they turn about an axis `pivot_mm` from the endoscope, on its optical axis."""
     pivot = np.array([0.0, 0.0, pivot_mm])
     eyes = {}
     for name, degrees in TURNS_DEG.items():

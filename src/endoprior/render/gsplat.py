@@ -1,9 +1,8 @@
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 """The backend that calls gsplat (Apache-2.0, an extra), float32 on one CUDA device.
 
-gsplat's separate steps are used and not its `rasterization`: color and z are composited in one pass of four channels,
-ten where colors have slopes, the gradient of z can be stopped, and `means2d` is the tensor whose gradient is kept. Once
-per call the host waits for the device, to count the tiles.
+gsplat's separate steps are used and not its `rasterization`: color and z are composited in one pass, the gradient of z
+can be stopped, and `means2d` is the tensor whose gradient is kept. Once per call the host waits for the device.
 
 Where gsplat 1.5.3 differs from `reference`, read from its sources:
 
@@ -67,9 +66,8 @@ class Lens(NamedTuple):
     Ks: Tensor
     """(B, 1, 3, 3) intrinsics, px."""
     center: Tensor
-    """(B, 1, 3) position in the world, mm."""
     behind: Tensor
-    """(B, 1, 3) a point behind it: what lies there is culled."""
+    """(B, 1, 3) position in the world, mm, and a point behind it: what lies there is culled."""
     last_pixel: Tensor
     """(B, 1, 2) center of the last pixel, px."""
     widest: Tensor

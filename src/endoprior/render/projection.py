@@ -41,11 +41,7 @@ class Projected:
 
 
 def check(splats: Splats, background: Tensor) -> int:
-    """Check what every backend requires of its input, and return the SH degree.
-
-    Raises:
-        ValueError: shapes disagree, types differ, or K is not 1, 4, 9 or 16.
-    """
+    """Raise ValueError where shapes disagree, types differ, or K is not 1, 4, 9 or 16; return the SH degree."""
     sizes = check_shape(
         "means:N,3 quats:N,4 scales:N,3 opacities:N sh:N,K,3", **{n: getattr(splats, n) for n in FIELDS}
     )
@@ -58,11 +54,7 @@ def check(splats: Splats, background: Tensor) -> int:
 
 
 def check_device(splats: Splats, background: Tensor, device_type: str) -> None:
-    """Check what a backend of one type of device requires besides `check`.
-
-    Raises:
-        ValueError: something is not float32, or not on one device of that type.
-    """
+    """Raise ValueError where something is not float32, or not on one device of that type."""
     devices = {tensor.device for tensor in splats.tensors.values()} | {background.device}
     if splats.means.dtype != torch.float32 or len(devices) > 1 or splats.means.device.type != device_type:
         found = sorted(map(str, devices))

@@ -15,10 +15,7 @@ from .projection import check, project
 
 
 def rasterize(splats: Splats, camera: Camera, *, background: Tensor, depth_grad_to_means: bool = True) -> RenderOutput:
-    """Render the Gaussians near to far (Kerbl et al. 2023, Eq. 3); ties in z keep their order.
-
-    See `render.Rasterizer`.
-    """
+    """Render the Gaussians near to far (Kerbl et al. 2023, Eq. 3); ties keep their order. See `render.Rasterizer`."""
     check(splats, background)
     seen = project(splats, camera)
     assert seen.det is not None
