@@ -13,13 +13,13 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from endoprior.compute.exponential import power_of_two
 from endoprior.compute.simd import (
     LANES,
     fma,
     largest,
     load_some,
     magnitude,
+    power_of_two,
     splat,
     square_root,
     store,
