@@ -150,7 +150,7 @@ def only_background(backend, num):
     view = camera(33, 21)
     scene = pick(splats(view), torch.arange(num))
     scene = replace(scene, means=scene.means - 1e4 * torch.tensor(view.world_to_camera[2, :3]).float())
-    got, grads = render_with_grads(backend, scene, view)
+    got, grads = render_with_grads(backend, scene, view, dtype=torch.float32)
     assert (got.color == torch.tensor([0.1, 0.2, 0.3])).all() and not got.alpha.any() and not got.depth.any()
     assert got.means2d.shape == (num, 2) and not got.radii.any()
     assert all(not grads[name].any() for name in (*NAMES, "means2d")) and grads["background"].any()
