@@ -28,7 +28,7 @@ from endoprior.training import step as iteration_module
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA, TORCH, TrainingOps
 from endoprior.training.optimizer import Optimizer
-from endoprior.training.stage import Stage, StepReport
+from endoprior.training.trainer import Stage, StepReport
 
 PRESETS = ("default", "paper")
 FRAMES = 4

@@ -16,8 +16,8 @@ from endoprior.training.adam_numba import adam_step, adam_unstored_step
 from endoprior.training.density import DensityStats
 from endoprior.training.frames import TrainingFrames
 from endoprior.training.ops import NUMBA, TORCH
-from endoprior.training.stage import Stage
 from endoprior.training.step import Drawn
+from endoprior.training.trainer import Stage
 from endoprior_baselines.deform3dgs import METHOD
 from endoprior_baselines.deform3dgs_points import first_points
 from endoprior_baselines.learned_basis import COEFFICIENTS, value_at

@@ -271,7 +271,7 @@ def test_the_last_iteration_and_a_checkpoint_wait_for_the_check(tiny_sequence):
         trainer.start()
         as_on_a_device(trainer)
         poison(trainer, "means", float("nan"))
-        assert trainer.step().divergence is None
+        assert trainer.step().iteration == 1
         with pytest.raises(Diverged):
             ending(trainer)
         assert trainer.state.iteration == 0

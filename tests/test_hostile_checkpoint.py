@@ -7,7 +7,7 @@ from state_files import StateFile
 
 from endoprior.core.checks import InputError
 from endoprior.data import load_sequence
-from endoprior.runs.checkpoint import check_state, load_checkpoint
+from endoprior.runs.folder import check_state, load_checkpoint
 from endoprior.runs.train import train
 from endoprior.training.gaussian_trainer import GaussianTrainer
 

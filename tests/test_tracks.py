@@ -142,8 +142,7 @@ def test_a_step_agrees_with_arrays():
     cycle_px = np.linalg.norm(step + 2 * bilinear(back, end / 2), axis=-1)
     found = ((end >= 0) & (end <= (WIDTH, HEIGHT))).all(-1) & tissue_mask[y, x]
     assert 500 < found.sum() < 3500
-    got_end, got_cycle = np.empty_like(start), np.empty(len(start))
-    tracks.follow(start, there, back, tissue_mask, got_end, got_cycle)
+    got_end, got_cycle = tracks.follow(start, there, back, tissue_mask)
     np.testing.assert_allclose(got_end, end, rtol=1e-6, atol=1e-5)  # float32 flow
     np.testing.assert_allclose(got_cycle, np.where(found, cycle_px, np.inf), rtol=1e-5, atol=1e-5)
 

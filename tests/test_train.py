@@ -25,8 +25,8 @@ from endoprior.runs.train import train
 from endoprior.training.gaussian_trainer import GaussianTrainer
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import log_linear
-from endoprior.training.stage import Stage
 from endoprior.training.step import sh_degree
+from endoprior.training.trainer import Stage
 
 GOLDEN = Path(__file__).parent / "golden" / "train_losses.json"
 

@@ -17,8 +17,7 @@ from .devices import Wanted, on_device
 from .paths import open_gaussians, sequence_of
 
 if TYPE_CHECKING:
-    from ..training.stage import StepReport
-    from ..training.trainer import Trainer
+    from ..training.trainer import StepReport, Trainer
     from ..view.server import Viewer
     from ..view.viewable import Viewable
 

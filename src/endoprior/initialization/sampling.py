@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..core.checks import check_shape, input_error
 from ..core.config import InitConfig, PriorConfig
@@ -90,7 +90,7 @@ def remove_outliers(cloud: PointCloud, num_neighbors: int, num_std: float) -> Po
     """
     if len(cloud) <= num_neighbors:
         return cloud
-    distance, _ = cKDTree(cloud.points).query(cloud.points, k=num_neighbors)
+    distance, _ = KDTree(cloud.points).query(cloud.points, k=num_neighbors)
     average = distance.reshape(len(cloud), -1).mean(1)
     keep = average <= average.mean() + num_std * average.std(ddof=1)
     return cloud.subset(keep)
@@ -275,7 +275,7 @@ def initial_log_scales(points: NDArray[np.floating], variance_factor: float = 1.
     if len(points) < MIN_POINTS or not np.isfinite(points).all():
         raise ValueError(f"points must be at least {MIN_POINTS} finite points, got {len(points)}")
     # The nearest neighbor is the point itself or one that coincides with it: distance 0 either way.
-    distance, _ = cKDTree(points).query(points, k=MIN_POINTS)
+    distance, _ = KDTree(points).query(points, k=MIN_POINTS)
     spacing = np.maximum((distance[:, 1:] ** 2).mean(1), MIN_SQUARED_SPACING)
     return (0.5 * np.log(variance_factor * spacing)).astype(np.float32)
 

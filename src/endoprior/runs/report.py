@@ -26,24 +26,10 @@ from .folder import LOG
 from .log import LOG_EVERY, read_log
 
 SHOWN_SCORES = (
-    "psnr_tissue",
-    "psnr",
-    "ssim",
-    "depth_rmse_mm",
-    "flow_error_dis",
-    "color_share",
-    "depth_instability_mm",
-    "side_psnr",
-    "right_psnr",
-    "psnr_behind_tool",
-    "psnr_behind_tool_seen",
-    "depth_rmse_behind_tool_mm",
-    "track_error_mm",
-    "num_gaussians",
-    "fps",
-    "fps_cached",
-    "train_seconds",
-)
+    "psnr_tissue psnr ssim depth_rmse_mm flow_error_dis color_share depth_instability_mm side_psnr right_psnr "
+    "psnr_behind_tool psnr_behind_tool_seen depth_rmse_behind_tool_mm track_error_mm num_gaussians fps fps_cached "
+    "train_seconds"
+).split()
 TURNS_DEG = (-20, -12, 12, 20)
 """Cameras beside the endoscope's, degrees; above 0 to its right."""
 ERROR_FULL_SCALE = 0.15
@@ -68,7 +54,7 @@ def write_report(scene: Scene, sequence: FrameSequence, run: Path, path: Path, t
     FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, fontsize=12)
-    top, bottom = figure.subfigures(2, 1, height_ratios=[2.1 * len(rows), 3.4])
+    (top,), (bottom,) = figure.subfigures(2, 1, squeeze=False, height_ratios=[2.1 * len(rows), 3.4])
     for row, cells in zip(top.subplots(len(rows), len(rows[0])), rows, strict=True):
         for axis in row:
             axis.set_axis_off()

@@ -19,14 +19,9 @@ BETA1, BETA2 = 0.9, 0.999
 
 
 class AdamState:
-    """Moments of one parameter and its number of steps; a temporal basis counts the steps of each basis function."""
+    """Moments of one parameter and its number of steps; a temporal basis counts the steps of each of B functions."""
 
     def __init__(self, param: Tensor, num_counts: int = 1) -> None:
-        """Start with zero moments.
-
-        Args:
-            num_counts: B for a temporal basis, else 1.
-        """
         self.first = torch.zeros_like(param, requires_grad=False)
         self.second = torch.zeros_like(param, requires_grad=False)
         self.steps = torch.zeros(num_counts, device=param.device)
@@ -46,7 +41,6 @@ class PlaneAdam:
     """Moments of the planes; they take memory only where cells are touched."""
 
     def __init__(self, grid: PlaneGrid, epsilon: float) -> None:
-        """Start with zero moments at step 0."""
         self.grid, self.epsilon = grid, epsilon
         self.steps = torch.zeros((), device=grid.values.device)
         """() a whole number."""
@@ -54,24 +48,26 @@ class PlaneAdam:
 
     def arrays(self) -> dict[str, Tensor]:
         """Marks of all cells, moments of the touched ones (in order of cells) and the step count."""
-        touched = self.grid.marks.nonzero()[:, 0]
-        return {
-            "marks": self.grid.marks & TOUCHED,
-            "exp_avg": self.exp_avg[touched],
-            "exp_avg_sq": self.exp_avg_sq[touched],
-            "steps": self.steps.to(torch.int64).reshape(1),
-        }
+        touched, steps = self.grid.marks.nonzero()[:, 0], self.steps.to(torch.int64).reshape(1)
+        moments = {"exp_avg": self.exp_avg[touched], "exp_avg_sq": self.exp_avg_sq[touched]}
+        return {"marks": self.grid.marks & TOUCHED, **moments, "steps": steps}
 
     def load(self, arrays: dict[str, Tensor]) -> None:
         """Copy in what `arrays` gave; gradients that no step consumed are dropped."""
         self.grid.clear_grads()
         self.grid.marks.copy_(arrays["marks"])
         touched = self.grid.marks.nonzero()[:, 0]
-        self.exp_avg.zero_()
-        self.exp_avg_sq.zero_()
-        self.exp_avg[touched] = arrays["exp_avg"].to(touched.device)
-        self.exp_avg_sq[touched] = arrays["exp_avg_sq"].to(touched.device)
+        for name in ("exp_avg", "exp_avg_sq"):
+            moment = getattr(self, name)
+            moment.zero_()
+            moment[touched] = arrays[name].to(touched.device)
         self.steps.copy_(arrays["steps"][0])
+
+
+def gradient_of(param: Tensor) -> Tensor:
+    """The contiguous gradient of a tensor that has one."""
+    assert param.grad is not None
+    return param.grad.contiguous()
 
 
 @torch.no_grad()
@@ -83,16 +79,8 @@ def adam_step(
     Args:
         params: leaves with `.grad`, none of them empty. states: one per parameter.
     """
-    _fused(
-        [p.detach() for p in params],
-        [p.grad.contiguous() for p in params],
-        [s.first for s in states],
-        [s.second for s in states],
-        [s.steps[0] for s in states],
-        rate,
-        epsilon,
-        skip,
-    )
+    values, grads = [p.detach() for p in params], [gradient_of(p) for p in params]
+    _fused(values, grads, [(s.first, s.second, s.steps[0]) for s in states], rate, epsilon, skip)
 
 
 @torch.no_grad()
@@ -116,26 +104,27 @@ def adam_basis_step(
     if len(active) == 0:
         return
     band = slice(int(active[0]), int(active[-1]) + 1)
-    weights, rates = (torch.as_tensor(v).to(param.device, param.dtype, non_blocking=True) for v in (weights, rates))
-    grad = sum(w[band, None] * g.v_offsets[:, None] for w, g in zip(weights, gradients, strict=True))
-    live = 1.0 if skip is None else 1 - skip
-    if skip is not None:
-        grad = torch.where(skip == 0, grad, 0)
-    steps = state.steps[band].add_(live)
-    counts = steps.clamp(min=1)[:, None]
+    shares, channel_rates = (
+        torch.as_tensor(each).to(param.device, param.dtype, non_blocking=True) for each in (weights[:, band], rates)
+    )
+    grad = torch.einsum("kb,knc->nbc", shares, torch.stack([gradient.v_offsets for gradient in gradients]))
+    live = param.new_ones(()) if skip is None else 1 - skip
+    grad = torch.where(live > 0, grad, 0)
+    counts = state.steps[band].add_(live).clamp(min=1)[:, None]
     first, second = state.first[:, band], state.second[:, band]
     first.lerp_(grad, (1 - BETA1) * live)
     second.lerp_(grad.square(), (1 - BETA2) * live)
     root_scale = (1 - BETA2**counts).rsqrt()
-    param.detach()[:, band].sub_(live * rates / (1 - BETA1**counts) * first / (second.sqrt() * root_scale + epsilon))
+    step = live * channel_rates / (1 - BETA1**counts) * first / (second.sqrt() * root_scale + epsilon)
+    param.detach()[:, band].sub_(step)
 
 
 @torch.no_grad()
 def adam_planes_step(planes: PlaneAdam, rate: float, skip: Tensor | None = None) -> None:
     """One step of all planes of a HexPlane field; their gradients are then cleared."""
     grid = planes.grid
-    buffers = (grid.values, grid.grads, planes.exp_avg, planes.exp_avg_sq, planes.steps)
-    _fused(*([buffer] for buffer in buffers), rate, planes.epsilon, skip)
+    moments = [(planes.exp_avg, planes.exp_avg_sq, planes.steps)]
+    _fused([grid.values], [grid.grads], moments, rate, planes.epsilon, skip)
     grid.grads.zero_()
     grid.marks.fill_(TOUCHED)
 
@@ -143,14 +132,13 @@ def adam_planes_step(planes: PlaneAdam, rate: float, skip: Tensor | None = None)
 def _fused(
     params: list[Tensor],
     grads: list[Tensor],
-    firsts: list[Tensor],
-    seconds: list[Tensor],
-    steps: list[Tensor],
+    states: list[tuple[Tensor, Tensor, Tensor]],
     rate: float,
     epsilon: float,
     skip: Tensor | None,
 ) -> None:
     """PyTorch's fused kernel: one pass over memory, many small tensors per launch."""
+    firsts, seconds, steps = (list(each) for each in zip(*states, strict=True))
     adam(
         params, grads, firsts, seconds, [], steps,
         fused=True, found_inf=skip, amsgrad=False, beta1=BETA1, beta2=BETA2, lr=rate, weight_decay=0.0, eps=epsilon,

@@ -6,11 +6,16 @@ pass is several times faster. Elements are independent: results do not depend on
 Cells of planes that no gradient ever reached are skipped, exactly: their moments are zero, and dense Adam leaves them
 unchanged, 0 / (0 + eps) = 0. That gives the numbers of dense Adam with a fraction of the memory traffic. A touched cell
 without a new gradient still moves by its momentum and is stepped too; its gradient need not be read or cleared.
+
+`_skip` has no use here: on a CPU the divergence check comes first.
 """
+
+# pyright: reportCallIssue=false
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numba import njit, prange
@@ -21,21 +26,18 @@ from ..compute.fastmath import REORDERED
 from ..compute.simd import LANES, prefetch
 from ..model.hexplane import FRESH, TOUCHED, PlaneGrid
 from ..model.motion import RankOneGradient, UnstoredGradient
-from .adam import BETA1, BETA2, AdamState, PlaneAdam
+from .adam import BETA1, BETA2, AdamState, PlaneAdam, gradient_of
 
 CHUNK = 128  # rows per task
 _AHEAD = 4  # rows between asking for the basis functions of one and updating them
 
 
-def adam_step(
-    states: list[AdamState], params: list[Tensor], rate: float, epsilon: float, skip: Tensor | None = None
-) -> None:
-    """See `adam.adam_step`; `skip` has no use here: the divergence check comes first on a CPU."""
+def adam_step(states: list[AdamState], params: list[Tensor], rate: float, epsilon: float, _skip: None = None) -> None:
+    """See `adam.adam_step`."""
     for state, param in zip(states, params, strict=True):
-        state.steps += 1
-        rates, root_scale = _corrected(np.array([rate]), _counts(state))
-        tensors = (param, param.grad.contiguous(), state.first, state.second)
-        _adam_flat(*(t.detach().reshape(-1).numpy() for t in tensors), rates[0], root_scale[0], *_constants(epsilon))
+        rates, root_scales = _corrected(np.array([rate]), _counted(state))
+        tensors = (param, gradient_of(param), state.first, state.second)
+        _adam_flat(*(t.detach().reshape(-1).numpy() for t in tensors), rates[0], root_scales[0], *_constants(epsilon))
 
 
 def adam_basis_step(
@@ -44,35 +46,35 @@ def adam_basis_step(
     gradients: list[RankOneGradient],
     rates: NDArray,
     epsilon: float,
-    skip: Tensor | None = None,
+    _skip: None = None,
 ) -> None:
-    """See `adam.adam_basis_step`; `skip` has no use here."""
+    """See `adam.adam_basis_step`."""
     weights = np.stack([gradient.weights for gradient in gradients]).astype(np.float32)
     active = np.flatnonzero(weights.any(0))
     if len(active) == 0:
         return
     begin, end = int(active[0]), int(active[-1]) + 1
-    state.steps[begin:end] += 1
-    scaled, root_scale = _corrected(rates[None, :], _counts(state)[begin:end, None])
+    scaled, root_scales = _corrected(rates[None, :], _counted(state, slice(begin, end))[:, None])
     v_offsets = np.stack([gradient.v_offsets.numpy() for gradient in gradients])
     views = (param.detach().numpy(), weights, v_offsets, state.first.numpy(), state.second.numpy())
-    _adam_outer(*views, begin, scaled, root_scale[:, 0], *_constants(epsilon))
+    _adam_outer(*views, begin, scaled, root_scales[:, 0], *_constants(epsilon))
 
 
 def adam_unstored_step(
-    states: list[AdamState], params: list[Tensor], gradients: list[UnstoredGradient], rate: float, epsilon: float
+    states: list[AdamState], params: list[Tensor], gradients: Sequence[UnstoredGradient], rate: float, epsilon: float
 ) -> None:
     """Like `adam_step`, with a gradient that is computed where it is used."""
-    for state in states:
-        state.steps += 1
-    rates, root_scale = _corrected(np.array([rate]), _counts(states[0]))
+    counts = [_counted(state) for state in states]
+    rates, root_scales = _corrected(np.array([rate]), counts[0])
     held = zip(*((param, state.first, state.second) for param, state in zip(params, states, strict=True)), strict=True)
     arrays = [[tensor.detach().numpy() for tensor in tensors] for tensors in held]
-    gradients[0].adam_step(gradients, *arrays, rates[0], root_scale[0], _constants(epsilon))
+    gradients[0].adam_step(gradients, *arrays, rates[0], root_scales[0], _constants(epsilon))
 
 
-def _counts(state: AdamState) -> NDArray[np.int64]:
-    return state.steps.numpy().astype(np.int64)
+def _counted(state: AdamState, functions: slice = slice(None)) -> NDArray[np.int64]:
+    """Numbers of steps, this one included."""
+    state.steps[functions] += 1
+    return state.steps[functions].numpy().astype(np.int64)
 
 
 def _corrected(rates: NDArray, steps: NDArray) -> tuple[NDArray, NDArray]:
@@ -141,8 +143,8 @@ _ZERO = np.float32(0)
 _TINY = np.float32(np.finfo(np.float32).tiny)
 
 
-def adam_planes_step(planes: PlaneAdam, rate: float, skip: Tensor | None = None) -> None:
-    """See `adam.adam_planes_step`; `skip` has no use here: the divergence check comes first on a CPU."""
+def adam_planes_step(planes: PlaneAdam, rate: float, _skip: None = None) -> None:
+    """See `adam.adam_planes_step`."""
     grid = planes.grid
     planes.steps += 1
     buffers = (grid.values, grid.grads, planes.exp_avg, planes.exp_avg_sq, grid.marks)
@@ -166,15 +168,9 @@ def step_cells(
         marks: (cells,) uint8 of `TOUCHED` and `FRESH` bits; FRESH is cleared.
         step: number of this step, from 1. rate: learning rate.
     """
-    _step_cells(
-        *(t.numpy() for t in (values, grads, exp_avg, exp_avg_sq, marks)),
-        np.float32(1 - BETA1),
-        np.float32(BETA2),
-        np.float32(1 - BETA2),
-        np.float32(rate / (1 - BETA1**step)),
-        np.float32(1 / math.sqrt(1 - BETA2**step)),
-        np.float32(epsilon),
-    )
+    arrays = (t.numpy() for t in (values, grads, exp_avg, exp_avg_sq, marks))
+    scaled, correction = rate / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)
+    _step_cells(*arrays, *map(np.float32, (1 - BETA1, BETA2, 1 - BETA2, scaled, correction, epsilon)))
 
 
 @njit(inline="always")
@@ -203,10 +199,9 @@ def _step_cells(values, grads, exp_avg, exp_avg_sq, marks, blend1, beta2, blend2
                         grads[i, c] = _ZERO
                     marks[i] = TOUCHED
                 elif marks[i]:
+                    g = _ZERO
                     for c in range(channels):
-                        _update(
-                            i, c, _ZERO, values, exp_avg, exp_avg_sq, blend1, beta2, blend2, rate, correction, epsilon
-                        )
+                        _update(i, c, g, values, exp_avg, exp_avg_sq, blend1, beta2, blend2, rate, correction, epsilon)
 
 
 def count_unusable(gradient: Tensor, limit: float) -> int:

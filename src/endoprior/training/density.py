@@ -22,6 +22,7 @@ from ..core.config import DensityConfig
 from ..core.geometry import quaternion_to_matrix
 from ..core.types import RenderOutput
 from ..model.gaussians import SH_C0, Gaussians
+from .adam import gradient_of
 from .divergence import ADVICE, Diverged
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ def add_gradient(stats: DensityStats, out: RenderOutput, width: int, height: int
         width, height: of the image, px.
     """
     counted = _counted(out.radii > 0, skip)
-    x, y = out.means2d.grad.unbind(-1)
+    x, y = gradient_of(out.means2d).unbind(-1)
     stats.grad2d_ndc_sum += torch.where(counted, torch.hypot(x * (width / 2), y * (height / 2)), 0)
     stats.num_seen += counted
 

@@ -1,7 +1,8 @@
 """Per-Gaussian statistics of one rendered image in Numba, in one pass over the Gaussians. CPU, float32.
 
 Kernels take C-contiguous arrays and trust them: `means2d` (N, 2) float32 px, `radii` (N,) int32 px and 0 where a
-Gaussian is not rendered, `tissue_mask` (H, W) bool, sums (N,) float32.
+Gaussian is not rendered, `tissue_mask` (H, W) bool, sums (N,) float32. `_skip` has no use here: on a CPU the divergence
+check comes first.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from ..core.types import RenderOutput
+from .adam import gradient_of
 from .density import DensityStats
 
 _CHUNK = 1024  # Gaussians per task
@@ -19,10 +21,9 @@ _HALF = np.float32(0.5)
 _ONE = np.float32(1)
 
 
-def add_gradient(stats: DensityStats, out: RenderOutput, width: int, height: int, skip: Tensor | None = None) -> None:
-    """See `density.add_gradient`; `skip` has no use here: the divergence check comes first on a CPU."""
-    gradient = out.means2d.grad.contiguous().numpy()
-    half = np.float32(width / 2), np.float32(height / 2)
+def add_gradient(stats: DensityStats, out: RenderOutput, width: int, height: int, _skip: None = None) -> None:
+    """See `density.add_gradient`."""
+    gradient, half = gradient_of(out.means2d).numpy(), (np.float32(width / 2), np.float32(height / 2))
     _add_gradient(out.radii.numpy(), gradient, *half, stats.grad2d_ndc_sum.numpy(), stats.num_seen.numpy())
 
 
@@ -33,14 +34,12 @@ def add_score(
     tissue_mask: Tensor,
     opacities: Tensor,
     scale: float = 1.0,
-    skip: Tensor | None = None,
+    _skip: None = None,
 ) -> None:
-    """See `density.add_score`; `skip` has no use here."""
-    _add_score(
-        out.means2d.detach().contiguous().numpy(), out.radii.contiguous().numpy(), np.float32(scale), prior.numpy(),
-        tissue_mask.numpy(), opacities.detach().numpy(), stats.score_sum.numpy(), stats.opacity_sum.numpy(),
-        stats.num_valid.numpy(),
-    )  # fmt: skip
+    """See `density.add_score`."""
+    means2d, radii = out.means2d.detach().contiguous().numpy(), out.radii.contiguous().numpy()
+    images, sums = (prior, tissue_mask, opacities.detach()), (stats.score_sum, stats.opacity_sum, stats.num_valid)
+    _add_score(means2d, radii, np.float32(scale), *(tensor.numpy() for tensor in (*images, *sums)))
 
 
 def valid_projection(means2d: Tensor, radii: Tensor, tissue_mask: Tensor) -> Tensor:

@@ -62,15 +62,14 @@ class TrainingFrames:
     """Training frames of a sequence by position, built when first used, cached in memory and on the device."""
 
     def __init__(self, sequence: FrameSequence, prior_cfg: PriorConfig, device: torch.device | str = "cpu") -> None:
-        """Args: sequence: source of the frames. prior_cfg: of the prior. device: where tensors are returned."""
         self.sequence, self.device = sequence, torch.device(device)
         self.indices = sequence.indices("train")
         self._prior_cfg = prior_cfg
-        self._frames: BoundedCache[TrainingFrame] = BoundedCache(cache_bytes(), _frame_bytes)
-        self._priors: BoundedCache[Tensor] = BoundedCache(cache_bytes() // 4, lambda prior: prior.nbytes)
-        device_limit = device_bytes(self.device)
-        self._device_frames: BoundedCache[TrainingFrame] = BoundedCache(device_limit, _frame_bytes)
-        self._device_priors: BoundedCache[Tensor] = BoundedCache(device_limit // 4, lambda prior: prior.nbytes)
+        limits = cache_bytes(), device_bytes(self.device)
+        self._frames, self._device_frames = (BoundedCache[TrainingFrame](limit, _frame_bytes) for limit in limits)
+        self._priors, self._device_priors = (
+            BoundedCache[Tensor](limit // 4, lambda prior: prior.nbytes) for limit in limits
+        )
 
     def __len__(self) -> int:
         return len(self.indices)

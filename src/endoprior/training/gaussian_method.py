@@ -27,9 +27,8 @@ from .gaussian_trainer import GaussianTrainer
 from .losses import supervised_terms
 from .ops import TrainingOps
 from .optimizer import Rate, rate_of
-from .stage import Stage
 from .step import Drawn
-from .trainer import Trainer
+from .trainer import Stage, Trainer
 
 EPOCHS = 2**31
 """Keeps the random numbers of epochs apart from those of iterations."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -30,13 +30,12 @@ from ..system.arrays_file import ArraySpec, part
 from .density import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
+from .losses import StartTracks
 from .missed_tools import VISITS, MaskDoubt
 from .ops import TrainingOps, ops_for
 from .optimizer import Optimizer
-from .stage import Stage, StepReport, stage_length
 from .step import TrainingStep
-from .track_loss import StartTracks
-from .trainer import DEFAULT_FRAMES_PER_SECOND, Trainer, device_for
+from .trainer import DEFAULT_FRAMES_PER_SECOND, Stage, StepReport, Trainer, device_for, stage_length
 
 if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
@@ -118,7 +117,7 @@ class GaussianTrainer(Trainer):
             fix = f"`{command('prepare', 'VIDEO', sequence.path)} --keep-right`, or leave --eyes out."
             raise input_error(sequence.path, "right/ and baseline_mm for --eyes both", "no right eye", fix)
         self.sequence, self.cfg = sequence, cfg.fitted(len(sequence))
-        self.method: GaussianMethod = method_of(cfg)
+        self.method = cast("GaussianMethod", method_of(cfg))
         self.motion = self.method.motion(self.cfg)
         self.device = device_for(cfg.render.backend)
         self.ops = ops or ops_for(self.device)
@@ -153,7 +152,8 @@ class GaussianTrainer(Trainer):
             coefficients = torch.from_numpy(motion.coefficients)
             gaussians["motion"].detach()[..., motion_layout(cfg.deformation)["means"]] = coefficients
             if cfg.loss.track_weight:
-                tracks = StartTracks.of_first(coefficients, torch.from_numpy(motion.followed).float()).to(self.device)
+                followed = torch.from_numpy(motion.followed).float()
+                tracks = StartTracks(coefficients, followed, torch.arange(len(coefficients))).to(self.device)
         field = self.motion.field(gaussians["means"].detach(), cfg)
         stage = Stage.COARSE if cfg.schedule.coarse_iterations else Stage.FINE
         shares = torch.zeros(len(self.sequence.indices("train")), VISITS) if self.step_once.doubt else None
@@ -189,27 +189,21 @@ class GaussianTrainer(Trainer):
         return state_schema(self.motion, self.cfg, doubts=self.step_once.doubt is not None)
 
     def step(self) -> StepReport:
-        """See `Trainer.step`, and `TrainingStep` for what happens in it.
-
-        Raises:
-            Diverged: the loss or a gradient is not finite, the images show nothing, or no Gaussian is left.
-        """
+        """See `Trainer.step`, and `TrainingStep` for what happens in it."""
         state = self.state
         if state.stage is Stage.COARSE and state.iteration >= stage_length(self.cfg, Stage.COARSE):
             self._enter(Stage.FINE, state.gaussians, state.field, state.tracks, state.left_out)
             if self.method.keeps_optimizer:
                 self.state.optimizer = state.optimizer
-        report = self.step_once(self.state)
-        if report.divergence is not None:
-            raise Diverged(report.divergence.reason)
-        return report
+        return self.step_once(self.state)
 
     def synchronize(self) -> None:
         """See `Trainer.synchronize`."""
-        divergence = self.step_once.check.results(applied=self.state.iteration)
-        if divergence is not None:
-            self.state.iteration = divergence.last_good
-            raise Diverged(divergence.reason)
+        try:
+            self.step_once.check.read(applied=self.state.iteration)
+        except Diverged as error:
+            self.state.iteration = error.last_good
+            raise
 
     def scene(self) -> SingleScene:
         """See `Trainer.scene`."""

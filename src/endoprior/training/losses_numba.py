@@ -5,6 +5,7 @@ image, which costs as much as rendering it; here each row of pixels is read once
 in order, so they are bit-identical whatever the number of threads.
 """
 
+# pyright: reportCallIssue=false
 from __future__ import annotations
 
 from typing import Any

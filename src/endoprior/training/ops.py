@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from ..model import ops as model_ops
 from . import adam, adam_numba, density, density_numba, losses, losses_numba, temporal, temporal_numba
@@ -19,16 +20,16 @@ class TrainingOps:
     """One implementation of each operation; those in PyTorch document them."""
 
     model: model_ops.ModelOps
-    supervised_losses: Callable
-    local_consistency: Callable
-    add_gradient: Callable
-    add_score: Callable
-    valid_projection: Callable
-    count_unusable: Callable
-    count_unusable_in_planes: Callable
-    adam_step: Callable
-    adam_basis_step: Callable
-    adam_planes_step: Callable
+    supervised_losses: Callable[..., Tensor]
+    local_consistency: Callable[..., tuple[Tensor, Tensor]]
+    add_gradient: Callable[..., None]
+    add_score: Callable[..., None]
+    valid_projection: Callable[..., Tensor]
+    count_unusable: Callable[..., int | Tensor]
+    count_unusable_in_planes: Callable[..., int | Tensor]
+    adam_step: Callable[..., None]
+    adam_basis_step: Callable[..., None]
+    adam_planes_step: Callable[..., None]
 
 
 NUMBA = TrainingOps(

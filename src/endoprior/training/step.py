@@ -21,12 +21,11 @@ from ..render import Rasterizer
 from . import density
 from .divergence import ADVICE, Diverged, DivergenceCheck
 from .frames import TrainingFrame, TrainingFrames
-from .losses import color_l1
+from .losses import color_l1, track_term
 from .missed_tools import START, MaskDoubt, missed_tool_frames, record_visit
 from .ops import TrainingOps
-from .stage import Stage, StepReport, stage_length
 from .temporal import temporal_terms
-from .track_loss import track_term
+from .trainer import Stage, StepReport, stage_length
 
 if TYPE_CHECKING:
     from .gaussian_method import GaussianMethod
@@ -100,11 +99,10 @@ class TrainingStep:
     def __call__(self, state: GaussiansState) -> StepReport:
         """One iteration.
 
-        Where the report has a `divergence`, the state is the one after the last good iteration.
-
         Raises:
-            Diverged: no Gaussian is left, or a split would give one of infinite size. The state is then the one before
-                density control.
+            Diverged: the loss or a gradient is not finite, or the images show nothing: the state is then the one after
+                the last good iteration. Or no Gaussian is left, or a split would give one of infinite size: the state
+                is then the one before density control.
         """
         began, cfg, method = clock.perf_counter(), self.cfg, self.method
         iteration = state.iteration + 1
@@ -119,26 +117,27 @@ class TrainingStep:
         sum(terms.values()).backward()
         unusable, empty_error = state.optimizer.count_unusable(), method.empty_error(drawn.frame.brightness)
         wait = densify or reset or last
-        divergence = self.check.after_backward(iteration, terms, unusable, color_error, empty_error, wait=wait)
-        event: dict[str, int] | None = None
-        if divergence is not None:
+        try:
+            self.check.after_backward(iteration, terms, unusable, color_error, empty_error, wait=wait)
+        except Diverged as error:
             state.optimizer.drop_gradients()
-            state.iteration = divergence.last_good
-        else:
-            with torch.no_grad():
-                self._observe(state, drawn)
-                self._update(state, drawn)
-                state.iteration = iteration  # what follows may raise, and must leave a state that can be resumed
-                if densify:
-                    event = self._densify(state, iteration, rng)
-                if reset:
-                    density.reset_opacities(state.optimizer, RESET_OPACITY)
+            state.iteration = error.last_good
+            raise
+        event: dict[str, int] | None = None
+        with torch.no_grad():
+            self._observe(state, drawn)
+            self._update(state, drawn)
+            state.iteration = iteration  # what follows may raise, and must leave a state that can be resumed
+            if densify:
+                event = self._densify(state, iteration, rng)
+            if reset:
+                density.reset_opacities(state.optimizer, RESET_OPACITY)
         losses = {name: value.detach() for name, value in terms.items()}
         seconds = clock.perf_counter() - began
         missed = None
         if fine and last and state.left_out is not None:
             missed = missed_tool_frames(state.left_out, self.frames.indices)
-        return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, event, divergence, missed)
+        return StepReport(state.stage, iteration, losses, len(state.gaussians), seconds, event, missed)
 
     def draw(self, state: GaussiansState, rng: np.random.Generator) -> Drawn:
         """Batch, deform, render; nothing is changed. `rng` belongs to the iteration."""

@@ -14,8 +14,7 @@ from .server import Viewer
 from .viewable_scene import ViewableScene
 
 if TYPE_CHECKING:
-    from ..training.stage import StepReport
-    from ..training.trainer import Trainer
+    from ..training.trainer import StepReport, Trainer
 
 REFRESH_SECONDS = 2.0
 """Least time between two displayed states."""
