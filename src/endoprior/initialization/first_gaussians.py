@@ -23,16 +23,12 @@ from .flow_tracks import InitialMotion, initial_motion
 from .sampling import PointCloud, concatenated, has_surface, initial_log_scales, initial_points
 from .unseen import unseen_points
 
-WINDOW_SHARE = 1 / 60
-"""Width of the window in which a plane is fitted, as a share of the image's."""
-SAME_SURFACE = 0.03
-"""Pixels whose depth differs by more than this share belong to other tissue."""
+WINDOW_SHARE = 1 / 60  # width of the window in which a plane is fitted, as a share of the image's
+SAME_SURFACE = 0.03  # pixels whose depth differs by more than this share belong to other tissue
 PLAIN = 1e-4
 """Pull towards a plane at right angles to the ray, where a window holds too few pixels: share of the fit's weight."""
-UNSEEN_OPACITY = 0.9
-"""Initial opacity of what no frame shows: no color asks for it."""
-BYTES_PER_POINT = 100
-"""Memory for each pixel of each window, bytes."""
+UNSEEN_OPACITY = 0.9  # initial opacity of what no frame shows: no color asks for it
+BYTES_PER_POINT = 100  # memory for each pixel of each window, bytes
 
 
 def surface_normals(cloud: PointCloud, frames: Sequence[Frame]) -> NDArray[np.float32]:
@@ -100,16 +96,11 @@ def _normals_of_frame(points: NDArray, frame: Frame) -> NDArray:
 class FirstGaussians:
     """The start of N Gaussians."""
 
-    cloud: PointCloud
-    """Centers, colors and source frames."""
-    log_scales: NDArray[np.float32]
-    """(N, 3) log of mm."""
-    quats: NDArray[np.float32]
-    """(N, 4) wxyz."""
-    opacities: NDArray[np.float32]
-    """(N,) in (0, 1)."""
-    motion: InitialMotion | None
-    """None: at rest."""
+    cloud: PointCloud  # centers, colors and source frames
+    log_scales: NDArray[np.float32]  # (N, 3) log of mm
+    quats: NDArray[np.float32]  # (N, 4) wxyz
+    opacities: NDArray[np.float32]  # (N,) in (0, 1)
+    motion: InitialMotion | None  # None: at rest
 
 
 def resting_spheres(cloud: PointCloud, opacity: float, variance_factor: float = 1.0) -> FirstGaussians:

@@ -35,18 +35,13 @@ from ..system.memory import workers
 from .neighbor_motion import fill_gaps, smooth_motion
 from .sampling import PointCloud, has_surface
 
-SPACING = 12
-"""Largest number of frames between two anchors. With 6 the tracks of the phantoms are no better."""
-LEAST_ANCHORS = 4
-"""Also of a short sequence: a point that is hidden in one anchor is followed by way of another."""
-REACH = 48
-"""Frames to both sides of an anchor to which flow is computed."""
+SPACING = 12  # largest number of frames between two anchors. With 6 the tracks of the phantoms are no better.
+LEAST_ANCHORS = 4  # also of a short sequence: a point that is hidden in one anchor is followed by way of another
+REACH = 48  # frames to both sides of an anchor to which flow is computed
 CYCLE_PX = 0.25
 """A point is lost where forward and backward flow of its two steps disagree by more than this, px of the flow."""
-ANCHOR_BYTES = 8 * (2 * REACH + 1)
-"""Memory per pixel of the flows of one anchor, bytes."""
-RIDGE = 1e-5
-"""Ridge term of the least-squares fit of coefficients to tracks; each frame has weight 1."""
+ANCHOR_BYTES = 8 * (2 * REACH + 1)  # memory per pixel of the flows of one anchor, bytes
+RIDGE = 1e-5  # ridge term of the least-squares fit of coefficients to tracks; each frame has weight 1
 Flow = NDArray[np.float16]
 """(h, w, 2) px of the gray images. Half precision: 0.01 px at 30 px, and all flows of an anchor fit in memory."""
 
@@ -57,8 +52,7 @@ log = logging.getLogger(__name__)
 class InitialMotion:
     """How N points move, and in which of T training frames the flow says so."""
 
-    coefficients: NDArray[np.float32]
-    """(N, B, 3) temporal coefficients of the centers, mm."""
+    coefficients: NDArray[np.float32]  # (N, B, 3) temporal coefficients of the centers, mm
     followed: NDArray[np.bool_]
     """(N, T) True where the flow found the point and returned to it; elsewhere its neighbors carried it."""
 

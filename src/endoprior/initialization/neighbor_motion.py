@@ -12,10 +12,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-LEAST_SHARE = 0.34
-"""Neighbors carry a point as long as those that are known have this share of the weight."""
-CARRIERS = 12
-"""Known points that carry a lost one."""
+LEAST_SHARE = 0.34  # neighbors carry a point as long as those that are known have this share of the weight
+CARRIERS = 12  # known points that carry a lost one
 COMPANIONS, COMPANION_STEP = 128, 4
 """A point moves as the mean of its 128 nearest points; every fourth of them is asked, the nearest first."""
 

@@ -26,10 +26,8 @@ from ..model.motion import basis_weights
 from .neighbor_motion import CARRIERS, weights_by_distance
 from .sampling import PointCloud, concatenated, eroded_mask, has_surface
 
-CELLS = 80
-"""Columns of cells: one for 8 px of an image 640 px wide."""
-RIM_PX = 9
-"""Width of the rim along tools, in px of an image 640 px wide, whose color and depth are not continued."""
+CELLS = 80  # columns of cells: one for 8 px of an image 640 px wide
+RIM_PX = 9  # width of the rim along tools, in px of an image 640 px wide, whose color and depth are not continued
 
 
 def unseen_points(

@@ -33,22 +33,16 @@ from ..system.installation import source_commit
 from ..system.signals import handled_by
 from ..training.trainer import Observer, Stage, StepReport, Trainer, device_for, stage_length
 
-LOCK = ".lock"
-"""File that a process holds while it trains in a folder."""
+LOCK = ".lock"  # file that a process holds while it trains in a folder
 CONFIG, LOG, CHECKPOINT, SCENE = "config.json", "log.jsonl", "checkpoint.safetensors", "scene.safetensors"
 CHECKPOINT_SECONDS = 60.0
 """Longest time of work that a crash can cost, besides the iteration in progress, unless told otherwise."""
-CHECKPOINT_SHARE = 0.05
-"""Share of the time that writing checkpoints may take: large states are written less often."""
+CHECKPOINT_SHARE = 0.05  # share of the time that writing checkpoints may take: large states are written less often
 FORMAT = "endoprior-checkpoint-1"
 
 
 def reject_unusable_folder(out: Path, *, resume: bool) -> None:
-    """Reject a folder that cannot take a run; nothing is created yet.
-
-    Raises:
-        InputError: it is a file, or it holds something and `resume` is False, or its name is not usable.
-    """
+    """Raise InputError where `out` is a file, or holds something without `resume`; nothing is created yet."""
     exists = kind_of(out) == "a folder"
     if not (resume and exists):
         is_run = exists and (out / CONFIG).is_file()
@@ -57,11 +51,7 @@ def reject_unusable_folder(out: Path, *, resume: bool) -> None:
 
 
 def prepare_run_folder(out: Path, *, resume: bool) -> None:
-    """Make sure that `out` exists and can take a run.
-
-    Raises:
-        InputError: as `reject_unusable_folder`, or it cannot be made.
-    """
+    """Make sure that `out` exists and can take a run; raise InputError if it cannot."""
     reject_unusable_folder(out, resume=resume)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -94,12 +84,10 @@ def held_folder(out: Path, *, resume: bool, begin: Callable[[], None]) -> Iterat
 def record_run(
     out: Path, sequence: FrameSequence, cfg: Config, fingerprint: str, *, resume: bool, **facts: Any
 ) -> None:
-    """Write `config.json`, all that is needed to repeat the run, and `facts`.
+    """Write `config.json`: all that is needed to repeat the run, and `facts`.
 
-    Args:
-        resume: the folder must hold a run with this config on these data.
     Raises:
-        InputError: it does not; or the data changed since the fingerprint was taken.
+        InputError: the run to `resume` has another config or other data; or the data changed while they were read.
     """
     about, backend = out / CONFIG, cfg.render.backend
     sequence.demand_unchanged()  # what was read before is of the same state
@@ -125,11 +113,7 @@ def record_run(
 def reject_other_run(
     file: Path, stored_config: Any, stored_fingerprint: Any, cfg: Config, fingerprint: str, data: Path
 ) -> None:
-    """Reject resuming with another config or on other data than those stored in `file`.
-
-    Raises:
-        InputError: the config differs, with the names of all fields that do, or the data do.
-    """
+    """Raise InputError where the stored config, naming all fields, or the stored data differ from the current ones."""
     if changed := ", ".join(_differences(to_dict(config_of(stored_config, file)), to_dict(cfg))):
         fix = f"`{command('train', '--resume', file.parent)}` takes the options of the folder"
         raise InputError(f"{file}: config differs at {changed}. Fix: {fix}; a new run needs a new folder.")
@@ -152,21 +136,13 @@ def _data_facts(stored: dict[str, Any]) -> dict[str, Any]:
 
 
 def config_of_run(run: Path) -> Config:
-    """The config that a run was started with, from its `config.json`.
-
-    Raises:
-        InputError: the file is missing or cannot be used.
-    """
+    """The config that a run was started with, from its `config.json`."""
     file = run / CONFIG
     return config_of(read_json(file, "pass the folder of a run that was interrupted.").get("config"), file)
 
 
 def sequence_of_run(run: Path, hint: str = "pass --data FOLDER.") -> Path:
-    """The sequence folder a run was trained on, from its `config.json`; `hint` is the fix of the error message.
-
-    Raises:
-        InputError: `config.json` is missing or does not name the folder, or the folder does not exist.
-    """
+    """The sequence folder that a run was trained on, from its `config.json`; `hint` is the fix of the error message."""
     path = _data_facts(read_json(run / CONFIG, hint)).get("path")
     if not isinstance(path, str) or not path:
         raise input_error(run / CONFIG, "the path of the sequence", repr(path), hint)
@@ -177,11 +153,7 @@ def sequence_of_run(run: Path, hint: str = "pass --data FOLDER.") -> Path:
 
 
 def read_config(file: Path, base: Config) -> Config:
-    """The config in a file: `config.json` of a run, or YAML or JSON with some fields; `base` gives the others.
-
-    Raises:
-        InputError: the file cannot be read, has an unknown field, or a value of the wrong kind or range.
-    """
+    """The config in a file: `config.json` of a run, or YAML or JSON with some fields; `base` gives the others."""
     fix = "pass config.json of a run, or a YAML file with fields of the config."
     if file.suffix.lower() == ".json":
         values = read_json(file, fix)
@@ -248,10 +220,8 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 def save_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
-    """Write everything that the next iteration depends on.
+    """Write everything that the next iteration depends on, and the fingerprint of the sequence.
 
-    Args:
-        fingerprint: of the sequence; a run only resumes on the same data.
     Raises:
         InputError: the data changed meanwhile; the checkpoint before is kept, which no changed frame went into.
     """
@@ -291,13 +261,7 @@ def load_checkpoint(trainer: Trainer, path: Path, fingerprint: str) -> None:
 
 
 def check_state(arrays: Mapping[str, Tensor], iterations: int) -> None:
-    """Reject arrays of a checkpoint, finite and of the right shapes, that no training can produce.
-
-    Args:
-        iterations: of all stages so far.
-    Raises:
-        InputError: naming the array.
-    """
+    """Raise InputError for an array, finite and of the right shape, that no training of so many iterations produces."""
     for name, value in arrays.items():
         low, high, expected = 0.0, float("inf"), "no negative number"
         if name.endswith(".steps"):

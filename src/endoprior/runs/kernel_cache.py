@@ -33,13 +33,15 @@ from ..system.surroundings import python_command
 PACKAGE = Path(__file__).parents[1]
 LIMIT_S = 900.0
 """Longest time to wait, s; then, or when the process fails, kernels are compiled when they are first used."""
-WIDTH, HEIGHT, FRAMES = 64, 48, 10
-"""Size of what is trained to compile, px, and its number of frames."""
+WIDTH, HEIGHT, FRAMES = 64, 48, 10  # size of what is trained to compile, px, and its number of frames
 _filled: set[str] = set()
 
 
 def fill(cfg: Config, say: Callable[[str], None] = lambda _: None) -> None:
-    """Make sure that the kernels which training and scoring with `cfg` need are in Numba's cache; `say` if it takes."""
+    """Make sure that the kernels which training and scoring with `cfg` need are in Numba's cache.
+
+    `say` takes one line if they must be compiled.
+    """
     if cfg.render.backend in ON_GPU or not method_of(cfg).has_gaussians:  # which need no Numba kernels
         return
     if (key := _key(cfg)) in _filled:

@@ -17,8 +17,7 @@ from ..system.atomic import write_text
 from ..training.trainer import Observer, Stage, StepReport, Trainer
 from .folder import CONFIG, LOG, SCENE
 
-LOG_EVERY = 10
-"""Iterations between two lines."""
+LOG_EVERY = 10  # iterations between two lines
 MISSED = "missed_tool_frames"
 """Frames whose masks likely miss a tool: in the last line, in the protocol of `metrics.json` and in `StepReport`."""
 MARGIN = "tool_margin_px"
@@ -74,11 +73,9 @@ def read_log(log: Path, *names: str) -> list[dict[str, Any]]:
 class Growth:
     """Counts of Gaussians, of all windows together."""
 
-    first: int
-    """In the first line of the log: before any event, unless one comes within the first iterations."""
+    first: int  # in the first line of the log: before any event, unless one comes within the first iterations
     last: int
-    num_events: int
-    """Events of density control."""
+    num_events: int  # events of density control
     changes: Counter[str]
     """How many Gaussians were `cloned`, `split` or removed by a rule (`removed_RULE`); 0 for what never happened."""
 

@@ -13,8 +13,7 @@ from ..system.console import say
 if TYPE_CHECKING:
     from ..training.trainer import Observer, StepReport, Trainer
 
-PLAIN_EVERY_SECONDS = 10.0
-"""Time between two lines in a log file."""
+PLAIN_EVERY_SECONDS = 10.0  # time between two lines in a log file
 NOTEBOOK_EVERY_SECONDS = 0.5
 
 

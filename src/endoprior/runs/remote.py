@@ -18,8 +18,7 @@ from ..system.ray_cluster import Cluster
 from .folder import CHECKPOINT_SECONDS, CONFIG, SCENE
 from .train import TrainingRun, WindowedRun, window_config
 
-RESTARTS = 3
-"""How often a training is resumed after its process died: a machine may be lost, or memory run out."""
+RESTARTS = 3  # how often a training is resumed after its process died: a machine may be lost, or memory run out
 
 
 @dataclass(frozen=True)
@@ -27,13 +26,10 @@ class Training:
     """A training in a folder of its own, as any process can do it that shares the file system."""
 
     name: str
-    data: Path
-    """Sequence folder, absolute."""
+    data: Path  # sequence folder, absolute
     cfg: Config
-    folder: Path
-    """Run folder, absolute."""
-    resume: bool
-    """Whether there must be a run in the folder already. One that is there is resumed in any case."""
+    folder: Path  # run folder, absolute
+    resume: bool  # whether there must be a run in the folder already. One that is there is resumed in any case.
     threads: Threads
     checkpoint_seconds: float = CHECKPOINT_SECONDS
 
@@ -45,11 +41,9 @@ class Training:
 class Trained:
     """The result of a training; its scene is in the folder."""
 
-    num_gaussians: int | None
-    """None for a scene that has none."""
+    num_gaussians: int | None  # None for a scene that has none
     seconds: float
-    notes: tuple[str, ...]
-    """Lines for the user about the sequence."""
+    notes: tuple[str, ...]  # lines for the user about the sequence
 
     def __str__(self) -> str:
         count = "" if self.num_gaussians is None else f", {self.num_gaussians:,} Gaussians"

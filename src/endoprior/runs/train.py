@@ -48,8 +48,7 @@ from .folder import (
 from .log import MARGIN, cut_log, log_writer, read_log
 from .progress import is_watched, training_progress
 
-LAST_GOOD = "last_good.safetensors"
-"""The scene just before its training diverged."""
+LAST_GOOD = "last_good.safetensors"  # the scene just before its training diverged
 
 log = logging.getLogger(__name__)
 
@@ -225,11 +224,7 @@ class WindowedRun:
         resume: bool,
         say: Callable[[str], None],
     ) -> None:
-        """Check the folder; every window is checked when it begins.
-
-        Args:
-            plan: first frame of each window, and the frame after its last.
-        """
+        """Check the folder; every window of the `plan`, from first frame to last + 1, is checked when it begins."""
         self.sequence, self.cfg, self.plan, self.say = sequence, cfg, plan, say
         self.out, self.resume = Path(out) if out is not None else None, resume
         if self.out:
@@ -248,11 +243,7 @@ class WindowedRun:
 
     @contextmanager
     def opened(self) -> Iterator[Path]:
-        """Begin or continue the run in its folder, which no other process can use meanwhile.
-
-        Raises:
-            InputError: the folder cannot take the run; one that was created is removed.
-        """
+        """Begin or continue the run in its folder, which no other process can use meanwhile."""
         assert self.out is not None, "a run in memory has no folder"
         out = self.out
 

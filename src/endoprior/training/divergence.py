@@ -23,18 +23,13 @@ from torch import Tensor
 
 from ..core.checks import InputError
 
-LARGEST_GRADIENT = 1e15
-"""Beyond this, or without a value, a gradient means that the run has diverged."""
-CHECK_EVERY = 20
-"""Iterations between two checks on a device: each check makes the host wait once."""
-WINDOW = 300
-"""Iterations over which images that are no better than empty ones count as divergence."""
+LARGEST_GRADIENT = 1e15  # beyond this, or without a value, a gradient means that the run has diverged
+CHECK_EVERY = 20  # iterations between two checks on a device: each check makes the host wait once
+WINDOW = 300  # iterations over which images that are no better than empty ones count as divergence
 PARTS = 10
 """... in each of so many parts of them: a bad start, such as gray for dark frames, must not outweigh what follows."""
-NO_BETTER = 0.95
-"""... when their color error is this share of that of the background alone."""
-ALIKE = 0.02
-"""Error of the background alone below which that is a fair guess and nothing is concluded."""
+NO_BETTER = 0.95  # ... when their color error is this share of that of the background alone.
+ALIKE = 0.02  # error of the background alone below which that is a fair guess and nothing is concluded
 
 ADVICE = "Lower the learning rates (--optim...), or look for wrong depth and poses with `endoprior check`"
 """For a method of Gaussians."""
@@ -50,13 +45,7 @@ class Diverged(InputError):
 
 
 def unusable_numbers(terms: Mapping[str, float], unusable: Mapping[str, int], advice: str = ADVICE) -> str | None:
-    """What is wrong with the numbers of an iteration, if anything is.
-
-    Args:
-        terms: weighted terms of the loss.
-        unusable: entries of each gradient that are not finite or beyond `LARGEST_GRADIENT`, by name.
-        advice: what to do.
-    """
+    """What is wrong with the terms of the loss, or with gradients of so many `unusable` entries; ends with `advice`."""
     found = [f"{name} {value}" for name, value in terms.items() if not math.isfinite(value)]
     found += [f"{count:,} unusable entries in the gradient of {name}" for name, count in unusable.items() if count]
     return f"expected a finite loss and gradient; got {', '.join(found)}. {advice}" if found else None
@@ -113,10 +102,8 @@ class DivergenceCheck:
             self.read(applied=iteration - 1)
 
     def read(self, applied: int) -> None:
-        """Check what is pending; on a device the host waits for it.
+        """Check what is pending; iteration `applied` was the last to be updated or skipped. A device is waited for.
 
-        Args:
-            applied: last iteration whose update was made or skipped.
         Raises:
             Diverged: one of them was unusable, or images show nothing.
         """

@@ -25,23 +25,16 @@ class TrainingFrame:
     """One training frame at one resolution."""
 
     index: int
-    time: float
-    """In [0, 1)."""
+    time: float  # in [0, 1)
     camera: Camera
-    rgb_u8: Tensor
-    """(H, W, 3) uint8."""
-    tissue_mask: Tensor
-    """(H, W) bool, True on tissue."""
+    rgb_u8: Tensor  # (H, W, 3) uint8
+    tissue_mask: Tensor  # (H, W) bool, True on tissue
     hidden: Tensor
     """(H, W) bool, True where something hides tissue: within the convex hull of `tissue_mask`, and not on it."""
-    inverse_depth: Tensor
-    """(H, W) 1 / mm; 0 where there is no depth."""
-    measured: Tensor
-    """(H, W) bool, True where tissue has a depth."""
-    num_measured: int
-    """Pixels of `measured`."""
-    brightness: float
-    """Mean color over tissue, in [0, 1]; 0 without tissue."""
+    inverse_depth: Tensor  # (H, W) 1 / mm; 0 where there is no depth
+    measured: Tensor  # (H, W) bool, True where tissue has a depth
+    num_measured: int  # pixels of `measured`
+    brightness: float  # mean color over tissue, in [0, 1]; 0 without tissue
 
     @property
     def rgb(self) -> Tensor:
@@ -54,8 +47,7 @@ class TrainingFrame:
         return torch.where(self.inverse_depth > 0, 1 / self.inverse_depth.clamp(min=1e-12), 0)
 
 
-DEVICE_SHARE = 0.25
-"""Share of a device's free memory that frames may take; frames beyond it are copied at each use."""
+DEVICE_SHARE = 0.25  # share of a device's free memory that frames may take; frames beyond it are copied at each use
 
 
 class TrainingFrames:

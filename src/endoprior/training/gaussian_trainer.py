@@ -46,14 +46,12 @@ class GaussiansState:
     """All that changes while training; a checkpoint holds exactly this."""
 
     stage: Stage
-    iteration: int
-    """Iterations of this stage already done."""
+    iteration: int  # iterations of this stage already done
     gaussians: Gaussians
     field: Field | None
     optimizer: Optimizer
     stats: DensityStats
-    tracks: StartTracks | None = None
-    """Where motion started from optical flow and is held to it."""
+    tracks: StartTracks | None = None  # where motion started from optical flow and is held to it
     left_out: Tensor | None = None
     """(F, VISITS) share of the view that was left out as a missed tool in the last visits of each training frame."""
 
@@ -130,16 +128,16 @@ class GaussianTrainer(Trainer):
         centers = torch.from_numpy(np.stack([self.cameras[i].center for i in frames.indices]))
         self.spatial_scale = spatial_scale(centers, cfg)
         self.step_once = TrainingStep(
-            self.method,
-            self.motion,
-            self.cfg,
-            frames,
-            centers,
-            render.load(cfg.render.backend),
-            self.ops,
-            DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
-            MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
-            torch.tensor(self.method.background, device=self.device),
+            method=self.method,
+            motion=self.motion,
+            cfg=self.cfg,
+            frames=frames,
+            camera_centers=centers,
+            rasterize=render.load(cfg.render.backend),
+            ops=self.ops,
+            check=DivergenceCheck(self.device, blocking=self.device.type == "cpu"),
+            doubt=MaskDoubt(sequence) if sequence.masks_are_found and not cfg.loss.trust_masks else None,
+            background=torch.tensor(self.method.background, device=self.device),
         )
 
     def start(self) -> None:

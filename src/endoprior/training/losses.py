@@ -24,11 +24,7 @@ if TYPE_CHECKING:
 
 
 def color_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
-    """L_rgb: mean absolute color difference over tissue pixels and channels.
-
-    Args:
-        color, target: (H, W, 3). tissue_mask: (H, W) bool, True on tissue.
-    """
+    """L_rgb: mean absolute difference of (H, W, 3) colors over tissue pixels (H, W) and channels."""
     count = (tissue_mask.sum() * color.shape[-1]).clamp(min=1)
     return ((color - target).abs() * tissue_mask[..., None]).sum() / count
 
@@ -38,9 +34,6 @@ def edge_l1(color: Tensor, target: Tensor, tissue_mask: Tensor) -> Tensor:
 
     Gradients are forward differences between two pixels of tissue, as in the gradient difference loss of Mathieu
     et al. 2016, but of gradients with their signs.
-
-    Args:
-        color, target: (H, W, 3). tissue_mask: (H, W) bool, True on tissue.
     """
     error = color - target
     down = (error[1:] - error[:-1]).abs() * (tissue_mask[1:] & tissue_mask[:-1])[..., None]
@@ -55,20 +48,14 @@ def inverse_depth(depth: Tensor) -> Tensor:
 
 
 def inverse_depth_l1(inverse: Tensor, target: Tensor, measured: Tensor) -> Tensor:
-    """L_depth: mean absolute difference of inverse depths over measured tissue pixels, 1 / mm.
-
-    Args:
-        inverse, target: (H, W) 1 / mm. measured: (H, W) bool, True where tissue has a depth.
-    """
+    """L_depth: mean absolute difference of inverse depths (H, W) over `measured` tissue pixels, 1 / mm."""
     return ((inverse - target).abs() * measured).sum() / measured.sum().clamp(min=1)
 
 
 def total_variation(image: Tensor, left_out: Tensor | None = None) -> Tensor:
-    """Sum of absolute forward differences along both axes, divided by the number of values.
+    """Sum of absolute forward differences of (H, W) or (H, W, C) along both axes, divided by the number of values.
 
-    Args:
-        image: (H, W) or (H, W, C).
-        left_out: (H, W) bool; a difference between two such pixels does not count. None: all count.
+    Differences between two pixels of `left_out` (H, W) do not count.
     """
     down, right = (image[1:] - image[:-1]).abs(), (image[:, 1:] - image[:, :-1]).abs()
     if left_out is not None:
@@ -133,20 +120,16 @@ def supervised_terms(out: RenderOutput, frame: TrainingFrame, cfg: LossConfig, o
 
 REFERENCE_WIDTH_PX = 640
 """Errors are in px of an image of this width, so that the weight of the term does not depend on the image size."""
-HUBER_PX = 1.0
-"""Errors beyond this count linearly: a track may be wrong."""
+HUBER_PX = 1.0  # errors beyond this count linearly: a track may be wrong
 
 
 @dataclass(frozen=True)
 class StartTracks:
     """The tracks that the first Gaussians started on."""
 
-    coefficients: Tensor
-    """(P, B, 3) motion from the point's source frame, mm."""
-    followed: Tensor
-    """(P, T) float, 1 where the flow found the point in a training frame and returned to it, else 0."""
-    rows: Tensor
-    """(N,) int64 track of each Gaussian: its own, or that of the first Gaussian it descends from."""
+    coefficients: Tensor  # (P, B, 3) motion from the point's source frame, mm
+    followed: Tensor  # (P, T) float, 1 where the flow found the point in a training frame and returned to it, else 0
+    rows: Tensor  # (N,) int64 track of each Gaussian: its own, or that of the first Gaussian it descends from
 
     def inherited(self, parents: Tensor) -> StartTracks:
         """The tracks of new Gaussians: (N',) `parents` are the rows of those that they were, or come from."""

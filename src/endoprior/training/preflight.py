@@ -22,11 +22,7 @@ from .gaussian_method import GaussianMethod
 
 
 def reject_ignored_options(cfg: Config) -> None:
-    """Reject a value that has no effect with the method of a config.
-
-    Raises:
-        InputError: names the option, and the only value that its method takes.
-    """
+    """Raise InputError for an option that the method of a config does not use; it names the only value to take."""
     method = method_of(cfg)
     only = dict(method.only)
     if isinstance(method, GaussianMethod):
@@ -51,14 +47,10 @@ def note_on_budget(cfg: Config) -> str | None:
 
 
 FLOAT = 4
-PICTURE_BYTES = 150
-"""Per pixel: a decoded frame, its prior, a rendered image and its gradients."""
-LEAST_BYTES = 300 * 2**20
-"""Compiled kernels, lists of the renderer, buffers of the libraries."""
-MOMENTS = 2
-"""Adam keeps two numbers of each parameter."""
-TRACK_BYTES = 64
-"""Per point and frame while motion is fitted: pixel, position and offset in float64."""
+PICTURE_BYTES = 150  # per pixel: a decoded frame, its prior, a rendered image and its gradients
+LEAST_BYTES = 300 * 2**20  # compiled kernels, lists of the renderer, buffers of the libraries
+MOMENTS = 2  # Adam keeps two numbers of each parameter
+TRACK_BYTES = 64  # per point and frame while motion is fitted: pixel, position and offset in float64
 
 
 def first_count(sequence: FrameSequence, cfg: Config) -> int:
@@ -77,11 +69,10 @@ def _start(cfg: Config) -> tuple[bool, float]:
 
 
 def least_bytes(cfg: Config, num: int, num_train: int, width: int, height: int) -> int:
-    """Memory that training needs beyond what the process uses already.
+    """Memory that training needs beyond what the process uses already, with `num` first Gaussians.
 
     Args:
-        cfg: fitted to the sequence (`Config.fitted`). num: first Gaussians. num_train: training frames.
-        width, height: of a frame, px.
+        cfg: fitted to the sequence (`Config.fitted`). width, height: of its `num_train` frames, px.
     """
     schema = method_of(cfg).schema(cfg)
     sizes = {
@@ -98,11 +89,7 @@ def least_bytes(cfg: Config, num: int, num_train: int, width: int, height: int) 
 
 
 def reject_too_large(sequence: FrameSequence, cfg: Config) -> None:
-    """Reject a training that the free memory cannot hold.
-
-    Raises:
-        InputError: it needs more than there is; with both numbers.
-    """
+    """Raise InputError, with both numbers, for a training that needs more than the free memory."""
     free = available_bytes()
     camera, num_train, num = sequence.camera(0), len(sequence.indices("train")), first_count(sequence, cfg)
     least = least_bytes(cfg.fitted(len(sequence)), num, num_train, camera.width, camera.height)

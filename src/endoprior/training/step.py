@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -35,38 +35,32 @@ RESET_OPACITY = 0.01
 """Where methods that reset opacities lower them to (3DGS)."""
 
 
+class Before(NamedTuple):
+    """The training frame just before, with which the temporal term compares."""
+
+    frame: TrainingFrame
+    tissue_now: Tensor  # (H, W) bool: the tissue mask of the rendered frame, missed tools included
+    means: Tensor | None  # (N, 3) centers at the frame before, mm, where they are known already
+
+
 @dataclass(frozen=True)
 class Drawn:
     """A training frame that was rendered, and what it was rendered from: what the loss of a method sees."""
 
     stage: Stage
-    iteration: int
-    """1-based, within the stage."""
-    position: int
-    """Place of the frame among the training frames."""
-    frame: TrainingFrame
-    """What is compared: `unmasked` without the pixels that show a tool in spite of the mask."""
+    iteration: int  # 1-based, within the stage
+    position: int  # place of the frame among the training frames
+    frame: TrainingFrame  # what is compared: without the pixels that show a tool in spite of the mask
     gaussians: Gaussians
     field: Field | None
-    offsets: Offsets | None
-    """What moved them; None in the coarse stage."""
-    splats: Splats
-    """The Gaussians as they were rendered."""
+    offsets: Offsets | None  # what moved them; None in the coarse stage
+    splats: Splats  # the Gaussians as they were rendered
     out: RenderOutput
-    draw: Callable[[Splats], RenderOutput]
-    """Renders other Gaussians from the same camera."""
-    context: Any
-    """What the method's `context` made of all training frames."""
-    unmasked: TrainingFrame | None = None
-    """The frame as it is in the sequence; it goes with `before`."""
-    before: TrainingFrame | None = None
-    """The frame before, where the temporal term takes part."""
-    means_before: Tensor | None = None
-    """(N, 3) centers at the frame before, mm, if they are known already."""
-    is_right: bool = False
-    """Of the right eye: only its picture and depth are compared."""
-    left_out: float | None = None
-    """Share of the view that does not count as it shows a missed tool; None where that was not asked."""
+    draw: Callable[[Splats], RenderOutput]  # renders other Gaussians from the same camera
+    context: Any  # what the method's `context` made of all training frames
+    before: Before | None = None  # the frame before, where the temporal term takes part
+    is_right: bool = False  # of the right eye: only its image and depth are compared
+    left_out: float | None = None  # share of the view that shows a missed tool; None where that was not asked
 
 
 @dataclass
@@ -77,19 +71,15 @@ class TrainingStep:
     """
 
     method: GaussianMethod
-    motion: Motion
-    """That of the method."""
+    motion: Motion  # that of the method
     cfg: Config
     frames: TrainingFrames
-    camera_centers: Tensor
-    """(T, 3) camera positions of the training frames, mm."""
+    camera_centers: Tensor  # (T, 3) camera positions of the training frames, mm
     rasterize: Rasterizer
     ops: TrainingOps
     check: DivergenceCheck
-    doubt: MaskDoubt | None = None
-    """Takes missed tools out of the frames; None trusts the masks."""
-    background: Tensor = field(default_factory=lambda: torch.zeros(3))
-    """(3,) color behind everything."""
+    doubt: MaskDoubt | None  # takes missed tools out of the frames; None trusts the masks
+    background: Tensor  # (3,) color behind everything
 
     @cached_property
     def context(self) -> Any:
@@ -104,8 +94,7 @@ class TrainingStep:
                 the last good iteration. Or no Gaussian is left, or a split would give one of infinite size: the state
                 is then the one before density control.
         """
-        began, cfg, method = clock.perf_counter(), self.cfg, self.method
-        iteration = state.iteration + 1
+        began, cfg, method, iteration = clock.perf_counter(), self.cfg, self.method, state.iteration + 1
         rng = np.random.default_rng([cfg.seed, int(state.stage), iteration])
         fine, last = state.stage is Stage.FINE, iteration == stage_length(cfg, state.stage)
         densify = method.density_due(state.stage, iteration, last, cfg)
@@ -114,7 +103,7 @@ class TrainingStep:
 
         drawn = self.draw(state, rng)
         terms, color_error = self.loss(state, drawn)
-        sum(terms.values()).backward()
+        sum(terms.values(), torch.zeros(())).backward()
         unusable, empty_error = state.optimizer.count_unusable(), method.empty_error(drawn.frame.brightness)
         wait = densify or reset or last
         try:
@@ -146,50 +135,31 @@ class TrainingStep:
         is_right = fine and cfg.data.eyes == "both" and rng.random() < 0.5
         half = fine and iteration <= cfg.schedule.half_resolution_iterations
         frame = counted = self.frames.frame(position, half=half, right=is_right)
-        before = None
+        previous = None
         if fine and not is_right and cfg.temporal.weight > 0 and iteration >= cfg.temporal.start_iteration:
-            before = self.frames.before(position)
+            previous = self.frames.before(position)
 
-        gaussians, model_ops = state.gaussians, self.ops.model
-        offsets = means_before = None
-        if fine and before and cfg.temporal.gradient == "both" and isinstance(state.field, HexPlaneField):
-            offsets, displacement = state.field.offsets_and_displacement(
-                gaussians["means"], frame.time, before.time, model_ops
-            )
-            means_before = gaussians["means"] + displacement
+        gaussians, model_ops, offsets, means_before = state.gaussians, self.ops.model, None, None
+        if fine and previous and cfg.temporal.gradient == "both" and isinstance(state.field, HexPlaneField):
+            means = gaussians["means"]
+            offsets, moved = state.field.offsets_and_displacement(means, frame.time, previous.time, model_ops)
+            means_before = means + moved
         elif fine:
             offsets = self.motion.offsets(gaussians, state.field, frame.time, cfg, model_ops)
         splats = gaussians.splats(offsets, sh_degree(cfg, state.stage, iteration))
 
-        draw = partial(
-            self.rasterize,
-            camera=frame.camera,
-            background=self.background,
-            depth_grad_to_means=cfg.render.depth_grad_to_means,
-        )
+        depth_grad = cfg.render.depth_grad_to_means
+        draw = partial(self.rasterize, camera=frame.camera, background=self.background, depth_grad_to_means=depth_grad)
         out = draw(splats)
         out.means2d.retain_grad()
         left_out = None
         if self.doubt and fine and not is_right and iteration > START * stage_length(cfg, Stage.FINE):
             counted = self.doubt.counted(frame, out.color)
             left_out = self.doubt.share(frame, counted)
+        before = previous and Before(previous, frame.tissue_mask, means_before)
+        moved_by = (gaussians, state.field, offsets, splats)
         return Drawn(
-            stage=state.stage,
-            iteration=iteration,
-            position=position,
-            frame=counted,
-            unmasked=frame,
-            before=before,
-            is_right=is_right,
-            left_out=left_out,
-            gaussians=gaussians,
-            field=state.field,
-            offsets=offsets,
-            means_before=means_before,
-            splats=splats,
-            out=out,
-            draw=draw,
-            context=self.context,
+            state.stage, iteration, position, counted, *moved_by, out, draw, self.context, before, is_right, left_out
         )
 
     def loss(self, state: GaussiansState, drawn: Drawn) -> tuple[dict[str, Tensor], Tensor]:
@@ -203,7 +173,7 @@ class TrainingStep:
             term = track_term(means, drawn.offsets.means, state.tracks, frame, drawn.position, basis, self.ops)
             terms |= {"track": cfg.loss.track_weight * term}
         if drawn.before is not None:
-            terms |= temporal_terms(drawn, self.motion, state.stats, cfg, self.ops)
+            terms |= temporal_terms(drawn, drawn.before, self.motion, state.stats, cfg, self.ops)
         return terms, error
 
     def _observe(self, state: GaussiansState, drawn: Drawn) -> None:

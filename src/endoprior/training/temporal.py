@@ -22,7 +22,7 @@ from .frames import TrainingFrame
 
 if TYPE_CHECKING:
     from .ops import TrainingOps
-    from .step import Drawn
+    from .step import Before, Drawn
 
 MIN_WEIGHT = 1e-4
 """Motion weights up to this are treated as zero (released code)."""
@@ -118,13 +118,13 @@ def least_points(cfg: TemporalConfig) -> int:
 
 
 def temporal_terms(
-    drawn: Drawn, motion: Motion, stats: DensityStats, cfg: Config, ops: TrainingOps
+    drawn: Drawn, before: Before, motion: Motion, stats: DensityStats, cfg: Config, ops: TrainingOps
 ) -> dict[str, Tensor]:
-    """L_local of Eq. (11), weighted, () each; nothing with few Gaussians. `drawn` has a frame before."""
-    temporal, out, means, before = cfg.temporal, drawn.out, drawn.splats.means, drawn.before
+    """L_local of Eq. (11), weighted, () each; nothing with few Gaussians."""
+    temporal, out, means = cfg.temporal, drawn.out, drawn.splats.means
     seen = out.radii > 0
     if temporal.valid_at_both:
-        seen = ops.valid_projection(out.means2d, out.radii, drawn.unmasked.tissue_mask)
+        seen = ops.valid_projection(out.means2d, out.radii, before.tissue_now)
     eligible = seen & (stats.num_valid >= temporal.min_valid)
     score = stats.score(cfg.density.unobserved_score)
     index, weights = (
@@ -133,9 +133,9 @@ def temporal_terms(
     )
     if not len(index):
         return {}
-    earlier = _means_before(drawn, motion, index, cfg, ops)
+    earlier = _means_before(drawn, before, motion, index, cfg, ops)
     if temporal.valid_at_both:
-        kept = _on_tissue(earlier.detach(), before, ops)
+        kept = _on_tissue(earlier.detach(), before.frame, ops)
         index, weights, earlier = index[kept], weights[kept], earlier[kept]
         if len(index) < least_points(temporal):
             return {}
@@ -146,11 +146,11 @@ def temporal_terms(
     }
 
 
-def _means_before(drawn: Drawn, motion: Motion, index: Tensor, cfg: Config, ops: TrainingOps) -> Tensor:
+def _means_before(drawn: Drawn, before: Before, motion: Motion, index: Tensor, cfg: Config, ops: TrainingOps) -> Tensor:
     """(P, 3) centers of the chosen Gaussians at the frame before, with a gradient only if that end is trained."""
-    if drawn.means_before is not None:
-        return drawn.means_before[index]
-    means, known = drawn.gaussians["means"], (drawn.gaussians, drawn.field, drawn.before.time, cfg, ops.model)
+    if before.means is not None:
+        return before.means[index]
+    means, known = drawn.gaussians["means"], (drawn.gaussians, drawn.field, before.frame.time, cfg, ops.model)
     if cfg.temporal.gradient == "both":
         # Moving all and then choosing is cheaper than the scattered gradient of choosing first.
         return (means + motion.offsets(*known).means)[index]

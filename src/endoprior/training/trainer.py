@@ -19,8 +19,7 @@ from ..data import FrameSequence
 from ..model.scene import RenderedScene
 from ..system.arrays_file import ArraySpec
 
-DEFAULT_FRAMES_PER_SECOND = 25.0
-"""Playing speed of a sequence that does not state its own."""
+DEFAULT_FRAMES_PER_SECOND = 25.0  # playing speed of a sequence that does not state its own
 
 
 class Stage(IntEnum):
@@ -62,8 +61,7 @@ class State(Protocol):
     """What changes while training; a checkpoint holds exactly this."""
 
     stage: Stage
-    iteration: int
-    """Iterations of this stage already done."""
+    iteration: int  # iterations of this stage already done
 
     def arrays(self) -> dict[str, Tensor]:
         """Every tensor by the name that it has in a checkpoint."""
@@ -74,11 +72,9 @@ class Trainer(ABC):
     """One training run: `start` or `restore`, then `run`; `scene` is its result so far."""
 
     sequence: FrameSequence
-    cfg: Config
-    """Fitted to the length of the sequence."""
+    cfg: Config  # fitted to the length of the sequence
     device: torch.device
-    state: State
-    """From `start` or `restore` on."""
+    state: State  # from `start` or `restore` on
 
     @abstractmethod
     def start(self) -> None:
@@ -137,8 +133,7 @@ class Trainer(ABC):
                 observe(report, self)
 
 
-Observer = Callable[[StepReport, Trainer], None]
-"""Called after each iteration: progress, log, checkpoints, viewer."""
+Observer = Callable[[StepReport, Trainer], None]  # called after each iteration: progress, log, checkpoints, viewer
 
 
 def device_for(backend: render.Backend) -> torch.device:
