@@ -11,7 +11,7 @@ from endoprior.compute.morton import morton_order
 from endoprior.core.config import Config, DensityConfig
 from endoprior.core.types import RenderOutput
 from endoprior.model.gaussians import create_gaussians
-from endoprior.training import density, density_numba
+from endoprior.training import density
 from endoprior.training.density import DensityStats, Plan, apply_plan, split_children
 from endoprior.training.ops import NUMBA
 from endoprior.training.optimizer import Optimizer, rate_of
@@ -47,7 +47,7 @@ def test_a_constant_prior_gives_that_score_to_every_observed_gaussian(c):
     stats = DensityStats.zeros(3)
     prior, mask = torch.full((20, 30), c), torch.ones(20, 30, dtype=torch.bool)
     for _ in range(5):
-        density_numba.add_score(stats, output([[3, 4], [29.9, 0.1], [15, 10]]), prior, mask, torch.full((3,), 0.4))
+        NUMBA.add_score(stats, output([[3, 4], [29.9, 0.1], [15, 10]]), prior, mask, torch.full((3,), 0.4))
     # epsilon 1e-6 in the denominator of Eq. (7)
     assert stats.score(0.0).tolist() == pytest.approx([c] * 3, abs=1e-6)
     assert stats.mean_opacity(torch.zeros(3)).tolist() == pytest.approx([0.4] * 3)
@@ -56,7 +56,7 @@ def test_a_constant_prior_gives_that_score_to_every_observed_gaussian(c):
 def test_score_samples_a_ramp_at_the_projected_centre():
     ramp = (torch.arange(30) + 0.5).expand(20, 30) / 30  # value x / 30 at x px
     stats = DensityStats.zeros(2)
-    density_numba.add_score(
+    NUMBA.add_score(
         stats,
         output([[7.25, 3.0], [20.5, 12.0]]),
         ramp.contiguous(),
@@ -71,7 +71,7 @@ def test_projections_off_the_image_off_tissue_or_undrawn_do_not_count():
     mask[:, :10] = False
     stats = DensityStats.zeros(5)
     where = [[-1, 5], [15, 25], [4, 4], [20, 10], [20, 10]]
-    density_numba.add_score(stats, output(where, [1, 1, 1, 0, 1]), torch.ones(20, 30), mask, torch.ones(5))
+    NUMBA.add_score(stats, output(where, [1, 1, 1, 0, 1]), torch.ones(20, 30), mask, torch.ones(5))
     assert stats.num_valid.tolist() == [0, 0, 0, 0, 1]
 
 
@@ -86,7 +86,7 @@ def test_score_agrees_with_grid_sample(scale):
     prior, mask = torch.rand(20, 30, generator=generator), torch.rand(20, 30, generator=generator) > 0.3
     opacities = torch.rand(num, generator=generator)
     stats = DensityStats.zeros(num)
-    density_numba.add_score(stats, output(means2d.tolist(), radii.tolist()), prior, mask, opacities, scale)
+    NUMBA.add_score(stats, output(means2d.tolist(), radii.tolist()), prior, mask, opacities, scale)
 
     grid = (2 * scale * means2d / torch.tensor([30.0, 20.0]) - 1)[None, None]
     maps = torch.stack([prior, mask.float()])[None]
@@ -98,7 +98,7 @@ def test_score_agrees_with_grid_sample(scale):
     assert torch.equal(stats.num_valid[clear], valid.float()[clear])
     torch.testing.assert_close(stats.score_sum[clear], torch.where(valid, value, 0)[clear], rtol=1e-5, atol=1e-5)
     assert torch.equal(stats.opacity_sum[clear], torch.where(valid, opacities, 0)[clear])
-    found = density_numba.valid_projection(scale * means2d, radii, mask)
+    found = NUMBA.valid_projection(scale * means2d, radii, mask)
     assert torch.equal(found, stats.num_valid > 0)
 
 
@@ -117,7 +117,7 @@ def test_gradient_is_counted_in_ndc_and_only_where_drawn():
     out = output([[1, 1], [2, 2]], [1, 0])
     out.means2d.grad = torch.tensor([[3.0, 4.0], [1.0, 1.0]])
     stats = DensityStats.zeros(2)
-    density_numba.add_gradient(stats, out, width=200, height=100)
+    NUMBA.add_gradient(stats, out, width=200, height=100)
     assert stats.grad2d_ndc_sum.tolist() == pytest.approx([np.hypot(300, 200), 0])
     assert stats.num_seen.tolist() == [1, 0]
 

@@ -15,8 +15,8 @@ from torch import Tensor
 from endoprior.core.config_deformation import HexPlaneConfig
 from endoprior.model.hexplane import FRESH, PLANE_NAMES, TOUCHED, PlaneGrid, mapped_zeros
 from endoprior.model.hexplane_numba import CHUNK, hexplane_linear
-from endoprior.training.adam import PlaneAdam
-from endoprior.training.adam_numba import adam_planes_step, step_cells
+from endoprior.training.adam import PlaneAdam, step_cells
+from endoprior.training.adam import adam_planes_step_numba as adam_planes_step
 
 
 def planes_of(grid: PlaneGrid, source: Tensor | None = None) -> list[list[Tensor]]:

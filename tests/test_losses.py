@@ -8,8 +8,8 @@ import torch
 from endoprior.core.config import LossConfig
 from endoprior.core.types import RenderOutput
 from endoprior.training import losses
+from endoprior.training.losses import supervised_losses_numba as supervised_losses
 from endoprior.training.losses import supervised_terms
-from endoprior.training.losses_numba import supervised_losses
 from endoprior.training.ops import NUMBA
 
 

@@ -14,7 +14,7 @@ from hypothesis_profiles import examples
 
 from endoprior.core.config import TemporalConfig
 from endoprior.training import losses, temporal, temporal_numba
-from endoprior.training.losses_numba import supervised_losses
+from endoprior.training.losses import supervised_losses_numba as supervised_losses
 
 
 @st.composite

@@ -69,8 +69,8 @@ def smooth_motion(positions: NDArray[np.floating], origins: NDArray[np.integer])
     count = min(COMPANIONS, positions.shape[1])
     for source in np.unique(origins):
         own = np.flatnonzero(origins == source)
-        tree = KDTree(positions[source])
-        distances, nearest = tree.query(positions[source, own], k=np.arange(1, count + 1, COMPANION_STEP), workers=-1)
+        tree, asked = KDTree(positions[source]), np.arange(1, count + 1, COMPANION_STEP)
+        distances, nearest = tree.query(positions[source, own], k=asked, workers=-1)  # pyright: ignore[reportArgumentType]
         mean_displacement(positions, source, own, nearest, weights_by_distance(distances), offsets)
     return offsets
 

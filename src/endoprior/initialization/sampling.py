@@ -28,12 +28,9 @@ from ..system.memory import workers
 class PointCloud:
     """Colored points."""
 
-    points: NDArray[np.float32]
-    """(N, 3) world coordinates, mm."""
-    colors: NDArray[np.float32]
-    """(N, 3) red, green, blue in [0, 1]."""
-    origins: NDArray[np.int32]
-    """(N,) position of the source frame of each point in the list of sampled frames."""
+    points: NDArray[np.float32]  # (N, 3) world coordinates, mm
+    colors: NDArray[np.float32]  # (N, 3) red, green, blue in [0, 1]
+    origins: NDArray[np.int32]  # (N,) position of the source frame of each point in the list of sampled frames
 
     def __len__(self) -> int:
         return len(self.points)
@@ -51,13 +48,13 @@ def concatenated(clouds: list[PointCloud]) -> PointCloud:
 
 
 def merge_voxels(cloud: PointCloud, divisions: int) -> PointCloud:
-    """Replace the points of each voxel by their mean position and mean color.
+    """Replace the points of each voxel by their mean position and mean color, with the origin of the first one.
 
     Args:
         cloud: finite points.
         divisions: number of voxels along the longest side of the bounding box, whose corner is the center of a voxel.
     Returns:
-        One point per occupied voxel, ordered by voxel (x, then y, then z), with the origin of its first point.
+        One point per occupied voxel, ordered by voxel (x, then y, then z).
     """
     if len(cloud) == 0:
         return cloud
@@ -79,14 +76,11 @@ def merge_voxels(cloud: PointCloud, divisions: int) -> PointCloud:
 
 
 def remove_outliers(cloud: PointCloud, num_neighbors: int, num_std: float) -> PointCloud:
-    """Remove points whose mean distance to their neighbors is unusually large.
+    """Remove points whose mean distance to their nearest points is unusually large; all stay if there are too few.
 
     Args:
-        cloud: finite points.
         num_neighbors: number of nearest points in the mean, including the point itself (distance 0).
         num_std: points above the mean plus this many standard deviations are removed.
-    Returns:
-        The other points, in order; the cloud itself if it has at most `num_neighbors` points.
     """
     if len(cloud) <= num_neighbors:
         return cloud
@@ -156,10 +150,7 @@ def initial_points(
 
 
 def has_surface(frame: Frame) -> NDArray[np.bool_]:
-    """(H, W) True where depth was measured and lies behind the near plane of the renderer.
-
-    Depth in meters, mistaken for millimeters, lies in front of the near plane and would never be rendered.
-    """
+    """(H, W) True where depth was measured and lies behind the near plane of the renderer; meters never do."""
     return frame.depth_valid & (frame.depth > NEAR_Z) & (frame.depth < FARTHEST_MM)
 
 
@@ -248,8 +239,6 @@ def sample_pixels(weights: NDArray[np.float64], count: int, rng: np.random.Gener
 
     Args:
         weights: (H, W) weights >= 0; pixels of weight 0 are never sampled.
-        count: number of pixels.
-        rng: source of randomness.
     Returns:
         (min(count, non-zero weights),) flat indices, ascending.
     """
@@ -261,13 +250,10 @@ def sample_pixels(weights: NDArray[np.float64], count: int, rng: np.random.Gener
 
 
 def initial_log_scales(points: NDArray[np.floating], variance_factor: float = 1.0) -> NDArray[np.float32]:
-    """Log standard deviation of isotropic Gaussians, from the distance to their nearest neighbors.
+    """(N,) log standard deviation of isotropic Gaussians at points (N, 3), mm, from their 3 nearest neighbors.
 
-    Args:
-        points: (N, 3) centers, mm; repeated points count as neighbors at distance 0.
-        variance_factor: multiplies the mean squared distance.
-    Returns:
-        (N,) 0.5 log(factor * max(mean of the 3 smallest squared distances, 1e-7 mm^2)).
+    0.5 log(factor * max(mean of the 3 smallest squared distances, 1e-7 mm^2)); repeated points are at distance 0.
+
     Raises:
         ValueError: wrong shape, not finite, or fewer than 4 points.
     """

@@ -27,7 +27,7 @@ from ..model.motion import Field, Motion
 from ..model.scene_file import check_cameras
 from ..model.single_scene import SingleScene
 from ..system.arrays_file import ArraySpec, part
-from .density import DensityStats
+from .density_stats import DensityStats
 from .divergence import Diverged, DivergenceCheck
 from .frames import TrainingFrames
 from .losses import StartTracks
@@ -51,30 +51,24 @@ class GaussiansState:
     field: Field | None
     optimizer: Optimizer
     stats: DensityStats
-    tracks: StartTracks | None = None  # where motion started from optical flow and is held to it
-    left_out: Tensor | None = None
-    """(F, VISITS) share of the view that was left out as a missed tool in the last visits of each training frame."""
+    tracks: StartTracks | None  # where motion started from optical flow and is held to it
+    left_out: Tensor | None  # (F, VISITS) share of the view that showed a missed tool in the last visits of each frame
 
     def arrays(self) -> dict[str, Tensor]:
         """Every tensor by the name that it has in a checkpoint."""
-        arrays = {f"gaussians.{name}": value.detach() for name, value in self.gaussians.tensors.items()}
-        arrays |= {f"stats.{name}": value for name, value in self.stats.tensors().items()}
-        arrays |= {f"optimizer.{name}": value for name, value in self.optimizer.state_arrays().items()}
-        if self.tracks is not None:
-            arrays |= {f"tracks.{name}": value for name, value in self.tracks.tensors().items()}
-        if self.left_out is not None:
-            arrays["left_out"] = self.left_out
-        if self.field is not None:
-            arrays |= {f"field.{name}": value for name, value in self.field.state_arrays().items()}
-        return arrays
+        parts = {
+            "gaussians": {name: value.detach() for name, value in self.gaussians.tensors.items()},
+            "stats": self.stats.tensors(),
+            "optimizer": self.optimizer.state_arrays(),
+            "tracks": self.tracks.tensors() if self.tracks else {},
+            "field": self.field.state_arrays() if self.field else {},
+        }
+        arrays = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
+        return arrays if self.left_out is None else arrays | {"left_out": self.left_out}
 
 
 def state_schema(motion: Motion, cfg: Config, *, doubts: bool) -> dict[str, ArraySpec]:
-    """The arrays of a `GaussiansState`: the model, Adam's moments, statistics of density control, and tracks, if any.
-
-    Args:
-        doubts: also how much of each frame was left out as a missed tool.
-    """
+    """The arrays of a `GaussiansState`; where masks are in doubt, also how much of each frame was left out."""
     model = motion.schema(cfg)
     trained = {name.removeprefix("gaussians."): spec for name, spec in model.items() if name.startswith("gaussians.")}
     trained |= {name: ArraySpec("float32", shape) for name, shape in motion.parameter_shapes(cfg).items()}
@@ -103,13 +97,10 @@ class GaussianTrainer(Trainer):
     state: GaussiansState
 
     def __init__(self, sequence: FrameSequence, cfg: Config, ops: TrainingOps | None = None) -> None:
-        """Prepare; nothing is computed yet.
+        """Prepare with `ops`, or with those that suit the device; nothing is computed yet.
 
-        Args:
-            ops: implementation of the operations; None takes the one that suits the device.
         Raises:
-            InputError: the cameras cannot be used, the backend has no device here, or there is no right eye to train
-                on.
+            InputError: the cameras cannot be used, the backend has no device here, or there is no right eye.
         """
         if cfg.data.eyes == "both" and sequence.right_eye is None:
             fix = f"`{command('prepare', 'VIDEO', sequence.path)} --keep-right`, or leave --eyes out."

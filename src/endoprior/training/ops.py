@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..model import ops as model_ops
-from . import adam, adam_numba, density, density_numba, losses, losses_numba, temporal, temporal_numba
+from . import adam, density_stats, losses, temporal, temporal_numba
 
 
 @dataclass(frozen=True)
@@ -34,24 +34,24 @@ class TrainingOps:
 
 NUMBA = TrainingOps(
     model=model_ops.NUMBA,
-    supervised_losses=losses_numba.supervised_losses,
+    supervised_losses=losses.supervised_losses_numba,
     local_consistency=temporal_numba.local_consistency,
-    add_gradient=density_numba.add_gradient,
-    add_score=density_numba.add_score,
-    valid_projection=density_numba.valid_projection,
-    count_unusable=adam_numba.count_unusable,
-    count_unusable_in_planes=adam_numba.count_unusable_in_planes,
-    adam_step=adam_numba.adam_step,
-    adam_basis_step=adam_numba.adam_basis_step,
-    adam_planes_step=adam_numba.adam_planes_step,
+    add_gradient=density_stats.add_gradient_numba,
+    add_score=density_stats.add_score_numba,
+    valid_projection=density_stats.valid_projection_numba,
+    count_unusable=adam.count_unusable_numba,
+    count_unusable_in_planes=adam.count_unusable_in_planes_numba,
+    adam_step=adam.adam_step_numba,
+    adam_basis_step=adam.adam_basis_step_numba,
+    adam_planes_step=adam.adam_planes_step_numba,
 )
 TORCH = TrainingOps(
     model=model_ops.TORCH,
     supervised_losses=losses.supervised_losses,
     local_consistency=temporal.local_consistency,
-    add_gradient=density.add_gradient,
-    add_score=density.add_score,
-    valid_projection=density.valid_projection,
+    add_gradient=density_stats.add_gradient,
+    add_score=density_stats.add_score,
+    valid_projection=density_stats.valid_projection,
     count_unusable=adam.count_unusable,
     count_unusable_in_planes=adam.count_unusable_in_planes,
     adam_step=adam.adam_step,

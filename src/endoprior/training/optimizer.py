@@ -13,8 +13,7 @@ from torch import Tensor
 from ..core.config import Config, OptimConfig
 from ..model.gaussians import ATTRIBUTES, Gaussians, motion_layout
 from ..model.motion import Field, UnstoredGradient
-from .adam import AdamState, PlaneAdam
-from .adam_numba import adam_unstored_step
+from .adam import AdamState, PlaneAdam, adam_unstored_step
 from .divergence import LARGEST_GRADIENT
 from .ops import TrainingOps
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from ..core.config import Config, TemporalConfig
 from ..core.geometry import project
 from ..model.motion import Motion
-from .density import DensityStats
+from .density_stats import DensityStats
 from .frames import TrainingFrame
 
 if TYPE_CHECKING:
@@ -37,13 +37,7 @@ POINTS_AT_A_TIME = 4096
 
 
 def motion_weight(score: NDArray, threshold: float, temperature: float) -> NDArray:
-    """w^mot = sigmoid((s - tau_m) / gamma_m), Eq. (9).
-
-    Args:
-        score: (N,) texture-prior scores in [0, 1].
-    Returns:
-        (N,) in (0, 1).
-    """
+    """(N,) w^mot = sigmoid((s - tau_m) / gamma_m) of texture-prior scores s (N,), Eq. (9)."""
     with np.errstate(over="ignore"):  # 1 / infinity is the right weight of a score far below the threshold
         return 1 / (1 + np.exp(-(score - threshold) / temperature))
 
@@ -196,7 +190,7 @@ def affinity(distances: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
     sigma_loc, which the paper leaves open, is the median neighbor distance of the iteration (released code).
 
     Args:
-        distances: (P, K) mm. indices: (P, K) of the neighbors. weights: (P,) motion weights.
+        distances, indices: (P, K) of the neighbors, mm. weights: (P,) motion weights.
     """
     sigma = distances.flatten().quantile(0.5).clamp(min=1e-8)  # as in NumPy, between the middle two of an even number
     return ((-(distances**2) / (2 * sigma**2)).exp() * weights[:, None] * weights[indices]).clamp(min=SUM_EPS)
