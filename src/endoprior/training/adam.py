@@ -283,33 +283,12 @@ def _adam_outer(param, weights, v, first, second, begin, rate, root_scale, beta1
 
 
 def adam_planes_step_numba(planes: PlaneAdam, rate: float, _skip: None = None) -> None:
-    """See `adam_planes_step`."""
-    grid = planes.grid
+    """See `adam_planes_step`; marks tell the cells that were ever touched, and those with a new gradient."""
     planes.steps += 1
-    buffers = (grid.values, grid.grads, planes.exp_avg, planes.exp_avg_sq, grid.marks)
-    step_cells(*buffers, int(planes.steps), rate, planes.epsilon)
-
-
-def step_cells(
-    values: Tensor,
-    grads: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    marks: Tensor,
-    step: int,
-    rate: float,
-    epsilon: float,
-) -> None:
-    """Update, in place, the rows of `values` that `marks` calls touched, and clear their gradients.
-
-    Args:
-        values, grads, exp_avg, exp_avg_sq: (cells, C) float32, contiguous; rows with mark 0 must have zero gradient.
-        marks: (cells,) uint8 of `TOUCHED` and `FRESH` bits; FRESH is cleared.
-        step: number of this step, from 1. rate: learning rate.
-    """
-    arrays = (t.numpy() for t in (values, grads, exp_avg, exp_avg_sq, marks))
+    grid, step = planes.grid, int(planes.steps)
+    arrays = (t.numpy() for t in (grid.values, grid.grads, planes.exp_avg, planes.exp_avg_sq, grid.marks))
     scaled, correction = rate / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)
-    _step_cells(*arrays, *map(np.float32, (1 - BETA1, BETA2, 1 - BETA2, scaled, correction, epsilon)))
+    _step_cells(*arrays, *map(np.float32, (1 - BETA1, BETA2, 1 - BETA2, scaled, correction, planes.epsilon)))
 
 
 @njit(inline="always")
